@@ -1,0 +1,101 @@
+//! The accounting of frames: every trigger that was expected ends in exactly one column.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+/// Why a frame that a point needed did not count towards it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LossCause {
+    /// The camera exposed a frame (its id says so) that never reached the host.
+    CameraGap,
+    /// A VSYNC edge came while the camera should have been ready, and no frame followed.
+    MissedTrigger,
+    /// No VSYNC edge was seen where the frame's, or its light's, should have been.
+    EdgeMissing,
+    /// The frame was triggered by an edge that is not the projector's.
+    FalseEdge,
+    /// The measured delay lies further from the wanted one than the plan's `max_jitter_us`.
+    Jitter,
+    /// The frame's own exposure differs from the one that the point asked for.
+    SettingsMismatch,
+    /// No buffer of the pool was free.
+    PoolEmpty,
+    /// The pipeline's queue was full.
+    QueueFull,
+    /// A stage failed or panicked.
+    StageError,
+    /// The data could not be written.
+    WriterError,
+}
+
+/// Where the triggers of a point, an attempt or a run went.
+///
+/// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` is counted
+/// from the camera's frame ids and the VSYNC edges, the other columns frame by frame where each is decided.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Counts {
+    /// Triggers that the camera should have answered.
+    pub expected: u64,
+    /// Frames summed into stored images.
+    pub averaged: u64,
+    /// Frames that may have been exposed under the settings before.
+    pub settling: u64,
+    /// Frames that nobody waited for: between passes, after a pause or a cancel, or of an attempt given up.
+    pub cancelled: u64,
+    /// Frames lost, by cause.
+    #[serde(default)]
+    pub lost: BTreeMap<LossCause, u64>,
+}
+
+impl Counts {
+    /// Notes `frames` lost to `cause`; none leaves no entry.
+    pub fn lose(&mut self, cause: LossCause, frames: u64) {
+        if frames > 0 {
+            *self.lost.entry(cause).or_default() += frames;
+        }
+    }
+
+    /// Frames lost, over all causes.
+    pub fn lost_total(&self) -> u64 {
+        self.lost.values().sum()
+    }
+
+    /// Whether every expected trigger is accounted for exactly once.
+    pub fn balanced(&self) -> bool {
+        self.expected == self.averaged + self.settling + self.cancelled + self.lost_total()
+    }
+
+    /// Adds another account to this one.
+    pub fn add(&mut self, other: &Counts) {
+        self.expected += other.expected;
+        self.averaged += other.averaged;
+        self.settling += other.settling;
+        self.cancelled += other.cancelled;
+        for (&cause, &frames) in &other.lost {
+            self.lose(cause, frames);
+        }
+    }
+
+    /// Turns the frames that had been averaged into frames lost to `cause`: their sum could not be kept.
+    pub fn forfeit(&mut self, cause: LossCause) {
+        let frames = std::mem::take(&mut self.averaged);
+        self.lose(cause, frames);
+    }
+}
+
+/// What the edges of a run's VSYNC line were like.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct VsyncStats {
+    /// True edges seen.
+    pub edges: u64,
+    /// Edges that should have been and were not seen.
+    pub missed: u64,
+    /// Edges that are not the projector's.
+    pub false_edges: u64,
+    /// Mean period.
+    pub period_us: f64,
+    /// Standard deviation of single periods.
+    pub jitter_us: f64,
+}

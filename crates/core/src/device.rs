@@ -1,0 +1,170 @@
+//! What the devices of a rig must do. The traits are blocking: one named thread owns each device.
+
+use std::time::Duration;
+
+use crate::{DeviceError, Edge, FrameBuf, FrameStamp, PixelFormat};
+
+/// How a sensor exposes its rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shutter {
+    /// Each row starts one row time after the row above it.
+    Rolling,
+    /// All rows together.
+    Global,
+}
+
+/// Whether a sensor can expose while it reads out the frame before.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Readout {
+    /// Readout follows exposure: a trigger that comes before its end is not answered.
+    Sequential,
+    /// The next exposure may start during readout, as long as no row is exposed twice at once.
+    Overlapped,
+}
+
+/// Names one set of camera settings: the point of the plan that they serve and how often it was begun.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct SettingsId {
+    /// Ordinal of the point in the order of acquisition.
+    pub point: u32,
+    /// 0 for the first attempt.
+    pub attempt: u32,
+}
+
+/// What a sweep changes from point to point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraSettings {
+    /// Rolling for epipolar imaging.
+    pub shutter: Shutter,
+    /// Exposure of each row.
+    pub exposure_us: f64,
+    /// From the trigger's edge, after the camera's own latency, to the start of row 0's exposure.
+    pub trigger_delay_us: f64,
+}
+
+/// When new settings take effect, counted in frames triggered after they were written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FirstFrame {
+    /// The first `n` frames still have the old settings, the next one has the new ones.
+    Exactly(u32),
+    /// Up to `n` frames may still have the old settings.
+    Within(u32),
+}
+
+impl FirstFrame {
+    /// How many frames after the change cannot be trusted to have the new settings.
+    pub fn settling_frames(self) -> u32 {
+        match self {
+            Self::Exactly(n) | Self::Within(n) => n,
+        }
+    }
+}
+
+/// What the camera made of the settings that it was given.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Applied {
+    /// The settings as the hardware took them.
+    pub actual: CameraSettings,
+    /// When the last of them had been written, on the host's clock: frames exposed earlier have the old ones.
+    pub written_ns: i64,
+    /// When they take effect.
+    pub first_frame: FirstFrame,
+}
+
+/// What a camera is and how fast it can be.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CameraCapabilities {
+    /// Maker, model and serial number, for the manifest.
+    pub model: String,
+    /// Columns of a frame.
+    pub width: usize,
+    /// Rows of a frame.
+    pub height: usize,
+    /// How its pixels are packed.
+    pub format: PixelFormat,
+    /// From the start of one row's exposure to the next row's.
+    pub row_time_us: f64,
+    /// From the trigger's edge to the start of row 0's exposure, at a trigger delay of zero.
+    pub trigger_latency_us: f64,
+    /// From the end of row 0's exposure to the camera being ready for the next trigger.
+    pub readout_us: f64,
+    /// Whether that readout may overlap the next exposure.
+    pub readout: Readout,
+    /// Exposures are multiples of this.
+    pub exposure_step_us: f64,
+}
+
+/// A triggered camera.
+pub trait Camera: Send {
+    /// What the camera is; constant while it is open.
+    fn capabilities(&self) -> &CameraCapabilities;
+
+    /// Writes settings, also while armed, so that a sweep need not stop the stream.
+    ///
+    /// # Errors
+    /// `OutOfRange` if the camera cannot take a value; the old settings then stay.
+    fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError>;
+
+    /// From now on triggers are answered.
+    ///
+    /// # Errors
+    /// Any kind; the camera then stays disarmed.
+    fn arm(&mut self) -> Result<(), DeviceError>;
+
+    /// Waits for the next frame and copies it into `buf`; `None` when none came within `timeout`.
+    ///
+    /// # Errors
+    /// `NotReady` before [`Camera::arm`], `Disconnected` when the device is gone.
+    fn next_frame(
+        &mut self,
+        buf: &mut FrameBuf,
+        timeout: Duration,
+    ) -> Result<Option<FrameStamp>, DeviceError>;
+
+    /// Answers no further trigger. Idempotent.
+    ///
+    /// # Errors
+    /// `Disconnected` when the device is gone.
+    fn disarm(&mut self) -> Result<(), DeviceError>;
+}
+
+/// A watcher of the projector's VSYNC line.
+pub trait Vsync: Send {
+    /// Waits for the next edge; `None` when none came within `timeout`.
+    ///
+    /// # Errors
+    /// `Disconnected` when the device is gone.
+    fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError>;
+}
+
+/// What a projector shows.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Pattern {
+    /// Every row fully lit.
+    White,
+    /// A weight in 0..=1 for each row, top row first.
+    Rows(Vec<f32>),
+}
+
+/// From when on a pattern is certain to be in the light.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Shown {
+    /// Exposures that start earlier, on the host's clock, may still see the pattern before.
+    pub not_before_ns: i64,
+}
+
+/// A projector.
+pub trait Projector: Send {
+    /// Shows a pattern.
+    ///
+    /// # Errors
+    /// `OutOfRange` if the pattern does not fit the projector.
+    fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError>;
+
+    /// Light off. Part of every way out.
+    ///
+    /// # Errors
+    /// `Disconnected` when the device is gone.
+    fn blank(&mut self) -> Result<Shown, DeviceError>;
+}

@@ -1,0 +1,146 @@
+//! Frames, their stamps, and the bounded pool that their buffers come from and return to by themselves.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+
+use crate::PixelFormat;
+
+/// One VSYNC edge as the device that watches it reports it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Edge {
+    /// The device's own count of edges, so that edges lost on the way show.
+    pub seq: u64,
+    /// When the edge was, on the host's clock.
+    pub host_ns: i64,
+}
+
+/// What a camera says of a frame. Everything here exists on a real camera.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FrameStamp {
+    /// The device's frame id. It counts every exposure, also one whose frame is lost on the way.
+    pub seq: u64,
+    /// Start of the exposure of row 0 on the device's own clock.
+    pub device_ns: i64,
+    /// Start of the exposure of row 0 on the host's clock: `device_ns` through the driver's clock model.
+    pub exposure_start_ns: i64,
+    /// When the frame was complete on the host.
+    pub host_ns: i64,
+    /// The exposure that the frame itself carries (chunk data), where the camera offers it.
+    pub exposure_us: Option<f64>,
+}
+
+/// A frame as it came off the device: packed pixels, row by row, top row first.
+pub struct Frame {
+    /// The pixels; goes back to its pool when the frame is dropped.
+    pub data: FrameBuf,
+    /// How they are packed.
+    pub format: PixelFormat,
+    /// When and how the frame was exposed.
+    pub stamp: FrameStamp,
+}
+
+struct Shelf {
+    free: Mutex<Vec<Box<[u8]>>>,
+    returned: Condvar,
+}
+
+impl Shelf {
+    fn lock(&self) -> MutexGuard<'_, Vec<Box<[u8]>>> {
+        // A push or pop cannot be half done, so the shelf outlives a panic elsewhere.
+        self.free.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A fixed number of buffers of one size, allocated once. Cloning gives the same pool.
+#[derive(Clone)]
+pub struct FramePool {
+    shelf: Arc<Shelf>,
+    buffer_bytes: usize,
+}
+
+impl FramePool {
+    /// `buffers` buffers of `buffer_bytes` bytes each.
+    pub fn new(buffers: usize, buffer_bytes: usize) -> Self {
+        let free = (0..buffers).map(|_| vec![0; buffer_bytes].into_boxed_slice()).collect();
+        Self { shelf: Arc::new(Shelf { free: Mutex::new(free), returned: Condvar::new() }), buffer_bytes }
+    }
+
+    /// A buffer if one is free.
+    pub fn try_take(&self) -> Option<FrameBuf> {
+        let data = self.shelf.lock().pop()?;
+        Some(FrameBuf { data, home: Some(self.shelf.clone()) })
+    }
+
+    /// A buffer as soon as one is free.
+    pub fn take(&self) -> FrameBuf {
+        let mut free = self.shelf.lock();
+        loop {
+            if let Some(data) = free.pop() {
+                return FrameBuf { data, home: Some(self.shelf.clone()) };
+            }
+            free = self.shelf.returned.wait(free).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// A buffer of the pool's size that belongs to no pool: where a frame goes that there is no room for.
+    pub fn spare(&self) -> FrameBuf {
+        FrameBuf { data: vec![0; self.buffer_bytes].into_boxed_slice(), home: None }
+    }
+}
+
+/// A buffer on loan from a [`FramePool`]; dropping it gives it back.
+pub struct FrameBuf {
+    data: Box<[u8]>,
+    home: Option<Arc<Shelf>>,
+}
+
+impl Deref for FrameBuf {
+    type Target = [u8];
+    fn deref(&self) -> &[u8] {
+        &self.data
+    }
+}
+
+impl DerefMut for FrameBuf {
+    fn deref_mut(&mut self) -> &mut [u8] {
+        &mut self.data
+    }
+}
+
+impl Drop for FrameBuf {
+    fn drop(&mut self) {
+        if let Some(shelf) = self.home.take() {
+            shelf.lock().push(std::mem::take(&mut self.data));
+            shelf.returned.notify_one();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pool_lends_each_buffer_once_and_takes_it_back() {
+        let pool = FramePool::new(2, 16);
+        let (a, b) = (pool.try_take().unwrap(), pool.try_take().unwrap());
+        assert!(pool.try_take().is_none());
+        let address = a.as_ptr();
+        drop(a);
+        assert_eq!(pool.take().as_ptr(), address, "the same memory, not a new allocation");
+        drop((b, pool.spare()));
+        assert_eq!(pool.shelf.lock().len(), 2, "a spare buffer never joins the pool");
+    }
+
+    #[test]
+    fn a_waiting_taker_gets_the_buffer_that_another_thread_returns() {
+        let pool = FramePool::new(1, 1);
+        let lent = pool.take();
+        let waiter = std::thread::spawn({
+            let pool = pool.clone();
+            move || pool.take().len()
+        });
+        drop(lent);
+        assert_eq!(waiter.join().unwrap(), 1);
+    }
+}
