@@ -1,0 +1,243 @@
+use std::ops::RangeInclusive;
+
+use ndarray::{Array2, Array3, ArrayView3, Axis, s};
+use rayon::prelude::*;
+
+use super::{PlaneError, RowTiming, Setting};
+
+/// A row belongs to the unknowns when some setting collects at least this share of its dwell.
+pub const MIN_WEIGHT: f64 = 0.05;
+
+/// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings,
+/// in the frame that the delays are measured against, is at least [`MIN_WEIGHT`].
+///
+/// # Errors
+/// Those of [`RowTiming::check`]; [`PlaneError::NothingSeen`] if no row qualifies.
+pub fn reach(timing: &RowTiming, settings: &[Setting]) -> Result<RangeInclusive<i32>, PlaneError> {
+    timing.check(settings)?;
+    let lowest = timing.relative_row(0, timing.camera_rows() - 1);
+    let highest = timing.relative_row(timing.projector_rows() - 1, 0);
+    let seen = |u: &i32| settings.iter().any(|setting| timing.weight_in_frame(*u, 0, setting) >= MIN_WEIGHT);
+    let first = (lowest..=highest).find(seen);
+    let last = (lowest..=highest).rfind(seen);
+    first.zip(last).map(|(first, last)| first..=last).ok_or(PlaneError::NothingSeen)
+}
+
+/// An unknown of one camera row: the light it receives from one projector row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Slot {
+    /// Relative row of the projector row.
+    pub u: i32,
+    /// Whether the row is asked for.
+    pub kind: SlotKind,
+}
+
+/// What becomes of a slot's estimate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SlotKind {
+    /// Inside the plan's reach: part of the transport.
+    Own,
+    /// Outside the reach, but lit while an exposure reached over the retrace into the next or previous frame: solved
+    /// for, because the exposure saw it, and then dropped.
+    Wrapped,
+}
+
+/// The forward model of all pixels of one camera row.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RowModel {
+    /// The unknowns: own slots by ascending `u`, then wrapped slots by ascending `u`. Rows that the projector does
+    /// not have are not among them.
+    pub slots: Vec<Slot>,
+    /// `A`: weight of each slot in each setting, shape `[settings, slots]`.
+    pub weights: Array2<f64>,
+}
+
+impl RowModel {
+    /// The model of camera row `t` under the plan's settings; `reach` is that of the whole plan.
+    pub fn new(timing: &RowTiming, settings: &[Setting], reach: &RangeInclusive<i32>, t: usize) -> Self {
+        let rows = (0..timing.projector_rows()).map(|v| timing.relative_row(v, t));
+        let (own, outside): (Vec<i32>, Vec<i32>) = rows.partition(|u| reach.contains(u));
+        let seen = |u: &i32| settings.iter().any(|setting| timing.weight(*u, setting) >= MIN_WEIGHT);
+        // Rows just outside the reach stay below the threshold in their own frame, so those left are wrapped.
+        let wrapped = outside.into_iter().filter(seen).map(|u| Slot { u, kind: SlotKind::Wrapped });
+        let slots: Vec<Slot> =
+            own.into_iter().map(|u| Slot { u, kind: SlotKind::Own }).chain(wrapped).collect();
+        let weights = Array2::from_shape_fn((settings.len(), slots.len()), |(n, slot)| {
+            timing.weight(slots[slot].u, &settings[n])
+        });
+        Self { slots, weights }
+    }
+}
+
+/// The image that the model predicts for one setting.
+///
+/// `transport` is `[v, t, s]` over the projector rows of the camera's window, shape
+/// `[camera_rows, camera_rows, columns]`; projector rows outside the window send no light. Returns `[t, s]`.
+///
+/// # Errors
+/// Those of [`RowTiming::check`]; [`PlaneError::Shape`] if the transport does not fit the window.
+pub fn predict(
+    timing: &RowTiming,
+    transport: ArrayView3<f32>,
+    setting: &Setting,
+) -> Result<Array2<f32>, PlaneError> {
+    timing.check(std::slice::from_ref(setting))?;
+    let rows = timing.camera_rows();
+    let (_, _, columns) = transport.dim();
+    if transport.dim() != (rows, rows, columns) {
+        return Err(PlaneError::Shape {
+            array: "transport",
+            axes: "[projector rows of the window, camera rows, columns]",
+            actual: transport.shape().to_vec(),
+            expected: vec![rows, rows, columns],
+        });
+    }
+    let mut image = Array2::zeros((rows, columns));
+    image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut image_row)| {
+        let mut sum = vec![0.0; columns];
+        for v in 0..rows {
+            let weight = timing.weight(v as i32 - t as i32, setting);
+            if weight > 0.0 {
+                let light = transport.slice(s![v, t, ..]);
+                sum.iter_mut().zip(light).for_each(|(sum, &light)| *sum += weight * f64::from(light));
+            }
+        }
+        image_row.iter_mut().zip(sum).for_each(|(pixel, sum)| *pixel = sum as f32);
+    });
+    Ok(image)
+}
+
+/// A transport `[v, t, s]` over a window's projector rows, by relative row: `[u, t, s]` for `u` in `reach`, zero where
+/// the window has no such row.
+pub fn relative_rows(transport: ArrayView3<f32>, reach: &RangeInclusive<i32>) -> Array3<f32> {
+    let (rows, camera_rows, columns) = transport.dim();
+    let mut relative = Array3::zeros((reach.clone().count(), camera_rows, columns));
+    for (mut plane, u) in relative.axis_iter_mut(Axis(0)).zip(reach.clone()) {
+        for t in 0..camera_rows {
+            if let Ok(v) = usize::try_from(t as i64 + i64::from(u))
+                && v < rows
+            {
+                plane.row_mut(t).assign(&transport.slice(s![v, t, ..]));
+            }
+        }
+    }
+    relative
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TAU_US: f64 = 22.22;
+
+    /// The paper's sweep: t_d -1500..1500 us in 15, t_e 600..1200 us in 5, delays fastest.
+    fn paper_sweep() -> Vec<Setting> {
+        (0..75)
+            .map(|point| {
+                Setting::new(
+                    -1500.0 + 3000.0 / 14.0 * (point % 15) as f64,
+                    600.0 + 150.0 * (point / 15) as f64,
+                )
+            })
+            .collect()
+    }
+
+    fn timing(row_time_us: f64) -> RowTiming {
+        RowTiming::new(720, row_time_us, 50_000.0 / 3.0).unwrap()
+    }
+
+    #[test]
+    fn the_papers_sweep_reaches_94_rows() {
+        assert_eq!(reach(&timing(TAU_US), &paper_sweep()), Ok(-94..=94));
+        // 2100 us / 18.52 us = 113.4: row 113 is seen to 0.9, row 114 not at all.
+        assert_eq!(reach(&timing(18.52), &paper_sweep()), Ok(-113..=113));
+    }
+
+    #[test]
+    fn the_reach_stops_at_the_projectors_borders() {
+        let whole = RowTiming::new(32, TAU_US, 16_667.0).unwrap();
+        assert_eq!(reach(&whole, &paper_sweep()), Ok(-31..=31));
+        let window = timing(TAU_US).window(0, 10).unwrap();
+        assert_eq!(reach(&window, &paper_sweep()), Ok(-9..=94));
+    }
+
+    #[test]
+    fn a_delay_that_only_sees_the_retrace_sees_nothing() {
+        let tiny = RowTiming::new(8, TAU_US, 16_667.0).unwrap();
+        assert_eq!(reach(&tiny, &[Setting::new(5000.0, 600.0)]), Err(PlaneError::NothingSeen));
+        assert_eq!(reach(&tiny, &[Setting::new(0.0, 1.0)]), Err(PlaneError::NothingSeen));
+    }
+
+    #[test]
+    fn rows_beyond_the_border_are_no_slots() {
+        let model = RowModel::new(&timing(TAU_US), &paper_sweep(), &(-94..=94), 30);
+        assert_eq!(model.slots.first(), Some(&Slot { u: -30, kind: SlotKind::Own }));
+        assert_eq!(model.slots.iter().filter(|slot| slot.kind == SlotKind::Own).count(), 30 + 1 + 94);
+        let inner = RowModel::new(&timing(TAU_US), &paper_sweep(), &(-94..=94), 360);
+        assert_eq!(inner.slots.len(), 189);
+        assert_eq!(inner.weights.dim(), (75, 189));
+    }
+
+    #[test]
+    fn late_exposures_of_row_700_reach_over_the_retrace() {
+        // The retrace begins 19.5 rows after row 700's centre, the next frame (16666.67 - 700.5 * 22.22) us = 1101.56 us
+        // after it. Counted from the edges t_d + t_e/2 of the sweep.
+        let late = |limit_us: f64| {
+            let ends = paper_sweep().into_iter().map(|s| s.delays_us[0] + s.exposure_us / 2.0);
+            ends.filter(|&end_us| end_us > limit_us).count()
+        };
+        assert_eq!((late(19.5 * TAU_US), late(1101.56)), (38, 22));
+
+        let model = RowModel::new(&timing(TAU_US), &paper_sweep(), &(-94..=94), 700);
+        let wrapped: Vec<usize> =
+            (0..model.slots.len()).filter(|&i| model.slots[i].kind == SlotKind::Wrapped).collect();
+        let seen = |n: usize| wrapped.iter().any(|&i| model.weights[[n, i]] > 0.0);
+        assert_eq!((0..75).filter(|&n| seen(n)).count(), 22);
+        assert_eq!(model.slots[wrapped[0]].u, -700, "the next frame begins with row 0");
+        // The last exposure ends at 2100 us: (2100 - 1101.56) / 22.22 = 44.93 rows of the next frame.
+        assert_eq!(wrapped.len(), 45);
+        let last = model.weights.row(74);
+        let sum: f64 = wrapped.iter().map(|&i| last[i]).sum();
+        assert!((sum - (2100.0 - 1101.56) / TAU_US).abs() < 1e-3, "{sum}");
+
+        // With 18.52 us rows the retrace is long enough to keep every exposure out of the next frame.
+        let model = RowModel::new(&timing(18.52), &paper_sweep(), &(-113..=113), 700);
+        assert!(model.slots.iter().all(|slot| slot.kind == SlotKind::Own));
+    }
+
+    #[test]
+    fn row_sums_are_exposure_over_row_time_less_what_the_retrace_keeps_dark() {
+        let settings = paper_sweep();
+        let inner = RowModel::new(&timing(TAU_US), &settings, &(-95..=95), 360);
+        for (weights, setting) in inner.weights.axis_iter(Axis(0)).zip(&settings) {
+            assert!((weights.sum() - setting.exposure_us / TAU_US).abs() < 1e-9);
+        }
+        // Row 700, t_d 1500 us, t_e 1200 us: lit in 900..2100 us is only what the next frame lights from 1101.56 us.
+        let outer = RowModel::new(&timing(TAU_US), &settings, &(-94..=94), 700);
+        assert!((outer.weights.row(74).sum() - (2100.0 - 1101.56) / TAU_US).abs() < 1e-3);
+    }
+
+    #[test]
+    fn prediction_is_the_weighted_sum_of_rows() {
+        let timing = timing(TAU_US).centred(6).unwrap();
+        let transport = Array3::from_shape_fn((6, 6, 2), |(v, t, s)| (100 * v + 10 * t + s) as f32);
+        // t_e of two rows centred on the boundary between u = 1 and u = 2 sees exactly those.
+        let image = predict(&timing, transport.view(), &Setting::new(1.5 * TAU_US, 2.0 * TAU_US)).unwrap();
+        for t in 0..6 {
+            let expected: f32 = (t + 1..=t + 2).filter(|&v| v < 6).map(|v| transport[[v, t, 1]]).sum();
+            assert!((image[[t, 1]] - expected).abs() < 1e-3 * (1.0 + expected));
+        }
+        assert!(matches!(
+            predict(&timing, transport.slice(s![..5, .., ..]), &Setting::new(0.0, 100.0)),
+            Err(PlaneError::Shape { .. })
+        ));
+    }
+
+    #[test]
+    fn relative_rows_shift_each_camera_row() {
+        let transport = Array3::from_shape_fn((4, 4, 1), |(v, t, _)| (10 * v + t) as f32);
+        let relative = relative_rows(transport.view(), &(-1..=2));
+        assert_eq!(relative.slice(s![.., 0, 0]).to_vec(), [0.0, 0.0, 10.0, 20.0]);
+        assert_eq!(relative.slice(s![.., 3, 0]).to_vec(), [23.0, 33.0, 0.0, 0.0]);
+    }
+}

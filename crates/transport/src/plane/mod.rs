@@ -1,0 +1,33 @@
+//! Plane-to-ray light transport from delay-exposure stacks, after Kubo et al., "Acquiring and Characterizing
+//! Plane-to-Ray Indirect Light Transport" (ICCP 2018), with its Eq. 1 corrected (see [`delay_us`]).
+//!
+//! A raster projector lights one row at a time while a rolling shutter exposes camera rows at the same vertical speed.
+//! `T(v, t, s)` is the light that camera pixel (row `t`, column `s`) receives when projector row `v` alone is lit;
+//! 1.0 is the light of a white surface under its own row, collected over one row's dwell. An image taken with
+//! delay `t_d` and exposure `t_e` is a weighted sum of `T` over the relative row `u = v - t`:
+//!
+//! ```text
+//! I(s, t) = sum over u of A(u) T(t + u, s, t)
+//! A(u)    = |[u tau - t_p/2, u tau + t_p/2] ∩ [t_d - t_e/2, t_d + t_e/2]| / t_p,    t_p = tau
+//! ```
+//!
+//! [`RowTiming`] and [`Setting`] hold the quantities on the right, [`RowModel`] is `A` for one camera row with its
+//! borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
+
+mod cholesky;
+mod demux;
+mod error;
+mod forward;
+mod pivot;
+mod prior;
+mod quadratic;
+pub mod reference;
+mod timing;
+mod transport;
+
+pub use demux::Demux;
+pub use error::PlaneError;
+pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
+pub use prior::Prior;
+pub use timing::{RowTiming, Setting, delay_us, offset_us};
+pub use transport::Transport;
