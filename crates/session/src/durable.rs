@@ -1,0 +1,218 @@
+//! Writes that survive a power cut: either the old content or the new one is there, never a part.
+//!
+//! The order is: temporary file in the same folder, data, fsync, rename, fsync of the folder (the rename itself is
+//! only durable with the last step).
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use nix::errno::Errno;
+use nix::fcntl::{AT_FDCWD, RenameFlags, renameat2};
+use nix::sys::statvfs::statvfs;
+
+use crate::{Error, Result};
+
+/// How the name of every temporary file and folder ends.
+pub const TEMPORARY_SUFFIX: &str = ".raysweep-tmp";
+
+/// Replaces the file at `path` by `bytes`, durably and atomically. A stale temporary file is overwritten.
+///
+/// # Errors
+/// [`Error::Io`] where the file system refuses; the file at `path` is then as before.
+pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let temporary = temporary_path(path);
+    let write_data = || {
+        let mut file = File::create(&temporary)?;
+        file.write_all(bytes)?;
+        file.sync_all()
+    };
+    write_data().map_err(Error::io("write", &temporary))?;
+    fs::rename(&temporary, path).map_err(Error::io("replace", path))?;
+    sync_dir(parent(path))
+}
+
+/// Makes a new folder, durably. Its existence is the lock: it fails where something has this name.
+///
+/// # Errors
+/// [`Error::Io`], of the kind `AlreadyExists` where something has this name.
+pub fn create_dir(path: &Path) -> Result<()> {
+    fs::create_dir(path).map_err(Error::io("create folder", path))?;
+    sync_dir(parent(path))
+}
+
+/// Makes a folder and those above it where they are missing, durably.
+///
+/// # Errors
+/// [`Error::Io`] where the file system refuses.
+pub fn create_dir_all(path: &Path) -> Result<()> {
+    if path.as_os_str().is_empty() || path.is_dir() {
+        return Ok(());
+    }
+    create_dir_all(parent(path))?;
+    match create_dir(path) {
+        Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::AlreadyExists && path.is_dir() => {
+            Ok(())
+        }
+        done => done,
+    }
+}
+
+/// Replaces the folder at `path` by one that `fill` writes, durably. `fill` gets the temporary folder and must write
+/// its files durably. Readers see the old folder or the new one: the two are exchanged in one step where the file
+/// system can (all local Linux ones can); where it cannot, a crash between two renames leaves neither.
+///
+/// # Errors
+/// What `fill` gives, or [`Error::Io`]; the folder at `path` is then as before.
+pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
+    let fresh = temporary_path(path);
+    if fresh.exists() {
+        fs::remove_dir_all(&fresh).map_err(Error::io("remove", &fresh))?;
+    }
+    create_dir(&fresh)?;
+    fill(&fresh)?;
+    sync_dir(&fresh)?;
+    if path.exists() {
+        exchange(&fresh, path)?;
+    } else {
+        fs::rename(&fresh, path).map_err(Error::io("replace", path))?;
+    }
+    sync_dir(parent(path))?;
+    match fs::remove_dir_all(&fresh) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", &fresh)(error)),
+        _ => Ok(()),
+    }
+}
+
+/// Removes the temporary files and folders that a crash left anywhere below `dir`; gives their number. Only for the
+/// one process that writes there.
+///
+/// # Errors
+/// [`Error::Io`] where the file system refuses.
+pub fn remove_leftovers(dir: &Path) -> Result<usize> {
+    let mut removed = 0;
+    for entry in fs::read_dir(dir).map_err(Error::io("list", dir))? {
+        let entry = entry.map_err(Error::io("list", dir))?;
+        let path = entry.path();
+        let is_dir = entry.file_type().map_err(Error::io("examine", &path))?.is_dir();
+        if is_temporary(&path) {
+            if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) }
+                .map_err(Error::io("remove", &path))?;
+            removed += 1;
+        } else if is_dir {
+            removed += remove_leftovers(&path)?;
+        }
+    }
+    Ok(removed)
+}
+
+/// Bytes that an unprivileged process may still write to the file system that holds `dir`.
+///
+/// # Errors
+/// [`Error::Io`] where `dir` does not exist.
+pub fn available_bytes(dir: &Path) -> Result<u64> {
+    let stat = statvfs(dir).map_err(|errno| Error::io("examine", dir)(errno.into()))?;
+    Ok(stat.blocks_available() * stat.fragment_size())
+}
+
+/// Whether a path is one of a temporary file or folder.
+pub(crate) fn is_temporary(path: &Path) -> bool {
+    path.as_os_str().as_encoded_bytes().ends_with(TEMPORARY_SUFFIX.as_bytes())
+}
+
+/// Makes the entries of a folder durable.
+pub(crate) fn sync_dir(dir: &Path) -> Result<()> {
+    File::open(dir).and_then(|folder| folder.sync_all()).map_err(Error::io("sync folder", dir))
+}
+
+fn exchange(fresh: &Path, path: &Path) -> Result<()> {
+    match renameat2(AT_FDCWD, fresh, AT_FDCWD, path, RenameFlags::RENAME_EXCHANGE) {
+        Ok(()) => Ok(()),
+        Err(Errno::EINVAL | Errno::ENOSYS) => {
+            let old = temporary_path(&fresh.with_extension("old"));
+            fs::rename(path, &old)
+                .and_then(|()| fs::rename(fresh, path))
+                .and_then(|()| fs::remove_dir_all(&old))
+                .map_err(Error::io("replace", path))
+        }
+        Err(errno) => Err(Error::io("replace", path)(errno.into())),
+    }
+}
+
+fn temporary_path(path: &Path) -> PathBuf {
+    let mut name = OsString::from(path);
+    name.push(TEMPORARY_SUFFIX);
+    PathBuf::from(name)
+}
+
+fn parent(path: &Path) -> &Path {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stale_temporary_file_is_no_obstacle() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("plan.toml");
+        fs::write(temporary_path(&path), "torn, and longer than the new content").unwrap();
+        write(&path, b"new").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_failed_write_keeps_the_old_content() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("manifest.json");
+        write(&path, b"old").unwrap();
+        fs::create_dir(temporary_path(&path)).unwrap();
+        let error = write(&path, b"new").unwrap_err();
+        assert!(error.to_string().contains("manifest.json"), "{error}");
+        assert_eq!(fs::read(&path).unwrap(), b"old");
+    }
+
+    #[test]
+    fn leftovers_are_removed_at_any_depth_and_nothing_else_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let deep = dir.path().join("stack.zarr/sum");
+        create_dir_all(&deep).unwrap();
+        fs::write(deep.join("c.0.0.0"), "data").unwrap();
+        fs::write(deep.join("c.1.0.0.raysweep-tmp"), "torn").unwrap();
+        let torn = dir.path().join("transport.zarr.raysweep-tmp");
+        create_dir_all(&torn.join("transport")).unwrap();
+        fs::write(torn.join("transport/zarr.json"), "{").unwrap();
+        assert_eq!(remove_leftovers(dir.path()).unwrap(), 2);
+        assert_eq!(remove_leftovers(dir.path()).unwrap(), 0);
+        assert!(deep.join("c.0.0.0").exists() && !torn.exists());
+    }
+
+    #[test]
+    fn a_folder_is_replaced_whole_or_not_at_all() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("transport.zarr");
+        replace_dir(&path, |fresh| write(&fresh.join("old"), b"1")).unwrap();
+        let failed = replace_dir(&path, |fresh| {
+            write(&fresh.join("half"), b"2")?;
+            Err(Error::io("write", fresh)(io::Error::other("disk full")))
+        });
+        assert!(failed.is_err());
+        assert!(path.join("old").exists() && !path.join("half").exists());
+        replace_dir(&path, |fresh| write(&fresh.join("new"), b"3")).unwrap();
+        assert!(path.join("new").exists() && !path.join("old").exists() && !path.join("half").exists());
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn available_bytes_of_a_missing_folder_is_an_error() {
+        let dir = tempfile::tempdir().unwrap();
+        assert!(available_bytes(dir.path()).unwrap() > 0);
+        assert!(available_bytes(&dir.path().join("missing")).is_err());
+    }
+}

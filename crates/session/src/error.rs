@@ -1,0 +1,137 @@
+//! What can go wrong with a session's files.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// A result of this crate.
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// What can go wrong with a session's files. Each message names the path and what to do.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The file system refused.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried, as a verb.
+        action: &'static str,
+        /// On what.
+        path: PathBuf,
+        /// What the file system said.
+        source: io::Error,
+    },
+    /// The folder is not a session.
+    #[error(
+        "{} is not a session: {why}; give a folder that holds a ledger.jsonl (`raysweep sessions` lists them)",
+        path.display()
+    )]
+    NotASession {
+        /// The folder.
+        path: PathBuf,
+        /// What is missing.
+        why: String,
+    },
+    /// Another process is writing this session.
+    #[error("{} is being written by another process; wait until its run has ended", path.display())]
+    InUse {
+        /// The ledger.
+        path: PathBuf,
+    },
+    /// A line of the ledger cannot be read, or must not be written.
+    #[error("{} line {line}: {why}; restore the line from a backup, since what it said is not stored elsewhere", path.display())]
+    Ledger {
+        /// The ledger.
+        path: PathBuf,
+        /// Counted from 1.
+        line: usize,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// An entry would not read back as it was meant, so it was not written.
+    #[error("{}: an entry was refused: {why}", path.display())]
+    Entry {
+        /// The ledger.
+        path: PathBuf,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// The session was written by a newer raysweep.
+    #[error("{} has format {found}, this raysweep knows formats up to {known}; use a newer raysweep", path.display())]
+    NewerFormat {
+        /// The file that says so.
+        path: PathBuf,
+        /// The format that it states.
+        found: u32,
+        /// The newest format known here.
+        known: u32,
+    },
+    /// Data of the wrong shape.
+    #[error("{what} has the shape {found:?}, allowed is {allowed}")]
+    Shape {
+        /// What was given.
+        what: String,
+        /// Its shape.
+        found: Vec<usize>,
+        /// What is allowed.
+        allowed: String,
+    },
+    /// A point that the array does not have.
+    #[error("index {index} is outside of array `{array}`, which has {len} points (0 to {})", len.saturating_sub(1))]
+    Index {
+        /// The array.
+        array: &'static str,
+        /// The index asked for.
+        index: usize,
+        /// How many there are.
+        len: usize,
+    },
+    /// A point's data are not in the stack.
+    #[error("{}: array `{array}` holds no data at index {index}; acquire the point again with `raysweep resume`", path.display())]
+    NotStored {
+        /// The stack.
+        path: PathBuf,
+        /// The array.
+        array: &'static str,
+        /// The point.
+        index: usize,
+    },
+    /// A Zarr hierarchy could not be read or written.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Zarr {
+        /// What was tried, as a verb.
+        action: &'static str,
+        /// The hierarchy or array.
+        path: PathBuf,
+        /// What the library said.
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// A file could not be encoded or decoded.
+    #[error("cannot {action} {what}: {why}")]
+    Codec {
+        /// What was tried, as a verb.
+        action: &'static str,
+        /// The file or part.
+        what: String,
+        /// What the library said.
+        why: String,
+    },
+}
+
+impl Error {
+    /// For `map_err`: what was tried on which path.
+    pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
+        move |source| Error::Io { action, path: path.to_owned(), source }
+    }
+
+    /// For `map_err`: what was tried on which hierarchy.
+    pub(crate) fn zarr<E>(action: &'static str, path: &Path) -> impl FnOnce(E) -> Error
+    where
+        E: std::error::Error + Send + Sync + 'static,
+    {
+        move |source| Error::Zarr { action, path: path.to_owned(), source: Box::new(source) }
+    }
+
+    /// For `map_err`: which file could not be encoded or decoded.
+    pub(crate) fn codec<E: ToString>(action: &'static str, what: impl ToString) -> impl FnOnce(E) -> Error {
+        move |why| Error::Codec { action, what: what.to_string(), why: why.to_string() }
+    }
+}

@@ -1,0 +1,359 @@
+//! The folder of a session, and the sessions of a data folder.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use jiff::tz::TimeZone;
+
+use crate::ledger::{self, EndState, Ledger, SessionEntry, State};
+use crate::products::Products;
+use crate::stack::{ArrayName, Stack};
+use crate::{Error, Result, durable};
+
+/// Bytes of a session's name that go into its folder's name.
+const NAME_MAX_BYTES: usize = 64;
+
+/// A session's folder.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Session {
+    dir: PathBuf,
+}
+
+impl Session {
+    /// Makes the folder of a new session in `root` (made where it is missing), with `plan.toml` and `rig.toml` as
+    /// given, an empty stack and the ledger's first line, which comes last: without it there is no session.
+    ///
+    /// The folder is named `YYYYMMDD-HHMMSS_name` after `session.created` in UTC. Of the name, letters and digits of
+    /// any script, `-`, `_` and `.` stay, every run of anything else becomes one `-`, `-` and `.` at the ends go, and
+    /// it is cut to 64 bytes; a name of which nothing stays becomes `session`. Where the folder exists, `-2`, `-3`,
+    /// ... is appended: the making of the folder is the lock, and nothing is ever overwritten.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses, [`Error::Shape`] for an empty stack.
+    pub fn create(root: &Path, session: SessionEntry, plan: &str, rig: &str) -> Result<(Session, Ledger)> {
+        session.shape.check()?;
+        durable::create_dir_all(root)?;
+        let stamp = session.created.to_zoned(TimeZone::UTC).strftime("%Y%m%d-%H%M%S").to_string();
+        let session_dir = create_unused(root, &format!("{stamp}_{}", folder_name(&session.name)))?;
+        let created = Session { dir: session_dir };
+        durable::write(&created.plan_path(), plan.as_bytes())?;
+        durable::write(&created.rig_path(), rig.as_bytes())?;
+        durable::create_dir(&created.products_path())?;
+        Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
+        let ledger = Ledger::create(&created.ledger_path(), session)?;
+        Ok((created, ledger))
+    }
+
+    /// A session that exists, to read it or to go on with it ([`Session::resume`]).
+    ///
+    /// # Errors
+    /// [`Error::NotASession`] where there is no ledger.
+    pub fn open(dir: &Path) -> Result<Session> {
+        let session = Session { dir: dir.to_owned() };
+        match fs::metadata(session.ledger_path()) {
+            Ok(ledger) if ledger.is_file() => Ok(session),
+            Ok(_) => {
+                Err(Error::NotASession { path: dir.to_owned(), why: "its ledger.jsonl is not a file".into() })
+            }
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+                Err(Error::NotASession { path: dir.to_owned(), why: "it has no ledger.jsonl".into() })
+            }
+            Err(error) => Err(Error::io("examine", &session.ledger_path())(error)),
+        }
+    }
+
+    /// Opens the session for writing (to acquire what is missing, or to make its products again), for this process
+    /// alone as long as the ledger is open: removes what a crash left and cuts a torn last line off the ledger.
+    ///
+    /// # Errors
+    /// As [`Ledger::open`], [`Error::Io`] where a left-over cannot be removed.
+    pub fn resume(&self) -> Result<Ledger> {
+        let ledger = Ledger::open(&self.ledger_path())?;
+        durable::remove_leftovers(&self.dir)?;
+        Ok(ledger)
+    }
+
+    /// What the ledger says, read without locking it.
+    ///
+    /// # Errors
+    /// As [`ledger::read_state`].
+    pub fn state(&self) -> Result<State> {
+        ledger::read_state(&self.ledger_path())
+    }
+
+    /// The stack, to read it and to add to it.
+    ///
+    /// # Errors
+    /// As [`Stack::open`], and [`Error::Shape`] where it is not the stack that the ledger speaks of.
+    pub fn stack(&self) -> Result<Stack> {
+        let stack = Stack::open(&self.stack_path())?;
+        let expected = self.state()?.session.shape;
+        if *stack.shape() != expected {
+            return Err(Error::Shape {
+                what: self.stack_path().display().to_string(),
+                found: stack.shape().to_vec(),
+                allowed: format!(
+                    "{:?} [points, exposures, rows, columns], as its ledger says",
+                    expected.to_vec()
+                ),
+            });
+        }
+        Ok(stack)
+    }
+
+    /// The folder of the products.
+    pub fn products(&self) -> Products {
+        Products::new(self.products_path())
+    }
+
+    /// The session's folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// `plan.toml`, the plan as used.
+    pub fn plan_path(&self) -> PathBuf {
+        self.dir.join("plan.toml")
+    }
+
+    /// `rig.toml`, the rig as used.
+    pub fn rig_path(&self) -> PathBuf {
+        self.dir.join("rig.toml")
+    }
+
+    /// `ledger.jsonl`, see [`crate::ledger`].
+    pub fn ledger_path(&self) -> PathBuf {
+        self.dir.join("ledger.jsonl")
+    }
+
+    /// `stack.zarr`, see [`crate::stack`].
+    pub fn stack_path(&self) -> PathBuf {
+        self.dir.join("stack.zarr")
+    }
+
+    /// `transport.zarr`, see [`crate::transport`].
+    pub fn transport_path(&self) -> PathBuf {
+        self.dir.join("transport.zarr")
+    }
+
+    /// `products`, see [`crate::products`].
+    pub fn products_path(&self) -> PathBuf {
+        self.dir.join("products")
+    }
+
+    /// `report.html`, see [`crate::report`].
+    pub fn report_path(&self) -> PathBuf {
+        self.dir.join("report.html")
+    }
+
+    /// `manifest.json`, see [`crate::manifest`].
+    pub fn manifest_path(&self) -> PathBuf {
+        self.dir.join("manifest.json")
+    }
+}
+
+/// What a list of sessions shows of one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SessionSummary {
+    /// Its folder.
+    pub dir: PathBuf,
+    /// As given.
+    pub name: String,
+    /// The plan's kind.
+    pub kind: String,
+    /// UTC.
+    pub created: Timestamp,
+    /// Sweep points planned.
+    pub points: usize,
+    /// Sweep points stored.
+    pub stored: usize,
+    /// How its latest run ended; `None` while one is running and after a crash.
+    pub end: Option<EndState>,
+}
+
+/// The sessions of a data folder.
+#[derive(Debug, Default)]
+pub struct Listing {
+    /// By the folder's name, and so by age.
+    pub sessions: Vec<SessionSummary>,
+    /// The folders whose ledger cannot be read, with the reason.
+    pub unreadable: Vec<(PathBuf, Error)>,
+}
+
+/// The sessions in a data folder; only their ledgers are read. Folders without a ledger are not sessions.
+///
+/// # Errors
+/// [`Error::Io`] where `root` cannot be listed; what is wrong with one session stands in [`Listing::unreadable`].
+pub fn list(root: &Path) -> Result<Listing> {
+    let mut dirs = fs::read_dir(root)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>())
+        .map_err(Error::io("list", root))?;
+    dirs.sort();
+    let mut listing = Listing::default();
+    for dir in dirs {
+        let Ok(session) = Session::open(&dir) else { continue };
+        match session.state() {
+            Ok(state) => listing.sessions.push(SessionSummary {
+                stored: state.stored(ArrayName::Sum).count(),
+                points: state.session.shape.points,
+                end: state.end.as_ref().map(|end| end.state),
+                name: state.session.name,
+                kind: state.session.kind,
+                created: state.session.created,
+                dir,
+            }),
+            Err(error) => listing.unreadable.push((dir, error)),
+        }
+    }
+    Ok(listing)
+}
+
+fn create_unused(root: &Path, name: &str) -> Result<PathBuf> {
+    let mut number = 1;
+    loop {
+        let dir = match number {
+            1 => root.join(name),
+            _ => root.join(format!("{name}-{number}")),
+        };
+        match durable::create_dir(&dir) {
+            Ok(()) => return Ok(dir),
+            Err(Error::Io { source, .. }) if source.kind() == io::ErrorKind::AlreadyExists => number += 1,
+            Err(error) => return Err(error),
+        }
+    }
+}
+
+fn folder_name(name: &str) -> String {
+    let mut clean = String::new();
+    for character in name.chars() {
+        let kept = character.is_alphanumeric() || matches!(character, '-' | '_' | '.');
+        let character = if kept { character } else { '-' };
+        if character == '-' && clean.ends_with('-') {
+            continue;
+        }
+        if clean.len() + character.len_utf8() > NAME_MAX_BYTES {
+            break;
+        }
+        clean.push(character);
+    }
+    match clean.trim_matches(['-', '.']) {
+        "" => "session".into(),
+        trimmed => trimmed.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stack::StackShape;
+
+    fn session(name: &str) -> SessionEntry {
+        SessionEntry {
+            format: ledger::FORMAT,
+            name: name.into(),
+            kind: "sweep".into(),
+            operator: Some("Ada".into()),
+            sample: None,
+            note: None,
+            tags: vec!["test".into()],
+            created: "2026-03-04T05:06:07Z".parse().unwrap(),
+            software: "raysweep 0.1.0".into(),
+            shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5 },
+            first_row: 0,
+        }
+    }
+
+    #[test]
+    fn names_are_made_fit_for_a_folder() {
+        for (given, made) in [
+            ("v-groove", "v-groove"),
+            ("../../etc/passwd", "etc-passwd"),
+            ("Müller's 2nd  cup", "Müller-s-2nd-cup"),
+            ("a\0b\nc/d", "a-b-c-d"),
+            ("...", "session"),
+            ("", "session"),
+            (".hidden", "hidden"),
+        ] {
+            assert_eq!(folder_name(given), made, "{given:?}");
+        }
+        let long = folder_name(&"ä".repeat(100));
+        assert_eq!(long, "ä".repeat(32));
+    }
+
+    #[test]
+    fn a_session_is_never_overwritten() {
+        let root = tempfile::tempdir().unwrap();
+        let root = root.path().join("data");
+        let mut names = Vec::new();
+        for plan in ["one", "two", "three"] {
+            let (session, _) = Session::create(&root, session("cup"), plan, "rig").unwrap();
+            assert_eq!(fs::read_to_string(session.plan_path()).unwrap(), plan);
+            names.push(session.dir().file_name().unwrap().to_str().unwrap().to_owned());
+        }
+        assert_eq!(names, ["20260304-050607_cup", "20260304-050607_cup-2", "20260304-050607_cup-3"]);
+        assert_eq!(fs::read_to_string(root.join(&names[0]).join("plan.toml")).unwrap(), "one");
+    }
+
+    #[test]
+    fn concurrent_sessions_get_folders_of_their_own() {
+        let root = tempfile::tempdir().unwrap();
+        let dirs: Vec<_> = std::thread::scope(|scope| {
+            let make = || Session::create(root.path(), session("cup"), "", "").unwrap().0.dir().to_owned();
+            let threads: Vec<_> = (0..8).map(|_| scope.spawn(make)).collect();
+            threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        let distinct: std::collections::BTreeSet<_> = dirs.iter().collect();
+        assert_eq!(distinct.len(), 8);
+    }
+
+    #[test]
+    fn an_empty_stack_is_refused_before_anything_is_made() {
+        let root = tempfile::tempdir().unwrap();
+        let mut empty = session("cup");
+        empty.shape.rows = 0;
+        assert!(matches!(Session::create(root.path(), empty, "", ""), Err(Error::Shape { .. })));
+        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_folder_without_a_ledger_is_not_a_session() {
+        let root = tempfile::tempdir().unwrap();
+        for dir in [root.path().join("missing"), root.path().to_owned()] {
+            let error = Session::open(&dir).unwrap_err();
+            assert!(matches!(error, Error::NotASession { .. }), "{error}");
+            assert!(error.to_string().contains(dir.to_str().unwrap()), "{error}");
+        }
+        fs::create_dir(root.path().join("ledger.jsonl")).unwrap();
+        assert!(matches!(Session::open(root.path()), Err(Error::NotASession { .. })));
+    }
+
+    #[test]
+    fn the_list_names_what_it_cannot_read() {
+        let root = tempfile::tempdir().unwrap();
+        let (kept, _) = Session::create(root.path(), session("a"), "", "").unwrap();
+        let (bad, _) = Session::create(root.path(), session("b"), "", "").unwrap();
+        fs::write(bad.ledger_path(), "{}\n{}\n").unwrap();
+        fs::create_dir(root.path().join("other")).unwrap();
+        let listing = list(root.path()).unwrap();
+        assert_eq!(listing.sessions.len(), 1);
+        let summary = &listing.sessions[0];
+        assert_eq!((summary.dir.as_path(), summary.points, summary.stored), (kept.dir(), 4, 0));
+        assert_eq!(listing.unreadable.len(), 1);
+        assert_eq!(listing.unreadable[0].0, bad.dir());
+    }
+
+    #[test]
+    fn a_session_is_resumed_by_one_writer_and_without_leftovers() {
+        let root = tempfile::tempdir().unwrap();
+        let (session, ledger) = Session::create(root.path(), session("a"), "", "").unwrap();
+        let leftover = session.stack_path().join("sum/c.1.0.0.raysweep-tmp");
+        fs::write(&leftover, "torn").unwrap();
+        assert!(matches!(session.resume(), Err(Error::InUse { .. })));
+        assert!(leftover.exists(), "only the one writer may tidy up");
+        drop(ledger);
+        let _ledger = session.resume().unwrap();
+        assert!(!leftover.exists());
+    }
+}

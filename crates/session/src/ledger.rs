@@ -1,0 +1,453 @@
+//! The ledger of a session: `ledger.jsonl`, one JSON object a line, append-only.
+//!
+//! The ledger is what knows: a point is stored when its line says so. Each line is appended by one write and made
+//! durable before [`Ledger::append`] returns, so a crash can tear the last line only; a torn line is dropped, since
+//! nobody was told that it was written.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use raysweep_core::{Counts, VsyncStats};
+use serde::{Deserialize, Serialize};
+
+use crate::stack::{ArrayName, StackShape};
+use crate::{Error, Result};
+
+/// The format of the session folder that this version writes.
+pub const FORMAT: u32 = 1;
+
+/// One line of the ledger, told apart by its key `event`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Entry {
+    /// The first line, and only the first: what the session is.
+    Session(SessionEntry),
+    /// An acquisition run begins.
+    Run {
+        /// Wall-clock time, UTC.
+        started: Timestamp,
+        /// Whether it acquires what an earlier run left missing.
+        resumed: bool,
+    },
+    /// A point's data are durable in the stack. A later line for the same point replaces the earlier one.
+    Point(PointEntry),
+    /// An attempt at a point was given up.
+    AttemptFailed {
+        /// The array of the stack.
+        array: ArrayName,
+        /// Its first index.
+        index: usize,
+        /// Counted from 0.
+        attempt: u32,
+        /// What became of its frames.
+        counts: Counts,
+    },
+    /// A point is stored, and a stage failed on it: the results of this run lack it.
+    StageFailed {
+        /// The array of the stack.
+        array: ArrayName,
+        /// Its first index.
+        index: usize,
+        /// Counted from 0.
+        attempt: u32,
+        /// Which stage, and what it said.
+        error: String,
+    },
+    /// Frames outside any point: drained, in a pause, after a cancel.
+    Outside {
+        /// What became of them.
+        counts: Counts,
+    },
+    /// An acquisition run has ended.
+    End(EndEntry),
+}
+
+/// What a session is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SessionEntry {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// As given, before it was made fit for a folder's name.
+    pub name: String,
+    /// The plan's kind, for example `sweep`.
+    pub kind: String,
+    /// Who ran it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub operator: Option<String>,
+    /// What was in front of the camera.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sample: Option<String>,
+    /// Anything else.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub note: Option<String>,
+    /// Labels to find it by.
+    #[serde(default)]
+    pub tags: Vec<String>,
+    /// Wall-clock time, UTC.
+    pub created: Timestamp,
+    /// Name and version of the software.
+    pub software: String,
+    /// The arrays of the stack; `shape.points` is the number of planned points.
+    pub shape: StackShape,
+    /// Projector row that camera row 0 sees.
+    pub first_row: usize,
+}
+
+/// A stored point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PointEntry {
+    /// The array of the stack.
+    pub array: ArrayName,
+    /// Its first index: for `sum`, `exposure_index * delays + delay_index`; for `dark`, `exposure_index`.
+    pub index: usize,
+    /// Counted from 0.
+    pub attempt: u32,
+    /// Frames summed.
+    pub frames: u32,
+    /// The exposure time that the camera applied.
+    pub exposure_us: f64,
+    /// The delay that was asked for and applied (centre of exposure minus centre of illumination).
+    pub delay_us: f64,
+    /// The true delay of each summed frame, from its exposure start and its VSYNC edge; empty where delays mean
+    /// nothing (dark and regular frames).
+    pub delays_us: Vec<f64>,
+    /// What became of the attempt's frames.
+    pub counts: Counts,
+    /// CRC-32 of the stored data, see [`crate::stack::crc32`].
+    pub crc32: u32,
+}
+
+impl PointEntry {
+    /// The mean of the true delays, where there are any.
+    pub fn mean_delay_us(&self) -> Option<f64> {
+        let frames = self.delays_us.len();
+        (frames > 0).then(|| self.delays_us.iter().sum::<f64>() / frames as f64)
+    }
+}
+
+/// How an acquisition run ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EndEntry {
+    /// In which state.
+    pub state: EndState,
+    /// Why it faulted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+    /// Sweep points stored by now.
+    pub stored: usize,
+    /// Sweep points planned and not stored.
+    pub missing: usize,
+    /// The VSYNC line during the run, where it was watched.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub vsync: Option<VsyncStats>,
+}
+
+/// In which state a run ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EndState {
+    /// Everything planned is stored.
+    Complete,
+    /// Somebody ended it.
+    Cancelled,
+    /// A device or the disk failed.
+    Faulted,
+}
+
+/// What the lines of a ledger amount to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct State {
+    /// What the session is.
+    pub session: SessionEntry,
+    /// Acquisition runs begun.
+    pub runs: u32,
+    /// All frames of all runs, of repeated and failed attempts too.
+    pub counts: Counts,
+    /// How the latest run ended; `None` before the first, while one is running and after a crash.
+    pub end: Option<EndEntry>,
+    stored: BTreeMap<(ArrayName, usize), PointEntry>,
+    next_attempts: BTreeMap<(ArrayName, usize), u32>,
+}
+
+impl State {
+    /// What these entries, from a ledger's first line on, amount to.
+    ///
+    /// # Errors
+    /// [`Replay`] names the entry (counted from 0) that cannot follow the ones before.
+    pub fn replay(entries: &[Entry]) -> std::result::Result<State, Replay> {
+        let Some((Entry::Session(session), rest)) = entries.split_first() else {
+            return Err(Replay { entry: 0, why: "the first line is not a `session` entry".into() });
+        };
+        let mut state = State {
+            session: session.clone(),
+            runs: 0,
+            counts: Counts::default(),
+            end: None,
+            stored: BTreeMap::new(),
+            next_attempts: BTreeMap::new(),
+        };
+        for (entry, line) in rest.iter().zip(1..) {
+            state.apply(entry).map_err(|why| Replay { entry: line, why })?;
+        }
+        Ok(state)
+    }
+
+    /// The stored points of an array, by index: the latest line of each.
+    pub fn stored(&self, array: ArrayName) -> impl Iterator<Item = &PointEntry> {
+        self.stored.range((array, 0)..=(array, usize::MAX)).map(|(_, point)| point)
+    }
+
+    /// A stored point.
+    pub fn point(&self, array: ArrayName, index: usize) -> Option<&PointEntry> {
+        self.stored.get(&(array, index))
+    }
+
+    /// The planned indices of an array that are not stored, ascending.
+    pub fn missing(&self, array: ArrayName) -> impl Iterator<Item = usize> {
+        (0..self.session.shape.len(array)).filter(move |&index| self.point(array, index).is_none())
+    }
+
+    /// The number of the next attempt at a point: attempts that reached the ledger are never repeated, the one that
+    /// a crash cut short is.
+    pub fn next_attempt(&self, array: ArrayName, index: usize) -> u32 {
+        self.next_attempts.get(&(array, index)).copied().unwrap_or(0)
+    }
+
+    fn check(&self, entry: &Entry) -> std::result::Result<(), String> {
+        match entry {
+            Entry::Session(_) => Err("a `session` entry may only be the first line".into()),
+            Entry::Point(PointEntry { array, index, .. })
+            | Entry::AttemptFailed { array, index, .. }
+            | Entry::StageFailed { array, index, .. } => {
+                let len = self.session.shape.len(*array);
+                if *index < len {
+                    Ok(())
+                } else {
+                    Err(format!(
+                        "index {index} is outside of array `{}`, which has {len} points",
+                        array.as_str()
+                    ))
+                }
+            }
+            Entry::Run { .. } | Entry::Outside { .. } | Entry::End(_) => Ok(()),
+        }
+    }
+
+    fn apply(&mut self, entry: &Entry) -> std::result::Result<(), String> {
+        self.check(entry)?;
+        match entry {
+            Entry::Session(_) => {}
+            Entry::Run { .. } => {
+                self.runs += 1;
+                self.end = None;
+            }
+            Entry::Point(point) => {
+                self.counts.add(&point.counts);
+                self.note_attempt(point.array, point.index, point.attempt);
+                self.stored.insert((point.array, point.index), point.clone());
+            }
+            Entry::AttemptFailed { array, index, attempt, counts } => {
+                self.counts.add(counts);
+                self.note_attempt(*array, *index, *attempt);
+            }
+            Entry::Outside { counts } => self.counts.add(counts),
+            Entry::StageFailed { .. } => {}
+            Entry::End(end) => self.end = Some(end.clone()),
+        }
+        Ok(())
+    }
+
+    fn note_attempt(&mut self, array: ArrayName, index: usize, attempt: u32) {
+        let next = self.next_attempts.entry((array, index)).or_default();
+        *next = (*next).max(attempt.saturating_add(1));
+    }
+}
+
+/// An entry that cannot follow the ones before it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("entry {entry}: {why}")]
+pub struct Replay {
+    /// Counted from 0.
+    pub entry: usize,
+    /// What is wrong.
+    pub why: String,
+}
+
+/// A ledger open for appending. Only one can be, over all processes: the file is locked.
+#[derive(Debug)]
+pub struct Ledger {
+    path: PathBuf,
+    file: File,
+    len: u64,
+    broken: bool,
+    state: State,
+}
+
+impl Ledger {
+    /// Makes the ledger of a new session with its first line.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where a ledger exists or the file system refuses; [`Error::Entry`] as for [`Ledger::append`].
+    pub fn create(path: &Path, session: SessionEntry) -> Result<Ledger> {
+        let first = Entry::Session(session);
+        let state = State::replay(std::slice::from_ref(&first)).map_err(refused(path))?;
+        let file = OpenOptions::new()
+            .append(true)
+            .create_new(true)
+            .open(path)
+            .map_err(Error::io("create ledger", path))?;
+        lock(&file, path)?;
+        let mut ledger = Ledger { path: path.to_owned(), file, len: 0, broken: false, state };
+        ledger.append_line(&first)?;
+        if let Some(dir) = path.parent() {
+            crate::durable::sync_dir(dir)?;
+        }
+        Ok(ledger)
+    }
+
+    /// Opens a ledger to append to it. A torn last line is cut off.
+    ///
+    /// # Errors
+    /// [`Error::InUse`] where another process has it open for appending; otherwise as [`read`].
+    pub fn open(path: &Path) -> Result<Ledger> {
+        let file =
+            OpenOptions::new().read(true).append(true).open(path).map_err(Error::io("open ledger", path))?;
+        lock(&file, path)?;
+        let text = read_bytes(&file, path)?;
+        let (entries, len) = parse(&text, path)?;
+        let state = replay(&entries, path)?;
+        if len < text.len() as u64 {
+            file.set_len(len)
+                .and_then(|()| file.sync_all())
+                .map_err(Error::io("cut the torn last line off", path))?;
+        }
+        Ok(Ledger { path: path.to_owned(), file, len, broken: false, state })
+    }
+
+    /// What the ledger says by now.
+    pub fn state(&self) -> &State {
+        &self.state
+    }
+
+    /// Appends a line; when this returns, it is durable. Where it fails, the ledger is as before.
+    ///
+    /// # Errors
+    /// [`Error::Entry`] where the entry would not read back as it is (a number that is not finite) or cannot follow
+    /// the ones before (an index outside the plan); [`Error::Io`] where the file system refuses.
+    pub fn append(&mut self, entry: &Entry) -> Result<()> {
+        self.state.check(entry).map_err(refused(&self.path))?;
+        self.append_line(entry)?;
+        self.state.apply(entry).map_err(refused(&self.path))
+    }
+
+    fn append_line(&mut self, entry: &Entry) -> Result<()> {
+        let mut line = serde_json::to_vec(entry).map_err(refused(&self.path))?;
+        // JSON has no NaN and no infinity: they would be written as `null`, which no later reader accepts.
+        if serde_json::from_slice::<Entry>(&line).ok().as_ref() != Some(entry) {
+            return Err(refused(&self.path)("it would not read back as it is; every number must be finite"));
+        }
+        if self.broken {
+            return Err(refused(&self.path)(
+                "an earlier line could not be taken back; open the session again",
+            ));
+        }
+        line.push(b'\n');
+        if let Err(error) = self.file.write_all(&line).and_then(|()| self.file.sync_data()) {
+            // Half a line before the next one would damage the ledger for good.
+            self.broken = self.file.set_len(self.len).is_err();
+            return Err(Error::io("append to", &self.path)(error));
+        }
+        self.len += line.len() as u64;
+        Ok(())
+    }
+}
+
+/// Reads a ledger's entries without locking it; a torn last line is left out.
+///
+/// # Errors
+/// [`Error::Io`] where it cannot be read, [`Error::Ledger`] names a corrupt line, [`Error::NewerFormat`] a ledger of
+/// the future.
+pub fn read(path: &Path) -> Result<Vec<Entry>> {
+    let file = File::open(path).map_err(Error::io("open ledger", path))?;
+    let text = read_bytes(&file, path)?;
+    Ok(parse(&text, path)?.0)
+}
+
+/// Reads a ledger and replays it.
+///
+/// # Errors
+/// As [`read`], and [`Error::Ledger`] where a line cannot follow the ones before.
+pub fn read_state(path: &Path) -> Result<State> {
+    replay(&read(path)?, path)
+}
+
+fn replay(entries: &[Entry], path: &Path) -> Result<State> {
+    State::replay(entries).map_err(|Replay { entry, why }| Error::Ledger {
+        path: path.to_owned(),
+        line: entry + 1,
+        why,
+    })
+}
+
+fn read_bytes(mut file: &File, path: &Path) -> Result<Vec<u8>> {
+    let mut text = Vec::new();
+    file.read_to_end(&mut text).map_err(Error::io("read ledger", path))?;
+    Ok(text)
+}
+
+/// The whole entries, and the bytes that they take.
+fn parse(text: &[u8], path: &Path) -> Result<(Vec<Entry>, u64)> {
+    let mut entries = Vec::new();
+    let mut whole = 0;
+    for (line, number) in text.split_inclusive(|&byte| byte == b'\n').zip(1..) {
+        let is_last = whole + line.len() == text.len();
+        let entry = match serde_json::from_slice(line) {
+            // Without its newline a line was never acknowledged, even where it happens to parse.
+            Ok(_) if !line.ends_with(b"\n") => break,
+            Ok(entry) => entry,
+            // Blocks of the last line may have reached the disk in any order, but never as valid JSON that says
+            // something else.
+            Err(_) if is_last && serde_json::from_slice::<serde_json::Value>(line).is_err() => break,
+            Err(error) => {
+                check_format(line, path)?;
+                return Err(Error::Ledger { path: path.to_owned(), line: number, why: error.to_string() });
+            }
+        };
+        if number == 1 {
+            check_format(line, path)?;
+        }
+        whole += line.len();
+        entries.push(entry);
+    }
+    Ok((entries, whole as u64))
+}
+
+fn check_format(line: &[u8], path: &Path) -> Result<()> {
+    #[derive(Deserialize)]
+    struct Format {
+        format: u32,
+    }
+    match serde_json::from_slice(line) {
+        Ok(Format { format }) if format > FORMAT => {
+            Err(Error::NewerFormat { path: path.to_owned(), found: format, known: FORMAT })
+        }
+        _ => Ok(()),
+    }
+}
+
+fn lock(file: &File, path: &Path) -> Result<()> {
+    file.try_lock().map_err(|error| match error {
+        TryLockError::WouldBlock => Error::InUse { path: path.to_owned() },
+        TryLockError::Error(source) => Error::io("lock", path)(source),
+    })
+}
+
+fn refused<E: ToString>(path: &Path) -> impl FnOnce(E) -> Error {
+    move |why| Error::Entry { path: path.to_owned(), why: why.to_string() }
+}
+
+#[cfg(test)]
+mod tests;

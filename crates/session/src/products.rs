@@ -1,0 +1,111 @@
+//! `products/`: what was made from the stack, as files that other programs open.
+//!
+//! An image `NAME` is `NAME.exr` (channel Y, or R, G, B, metadata as text attributes `raysweep.KEY`) and `NAME.npy`
+//! (float32 `[t, s]`, or `[t, s, 3]`); a volume is `NAME.npy` alone. Beside each lies `NAME.json` with the metadata.
+//! Values are linear. Every file is written durably, and the same input gives the same bytes.
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use ndarray::{ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
+use ndarray_npy::WriteNpyExt;
+use serde_json::{Map, Value};
+
+use crate::{Error, Result, durable, exr_file};
+
+/// The folder of the products.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Products {
+    dir: PathBuf,
+}
+
+impl Products {
+    /// The products in `dir`, which is made where it is missing.
+    pub fn new(dir: impl Into<PathBuf>) -> Products {
+        Products { dir: dir.into() }
+    }
+
+    /// The folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Writes a monochrome image `[t, s]` as `name.exr`, `name.npy` and `name.json`.
+    ///
+    /// # Errors
+    /// [`Error::Codec`] for an empty image or a name that is not a plain file name, [`Error::Io`].
+    pub fn image(&self, name: &str, values: ArrayView2<f32>, metadata: &Map<String, Value>) -> Result<()> {
+        self.write(name, "exr", &exr_file::encode(&[("Y", values)], metadata)?)?;
+        self.write_array(name, &values, metadata)
+    }
+
+    /// Writes a colour image `[t, s, 3]` (R, G, B) as `name.exr`, `name.npy` and `name.json`.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] where the last axis is not 3; otherwise as [`Products::image`].
+    pub fn rgb(&self, name: &str, values: ArrayView3<f32>, metadata: &Map<String, Value>) -> Result<()> {
+        let channels: Vec<_> = ["R", "G", "B"].into_iter().zip(values.axis_iter(Axis(2))).collect();
+        if values.shape()[2] != 3 {
+            let found = values.shape().to_vec();
+            return Err(Error::Shape { what: format!("image `{name}`"), found, allowed: "[t, s, 3]".into() });
+        }
+        self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
+        self.write_array(name, &values, metadata)
+    }
+
+    /// Writes a volume as `name.npy` (C order) and `name.json`, which should name the axes.
+    ///
+    /// # Errors
+    /// As [`Products::image`].
+    pub fn volume(&self, name: &str, values: ArrayView3<f32>, metadata: &Map<String, Value>) -> Result<()> {
+        self.write_array(name, &values, metadata)
+    }
+
+    /// Reads back an image that [`Products::image`] wrote.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where there is none, [`Error::Codec`] where it is damaged.
+    pub fn read_image(&self, name: &str) -> Result<ndarray::Array2<f32>> {
+        let path = self.path(name, "npy")?;
+        let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
+        ndarray_npy::ReadNpyExt::read_npy(bytes.as_slice()).map_err(Error::codec("read", path.display()))
+    }
+
+    fn write_array<D: Dimension>(
+        &self,
+        name: &str,
+        values: &ArrayRef<f32, D>,
+        metadata: &Map<String, Value>,
+    ) -> Result<()> {
+        let mut npy = Cursor::new(Vec::new());
+        // An array in Fortran order would be written as such.
+        values
+            .as_standard_layout()
+            .write_npy(&mut npy)
+            .map_err(Error::codec("encode", format!("{name}.npy")))?;
+        self.write(name, "npy", npy.get_ref())?;
+        let mut sidecar =
+            serde_json::to_vec_pretty(metadata).map_err(Error::codec("encode", format!("{name}.json")))?;
+        sidecar.push(b'\n');
+        self.write(name, "json", &sidecar)
+    }
+
+    fn write(&self, name: &str, extension: &str, bytes: &[u8]) -> Result<()> {
+        let path = self.path(name, extension)?;
+        durable::create_dir_all(&self.dir)?;
+        durable::write(&path, bytes)
+    }
+
+    fn path(&self, name: &str, extension: &str) -> Result<PathBuf> {
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+        if name.is_empty() || !name.chars().all(plain) {
+            return Err(Error::codec("write", format!("product `{name}`"))(
+                "a name is made of letters, digits, `-` and `_`",
+            ));
+        }
+        Ok(self.dir.join(format!("{name}.{extension}")))
+    }
+}
+
+#[cfg(test)]
+mod tests;

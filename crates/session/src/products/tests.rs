@@ -1,0 +1,131 @@
+use super::*;
+use exr::prelude::read_first_flat_layer_from_file;
+use ndarray::{Array2, Array3};
+use ndarray_npy::{ReadNpyExt, read_npy};
+use serde_json::json;
+use std::fs;
+
+fn metadata() -> Map<String, Value> {
+    let value = json!({ "what": "Größe in µm", "delay_us": [-1500.0, 0.5], "average": 8, "zebra": null, "axes": ["t", "s"],
+        "a_key_that_is_longer_than_the_thirty_one_bytes_of_a_short_name": true });
+    value.as_object().cloned().unwrap()
+}
+
+fn image(rows: usize, columns: usize) -> Array2<f32> {
+    let mut image = Array2::from_shape_fn((rows, columns), |(t, s)| t as f32 * 100.0 + s as f32 / 3.0 - 5.0);
+    image[[0, 0]] = f32::INFINITY;
+    image
+}
+
+fn products() -> (tempfile::TempDir, Products) {
+    let dir = tempfile::tempdir().unwrap();
+    let products = Products::new(dir.path().join("products"));
+    (dir, products)
+}
+
+fn exr_channels(path: &Path) -> Vec<(String, Vec<f32>)> {
+    let image = read_first_flat_layer_from_file(path).unwrap();
+    let channels = image.layer_data.channel_data.list;
+    channels
+        .iter()
+        .map(|channel| (channel.name.to_string(), channel.sample_data.values_as_f32().collect()))
+        .collect()
+}
+
+#[test]
+fn an_image_is_the_same_in_exr_and_npy_with_its_metadata() {
+    let (_dir, products) = products();
+    let values = image(20, 33);
+    products.image("epipolar", values.view(), &metadata()).unwrap();
+    let path = |extension: &str| products.dir().join(format!("epipolar.{extension}"));
+    assert_eq!(products.read_image("epipolar").unwrap(), values);
+    assert_eq!(exr_channels(&path("exr")), [("Y".to_owned(), values.iter().copied().collect())]);
+    let sidecar: Value = serde_json::from_slice(&fs::read(path("json")).unwrap()).unwrap();
+    assert_eq!(sidecar, Value::Object(metadata()));
+
+    let header = read_first_flat_layer_from_file(path("exr")).unwrap().layer_data.attributes;
+    let text = |key: &str| {
+        let name = exr::prelude::Text::from(key);
+        let exr::prelude::attribute::AttributeValue::Text(text) = &header.other[&name] else {
+            panic!("{key}")
+        };
+        String::from_utf8(text.as_slice().to_vec()).unwrap()
+    };
+    assert_eq!(text("raysweep.what"), "Größe in µm");
+    assert_eq!(text("raysweep.delay_us"), "[-1500.0,0.5]");
+    assert_eq!(text("raysweep.average"), "8");
+}
+
+#[test]
+fn colours_keep_their_places() {
+    let (_dir, products) = products();
+    let values = Array3::from_shape_fn((4, 5, 3), |(t, s, c)| (c * 100 + t * 10 + s) as f32);
+    products.rgb("composite", values.view(), &metadata()).unwrap();
+    let channels = exr_channels(&products.dir().join("composite.exr"));
+    // OpenEXR sorts channels by name.
+    for ((name, found), (expected_name, c)) in channels.iter().zip([("B", 2), ("G", 1), ("R", 0)]) {
+        assert_eq!(name, expected_name);
+        assert_eq!(*found, values.index_axis(Axis(2), c).iter().copied().collect::<Vec<_>>());
+    }
+    let back: Array3<f32> = read_npy(products.dir().join("composite.npy")).unwrap();
+    assert_eq!(back, values);
+    let four = Array3::<f32>::zeros((4, 5, 4));
+    assert!(matches!(products.rgb("composite", four.view(), &metadata()), Err(Error::Shape { .. })));
+}
+
+#[test]
+fn a_volume_is_written_in_c_order_whatever_its_order_in_memory() {
+    let (_dir, products) = products();
+    let values = Array3::from_shape_fn((3, 4, 5), |(u, t, s)| (u * 100 + t * 10 + s) as f32);
+    let turned = values.t().as_standard_layout().into_owned();
+    products.volume("transport", turned.t(), &metadata()).unwrap();
+    let bytes = fs::read(products.dir().join("transport.npy")).unwrap();
+    let header = String::from_utf8_lossy(&bytes[..128]).into_owned();
+    assert!(header.contains("'fortran_order': False") && header.contains("'<f4'"), "{header}");
+    assert_eq!(Array3::<f32>::read_npy(bytes.as_slice()).unwrap(), values);
+    assert!(!products.dir().join("transport.exr").exists());
+}
+
+#[test]
+fn the_same_image_gives_the_same_bytes() {
+    let (_dir, products) = products();
+    let bytes = |name: &str| {
+        products.image(name, image(40, 50).view(), &metadata()).unwrap();
+        fs::read(products.dir().join(format!("{name}.exr"))).unwrap()
+    };
+    let first = bytes("a");
+    for name in ["b", "c", "d", "e", "f", "g"] {
+        assert!(bytes(name) == first, "{name}");
+    }
+}
+
+#[test]
+fn names_that_would_leave_the_folder_and_empty_images_are_refused() {
+    let (dir, products) = products();
+    for name in ["", "../plan", "a/b", ".hidden", "a.b", "ä"] {
+        assert!(
+            matches!(products.image(name, image(2, 2).view(), &metadata()), Err(Error::Codec { .. })),
+            "{name}"
+        );
+    }
+    assert!(matches!(
+        products.image("empty", image(1, 1).slice(ndarray::s![..0, ..]), &metadata()),
+        Err(Error::Codec { .. })
+    ));
+    let long = Map::from_iter([("x".repeat(300), Value::Null)]);
+    assert!(matches!(products.image("long", image(2, 2).view(), &long), Err(Error::Codec { .. })));
+    assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0, "nothing was written");
+}
+
+#[test]
+fn a_damaged_image_is_an_error() {
+    let (_dir, products) = products();
+    assert!(matches!(products.read_image("epipolar"), Err(Error::Io { .. })));
+    products.image("epipolar", image(2, 2).view(), &metadata()).unwrap();
+    let path = products.dir().join("epipolar.npy");
+    let bytes = fs::read(&path).unwrap();
+    for damaged in [&b"garbage"[..], &bytes[..bytes.len() - 1], &bytes[..40]] {
+        fs::write(&path, damaged).unwrap();
+        assert!(matches!(products.read_image("epipolar"), Err(Error::Codec { .. })));
+    }
+}

@@ -1,0 +1,206 @@
+//! Linear images as 8-bit PNG pictures on a stated scale.
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use maud::{Markup, html};
+use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
+
+use super::PALETTE;
+use crate::{Error, Result};
+
+/// Longer sides are reduced to this, so that a page stays at a few megabytes.
+const PICTURE_MAX_PX: usize = 1024;
+/// The same for the pictures of a contact sheet.
+const THUMBNAIL_MAX_PX: usize = 160;
+/// Pictures below this size are shown enlarged, with their pixels as squares.
+const PIXELATED_MAX_PX: usize = 512;
+/// More values than this do not make a percentile better.
+const PERCENTILE_SAMPLES: usize = 1 << 20;
+
+/// How linear values become grey levels: `white` and above is white, 0 and below is black, in between the transfer
+/// function of sRGB (IEC 61966-2-1).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ToneMap {
+    /// The value that is shown as white.
+    pub white: f32,
+}
+
+impl ToneMap {
+    /// The scale on which `percent` of all pixels of these images are not overexposed; white is 1 where that would be
+    /// 0 or where there are no finite values.
+    pub fn percentile(images: &[ArrayView2<f32>], percent: f64) -> ToneMap {
+        let total: usize = images.iter().map(|image| image.len()).sum();
+        let step = total.div_ceil(PERCENTILE_SAMPLES).max(1);
+        let values = images.iter().flat_map(|image| image.iter().copied());
+        let mut values: Vec<f32> = values.step_by(step).filter(|value| value.is_finite()).collect();
+        if values.is_empty() {
+            return ToneMap { white: 1.0 };
+        }
+        let rank = (percent.clamp(0.0, 100.0) / 100.0 * (values.len() - 1) as f64).round() as usize;
+        let (_, &mut white, _) = values.select_nth_unstable_by(rank, f32::total_cmp);
+        ToneMap { white: if white > 0.0 { white } else { 1.0 } }
+    }
+
+    fn level(self, value: f32) -> u8 {
+        let linear = (value / self.white).clamp(0.0, 1.0);
+        let encoded =
+            if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
+        // NaN becomes 0 in the conversion, and so black.
+        (encoded * 255.0).round() as u8
+    }
+}
+
+/// A numbered cross at a pixel; its colour is that of the series with the same place in a plot.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Marker {
+    /// What stands beside the cross.
+    pub label: String,
+    /// Camera row t of the pixel.
+    pub row: usize,
+    /// Camera column s of the pixel.
+    pub column: usize,
+}
+
+/// A picture, ready to be shown.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    levels: Array3<u8>,
+    size: (usize, usize),
+    reduction: usize,
+    tone_map: ToneMap,
+    caption: String,
+    markers: Vec<Marker>,
+}
+
+impl Picture {
+    /// A grey picture of a linear image `[t, s]`.
+    pub fn grey(image: ArrayView2<f32>, tone_map: ToneMap) -> Picture {
+        Picture::new(image.insert_axis(Axis(2)), tone_map, PICTURE_MAX_PX)
+    }
+
+    /// A colour picture of a linear image `[t, s, 3]` with the primaries of sRGB.
+    pub fn rgb(image: ArrayView3<f32>, tone_map: ToneMap) -> Picture {
+        Picture::new(image, tone_map, PICTURE_MAX_PX)
+    }
+
+    /// A grey picture for a contact sheet.
+    pub fn thumbnail(image: ArrayView2<f32>, tone_map: ToneMap) -> Picture {
+        Picture::new(image.insert_axis(Axis(2)), tone_map, THUMBNAIL_MAX_PX)
+    }
+
+    /// With a caption; scale and size are added to it.
+    pub fn with_caption(self, caption: impl Into<String>) -> Picture {
+        Picture { caption: caption.into(), ..self }
+    }
+
+    /// With crosses at these pixels.
+    pub fn with_markers(self, markers: Vec<Marker>) -> Picture {
+        Picture { markers, ..self }
+    }
+
+    fn new(image: ArrayView3<f32>, tone_map: ToneMap, max_px: usize) -> Picture {
+        let (rows, columns, channels) = image.dim();
+        let reduction = rows.max(columns).div_ceil(max_px).max(1);
+        let reduced = (rows.div_ceil(reduction), columns.div_ceil(reduction), channels);
+        let levels = Array3::from_shape_fn(reduced, |(row, column, channel)| {
+            let span = |index: usize, len: usize| index * reduction..len.min((index + 1) * reduction);
+            let block = image.slice(s![span(row, rows), span(column, columns), channel]);
+            tone_map.level(block.sum() / block.len() as f32)
+        });
+        Picture {
+            levels,
+            size: (rows, columns),
+            reduction,
+            tone_map,
+            caption: String::new(),
+            markers: Vec::new(),
+        }
+    }
+
+    pub(super) fn tone_map(&self) -> ToneMap {
+        self.tone_map
+    }
+
+    pub(super) fn to_figure(&self) -> Result<Markup> {
+        let (rows, columns) = self.size;
+        let shown = if self.reduction > 1 { format!(", shown 1:{}", self.reduction) } else { String::new() };
+        Ok(html! {
+            figure {
+                div.frame { (self.to_img(&self.caption)?) (self.overlay()) }
+                figcaption {
+                    @if !self.caption.is_empty() { strong { (self.caption) } " " }
+                    span.scale { (format!("white = {} · {columns} × {rows} px{shown}", short(self.tone_map.white))) }
+                }
+            }
+        })
+    }
+
+    pub(super) fn to_img(&self, alt: &str) -> Result<Markup> {
+        let (rows, columns, _) = self.levels.dim();
+        let source = format!("data:image/png;base64,{}", STANDARD.encode(self.to_png()?));
+        let class = (rows.max(columns) <= PIXELATED_MAX_PX).then_some("pixelated");
+        Ok(html! { img class=[class] src=(source) width=(columns) height=(rows) alt=(alt); })
+    }
+
+    fn to_png(&self) -> Result<Vec<u8>> {
+        let (rows, columns, channels) = self.levels.dim();
+        let failed = || format!("a picture of {columns} x {rows} pixels and {channels} channels");
+        let color = match channels {
+            1 => png::ColorType::Grayscale,
+            3 => png::ColorType::Rgb,
+            _ => return Err(Error::codec("draw", failed())("pictures have 1 or 3 channels")),
+        };
+        let px = |len: usize| u32::try_from(len).map_err(Error::codec("draw", failed()));
+        let mut file = Vec::new();
+        let mut encoder = png::Encoder::new(&mut file, px(columns)?, px(rows)?);
+        encoder.set_color(color);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_compression(png::Compression::High);
+        let levels: Vec<u8> = self.levels.iter().copied().collect();
+        encoder
+            .write_header()
+            .and_then(|mut writer| {
+                writer.write_image_data(&levels)?;
+                writer.finish()
+            })
+            .map_err(Error::codec("draw", failed()))?;
+        Ok(file)
+    }
+
+    fn overlay(&self) -> Markup {
+        let (rows, columns) = self.size;
+        let arm = 0.028 * columns as f64;
+        html! {
+            @if !self.markers.is_empty() {
+                svg.markers viewBox=(format!("0 0 {columns} {rows}")) aria-hidden="true" {
+                    @for (marker, colour) in self.markers.iter().zip(PALETTE.iter().cycle()) {
+                        @let x = marker.column as f64 + 0.5;
+                        @let y = marker.row as f64 + 0.5;
+                        @let cross = format!(
+                            "M{} {y}H{}M{x} {}V{}",
+                            short(x - arm), short(x + arm), short(y - arm), short(y + arm)
+                        );
+                        path.halo d=(cross) {}
+                        path d=(cross) stroke=(colour) {}
+                        text x=(short(x + 0.9 * arm)) y=(short(y - 0.6 * arm)) fill=(colour)
+                            font-size=(short(2.1 * arm)) { (marker.label) }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Three significant digits.
+pub(super) fn short(value: impl Into<f64>) -> String {
+    let value = value.into();
+    if value == 0.0 || !value.is_finite() {
+        return value.to_string();
+    }
+    let magnitude = value.abs().log10().floor() as i32;
+    if !(-4..6).contains(&magnitude) {
+        return format!("{value:.2e}");
+    }
+    let text = format!("{value:.*}", usize::try_from(2 - magnitude).unwrap_or(0));
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+}

@@ -1,0 +1,220 @@
+//! Plots as inline SVG that takes its ink from the page.
+
+use maud::{Markup, PreEscaped, html};
+use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+
+use super::PALETTE;
+use super::picture::short;
+use crate::{Error, Result};
+
+const SIZE_PX: (u32, u32) = (620, 310);
+/// Stands for the page's text colour until the drawing is done; no series has it.
+const INK: RGBColor = RGBColor(1, 2, 3);
+const INK_HEX: &str = "\"#010203\"";
+
+/// A plot of one or more series.
+#[derive(Debug, Clone, Default)]
+pub struct Plot {
+    /// The heading.
+    pub title: String,
+    /// With its unit.
+    pub x_label: String,
+    /// With its unit.
+    pub y_label: String,
+    /// Drawn in order; values that are not finite are left out.
+    pub series: Vec<Series>,
+    /// Vertical lines.
+    pub guides: Vec<Guide>,
+}
+
+/// Values to be drawn.
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// Shown in the legend.
+    pub name: String,
+    /// How to draw it.
+    pub style: SeriesStyle,
+    /// x and y.
+    pub points: Vec<(f64, f64)>,
+}
+
+/// How a series is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SeriesStyle {
+    /// Points joined by lines.
+    Line,
+    /// Points alone.
+    Dots,
+    /// Bars from 0, as wide as the smallest distance in x: a histogram.
+    Bars,
+}
+
+/// A vertical line that marks a value of x.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Guide {
+    /// Where.
+    pub x: f64,
+    /// What stands at its upper end.
+    pub label: String,
+}
+
+impl Plot {
+    pub(super) fn to_figure(&self) -> Result<Markup> {
+        let series: Vec<_> = self.series.iter().map(Series::finite).collect();
+        let drawing = match Bounds::of(&series, &self.guides) {
+            Some(bounds) => {
+                let svg = self
+                    .draw(&series, &bounds)
+                    .map_err(Error::codec("draw", format!("plot `{}`", self.title)))?;
+                html! { (PreEscaped(svg)) }
+            }
+            None => html! { p.empty { "no data" } },
+        };
+        Ok(html! {
+            figure.plot {
+                figcaption {
+                    strong { (self.title) }
+                    @if series.len() > 1 {
+                        span.legend {
+                            @for (series, colour) in series.iter().zip(PALETTE.iter().cycle()) {
+                                span { i style=(format!("background:{colour}")) {} (series.name) }
+                            }
+                        }
+                    }
+                }
+                (drawing)
+            }
+        })
+    }
+
+    fn draw(
+        &self,
+        series: &[Series],
+        bounds: &Bounds,
+    ) -> std::result::Result<String, Box<dyn std::error::Error>> {
+        let mut svg = String::new();
+        {
+            let faded = INK.mix(0.75);
+            let root = SVGBackend::with_string(&mut svg, SIZE_PX).into_drawing_area();
+            let mut chart = ChartBuilder::on(&root)
+                .margin(8)
+                .margin_right(18)
+                .margin_top(if self.guides.is_empty() { 8 } else { 30 })
+                .x_label_area_size(46)
+                .y_label_area_size(62)
+                .build_cartesian_2d(bounds.x.0..bounds.x.1, bounds.y.0..bounds.y.1)?;
+            chart
+                .configure_mesh()
+                .light_line_style(TRANSPARENT)
+                .bold_line_style(INK.mix(0.11))
+                .axis_style(INK.mix(0.45))
+                .label_style(("sans-serif", 14).into_font().color(&faded))
+                .axis_desc_style(("sans-serif", 14).into_font().color(&faded))
+                .x_desc(&self.x_label)
+                .y_desc(&self.y_label)
+                .x_labels(7)
+                .y_labels(6)
+                .x_label_formatter(&|x| short(*x))
+                .y_label_formatter(&|y| short(*y))
+                .draw()?;
+            for guide in &self.guides {
+                let line = vec![(guide.x, bounds.y.0), (guide.x, bounds.y.1)];
+                chart.draw_series(DashedLineSeries::new(line, 4, 4, INK.mix(0.5).stroke_width(1)))?;
+                let style = TextStyle::from(("sans-serif", 13).into_font())
+                    .color(&faded)
+                    .pos(Pos::new(HPos::Center, VPos::Bottom));
+                let (x, y) = chart.plotting_area().map_coordinate(&(guide.x, bounds.y.1));
+                root.draw_text(&guide.label, &style, (x, y - 4))?;
+            }
+            for (series, colour) in series.iter().zip(PALETTE.iter().cycle()) {
+                let colour = parse_hex(colour);
+                match series.style {
+                    SeriesStyle::Line => {
+                        chart.draw_series(LineSeries::new(series.points.clone(), colour.stroke_width(2)))?;
+                        // Where the samples are few, the reader should see which values were measured.
+                        if series.points.len() <= 40 {
+                            chart.draw_series(dots(series, colour))?;
+                        }
+                    }
+                    SeriesStyle::Dots => {
+                        chart.draw_series(dots(series, colour))?;
+                    }
+                    SeriesStyle::Bars => {
+                        let half = 0.46 * series.spacing();
+                        let bars = series
+                            .points
+                            .iter()
+                            .map(|&(x, y)| Rectangle::new([(x - half, 0.0), (x + half, y)], colour.filled()));
+                        chart.draw_series(bars)?;
+                    }
+                }
+            }
+            root.present()?;
+        }
+        let (width, height) = SIZE_PX;
+        Ok(svg
+            .replacen(&format!("width=\"{width}\" height=\"{height}\" "), "role=\"img\" ", 1)
+            .replace(INK_HEX, "\"currentColor\""))
+    }
+}
+
+impl Series {
+    /// A line.
+    pub fn line(name: impl Into<String>, points: Vec<(f64, f64)>) -> Series {
+        Series { name: name.into(), style: SeriesStyle::Line, points }
+    }
+
+    fn finite(&self) -> Series {
+        let points = self.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
+        Series { points, ..self.clone() }
+    }
+
+    fn spacing(&self) -> f64 {
+        let mut xs: Vec<f64> = self.points.iter().map(|&(x, _)| x).collect();
+        xs.sort_by(f64::total_cmp);
+        let gaps = xs.windows(2).map(|pair| pair[1] - pair[0]).filter(|gap| *gap > 0.0);
+        gaps.min_by(f64::total_cmp).unwrap_or(1.0)
+    }
+}
+
+struct Bounds {
+    x: (f64, f64),
+    y: (f64, f64),
+}
+
+impl Bounds {
+    /// Around all points, with a margin; y starts at 0 where nothing is below. `None` where there is nothing.
+    fn of(series: &[Series], guides: &[Guide]) -> Option<Bounds> {
+        let points = || series.iter().flat_map(|series| &series.points);
+        points().next()?;
+        let bars = series.iter().filter(|series| series.style == SeriesStyle::Bars);
+        let half_bar = bars.map(|series| 0.5 * series.spacing()).fold(0.0, f64::max);
+        let guides = guides.iter().map(|guide| guide.x).filter(|x| x.is_finite());
+        let x = span(points().map(|&(x, _)| x).chain(guides));
+        let y = span(points().map(|&(_, y)| y).chain([0.0]));
+        let margin_x = half_bar.max(0.015 * (x.1 - x.0));
+        let margin_y = 0.06 * (y.1 - y.0);
+        Some(Bounds {
+            x: (x.0 - margin_x, x.1 + margin_x),
+            y: (if y.0 < 0.0 { y.0 - margin_y } else { 0.0 }, y.1 + margin_y),
+        })
+    }
+}
+
+/// Smallest and largest value; never an empty interval.
+fn span(values: impl Iterator<Item = f64>) -> (f64, f64) {
+    let (low, high) = values
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)));
+    if low < high { (low, high) } else { (low - 0.5, high + 0.5) }
+}
+
+fn dots(series: &Series, colour: RGBColor) -> impl Iterator<Item = Circle<(f64, f64), i32>> {
+    series.points.iter().map(move |&point| Circle::new(point, 3, colour.filled()))
+}
+
+fn parse_hex(colour: &str) -> RGBColor {
+    let channel =
+        |at: usize| colour.get(at..at + 2).and_then(|hex| u8::from_str_radix(hex, 16).ok()).unwrap_or(0);
+    RGBColor(channel(1), channel(3), channel(5))
+}

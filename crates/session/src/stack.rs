@@ -1,0 +1,266 @@
+//! `stack.zarr`: the summed frames, a Zarr v3 group.
+//!
+//! | array | type | axes | what |
+//! | --- | --- | --- | --- |
+//! | `sum` | uint32 | `[point, t, s]` | the sweep; point = exposure_index * delays + delay_index |
+//! | `dark` | uint32 | `[exposure, t, s]` | projector off, one per exposure |
+//! | `regular` | uint32 | `[1, t, s]` | all rows lit by a long exposure |
+//!
+//! t is the camera row (the top one is 0), s the camera column. Values are camera counts (DN), summed over the frames
+//! that the ledger names. One shard is one point, with inner chunks of 64 x 64 pixels. A point without a line in the
+//! ledger is not stored, whatever the array holds there.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ndarray::{Array2, Array3, ArrayView2, Axis, Ix2, s};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+use zarrs::array::{Array, ArrayBuilder, data_type};
+
+use crate::zarr::{self, CHUNK_PX, DurableStore};
+use crate::{Error, Result};
+
+/// An array of the stack.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ArrayName {
+    /// The sweep.
+    Sum,
+    /// Projector off, one per exposure.
+    Dark,
+    /// All rows lit by a long exposure.
+    Regular,
+}
+
+impl ArrayName {
+    /// All of them.
+    pub const ALL: [ArrayName; 3] = [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular];
+
+    /// The name in the Zarr group and in the ledger.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            ArrayName::Sum => "sum",
+            ArrayName::Dark => "dark",
+            ArrayName::Regular => "regular",
+        }
+    }
+
+    fn first_axis(self) -> &'static str {
+        match self {
+            ArrayName::Sum => "point",
+            ArrayName::Dark => "exposure",
+            ArrayName::Regular => "frame",
+        }
+    }
+}
+
+/// The shapes of the stack's arrays.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StackShape {
+    /// Planned points of the sweep.
+    pub points: usize,
+    /// Exposures, each with a dark frame.
+    pub exposures: usize,
+    /// Camera rows, axis t.
+    pub rows: usize,
+    /// Camera columns, axis s.
+    pub columns: usize,
+}
+
+impl StackShape {
+    /// Points of an array.
+    pub fn len(&self, array: ArrayName) -> usize {
+        match array {
+            ArrayName::Sum => self.points,
+            ArrayName::Dark => self.exposures,
+            ArrayName::Regular => 1,
+        }
+    }
+
+    pub(crate) fn check(&self) -> Result<()> {
+        let found = self.to_vec();
+        if found.contains(&0) {
+            return Err(Error::Shape {
+                what: "the stack [points, exposures, rows, columns]".into(),
+                found,
+                allowed: "at least 1 along each axis".into(),
+            });
+        }
+        Ok(())
+    }
+
+    pub(crate) fn to_vec(self) -> Vec<usize> {
+        vec![self.points, self.exposures, self.rows, self.columns]
+    }
+
+    fn chunk(&self) -> [usize; 3] {
+        [1, self.rows.min(CHUNK_PX), self.columns.min(CHUNK_PX)]
+    }
+
+    /// A shard must be a whole number of inner chunks, so it may reach beyond the frame; what lies there is 0.
+    fn shard(&self) -> [usize; 3] {
+        let [_, rows, columns] = self.chunk();
+        [1, self.rows.next_multiple_of(rows), self.columns.next_multiple_of(columns)]
+    }
+}
+
+/// The stack of a session.
+pub struct Stack {
+    dir: PathBuf,
+    shape: StackShape,
+    arrays: [Array<DurableStore>; 3],
+}
+
+impl Stack {
+    /// Makes an empty stack at `dir`; `kind` is the plan's kind.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for an axis of length 0, [`Error::Zarr`] where the file system refuses.
+    pub fn create(dir: &Path, shape: &StackShape, kind: &str) -> Result<Stack> {
+        shape.check()?;
+        let store = DurableStore::new(dir)?;
+        let attributes = json!({
+            "kind": kind,
+            "axes": { "point": "exposure_index * delays + delay_index", "t": "camera row, top first", "s": "camera column" },
+            "units": "camera counts (DN), summed over frames; ledger.jsonl says how many frames and at which delays",
+        });
+        zarr::create_group(&store, into_map(attributes))?;
+        let create = |name| create_array(&store, name, shape);
+        let arrays = [create(ArrayName::Sum)?, create(ArrayName::Dark)?, create(ArrayName::Regular)?];
+        Ok(Stack { dir: dir.to_owned(), shape: *shape, arrays })
+    }
+
+    /// Opens the stack at `dir`.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] where it cannot be read, [`Error::Shape`] where its arrays do not belong together.
+    pub fn open(dir: &Path) -> Result<Stack> {
+        let store = DurableStore::new(dir)?;
+        let open = |name: ArrayName| zarr::open_array(&store, name.as_str());
+        let arrays = [open(ArrayName::Sum)?, open(ArrayName::Dark)?, open(ArrayName::Regular)?];
+        let [sum, dark, _] = arrays.each_ref().map(zarr::shape_of);
+        let shape = StackShape { points: sum[0], exposures: dark[0], rows: sum[1], columns: sum[2] };
+        shape.check()?;
+        for (name, array) in ArrayName::ALL.into_iter().zip(&arrays) {
+            let expected = [shape.len(name), shape.rows, shape.columns];
+            let found = zarr::shape_of(array);
+            if found != expected {
+                let what = dir.join(name.as_str()).display().to_string();
+                return Err(Error::Shape { what, found, allowed: format!("{expected:?}") });
+            }
+            let shard = array.chunk_shape_usize(&[0, 0, 0]).map_err(Error::zarr("open", dir))?;
+            if shard != shape.shard() {
+                let what = format!("a shard of {}", dir.join(name.as_str()).display());
+                return Err(Error::Shape { what, found: shard, allowed: format!("{:?}", shape.shard()) });
+            }
+        }
+        Ok(Stack { dir: dir.to_owned(), shape, arrays })
+    }
+
+    /// The shapes of the arrays.
+    pub fn shape(&self) -> &StackShape {
+        &self.shape
+    }
+
+    /// Writes one point `[t, s]`, replacing what was there; when this returns, it is durable. Gives the data's
+    /// CRC-32, which belongs into the ledger's line.
+    ///
+    /// # Errors
+    /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] where the file system refuses.
+    pub fn write(&self, array: ArrayName, index: usize, data: ArrayView2<u32>) -> Result<u32> {
+        self.check_index(array, index)?;
+        if data.dim() != (self.shape.rows, self.shape.columns) {
+            return Err(Error::Shape {
+                what: format!("a point of array `{}`", array.as_str()),
+                found: data.shape().to_vec(),
+                allowed: format!("{:?}", [self.shape.rows, self.shape.columns]),
+            });
+        }
+        zarr::write_chunk(
+            self.array(array),
+            [index as u64, 0, 0],
+            self.shape.shard(),
+            data.insert_axis(Axis(0)),
+        )?;
+        Ok(crc32(data))
+    }
+
+    /// Reads one point `[t, s]`. Whether it is to be believed, the ledger knows (compare [`crc32`]).
+    ///
+    /// # Errors
+    /// [`Error::NotStored`] where nothing was written, [`Error::Index`], or [`Error::Zarr`] for damaged data.
+    pub fn read_point(&self, array: ArrayName, index: usize) -> Result<Array2<u32>> {
+        self.check_index(array, index)?;
+        let shard = self
+            .array(array)
+            .retrieve_chunk_if_exists_opt::<Array3<u32>>(&[index as u64, 0, 0], &zarr::codec_options())
+            .map_err(Error::zarr("read", &self.dir.join(array.as_str())))?;
+        let Some(shard) = shard else {
+            return Err(Error::NotStored { path: self.dir.clone(), array: array.as_str(), index });
+        };
+        let frame = shard.slice_move(s![0, ..self.shape.rows, ..self.shape.columns]);
+        debug_assert_eq!(frame.raw_dim(), Ix2(self.shape.rows, self.shape.columns));
+        Ok(frame.as_standard_layout().into_owned())
+    }
+
+    /// Reads a whole array `[point, t, s]`; points that were never written are 0.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] for damaged data.
+    pub fn read(&self, array: ArrayName) -> Result<Array3<u32>> {
+        zarr::read_all(self.array(array))
+    }
+
+    fn array(&self, array: ArrayName) -> &Array<DurableStore> {
+        let [sum, dark, regular] = &self.arrays;
+        match array {
+            ArrayName::Sum => sum,
+            ArrayName::Dark => dark,
+            ArrayName::Regular => regular,
+        }
+    }
+
+    fn check_index(&self, array: ArrayName, index: usize) -> Result<()> {
+        let len = self.shape.len(array);
+        if index < len { Ok(()) } else { Err(Error::Index { array: array.as_str(), index, len }) }
+    }
+}
+
+/// CRC-32 (the one of zip and PNG) of an image as little-endian uint32 in C order.
+pub fn crc32(data: ArrayView2<u32>) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    let mut row_bytes = Vec::with_capacity(data.ncols() * 4);
+    for row in data.rows() {
+        row_bytes.clear();
+        row_bytes.extend(row.iter().flat_map(|value| value.to_le_bytes()));
+        hasher.update(&row_bytes);
+    }
+    hasher.finalize()
+}
+
+fn create_array(
+    store: &Arc<DurableStore>,
+    name: ArrayName,
+    shape: &StackShape,
+) -> Result<Array<DurableStore>> {
+    let to_u64 = |axes: [usize; 3]| axes.map(|len| len as u64).to_vec();
+    let array_shape = [shape.len(name), shape.rows, shape.columns];
+    let mut builder =
+        ArrayBuilder::new(to_u64(array_shape), to_u64(shape.shard()), data_type::uint32(), 0u32);
+    zarr::with_codecs(&mut builder)
+        .subchunk_shape(to_u64(shape.chunk()))
+        .dimension_names(Some([name.first_axis(), "t", "s"]))
+        .attributes(into_map(json!({ "units": "DN" })));
+    zarr::create_array(store, name.as_str(), &builder)
+}
+
+fn into_map(value: Value) -> Map<String, Value> {
+    match value {
+        Value::Object(map) => map,
+        _ => Map::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,179 @@
+//! What `stack.zarr` and `transport.zarr` share: a durable store, and chunks at the edge of an array.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ndarray::{Array3, ArrayView3, s};
+use serde_json::{Map, Value};
+use zarrs::array::codec::{BytesCodec, ShardingCodecOptions, SubchunkWriteOrder, ZstdCodec};
+use zarrs::array::{
+    Array, ArrayBuilder, ArrayMetadataOptions, BytesToBytesCodecTraits, CodecOptions, CodecSpecificOptions,
+    Element, ElementOwned,
+};
+use zarrs::filesystem::FilesystemStore;
+use zarrs::group::GroupBuilder;
+use zarrs::metadata::ChunkKeySeparator;
+use zarrs::storage::byte_range::ByteRangeIterator;
+use zarrs::storage::{
+    Bytes, MaybeBytesIterator, OffsetBytesIterator, ReadableStorageTraits, StorageError, StoreKey,
+    StorePrefix, WritableStorageTraits,
+};
+
+use crate::{Error, Result, durable};
+
+/// Rows and columns of a chunk, at most.
+pub(crate) const CHUNK_PX: usize = 64;
+
+/// A file system store whose every write is durable. zarrs' own store writes in place, and its atomic adapter does
+/// not sync the folder.
+pub(crate) struct DurableStore {
+    root: PathBuf,
+    files: FilesystemStore,
+}
+
+impl DurableStore {
+    pub(crate) fn new(root: &Path) -> Result<Arc<DurableStore>> {
+        let files = FilesystemStore::new(root).map_err(Error::zarr("open", root))?;
+        Ok(Arc::new(DurableStore { root: root.to_owned(), files }))
+    }
+
+    pub(crate) fn root(&self) -> &Path {
+        &self.root
+    }
+}
+
+impl ReadableStorageTraits for DurableStore {
+    fn get_partial_many<'a>(
+        &'a self,
+        key: &StoreKey,
+        byte_ranges: ByteRangeIterator<'a>,
+    ) -> std::result::Result<MaybeBytesIterator<'a>, StorageError> {
+        self.files.get_partial_many(key, byte_ranges)
+    }
+
+    fn size_key(&self, key: &StoreKey) -> std::result::Result<Option<u64>, StorageError> {
+        self.files.size_key(key)
+    }
+
+    fn supports_get_partial(&self) -> bool {
+        self.files.supports_get_partial()
+    }
+}
+
+impl WritableStorageTraits for DurableStore {
+    fn set(&self, key: &StoreKey, value: Bytes) -> std::result::Result<(), StorageError> {
+        let path = self.files.key_to_fspath(key);
+        let parent = path.parent().unwrap_or(&self.root);
+        durable::create_dir_all(parent)
+            .and_then(|()| durable::write(&path, &value))
+            .map_err(|error| StorageError::Other(error.to_string()))
+    }
+
+    fn set_partial_many(
+        &self,
+        key: &StoreKey,
+        _: OffsetBytesIterator,
+    ) -> std::result::Result<(), StorageError> {
+        Err(StorageError::Unsupported(format!("{key} can only be written whole")))
+    }
+
+    fn erase(&self, key: &StoreKey) -> std::result::Result<(), StorageError> {
+        Err(StorageError::Unsupported(format!("{key} cannot be erased from a session")))
+    }
+
+    fn erase_prefix(&self, prefix: &StorePrefix) -> std::result::Result<(), StorageError> {
+        Err(StorageError::Unsupported(format!("{prefix} cannot be erased from a session")))
+    }
+
+    fn supports_set_partial(&self) -> bool {
+        false
+    }
+}
+
+/// Writes the metadata of the root group.
+pub(crate) fn create_group(store: &Arc<DurableStore>, attributes: Map<String, Value>) -> Result<()> {
+    GroupBuilder::new()
+        .attributes(attributes)
+        .build(store.clone(), "/")
+        .map_err(Error::zarr("create", store.root()))?
+        .store_metadata()
+        .map_err(Error::zarr("create", store.root()))
+}
+
+/// Codecs of all data: little-endian, Zstandard level 1 with its checksum. Chunks are files of one folder
+/// (`c.0.0.0`), so that a point costs one fsync of a file and one of a folder.
+pub(crate) fn with_codecs(builder: &mut ArrayBuilder) -> &mut ArrayBuilder {
+    let zstd: Arc<dyn BytesToBytesCodecTraits> = Arc::new(ZstdCodec::new(1, true));
+    builder
+        .array_to_bytes_codec(Arc::new(BytesCodec::little()))
+        .bytes_to_bytes_codecs(vec![zstd])
+        .chunk_key_encoding_default_separator(ChunkKeySeparator::Dot)
+}
+
+/// Builds an array and writes its metadata.
+pub(crate) fn create_array(
+    store: &Arc<DurableStore>,
+    name: &str,
+    builder: &ArrayBuilder,
+) -> Result<Array<DurableStore>> {
+    let array = builder
+        .build(store.clone(), &format!("/{name}"))
+        .map_err(Error::zarr("create", &store.root().join(name)))?
+        // The library's version would change the bytes of the metadata with every update.
+        .with_metadata_options(ArrayMetadataOptions::default().with_include_zarrs_metadata(false))
+        .with_codec_specific_options(&in_fixed_order());
+    array.store_metadata().map_err(Error::zarr("create", &store.root().join(name)))?;
+    Ok(array)
+}
+
+/// Opens an array of three axes.
+pub(crate) fn open_array(store: &Arc<DurableStore>, name: &str) -> Result<Array<DurableStore>> {
+    let path = store.root().join(name);
+    let array = Array::open(store.clone(), &format!("/{name}")).map_err(Error::zarr("open", &path))?;
+    if array.shape().len() != 3 {
+        let found = shape_of(&array);
+        return Err(Error::Shape { what: path.display().to_string(), found, allowed: "three axes".into() });
+    }
+    Ok(array.with_codec_specific_options(&in_fixed_order()))
+}
+
+fn path_of(array: &Array<DurableStore>) -> PathBuf {
+    array.storage().root().join(array.path().as_str().trim_start_matches('/'))
+}
+
+pub(crate) fn shape_of(array: &Array<DurableStore>) -> Vec<usize> {
+    array.shape().iter().map(|&len| usize::try_from(len).unwrap_or(usize::MAX)).collect()
+}
+
+/// Writes one chunk; where the array ends within the chunk, the rest is filled with zeros.
+pub(crate) fn write_chunk<T: Element + Clone + Default>(
+    array: &Array<DurableStore>,
+    indices: [u64; 3],
+    chunk_shape: [usize; 3],
+    data: ArrayView3<T>,
+) -> Result<()> {
+    let mut chunk = Array3::from_elem(chunk_shape, T::default());
+    let (depth, rows, columns) = data.dim();
+    chunk.slice_mut(s![..depth, ..rows, ..columns]).assign(&data);
+    let options = codec_options();
+    array.store_chunk_opt(&indices, chunk, &options).map_err(Error::zarr("write", &path_of(array)))
+}
+
+/// Reads a whole array.
+pub(crate) fn read_all<T: ElementOwned>(array: &Array<DurableStore>) -> Result<Array3<T>> {
+    array
+        .retrieve_array_subset_opt(&array.subset_all(), &codec_options())
+        .map_err(Error::zarr("read", &path_of(array)))
+}
+
+/// A chunk that is all zeros is stored like any other: a stored point has a file.
+pub(crate) fn codec_options() -> CodecOptions {
+    CodecOptions::default().with_store_empty_chunks(true)
+}
+
+/// In any other order the bytes of a shard would depend on the threads. This is not part of the metadata, so an array
+/// that is opened needs it as much as a new one.
+fn in_fixed_order() -> CodecSpecificOptions {
+    let order = ShardingCodecOptions::default().with_subchunk_write_order(SubchunkWriteOrder::C);
+    CodecSpecificOptions::default().with_option(order)
+}

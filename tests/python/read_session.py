@@ -1,0 +1,218 @@
+#!/usr/bin/env python3
+"""Reads every file of a session with packages that know nothing of raysweep, and checks that the files agree.
+
+    python3 -m venv VENV && VENV/bin/pip install -r tests/python/requirements.txt
+    VENV/bin/python tests/python/read_session.py SESSION_FOLDER...
+
+Exits with 0 where all holds, and with 1 and one line a fault where something does not.
+"""
+
+import hashlib
+import json
+import pathlib
+import sys
+import tomllib
+import zlib
+from html.parser import HTMLParser
+
+import numpy as np
+import OpenEXR
+import zarr
+
+ATTRIBUTE_PREFIX = "raysweep."
+
+
+class Faults:
+    """Collects what does not hold, and counts what was checked."""
+
+    def __init__(self):
+        self.checked = 0
+        self.found = []
+
+    def check(self, holds, what):
+        self.checked += 1
+        if not holds:
+            self.found.append(what)
+
+    def equal(self, found, expected, what):
+        self.check(found == expected, f"{what}: {found!r}, expected {expected!r}")
+
+    def same_array(self, found, expected, what):
+        same = (
+            found.shape == expected.shape
+            and found.dtype == expected.dtype
+            and np.array_equal(found, expected, equal_nan=True)
+        )
+        self.check(same, f"{what}: {found.dtype}{found.shape} differs from {expected.dtype}{expected.shape}")
+
+
+def read_ledger(session):
+    lines = (session / "ledger.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines]
+
+
+def check_ledger(faults, entries):
+    """The first line, and that every trigger is accounted for."""
+    header = entries[0]
+    faults.equal(header["event"], "session", "first line of the ledger")
+    faults.equal(header["format"], 1, "format of the ledger")
+    faults.check(all(entry["event"] != "session" for entry in entries[1:]), "a second `session` line")
+    for number, entry in enumerate(entries, start=1):
+        if counts := entry.get("counts"):
+            parts = [counts[name] for name in ("averaged", "settling", "cancelled")]
+            total = sum(parts) + sum(counts["lost"].values())
+            faults.equal(total, counts["expected"], f"accounting in line {number} of the ledger")
+    return header
+
+
+def check_stack(faults, session, header, entries):
+    """Shapes, types, names of axes, and the checksum of every stored point."""
+    group = zarr.open_group(session / "stack.zarr", mode="r", zarr_format=3)
+    shape = header["shape"]
+    frame = (shape["rows"], shape["columns"])
+    expected = {
+        "sum": ((shape["points"], *frame), ("point", "t", "s")),
+        "dark": ((shape["exposures"], *frame), ("exposure", "t", "s")),
+        "regular": ((1, *frame), ("frame", "t", "s")),
+    }
+    faults.equal(sorted(group.array_keys()), sorted(expected), "arrays of stack.zarr")
+    faults.equal(group.attrs["kind"], header["kind"], "kind of stack.zarr")
+    stored = {(entry["array"], entry["index"]): entry for entry in entries if entry["event"] == "point"}
+    for name, (array_shape, axes) in expected.items():
+        array = group[name]
+        faults.equal(array.shape, array_shape, f"shape of {name}")
+        faults.equal(array.dtype, np.dtype("uint32"), f"type of {name}")
+        faults.equal(array.metadata.dimension_names, axes, f"axes of {name}")
+        faults.equal(array.shards[0], 1, f"points in a shard of {name}")
+        values = array[:]
+        for (array_name, index), entry in stored.items():
+            if array_name == name:
+                crc32 = zlib.crc32(values[index].astype("<u4").tobytes())
+                faults.equal(crc32, entry["crc32"], f"checksum of {name}[{index}]")
+                faults.same_array(array[index], values[index], f"{name}[{index}] read alone")
+
+
+def check_npy(faults, path):
+    """C order, float32, and the sidecar; gives the array and the metadata."""
+    with path.open("rb") as file:
+        version = np.lib.format.read_magic(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        _, fortran_order, dtype = read_header(file)
+    faults.check(not fortran_order, f"{path.name} is in Fortran order")
+    faults.equal(dtype, np.dtype("<f4"), f"type of {path.name}")
+    return np.load(path), json.loads(path.with_suffix(".json").read_text())
+
+
+def check_exr(faults, path, values, metadata):
+    """Names and values of the channels, and the metadata in the header."""
+    # The file stays open: closing it empties its header.
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        header, channels = file.header(), file.channels()
+        names = {"Y"} if values.ndim == 2 else {"R", "G", "B"}
+        faults.equal(set(channels), names, f"channels of {path.name}")
+        faults.equal(header["compression"], OpenEXR.ZIP_COMPRESSION, f"compression of {path.name}")
+        faults.equal(header["type"], OpenEXR.scanlineimage, f"storage of {path.name}")
+        for name, channel in channels.items():
+            expected = values if values.ndim == 2 else values[:, :, "RGB".index(name)]
+            faults.same_array(channel.pixels, expected, f"{path.name} channel {name} against NPY")
+        for key, value in metadata.items():
+            text = header.get(ATTRIBUTE_PREFIX + key)
+            faults.check(text is not None, f"{path.name} lacks {ATTRIBUTE_PREFIX}{key}")
+            if text is not None:
+                faults.equal(text if isinstance(value, str) else json.loads(text), value, f"{path.name} {key}")
+
+
+def check_products(faults, session):
+    products = {}
+    for path in sorted((session / "products").glob("*.npy")):
+        values, metadata = check_npy(faults, path)
+        products[path.stem] = values, metadata
+        exr = path.with_suffix(".exr")
+        if exr.exists():
+            check_exr(faults, exr, values, metadata)
+    for exr in (session / "products").glob("*.exr"):
+        faults.check(exr.stem in products, f"{exr.name} has no NPY beside it")
+    return products
+
+
+def check_transport(faults, session, header, products):
+    """transport.zarr is transport.npy, and its plane u = 0 is the epipolar image."""
+    array = zarr.open_group(session / "transport.zarr", mode="r", zarr_format=3)["transport"]
+    volume, metadata = products["transport"]
+    faults.equal(array.metadata.dimension_names, ("u", "t", "s"), "axes of transport")
+    faults.same_array(array[:], volume, "transport.zarr against transport.npy")
+    faults.equal(metadata["axes"], ["u", "t", "s"], "axes in transport.json")
+    for key in ("u_min", "u_max"):
+        faults.equal(array.attrs[key], metadata[key], f"{key} of transport.zarr against transport.json")
+    depth = metadata["u_max"] - metadata["u_min"] + 1
+    shape = header["shape"]
+    faults.equal(volume.shape, (depth, shape["rows"], shape["columns"]), "shape of transport")
+    with OpenEXR.File(str(session / "products" / "epipolar.exr"), separate_channels=True) as file:
+        faults.same_array(file.channels()["Y"].pixels, volume[-metadata["u_min"]], "epipolar.exr against u = 0")
+
+
+def check_manifest(faults, session, header):
+    manifest = json.loads((session / "manifest.json").read_text())
+    points = manifest["points"]
+    faults.equal(points["planned"], header["shape"]["points"], "points planned")
+    faults.equal(points["stored"] + points["missing"], points["planned"], "points stored and missing")
+    files = {path.relative_to(session).as_posix(): path for path in session.rglob("*") if path.is_file()}
+    del files["manifest.json"]
+    faults.equal(sorted(files), sorted(manifest["files"]), "files in the manifest")
+    for name, record in manifest["files"].items():
+        content = files[name].read_bytes() if name in files else b""
+        faults.equal(len(content), record["bytes"], f"size of {name}")
+        faults.equal(hashlib.sha256(content).hexdigest(), record["sha256"], f"checksum of {name}")
+
+
+class ReportParser(HTMLParser):
+    """Finds what a report would load from elsewhere."""
+
+    def __init__(self):
+        super().__init__()
+        self.pictures = 0
+        self.foreign = []
+
+    def handle_starttag(self, tag, attrs):
+        self.pictures += tag in ("img", "svg")
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href") and not (value or "").startswith(("data:", "#")):
+                self.foreign.append(f"<{tag} {name}={value}>")
+
+
+def check_report(faults, session):
+    parser = ReportParser()
+    parser.feed((session / "report.html").read_text())
+    faults.check(parser.pictures > 0, "report.html shows nothing")
+    faults.check(not parser.foreign, f"report.html is not self-contained: {parser.foreign}")
+
+
+def check_session(session):
+    faults = Faults()
+    for name in ("plan.toml", "rig.toml"):
+        faults.check("kind" in tomllib.loads((session / name).read_text()), f"{name} names no kind")
+    entries = read_ledger(session)
+    header = check_ledger(faults, entries)
+    check_stack(faults, session, header, entries)
+    products = check_products(faults, session)
+    check_transport(faults, session, header, products)
+    check_manifest(faults, session, header)
+    check_report(faults, session)
+    return faults
+
+
+def main(arguments):
+    if not arguments:
+        sys.exit(__doc__)
+    failed = 0
+    for argument in arguments:
+        faults = check_session(pathlib.Path(argument))
+        for fault in faults.found:
+            print(f"{argument}: {fault}", file=sys.stderr)
+        print(f"{argument}: {faults.checked - len(faults.found)} of {faults.checked} checks hold")
+        failed += bool(faults.found)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
