@@ -1,1 +1,24 @@
-//! raysweep-pipeline
+//! From frames to results: frames and VSYNC edges become averaged units, units pass stages in parallel, and sinks and
+//! folds receive them in order.
+//!
+//! No device, no file and no socket is known here; threads are `std` threads with names, workers are rayon's.
+
+mod assembler;
+mod demux;
+mod edges;
+mod pipeline;
+mod queue;
+mod registry;
+mod schedule;
+mod stage;
+mod unit;
+
+pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label, Labeller};
+pub use demux::{DemuxFold, DemuxOptions};
+pub use edges::{EdgeTracker, Line};
+pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, run_stages};
+pub use queue::{Input, Policy, QueueError};
+pub use registry::{Entry, Registry, RegistryError};
+pub use schedule::{Point, Role, Schedule, SweepGeometry};
+pub use stage::{Fold, FoldError, HotPixels, Product, Stage, StageError};
+pub use unit::Unit;

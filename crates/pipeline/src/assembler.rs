@@ -1,0 +1,408 @@
+//! Frames and VSYNC edges in, averaged units out. A plain state machine: no thread, no clock, no channel; every
+//! decision hangs on stamps alone, never on who came first.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use ndarray::Array2;
+use raysweep_core::{
+    Applied, Counts, Edge, Frame, FrameStamp, LossCause, PixelFormat, Raster, SettingsId, VsyncStats,
+    ns_from_us, us_from_ns,
+};
+
+use crate::edges::{EdgeTracker, Found, Line, TrueEdge};
+use crate::unit::Unit;
+
+/// One attempt at a point, as the camera was set for it.
+#[derive(Debug, Clone, Copy)]
+pub struct Job {
+    /// Point and attempt.
+    pub id: SettingsId,
+    /// Frames to average.
+    pub frames: u32,
+    /// What the camera made of the settings.
+    pub applied: Applied,
+    /// Wanted t_d.
+    pub delay_us: f64,
+    /// Which edge's light is measured: the trigger's own (0) or a later one.
+    pub light_edges_later: u32,
+}
+
+/// What a frame is taken for, before it is known whether it is sound.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Label {
+    /// It belongs to the point.
+    Counted,
+    /// It may have been exposed under the settings before.
+    Settling,
+    /// Nobody waits for it.
+    Cancelled,
+}
+
+/// Tells the frames of a point from those that still carry old settings.
+#[derive(Debug, Clone, Copy)]
+pub struct Labeller {
+    written_ns: i64,
+    settling_frames: u64,
+    first_seq: Option<u64>,
+}
+
+impl Labeller {
+    /// For the frames that follow a change of settings.
+    pub fn new(applied: &Applied) -> Self {
+        Self {
+            written_ns: applied.written_ns,
+            settling_frames: u64::from(applied.first_frame.settling_frames()),
+            first_seq: None,
+        }
+    }
+
+    /// The label of the next frame. Frames are counted by the device's id, so that one lost on the way still counts.
+    pub fn label(&mut self, stamp: &FrameStamp) -> Label {
+        if stamp.exposure_start_ns < self.written_ns {
+            return Label::Settling;
+        }
+        let first_seq = *self.first_seq.get_or_insert(stamp.seq);
+        if stamp.seq - first_seq < self.settling_frames { Label::Settling } else { Label::Counted }
+    }
+}
+
+/// What the device threads tell the assembler, in order.
+pub enum Event {
+    /// The line had an edge.
+    Edge(Edge),
+    /// The camera has been set for an attempt.
+    Begin(Job),
+    /// A frame.
+    Frame(Frame, Label),
+    /// A frame that there was no room for; without a cause, one that no point waited for.
+    Lost(FrameStamp, Option<LossCause>),
+    /// The attempt is over: complete, or given up.
+    End,
+    /// Nobody takes frames for a while: those that pass are nobody's loss.
+    Idle,
+    /// No further frame of this pass comes: decide everything.
+    Flush,
+}
+
+/// What the assembler decided.
+pub enum Decision {
+    /// A point's image.
+    Unit(Unit),
+    /// An attempt without all its frames.
+    Failed(SettingsId, Counts),
+    /// The pass is over; frames outside any attempt, and the line so far.
+    Flushed(Counts, VsyncStats),
+}
+
+/// What the assembler must know of the rig.
+#[derive(Debug, Clone, Copy)]
+pub struct AssemblerConfig {
+    /// Camera rows and columns.
+    pub size: (usize, usize),
+    /// How frames are packed.
+    pub format: PixelFormat,
+    /// When the projector lights its rows.
+    pub raster: Raster,
+    /// Projector row that camera row 0 sees.
+    pub first_row: usize,
+    /// From the trigger's edge to the start of row 0's exposure at a trigger delay of zero.
+    pub trigger_latency_us: f64,
+    /// From the end of row 0's exposure until the next trigger is answered.
+    pub readout_us: f64,
+    /// Whether that readout may overlap the next exposure.
+    pub overlapped: bool,
+    /// Frames whose measured delay is further off than this do not count.
+    pub max_jitter_us: f64,
+    /// How far an edge may lie from where the last true one puts it.
+    pub edge_gate_us: f64,
+}
+
+/// A frame is tied to the edge within this of the one that must have triggered it.
+const TRIGGER_TOLERANCE_NS: i64 = 200_000;
+/// A frame waits this long, on the host's clock, for the edges around it.
+const EDGE_PATIENCE_NS: i64 = 100_000_000;
+/// A camera's own word for its exposure may differ by rounding from what it was set to.
+const EXPOSURE_TOLERANCE_US: f64 = 0.5;
+
+/// The assembler's state.
+pub struct Assembler {
+    config: AssemblerConfig,
+    tracker: EdgeTracker,
+    waiting: VecDeque<Waiting>,
+    attempt: Option<Attempt>,
+    outside: Counts,
+    last_seq: Option<u64>,
+    /// Whether frames may have passed that nobody asked for.
+    idle: bool,
+    newest_ns: i64,
+    pixels: Vec<u16>,
+}
+
+/// Events that wait for edges, in their order.
+enum Waiting {
+    Begin(Job),
+    Frame(Frame, Label),
+    Lost(FrameStamp, Option<LossCause>),
+    End,
+    Idle,
+    Flush,
+}
+
+struct Attempt {
+    job: Job,
+    sum: Array2<u32>,
+    averaged: u32,
+    delays_us: Vec<f64>,
+    counts: Counts,
+    /// The last frame that was tied to an edge, and frames since then that were triggered by none.
+    tied: Option<(u64, TrueEdge)>,
+    untied: i64,
+}
+
+/// The light of a frame, or why it does not count.
+enum Verdict {
+    Undecided,
+    Sound { trigger: TrueEdge, delay_us: f64 },
+    Unsound { trigger: Option<TrueEdge>, cause: LossCause },
+}
+
+impl Assembler {
+    /// An assembler that has seen nothing.
+    pub fn new(config: AssemblerConfig) -> Self {
+        let line =
+            Line { period_ns: ns_from_us(config.raster.period_us), gate_ns: ns_from_us(config.edge_gate_us) };
+        Self {
+            config,
+            tracker: EdgeTracker::new(line),
+            waiting: VecDeque::new(),
+            attempt: None,
+            outside: Counts::default(),
+            last_seq: None,
+            idle: true,
+            newest_ns: i64::MIN,
+            pixels: vec![0; config.size.0 * config.size.1],
+        }
+    }
+
+    /// Takes an event; what can be decided now goes to `decide`, in order.
+    pub fn push(&mut self, event: Event, mut decide: impl FnMut(Decision)) {
+        match event {
+            Event::Edge(edge) => {
+                self.newest_ns = self.newest_ns.max(edge.host_ns);
+                self.tracker.push(edge);
+            }
+            Event::Begin(job) => self.waiting.push_back(Waiting::Begin(job)),
+            Event::Frame(frame, label) => {
+                self.newest_ns = self.newest_ns.max(frame.stamp.host_ns);
+                self.waiting.push_back(Waiting::Frame(frame, label));
+            }
+            Event::Lost(stamp, cause) => self.waiting.push_back(Waiting::Lost(stamp, cause)),
+            Event::End => self.waiting.push_back(Waiting::End),
+            Event::Idle => self.waiting.push_back(Waiting::Idle),
+            Event::Flush => self.waiting.push_back(Waiting::Flush),
+        }
+        while let Some(next) = self.waiting.pop_front() {
+            let flushing = self.waiting.iter().chain([&next]).any(|item| matches!(item, Waiting::Flush));
+            if let Some(undecided) = self.settle(next, flushing, &mut decide) {
+                self.waiting.push_front(undecided);
+                break;
+            }
+        }
+    }
+
+    /// Settles one item; gives it back if its edges are still to come.
+    fn settle(
+        &mut self,
+        item: Waiting,
+        flushing: bool,
+        decide: &mut impl FnMut(Decision),
+    ) -> Option<Waiting> {
+        match item {
+            Waiting::Begin(job) => self.begin(job),
+            Waiting::Lost(stamp, cause) => {
+                self.follow(stamp.seq);
+                match cause {
+                    Some(cause) => self.counts().lose(cause, 1),
+                    None => self.counts().cancelled += 1,
+                }
+                if let Some(attempt) = &mut self.attempt {
+                    attempt.untied += 1;
+                }
+            }
+            Waiting::Frame(frame, Label::Counted) => match self.judge(&frame.stamp, flushing) {
+                Verdict::Undecided => return Some(Waiting::Frame(frame, Label::Counted)),
+                verdict => self.count(&frame, verdict),
+            },
+            Waiting::Frame(frame, label) => {
+                self.follow(frame.stamp.seq);
+                let counts = self.counts();
+                if label == Label::Settling {
+                    counts.settling += 1;
+                } else {
+                    counts.cancelled += 1;
+                }
+            }
+            Waiting::End => {
+                if let Some(attempt) = self.attempt.take() {
+                    decide(attempt.finish());
+                }
+            }
+            Waiting::Idle => self.idle = true,
+            Waiting::Flush => {
+                self.idle = true;
+                decide(Decision::Flushed(std::mem::take(&mut self.outside), self.tracker.stats()));
+            }
+        }
+        None
+    }
+
+    fn begin(&mut self, job: Job) {
+        self.attempt = Some(Attempt {
+            job,
+            sum: Array2::zeros(self.config.size),
+            averaged: 0,
+            delays_us: Vec::with_capacity(job.frames as usize),
+            counts: Counts::default(),
+            tied: None,
+            untied: 0,
+        });
+    }
+
+    /// The account that the present belongs to.
+    fn counts(&mut self) -> &mut Counts {
+        self.attempt.as_mut().map_or(&mut self.outside, |attempt| &mut attempt.counts)
+    }
+
+    /// Follows the camera's frame ids: every id is a trigger that was answered, an id left out is a lost frame.
+    fn follow(&mut self, seq: u64) {
+        let gap = self.last_seq.map_or(0, |last| seq.saturating_sub(last + 1));
+        self.last_seq = Some(seq);
+        let idle = std::mem::replace(&mut self.idle, false);
+        self.counts().expected += gap + 1;
+        if idle {
+            self.counts().cancelled += gap;
+        } else {
+            self.counts().lose(LossCause::CameraGap, gap);
+        }
+    }
+
+    /// Ties a frame to the edge that triggered it and to the edge of the light that it saw.
+    fn judge(&self, stamp: &FrameStamp, flushing: bool) -> Verdict {
+        let Some(Attempt { job, .. }) = &self.attempt else {
+            return Verdict::Unsound { trigger: None, cause: LossCause::SettingsMismatch };
+        };
+        let settings = &job.applied.actual;
+        let out_of_patience = flushing || self.newest_ns > stamp.host_ns.saturating_add(EDGE_PATIENCE_NS);
+        let known_ns = if out_of_patience { i64::MAX } else { self.tracker.known_until_ns() };
+
+        let trigger_ns =
+            stamp.exposure_start_ns - ns_from_us(self.config.trigger_latency_us + settings.trigger_delay_us);
+        if known_ns < trigger_ns + TRIGGER_TOLERANCE_NS {
+            return Verdict::Undecided;
+        }
+        let trigger = match self.tracker.near(trigger_ns, TRIGGER_TOLERANCE_NS) {
+            Found::True(edge) => edge,
+            Found::False => return Verdict::Unsound { trigger: None, cause: LossCause::FalseEdge },
+            Found::Nothing => return Verdict::Unsound { trigger: None, cause: LossCause::EdgeMissing },
+        };
+        let later = i64::from(job.light_edges_later);
+        let light = if later == 0 {
+            trigger
+        } else {
+            match self.tracker.by_index(trigger.index + later) {
+                Some(edge) => edge,
+                None if known_ns < self.tracker.expected_ns(trigger, later) + self.tracker.gate_ns() => {
+                    return Verdict::Undecided;
+                }
+                None => return Verdict::Unsound { trigger: Some(trigger), cause: LossCause::EdgeMissing },
+            }
+        };
+        let exposure_us = stamp.exposure_us.unwrap_or(settings.exposure_us);
+        if (exposure_us - settings.exposure_us).abs() > EXPOSURE_TOLERANCE_US {
+            return Verdict::Unsound { trigger: Some(trigger), cause: LossCause::SettingsMismatch };
+        }
+        let start_us = us_from_ns(stamp.exposure_start_ns - light.host_ns);
+        let delay_us = self.config.raster.delay_us(self.config.first_row, start_us, exposure_us);
+        if (delay_us - job.delay_us).abs() > self.config.max_jitter_us {
+            return Verdict::Unsound { trigger: Some(trigger), cause: LossCause::Jitter };
+        }
+        Verdict::Sound { trigger, delay_us }
+    }
+
+    /// Adds a sound frame to the sum, or notes why it does not count.
+    fn count(&mut self, frame: &Frame, verdict: Verdict) {
+        self.follow(frame.stamp.seq);
+        let busy_periods = self.busy_periods();
+        let Some(attempt) = &mut self.attempt else { return };
+        let (trigger, sound) = match verdict {
+            Verdict::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
+            Verdict::Unsound { trigger, cause } => (trigger, Err(cause)),
+            Verdict::Undecided => return,
+        };
+        match trigger {
+            Some(edge) => attempt.tie(frame.stamp.seq, edge, busy_periods),
+            None => attempt.untied += 1,
+        }
+        let summed = sound.and_then(|delay_us| {
+            frame.format.unpack_into(&frame.data, &mut self.pixels).map(|()| delay_us).map_err(|error| {
+                tracing::warn!(%error, seq = frame.stamp.seq, "frame does not match its format");
+                LossCause::SettingsMismatch
+            })
+        });
+        match summed {
+            Ok(_) if attempt.averaged == attempt.job.frames => attempt.counts.cancelled += 1,
+            Ok(delay_us) => {
+                attempt.averaged += 1;
+                attempt.delays_us.push(delay_us);
+                attempt.sum.iter_mut().zip(&self.pixels).for_each(|(sum, &pixel)| *sum += u32::from(pixel));
+            }
+            Err(cause) => attempt.counts.lose(cause, 1),
+        }
+    }
+
+    /// How many periods apart the triggers are that the camera can answer under the present settings.
+    fn busy_periods(&self) -> i64 {
+        let Some(attempt) = &self.attempt else { return 1 };
+        let settings = &attempt.job.applied.actual;
+        let lead_us = self.config.trigger_latency_us + settings.trigger_delay_us;
+        let busy_us = if self.config.overlapped {
+            lead_us + settings.exposure_us.max(self.config.readout_us)
+        } else {
+            lead_us + settings.exposure_us + self.config.readout_us
+        };
+        (busy_us / self.config.raster.period_us).ceil().max(1.0) as i64
+    }
+}
+
+impl Attempt {
+    /// Notes which triggers stayed unanswered since the last frame that was tied to an edge.
+    fn tie(&mut self, seq: u64, edge: TrueEdge, busy_periods: i64) {
+        if let Some((last_seq, last_edge)) = self.tied {
+            let answered = i64::try_from(seq - last_seq).unwrap_or(i64::MAX) - self.untied;
+            let unanswered = (edge.index - last_edge.index) - answered * busy_periods;
+            let unanswered = u64::try_from(unanswered).unwrap_or(0);
+            self.counts.expected += unanswered;
+            self.counts.lose(LossCause::MissedTrigger, unanswered);
+        }
+        self.tied = Some((seq, edge));
+        self.untied = 0;
+    }
+
+    fn finish(mut self) -> Decision {
+        self.counts.averaged = u64::from(self.averaged);
+        if self.averaged < self.job.frames {
+            // Sound frames of an attempt that lacks others are not kept: the point is taken again as a whole.
+            self.counts.cancelled += std::mem::take(&mut self.counts.averaged);
+            return Decision::Failed(self.job.id, self.counts);
+        }
+        Decision::Unit(Unit {
+            id: self.job.id,
+            frames: self.averaged,
+            exposure_us: self.job.applied.actual.exposure_us,
+            delays_us: self.delays_us,
+            sum: Arc::new(self.sum),
+            counts: self.counts,
+        })
+    }
+}

@@ -1,0 +1,250 @@
+//! Which VSYNC edges are the projector's: period gate, missed and false edges, jitter.
+
+use std::collections::VecDeque;
+
+use raysweep_core::{Edge, VsyncStats, us_from_ns};
+
+/// The line as a rig states it.
+#[derive(Debug, Clone, Copy)]
+pub struct Line {
+    /// Nominal period.
+    pub period_ns: i64,
+    /// An edge this far from where the last true one puts it is not the projector's.
+    pub gate_ns: i64,
+}
+
+/// A true edge and its place in the count of periods.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TrueEdge {
+    /// Periods since the first true edge, missed ones counted.
+    pub index: i64,
+    /// When it was.
+    pub host_ns: i64,
+}
+
+/// What lies near a moment on the line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Found {
+    /// A true edge.
+    True(TrueEdge),
+    /// An edge that is not the projector's.
+    False,
+    /// None.
+    Nothing,
+}
+
+/// How many edges the tracker remembers: more than any exposure spans.
+const MEMORY: usize = 256;
+/// So many false edges in a row mean that it was the lock that was false.
+const RELOCK_AFTER: u32 = 8;
+
+/// Sorts the edges of a VSYNC line into true and false ones.
+pub struct EdgeTracker {
+    line: Line,
+    last: Option<TrueEdge>,
+    /// Edges before the first pair that lies a whole number of periods apart.
+    candidates: VecDeque<i64>,
+    false_in_a_row: u32,
+    recent: VecDeque<(i64, Option<TrueEdge>)>,
+    first_ns: i64,
+    stats: VsyncStats,
+    periods: u64,
+    sum_us: f64,
+    sum_squares_us2: f64,
+}
+
+impl EdgeTracker {
+    /// A tracker that has seen nothing.
+    pub fn new(line: Line) -> Self {
+        Self {
+            line,
+            last: None,
+            candidates: VecDeque::new(),
+            false_in_a_row: 0,
+            recent: VecDeque::new(),
+            first_ns: 0,
+            stats: VsyncStats::default(),
+            periods: 0,
+            sum_us: 0.0,
+            sum_squares_us2: 0.0,
+        }
+    }
+
+    /// Takes the next edge of the line.
+    pub fn push(&mut self, edge: Edge) {
+        let now_ns = edge.host_ns;
+        let accepted = match self.last {
+            Some(last) => self.periods_between(last.host_ns, now_ns).map(|n| (last, n)),
+            None => self.lock(now_ns),
+        };
+        let true_edge = accepted.map(|(from, n)| {
+            let edge = TrueEdge { index: from.index + n, host_ns: now_ns };
+            self.note_true(from, edge, n);
+            edge
+        });
+        if true_edge.is_none() && self.last.is_some() {
+            self.stats.false_edges += 1;
+            self.false_in_a_row += 1;
+            if self.false_in_a_row >= RELOCK_AFTER {
+                self.last = None;
+                self.candidates.clear();
+            }
+        }
+        self.remember(now_ns, true_edge);
+    }
+
+    fn remember(&mut self, host_ns: i64, edge: Option<TrueEdge>) {
+        if self.recent.len() == MEMORY {
+            self.recent.pop_front();
+        }
+        self.recent.push_back((host_ns, edge));
+    }
+
+    /// Whole periods, at least one, between two moments; `None` when they are not a whole number apart.
+    fn periods_between(&self, from_ns: i64, to_ns: i64) -> Option<i64> {
+        let n = ((to_ns - from_ns) as f64 / self.line.period_ns as f64).round() as i64;
+        let off_ns = (to_ns - from_ns - n * self.line.period_ns).abs();
+        (n >= 1 && off_ns <= self.line.gate_ns).then_some(n)
+    }
+
+    /// Looks for the first edge that a later one confirms.
+    fn lock(&mut self, now_ns: i64) -> Option<(TrueEdge, i64)> {
+        let found = self.candidates.iter().find_map(|&first_ns| {
+            let n = self.periods_between(first_ns, now_ns).filter(|&n| n <= 4)?;
+            Some((first_ns, n))
+        });
+        let Some((first_ns, n)) = found else {
+            if self.candidates.len() == RELOCK_AFTER as usize {
+                self.candidates.pop_front();
+            }
+            self.candidates.push_back(now_ns);
+            return None;
+        };
+        let first = TrueEdge { index: 0, host_ns: first_ns };
+        for (host_ns, edge) in &mut self.recent {
+            if *host_ns == first_ns {
+                *edge = Some(first);
+            }
+        }
+        self.candidates.clear();
+        self.stats.edges += 1;
+        self.first_ns = first_ns;
+        Some((first, n))
+    }
+
+    fn note_true(&mut self, from: TrueEdge, edge: TrueEdge, n: i64) {
+        self.last = Some(edge);
+        self.false_in_a_row = 0;
+        self.stats.edges += 1;
+        self.stats.missed += n.unsigned_abs() - 1;
+        if n == 1 {
+            let deviation_us = us_from_ns(edge.host_ns - from.host_ns - self.line.period_ns);
+            self.periods += 1;
+            self.sum_us += deviation_us;
+            self.sum_squares_us2 += deviation_us * deviation_us;
+        }
+    }
+
+    /// Whether true edges can be told from false ones yet.
+    pub fn is_locked(&self) -> bool {
+        self.last.is_some()
+    }
+
+    /// The time up to which all edges are known.
+    pub fn known_until_ns(&self) -> i64 {
+        self.recent.back().map_or(i64::MIN, |&(host_ns, _)| host_ns)
+    }
+
+    /// The edge nearest to `host_ns`, within `tolerance_ns`.
+    pub fn near(&self, host_ns: i64, tolerance_ns: i64) -> Found {
+        let nearest = self.recent.iter().min_by_key(|(edge_ns, _)| (edge_ns - host_ns).abs());
+        match nearest {
+            Some(&(edge_ns, edge)) if (edge_ns - host_ns).abs() <= tolerance_ns => {
+                edge.map_or(Found::False, Found::True)
+            }
+            _ => Found::Nothing,
+        }
+    }
+
+    /// The true edge with an index, if it was seen.
+    pub fn by_index(&self, index: i64) -> Option<TrueEdge> {
+        self.recent.iter().rev().find_map(|&(_, edge)| edge.filter(|edge| edge.index == index))
+    }
+
+    /// Nominal time of the edge `periods` after `edge`, for knowing when it is overdue.
+    pub fn expected_ns(&self, edge: TrueEdge, periods: i64) -> i64 {
+        edge.host_ns + periods * self.line.period_ns
+    }
+
+    /// How far an edge may lie from where it is expected.
+    pub fn gate_ns(&self) -> i64 {
+        self.line.gate_ns
+    }
+
+    /// Statistics so far. Jitter is that of a single edge: a period's deviation carries two.
+    pub fn stats(&self) -> VsyncStats {
+        let n = self.periods.max(1) as f64;
+        let mean_us = self.sum_us / n;
+        let variance_us2 = (self.sum_squares_us2 / n - mean_us * mean_us).max(0.0);
+        VsyncStats {
+            period_us: us_from_ns(self.line.period_ns) + mean_us,
+            jitter_us: variance_us2.sqrt(),
+            ..self.stats
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LINE: Line = Line { period_ns: 16_666_667, gate_ns: 500_000 };
+
+    fn tracker(edges: impl IntoIterator<Item = i64>) -> EdgeTracker {
+        let mut tracker = EdgeTracker::new(LINE);
+        edges
+            .into_iter()
+            .enumerate()
+            .for_each(|(seq, host_ns)| tracker.push(Edge { seq: seq as u64, host_ns }));
+        tracker
+    }
+
+    #[test]
+    fn missing_and_false_edges_are_told_apart_and_counted() {
+        let true_edges = (0..100_i64).filter(|k| k % 10 != 7).map(|k| k * LINE.period_ns);
+        let false_edges = (0..10_i64).map(|k| (k * 10 + 3) * LINE.period_ns + 5_000_000);
+        let mut edges: Vec<i64> = true_edges.chain(false_edges).collect();
+        edges.sort_unstable();
+        let tracker = tracker(edges);
+        let stats = tracker.stats();
+        assert_eq!((stats.edges, stats.missed, stats.false_edges), (90, 10, 10));
+        assert_eq!(tracker.near(93 * LINE.period_ns + 5_000_100, 1_000), Found::False);
+        assert_eq!(tracker.near(97 * LINE.period_ns, 1_000_000), Found::Nothing);
+        assert_eq!(tracker.by_index(97), None);
+        assert_eq!(tracker.by_index(98).unwrap().host_ns, 98 * LINE.period_ns);
+    }
+
+    #[test]
+    fn a_false_edge_at_the_very_start_does_not_become_the_reference() {
+        let edges = [4_000_000].into_iter().chain((1..6).map(|k| k * LINE.period_ns));
+        let tracker = tracker(edges);
+        assert_eq!(tracker.near(4_000_000, 10), Found::False);
+        assert_eq!(tracker.by_index(4).unwrap().host_ns, 5 * LINE.period_ns);
+    }
+
+    #[test]
+    fn a_projector_that_restarts_is_found_again() {
+        let jump_ns = LINE.period_ns / 2;
+        let edges = (0..5).map(|k| k * LINE.period_ns).chain((5..30).map(|k| k * LINE.period_ns + jump_ns));
+        let tracker = tracker(edges);
+        assert!(matches!(tracker.near(29 * LINE.period_ns + jump_ns, 10), Found::True(_)));
+    }
+
+    #[test]
+    fn jitter_is_the_spread_of_the_periods() {
+        // Alternating +-30 us: every period deviates by 60 us.
+        let edges = (0..200).map(|k: i64| k * LINE.period_ns + if k % 2 == 0 { 30_000 } else { -30_000 });
+        let stats = tracker(edges).stats();
+        assert!((stats.jitter_us - 60.0).abs() < 1.0, "{}", stats.jitter_us);
+    }
+}

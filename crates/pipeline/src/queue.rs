@@ -1,0 +1,94 @@
+//! The bounded queue between the device threads and the assembler.
+
+use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
+
+/// What happens to an item that finds the queue full.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Policy {
+    /// The sender waits: simulation and replay, where the source can.
+    Wait,
+    /// The item is handed back and counted by its owner: science on a real camera, where the point is repeated.
+    Fail,
+    /// The item is dropped and nobody minds: views for people.
+    DropNewest,
+}
+
+/// Why an item did not enter the queue.
+#[derive(Debug, thiserror::Error)]
+pub enum QueueError<T> {
+    /// Full, under [`Policy::Fail`].
+    #[error("the queue is full")]
+    Full(T),
+    /// The other side has ended.
+    #[error("the receiving thread has ended")]
+    Closed,
+}
+
+/// The sending side. Cloning gives another sender into the same queue.
+pub struct Input<T> {
+    sender: SyncSender<T>,
+    policy: Policy,
+}
+
+impl<T> Clone for Input<T> {
+    fn clone(&self) -> Self {
+        Self { sender: self.sender.clone(), policy: self.policy }
+    }
+}
+
+impl<T> Input<T> {
+    /// A queue of at most `capacity` items.
+    pub fn new(capacity: usize, policy: Policy) -> (Self, Receiver<T>) {
+        let (sender, receiver) = mpsc::sync_channel(capacity);
+        (Self { sender, policy }, receiver)
+    }
+
+    /// Sends what may be refused, by the queue's policy.
+    ///
+    /// # Errors
+    /// `Full` under [`Policy::Fail`]; `Closed` when the receiver is gone.
+    pub fn offer(&self, item: T) -> Result<(), QueueError<T>> {
+        if self.policy == Policy::Wait {
+            return self.send(item);
+        }
+        match self.sender.try_send(item) {
+            Ok(()) => Ok(()),
+            Err(TrySendError::Full(item)) if self.policy == Policy::Fail => Err(QueueError::Full(item)),
+            Err(TrySendError::Full(_)) => Ok(()),
+            Err(TrySendError::Disconnected(_)) => Err(QueueError::Closed),
+        }
+    }
+
+    /// Sends what must arrive, waiting for room.
+    ///
+    /// # Errors
+    /// `Closed` when the receiver is gone.
+    pub fn send(&self, item: T) -> Result<(), QueueError<T>> {
+        self.sender.send(item).map_err(|mpsc::SendError(_)| QueueError::Closed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_policy_does_what_it_says_when_full() {
+        let (input, receiver) = Input::new(1, Policy::Fail);
+        input.offer(1).unwrap();
+        assert!(matches!(input.offer(2), Err(QueueError::Full(2))));
+        drop(receiver);
+        assert!(matches!(input.offer(3), Err(QueueError::Closed)));
+
+        let (input, receiver) = Input::new(1, Policy::DropNewest);
+        input.offer(1).unwrap();
+        input.offer(2).unwrap();
+        drop(input);
+        assert_eq!(receiver.iter().collect::<Vec<_>>(), [1]);
+
+        let (input, receiver) = Input::new(1, Policy::Wait);
+        let sender = std::thread::spawn(move || (0..100).for_each(|i| input.offer(i).unwrap()));
+        assert_eq!(receiver.iter().collect::<Vec<_>>(), (0..100).collect::<Vec<_>>());
+        sender.join().unwrap();
+    }
+}

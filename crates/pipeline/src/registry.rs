@@ -1,0 +1,103 @@
+//! Stages and folds by the names that plans use.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use crate::demux::{DemuxFold, DemuxOptions};
+use crate::schedule::{Schedule, SweepGeometry};
+use crate::stage::{Fold, HotPixels, Stage};
+
+/// Why a plan's stage cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum RegistryError {
+    /// Nothing has that name.
+    #[error("stage name = {name:?}: known are {known}")]
+    Unknown {
+        /// The name in the plan.
+        name: String,
+        /// All names there are.
+        known: String,
+    },
+    /// An option that the stage does not have, or at a value it does not take.
+    #[error("stage {name}: {source}")]
+    Options {
+        /// The stage's name.
+        name: String,
+        /// What serde says of it.
+        source: serde_json::Error,
+    },
+    /// Options that are well formed and make no sense.
+    #[error("stage {name}: {what}")]
+    Invalid {
+        /// The stage's name.
+        name: String,
+        /// Field, value, what is allowed.
+        what: String,
+    },
+}
+
+/// What a name stands for.
+pub enum Entry {
+    /// Works on each unit alone.
+    Stage(Box<dyn Stage>),
+    /// Works on all units in order.
+    Fold(Box<dyn Fold>),
+}
+
+type Make = Box<dyn Fn(Value, &Schedule, &SweepGeometry) -> Result<Entry, RegistryError> + Send + Sync>;
+
+/// All stages and folds that plans may name.
+pub struct Registry {
+    makers: BTreeMap<&'static str, Make>,
+}
+
+impl Default for Registry {
+    /// The stages and folds of the plane rig.
+    fn default() -> Self {
+        let mut registry = Self { makers: BTreeMap::new() };
+        registry.register("hot-pixels", |options, _, _| {
+            let stage: HotPixels = parse("hot-pixels", options)?;
+            Ok(Entry::Stage(Box::new(stage)))
+        });
+        registry.register("demux", |options, schedule, geometry| {
+            let options: DemuxOptions = parse("demux", options)?;
+            let fold = DemuxFold::new(options, schedule, geometry)?;
+            Ok(Entry::Fold(Box::new(fold)))
+        });
+        registry
+    }
+}
+
+fn parse<T: serde::de::DeserializeOwned>(name: &str, options: Value) -> Result<T, RegistryError> {
+    serde_json::from_value(options).map_err(|source| RegistryError::Options { name: name.into(), source })
+}
+
+impl Registry {
+    /// Adds a name, or replaces what it stood for.
+    pub fn register(
+        &mut self,
+        name: &'static str,
+        make: impl Fn(Value, &Schedule, &SweepGeometry) -> Result<Entry, RegistryError> + Send + Sync + 'static,
+    ) {
+        self.makers.insert(name, Box::new(make));
+    }
+
+    /// Makes what `name` stands for, with the plan's options (a JSON object).
+    ///
+    /// # Errors
+    /// For names that nothing has and options that the stage refuses.
+    pub fn make(
+        &self,
+        name: &str,
+        options: Value,
+        schedule: &Schedule,
+        geometry: &SweepGeometry,
+    ) -> Result<Entry, RegistryError> {
+        let make = self.makers.get(name).ok_or_else(|| RegistryError::Unknown {
+            name: name.into(),
+            known: self.makers.keys().copied().collect::<Vec<_>>().join(", "),
+        })?;
+        make(options, schedule, geometry)
+    }
+}

@@ -1,0 +1,120 @@
+//! What is done to units: stages, in parallel and each alone; folds, over all of them in order.
+
+use ndarray::{Array2, ArrayView2};
+use raysweep_transport::plane::Transport;
+use serde::{Deserialize, Serialize};
+
+use crate::unit::Unit;
+
+/// Why a stage gave up on a unit.
+#[derive(Debug, thiserror::Error)]
+#[error("stage {stage}: {what}")]
+pub struct StageError {
+    /// The stage's name.
+    pub stage: String,
+    /// What happened.
+    pub what: String,
+}
+
+/// A pure step on one unit's mean image; runs on any worker thread.
+pub trait Stage: Send + Sync {
+    /// Its name in plans.
+    fn name(&self) -> &str;
+
+    /// The image that the next stage, or the folds, receive: counts, `[t, s]`.
+    ///
+    /// # Errors
+    /// When this unit cannot be processed; its raw image is stored all the same.
+    fn apply(&self, unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError>;
+}
+
+/// What a fold makes.
+#[derive(Debug, Clone)]
+pub enum Product {
+    /// An image `[t, s]` in the scene's units (1 = a white pixel).
+    Image {
+        /// File name without extension.
+        name: &'static str,
+        /// What it shows, in a sentence.
+        about: &'static str,
+        /// The pixels.
+        image: Array2<f32>,
+    },
+    /// The light transport `[u, t, s]`.
+    Transport(Box<Transport>),
+    /// A number that the report states.
+    Figure {
+        /// What it is, with its unit.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+    },
+}
+
+/// Why a fold could not finish.
+#[derive(Debug, thiserror::Error)]
+#[error("{fold}: {what}")]
+pub struct FoldError {
+    /// The fold's name.
+    pub fold: String,
+    /// What happened and what to do.
+    pub what: String,
+}
+
+/// Takes units in order and makes products of all of them.
+pub trait Fold: Send {
+    /// Its name in plans.
+    fn name(&self) -> &str;
+
+    /// Takes the next unit; a later attempt of a point replaces the earlier.
+    fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>);
+
+    /// The products of what was taken.
+    ///
+    /// # Errors
+    /// When that is too little.
+    fn finish(&mut self) -> Result<Vec<Product>, FoldError>;
+}
+
+/// Stage `hot-pixels`: a pixel that outshines all its neighbours by more than `threshold_dn` takes their median.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HotPixels {
+    /// Counts above the brightest neighbour from which on a pixel counts as hot.
+    pub threshold_dn: f32,
+    /// Distance of the neighbours: 1, or 2 on a Bayer mosaic.
+    pub step_px: usize,
+}
+
+impl Default for HotPixels {
+    fn default() -> Self {
+        Self { threshold_dn: 100.0, step_px: 1 }
+    }
+}
+
+impl Stage for HotPixels {
+    fn name(&self) -> &str {
+        "hot-pixels"
+    }
+
+    fn apply(&self, _unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError> {
+        let (height, width) = image.dim();
+        let mut repaired = image.clone();
+        let step = self.step_px as isize;
+        let mut around = Vec::with_capacity(8);
+        for ((t, s), pixel) in repaired.indexed_iter_mut() {
+            around.clear();
+            for (dt, ds) in [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)] {
+                let neighbour = t.checked_add_signed(dt * step).zip(s.checked_add_signed(ds * step));
+                if let Some((t, s)) = neighbour.filter(|&(t, s)| t < height && s < width) {
+                    around.push(image[[t, s]]);
+                }
+            }
+            around.sort_unstable_by(f32::total_cmp);
+            if around.last().is_some_and(|&brightest| *pixel > brightest + self.threshold_dn) {
+                *pixel = around[around.len() / 2];
+            }
+        }
+        Ok(repaired)
+    }
+}
