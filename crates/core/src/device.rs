@@ -95,6 +95,18 @@ pub struct CameraCapabilities {
     pub exposure_step_us: f64,
 }
 
+impl CameraCapabilities {
+    /// How many VSYNC periods lie between two triggers that the camera can answer under these settings.
+    pub fn periods_per_frame(&self, settings: &CameraSettings, period_us: f64) -> u32 {
+        let exposed_us = match self.readout {
+            Readout::Sequential => settings.exposure_us + self.readout_us,
+            Readout::Overlapped => settings.exposure_us.max(self.readout_us),
+        };
+        let busy_us = self.trigger_latency_us + settings.trigger_delay_us + exposed_us;
+        (busy_us / period_us).ceil().max(1.0) as u32
+    }
+}
+
 /// A triggered camera.
 pub trait Camera: Send {
     /// What the camera is; constant while it is open.

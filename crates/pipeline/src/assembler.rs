@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 use raysweep_core::{
-    Applied, Counts, Edge, Frame, FrameStamp, LossCause, PixelFormat, Raster, SettingsId, VsyncStats,
+    Applied, CameraCapabilities, Counts, Edge, Frame, FrameStamp, LossCause, Raster, SettingsId, VsyncStats,
     ns_from_us, us_from_ns,
 };
 
@@ -96,22 +96,14 @@ pub enum Decision {
 }
 
 /// What the assembler must know of the rig.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct AssemblerConfig {
-    /// Camera rows and columns.
-    pub size: (usize, usize),
-    /// How frames are packed.
-    pub format: PixelFormat,
+    /// The camera.
+    pub camera: CameraCapabilities,
     /// When the projector lights its rows.
     pub raster: Raster,
     /// Projector row that camera row 0 sees.
     pub first_row: usize,
-    /// From the trigger's edge to the start of row 0's exposure at a trigger delay of zero.
-    pub trigger_latency_us: f64,
-    /// From the end of row 0's exposure until the next trigger is answered.
-    pub readout_us: f64,
-    /// Whether that readout may overlap the next exposure.
-    pub overlapped: bool,
     /// Frames whose measured delay is further off than this do not count.
     pub max_jitter_us: f64,
     /// How far an edge may lie from where the last true one puts it.
@@ -172,6 +164,7 @@ impl Assembler {
     pub fn new(config: AssemblerConfig) -> Self {
         let line =
             Line { period_ns: ns_from_us(config.raster.period_us), gate_ns: ns_from_us(config.edge_gate_us) };
+        let pixels = vec![0; config.camera.height * config.camera.width];
         Self {
             config,
             tracker: EdgeTracker::new(line),
@@ -181,7 +174,7 @@ impl Assembler {
             last_seq: None,
             idle: true,
             newest_ns: i64::MIN,
-            pixels: vec![0; config.size.0 * config.size.1],
+            pixels,
         }
     }
 
@@ -260,7 +253,7 @@ impl Assembler {
     fn begin(&mut self, job: Job) {
         self.attempt = Some(Attempt {
             job,
-            sum: Array2::zeros(self.config.size),
+            sum: Array2::zeros((self.config.camera.height, self.config.camera.width)),
             averaged: 0,
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
@@ -296,8 +289,8 @@ impl Assembler {
         let out_of_patience = flushing || self.newest_ns > stamp.host_ns.saturating_add(EDGE_PATIENCE_NS);
         let known_ns = if out_of_patience { i64::MAX } else { self.tracker.known_until_ns() };
 
-        let trigger_ns =
-            stamp.exposure_start_ns - ns_from_us(self.config.trigger_latency_us + settings.trigger_delay_us);
+        let trigger_ns = stamp.exposure_start_ns
+            - ns_from_us(self.config.camera.trigger_latency_us + settings.trigger_delay_us);
         if known_ns < trigger_ns + TRIGGER_TOLERANCE_NS {
             return Verdict::Undecided;
         }
@@ -333,15 +326,16 @@ impl Assembler {
     /// Adds a sound frame to the sum, or notes why it does not count.
     fn count(&mut self, frame: &Frame, verdict: Verdict) {
         self.follow(frame.stamp.seq);
-        let busy_periods = self.busy_periods();
         let Some(attempt) = &mut self.attempt else { return };
+        let settings = &attempt.job.applied.actual;
+        let periods_per_frame = self.config.camera.periods_per_frame(settings, self.config.raster.period_us);
         let (trigger, sound) = match verdict {
             Verdict::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
             Verdict::Unsound { trigger, cause } => (trigger, Err(cause)),
             Verdict::Undecided => return,
         };
         match trigger {
-            Some(edge) => attempt.tie(frame.stamp.seq, edge, busy_periods),
+            Some(edge) => attempt.tie(frame.stamp.seq, edge, i64::from(periods_per_frame)),
             None => attempt.untied += 1,
         }
         let summed = sound.and_then(|delay_us| {
@@ -360,27 +354,14 @@ impl Assembler {
             Err(cause) => attempt.counts.lose(cause, 1),
         }
     }
-
-    /// How many periods apart the triggers are that the camera can answer under the present settings.
-    fn busy_periods(&self) -> i64 {
-        let Some(attempt) = &self.attempt else { return 1 };
-        let settings = &attempt.job.applied.actual;
-        let lead_us = self.config.trigger_latency_us + settings.trigger_delay_us;
-        let busy_us = if self.config.overlapped {
-            lead_us + settings.exposure_us.max(self.config.readout_us)
-        } else {
-            lead_us + settings.exposure_us + self.config.readout_us
-        };
-        (busy_us / self.config.raster.period_us).ceil().max(1.0) as i64
-    }
 }
 
 impl Attempt {
     /// Notes which triggers stayed unanswered since the last frame that was tied to an edge.
-    fn tie(&mut self, seq: u64, edge: TrueEdge, busy_periods: i64) {
+    fn tie(&mut self, seq: u64, edge: TrueEdge, periods_per_frame: i64) {
         if let Some((last_seq, last_edge)) = self.tied {
             let answered = i64::try_from(seq - last_seq).unwrap_or(i64::MAX) - self.untied;
-            let unanswered = (edge.index - last_edge.index) - answered * busy_periods;
+            let unanswered = (edge.index - last_edge.index) - answered * periods_per_frame;
             let unanswered = u64::try_from(unanswered).unwrap_or(0);
             self.counts.expected += unanswered;
             self.counts.lose(LossCause::MissedTrigger, unanswered);
@@ -406,3 +387,6 @@ impl Attempt {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

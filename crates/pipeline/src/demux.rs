@@ -169,7 +169,7 @@ impl Fold for DemuxFold {
             },
             Product::Figure { name: "images demultiplexed", value: lights.len() as f64 },
             Product::Figure {
-                name: "pixels with saturated images left out",
+                name: "saturated pixels",
                 value: transport.saturated.iter().filter(|&&saturated| saturated).count() as f64,
             },
         ];
@@ -189,10 +189,8 @@ impl Fold for DemuxFold {
                 about: "a captured exposure of one whole VSYNC period: every row lit once",
                 image: regular,
             });
-            products.push(Product::Figure {
-                name: "regular image, predicted over captured light",
-                value: expected / seen,
-            });
+            products
+                .push(Product::Figure { name: "predicted / captured regular light", value: expected / seen });
         }
         products.push(Product::Transport(Box::new(transport)));
         Ok(products)

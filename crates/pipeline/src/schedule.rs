@@ -1,6 +1,6 @@
 //! What a sweep acquires, point by point, in the order of acquisition.
 
-use raysweep_core::Raster;
+use raysweep_core::{CameraSettings, Raster, Shutter};
 
 /// What a point's image is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -74,4 +74,29 @@ pub struct SweepGeometry {
     pub white_dn: f64,
     /// Counts from which on a pixel counts as saturated.
     pub saturation_dn: f64,
+}
+
+/// How a camera must be set for a point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Shot {
+    /// Its settings.
+    pub settings: CameraSettings,
+    /// Which edge's light is measured: the trigger's own (0) or a later one.
+    pub light_edges_later: u32,
+}
+
+impl SweepGeometry {
+    /// The settings for a point on a camera with this trigger latency.
+    pub fn shot(&self, point: &Point, trigger_latency_us: f64) -> Shot {
+        let trigger =
+            self.raster.trigger(self.first_row, point.delay_us, point.exposure_us, trigger_latency_us);
+        Shot {
+            settings: CameraSettings {
+                shutter: Shutter::Rolling,
+                exposure_us: point.exposure_us,
+                trigger_delay_us: trigger.trigger_delay_us,
+            },
+            light_edges_later: trigger.light_edges_later,
+        }
+    }
 }
