@@ -1,1 +1,18 @@
-//! Simulated rigs.
+//! Simulated rigs: scenes, projector, camera, sensor and VSYNC line under one clock, with seeded faults.
+//!
+//! A [`PlaneRig`] opens devices that implement the traits of `raysweep-core` and carry nothing that real devices
+//! lack. All randomness is keyed by what it is for (point, attempt, frame), so the same seed gives the same bits
+//! whatever the number of threads and wherever a run was interrupted.
+
+pub mod config;
+mod devices;
+mod keyed;
+mod line;
+pub mod optics;
+mod rig;
+pub mod scene;
+mod sensor;
+
+pub use config::SimConfig;
+pub use devices::Devices;
+pub use rig::{PlaneRig, PlaneSetup, SimError};

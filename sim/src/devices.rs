@@ -1,0 +1,242 @@
+//! The simulated devices: the traits of `raysweep-core` over one [`Line`] and one clock.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use raysweep_core::{
+    Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, DeviceErrorKind,
+    Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync, us_from_ns,
+};
+
+use crate::line::{Exposure, Light, Line, LineTruth};
+use crate::rig::Bench;
+use crate::sensor::Exposed;
+
+/// The devices of one rig, all on one clock.
+pub struct Devices {
+    /// The camera.
+    pub camera: Box<dyn Camera>,
+    /// The watcher of the VSYNC line.
+    pub vsync: Box<dyn Vsync>,
+    /// The projector; dark at first.
+    pub projector: Box<dyn Projector>,
+    /// The clock that they live by.
+    pub clock: Clock,
+    /// What really happens on the line. A real rig has no such thing: it is for tests alone.
+    pub truth: TruthProbe,
+}
+
+/// Looks behind the devices, for tests alone.
+#[derive(Clone)]
+pub struct TruthProbe(SharedLine);
+
+impl TruthProbe {
+    /// What has really happened so far.
+    pub fn read(&self) -> LineTruth {
+        self.0.lock().truth()
+    }
+}
+
+#[derive(Clone)]
+struct SharedLine(Arc<Mutex<Line>>);
+
+impl SharedLine {
+    fn lock(&self) -> MutexGuard<'_, Line> {
+        // A device that panicked has ended its own thread; the line itself is never left half changed.
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits until `ready` gives something or `timeout` has passed.
+    fn wait<T>(
+        &self,
+        clock: &ClockHandle,
+        timeout: Duration,
+        mut ready: impl FnMut(&mut Line, i64) -> Option<T>,
+    ) -> Option<T> {
+        let deadline_ns =
+            clock.now_ns().saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
+        loop {
+            let now_ns = clock.now_ns();
+            let wake_ns = {
+                let mut line = self.lock();
+                line.advance(now_ns);
+                if let Some(found) = ready(&mut line, now_ns) {
+                    return Some(found);
+                }
+                line.next_event_ns().min(line.next_frame_ns().unwrap_or(i64::MAX)).max(now_ns + 1)
+            };
+            if now_ns >= deadline_ns {
+                return None;
+            }
+            clock.sleep_until(wake_ns.min(deadline_ns));
+        }
+    }
+}
+
+pub fn open(bench: &Arc<Bench>, line: Line, clock: Clock) -> Devices {
+    let line = SharedLine(Arc::new(Mutex::new(line)));
+    Devices {
+        camera: Box::new(SimCamera::new(bench.clone(), line.clone(), clock.register())),
+        vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
+        projector: Box::new(SimProjector { bench: bench.clone(), line: line.clone(), clock: clock.clone() }),
+        truth: TruthProbe(line),
+        clock,
+    }
+}
+
+struct SimCamera {
+    bench: Arc<Bench>,
+    line: SharedLine,
+    clock: ClockHandle,
+    capabilities: CameraCapabilities,
+    light: Vec<f32>,
+    counts: Vec<u16>,
+}
+
+impl SimCamera {
+    fn new(bench: Arc<Bench>, line: SharedLine, clock: ClockHandle) -> Self {
+        let (height, width) = bench.size;
+        let capabilities = bench.capabilities();
+        Self {
+            bench,
+            line,
+            clock,
+            capabilities,
+            light: vec![0.0; height * width],
+            counts: vec![0; height * width],
+        }
+    }
+
+    fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
+        DeviceError::new("camera", kind, what.into())
+    }
+
+    /// Integrates the light of an exposure and reads the sensor.
+    fn render(&mut self, exposure: &Exposure, lights: &[Light]) {
+        let (_, width) = self.bench.size;
+        let exposure_us = exposure.settings.exposure_us;
+        let ambient = self.bench.ambient(exposure);
+        for (t, row) in self.light.chunks_mut(width).enumerate() {
+            row.fill(ambient);
+            let row_start_us = self.bench.row_start_us(exposure.settings.shutter, t);
+            for light in lights {
+                if let Some(optics) = &light.optics {
+                    let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
+                    optics.expose_row(t, from_us, from_us + exposure_us, row);
+                }
+            }
+        }
+        let exposed = Exposed { light: &mut self.light, exposure_us, key: exposure.key };
+        self.bench.sensor.read(exposed, &mut self.counts);
+    }
+}
+
+impl Camera for SimCamera {
+    fn capabilities(&self) -> &CameraCapabilities {
+        &self.capabilities
+    }
+
+    fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
+        let camera = &self.bench.config.camera;
+        let stepped = |value: f64, step: f64| if step > 0.0 { (value / step).round() * step } else { value };
+        let actual = CameraSettings {
+            shutter: settings.shutter,
+            exposure_us: stepped(settings.exposure_us, camera.exposure_step_us),
+            trigger_delay_us: stepped(settings.trigger_delay_us, camera.delay_step_us),
+        };
+        if !(actual.exposure_us > 0.0 && actual.exposure_us <= 1e6) {
+            return Err(Self::error(
+                DeviceErrorKind::OutOfRange,
+                format!(
+                    "exposure_us = {}: the simulated camera takes more than 0 and at most 1000000",
+                    settings.exposure_us
+                ),
+            ));
+        }
+        if !(actual.trigger_delay_us >= 0.0 && actual.trigger_delay_us <= 16e6) {
+            return Err(Self::error(
+                DeviceErrorKind::OutOfRange,
+                format!(
+                    "trigger_delay_us = {}: the simulated camera takes 0 to 16000000",
+                    settings.trigger_delay_us
+                ),
+            ));
+        }
+        let written_ns = self.clock.now_ns();
+        self.line.lock().configure(written_ns, id, actual);
+        let first_frame = if camera.late_frames_min == camera.late_frames_max {
+            FirstFrame::Exactly(camera.late_frames_max)
+        } else {
+            FirstFrame::Within(camera.late_frames_max)
+        };
+        Ok(Applied { actual, written_ns, first_frame })
+    }
+
+    fn arm(&mut self) -> Result<(), DeviceError> {
+        self.line.lock().set_armed(self.clock.now_ns(), true);
+        Ok(())
+    }
+
+    fn next_frame(
+        &mut self,
+        buf: &mut FrameBuf,
+        timeout: Duration,
+    ) -> Result<Option<FrameStamp>, DeviceError> {
+        if !self.line.lock().is_armed() {
+            return Err(Self::error(
+                DeviceErrorKind::NotReady,
+                "next_frame before arm: arm the camera first",
+            ));
+        }
+        let taken = self.line.wait(&self.clock, timeout, |line, now_ns| line.take_frame(now_ns));
+        let Some((exposure, lights)) = taken else { return Ok(None) };
+        self.render(&exposure, &lights);
+        self.bench
+            .format
+            .pack_into(&self.counts, buf)
+            .map_err(|error| DeviceError::new("camera", DeviceErrorKind::Protocol, error))?;
+        Ok(Some(FrameStamp {
+            seq: exposure.seq,
+            device_ns: exposure.start_ns,
+            exposure_start_ns: exposure.start_ns,
+            host_ns: exposure.done_ns,
+            exposure_us: self.bench.config.camera.chunk_exposure.then_some(exposure.settings.exposure_us),
+        }))
+    }
+
+    fn disarm(&mut self) -> Result<(), DeviceError> {
+        self.line.lock().set_armed(self.clock.now_ns(), false);
+        Ok(())
+    }
+}
+
+struct SimVsync {
+    line: SharedLine,
+    clock: ClockHandle,
+}
+
+impl Vsync for SimVsync {
+    fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
+        Ok(self.line.wait(&self.clock, timeout, |line, _| line.take_edge()))
+    }
+}
+
+struct SimProjector {
+    bench: Arc<Bench>,
+    line: SharedLine,
+    clock: Clock,
+}
+
+impl Projector for SimProjector {
+    fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
+        let optics = self
+            .bench
+            .optics_of(pattern)
+            .map_err(|error| DeviceError::new("projector", DeviceErrorKind::OutOfRange, error))?;
+        Ok(Shown { not_before_ns: self.line.lock().show(self.clock.now_ns(), Some(optics)) })
+    }
+
+    fn blank(&mut self) -> Result<Shown, DeviceError> {
+        Ok(Shown { not_before_ns: self.line.lock().show(self.clock.now_ns(), None) })
+    }
+}

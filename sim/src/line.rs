@@ -1,0 +1,359 @@
+//! The electrical side of the rig: the VSYNC line, the projector's frames of light behind it, and the camera that its
+//! edges trigger. Events happen in the order of time, whoever looks first.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use rand_distr::{Distribution, StandardNormal};
+use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, Shutter, ns_from_us};
+
+use crate::config::{SimCamera, SimProjector, SimVsync};
+use crate::keyed::{Purpose, keyed, uniform};
+use crate::optics::Optics;
+
+/// One frame of the projector: when its edge was and what it shows (`None`: dark).
+#[derive(Clone)]
+pub struct Light {
+    /// When its edge was, or should have been.
+    pub edge_ns: i64,
+    /// When the light's own clock began: the edge, plus what no edge shows.
+    pub start_ns: i64,
+    /// The scene under the pattern shown.
+    pub optics: Option<Arc<Optics>>,
+}
+
+/// One exposure of the camera.
+pub struct Exposure {
+    /// The camera's frame id.
+    pub seq: u64,
+    /// Point, attempt, and frames since the settings were written: what noise is keyed by.
+    pub key: [u64; 3],
+    /// Settings in force.
+    pub settings: CameraSettings,
+    /// Start of row 0's exposure.
+    pub start_ns: i64,
+    /// When the frame is on the host.
+    pub done_ns: i64,
+    /// Whether it gets there.
+    pub delivered: bool,
+}
+
+/// Constants of the line.
+pub struct LineConfig {
+    pub seed: u64,
+    pub period_ns: i64,
+    pub vsync: SimVsync,
+    pub projector: SimProjector,
+    pub camera: SimCamera,
+    /// From the end of row 0's exposure until the last row is read.
+    pub readout_ns: i64,
+    /// From the end of row 0's exposure to the end of the last row's.
+    pub rolling_ns: i64,
+}
+
+/// The line's state at one moment.
+pub struct Line {
+    config: LineConfig,
+    /// Number of the next period to be drawn.
+    next_period: i64,
+    /// Periods drawn since the camera's last trigger, or since it became ready.
+    draws: u64,
+    was_ready: bool,
+    /// Edges on the line that lie ahead, in order.
+    pending: VecDeque<PendingEdge>,
+    /// Light of the recent periods and of the one ahead.
+    lights: VecDeque<Light>,
+    shown: Option<Arc<Optics>>,
+    /// What the projector will show from an edge on.
+    next_shown: Option<(i64, Option<Arc<Optics>>)>,
+    seen: VecDeque<Edge>,
+    edges: u64,
+    camera: CameraLine,
+    truth: LineTruth,
+}
+
+struct PendingEdge {
+    at_ns: i64,
+    kind: EdgeKind,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum EdgeKind {
+    True,
+    Missing,
+    Unseen,
+    False,
+}
+
+struct CameraLine {
+    armed: bool,
+    busy_until_ns: i64,
+    id: SettingsId,
+    in_force: CameraSettings,
+    written: Option<(u32, CameraSettings)>,
+    /// Triggers answered since the settings were written.
+    frames: u64,
+    seq: u64,
+    exposures: VecDeque<Exposure>,
+}
+
+/// What really happened, for tests alone.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct LineTruth {
+    /// Exposures that the camera made while armed.
+    pub exposures: u64,
+    /// Of those, triggered by false edges.
+    pub false_triggers: u64,
+    /// Edges that never reached the line.
+    pub missing_edges: u64,
+    /// Edges that the watching device missed.
+    pub unseen_edges: u64,
+    /// Frames lost on the way.
+    pub dropped_frames: u64,
+}
+
+/// Frames that the camera keeps for a host that does not take them; older ones are lost.
+const CAMERA_BUFFERS: usize = 32;
+/// A period is drawn this long before its nominal edge, so that no jitter puts the edge before the draw.
+const GUARD_NS: i64 = 400_000;
+
+impl Line {
+    /// A line at rest at `now_ns`.
+    pub fn new(config: LineConfig, now_ns: i64) -> Self {
+        let idle = CameraSettings { shutter: Shutter::Rolling, exposure_us: 100.0, trigger_delay_us: 0.0 };
+        Self {
+            next_period: now_ns / config.period_ns + 1,
+            config,
+            draws: 0,
+            was_ready: true,
+            pending: VecDeque::new(),
+            lights: VecDeque::new(),
+            shown: None,
+            next_shown: None,
+            seen: VecDeque::new(),
+            edges: 0,
+            camera: CameraLine {
+                armed: false,
+                busy_until_ns: 0,
+                id: SettingsId { point: u32::MAX, attempt: 0 },
+                in_force: idle,
+                written: None,
+                frames: 0,
+                seq: 0,
+                exposures: VecDeque::new(),
+            },
+            truth: LineTruth::default(),
+        }
+    }
+
+    pub fn truth(&self) -> LineTruth {
+        self.truth
+    }
+
+    /// When something happens next.
+    pub fn next_event_ns(&self) -> i64 {
+        let draw_ns = self.nominal_ns(self.next_period) - GUARD_NS;
+        self.pending.front().map_or(draw_ns, |edge| edge.at_ns.min(draw_ns))
+    }
+
+    /// Lets everything happen that happens until `now_ns`.
+    pub fn advance(&mut self, now_ns: i64) {
+        while self.next_event_ns() <= now_ns {
+            let draw_ns = self.nominal_ns(self.next_period) - GUARD_NS;
+            match self.pending.front() {
+                Some(edge) if edge.at_ns <= draw_ns => {
+                    if let Some(edge) = self.pending.pop_front() {
+                        self.edge(&edge);
+                    }
+                }
+                _ => self.draw_period(),
+            }
+        }
+    }
+
+    fn nominal_ns(&self, period: i64) -> i64 {
+        period * self.config.period_ns
+    }
+
+    /// Decides what the next period brings. All that is random is keyed by the point, the frame that the camera is at
+    /// and whether it is ready for the next, so that a point has the same edges in an uninterrupted run and in a
+    /// resumed one.
+    fn draw_period(&mut self) {
+        let nominal_ns = self.nominal_ns(self.next_period);
+        let ready = self.camera.busy_until_ns <= nominal_ns - GUARD_NS;
+        if ready != self.was_ready {
+            (self.was_ready, self.draws) = (ready, 0);
+        }
+        let SettingsId { point, attempt } = self.camera.id;
+        let mut random = keyed(
+            self.config.seed,
+            Purpose::Line,
+            &[u64::from(point), u64::from(attempt), self.camera.frames, u64::from(ready), self.draws],
+        );
+        let vsync = &self.config.vsync;
+        let z: f64 = StandardNormal.sample(&mut random);
+        let limit_us = GUARD_NS as f64 / 1e3 / 2.0;
+        let jitter_ns = ns_from_us((z * vsync.jitter_us).clamp(-limit_us, limit_us));
+        let phase_ns = ns_from_us((2.0 * uniform(&mut random) - 1.0) * self.config.projector.phase_jitter_us);
+        let missing = uniform(&mut random) < vsync.missing;
+        let unseen = uniform(&mut random) < vsync.unseen;
+        let false_edge = uniform(&mut random) < vsync.false_edges;
+        let false_at = uniform(&mut random);
+
+        let edge_ns = nominal_ns + jitter_ns;
+        if let Some((_, shown)) = self.next_shown.take_if(|(from, _)| *from <= self.next_period) {
+            self.shown = shown;
+        }
+        self.lights.push_back(Light { edge_ns, start_ns: edge_ns + phase_ns, optics: self.shown.clone() });
+        let kind = match (missing, unseen) {
+            (true, _) => EdgeKind::Missing,
+            (false, true) => EdgeKind::Unseen,
+            (false, false) => EdgeKind::True,
+        };
+        self.pending.push_back(PendingEdge { at_ns: edge_ns, kind });
+        if false_edge {
+            // Anywhere but close to the true edges, where it would be one of them for all purposes.
+            let offset_ns = (self.config.period_ns as f64 * (0.1 + 0.8 * false_at)) as i64;
+            self.pending.push_back(PendingEdge { at_ns: nominal_ns + offset_ns, kind: EdgeKind::False });
+        }
+        self.next_period += 1;
+        self.draws += 1;
+        self.forget_old_lights(nominal_ns);
+    }
+
+    /// Keeps the light that a waiting exposure, or one about to start, can still see.
+    fn forget_old_lights(&mut self, nominal_ns: i64) {
+        let oldest_ns =
+            self.camera.exposures.front().map_or(nominal_ns, |exposure| exposure.start_ns.min(nominal_ns));
+        while self.lights.get(2).is_some_and(|light| light.start_ns < oldest_ns) {
+            self.lights.pop_front();
+        }
+    }
+
+    fn edge(&mut self, edge: &PendingEdge) {
+        if edge.kind == EdgeKind::Missing {
+            self.truth.missing_edges += 1;
+            return;
+        }
+        self.edges += 1;
+        if edge.kind == EdgeKind::Unseen {
+            self.truth.unseen_edges += 1;
+        } else {
+            self.seen.push_back(Edge { seq: self.edges, host_ns: edge.at_ns });
+        }
+        if self.trigger(edge.at_ns) && edge.kind == EdgeKind::False {
+            self.truth.false_triggers += 1;
+        }
+    }
+
+    /// Whether the camera answered.
+    fn trigger(&mut self, edge_ns: i64) -> bool {
+        let camera = &mut self.camera;
+        if !camera.armed || camera.busy_until_ns > edge_ns {
+            return false;
+        }
+        match &mut camera.written {
+            Some((0, settings)) => {
+                camera.in_force = *settings;
+                camera.written = None;
+            }
+            Some((frames_left, _)) => *frames_left -= 1,
+            None => {}
+        }
+        let config = &self.config;
+        let settings = camera.in_force;
+        let start_ns = edge_ns + ns_from_us(config.camera.trigger_latency_us + settings.trigger_delay_us);
+        let exposure_ns = ns_from_us(settings.exposure_us);
+        let key = [u64::from(camera.id.point), u64::from(camera.id.attempt), camera.frames];
+        let delivered = uniform(&mut keyed(config.seed, Purpose::Drop, &key)) >= config.camera.dropped;
+        camera.busy_until_ns = match config.camera.readout {
+            Readout::Sequential => start_ns + exposure_ns + config.readout_ns,
+            Readout::Overlapped => start_ns + exposure_ns.max(config.readout_ns),
+        };
+        let done_ns = start_ns + exposure_ns + config.rolling_ns.max(config.readout_ns);
+        if camera.exposures.len() == CAMERA_BUFFERS {
+            camera.exposures.pop_front();
+        }
+        camera.exposures.push_back(Exposure { seq: camera.seq, key, settings, start_ns, done_ns, delivered });
+        camera.seq += 1;
+        camera.frames += 1;
+        self.draws = 0;
+        self.was_ready = false;
+        self.truth.exposures += 1;
+        self.truth.dropped_frames += u64::from(!delivered);
+        true
+    }
+
+    /// Writes camera settings at `now_ns`; they take effect after `late_frames` more frames.
+    pub fn configure(&mut self, now_ns: i64, id: SettingsId, settings: CameraSettings) {
+        self.advance(now_ns);
+        let config = &self.config;
+        let late = if config.camera.late_frames_min < config.camera.late_frames_max {
+            let span = config.camera.late_frames_max - config.camera.late_frames_min + 1;
+            let key = [u64::from(id.point), u64::from(id.attempt)];
+            let draw = uniform(&mut keyed(config.seed, Purpose::Late, &key));
+            config.camera.late_frames_min + (draw * f64::from(span)) as u32
+        } else {
+            config.camera.late_frames_max
+        };
+        self.camera.id = id;
+        self.camera.frames = 0;
+        self.camera.written = Some((late, settings));
+        self.redraw(now_ns);
+    }
+
+    /// What lies ahead was drawn for the settings before: draws it again for the new ones.
+    fn redraw(&mut self, now_ns: i64) {
+        self.pending.clear();
+        self.draws = 0;
+        self.was_ready = true;
+        while self.lights.back().is_some_and(|light| light.edge_ns > now_ns) {
+            self.lights.pop_back();
+            self.next_period -= 1;
+        }
+    }
+
+    /// Arms or disarms the camera.
+    pub fn set_armed(&mut self, now_ns: i64, armed: bool) {
+        self.advance(now_ns);
+        self.camera.armed = armed;
+        if !armed {
+            self.camera.exposures.clear();
+        }
+    }
+
+    pub fn is_armed(&self) -> bool {
+        self.camera.armed
+    }
+
+    /// When the oldest exposure's frame is on the host.
+    pub fn next_frame_ns(&self) -> Option<i64> {
+        self.camera.exposures.front().map(|exposure| exposure.done_ns)
+    }
+
+    /// The next frame that is on the host at `now_ns`, with the light that it saw.
+    pub fn take_frame(&mut self, now_ns: i64) -> Option<(Exposure, Vec<Light>)> {
+        while self.next_frame_ns()? <= now_ns {
+            let exposure = self.camera.exposures.pop_front()?;
+            if exposure.delivered {
+                let lights =
+                    self.lights.iter().filter(|light| light.start_ns < exposure.done_ns).cloned().collect();
+                return Some((exposure, lights));
+            }
+        }
+        None
+    }
+
+    /// The next edge that the watching device has seen.
+    pub fn take_edge(&mut self) -> Option<Edge> {
+        self.seen.pop_front()
+    }
+
+    /// Shows something else (`None`: dark); returns from when on it is in the light.
+    pub fn show(&mut self, now_ns: i64, optics: Option<Arc<Optics>>) -> i64 {
+        self.advance(now_ns);
+        let from_period = self.next_period + i64::from(self.config.projector.video_latency_frames);
+        self.next_shown = Some((from_period, optics));
+        self.nominal_ns(from_period)
+    }
+}

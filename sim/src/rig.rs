@@ -1,0 +1,293 @@
+//! The simulated plane rig: a scene, a projector that draws it and a camera that looks at it.
+
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+use ndarray::Array2;
+use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
+
+use crate::config::{Beam, SimConfig};
+use crate::devices::{self, Devices};
+use crate::keyed::{Purpose, keyed, uniform};
+use crate::line::{Exposure, Line, LineConfig};
+use crate::optics::{self, Optics};
+use crate::scene::{Scene, SceneError, SceneSize};
+use crate::sensor::Sensor;
+
+/// Why a simulated rig cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub enum SimError {
+    /// The scene cannot be read or made.
+    #[error("sim.scene: {0}")]
+    Scene(#[from] SceneError),
+    /// More rows than the projector has.
+    #[error(
+        "sim.scene has {scene_rows} rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.first_projector_row or take a smaller scene"
+    )]
+    SceneRows {
+        /// Rows of the scene.
+        scene_rows: usize,
+        /// Projector row of its first.
+        first_row: usize,
+        /// Rows of the projector.
+        projector_rows: usize,
+    },
+    /// Times must rise from row to row.
+    #[error(
+        "sim.projector.row_table: rows would be drawn in a different order; take a smaller percent or amplitude_us"
+    )]
+    RowTable,
+    /// A beam without extent, or wider than any.
+    #[error(
+        "sim.projector.beam = {0:?}: sigma_rows must lie in 0..=100 (not 0), up_rows + down_rows in 0..=500 (not 0)"
+    )]
+    Beam(Beam),
+    /// A pattern for another projector.
+    #[error("the pattern has {given} rows, projector.rows = {rows}: give one weight in 0..=1 for each row")]
+    Pattern {
+        /// Rows of the pattern.
+        given: usize,
+        /// Rows of the projector.
+        rows: usize,
+    },
+    /// A key of `[sim]` outside its range.
+    #[error("sim.{key} = {value}: allowed is {allowed}")]
+    Range {
+        /// The key below `[sim]`.
+        key: &'static str,
+        /// Its value.
+        value: f64,
+        /// What it may be.
+        allowed: &'static str,
+    },
+}
+
+/// What the rest of the rig file says that the simulation needs.
+#[derive(Debug, Clone, Copy)]
+pub struct PlaneSetup {
+    /// When the projector lights its rows.
+    pub raster: Raster,
+    /// Row time of the camera.
+    pub camera_row_time_us: f64,
+    /// Counts, above black, of a white pixel in the time of one projector row.
+    pub white_dn: f64,
+    /// Counts without light.
+    pub black_dn: f64,
+    /// How frames are packed.
+    pub format: PixelFormat,
+    /// Projector row that camera row 0 sees; left out: the scene is a window in the middle of the projector's rows.
+    pub first_row: Option<usize>,
+}
+
+/// A simulated plane rig whose devices can be opened again and again.
+pub struct PlaneRig {
+    bench: Arc<Bench>,
+}
+
+/// Everything about the rig that does not change while it runs.
+pub(crate) struct Bench {
+    pub config: SimConfig,
+    setup: PlaneSetup,
+    scene: Scene,
+    first_row: usize,
+    pub size: (usize, usize),
+    pub format: PixelFormat,
+    pub sensor: Sensor,
+    white: OnceLock<Arc<Optics>>,
+}
+
+impl PlaneRig {
+    /// Builds the rig; a scene file is looked up relative to `folder`.
+    ///
+    /// # Errors
+    /// When the scene cannot be read or a key is out of range; the message names the key.
+    pub fn new(config: SimConfig, setup: PlaneSetup, folder: &Path) -> Result<Self, SimError> {
+        check_ranges(&config)?;
+        let scene = if config.scene.extension().is_some_and(|extension| extension == "npz") {
+            Scene::load(&folder.join(&config.scene))?
+        } else {
+            let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
+            Scene::builtin(&config.scene.to_string_lossy(), size, config.seed)?
+        };
+        let first_row = optics::first_scene_row(&setup.raster, scene.rows(), setup.first_row)?;
+        let size = scene.size();
+        let sensor = Sensor::new(&config.sensor, size, setup.white_dn, setup.black_dn, config.seed);
+        let bench = Bench {
+            config,
+            setup,
+            scene,
+            first_row,
+            size,
+            format: setup.format,
+            sensor,
+            white: OnceLock::new(),
+        };
+        bench.optics_of(&Pattern::White)?;
+        Ok(Self { bench: Arc::new(bench) })
+    }
+
+    /// The scene: the truth that a recovery is held against.
+    pub fn scene(&self) -> &Scene {
+        &self.bench.scene
+    }
+
+    /// Projector row that camera row 0 sees.
+    pub fn first_row(&self) -> usize {
+        self.bench.first_row
+    }
+
+    /// Opens the devices, at time zero of their own clock.
+    pub fn open(&self) -> Devices {
+        let clock = if self.bench.config.realtime { Clock::real() } else { Clock::simulated() };
+        devices::open(&self.bench, Line::new(self.bench.line_config(), clock.now_ns()), clock)
+    }
+
+    /// The light of an image without noise or jitter, in the scene's units, `[t, s]`: each camera row exposed for
+    /// `exposure_us`, centred `delay_us` after its own projector row, to one white frame.
+    ///
+    /// # Errors
+    /// Never for a rig that was built; kept so that no caller has to trust that.
+    pub fn noise_free(&self, delay_us: f64, exposure_us: f64) -> Result<Array2<f32>, SimError> {
+        let optics = self.bench.optics_of(&Pattern::White)?;
+        let start_us = self.bench.setup.raster.row_centre_us(self.first_row()) + delay_us - exposure_us / 2.0;
+        let mut image = Array2::zeros(self.bench.size);
+        for (t, mut row) in image.rows_mut().into_iter().enumerate() {
+            let mut light = vec![0.0; row.len()];
+            let from_us = start_us + self.bench.row_start_us(Shutter::Rolling, t);
+            optics.expose_row(t, from_us, from_us + exposure_us, &mut light);
+            row.assign(&ndarray::ArrayView1::from(&light));
+        }
+        Ok(image)
+    }
+}
+
+impl Bench {
+    pub fn optics_of(&self, pattern: &Pattern) -> Result<Arc<Optics>, SimError> {
+        let rows = self.setup.raster.rows;
+        let build = |weights: &[f32]| {
+            let mosaic = self.format.is_mosaic();
+            let (raster, projector) = (&self.setup.raster, &self.config.projector);
+            Optics::new(&self.scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)
+                .map(Arc::new)
+        };
+        match pattern {
+            Pattern::White => {
+                if let Some(white) = self.white.get() {
+                    return Ok(white.clone());
+                }
+                let white = build(&vec![1.0; rows])?;
+                Ok(self.white.get_or_init(|| white).clone())
+            }
+            Pattern::Rows(weights) => {
+                if weights.len() != rows || weights.iter().any(|weight| !(0.0..=1.0).contains(weight)) {
+                    return Err(SimError::Pattern { given: weights.len(), rows });
+                }
+                build(weights)
+            }
+        }
+    }
+
+    /// When row `t` starts its exposure, after row 0.
+    pub fn row_start_us(&self, shutter: Shutter, t: usize) -> f64 {
+        match shutter {
+            Shutter::Rolling => t as f64 * self.setup.camera_row_time_us,
+            Shutter::Global => 0.0,
+        }
+    }
+
+    /// Ambient light of an exposure, in the scene's units.
+    pub fn ambient(&self, exposure: &Exposure) -> f32 {
+        let ambient = &self.config.ambient;
+        if ambient.level == 0.0 {
+            return 0.0;
+        }
+        let exposure_s = exposure.settings.exposure_us * 1e-6;
+        let key = [exposure.key[0], exposure.key[1]];
+        let phase = uniform(&mut keyed(self.config.seed, Purpose::Flicker, &key));
+        let start_s = exposure.key[2] as f64 * self.setup.raster.period_us * 1e-6;
+        let angle = |time_s: f64| std::f64::consts::TAU * (phase + ambient.flicker_hz * time_s);
+        // The integral of 1 + m sin(angle) over the exposure.
+        let swing = (angle(start_s).cos() - angle(start_s + exposure_s).cos())
+            / (std::f64::consts::TAU * ambient.flicker_hz.max(1e-9));
+        let rows = (exposure_s + ambient.flicker * swing) / (self.setup.raster.row_time_us * 1e-6);
+        (ambient.level * rows) as f32
+    }
+
+    pub fn capabilities(&self) -> CameraCapabilities {
+        let (height, width) = self.size;
+        let camera = &self.config.camera;
+        CameraCapabilities {
+            model: "raysweep simulated camera".into(),
+            width,
+            height,
+            format: self.format,
+            row_time_us: self.setup.camera_row_time_us,
+            trigger_latency_us: camera.trigger_latency_us,
+            readout_us: self.readout_us(),
+            readout: camera.readout,
+            exposure_step_us: camera.exposure_step_us,
+        }
+    }
+
+    fn readout_us(&self) -> f64 {
+        self.config.camera.readout_us.unwrap_or(self.size.0 as f64 * self.setup.camera_row_time_us)
+    }
+
+    fn line_config(&self) -> LineConfig {
+        LineConfig {
+            seed: self.config.seed,
+            period_ns: ns_from_us(self.setup.raster.period_us),
+            vsync: self.config.vsync.clone(),
+            projector: self.config.projector.clone(),
+            camera: self.config.camera.clone(),
+            readout_ns: ns_from_us(self.readout_us()),
+            rolling_ns: ns_from_us(self.size.0.saturating_sub(1) as f64 * self.setup.camera_row_time_us),
+        }
+    }
+}
+
+fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
+    let share = "0 to 1";
+    let not_negative = "0 or more";
+    let rules = [
+        ("vsync.missing", config.vsync.missing, share),
+        ("vsync.false_edges", config.vsync.false_edges, share),
+        ("vsync.unseen", config.vsync.unseen, share),
+        ("camera.dropped", config.camera.dropped, share),
+        ("sensor.hot_pixels", config.sensor.hot_pixels, share),
+        ("ambient.flicker", config.ambient.flicker, share),
+        ("vsync.jitter_us", config.vsync.jitter_us, not_negative),
+        ("projector.phase_jitter_us", config.projector.phase_jitter_us, not_negative),
+        ("camera.trigger_latency_us", config.camera.trigger_latency_us, not_negative),
+        ("camera.readout_us", config.camera.readout_us.unwrap_or(0.0), not_negative),
+        ("sensor.electrons_per_dn", config.sensor.electrons_per_dn, "more than 0"),
+        ("sensor.full_well_e", config.sensor.full_well_e, "more than 0"),
+        ("sensor.read_noise_e", config.sensor.read_noise_e, not_negative),
+        ("sensor.dsnu_e", config.sensor.dsnu_e, not_negative),
+        ("sensor.prnu_percent", config.sensor.prnu_percent, not_negative),
+        ("sensor.vignetting_percent", config.sensor.vignetting_percent, "0 to 100"),
+        ("sensor.adc_bits", f64::from(config.sensor.adc_bits), "1 to 12"),
+        ("ambient.level", config.ambient.level, not_negative),
+        ("ambient.flicker_hz", config.ambient.flicker_hz, "more than 0"),
+    ];
+    for (key, value, allowed) in rules {
+        let range = match allowed {
+            "0 to 1" => 0.0..=1.0,
+            "0 to 100" => 0.0..=100.0,
+            "1 to 12" => 1.0..=12.0,
+            "more than 0" => f64::MIN_POSITIVE..=f64::MAX,
+            _ => 0.0..=f64::MAX,
+        };
+        if !range.contains(&value) {
+            return Err(SimError::Range { key, value, allowed });
+        }
+    }
+    if config.camera.late_frames_min > config.camera.late_frames_max {
+        return Err(SimError::Range {
+            key: "camera.late_frames_min",
+            value: f64::from(config.camera.late_frames_min),
+            allowed: "at most sim.camera.late_frames_max",
+        });
+    }
+    Ok(())
+}

@@ -1,0 +1,339 @@
+//! Scenes: light transport from projector rows to camera pixels.
+//!
+//! A scene's transport T `[V, H, W, C]` is the image `[H, W, C]` that the camera sees while
+//! projector row v alone is lit, for each of the V rows; C is 1 (mono) or 3 (linear RGB). Top rows
+//! come first. T = 1 is a white Lambertian plane at the reference distance, lit by that row alone
+//! during its dwell, so an image under row weights p is the sum over v of p\[v\] T\[v\]. Camera row
+//! t lies on the epipolar plane of projector row t: direct light is T\[t, t, ..\].
+//!
+//! Scenes come from files ([`Scene::load`]) or are computed by the project
+//! ([`Scene::builtin`]). Those keep their columns and so answer patterns that change along a row.
+
+mod ball;
+mod candle;
+mod dipole;
+mod error;
+mod form_factor;
+mod groove;
+mod mix;
+mod npz;
+mod projector;
+mod quadrature;
+mod slab;
+mod texture;
+mod translucent;
+mod vector;
+
+use std::fmt;
+use std::ops::Range;
+use std::path::Path;
+
+use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayViewMut3, ArrayViewMut4, Axis, s};
+
+pub use error::SceneError;
+use projector::{Pattern, PatternPart};
+pub use slab::slab_materials;
+
+/// Names that [`Scene::builtin`] knows.
+pub const BUILTIN_NAMES: [&str; 5] = ["v-groove", "mirror-ball", "slab", "candle", "mix"];
+
+/// Fewest rows and columns of a built-in scene.
+pub const MIN_SIDE: usize = 16;
+
+/// Most entries of a built-in scene's transport: 2 GiB of float32, and 720 x 720 x 720 fits in mono.
+pub const MAX_ENTRIES: usize = 1 << 29;
+
+/// RGB bands of mono and of colour scenes; mono takes the green coefficients of every medium and print.
+const MONO: &[usize] = &[1];
+const RGB: &[usize] = &[0, 1, 2];
+
+/// Camera rows (as many as projector rows) and camera columns of a built-in scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SceneSize {
+    /// Camera rows, equal to projector rows.
+    pub rows: usize,
+    /// Camera columns.
+    pub columns: usize,
+}
+
+/// A rectangle of camera pixels.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Window {
+    /// Camera rows.
+    pub rows: Range<usize>,
+    /// Camera columns.
+    pub columns: Range<usize>,
+}
+
+/// Light transport of a scene under a rectified projector-camera pair; see the [module](self).
+#[derive(Debug)]
+pub struct Scene {
+    /// T `[V, H, W, C]`: finite, not negative.
+    pub transport: Array4<f32>,
+    /// `[H, W]`: projector column 0..1 (left to right) that draws the point a pixel sees, where
+    /// the scene knows it. Pixels that see nothing lit hold any value within 0..1.
+    pub projector_column: Option<Array2<f32>>,
+    /// What a built-in scene is made of; empty for scenes given by their rows alone.
+    panels: Vec<Panel>,
+}
+
+impl Scene {
+    /// Loads a scene from a `.npz` file: `T` float32 (or float64, converted) `[V, H, W]` or
+    /// `[V, H, W, 3]`, and optionally `proj_uv` `[H, W, 2]`, whose u becomes
+    /// [`Scene::projector_column`].
+    ///
+    /// # Errors
+    /// The file cannot be opened or is damaged; `T` is missing; an array has another type or
+    /// shape; `T` holds a negative or non-finite value.
+    pub fn load(path: &Path) -> Result<Self, SceneError> {
+        npz::load(path)
+    }
+
+    /// Writes T (and `proj_uv`, if known) in the format that [`Scene::load`] reads.
+    ///
+    /// # Errors
+    /// [`SceneError::Write`].
+    pub fn save(&self, path: &Path) -> Result<(), SceneError> {
+        npz::save(self, path)
+    }
+
+    /// A scene given by its row transport `[V, H, W, C]` and, if known, projector columns `[H, W]`.
+    ///
+    /// # Errors
+    /// [`SceneError::Value`] for a negative or non-finite entry, [`SceneError::Layout`] for lengths
+    /// that do not fit together.
+    pub fn from_transport(
+        transport: Array4<f32>,
+        projector_column: Option<Array2<f32>>,
+    ) -> Result<Self, SceneError> {
+        Self::checked(transport, projector_column, "the transport array")
+    }
+
+    /// Computes a built-in scene in mono: one of [`BUILTIN_NAMES`].
+    ///
+    /// The seed varies print, texture and details of the geometry. The result does not depend on
+    /// the number of threads.
+    ///
+    /// # Errors
+    /// [`SceneError::UnknownName`], [`SceneError::Size`].
+    pub fn builtin(name: &str, size: SceneSize, seed: u64) -> Result<Self, SceneError> {
+        Self::compute(name, size, MONO, seed)
+    }
+
+    /// Computes a built-in scene in linear RGB; otherwise as [`Scene::builtin`].
+    ///
+    /// # Errors
+    /// [`SceneError::UnknownName`], [`SceneError::Size`].
+    pub fn builtin_rgb(name: &str, size: SceneSize, seed: u64) -> Result<Self, SceneError> {
+        Self::compute(name, size, RGB, seed)
+    }
+
+    fn compute(name: &str, size: SceneSize, bands: &[usize], seed: u64) -> Result<Self, SceneError> {
+        let SceneSize { rows, columns } = size;
+        let entries = rows.saturating_mul(rows).saturating_mul(columns).saturating_mul(bands.len());
+        if rows < MIN_SIDE || columns < MIN_SIDE || entries > MAX_ENTRIES {
+            return Err(SceneError::Size { rows, columns, channels: bands.len() });
+        }
+        let panels = match name {
+            "v-groove" => vec![Panel::whole(groove::build(size, bands, seed))],
+            "mirror-ball" => vec![Panel::whole(ball::build(size, bands, seed))],
+            "slab" => vec![Panel::whole(slab::build(size, bands, seed))],
+            "candle" => vec![Panel::whole(candle::build(size, bands, seed))],
+            "mix" => mix::build(size, bands, seed),
+            _ => return Err(SceneError::UnknownName { name: name.into() }),
+        };
+        let mut transport = Array4::zeros((rows, rows, columns, bands.len()));
+        let mut projector_column = Array2::zeros((rows, columns));
+        for panel in &panels {
+            let (rows, columns) = (panel.rows(), panel.columns());
+            panel.add_transport(transport.slice_mut(s![rows.clone(), rows.clone(), columns.clone(), ..]));
+            projector_column.slice_mut(s![rows, columns]).assign(&panel.middle_columns());
+        }
+        Ok(Self { transport, projector_column: Some(projector_column), panels })
+    }
+
+    fn checked(
+        transport: Array4<f32>,
+        projector_column: Option<Array2<f32>>,
+        origin: &str,
+    ) -> Result<Self, SceneError> {
+        let (rows, height, width, channels) = transport.dim();
+        let column_shape = projector_column.as_ref().map(|column| column.dim());
+        let sensible = rows > 0 && height > 0 && width > 0 && matches!(channels, 1 | 3);
+        if !sensible || column_shape.is_some_and(|shape| shape != (height, width)) {
+            return Err(SceneError::Layout { transport: transport.dim(), projector_column: column_shape });
+        }
+        if let Some((index, &value)) =
+            transport.indexed_iter().find(|&(_, &value)| !(value.is_finite() && value >= 0.0))
+        {
+            return Err(SceneError::Value { origin: origin.into(), index, value });
+        }
+        Ok(Self { transport, projector_column, panels: Vec::new() })
+    }
+
+    /// Number of projector rows, V.
+    pub fn rows(&self) -> usize {
+        self.transport.len_of(Axis(0))
+    }
+
+    /// Camera rows and columns, (H, W).
+    pub fn size(&self) -> (usize, usize) {
+        (self.transport.len_of(Axis(1)), self.transport.len_of(Axis(2)))
+    }
+
+    /// Number of channels, C: 1 or 3.
+    pub fn channels(&self) -> usize {
+        self.transport.len_of(Axis(3))
+    }
+
+    /// All camera pixels.
+    pub fn full_window(&self) -> Window {
+        let (rows, columns) = self.size();
+        Window { rows: 0..rows, columns: 0..columns }
+    }
+
+    /// Image `[h, w, C]` of a window of camera pixels under `pattern` `[V, columns]`, whose columns
+    /// share the projector's width equally.
+    ///
+    /// # Errors
+    /// [`SceneError::Pattern`] unless the pattern has V rows, some columns and finite values;
+    /// [`SceneError::RowsOnly`] for a pattern that changes along a row under a scene that was
+    /// given by its rows; [`SceneError::Window`] for a window outside the image.
+    pub fn render(&self, pattern: ArrayView2<f32>, window: &Window) -> Result<Array3<f32>, SceneError> {
+        let (height, width) = self.size();
+        if window.rows.end > height
+            || window.columns.end > width
+            || window.rows.is_empty()
+            || window.columns.is_empty()
+        {
+            return Err(SceneError::Window { window: window.clone(), height, width });
+        }
+        let shape = pattern.dim();
+        if shape.0 != self.rows() || shape.1 == 0 || !pattern.iter().all(|value| value.is_finite()) {
+            return Err(SceneError::Pattern { rows: shape.0, columns: shape.1, expected: self.rows() });
+        }
+        let pixels = s![window.rows.clone(), window.columns.clone(), ..];
+        let constant = pattern.outer_iter().all(|row| row.iter().all(|&value| value == row[0]));
+        if !constant {
+            return Ok(self.render_columns(pattern)?.slice_move(pixels));
+        }
+        let mut image = Array3::zeros((window.rows.len(), window.columns.len(), self.channels()));
+        for (row, transport) in pattern.outer_iter().zip(self.transport.outer_iter()) {
+            if row[0] != 0.0 {
+                image.scaled_add(row[0], &transport.slice(pixels));
+            }
+        }
+        Ok(image)
+    }
+
+    /// Image `[H, W, C]` under any pattern, from what the scene is made of.
+    fn render_columns(&self, pattern: ArrayView2<f32>) -> Result<Array3<f32>, SceneError> {
+        if self.panels.is_empty() {
+            return Err(SceneError::RowsOnly { columns: pattern.ncols() });
+        }
+        let (height, width) = self.size();
+        let pattern = Pattern::new(pattern);
+        let mut image = Array3::zeros((height, width, self.channels()));
+        for panel in &self.panels {
+            let part = pattern.part(panel.rows(), panel.projector_columns.clone());
+            panel.add_image(&part, image.slice_mut(s![panel.rows(), panel.columns(), ..]));
+        }
+        Ok(image)
+    }
+}
+
+/// One object of a built-in scene and its place in the image.
+#[derive(Debug)]
+struct Panel {
+    /// Camera (and projector) row and camera column of the upper left corner.
+    row: usize,
+    column: usize,
+    /// Stretch of the projector's columns that lights the object.
+    projector_columns: Range<f64>,
+    object: Object,
+}
+
+impl Panel {
+    fn whole(object: Object) -> Self {
+        Self { row: 0, column: 0, projector_columns: 0.0..1.0, object }
+    }
+
+    fn rows(&self) -> Range<usize> {
+        self.row..self.row + self.object.direct.value.len_of(Axis(0))
+    }
+
+    fn columns(&self) -> Range<usize> {
+        self.column..self.column + self.object.direct.value.len_of(Axis(1))
+    }
+
+    fn add_transport(&self, mut transport: ArrayViewMut4<f32>) {
+        for (row, direct) in self.object.direct.value.outer_iter().enumerate() {
+            let mut own_row = transport.slice_mut(s![row, row, .., ..]);
+            own_row += &direct;
+        }
+        self.object.indirect.add_transport(transport);
+    }
+
+    fn add_image(&self, pattern: &PatternPart, mut image: ArrayViewMut3<f32>) {
+        let direct = &self.object.direct;
+        for ((row, column, channel), value) in direct.value.indexed_iter() {
+            image[[row, column, channel]] += value * pattern.mean(row, direct.columns(row, column));
+        }
+        self.object.indirect.add_image(pattern, image);
+    }
+
+    /// Projector column, of the whole projector, at each pixel's middle.
+    fn middle_columns(&self) -> Array2<f32> {
+        let (rows, columns, _) = self.object.direct.value.dim();
+        let Range { start, end } = self.projector_columns;
+        Array2::from_shape_fn((rows, columns), |(row, column)| {
+            let (from, to) = self.object.direct.columns(row, column);
+            (start + (end - start) * 0.5 * f64::from(from + to)) as f32
+        })
+    }
+}
+
+/// An object as the built-in scenes compute it.
+#[derive(Debug)]
+struct Object {
+    direct: Direct,
+    indirect: Box<dyn Indirect>,
+}
+
+/// Light that comes straight from the projector: row t draws what camera row t sees.
+#[derive(Debug, Clone)]
+struct Direct {
+    /// `[row, column, channel]` under white light.
+    value: Array3<f32>,
+    /// `[row, column, 2]`: projector columns 0..1 that draw the pixel's left and right border.
+    columns: Array3<f32>,
+}
+
+impl Direct {
+    /// No light yet; `column_at(row, x)` is the projector column that draws the point seen at x.
+    fn new(size: SceneSize, channels: usize, column_at: impl Fn(usize, f64) -> f32) -> Self {
+        Self {
+            value: Array3::zeros((size.rows, size.columns, channels)),
+            columns: Array3::from_shape_fn((size.rows, size.columns, 2), |(row, column, border)| {
+                column_at(row, (column + border) as f64)
+            }),
+        }
+    }
+
+    fn columns(&self, row: usize, column: usize) -> (f32, f32) {
+        (self.columns[[row, column, 0]], self.columns[[row, column, 1]])
+    }
+}
+
+/// Light that reaches the camera on any other way. Both answers describe the same light: the
+/// transport of a row equals the image under that row alone.
+trait Indirect: fmt::Debug + Send + Sync {
+    /// Adds the image under each row to `transport` `[V, H, W, C]`.
+    fn add_transport(&self, transport: ArrayViewMut4<f32>);
+
+    /// Adds the image under a pattern to `image` `[H, W, C]`.
+    fn add_image(&self, pattern: &PatternPart, image: ArrayViewMut3<f32>);
+}
+
+#[cfg(test)]
+mod tests;

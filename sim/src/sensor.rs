@@ -1,0 +1,152 @@
+//! The sensor after EMVA 1288 (release 4.0): light to electrons to counts.
+
+use ndarray::Array2;
+use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
+
+use crate::config::SimSensor;
+use crate::keyed::{Purpose, keyed, uniform};
+
+/// What one frame's exposure adds to its light.
+pub struct Exposed<'a> {
+    /// Light of each pixel in the scene's units (1 = a white pixel's row), `[t, s]`, row-major.
+    pub light: &'a mut [f32],
+    /// How long each row collected dark current.
+    pub exposure_us: f64,
+    /// What noise is keyed by: point, attempt, frame.
+    pub key: [u64; 3],
+}
+
+/// The constant properties of each pixel, drawn once.
+pub struct Sensor {
+    config: SimSensor,
+    seed: u64,
+    width: usize,
+    /// Electrons of a white pixel's row, after vignetting and PRNU, `[t, s]` row-major.
+    electrons_per_light: Vec<f32>,
+    /// Electrons without any light or time.
+    offset_e: Vec<f32>,
+    /// Electrons per microsecond without light.
+    dark_e_per_us: Vec<f32>,
+    black_dn: f32,
+    /// Counts between neighbouring codes.
+    step_dn: f32,
+    max_dn: f32,
+}
+
+impl Sensor {
+    /// A sensor of `size` (rows, columns) on whose 12-bit scale a white pixel's row gives `white_dn` counts above
+    /// `black_dn`.
+    pub fn new(config: &SimSensor, size: (usize, usize), white_dn: f64, black_dn: f64, seed: u64) -> Self {
+        let (height, width) = size;
+        let mut random = keyed(seed, Purpose::Pattern, &[]);
+        let mut spread = |sigma: f64| -> f64 {
+            let z: f64 = StandardNormal.sample(&mut random);
+            if config.noise { sigma * z } else { 0.0 }
+        };
+        let gain = Array2::from_shape_fn(size, |(t, s)| {
+            // Light falls off with the square of the distance from the centre, as cos^4 does to first order.
+            let (y, x) = ((t as f64 + 0.5) / height as f64 - 0.5, (s as f64 + 0.5) / width as f64 - 0.5);
+            let vignetting = 1.0 - config.vignetting_percent / 100.0 * 2.0 * (x * x + y * y);
+            white_dn * config.electrons_per_dn * vignetting * (1.0 + spread(config.prnu_percent / 100.0))
+        });
+        let offset_e = (0..height * width).map(|_| spread(config.dsnu_e) as f32).collect();
+        let dark_e_per_us = (0..height * width)
+            .map(|_| {
+                let hot = config.noise && uniform(&mut random) < config.hot_pixels;
+                let dark = if config.noise { config.dark_current_e_per_s } else { 0.0 };
+                ((if hot { config.hot_pixel_e_per_s } else { dark }) * 1e-6) as f32
+            })
+            .collect();
+        let bits = config.adc_bits.clamp(1, 12);
+        let step_dn = (1_u32 << (12 - bits)) as f32;
+        Self {
+            config: config.clone(),
+            seed,
+            width,
+            electrons_per_light: gain.iter().map(|&gain| gain as f32).collect(),
+            offset_e,
+            dark_e_per_us,
+            black_dn: black_dn as f32,
+            step_dn,
+            max_dn: 4096.0 - step_dn,
+        }
+    }
+
+    /// Turns light into counts of the 12-bit scale, `[t, s]` row-major.
+    pub fn read(&self, exposed: Exposed<'_>, counts: &mut [u16]) {
+        let Exposed { light, exposure_us, key } = exposed;
+        let width = self.width;
+        light.par_chunks_mut(width).zip(counts.par_chunks_mut(width)).enumerate().for_each(
+            |(t, (light, counts))| {
+                let mut random = keyed(self.seed, Purpose::Noise, &[key[0], key[1], key[2], t as u64]);
+                let pixels = t * width..(t + 1) * width;
+                let gains = &self.electrons_per_light[pixels.clone()];
+                let offsets = &self.offset_e[pixels.clone()];
+                let dark = &self.dark_e_per_us[pixels];
+                for (s, (light, count)) in light.iter().zip(counts).enumerate() {
+                    let collected_e = light * gains[s] + dark[s] * exposure_us as f32;
+                    let mut electrons = collected_e;
+                    if self.config.noise {
+                        // Shot noise in its Gaussian limit: below some 20 electrons, where it is not Gaussian, the read
+                        // noise hides the difference.
+                        let variance = collected_e.max(0.0) + (self.config.read_noise_e as f32).powi(2);
+                        let z: f32 = StandardNormal.sample(&mut random);
+                        electrons += variance.sqrt() * z;
+                    }
+                    let electrons = (electrons + offsets[s]).min(self.config.full_well_e as f32);
+                    let level = self.black_dn + electrons / self.config.electrons_per_dn as f32;
+                    *count = ((level / self.step_dn).round() * self.step_dn).clamp(0.0, self.max_dn) as u16;
+                }
+            },
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Mean and variance over a uniform field of `light`, over pixels and frames.
+    fn field(config: &SimSensor, light: f32, frames: u64) -> (f64, f64) {
+        let sensor = Sensor::new(config, (64, 64), 2500.0, 64.0, 3);
+        let mut all = Vec::new();
+        for frame in 0..frames {
+            let mut counts = vec![0; 64 * 64];
+            let mut field = vec![light; 64 * 64];
+            sensor.read(Exposed { light: &mut field, exposure_us: 1000.0, key: [1, 0, frame] }, &mut counts);
+            all.extend(counts.into_iter().map(f64::from));
+        }
+        let mean = all.iter().sum::<f64>() / all.len() as f64;
+        (mean, all.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / all.len() as f64)
+    }
+
+    #[test]
+    fn photon_transfer_follows_emva_1288() {
+        // sigma_y^2 = K^2 sigma_d^2 + 1/12 + K (mu_y - mu_y.dark), K in counts per electron.
+        let config = SimSensor { prnu_percent: 0.0, dsnu_e: 0.0, hot_pixels: 0.0, ..SimSensor::default() };
+        let gain = 1.0 / config.electrons_per_dn;
+        for light in [0.0, 0.05, 0.3, 1.0] {
+            let (mean, variance) = field(&config, light, 8);
+            assert!((mean - 64.0 - f64::from(light) * 2500.0).abs() < 1.0, "mean {mean} at {light}");
+            let expected = (gain * config.read_noise_e).powi(2) + 1.0 / 12.0 + gain * (mean - 64.0);
+            assert!(
+                (variance / expected - 1.0).abs() < 0.04,
+                "variance {variance}, expected {expected} at {light}"
+            );
+        }
+    }
+
+    #[test]
+    fn codes_of_fewer_bits_step_and_saturate_on_the_12_bit_scale() {
+        let config = SimSensor { adc_bits: 10, noise: false, ..SimSensor::default() };
+        assert_eq!(field(&config, 0.1204, 1).0, 364.0);
+        assert_eq!(field(&config, 100.0, 1).0, 4092.0);
+    }
+
+    #[test]
+    fn full_well_saturates_before_the_converter_where_it_is_smaller() {
+        let config = SimSensor { full_well_e: 1660.0, noise: false, ..SimSensor::default() };
+        assert_eq!(field(&config, 1.0, 1).0, 1064.0);
+    }
+}

@@ -1,0 +1,288 @@
+//! The simulated devices through the traits that real ones implement, on a scene whose every number is known.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::path::Path;
+use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
+
+use ndarray::Array3;
+use raysweep_core::{
+    Camera, CameraSettings, DeviceErrorKind, Edge, FirstFrame, FramePool, FrameStamp, Pattern, PixelFormat,
+    Raster, SettingsId, Shutter,
+};
+use raysweep_sim::config::{Beam, RowTable, SimProjector, SimSensor, SimVsync, Spot};
+use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimConfig};
+
+const ROWS: usize = 8;
+const COLUMNS: usize = 4;
+const TAU_US: f64 = 20.0;
+const WHITE: f64 = 1000.0;
+const RASTER: Raster = Raster { rows: ROWS, row_time_us: TAU_US, first_row_us: 500.0, period_us: 16_000.0 };
+
+/// Row v lights camera row v with 1 and the row below it with a quarter.
+fn scene(folder: &Path) -> std::path::PathBuf {
+    let transport = Array3::<f32>::from_shape_fn((ROWS, ROWS, COLUMNS), |(v, t, _)| match t.checked_sub(v) {
+        Some(0) => 1.0,
+        Some(1) => 0.25,
+        _ => 0.0,
+    });
+    let path = folder.join("steps.npz");
+    let mut npz = ndarray_npy::NpzWriter::new(std::fs::File::create(&path).unwrap());
+    npz.add_array("T", &transport).unwrap();
+    npz.finish().unwrap();
+    path
+}
+
+fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = SimConfig {
+        scene: scene(folder.path()),
+        sensor: SimSensor { noise: false, ..SimSensor::default() },
+        vsync: SimVsync { jitter_us: 0.0, ..SimVsync::default() },
+        ..SimConfig::default()
+    };
+    config.camera.trigger_latency_us = 0.0;
+    change(&mut config);
+    let setup = PlaneSetup {
+        raster: RASTER,
+        camera_row_time_us: TAU_US,
+        white_dn: WHITE,
+        black_dn: 0.0,
+        format: PixelFormat::Mono12,
+        first_row: None,
+    };
+    PlaneRig::new(config, setup, Path::new("")).unwrap()
+}
+
+/// The rig at work: its VSYNC watched on a thread of its own, because virtual time waits for every device.
+struct Bench {
+    camera: Option<Box<dyn Camera>>,
+    edges: Receiver<Edge>,
+    pool: FramePool,
+}
+
+impl Bench {
+    /// Shows a pattern (`None`: dark) and waits until it is in the light.
+    fn lit(rig: &PlaneRig, pattern: Option<&Pattern>) -> Self {
+        let Devices { mut camera, mut vsync, mut projector, .. } = rig.open();
+        let (seen, edges) = channel();
+        std::thread::spawn(move || {
+            while let Ok(edge) = vsync.next_edge(Duration::from_secs(1)) {
+                if edge.is_some_and(|edge| seen.send(edge).is_err()) {
+                    break;
+                }
+            }
+        });
+        camera.arm().unwrap();
+        let shown = match pattern {
+            Some(pattern) => projector.show(pattern).unwrap(),
+            None => projector.blank().unwrap(),
+        };
+        let mut bench = Self { camera: Some(camera), edges, pool: FramePool::new(1, ROWS * COLUMNS * 2) };
+        while bench.frame().1.exposure_start_ns < shown.not_before_ns {}
+        bench
+    }
+
+    fn camera(&mut self) -> &mut dyn Camera {
+        &mut **self.camera.as_mut().unwrap()
+    }
+
+    /// Light of each pixel, `[row][column]`, of the next frame, with its stamp.
+    fn frame(&mut self) -> (Vec<Vec<f64>>, FrameStamp) {
+        let mut data = self.pool.take();
+        let mut pixels = [0; ROWS * COLUMNS];
+        let stamp = self.camera().next_frame(&mut data, Duration::from_secs(1)).unwrap().expect("a frame");
+        PixelFormat::Mono12.unpack_into(&data, &mut pixels).unwrap();
+        let rows = pixels.chunks(COLUMNS).map(|row| row.iter().map(|&dn| f64::from(dn) / WHITE).collect());
+        (rows.collect(), stamp)
+    }
+
+    /// The first frame under new settings.
+    fn expose(&mut self, settings: CameraSettings) -> Vec<Vec<f64>> {
+        self.camera().configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
+        self.frame().0
+    }
+}
+
+impl Drop for Bench {
+    fn drop(&mut self) {
+        // Without the camera the clock runs on for the watcher, which then finds nobody to tell.
+        self.camera = None;
+    }
+}
+
+fn rolling(start_us: f64, exposure_us: f64) -> CameraSettings {
+    CameraSettings { shutter: Shutter::Rolling, exposure_us, trigger_delay_us: start_us }
+}
+
+fn only(row: usize) -> Pattern {
+    Pattern::Rows((0..ROWS).map(|v| if v == row { 1.0 } else { 0.0 }).collect())
+}
+
+#[test]
+fn a_rolling_shutter_follows_the_projector_row_by_row() {
+    let rig = rig(|_| {});
+    let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+    // Each row is exposed exactly while its own projector row is lit.
+    let settings = rolling(500.0, TAU_US);
+    bench.camera().configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
+    let (own, stamp) = bench.frame();
+    assert!(own.iter().flatten().all(|&light| light == 1.0), "{own:?}");
+    assert_eq!(stamp.exposure_us, Some(TAU_US));
+    assert_eq!(
+        stamp.host_ns - stamp.exposure_start_ns,
+        20_000 + 8 * 20_000,
+        "exposure, then the rows' readout"
+    );
+    // One row earlier each camera row receives the row above its own: a quarter, and nothing for the topmost.
+    let above = bench.expose(rolling(480.0, TAU_US));
+    assert!(
+        above[0].iter().all(|&light| light == 0.0) && above[1..].iter().flatten().all(|&light| light == 0.25)
+    );
+    // Half a row early: half of either.
+    let between = bench.expose(rolling(490.0, TAU_US));
+    assert!(between[1..].iter().flatten().all(|&light| (light - 0.625).abs() <= 0.0005), "{between:?}");
+}
+
+#[test]
+fn a_global_shutter_sees_the_rows_of_one_moment() {
+    let rig = rig(|_| {});
+    let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+    let settings = CameraSettings { shutter: Shutter::Global, ..rolling(500.0 + 2.0 * TAU_US, 2.0 * TAU_US) };
+    let rows = bench.expose(settings);
+    let first: Vec<f64> = rows.iter().map(|row| row[0]).collect();
+    assert_eq!(first, [0.0, 0.0, 1.0, 1.25, 0.25, 0.0, 0.0, 0.0]);
+}
+
+#[test]
+fn a_single_row_lights_what_the_scene_says_and_a_dark_projector_nothing() {
+    let rig = rig(|_| {});
+    let mut bench = Bench::lit(&rig, Some(&only(3)));
+    let long = rolling(0.0, 16_000.0);
+    let rows = bench.expose(long);
+    let first: Vec<f64> = rows.iter().map(|row| row[0]).collect();
+    assert_eq!(first, [0.0, 0.0, 0.0, 1.0, 0.25, 0.0, 0.0, 0.0]);
+    let dark = Bench::lit(&rig, None).expose(long);
+    assert!(dark.iter().flatten().all(|&light| light == 0.0));
+}
+
+#[test]
+fn a_beam_spreads_a_row_and_keeps_its_light() {
+    for (beam, expected) in [
+        (Beam::FlatTop { up_rows: 0.5, down_rows: 1.5 }, [0.0, 0.0, 0.5, 0.5, 0.0]),
+        (Beam::Gaussian { sigma_rows: 0.5 }, [0.0002, 0.1065, 0.7866, 0.1065, 0.0002]),
+    ] {
+        let rig = rig(|config| config.projector.beam = beam);
+        let mut bench = Bench::lit(&rig, Some(&only(3)));
+        let rows = bench.expose(rolling(0.0, 16_000.0));
+        // The quarter that each lit row sends to the row below is part of the scene, not of the beam.
+        let mut seen = [0.0; 5];
+        for (k, share) in seen.iter_mut().enumerate() {
+            *share = rows[k + 1][0] - 0.25 * expected.get(k.wrapping_sub(1)).copied().unwrap_or(0.0);
+        }
+        for (seen, expected) in seen.iter().zip(expected) {
+            assert!((seen - expected).abs() < 0.002, "{seen} is not {expected}");
+        }
+    }
+}
+
+#[test]
+fn a_flying_spot_lights_each_column_at_its_own_moment() {
+    // Columns are passed at 2.5, 7.5, 12.5 and 17.5 us of a row's 20; an exposure of the row's first half sees two.
+    let halves = |spot| {
+        let rig = rig(|config| config.projector = SimProjector { spot, ..SimProjector::default() });
+        let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+        bench.expose(rolling(500.0, TAU_US / 2.0))
+    };
+    let one_way = halves(Spot::OneWay);
+    assert!(one_way.iter().all(|row| row[..] == [1.0, 1.0, 0.0, 0.0]), "{one_way:?}");
+    let both_ways = halves(Spot::Bidirectional);
+    assert_eq!(
+        (&both_ways[2][..], &both_ways[3][..]),
+        (&[1.0, 1.0, 0.0, 0.0][..], &[0.0, 0.0, 1.0, 1.0][..])
+    );
+    let uniform = halves(Spot::Uniform);
+    assert!(uniform.iter().flatten().all(|&light| light == 0.5), "{uniform:?}");
+}
+
+#[test]
+fn row_tables_bend_the_sweep_and_keep_its_ends() {
+    for table in [RowTable::Quadratic { percent: 5.0 }, RowTable::Kinked { pieces: 3, amplitude_us: 12.0 }] {
+        let rig = rig(|config| config.projector.row_table = table.clone());
+        let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+        let global = |start_us, exposure_us| CameraSettings {
+            shutter: Shutter::Global,
+            ..rolling(start_us, exposure_us)
+        };
+        let total = |rows: Vec<Vec<f64>>| rows.iter().map(|row| row[0]).sum::<f64>();
+        let all = total(bench.expose(global(500.0, 160.0)));
+        assert_eq!(all, 8.0 + 7.0 * 0.25, "the whole sweep takes as long as before: {table:?}");
+        let half = total(bench.expose(global(500.0, 80.0)));
+        assert!((half - 5.0).abs() > 0.1, "half the time is not half the rows: {half}, {table:?}");
+    }
+    assert!(
+        std::panic::catch_unwind(|| rig(|config| {
+            config.projector.row_table = RowTable::Kinked { pieces: 8, amplitude_us: 500.0 };
+        }))
+        .is_err()
+    );
+}
+
+#[test]
+fn settings_take_effect_as_late_as_they_are_said_to() {
+    let rig = rig(|config| (config.camera.late_frames_min, config.camera.late_frames_max) = (2, 2));
+    let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+    let settings = rolling(500.0, 123.0);
+    let applied = bench.camera().configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
+    assert_eq!(applied.first_frame, FirstFrame::Exactly(2));
+    let exposures: Vec<_> = (0..4).map(|_| bench.frame().1.exposure_us.unwrap()).collect();
+    assert!(
+        exposures[..2].iter().all(|&us| us != 123.0) && exposures[2..] == [123.0, 123.0],
+        "{exposures:?}"
+    );
+}
+
+#[test]
+fn the_light_of_the_next_edge_is_seen_by_an_exposure_that_begins_before_it() {
+    let rig = rig(|_| {});
+    let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+    let settings = rolling(16_000.0 - 200.0, 200.0 + 500.0 + TAU_US);
+    bench.camera().configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
+    let (rows, stamp) = bench.frame();
+    assert!(rows.iter().flatten().all(|&light| light >= 1.0), "{rows:?}");
+    let edge = bench.edges.recv().unwrap();
+    assert_eq!((stamp.exposure_start_ns - edge.host_ns).rem_euclid(16_000_000), 15_800_000);
+}
+
+#[test]
+fn what_a_camera_cannot_do_is_refused_by_field_and_value() {
+    let rig = rig(|_| {});
+    let mut devices = rig.open();
+    let id = SettingsId { point: 0, attempt: 0 };
+    for (settings, field) in [
+        (rolling(0.0, 0.0), "exposure_us"),
+        (rolling(0.0, f64::NAN), "exposure_us"),
+        (rolling(-1.0, 10.0), "trigger_delay_us"),
+    ] {
+        let error = devices.camera.configure(id, &settings).unwrap_err();
+        assert_eq!((error.device, error.kind), ("camera", DeviceErrorKind::OutOfRange));
+        assert!(error.to_string().contains(field), "{error}");
+    }
+    let mut data = FramePool::new(1, ROWS * COLUMNS * 2).take();
+    let error = devices.camera.next_frame(&mut data, Duration::ZERO).unwrap_err();
+    assert_eq!(error.kind, DeviceErrorKind::NotReady);
+    assert!(devices.projector.show(&Pattern::Rows(vec![1.0; 3])).unwrap_err().to_string().contains("3 rows"));
+}
+
+#[test]
+fn a_wait_ends_when_its_time_is_up() {
+    let rig = rig(|_| {});
+    let mut devices = rig.open();
+    devices.camera.disarm().unwrap();
+    let before_ns = devices.clock.now_ns();
+    // No edge lies within the first millisecond of a line whose period is sixteen.
+    drop(devices.camera);
+    assert!(devices.vsync.next_edge(Duration::from_millis(1)).unwrap().is_none());
+    assert_eq!(devices.clock.now_ns() - before_ns, 1_000_000);
+}
