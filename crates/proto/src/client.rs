@@ -1,0 +1,413 @@
+//! A small blocking client.
+
+use std::io::{self, BufRead, BufReader, ErrorKind, Write};
+use std::os::unix::fs::MetadataExt;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use nix::unistd::{Gid, Group};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
+
+use crate::{
+    CheckParams, CheckReport, Description, Empty, Event, Id, Incoming, Method, Outcome, Request,
+    ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
+};
+
+/// How long an answer may take. No call waits for a run, so that a longer wait means a daemon that hangs.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// Why a call did not succeed.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// Nobody listens there.
+    #[error("no raysweepd listens on {}: start it, or name its socket with --socket or RAYSWEEP_SOCKET", path.display())]
+    NotRunning {
+        /// The socket.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The socket may not be used by this user.
+    #[error("{} may not be used by this user: {advice}", path.display())]
+    Permission {
+        /// The socket.
+        path: PathBuf,
+        /// Which group to join.
+        advice: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Connecting failed in another way.
+    #[error("cannot connect to {}: {source}", path.display())]
+    Connect {
+        /// The socket.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The connection broke.
+    #[error("the connection to {} was lost: {source}; see whether raysweepd still runs", path.display())]
+    Lost {
+        /// The socket.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// No answer came.
+    #[error("raysweepd at {} has not answered `{method}` for {} s; see its log", path.display(), after.as_secs())]
+    Timeout {
+        /// The socket.
+        path: PathBuf,
+        /// What was called.
+        method: &'static str,
+        /// How long it was waited for.
+        after: Duration,
+    },
+    /// What came is not what a daemon of this version sends.
+    #[error("what listens on {} does not speak as this version's raysweepd does: {what}", path.display())]
+    Protocol {
+        /// The socket.
+        path: PathBuf,
+        /// What was wrong.
+        what: String,
+    },
+    /// The daemon refused, or failed.
+    #[error(transparent)]
+    Rpc(#[from] RpcError),
+}
+
+/// A connection to a daemon.
+#[derive(Debug)]
+pub struct Client {
+    path: PathBuf,
+    stream: BufReader<UnixStream>,
+    /// The part of a line that had come when a time limit was reached.
+    partial: Vec<u8>,
+    next_id: u64,
+}
+
+impl Client {
+    /// Connects to the daemon that listens on a socket.
+    ///
+    /// # Errors
+    /// [`ClientError::NotRunning`], [`ClientError::Permission`], [`ClientError::Connect`].
+    pub fn connect(path: impl AsRef<Path>) -> Result<Self, ClientError> {
+        let path = path.as_ref().to_owned();
+        match UnixStream::connect(&path) {
+            Ok(stream) => Ok(Self { path, stream: BufReader::new(stream), partial: Vec::new(), next_id: 1 }),
+            Err(source) => Err(match source.kind() {
+                ErrorKind::NotFound | ErrorKind::ConnectionRefused => {
+                    ClientError::NotRunning { path, source }
+                }
+                ErrorKind::PermissionDenied => {
+                    ClientError::Permission { advice: advice(&path), path, source }
+                }
+                _ => ClientError::Connect { path, source },
+            }),
+        }
+    }
+
+    /// What can be asked.
+    ///
+    /// # Errors
+    /// As every call here: the daemon's own [`ClientError::Rpc`], or a connection that does not carry.
+    pub fn describe(&mut self) -> Result<Description, ClientError> {
+        self.call(Method::Describe, &Empty {})
+    }
+
+    /// What the daemon is doing.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn status(&mut self) -> Result<Status, ClientError> {
+        self.call(Method::Status, &Empty {})
+    }
+
+    /// What a plan would do.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn check(&mut self, plan: impl Into<String>) -> Result<CheckReport, ClientError> {
+        self.call(Method::Check, &CheckParams { plan: plan.into() })
+    }
+
+    /// Begins a run.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn run(&mut self, params: &RunParams) -> Result<Started, ClientError> {
+        self.call(Method::Run, params)
+    }
+
+    /// Begins to acquire what a session lacks.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn resume(&mut self, session: impl Into<PathBuf>) -> Result<Started, ClientError> {
+        self.call(Method::Resume, &ResumeParams { session: session.into() })
+    }
+
+    /// Holds the run before its next point.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn pause(&mut self) -> Result<(), ClientError> {
+        self.call(Method::Pause, &Empty {}).map(|Empty {}| ())
+    }
+
+    /// Goes on after [`Client::pause`].
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn go_on(&mut self) -> Result<(), ClientError> {
+        self.call(Method::Continue, &Empty {}).map(|Empty {}| ())
+    }
+
+    /// Ends the run in order.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn cancel(&mut self) -> Result<(), ClientError> {
+        self.call(Method::Cancel, &Empty {}).map(|Empty {}| ())
+    }
+
+    /// The sessions of the daemon's data folder, oldest first.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn sessions(&mut self) -> Result<Vec<SessionInfo>, ClientError> {
+        self.call(Method::Sessions, &Empty {})
+    }
+
+    /// Everything that happens from now on. The connection carries nothing else then; make another for calls.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn subscribe(mut self) -> Result<Subscription, ClientError> {
+        let Empty {} = self.call(Method::Subscribe, &Empty {})?;
+        Ok(Subscription { client: self })
+    }
+
+    fn call<R: DeserializeOwned>(
+        &mut self,
+        method: Method,
+        params: &impl Serialize,
+    ) -> Result<R, ClientError> {
+        let id = self.next_id;
+        self.next_id += 1;
+        let params = match serde_json::to_value(params) {
+            Ok(Value::Object(params)) => params,
+            _ => Map::new(),
+        };
+        self.send(&Request::new(id, method.name(), params))?;
+        let Some(incoming) = self.receive(Some(ANSWER_TIMEOUT))? else {
+            let after = ANSWER_TIMEOUT;
+            return Err(ClientError::Timeout { path: self.path.clone(), method: method.name(), after });
+        };
+        let Incoming::Response(response) = incoming else {
+            return Err(self.protocol(format!("an event came instead of the answer to `{}`", method.name())));
+        };
+        match response.outcome {
+            // An error without an id is about the connection: too many clients, or a line that is too long.
+            Outcome::Error(error) => Err(error.into()),
+            Outcome::Result(_) if response.id != Id::Number(id.into()) => {
+                Err(self.protocol(format!("the answer to `{}` has the id of another request", method.name())))
+            }
+            Outcome::Result(value) => serde_json::from_value(value)
+                .map_err(|error| self.protocol(format!("the result of `{}`: {error}", method.name()))),
+        }
+    }
+
+    fn send(&mut self, request: &Request) -> Result<(), ClientError> {
+        let mut line = serde_json::to_vec(request).map_err(|error| self.lost(error.into()))?;
+        line.push(b'\n');
+        let sent = self
+            .stream
+            .get_ref()
+            .set_write_timeout(Some(ANSWER_TIMEOUT))
+            .and_then(|()| self.stream.get_mut().write_all(&line));
+        match sent {
+            // A daemon that hangs up while it is being written to has said why: the reason waits to be read.
+            Err(error) if !matches!(error.kind(), ErrorKind::BrokenPipe | ErrorKind::ConnectionReset) => {
+                Err(self.lost(error))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The next message, or nothing if none has come within the time.
+    fn receive(&mut self, timeout: Option<Duration>) -> Result<Option<Incoming>, ClientError> {
+        self.stream.get_ref().set_read_timeout(timeout).map_err(|error| self.lost(error))?;
+        match self.stream.read_until(b'\n', &mut self.partial) {
+            Ok(_) if self.partial.last() != Some(&b'\n') => Err(self.lost(ErrorKind::UnexpectedEof.into())),
+            Ok(_) => {
+                let line = std::mem::take(&mut self.partial);
+                let message = serde_json::from_slice(&line)
+                    .map_err(|error| self.protocol(format!("a line is {error}")))?;
+                Ok(Some(message))
+            }
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => Ok(None),
+            Err(error) => Err(self.lost(error)),
+        }
+    }
+
+    fn lost(&self, source: io::Error) -> ClientError {
+        ClientError::Lost { path: self.path.clone(), source }
+    }
+
+    fn protocol(&self, what: String) -> ClientError {
+        ClientError::Protocol { path: self.path.clone(), what }
+    }
+}
+
+/// Events as they happen. As an iterator it waits for each as long as it takes and ends with an error when the
+/// daemon goes.
+#[derive(Debug)]
+pub struct Subscription {
+    client: Client,
+}
+
+impl Subscription {
+    /// The next event, or nothing if none has come within `timeout`, which must not be zero.
+    ///
+    /// # Errors
+    /// [`ClientError::Lost`] when the daemon goes, [`ClientError::Protocol`].
+    pub fn next_within(&mut self, timeout: Duration) -> Result<Option<Event>, ClientError> {
+        self.receive(Some(timeout))
+    }
+
+    fn receive(&mut self, timeout: Option<Duration>) -> Result<Option<Event>, ClientError> {
+        match self.client.receive(timeout)? {
+            Some(Incoming::Event(notice)) => Ok(Some(notice.params)),
+            Some(Incoming::Response(response)) => match response.outcome {
+                Outcome::Error(error) => Err(error.into()),
+                Outcome::Result(_) => Err(self.client.protocol("an answer that nobody asked for".into())),
+            },
+            None => Ok(None),
+        }
+    }
+}
+
+impl Iterator for Subscription {
+    type Item = Result<Event, ClientError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        self.receive(None).transpose()
+    }
+}
+
+/// Who may use the socket, told to somebody who may not.
+fn advice(path: &Path) -> String {
+    let Ok(metadata) = std::fs::metadata(path) else {
+        return "its folder is closed to this user; ask who runs the daemon".into();
+    };
+    match Group::from_gid(Gid::from_raw(metadata.gid())) {
+        Ok(Some(group)) => {
+            format!("join the group `{0}` (`usermod -aG {0} USER` as root) and log in again", group.name)
+        }
+        _ => format!(
+            "its group, number {}, has no name on this machine; ask who runs the daemon",
+            metadata.gid()
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::net::UnixListener;
+    use std::thread;
+
+    use super::*;
+    use crate::ErrorCode;
+
+    /// A daemon that reads one line, sends `answer` as it is, and hangs up.
+    fn peer(answer: &'static str) -> (tempfile::TempDir, PathBuf, thread::JoinHandle<String>) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("socket");
+        let listener = UnixListener::bind(&path).unwrap();
+        let thread = thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            let mut line = String::new();
+            BufReader::new(stream.try_clone().unwrap()).read_line(&mut line).unwrap();
+            stream.write_all(answer.as_bytes()).unwrap();
+            line
+        });
+        (folder, path, thread)
+    }
+
+    #[test]
+    fn a_missing_socket_and_a_dead_one_are_named_with_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("raysweepd.sock");
+        let check = || {
+            let error = Client::connect(&path).unwrap_err();
+            assert!(matches!(error, ClientError::NotRunning { .. }), "{error}");
+            let message = error.to_string();
+            assert!(message.contains(path.to_str().unwrap()) && message.contains("start it"), "{message}");
+        };
+        check();
+        drop(UnixListener::bind(&path).unwrap());
+        assert!(path.exists());
+        check();
+    }
+
+    #[test]
+    fn the_advice_names_the_group_of_the_socket() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let gid = Gid::from_raw(std::fs::metadata(file.path()).unwrap().gid());
+        let name = Group::from_gid(gid).unwrap().unwrap().name;
+        assert!(advice(file.path()).contains(&format!("`{name}`")));
+    }
+
+    #[test]
+    fn a_call_is_one_line_and_its_error_comes_back_whole() {
+        let answer = r#"{"jsonrpc":"2.0","id":1,"error":{"code":1,"message":"no","data":{"name":"invalid_plan","span":[3,5]}}}"#;
+        let (_folder, path, peer) = peer(Box::leak(format!("{answer}\n").into_boxed_str()));
+        let error = Client::connect(path).unwrap().check("a\nb").unwrap_err();
+        let ClientError::Rpc(error) = error else { panic!("{error}") };
+        assert_eq!((error.name(), error.data.unwrap().span), (Some(ErrorCode::InvalidPlan), Some((3, 5))));
+        assert_eq!(
+            peer.join().unwrap(),
+            "{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"check\",\"params\":{\"plan\":\"a\\nb\"}}\n"
+        );
+    }
+
+    #[test]
+    fn answers_that_are_none_are_refused() {
+        for (answer, wanted) in [
+            ("", "Lost"),
+            ("{\"jsonrpc\":\"2.0\",\"id\":1,\"result\":{}}", "Lost"),
+            ("HTTP/1.1 400 Bad Request\r\n", "Protocol"),
+            ("{\"jsonrpc\":\"2.0\",\"id\":2,\"result\":{}}\n", "Protocol"),
+            ("{\"jsonrpc\":\"2.0\",\"id\":1,\"result\":{\"sesion\":\"\"}}\n", "Protocol"),
+            ("{\"jsonrpc\":\"2.0\",\"id\":null,\"error\":{\"code\":9,\"message\":\"full\"}}\n", "Rpc"),
+        ] {
+            let (_folder, path, peer) = peer(answer);
+            let error = Client::connect(path).unwrap().cancel().unwrap_err();
+            assert!(format!("{error:?}").starts_with(wanted), "{answer:?}: {error:?}");
+            peer.join().unwrap();
+        }
+    }
+
+    #[test]
+    fn an_event_that_comes_in_two_halves_is_one_event() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("socket");
+        let listener = UnixListener::bind(&path).unwrap();
+        let thread = thread::spawn(move || Client::connect(path).unwrap().subscribe().unwrap());
+        let (mut stream, _) = listener.accept().unwrap();
+        stream.write_all(b"{\"jsonrpc\":\"2.0\",\"id\":1,\"result\":{}}\n").unwrap();
+        let mut events = thread.join().unwrap();
+        let wait = Duration::from_millis(1);
+        assert_eq!(events.next_within(wait).unwrap(), None);
+        stream.write_all(b"{\"jsonrpc\":\"2.0\",\"method\":\"event\",\"par").unwrap();
+        assert_eq!(events.next_within(wait).unwrap(), None);
+        stream.write_all(b"ams\":{\"event\":\"skipped\",\"events\":3}}\n").unwrap();
+        assert_eq!(events.next().unwrap().unwrap(), Event::Skipped { events: 3 });
+        drop(stream);
+        assert!(matches!(events.next(), Some(Err(ClientError::Lost { .. }))));
+    }
+}

@@ -1,0 +1,359 @@
+//! Parameters, results and events. Field names are stable; times are seconds or, where `_us` says so, microseconds.
+
+use std::path::PathBuf;
+
+use raysweep_core::{Counts, VsyncStats};
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use serde::{Deserialize, Serialize};
+
+/// What the daemon is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RunState {
+    /// Nothing; ready for a run.
+    Idle,
+    /// Opening devices and the session.
+    Preparing,
+    /// The camera is armed, no point has begun.
+    Armed,
+    /// Acquiring.
+    Running,
+    /// Holding between two points.
+    Paused,
+    /// Acquisition is over; results are being made and written.
+    Draining,
+    /// The last run ended with an error; ready for another.
+    Faulted,
+}
+
+impl RunState {
+    /// Whether the daemon may go from this state to `next`.
+    pub const fn may_become(self, next: RunState) -> bool {
+        use RunState::{Armed, Draining, Faulted, Idle, Paused, Preparing, Running};
+        matches!(
+            (self, next),
+            (Idle | Faulted, Preparing)
+                | (Preparing, Idle | Armed | Draining | Faulted)
+                | (Armed, Running | Draining | Faulted)
+                | (Running, Paused | Draining | Faulted)
+                | (Paused, Running | Draining | Faulted)
+                | (Draining, Idle | Faulted)
+        )
+    }
+}
+
+/// How far a run is.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Progress {
+    /// Points stored, of this run and of those before it that it resumes.
+    pub points_stored: usize,
+    /// Points that the run needs: the sweep's, its dark images and the regular image.
+    pub points_planned: usize,
+    /// Where this run's triggers have gone so far.
+    #[schemars(schema_with = "counts_schema")]
+    pub counts: Counts,
+    /// Seconds since the run began.
+    pub elapsed_s: f64,
+    /// Seconds that it will still take at its present pace, if that can be said yet.
+    pub left_s: Option<f64>,
+    /// Frames averaged per second.
+    pub frames_per_s: f64,
+}
+
+/// `core` knows no schemas, so those of its accounts are written out here.
+fn counts_schema(_: &mut SchemaGenerator) -> Schema {
+    let frames = json_schema!({ "type": "integer", "minimum": 0 });
+    json_schema!({
+        "type": "object",
+        "description": "Frames: expected = averaged + settling + cancelled + sum of lost.",
+        "properties": {
+            "expected": frames,
+            "averaged": frames,
+            "settling": frames,
+            "cancelled": frames,
+            "lost": { "type": "object", "description": "Frames by cause.", "additionalProperties": frames },
+        },
+        "required": ["expected", "averaged", "settling", "cancelled", "lost"],
+    })
+}
+
+fn vsync_schema(_: &mut SchemaGenerator) -> Schema {
+    let edges = json_schema!({ "type": "integer", "minimum": 0 });
+    json_schema!({
+        "type": ["object", "null"],
+        "properties": {
+            "edges": edges,
+            "missed": edges,
+            "false_edges": edges,
+            "period_us": { "type": "number" },
+            "jitter_us": { "type": "number" },
+        },
+        "required": ["edges", "missed", "false_edges", "period_us", "jitter_us"],
+    })
+}
+
+/// `status`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Status {
+    /// Version of the daemon.
+    pub version: String,
+    /// Kind of the rig.
+    pub rig: String,
+    /// What the daemon is doing.
+    pub state: RunState,
+    /// The session of the present or the last run.
+    pub session: Option<PathBuf>,
+    /// How far that run is, or was.
+    pub progress: Option<Progress>,
+    /// Its VSYNC line, as of the last pass.
+    #[schemars(schema_with = "vsync_schema")]
+    pub vsync: Option<VsyncStats>,
+    /// Why the last run faulted.
+    pub error: Option<String>,
+}
+
+/// Parameters of `check`.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CheckParams {
+    /// The plan's TOML text.
+    pub plan: String,
+}
+
+/// Result of `check`: what a plan would do, before anything moves.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct CheckReport {
+    /// Points of the sweep.
+    pub points: usize,
+    /// Further points: dark images and the regular image.
+    pub extra_points: usize,
+    /// Frames to average over all points.
+    pub frames: u64,
+    /// Shortest time that the light takes.
+    pub light_s: f64,
+    /// Memory for the images and the results.
+    pub memory_bytes: u64,
+    /// Disk space for the session.
+    pub disk_bytes: u64,
+    /// Disk space that is free.
+    pub disk_free_bytes: u64,
+    /// First and last relative row that the sweep reaches.
+    pub reach_rows: (i32, i32),
+    /// Condition number of the demultiplexing of a camera row in the middle, with its prior.
+    pub condition: f64,
+    /// What an operator should know; none of it stops the run.
+    pub warnings: Vec<String>,
+}
+
+/// Parameters of `run`.
+#[derive(Debug, Clone, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RunParams {
+    /// The plan's TOML text.
+    pub plan: String,
+    /// Who runs it.
+    #[serde(default)]
+    pub operator: Option<String>,
+    /// What stands before the camera.
+    #[serde(default)]
+    pub sample: Option<String>,
+    /// Anything else.
+    #[serde(default)]
+    pub note: Option<String>,
+    /// Words to find the session by.
+    #[serde(default)]
+    pub tags: Vec<String>,
+}
+
+/// Parameters of `resume`.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ResumeParams {
+    /// The session's folder, or its name within the daemon's data folder.
+    pub session: PathBuf,
+}
+
+/// Result of `run` and `resume`: the run has begun.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Started {
+    /// The session's folder.
+    pub session: PathBuf,
+}
+
+/// One entry of `sessions`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct SessionInfo {
+    /// The session's folder.
+    pub session: PathBuf,
+    /// The plan's name.
+    pub name: String,
+    /// When it was made (RFC 3339).
+    pub created: String,
+    /// Points of the sweep that are stored.
+    pub stored: usize,
+    /// Points of the sweep.
+    pub points: usize,
+    /// `complete`, `cancelled`, `faulted`; `unfinished` where no run has ended; `unreadable`.
+    pub state: String,
+}
+
+/// What `subscribe` streams, as notifications of method `event`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum Event {
+    /// The daemon went to another state.
+    State {
+        /// The new state.
+        state: RunState,
+        /// The session it concerns.
+        session: Option<PathBuf>,
+    },
+    /// A point was stored or given up.
+    Progress(Progress),
+    /// An attempt at a point failed; the point is taken again.
+    Lost {
+        /// Ordinal of the point in the order of acquisition.
+        point: u32,
+        /// Counted from 0.
+        attempt: u32,
+        /// Where its triggers went.
+        #[schemars(schema_with = "counts_schema")]
+        counts: Counts,
+    },
+    /// The VSYNC line at the end of a pass.
+    Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
+    /// A run has ended.
+    Finished {
+        /// The session's folder.
+        session: PathBuf,
+        /// `complete`, `cancelled` or `faulted`.
+        state: String,
+        /// Why it faulted.
+        error: Option<String>,
+        /// The report, if one was made.
+        report: Option<PathBuf>,
+        /// Points of the sweep stored.
+        stored: usize,
+        /// Points of the sweep missing.
+        missing: usize,
+    },
+    /// This many events were left out because the subscriber read too slowly.
+    Skipped {
+        /// How many.
+        events: u64,
+    },
+}
+
+/// Stable codes of what can go wrong; the number is the JSON-RPC error's `code`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum ErrorCode {
+    /// Not JSON.
+    ParseError = -32700,
+    /// JSON, but not a JSON-RPC 2.0 request.
+    InvalidRequest = -32600,
+    /// No such method.
+    MethodNotFound = -32601,
+    /// Parameters of the wrong shape.
+    InvalidParams = -32602,
+    /// A defect of the daemon.
+    Internal = -32603,
+    /// The plan cannot be read or makes no sense.
+    InvalidPlan = 1,
+    /// A run is under way.
+    Busy = 2,
+    /// No run is under way, or not in a state for this.
+    NotRunning = 3,
+    /// The caller is an observer.
+    Forbidden = 4,
+    /// No such session, or not one that can be resumed.
+    NoSession = 5,
+    /// A device failed.
+    Device = 6,
+    /// The disk failed or is too small.
+    Storage = 7,
+    /// The message is longer than allowed.
+    TooLong = 8,
+    /// Too many clients.
+    TooManyClients = 9,
+}
+
+/// An error as a JSON-RPC error object carries it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, thiserror::Error)]
+#[error("{message}")]
+pub struct RpcError {
+    /// [`ErrorCode`] as a number.
+    pub code: i64,
+    /// What happened: field, value, what is allowed, what to do.
+    pub message: String,
+    /// More, for programs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub data: Option<ErrorData>,
+}
+
+/// What a program may want to know of an error.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ErrorData {
+    /// The code by name.
+    pub name: ErrorCode,
+    /// The offending field, `sweep.delay_us.count` for example.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
+    /// Bytes from..to of the plan's text that the error is about.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub span: Option<(usize, usize)>,
+    /// What to do.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub help: Option<String>,
+}
+
+impl RpcError {
+    /// An error with its code and nothing more.
+    pub fn new(code: ErrorCode, message: impl Into<String>) -> Self {
+        let data = ErrorData { name: code, field: None, span: None, help: None };
+        Self { code: code as i64, message: message.into(), data: Some(data) }
+    }
+
+    /// The same, about a field of what was sent.
+    #[must_use]
+    pub fn of_field(mut self, field: impl Into<String>) -> Self {
+        if let Some(data) = &mut self.data {
+            data.field = Some(field.into());
+        }
+        self
+    }
+
+    /// The same, with what to do.
+    #[must_use]
+    pub fn with_help(mut self, help: impl Into<String>) -> Self {
+        if let Some(data) = &mut self.data {
+            data.help = Some(help.into());
+        }
+        self
+    }
+
+    /// The error's code by name, if it is one of ours.
+    pub fn name(&self) -> Option<ErrorCode> {
+        self.data.as_ref().map(|data| data.name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use RunState::{Armed, Draining, Faulted, Idle, Paused, Preparing, Running};
+
+    #[test]
+    fn every_state_can_end_and_no_state_skips_draining() {
+        let all = [Idle, Preparing, Armed, Running, Paused, Draining, Faulted];
+        for state in [Preparing, Armed, Running, Paused] {
+            assert!(state.may_become(Draining) && state.may_become(Faulted), "{state:?}");
+            // Only a run that was refused before it began leaves no trace.
+            assert_eq!(state.may_become(Idle), state == Preparing, "{state:?}");
+        }
+        for state in all {
+            assert!(!state.may_become(state), "{state:?} to itself");
+            assert_eq!(state.may_become(Preparing), matches!(state, Idle | Faulted));
+        }
+    }
+}

@@ -1,0 +1,272 @@
+//! The one table of what can be asked, and its description for programs.
+
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    CheckParams, CheckReport, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES, ResumeParams, RunParams,
+    SessionInfo, Started, Status,
+};
+
+/// What a caller may do.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Role {
+    /// Read.
+    Observer,
+    /// Read, and drive the rig.
+    Operator,
+}
+
+/// No parameters, or nothing to say beyond that it was done: `{}`.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Empty {}
+
+/// What can be asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// This table.
+    Describe,
+    /// What the daemon is doing.
+    Status,
+    /// What a plan would do.
+    Check,
+    /// Begins a run.
+    Run,
+    /// Goes on with a session.
+    Resume,
+    /// Holds a run.
+    Pause,
+    /// Goes on after a pause.
+    Continue,
+    /// Ends a run.
+    Cancel,
+    /// The sessions on disk.
+    Sessions,
+    /// Events from now on.
+    Subscribe,
+}
+
+struct Row {
+    name: &'static str,
+    role: Role,
+    about: &'static str,
+    params: fn() -> Schema,
+    result: fn() -> Schema,
+}
+
+const fn row<P: JsonSchema, R: JsonSchema>(name: &'static str, role: Role, about: &'static str) -> Row {
+    Row { name, role, about, params: schema::<P>, result: schema::<R> }
+}
+
+fn schema<T: JsonSchema>() -> Schema {
+    SchemaGenerator::default().into_root_schema_for::<T>()
+}
+
+impl Method {
+    /// Every method.
+    pub const ALL: [Method; 10] = [
+        Self::Describe,
+        Self::Status,
+        Self::Check,
+        Self::Run,
+        Self::Resume,
+        Self::Pause,
+        Self::Continue,
+        Self::Cancel,
+        Self::Sessions,
+        Self::Subscribe,
+    ];
+
+    const fn row(self) -> Row {
+        use Role::{Observer, Operator};
+        match self {
+            Self::Describe => row::<Empty, Description>(
+                "describe",
+                Observer,
+                "The methods with their schemas, the events, the error codes and the limits.",
+            ),
+            Self::Status => row::<Empty, Status>("status", Observer, "What the daemon is doing."),
+            Self::Check => {
+                row::<CheckParams, CheckReport>("check", Observer, "What a plan would do; nothing moves.")
+            }
+            Self::Run => row::<RunParams, Started>(
+                "run",
+                Operator,
+                "Begins a run and answers at once; the event `finished` ends it.",
+            ),
+            Self::Resume => row::<ResumeParams, Started>(
+                "resume",
+                Operator,
+                "Begins to acquire the points that a session lacks, as `run` does.",
+            ),
+            Self::Pause => row::<Empty, Empty>("pause", Operator, "Holds the run before its next point."),
+            Self::Continue => row::<Empty, Empty>("continue", Operator, "Goes on with a run that is held."),
+            Self::Cancel => {
+                row::<Empty, Empty>("cancel", Operator, "Ends the run in order; what was acquired is kept.")
+            }
+            Self::Sessions => row::<Empty, Vec<SessionInfo>>(
+                "sessions",
+                Observer,
+                "The sessions of the daemon's data folder, oldest first.",
+            ),
+            Self::Subscribe => row::<Empty, Empty>(
+                "subscribe",
+                Observer,
+                "Sends every event from now on, as notifications of method `event`, over this connection.",
+            ),
+        }
+    }
+
+    /// The name on the wire.
+    pub const fn name(self) -> &'static str {
+        self.row().name
+    }
+
+    /// The method of a name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|method| method.name() == name)
+    }
+
+    /// What a caller must be to call it.
+    pub const fn role(self) -> Role {
+        self.row().role
+    }
+}
+
+/// Result of `describe`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Description {
+    /// Version of the daemon.
+    pub version: String,
+    /// What can be called.
+    pub methods: Vec<MethodInfo>,
+    /// JSON Schema of the `params` of the notification `event`.
+    pub event: Schema,
+    /// What can go wrong.
+    pub errors: Vec<ErrorInfo>,
+    /// What is bounded.
+    pub limits: LimitsInfo,
+}
+
+/// A method for programs.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct MethodInfo {
+    /// Its name on the wire.
+    pub name: String,
+    /// What a caller must be to call it.
+    pub role: Role,
+    /// What it does.
+    pub about: String,
+    /// JSON Schema of its `params`.
+    pub params: Schema,
+    /// JSON Schema of its `result`.
+    pub result: Schema,
+}
+
+/// An error code for programs.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct ErrorInfo {
+    /// `error.data.name`
+    pub name: ErrorCode,
+    /// `error.code`
+    pub code: i64,
+    /// What it means.
+    pub meaning: String,
+}
+
+/// What the daemon bounds.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct LimitsInfo {
+    /// The longest request, without its line feed; a longer one ends the connection.
+    pub message_bytes: usize,
+    /// How many clients may be connected at once.
+    pub clients: usize,
+}
+
+/// What `describe` answers, for a daemon of this version.
+pub fn describe(version: &str) -> Description {
+    let methods = Method::ALL.map(|method| {
+        let Row { name, role, about, params, result } = method.row();
+        MethodInfo { name: name.into(), role, about: about.into(), params: params(), result: result() }
+    });
+    Description {
+        version: version.into(),
+        methods: methods.into(),
+        event: schema::<Event>(),
+        errors: error_codes(),
+        limits: LimitsInfo { message_bytes: MAX_MESSAGE_BYTES, clients: MAX_CLIENTS },
+    }
+}
+
+/// Names and meanings are those of the schema that the type derives, so that no code can be forgotten here.
+fn error_codes() -> Vec<ErrorInfo> {
+    let schema = schema::<ErrorCode>();
+    let variants = schema.get("oneOf").and_then(|variants| variants.as_array());
+    let info = |variant: &serde_json::Value| {
+        let name = ErrorCode::deserialize(variant.get("const")?).ok()?;
+        let meaning = variant.get("description")?.as_str()?.to_owned();
+        Some(ErrorInfo { name, code: name as i64, meaning })
+    };
+    variants.into_iter().flatten().filter_map(info).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use raysweep_core::{Counts, LossCause, VsyncStats};
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    #[test]
+    fn names_lead_back_to_their_methods() {
+        for method in Method::ALL {
+            assert_eq!(Method::from_name(method.name()), Some(method));
+        }
+        assert_eq!(Method::from_name("go_on"), None);
+    }
+
+    #[test]
+    fn who_only_observes_cannot_move_the_rig() {
+        let drives =
+            Method::ALL.into_iter().filter(|method| method.role() == Role::Operator).map(Method::name);
+        assert_eq!(drives.collect::<Vec<_>>(), ["run", "resume", "pause", "continue", "cancel"]);
+    }
+
+    #[test]
+    fn every_method_has_schemas_and_every_code_a_meaning() {
+        let description = serde_json::to_value(describe("1")).unwrap();
+        let methods = description["methods"].as_array().unwrap();
+        assert_eq!(methods.len(), Method::ALL.len());
+        for method in methods {
+            assert_eq!(method["params"]["type"], "object", "{method}");
+            assert!(["object", "array"].contains(&method["result"]["type"].as_str().unwrap()), "{method}");
+        }
+        let run = methods.iter().find(|method| method["name"] == "run").unwrap();
+        assert_eq!(run["params"]["required"], json!(["plan"]));
+        assert_eq!(run["params"]["additionalProperties"], false);
+
+        let codes = describe("1").errors;
+        assert_eq!(codes.len(), 14, "a code without a doc comment would be left out");
+        assert!(codes.iter().all(|error| !error.meaning.is_empty()));
+        assert!(codes.iter().any(|error| error.name == ErrorCode::Busy && error.code == 2));
+    }
+
+    #[test]
+    fn the_schemas_that_are_written_out_are_what_is_sent() {
+        let mut counts = Counts::default();
+        counts.lose(LossCause::CameraGap, 1);
+        let keys = |value: &Value| value.as_object().unwrap().keys().cloned().collect::<BTreeSet<_>>();
+        let described =
+            |schema: Schema, field: &str| keys(&schema.get("properties").unwrap()[field]["properties"]);
+        assert_eq!(
+            described(schema::<crate::Progress>(), "counts"),
+            keys(&serde_json::to_value(counts).unwrap())
+        );
+        let vsync = serde_json::to_value(VsyncStats::default()).unwrap();
+        assert_eq!(described(schema::<Status>(), "vsync"), keys(&vsync));
+    }
+}
