@@ -1,1 +1,16 @@
-//! raysweepd
+//! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
+
+pub mod check;
+pub mod cli;
+pub mod config;
+pub mod control;
+pub mod process;
+pub mod processing;
+mod report;
+mod results;
+pub mod rig;
+pub mod run;
+pub mod server;
+
+/// Name and version, as sessions keep it.
+pub const SOFTWARE: &str = concat!("raysweepd ", env!("CARGO_PKG_VERSION"));

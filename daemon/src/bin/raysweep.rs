@@ -1,0 +1,7 @@
+//! The command-line client of `raysweepd`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    raysweep::cli::main()
+}

@@ -1,0 +1,121 @@
+//! The daemon: owns a rig, serves a socket, and ends in order.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::Parser;
+use raysweep::control::Control;
+use raysweep::rig::Rig;
+use raysweep::run::Runner;
+use raysweep::server::{self, Access, Listening};
+use raysweep_pipeline::Registry;
+use sd_notify::NotifyState;
+use tokio::signal::unix::{SignalKind, signal};
+
+/// Capture daemon for light-transport rigs.
+#[derive(Parser)]
+#[command(version, after_help = "Exit status: 0 ended in order, 1 could not start or failed, 2 wrong usage.")]
+struct Arguments {
+    /// The rig file.
+    #[arg(long, value_name = "FILE")]
+    rig: PathBuf,
+    /// Where clients connect; not needed under systemd's socket activation.
+    #[arg(long, value_name = "PATH", default_value = "/run/raysweep/raysweepd.sock")]
+    socket: PathBuf,
+    /// Where sessions are kept.
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/raysweep")]
+    data: PathBuf,
+    /// Group whose members may drive the rig; others who can connect may only look.
+    #[arg(long, value_name = "GROUP", default_value = "raysweep")]
+    operators: String,
+    /// Reads the rig file, opens every device once, says what it found, and ends.
+    #[arg(long)]
+    check: bool,
+}
+
+fn main() -> ExitCode {
+    tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
+    let arguments = Arguments::parse();
+    match run(&arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("raysweepd: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
+    let rig = Rig::load(&arguments.rig)?;
+    let devices = rig.open()?;
+    let camera = devices.camera.capabilities().clone();
+    // A run opens its own; between runs the devices are free for other programs.
+    drop(devices);
+    let opened = format!(
+        "{} ({} x {} {:?}), rig {}",
+        camera.model,
+        camera.width,
+        camera.height,
+        camera.format,
+        arguments.rig.display()
+    );
+    if arguments.check {
+        println!("{opened}");
+        return Ok(());
+    }
+    tracing::info!("{opened}");
+    std::fs::create_dir_all(&arguments.data).map_err(|error| {
+        format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
+    })?;
+    let runner = Arc::new(Runner::new(rig, arguments.data.clone(), Registry::default()));
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+    let served = runtime.block_on(serve(arguments, runner.clone()));
+    // A server that failed leaves a run behind; after an orderly end there is none.
+    runner.shut_down();
+    runtime.shutdown_timeout(Duration::from_secs(1));
+    served
+}
+
+async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn std::error::Error>> {
+    let Listening { listener, file } = match Listening::inherited()? {
+        Some(listening) => listening,
+        None => Listening::bind(&arguments.socket)?,
+    };
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let watchdog = tokio::spawn(feed_watchdog(runner.clone()));
+    let _ = sd_notify::notify(&[NotifyState::Ready]);
+    let ended = {
+        let runner = runner.clone();
+        async move {
+            tokio::select! {
+                _ = terminate.recv() => {}
+                _ = interrupt.recv() => {}
+            }
+            tracing::info!("ending in order");
+            let _ = sd_notify::notify(&[NotifyState::Stopping]);
+            // Clients are served until the run has ended, so that they learn how.
+            let _ = tokio::task::spawn_blocking(move || runner.shut_down()).await;
+        }
+    };
+    let control: Arc<dyn Control> = runner;
+    let served =
+        server::serve(listener, control, Access::new(Some(arguments.operators.clone())), ended).await;
+    watchdog.abort();
+    drop(file);
+    Ok(served?)
+}
+
+/// Tells systemd that the daemon lives, as often as its unit asks, and only if it still answers.
+async fn feed_watchdog(runner: Arc<Runner>) {
+    let Some(interval) = sd_notify::watchdog_enabled() else { return };
+    loop {
+        tokio::time::sleep(interval / 2).await;
+        let runner = runner.clone();
+        if tokio::task::spawn_blocking(move || runner.status()).await.is_ok() {
+            let _ = sd_notify::notify(&[NotifyState::Watchdog]);
+        }
+    }
+}

@@ -1,0 +1,99 @@
+//! What a plan would do, before anything moves.
+
+use std::path::Path;
+
+use raysweep_core::CameraCapabilities;
+use raysweep_pipeline::{DemuxFold, DemuxOptions, Point};
+use raysweep_proto::CheckReport;
+use raysweep_session::durable;
+
+use crate::config::ConfigError;
+use crate::processing::Task;
+
+/// Condition number from which on noise is amplified more than the prior can hold.
+const ILL_CONDITIONED: f64 = 1e9;
+
+/// Foresees a task whose session will lie in `data`.
+///
+/// # Errors
+/// When the plan makes no model on this rig.
+pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<CheckReport, ConfigError> {
+    let no_model = |message: String| ConfigError { message, field: Some("sweep".into()), span: None };
+    let options = task.plan.stage.iter().find(|stage| stage.name == "demux").map(|stage| {
+        serde_json::from_value::<DemuxOptions>(serde_json::Value::Object(stage.options.clone()))
+    });
+    let options = options.transpose().map_err(|error| no_model(error.to_string()))?.unwrap_or_default();
+    let geometry = &task.geometry;
+    let demux = DemuxFold::new(options, &task.schedule, geometry)
+        .map_err(|error| no_model(error.to_string()))?
+        .demux()
+        .map_err(|error| no_model(error.to_string()))?;
+    let condition = demux.condition(geometry.height / 2).map_err(|error| no_model(error.to_string()))?;
+    let reach = demux.reach();
+
+    let points = task.schedule.sweep_len();
+    let frames: u64 = task.schedule.points.iter().map(|point| u64::from(point.frames)).sum();
+    let pixels = (geometry.height * geometry.width) as u64;
+    let reach_rows = reach.clone().count() as u64;
+    // The stack as counts and as light, the transport, and its copy on the way to the disk.
+    let memory_bytes = pixels * 4 * (2 * task.schedule.points.len() as u64 + 2 * reach_rows);
+    let disk_bytes = pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows) + 10_000_000;
+    let existing = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
+    let disk_free_bytes = durable::available_bytes(existing).unwrap_or(u64::MAX);
+
+    let mut warnings = Vec::new();
+    let periods: Vec<u64> = task.schedule.points.iter().map(|point| periods(task, camera, point)).collect();
+    let slow = periods.iter().filter(|&&periods| periods > 1).count();
+    if slow > 0 {
+        warnings.push(format!(
+            "{slow} of {} points take more than one VSYNC period a frame, because trigger delay, exposure and readout together are longer: a faster or overlapped readout would save time",
+            periods.len()
+        ));
+    }
+    if points < reach_rows as usize / 8 {
+        warnings.push(format!(
+            "{points} points for {reach_rows} rows: expect smooth profiles only; take more delays"
+        ));
+    }
+    if condition > ILL_CONDITIONED {
+        warnings
+            .push(format!("condition number {condition:.1e}: raise alpha or take delays that overlap more"));
+    }
+    let brightest_rows = task
+        .schedule
+        .points
+        .iter()
+        .map(|point| (point.exposure_us / geometry.raster.row_time_us).min(geometry.raster.rows as f64))
+        .fold(0.0, f64::max);
+    let headroom = geometry.saturation_dn / geometry.white_dn;
+    if headroom < 1.2 {
+        warnings.push(format!(
+            "a pixel saturates at {headroom:.2} of a white one over {brightest_rows:.0} rows: lower camera.white_dn (gain, aperture) to leave room for indirect light"
+        ));
+    }
+    Ok(CheckReport {
+        points,
+        extra_points: task.schedule.points.len() - points,
+        frames,
+        light_s: periods
+            .iter()
+            .zip(&task.schedule.points)
+            .map(|(n, point)| n * u64::from(point.frames))
+            .sum::<u64>() as f64
+            * geometry.raster.period_us
+            * 1e-6,
+        memory_bytes,
+        disk_bytes,
+        disk_free_bytes,
+        reach_rows: (*reach.start(), *reach.end()),
+        // JSON has no infinity.
+        condition: condition.min(f64::MAX),
+        warnings,
+    })
+}
+
+/// VSYNC periods that each frame of a point takes.
+fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
+    let shot = task.geometry.shot(point, camera.trigger_latency_us);
+    u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))
+}

@@ -1,0 +1,144 @@
+//! What can go wrong, for people, for programs, and as an exit code.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use miette::{Diagnostic, NamedSource, SourceSpan};
+use raysweep_proto::{ClientError, ErrorCode, RpcError};
+use serde_json::{Value, json};
+
+use super::Exit;
+use crate::process::ProcessError;
+
+/// Why the command did not do what it was asked for.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Failure {
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    #[error("{0}")]
+    Plan(Box<PlanProblem>),
+    #[error("cannot read {}: {source}", path.display())]
+    File { path: PathBuf, source: io::Error },
+    #[error(transparent)]
+    Process(#[from] ProcessError),
+    #[error("cannot watch for Ctrl-C: {0}")]
+    Signals(io::Error),
+    #[error("cannot print: {0}")]
+    Output(io::Error),
+}
+
+/// What the daemon found wrong with a plan, with the plan's text.
+#[derive(Debug, thiserror::Error, Diagnostic)]
+#[error("{error}")]
+pub(super) struct PlanProblem {
+    error: RpcError,
+    #[source_code]
+    plan: NamedSource<String>,
+    #[label("{}", label.as_deref().unwrap_or("here"))]
+    span: Option<SourceSpan>,
+    label: Option<String>,
+    #[help]
+    help: Option<String>,
+}
+
+impl Failure {
+    /// The failure of a call that carried a plan's text.
+    pub fn of_plan(error: ClientError, path: &Path, text: &str) -> Self {
+        match error {
+            ClientError::Rpc(error) if error.name() == Some(ErrorCode::InvalidPlan) => {
+                let data = error.data.clone();
+                let span = data.as_ref().and_then(|data| data.span).map(|(start, end)| {
+                    let start = start.min(text.len());
+                    SourceSpan::from(start..end.clamp(start, text.len()))
+                });
+                let (label, help) = data.map_or((None, None), |data| (data.field, data.help));
+                let plan = NamedSource::new(path.display().to_string(), text.to_owned());
+                Self::Plan(Box::new(PlanProblem { error, plan, span, label, help }))
+            }
+            error => error.into(),
+        }
+    }
+
+    /// Tells the user, and says how to exit. A reader that has closed our output wants to hear no more.
+    pub fn report(self, json: bool) -> Exit {
+        let exit = self.exit();
+        let gone = matches!(&self, Self::Output(error) if error.kind() == io::ErrorKind::BrokenPipe);
+        match self {
+            _ if gone => {}
+            failure if json => {
+                use io::Write as _;
+                // With the output gone too, the exit code is all that is left to say.
+                let _ = writeln!(io::stdout(), "{}", json!({ "error": failure.for_programs() }));
+            }
+            Self::Plan(problem) => eprintln!("{:?}", miette::Report::new(*problem)),
+            failure => eprintln!("raysweep: {failure}"),
+        }
+        exit
+    }
+
+    fn for_programs(&self) -> Value {
+        let rpc = match self {
+            Self::Client(ClientError::Rpc(error)) => Some(error),
+            Self::Plan(problem) => Some(&problem.error),
+            _ => None,
+        };
+        let value = rpc.and_then(|error| serde_json::to_value(error).ok());
+        value.unwrap_or_else(|| json!({ "message": self.to_string() }))
+    }
+
+    fn exit(&self) -> Exit {
+        match self {
+            Self::Client(ClientError::Rpc(error)) => match error.name() {
+                Some(ErrorCode::Internal | ErrorCode::Device | ErrorCode::Storage) => Exit::Failed,
+                _ => Exit::Refused,
+            },
+            Self::Client(_) => Exit::Unreachable,
+            Self::Plan(_) => Exit::Refused,
+            Self::File { .. } => Exit::Usage,
+            Self::Process(_) | Self::Signals(_) | Self::Output(_) => Exit::Failed,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn invalid(span: (usize, usize)) -> ClientError {
+        let mut error = RpcError::new(ErrorCode::InvalidPlan, "count is 0").of_field("sweep.count");
+        error.data.as_mut().unwrap().span = Some(span);
+        error.into()
+    }
+
+    #[test]
+    fn a_plans_error_shows_its_file_its_line_and_its_field() {
+        let text = "kind = \"sweep\"\n[sweep]\ncount = 0\n";
+        let start = text.find('0').unwrap();
+        let failure = Failure::of_plan(invalid((start, start + 1)), Path::new("night.toml"), text);
+        assert_eq!(failure.exit(), Exit::Refused);
+        let Failure::Plan(problem) = failure else { panic!("{failure}") };
+        let shown = format!("{:?}", miette::Report::new(*problem));
+        for part in ["count is 0", "night.toml:3:9", "count = 0", "sweep.count"] {
+            assert!(shown.contains(part), "{part} in {shown}");
+        }
+    }
+
+    #[test]
+    fn a_span_beyond_the_text_does_no_harm() {
+        for span in [(0, 99), (99, 100), (5, 2)] {
+            let failure = Failure::of_plan(invalid(span), Path::new("p"), "é = 1");
+            let Failure::Plan(problem) = failure else { panic!("{failure}") };
+            assert!(format!("{:?}", miette::Report::new(*problem)).contains("count is 0"));
+        }
+    }
+
+    #[test]
+    fn refusals_failures_and_silence_end_differently() {
+        let rpc = |code| Failure::from(ClientError::from(RpcError::new(code, "")));
+        assert_eq!(rpc(ErrorCode::Forbidden).exit(), Exit::Refused);
+        assert_eq!(rpc(ErrorCode::Busy).exit(), Exit::Refused);
+        assert_eq!(rpc(ErrorCode::Device).exit(), Exit::Failed);
+        let lost = ClientError::Lost { path: "s".into(), source: io::ErrorKind::UnexpectedEof.into() };
+        assert_eq!(Failure::from(lost).exit(), Exit::Unreachable);
+    }
+}

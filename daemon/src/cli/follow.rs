@@ -1,0 +1,98 @@
+//! Following a run to its end.
+
+use std::io;
+use std::path::Path;
+use std::time::Duration;
+
+use raysweep_proto::{Client, Event, Subscription};
+use tokio::runtime::Runtime;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use super::Exit;
+use super::failure::Failure;
+use super::view::View;
+
+/// How long an interrupt may wait for an event that does not come.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// What Ctrl-C means.
+pub(super) enum OnInterrupt {
+    /// The first asks the daemon, over this connection, to cancel the run; the second leaves the run to it.
+    Cancel(Client),
+    /// The first leaves the run to the daemon.
+    Leave,
+}
+
+/// Ctrl-C, noticed instead of deadly.
+pub(super) struct Interrupts {
+    /// Driven only by [`Interrupts::pending`].
+    runtime: Runtime,
+    signal: Signal,
+}
+
+impl Interrupts {
+    /// From here on SIGINT ends the process no more.
+    pub fn new() -> io::Result<Self> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
+        let signal = {
+            let _within = runtime.enter();
+            signal(SignalKind::interrupt())?
+        };
+        Ok(Self { runtime, signal })
+    }
+
+    /// Whether Ctrl-C was pressed since the last time this was asked.
+    fn pending(&mut self) -> bool {
+        let Self { runtime, signal } = self;
+        runtime.block_on(async {
+            // Yielding gives the runtime its one chance to look for signals.
+            tokio::select! {
+                biased;
+                _ = signal.recv() => true,
+                () = tokio::task::yield_now() => false,
+            }
+        })
+    }
+}
+
+/// Shows what happens until the run of `session` has ended.
+pub(super) fn follow(
+    mut events: Subscription,
+    session: &Path,
+    mut interrupts: Interrupts,
+    mut view: View,
+    mut on_interrupt: OnInterrupt,
+) -> Result<Exit, Failure> {
+    let mut cancelled = false;
+    loop {
+        if interrupts.pending() {
+            match &mut on_interrupt {
+                OnInterrupt::Cancel(client) if !cancelled => {
+                    cancelled = true;
+                    match client.cancel() {
+                        Ok(()) => view.note("cancelling the run; Ctrl-C again leaves it to the daemon"),
+                        Err(error) => {
+                            view.note(&format!("{error}; Ctrl-C again leaves the run to the daemon"))
+                        }
+                    }
+                }
+                OnInterrupt::Cancel(_) => {
+                    view.note("left to the daemon; `raysweep watch` follows it");
+                    return Ok(Exit::Incomplete);
+                }
+                OnInterrupt::Leave => return Ok(Exit::Done),
+            }
+        }
+        let Some(event) = events.next_within(PATIENCE)? else { continue };
+        view.show(&event).map_err(Failure::Output)?;
+        if let Event::Finished { session: ended, state, missing, .. } = &event
+            && ended == session
+        {
+            return Ok(match state.as_str() {
+                "complete" if *missing == 0 => Exit::Done,
+                "faulted" => Exit::Failed,
+                _ => Exit::Incomplete,
+            });
+        }
+    }
+}

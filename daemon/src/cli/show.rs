@@ -1,0 +1,210 @@
+//! Results as text for people.
+
+use std::path::Path;
+use std::time::Duration;
+
+use indicatif::{BinaryBytes, FormattedDuration};
+use raysweep_core::Counts;
+use raysweep_proto::{CheckReport, Description, Progress, Role, RunState, SessionInfo, Status};
+
+use crate::process::Processed;
+
+/// `status`
+pub(super) fn status(status: &Status) -> String {
+    let mut rows = vec![
+        ("daemon", format!("{}, {} rig", status.version, status.rig)),
+        ("state", state(status.state).to_owned()),
+    ];
+    if let Some(session) = &status.session {
+        rows.push(("session", session.display().to_string()));
+    }
+    if let Some(progress) = &status.progress {
+        rows.push(("points", format!("{} of {} stored", progress.points_stored, progress.points_planned)));
+        rows.push(("pace", pace(progress)));
+        rows.push(("elapsed", duration(progress.elapsed_s)));
+    }
+    if let Some(vsync) = &status.vsync {
+        rows.push((
+            "vsync",
+            format!(
+                "{:.2} us, jitter {:.2} us; {} edges, {} missed, {} false",
+                vsync.period_us, vsync.jitter_us, vsync.edges, vsync.missed, vsync.false_edges
+            ),
+        ));
+    }
+    if let Some(error) = &status.error {
+        rows.push(("error", error.clone()));
+    }
+    block(&rows)
+}
+
+/// `check`
+pub(super) fn check(report: &CheckReport) -> String {
+    let (first, last) = report.reach_rows;
+    let mut rows = vec![
+        ("points", format!("{}, and {} of dark and regular images", report.points, report.extra_points)),
+        ("frames", report.frames.to_string()),
+        ("light", format!("at least {}", duration(report.light_s))),
+        ("memory", BinaryBytes(report.memory_bytes).to_string()),
+        (
+            "disk",
+            format!("{} of {} free", BinaryBytes(report.disk_bytes), BinaryBytes(report.disk_free_bytes)),
+        ),
+        ("reach", format!("relative rows {first} to {last}")),
+        ("condition", format!("{:.3e}", report.condition)),
+    ];
+    rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
+    block(&rows)
+}
+
+/// `sessions`
+pub(super) fn sessions(sessions: &[SessionInfo]) -> String {
+    if sessions.is_empty() {
+        return "no sessions".into();
+    }
+    let row = |session: &SessionInfo| {
+        let points = format!("{}/{}", session.stored, session.points);
+        let folder = session.session.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        [folder, session.state.clone(), points, session.name.clone()]
+    };
+    let mut rows = vec![["session", "state", "points", "name"].map(str::to_owned)];
+    rows.extend(sessions.iter().map(row));
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths = [width(0), width(1), width(2)];
+    let line = |[folder, state, points, name]: &[String; 4]| {
+        let [w0, w1, w2] = widths;
+        format!("{folder:w0$}  {state:w1$}  {points:>w2$}  {name}")
+    };
+    rows.iter().map(line).collect::<Vec<_>>().join("\n")
+}
+
+/// `describe`
+pub(super) fn description(description: &Description) -> String {
+    let mut lines = vec![format!("raysweepd {}", description.version), String::new(), "methods".into()];
+    lines.extend(description.methods.iter().map(|method| {
+        let role = match method.role {
+            Role::Observer => "observer",
+            Role::Operator => "operator",
+        };
+        format!("  {:10} {role:8}  {}", method.name, method.about)
+    }));
+    lines.extend([String::new(), "errors".into()]);
+    lines.extend(description.errors.iter().map(|error| format!("  {:6}  {}", error.code, error.meaning)));
+    let limits = &description.limits;
+    lines.extend([
+        String::new(),
+        format!("at most {} clients, requests of {} bytes", limits.clients, limits.message_bytes),
+    ]);
+    lines.join("\n")
+}
+
+/// How a run has ended.
+pub(super) fn ending(
+    session: &Path,
+    state: &str,
+    report: Option<&Path>,
+    stored: usize,
+    missing: usize,
+) -> String {
+    let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
+    lines.push(format!("session: {}", session.display()));
+    lines.extend(report.map(|report| format!("report: {}", report.display())));
+    if missing > 0 {
+        lines.push(format!("`raysweep resume {}` takes what is missing", name(session)));
+    }
+    lines.join("\n")
+}
+
+/// `process`
+pub(super) fn processed(made: &Processed) -> String {
+    let mut lines: Vec<_> = made.problems.iter().map(|problem| format!("not made: {problem}")).collect();
+    lines.push(format!("made from {} of {} points", made.stored, made.points));
+    lines.push(format!("report: {}", made.report.display()));
+    lines.join("\n")
+}
+
+/// Rate, losses and time left.
+pub(super) fn pace(progress: &Progress) -> String {
+    let left =
+        progress.left_s.map_or_else(|| "time left unknown".into(), |left| format!("{} left", duration(left)));
+    format!("{:.0} frames/s  {}  {left}", progress.frames_per_s, losses(&progress.counts))
+}
+
+/// Frames lost, by cause.
+pub(super) fn losses(counts: &Counts) -> String {
+    let causes: Vec<_> =
+        counts.lost.iter().map(|(cause, frames)| format!("{frames} {}", words(cause))).collect();
+    match causes.is_empty() {
+        true => "none lost".into(),
+        false => format!("{} lost ({})", counts.lost_total(), causes.join(", ")),
+    }
+}
+
+/// A state in a word or two.
+pub(super) fn state(state: RunState) -> &'static str {
+    match state {
+        RunState::Idle => "idle",
+        RunState::Preparing => "preparing",
+        RunState::Armed => "armed",
+        RunState::Running => "running",
+        RunState::Paused => "paused",
+        RunState::Draining => "finishing",
+        RunState::Faulted => "faulted",
+    }
+}
+
+/// A name as it stands in JSON, without its underscores.
+fn words(name: &impl serde::Serialize) -> String {
+    let json = serde_json::to_value(name).unwrap_or_default();
+    json.as_str().unwrap_or_default().replace('_', " ")
+}
+
+fn name(session: &Path) -> String {
+    session.file_name().unwrap_or(session.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Seconds as hours, minutes and seconds.
+fn duration(seconds: f64) -> String {
+    match Duration::try_from_secs_f64(seconds.ceil()) {
+        Ok(duration) => FormattedDuration(duration).to_string(),
+        Err(_) => "unknown".into(),
+    }
+}
+
+/// Rows of a word and what belongs to it.
+fn block(rows: &[(&str, String)]) -> String {
+    rows.iter().map(|(word, text)| format!("{word:10} {text}")).collect::<Vec<_>>().join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_core::LossCause;
+
+    use super::*;
+
+    #[test]
+    fn losses_are_told_by_cause() {
+        let mut counts = Counts::default();
+        assert_eq!(losses(&counts), "none lost");
+        counts.lose(LossCause::CameraGap, 3);
+        counts.lose(LossCause::Jitter, 1);
+        assert_eq!(losses(&counts), "4 lost (3 camera gap, 1 jitter)");
+    }
+
+    #[test]
+    fn no_time_is_too_strange_to_be_told() {
+        assert_eq!(duration(61.2), "00:01:02");
+        for strange in [-1.0, f64::NAN, f64::INFINITY, 1e300] {
+            assert_eq!(duration(strange), "unknown");
+        }
+    }
+
+    #[test]
+    fn an_unfinished_session_is_told_how_to_go_on() {
+        let folder = Path::new("/data/20260101-000000_corner");
+        let unfinished = ending(folder, "cancelled", None, 40, 35);
+        assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
+        let complete = ending(folder, "complete", Some(&folder.join("report.html")), 75, 0);
+        assert!(complete.ends_with("report.html") && !complete.contains("resume"), "{complete}");
+    }
+}

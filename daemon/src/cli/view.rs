@@ -1,0 +1,109 @@
+//! A run as it is seen: a bar on a terminal, lines elsewhere, JSON for programs.
+
+use std::io::{self, IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use raysweep_proto::{Event, Progress, RunState};
+
+use super::show;
+
+/// How often progress is told where it cannot be drawn.
+const PACE: Duration = Duration::from_secs(5);
+
+const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} points  {msg}";
+
+/// How a run's events are shown.
+pub(super) enum View {
+    /// Drawn on standard error.
+    Bar(ProgressBar),
+    /// Told on standard error, at times.
+    Lines {
+        /// When progress was last told.
+        told: Option<Instant>,
+    },
+    /// Each event as a line on standard output.
+    Json,
+}
+
+impl View {
+    /// The view that suits where we print.
+    pub fn new(json: bool) -> Self {
+        if json {
+            return Self::Json;
+        }
+        if !io::stderr().is_terminal() {
+            return Self::Lines { told: None };
+        }
+        let bar = ProgressBar::new(0);
+        if let Ok(style) = ProgressStyle::with_template(BAR) {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        Self::Bar(bar)
+    }
+
+    /// Shows an event; what a run came to goes to standard output, all else to standard error.
+    pub fn show(&mut self, event: &Event) -> io::Result<()> {
+        if let Self::Json = self {
+            return writeln!(io::stdout(), "{}", serde_json::to_string(event)?);
+        }
+        match event {
+            // How the run has ended is told in a moment.
+            Event::State { state: RunState::Idle | RunState::Faulted, .. } => {}
+            Event::State { state, .. } => self.state(*state),
+            Event::Progress(progress) => self.progress(progress),
+            // An attempt that a pause or a cancel cut short has lost nothing.
+            Event::Lost { counts, .. } if counts.lost_total() == 0 => {}
+            Event::Lost { point, attempt, counts } => {
+                let lost = show::losses(counts);
+                self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
+            }
+            Event::Vsync(_) => {}
+            Event::Finished { session, state, error, report, stored, missing } => {
+                if let Self::Bar(bar) = self {
+                    bar.finish_and_clear();
+                }
+                if let Some(error) = error {
+                    self.note(error);
+                }
+                let summary = show::ending(session, state, report.as_deref(), *stored, *missing);
+                writeln!(io::stdout(), "{summary}")?;
+            }
+            Event::Skipped { events } => {
+                self.note(&format!("{events} events were skipped: this end was too slow"))
+            }
+        }
+        Ok(())
+    }
+
+    /// Says something beside the run's events.
+    pub fn note(&mut self, text: &str) {
+        match self {
+            Self::Bar(bar) => bar.suspend(|| eprintln!("{text}")),
+            Self::Lines { .. } | Self::Json => eprintln!("{text}"),
+        }
+    }
+
+    fn state(&mut self, state: RunState) {
+        match self {
+            Self::Bar(bar) => bar.set_prefix(show::state(state)),
+            _ => self.note(show::state(state)),
+        }
+    }
+
+    fn progress(&mut self, progress: &Progress) {
+        let details = show::pace(progress);
+        match self {
+            Self::Bar(bar) => {
+                bar.set_length(progress.points_planned as u64);
+                bar.set_position(progress.points_stored as u64);
+                bar.set_message(details);
+            }
+            Self::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
+                *told = Some(Instant::now());
+                eprintln!("{}/{} points  {details}", progress.points_stored, progress.points_planned);
+            }
+            Self::Lines { .. } | Self::Json => {}
+        }
+    }
+}

@@ -1,0 +1,72 @@
+//! Rig and plan files: TOML with unknown keys refused and errors that point at the place in the text.
+
+mod plan;
+mod rig;
+
+use std::ops::Range;
+
+pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
+pub use rig::{CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
+
+/// What is wrong with a rig or plan file, and where.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{message}")]
+pub struct ConfigError {
+    /// Field, value, what is allowed.
+    pub message: String,
+    /// The field, where one is meant.
+    pub field: Option<String>,
+    /// Bytes of the text that it is about.
+    pub span: Option<Range<usize>>,
+}
+
+impl ConfigError {
+    /// An error about the value at a path of keys (`["sweep", "average"]`) of `text`.
+    pub(crate) fn at(text: &str, path: &[&str], message: impl Into<String>) -> Self {
+        Self { message: message.into(), field: Some(path.join(".")), span: span_of(text, path) }
+    }
+
+    pub(crate) fn parse(error: &toml::de::Error) -> Self {
+        Self { message: error.message().to_owned(), field: None, span: error.span() }
+    }
+
+    /// The error with the name of its file, the line and the line's text, for logs and plain output.
+    pub fn render(&self, file: &str, text: &str) -> String {
+        let Some(span) = self.span.clone().filter(|span| span.start <= text.len()) else {
+            return format!("{file}: {self}");
+        };
+        let line = text[..span.start].matches('\n').count();
+        let shown = text.lines().nth(line).unwrap_or_default();
+        format!("{file}, line {}: {self}\n  {shown}", line + 1)
+    }
+}
+
+/// Where the value at a path of keys stands, or the deepest table on the way to it.
+fn span_of(text: &str, path: &[&str]) -> Option<Range<usize>> {
+    let document = toml::de::DeTable::parse(text).ok()?;
+    let mut found = None;
+    let mut table = document.get_ref();
+    for key in path {
+        let Some((_, value)) = table.iter().find(|(name, _)| name.get_ref() == key) else { break };
+        found = Some(value.span());
+        match value.get_ref() {
+            toml::de::DeValue::Table(inner) => table = inner,
+            _ => break,
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spans_point_at_the_value_however_it_is_written() {
+        let text = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = 1, stop = 2, count = 0 }\n";
+        let span = span_of(text, &["sweep", "delay_us", "count"]).unwrap();
+        assert_eq!(&text[span], "0");
+        let table = span_of(text, &["sweep", "average"]).unwrap();
+        assert!(text[table].contains("[sweep]"));
+    }
+}

@@ -1,0 +1,238 @@
+//! `plan.toml`: what to acquire and what to make of it.
+
+use raysweep_pipeline::{Point, Role, Schedule};
+use serde::Deserialize;
+use serde_json::{Map, Value};
+
+use super::ConfigError;
+
+/// A plan.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Plan {
+    /// What kind of acquisition it is.
+    pub kind: PlanKind,
+    /// Names the session.
+    #[serde(default = "default_name")]
+    pub name: String,
+    /// `[sweep]`
+    #[serde(default)]
+    pub sweep: Sweep,
+    /// `[[stage]]`, in order; none: `demux`.
+    #[serde(default = "default_stages")]
+    pub stage: Vec<StageTable>,
+}
+
+/// The kinds of acquisition.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PlanKind {
+    /// A delay-exposure sweep of the plane rig.
+    Sweep,
+}
+
+/// `[sweep]`: the grid of delays and exposures; the defaults are the paper's.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Sweep {
+    /// t_d.
+    pub delay_us: Axis,
+    /// t_e.
+    pub exposure_us: Axis,
+    /// Frames averaged at each point.
+    pub average: u32,
+    /// Frames whose measured delay is further off do not count and are taken again.
+    pub max_jitter_us: f64,
+}
+
+impl Default for Sweep {
+    fn default() -> Self {
+        Self {
+            delay_us: Axis::Range { start: -1500.0, stop: 1500.0, count: 15 },
+            exposure_us: Axis::Range { start: 600.0, stop: 1200.0, count: 5 },
+            average: 8,
+            max_jitter_us: 50.0,
+        }
+    }
+}
+
+/// Values along one axis of the sweep.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "a list of numbers, or { start = .., stop = .., count = .. }",
+    deny_unknown_fields
+)]
+pub enum Axis {
+    /// These, in this order.
+    List(Vec<f64>),
+    /// Evenly spaced, both ends included.
+    Range {
+        /// First value.
+        start: f64,
+        /// Last value.
+        stop: f64,
+        /// How many.
+        count: usize,
+    },
+}
+
+impl Axis {
+    /// The values in order.
+    pub fn values(&self) -> Vec<f64> {
+        match *self {
+            Self::List(ref values) => values.clone(),
+            Self::Range { start, count: 1, .. } => vec![start],
+            Self::Range { start, stop, count } => {
+                (0..count).map(|k| start + (stop - start) * k as f64 / (count - 1) as f64).collect()
+            }
+        }
+    }
+
+    fn len(&self) -> usize {
+        match self {
+            Self::List(values) => values.len(),
+            Self::Range { count, .. } => *count,
+        }
+    }
+}
+
+/// One `[[stage]]`: its name and the options that the stage itself reads.
+#[derive(Debug, Clone, Deserialize)]
+pub struct StageTable {
+    /// The name it is registered by.
+    pub name: String,
+    /// Everything else in its table.
+    #[serde(flatten)]
+    pub options: Map<String, Value>,
+}
+
+fn default_name() -> String {
+    "sweep".into()
+}
+
+fn default_stages() -> Vec<StageTable> {
+    vec![StageTable { name: "demux".into(), options: Map::new() }]
+}
+
+/// Most values along an axis.
+const MAX_AXIS: usize = 1024;
+/// Most points of a sweep.
+const MAX_POINTS: usize = 8192;
+/// Most frames of a point: their sum fits 32 bits at 16 bits a pixel.
+const MAX_AVERAGE: u32 = 65_536;
+
+impl Plan {
+    /// Reads a plan.
+    ///
+    /// # Errors
+    /// With the place in the text, for anything that is not a plan that can be run.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let plan: Self = toml::from_str(text).map_err(|error| ConfigError::parse(&error))?;
+        plan.check(text)?;
+        Ok(plan)
+    }
+
+    fn check(&self, text: &str) -> Result<(), ConfigError> {
+        let sweep = &self.sweep;
+        if self.name.trim().is_empty() {
+            return Err(ConfigError::at(text, &["name"], "name is empty: give the session a name"));
+        }
+        for (key, axis) in [("delay_us", &sweep.delay_us), ("exposure_us", &sweep.exposure_us)] {
+            if !(1..=MAX_AXIS).contains(&axis.len()) {
+                let message = format!("sweep.{key} has {} values: 1 to {MAX_AXIS} are allowed", axis.len());
+                return Err(ConfigError::at(text, &["sweep", key, "count"], message));
+            }
+            if let Some(value) = axis.values().into_iter().find(|value| !value.is_finite()) {
+                let message = format!("sweep.{key} contains {value}: give finite microseconds");
+                return Err(ConfigError::at(text, &["sweep", key], message));
+            }
+        }
+        if let Some(value) = sweep.exposure_us.values().into_iter().find(|&exposure_us| exposure_us <= 0.0) {
+            let message = format!("sweep.exposure_us contains {value}: exposures are longer than 0 us");
+            return Err(ConfigError::at(text, &["sweep", "exposure_us"], message));
+        }
+        let points = sweep.delay_us.len() * sweep.exposure_us.len();
+        if points > MAX_POINTS {
+            let message =
+                format!("the sweep has {points} points: at most {MAX_POINTS} are allowed; split it");
+            return Err(ConfigError::at(text, &["sweep"], message));
+        }
+        if !(1..=MAX_AVERAGE).contains(&sweep.average) {
+            let message = format!("sweep.average = {}: 1 to {MAX_AVERAGE} frames are allowed", sweep.average);
+            return Err(ConfigError::at(text, &["sweep", "average"], message));
+        }
+        if !(sweep.max_jitter_us > 0.0 && sweep.max_jitter_us.is_finite()) {
+            let message =
+                format!("sweep.max_jitter_us = {}: give microseconds greater than 0", sweep.max_jitter_us);
+            return Err(ConfigError::at(text, &["sweep", "max_jitter_us"], message));
+        }
+        Ok(())
+    }
+
+    /// The points of the plan: dark images of each exposure, the regular image, then the sweep with the exposure in
+    /// the outer loop, because some cameras take long to change it.
+    pub fn schedule(&self, period_us: f64) -> Schedule {
+        let frames = self.sweep.average;
+        let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames };
+        let exposures = self.sweep.exposure_us.values();
+        let delays = self.sweep.delay_us.values();
+
+        let mut dark_exposures: Vec<f64> = Vec::new();
+        for &exposure_us in exposures.iter().chain([&period_us]) {
+            if !dark_exposures.contains(&exposure_us) {
+                dark_exposures.push(exposure_us);
+            }
+        }
+        let mut points: Vec<Point> =
+            (0..).zip(&dark_exposures).map(|(index, &us)| point(Role::Dark(index), 0.0, us)).collect();
+        points.push(point(Role::Regular, 0.0, period_us));
+        let grid = exposures
+            .iter()
+            .flat_map(|&exposure_us| delays.iter().map(move |&delay_us| (delay_us, exposure_us)));
+        points.extend(
+            (0..)
+                .zip(grid)
+                .map(|(index, (delay_us, exposure_us))| point(Role::Sweep(index), delay_us, exposure_us)),
+        );
+        Schedule { points }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_key_but_kind_has_a_default_and_it_is_the_papers_sweep() {
+        let plan = Plan::parse("kind = \"sweep\"").unwrap();
+        let schedule = plan.schedule(16_667.0);
+        assert_eq!(schedule.sweep_len(), 75);
+        assert_eq!(schedule.dark_len(), 6);
+        let sweep: Vec<_> = schedule.points.iter().filter(|p| matches!(p.role, Role::Sweep(_))).collect();
+        assert_eq!((sweep[0].delay_us, sweep[0].exposure_us), (-1500.0, 600.0));
+        assert_eq!((sweep[14].delay_us, sweep[15].exposure_us), (1500.0, 750.0));
+        assert_eq!(plan.stage[0].name, "demux");
+    }
+
+    #[test]
+    fn bad_plans_are_refused_with_field_and_place() {
+        let cases = [
+            ("kind = \"swep\"", "sweep"),
+            ("kind = \"sweep\"\naverage = 8", "unknown field"),
+            ("kind = \"sweep\"\n[sweep]\naverage = 0", "1 to 65536"),
+            ("kind = \"sweep\"\n[sweep]\ndelay_us = { start = 0, stop = 1, count = 0 }", "1 to 1024"),
+            ("kind = \"sweep\"\n[sweep]\ndelay_us = { start = 0, stop = 1 }", "list of numbers"),
+            ("kind = \"sweep\"\n[sweep]\nexposure_us = [0]", "longer than 0"),
+            ("kind = \"sweep\"\n[sweep]\ndelay_us = [nan]", "finite"),
+            ("kind = \"sweep\"\n[sweep]\nmax_jitter_us = -1", "greater than 0"),
+            ("kind = \"sweep\"\nname = \"  \"", "empty"),
+            ("kind = \"sweep\"\n[[stage]]\nprior = \"split\"", "name"),
+        ];
+        for (text, expected) in cases {
+            let error = Plan::parse(text).unwrap_err();
+            assert!(error.message.contains(expected), "{text:?}: {}", error.message);
+            assert!(error.span.is_some(), "{text:?} has no place");
+        }
+    }
+}

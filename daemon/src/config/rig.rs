@@ -1,0 +1,229 @@
+//! `rig.toml`: what the rig is made of and what is known of its timing.
+
+use raysweep_core::{PixelFormat, Raster};
+use raysweep_sim::SimConfig;
+use serde::Deserialize;
+
+use super::ConfigError;
+
+/// A rig.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RigFile {
+    /// Which of the rigs it is.
+    pub kind: RigKind,
+    /// `[camera]`
+    pub camera: CameraSection,
+    /// `[vsync]`
+    pub vsync: VsyncSection,
+    /// `[projector]`
+    pub projector: ProjectorSection,
+    /// `[sim]`, for the driver `sim`.
+    #[serde(default)]
+    pub sim: SimConfig,
+}
+
+/// The kinds of rigs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RigKind {
+    /// Raster projector and rolling-shutter camera.
+    Plane,
+}
+
+/// Drivers by the names that rig files use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Driver {
+    /// The simulated rig.
+    Sim,
+}
+
+/// `[camera]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraSection {
+    /// Which driver opens it.
+    pub driver: Driver,
+    /// Counts, above black, of a white pixel in the time of one projector row.
+    #[serde(default = "default_white_dn")]
+    pub white_dn: f64,
+    /// Counts without light.
+    #[serde(default = "default_black_dn")]
+    pub black_dn: f64,
+    /// How frames are packed.
+    #[serde(default = "default_pixel_format")]
+    pub pixel_format: PixelFormat,
+    /// From the start of one row's exposure to the next row's; left out: the projector's row time, as rectified.
+    pub row_time_us: Option<f64>,
+    /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
+    pub first_projector_row: Option<usize>,
+}
+
+/// `[vsync]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct VsyncSection {
+    /// Which driver watches the line.
+    pub driver: Driver,
+    /// From one edge to the next.
+    #[serde(default = "default_period_us")]
+    pub period_us: f64,
+    /// An edge this far from where the one before puts it is not the projector's.
+    #[serde(default = "default_gate_us")]
+    pub gate_us: f64,
+}
+
+/// `[projector]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProjectorSection {
+    /// Which driver shows pictures.
+    pub driver: Driver,
+    /// Rows that it draws.
+    #[serde(default = "default_rows")]
+    pub rows: usize,
+    /// From one row to the next.
+    #[serde(default = "default_row_time_us")]
+    pub row_time_us: f64,
+    /// From the VSYNC edge to the start of row 0.
+    #[serde(default = "default_first_row_us")]
+    pub first_row_us: f64,
+}
+
+fn default_white_dn() -> f64 {
+    2500.0
+}
+fn default_black_dn() -> f64 {
+    64.0
+}
+fn default_pixel_format() -> PixelFormat {
+    PixelFormat::Mono12
+}
+fn default_period_us() -> f64 {
+    16_666.667
+}
+fn default_gate_us() -> f64 {
+    500.0
+}
+fn default_rows() -> usize {
+    720
+}
+/// 720p60 with its 750 lines.
+fn default_row_time_us() -> f64 {
+    22.22
+}
+/// 720p60: 5 lines of VSYNC and 20 of back porch.
+fn default_first_row_us() -> f64 {
+    555.5
+}
+
+/// Largest number of rows a raster projector is taken to have.
+const MAX_ROWS: usize = 8192;
+
+impl RigFile {
+    /// Reads a rig file.
+    ///
+    /// # Errors
+    /// With the place in the text, for anything that is not a rig.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let rig: Self = toml::from_str(text).map_err(|error| ConfigError::parse(&error))?;
+        rig.check(text)?;
+        Ok(rig)
+    }
+
+    /// When the projector lights its rows.
+    pub fn raster(&self) -> Raster {
+        Raster {
+            rows: self.projector.rows,
+            row_time_us: self.projector.row_time_us,
+            first_row_us: self.projector.first_row_us,
+            period_us: self.vsync.period_us,
+        }
+    }
+
+    /// The camera's row time: as stated, or the projector's.
+    pub fn camera_row_time_us(&self) -> f64 {
+        self.camera.row_time_us.unwrap_or(self.projector.row_time_us)
+    }
+
+    fn check(&self, text: &str) -> Result<(), ConfigError> {
+        let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
+        let max_dn = f64::from(camera.pixel_format.max_value());
+        let rules: [(&[&str], f64, f64, f64); 8] = [
+            (&["camera", "white_dn"], camera.white_dn, 1.0, max_dn),
+            (&["camera", "black_dn"], camera.black_dn, 0.0, max_dn / 2.0),
+            (&["camera", "row_time_us"], self.camera_row_time_us(), 0.1, 10_000.0),
+            (&["vsync", "period_us"], vsync.period_us, 100.0, 1e6),
+            (&["vsync", "gate_us"], vsync.gate_us, 1.0, vsync.period_us / 4.0),
+            (&["projector", "rows"], projector.rows as f64, 1.0, MAX_ROWS as f64),
+            (&["projector", "row_time_us"], projector.row_time_us, 0.1, 10_000.0),
+            (&["projector", "first_row_us"], projector.first_row_us, 0.0, vsync.period_us),
+        ];
+        for (path, value, low, high) in rules {
+            if !(low..=high).contains(&value) {
+                let message = format!("{} = {value}: allowed is {low} to {high}", path.join("."));
+                return Err(ConfigError::at(text, path, message));
+            }
+        }
+        let lit_us = projector.rows as f64 * projector.row_time_us;
+        if projector.first_row_us + lit_us > vsync.period_us {
+            let message = format!(
+                "projector.rows x row_time_us + first_row_us = {:.1} us is longer than vsync.period_us = {}: a frame's rows must be drawn before the next edge; lower rows, row_time_us or first_row_us",
+                projector.first_row_us + lit_us,
+                vsync.period_us
+            );
+            return Err(ConfigError::at(text, &["projector", "row_time_us"], message));
+        }
+        if (self.camera_row_time_us() - projector.row_time_us).abs() > 1e-3 * projector.row_time_us {
+            let message = format!(
+                "camera.row_time_us = {} differs from projector.row_time_us = {}: the rows must run at the same speed; set the camera's pixel clock or lens so that they do",
+                self.camera_row_time_us(),
+                projector.row_time_us
+            );
+            return Err(ConfigError::at(text, &["camera", "row_time_us"], message));
+        }
+        if camera.first_projector_row.is_some_and(|row| row >= projector.rows) {
+            let message = format!(
+                "camera.first_projector_row = {}: allowed is 0 to {}",
+                camera.first_projector_row.unwrap_or_default(),
+                projector.rows - 1
+            );
+            return Err(ConfigError::at(text, &["camera", "first_projector_row"], message));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MINIMAL: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n";
+
+    #[test]
+    fn every_key_but_kind_and_drivers_has_a_default() {
+        let rig = RigFile::parse(MINIMAL).unwrap();
+        assert_eq!(rig.raster().rows, 720);
+        assert_eq!(rig.camera_row_time_us(), 22.22);
+    }
+
+    #[test]
+    fn bad_rigs_are_refused_with_field_and_place() {
+        let cases = [
+            (MINIMAL.replace("\"plane\"", "\"plan\""), "plane"),
+            (MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"fx3\""), "sim"),
+            (MINIMAL.replace("[vsync]\n", "[vsync]\nperiod_us = 5\n"), "vsync.period_us = 5"),
+            (MINIMAL.replace("[camera]\n", "[camera]\ngain = 3\n"), "gain"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nwhite_dn = 5000\n"), "4095"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nrow_time_us = 30\n"), "same speed"),
+            (MINIMAL.replace("[projector]\n", "[projector]\nrows = 1000\n"), "longer than"),
+            (format!("{MINIMAL}[sim.camera]\nlate_frames = 3\n"), "late_frames"),
+        ];
+        for (text, expected) in cases {
+            let error = RigFile::parse(&text).unwrap_err();
+            assert!(error.message.contains(expected), "{text:?}: {}", error.message);
+            assert!(error.span.is_some(), "{text:?} has no place");
+        }
+    }
+}

@@ -1,0 +1,104 @@
+//! Offline: products made again from what a session holds, and sessions copied out for others.
+
+use std::path::{Path, PathBuf};
+
+use raysweep_pipeline::Registry;
+use raysweep_session::Session;
+use raysweep_session::stack::ArrayName;
+
+use crate::config::{Plan, RigFile};
+use crate::processing::Task;
+use crate::results;
+
+/// Why a session cannot be processed.
+#[derive(Debug, thiserror::Error)]
+pub enum ProcessError {
+    /// The session cannot be read or written.
+    #[error(transparent)]
+    Session(#[from] raysweep_session::Error),
+    /// Its plan or rig file cannot be read.
+    #[error("{0}")]
+    Config(String),
+    /// A file cannot be copied.
+    #[error("cannot copy to {}: {source}", path.display())]
+    Copy {
+        /// Where to.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+}
+
+/// What was made.
+#[derive(Debug, Clone)]
+pub struct Processed {
+    /// The report.
+    pub report: PathBuf,
+    /// Points of the sweep that went into it.
+    pub stored: usize,
+    /// Points of the sweep.
+    pub points: usize,
+    /// What could not be made, and why.
+    pub problems: Vec<String>,
+}
+
+/// Makes the products of a session again, with the plan and the rig file that lie in it: the same bits as the run's.
+///
+/// # Errors
+/// When the session is being written by a run, or cannot be read.
+pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
+    let session = Session::open(dir)?;
+    let ledger = session.resume()?;
+    let read = |path: PathBuf| {
+        std::fs::read_to_string(&path)
+            .map(|text| (path.clone(), text))
+            .map_err(|error| ProcessError::Config(format!("cannot read {}: {error}", path.display())))
+    };
+    let (plan_path, plan_text) = read(session.plan_path())?;
+    let (rig_path, rig_text) = read(session.rig_path())?;
+    let plan = Plan::parse(&plan_text)
+        .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
+    let rig = RigFile::parse(&rig_text)
+        .map_err(|error| ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text)))?;
+    let state = ledger.state();
+    let shape = state.session.shape;
+    let task = Task::new(plan, &rig, state.session.first_row, (shape.rows, shape.columns));
+    let mut processing = task
+        .processing(&Registry::default(), &plan_text)
+        .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
+    let failed = processing.feed_stored(&task, state, &session.stack()?)?;
+    let (products, mut problems) = processing.finish();
+    problems.extend(failed.iter().map(ToString::to_string));
+    results::write_products(&session, &task, &products)?;
+    results::write_report(&session, state, &task, &products, &problems)?;
+    results::write_manifest(&session, state, &task, &rig)?;
+    Ok(Processed {
+        report: session.report_path(),
+        stored: state.stored(ArrayName::Sum).count(),
+        points: shape.points,
+        problems,
+    })
+}
+
+/// Copies a session's products, report and manifest into `to`, a folder that is made and must not exist.
+///
+/// # Errors
+/// When the session cannot be read or `to` cannot be written.
+pub fn export(dir: &Path, to: &Path) -> Result<usize, ProcessError> {
+    let session = Session::open(dir)?;
+    std::fs::create_dir(to).map_err(|source| ProcessError::Copy { path: to.to_owned(), source })?;
+    let mut files =
+        vec![session.report_path(), session.manifest_path(), session.plan_path(), session.rig_path()];
+    if let Ok(products) = std::fs::read_dir(session.products_path()) {
+        files.extend(products.flatten().map(|entry| entry.path()));
+    }
+    files.push(session.ledger_path());
+    let mut copied = 0;
+    for file in files.iter().filter(|file| file.is_file()) {
+        let Some(name) = file.file_name() else { continue };
+        let target = to.join(name);
+        std::fs::copy(file, &target).map_err(|source| ProcessError::Copy { path: target, source })?;
+        copied += 1;
+    }
+    Ok(copied)
+}

@@ -1,0 +1,383 @@
+//! The report of a sweep: what was taken, what came out, and how far to trust it.
+
+use std::collections::BTreeMap;
+
+use ndarray::{Array2, ArrayView2, Axis};
+use raysweep_pipeline::{Product, Role};
+use raysweep_session::ledger::{PointEntry, State};
+use raysweep_session::report::{
+    Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table,
+    ToneMap,
+};
+use raysweep_session::stack::{ArrayName, Stack};
+use raysweep_session::{Result, Session};
+use raysweep_transport::plane::Transport;
+
+use crate::processing::{Task, place};
+
+/// Share of pixels, in percent, that a picture's scale does not overexpose.
+const PERCENTILE: f64 = 99.5;
+
+/// The same for the stack's indirect light, which is far dimmer and fills more of its images.
+const INDIRECT_PERCENTILE: f64 = 70.0;
+
+/// Makes the report of a session.
+///
+/// # Errors
+/// When the stack cannot be read.
+pub fn make(
+    session: &Session,
+    state: &State,
+    task: &Task,
+    products: &[Product],
+    problems: &[String],
+) -> Result<Report> {
+    let stack = session.stack()?;
+    let transport = products.iter().find_map(|product| match product {
+        Product::Transport(transport) => Some(&**transport),
+        _ => None,
+    });
+    let markers = transport.map(mark).unwrap_or_default();
+    let sweep = SweepImages { task, state, stack: &stack };
+    let mut sections = Vec::new();
+    if !problems.is_empty() {
+        let blocks = problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone())).collect();
+        sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
+    }
+    if let Some(transport) = transport {
+        sections.push(images(products, transport, &markers));
+        sections.push(profiles(&sweep, transport, &markers)?);
+    }
+    sections.push(sweep.contact_sheet()?);
+    sections.push(trust(state, task, products));
+    Ok(Report {
+        title: state.session.name.clone(),
+        subtitle: subtitle(state, session),
+        facts: facts(state, task),
+        sections,
+    })
+}
+
+fn subtitle(state: &State, session: &Session) -> String {
+    let entry = &state.session;
+    let parts = [
+        Some(entry.created.strftime("%Y-%m-%d %H:%M UTC").to_string()),
+        entry.operator.as_ref().map(|operator| format!("by {operator}")),
+        entry.sample.as_ref().map(|sample| format!("sample {sample}")),
+        (!entry.tags.is_empty()).then(|| entry.tags.join(", ")),
+        entry.note.clone(),
+        session.dir().file_name().map(|name| name.to_string_lossy().into_owned()),
+    ];
+    parts.into_iter().flatten().collect::<Vec<_>>().join(" · ")
+}
+
+fn facts(state: &State, task: &Task) -> Vec<(String, String)> {
+    let sweep = &task.plan.sweep;
+    let range = |values: Vec<f64>| match (values.first(), values.last()) {
+        (Some(first), Some(last)) => format!("{first:.0} … {last:.0} µs in {}", values.len()),
+        _ => String::new(),
+    };
+    let stored = state.stored(ArrayName::Sum).count();
+    let lost = state.counts.lost_total();
+    [
+        ("delay", range(sweep.delay_us.values())),
+        ("exposure", range(sweep.exposure_us.values())),
+        ("frames averaged", sweep.average.to_string()),
+        ("points stored", format!("{stored} of {}", state.session.shape.points)),
+        ("camera", format!("{} × {} px", state.session.shape.columns, state.session.shape.rows)),
+        ("frames lost", lost.to_string()),
+    ]
+    .map(|(key, value)| (key.to_owned(), value))
+    .to_vec()
+}
+
+/// Pixels worth a look: the brightest of each kind of light.
+fn mark(transport: &Transport) -> Vec<Marker> {
+    let beyond = |near: i32| {
+        let total = transport.total();
+        let inside = transport.band(-near..=near);
+        total - inside
+    };
+    let kinds = [
+        transport.epipolar(1),
+        transport.band(-4..=4) - transport.epipolar(1),
+        transport.band(-20..=20) - transport.band(-4..=4),
+        beyond(20),
+    ];
+    let mut markers: Vec<Marker> = Vec::new();
+    for image in &kinds {
+        let brightest = image
+            .indexed_iter()
+            .filter(|((t, s), _)| {
+                // Far enough from the others to be told apart in the picture.
+                let apart = image.nrows().min(image.ncols()) / 10;
+                markers.iter().all(|marker| marker.row.abs_diff(*t).max(marker.column.abs_diff(*s)) > apart)
+            })
+            .max_by(|a, b| a.1.total_cmp(b.1));
+        if let Some(((row, column), _)) = brightest {
+            markers.push(Marker { label: (markers.len() + 1).to_string(), row, column });
+        }
+    }
+    markers
+}
+
+fn images(products: &[Product], transport: &Transport, markers: &[Marker]) -> Section {
+    let mut pictures = Vec::new();
+    for wanted in ["regular", "epipolar", "non_epipolar"] {
+        for product in products {
+            if let Product::Image { name, about, image } = product
+                && *name == wanted
+            {
+                pictures.push(
+                    picture(image, &format!("{}: {about}", name.replace('_', "-")))
+                        .with_markers(markers.to_vec()),
+                );
+            }
+        }
+    }
+    let short = transport.band(-10..=10) - transport.epipolar(1);
+    let long = transport.non_epipolar(21);
+    pictures.push(picture(&short, "short range: light from 1 to 10 rows away"));
+    pictures.push(picture(&long, "long range: light from more than 10 rows away"));
+    Section {
+        title: "Light by where it came from".into(),
+        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below.".into(),
+        blocks: vec![Block::Pictures(pictures)],
+    }
+}
+
+fn picture(image: &Array2<f32>, caption: &str) -> Picture {
+    Picture::grey(image.view(), ToneMap::percentile(&[image.view()], PERCENTILE)).with_caption(caption)
+}
+
+fn profiles(sweep: &SweepImages<'_>, transport: &Transport, markers: &[Marker]) -> Result<Section> {
+    let exposure_us = sweep.task.plan.sweep.exposure_us.values().into_iter().fold(f64::INFINITY, f64::min);
+    let images = sweep.at_exposure(exposure_us)?;
+    let delay = markers.iter().map(|marker| {
+        let points =
+            images.iter().map(|(delay_us, image)| (*delay_us, f64::from(image[[marker.row, marker.column]])));
+        Series::line(
+            format!("pixel {} (t {}, s {})", marker.label, marker.row, marker.column),
+            points.collect(),
+        )
+    });
+    let delay = Plot {
+        title: format!("Delay profiles at an exposure of {exposure_us:.0} µs"),
+        x_label: "delay t_d / µs".into(),
+        y_label: "light".into(),
+        series: delay.collect(),
+        guides: Vec::new(),
+    };
+    let rows = markers.iter().map(|marker| {
+        let profile = transport.t.index_axis(Axis(2), marker.column).index_axis_move(Axis(1), marker.row);
+        let points = profile.iter().enumerate().map(|(index, &light)| {
+            (f64::from(transport.u_min) + index as f64, f64::from(light.max(1e-5)).log10())
+        });
+        Series::line(format!("pixel {}", marker.label), points.collect())
+    });
+    let rows = Plot {
+        title: "Transport over relative projector rows".into(),
+        x_label: "u = v − t / rows".into(),
+        y_label: "log10 of light".into(),
+        series: rows.collect(),
+        guides: Vec::new(),
+    };
+    Ok(Section {
+        title: "Profiles of the marked pixels".into(),
+        intro: "Left: what the camera saw over the delay. Right: what demultiplexing makes of all images: the light from each projector row.".into(),
+        blocks: vec![Block::Plots(vec![delay, rows])],
+    })
+}
+
+/// The sweep's images, read from the stack when they are needed.
+struct SweepImages<'a> {
+    task: &'a Task,
+    state: &'a State,
+    stack: &'a Stack,
+}
+
+impl SweepImages<'_> {
+    /// A point's image minus its dark image, in the scene's units.
+    fn light(&self, role: Role) -> Result<Option<Array2<f32>>> {
+        let Some(point) = self.task.schedule.points.iter().find(|point| point.role == role) else {
+            return Ok(None);
+        };
+        let dark =
+            self.task.schedule.dark_of(point.exposure_us).map(|dark| self.mean(dark)).transpose()?.flatten();
+        let Some((image, dark)) = self.mean(role)?.zip(dark) else { return Ok(None) };
+        Ok(Some((image - dark) / self.task.geometry.white_dn as f32))
+    }
+
+    fn mean(&self, role: Role) -> Result<Option<Array2<f32>>> {
+        let (array, index) = place(role);
+        let Some(entry) = self.state.point(array, index) else { return Ok(None) };
+        let sum = self.stack.read_point(array, index)?;
+        Ok(Some(sum.mapv(|sum| sum as f32 / entry.frames as f32)))
+    }
+
+    fn at_exposure(&self, exposure_us: f64) -> Result<Vec<(f64, Array2<f32>)>> {
+        let mut images = Vec::new();
+        for point in &self.task.schedule.points {
+            if matches!(point.role, Role::Sweep(_))
+                && point.exposure_us == exposure_us
+                && let Some(image) = self.light(point.role)?
+            {
+                images.push((point.delay_us, image));
+            }
+        }
+        Ok(images)
+    }
+
+    fn contact_sheet(&self) -> Result<Section> {
+        let (delays, exposures) =
+            (self.task.plan.sweep.delay_us.values(), self.task.plan.sweep.exposure_us.values());
+        let mut lights = Vec::new();
+        for index in 0..(delays.len() * exposures.len()) as u32 {
+            lights.push(self.light(Role::Sweep(index))?);
+        }
+        let views: Vec<ArrayView2<'_, f32>> = lights.iter().flatten().map(|image| image.view()).collect();
+        let label = |value: &f64| format!("{value:.0}");
+        let sheet = |tone_map| ContactSheet {
+            column_title: "delay / µs".into(),
+            columns: delays.iter().map(label).collect(),
+            row_title: "exposure / µs".into(),
+            rows: exposures.iter().map(label).collect(),
+            pictures: lights
+                .iter()
+                .map(|image| image.as_ref().map(|image| Picture::thumbnail(image.view(), tone_map)))
+                .collect(),
+        };
+        Ok(Section {
+            title: "The stack".into(),
+            intro: "Every image of the sweep, dark image subtracted. A camera row collects the light of projector rows that lie delay / row time below its own, over a band as wide as the exposure. The second sheet is exposed for the indirect light.".into(),
+            blocks: vec![
+                Block::ContactSheet(sheet(ToneMap::percentile(&views, PERCENTILE))),
+                Block::ContactSheet(sheet(ToneMap::percentile(&views, INDIRECT_PERCENTILE))),
+            ],
+        })
+    }
+}
+
+fn trust(state: &State, task: &Task, products: &[Product]) -> Section {
+    let mut blocks = Vec::new();
+    let figures: Vec<(String, String)> = products
+        .iter()
+        .filter_map(|product| match product {
+            Product::Figure { name, value } => Some(((*name).to_owned(), short(*value))),
+            _ => None,
+        })
+        .collect();
+    if !figures.is_empty() {
+        blocks.push(Block::Facts(figures));
+    }
+    let counts = &state.counts;
+    let mut rows = vec![
+        vec!["expected triggers".to_owned(), counts.expected.to_string()],
+        vec!["averaged".into(), counts.averaged.to_string()],
+        vec!["settling".into(), counts.settling.to_string()],
+        vec!["cancelled".into(), counts.cancelled.to_string()],
+    ];
+    for (cause, frames) in &counts.lost {
+        let cause = serde_json::to_value(cause)
+            .ok()
+            .and_then(|value| value.as_str().map(|name| name.replace('_', " ")));
+        rows.push(vec![format!("lost: {}", cause.unwrap_or_default()), frames.to_string()]);
+    }
+    blocks.push(Block::Table(Table { headers: vec!["frames".into(), "count".into()], rows }));
+    if !counts.balanced() {
+        blocks.push(Block::Note(
+            NoteLevel::Error,
+            "The frames do not add up to the expected triggers: this is a defect.".into(),
+        ));
+    }
+    if let Some(vsync) = state.end.as_ref().and_then(|end| end.vsync) {
+        blocks.push(Block::Facts(
+            [
+                ("VSYNC period", format!("{:.3} µs", vsync.period_us)),
+                ("period jitter (sigma)", format!("{:.2} µs", vsync.jitter_us)),
+                (
+                    "edges seen / missed / false",
+                    format!("{} / {} / {}", vsync.edges, vsync.missed, vsync.false_edges),
+                ),
+            ]
+            .map(|(key, value)| (key.to_owned(), value))
+            .to_vec(),
+        ));
+    }
+    blocks.push(Block::Plots(jitter(state)));
+    if let Some(note) = regular_note(products) {
+        blocks.push(note);
+    }
+    let sweep = &task.plan.sweep;
+    Section {
+        title: "How far to trust it".into(),
+        intro: format!(
+            "Every frame is tied to the VSYNC edge of its light; a frame further than {:.0} µs from the wanted delay was taken again. The model uses the measured delays.",
+            sweep.max_jitter_us
+        ),
+        blocks,
+    }
+}
+
+/// A number with four decimals at the most.
+fn short(value: f64) -> String {
+    format!("{value:.4}").trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+/// How far the delays of single frames lay from those wanted: over time, and how often.
+fn jitter(state: &State) -> Vec<Plot> {
+    let deviation = |point: &PointEntry| {
+        let delay_us = point.delay_us;
+        point.delays_us.iter().map(move |true_us| true_us - delay_us).collect::<Vec<_>>()
+    };
+    let deviations_us: Vec<f64> = state.stored(ArrayName::Sum).flat_map(deviation).collect();
+    let mut histogram: BTreeMap<i64, f64> = BTreeMap::new();
+    for us in &deviations_us {
+        *histogram.entry(us.round() as i64).or_default() += 1.0;
+    }
+    let plot = |title: &str, x: &str, y: &str, style, points| Plot {
+        title: title.into(),
+        x_label: x.into(),
+        y_label: y.into(),
+        series: vec![Series { name: "frames".into(), style, points }],
+        guides: Vec::new(),
+    };
+    vec![
+        plot(
+            "Delay of each frame, measured minus wanted",
+            "frame of the sweep",
+            "deviation / µs",
+            SeriesStyle::Dots,
+            deviations_us.iter().enumerate().map(|(index, &us)| (index as f64, us)).collect(),
+        ),
+        plot(
+            "How often each deviation occurred",
+            "deviation / µs",
+            "frames",
+            SeriesStyle::Bars,
+            histogram.into_iter().map(|(us, frames)| (us as f64, frames)).collect(),
+        ),
+    ]
+}
+
+fn regular_note(products: &[Product]) -> Option<Block> {
+    let ratio = products.iter().find_map(|product| match product {
+        Product::Figure { name, value } if *name == "predicted / captured regular light" => Some(*value),
+        _ => None,
+    })?;
+    let off_percent = (ratio - 1.0) * 100.0;
+    let (level, verdict) = if off_percent.abs() <= 2.0 {
+        (NoteLevel::Info, "the circle closes")
+    } else {
+        (
+            NoteLevel::Warning,
+            "more than 2 %: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
+        )
+    };
+    Some(Block::Note(
+        level,
+        format!(
+            "Summed over all rows, the transport predicts the regular image within {off_percent:+.2} %: {verdict}."
+        ),
+    ))
+}

@@ -1,0 +1,125 @@
+//! From products to files.
+
+use std::collections::BTreeMap;
+
+use raysweep_pipeline::{Product, Role, Schedule};
+use raysweep_session::ledger::{EndState, State};
+use raysweep_session::{Result, Session, manifest, transport};
+use serde_json::{Map, Value, json};
+
+use crate::config::RigFile;
+use crate::processing::Task;
+use crate::report;
+
+/// A run's end in a word.
+pub fn name_of(state: EndState) -> &'static str {
+    match state {
+        EndState::Complete => "complete",
+        EndState::Cancelled => "cancelled",
+        EndState::Faulted => "faulted",
+    }
+}
+
+/// Writes images (EXR, NPY) and the transport (NPY, Zarr).
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> Result<()> {
+    let files = session.products();
+    for product in products {
+        match product {
+            Product::Image { name, about, image } => {
+                let mut metadata = common(task);
+                metadata.insert("axes".into(), json!(["t", "s"]));
+                metadata.insert("about".into(), json!(about));
+                files.image(name, image.view(), &metadata)?;
+            }
+            Product::Transport(found) => {
+                let mut metadata = common(task);
+                metadata.insert("axes".into(), json!(["u", "t", "s"]));
+                metadata.insert("u_min".into(), json!(found.u_min));
+                metadata.insert("u_max".into(), json!(found.u_max()));
+                metadata.insert(
+                    "about".into(),
+                    json!("light from projector row v = t + first_row + u to camera pixel (t, s); 0 where the projector has no such row"),
+                );
+                files.volume("transport", found.t.view(), &metadata)?;
+                transport::write(&session.transport_path(), found.t.view(), &metadata)?;
+            }
+            Product::Figure { .. } => {}
+        }
+    }
+    Ok(())
+}
+
+/// What every product says of itself.
+fn common(task: &Task) -> Map<String, Value> {
+    let geometry = &task.geometry;
+    let prior = task.plan.stage.iter().find(|stage| stage.name == "demux");
+    let entries = [
+        ("units", json!("1 = a white pixel lit by its own projector row")),
+        ("plan", json!(task.plan.name)),
+        ("demux", json!(prior.map(|stage| &stage.options))),
+        ("row_time_us", json!(geometry.raster.row_time_us)),
+        ("first_row", json!(geometry.first_row)),
+        ("white_dn", json!(geometry.white_dn)),
+        ("software", json!(crate::SOFTWARE)),
+    ];
+    entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+/// Writes the report.
+///
+/// # Errors
+/// When the stack cannot be read or the disk refuses.
+pub fn write_report(
+    session: &Session,
+    state: &State,
+    task: &Task,
+    products: &[Product],
+    problems: &[String],
+) -> Result<()> {
+    let page = report::make(session, state, task, products, problems)?.to_html()?;
+    raysweep_session::durable::write(&session.report_path(), page.as_bytes())
+}
+
+/// Writes the manifest, which comes last.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write_manifest(session: &Session, state: &State, task: &Task, rig: &RigFile) -> Result<()> {
+    let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
+    let mut settings = Map::new();
+    settings.insert(
+        "rig".into(),
+        json!({
+            "pixel_format": rig.camera.pixel_format,
+            "white_dn": rig.camera.white_dn,
+            "black_dn": rig.camera.black_dn,
+            "period_us": rig.vsync.period_us,
+            "rows": rig.projector.rows,
+            "row_time_us": rig.projector.row_time_us,
+            "first_row_us": rig.projector.first_row_us,
+            "first_row": task.geometry.first_row,
+        }),
+    );
+    settings.insert("exposures_us".into(), json!(taken_exposures(state, &task.schedule)));
+    manifest::write(session, state, software, settings)?;
+    Ok(())
+}
+
+/// The exposures of the sweep as the hardware took them.
+fn taken_exposures(state: &State, schedule: &Schedule) -> Vec<f64> {
+    let mut exposures: Vec<f64> = schedule
+        .points
+        .iter()
+        .filter(|point| matches!(point.role, Role::Sweep(_)))
+        .filter_map(|point| {
+            let (array, index) = crate::processing::place(point.role);
+            state.point(array, index).map(|entry| entry.exposure_us)
+        })
+        .collect();
+    exposures.sort_by(f64::total_cmp);
+    exposures.dedup();
+    exposures
+}

@@ -1,0 +1,102 @@
+//! The factory: from a rig file to open devices.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use raysweep_core::{Camera, DeviceError, Projector, Vsync};
+use raysweep_sim::{PlaneRig, PlaneSetup, SimError};
+
+use crate::config::{ConfigError, Driver, RigFile};
+
+/// Why a rig cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file is no rig.
+    #[error("{0}")]
+    Config(String),
+    /// The simulated rig cannot be built.
+    #[error(transparent)]
+    Sim(#[from] SimError),
+    /// A device cannot be opened.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}
+
+/// A rig whose devices can be opened, one run at a time.
+pub struct Rig {
+    /// What its file says.
+    pub file: RigFile,
+    /// The file's text, as sessions keep it.
+    pub text: String,
+    sim: Arc<PlaneRig>,
+}
+
+/// The open devices of a rig.
+pub struct Devices {
+    /// The camera.
+    pub camera: Box<dyn Camera>,
+    /// The watcher of the VSYNC line.
+    pub vsync: Box<dyn Vsync>,
+    /// The projector.
+    pub projector: Box<dyn Projector>,
+    /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
+    pub pace: Pace,
+}
+
+/// Who sets the pace of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Pace {
+    /// The devices wait until there is room.
+    Pipeline,
+    /// Frames come whether there is room or not.
+    Devices,
+}
+
+impl Rig {
+    /// Reads a rig file and builds what can be built before devices are opened.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+        let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
+        let file = RigFile::parse(&text).map_err(shown)?;
+        let setup = PlaneSetup {
+            raster: file.raster(),
+            camera_row_time_us: file.camera_row_time_us(),
+            white_dn: file.camera.white_dn,
+            black_dn: file.camera.black_dn,
+            format: file.camera.pixel_format,
+            first_row: file.camera.first_projector_row,
+        };
+        let folder = path.parent().unwrap_or(Path::new("."));
+        let sim = Arc::new(PlaneRig::new(file.sim.clone(), setup, folder)?);
+        Ok(Self { file, text, sim })
+    }
+
+    /// Projector row that camera row 0 sees.
+    pub fn first_row(&self) -> usize {
+        self.sim.first_row()
+    }
+
+    /// Opens all devices.
+    ///
+    /// # Errors
+    /// The first device that does not open.
+    pub fn open(&self) -> Result<Devices, RigError> {
+        let (Driver::Sim, Driver::Sim, Driver::Sim) =
+            (self.file.camera.driver, self.file.vsync.driver, self.file.projector.driver);
+        let sim = self.sim.open();
+        let pace = if self.file.sim.realtime { Pace::Devices } else { Pace::Pipeline };
+        Ok(Devices { camera: sim.camera, vsync: sim.vsync, projector: sim.projector, pace })
+    }
+}

@@ -1,0 +1,279 @@
+//! The camera's thread: sets the camera for one point after the other and hands its frames on.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use raysweep_core::{
+    Camera, DeviceError, DeviceErrorKind, Frame, FrameBuf, FramePool, FrameStamp, LossCause, SettingsId,
+};
+use raysweep_pipeline::{Event, Input, Job, Label, Labeller, Point, QueueError, Shot};
+
+use super::orders::{Order, Orders};
+use crate::rig::Pace;
+
+/// One attempt at a point.
+#[derive(Debug, Clone, Copy)]
+pub struct Attempt {
+    /// Point and attempt.
+    pub id: SettingsId,
+    /// What to acquire.
+    pub point: Point,
+    /// How to set the camera for it.
+    pub shot: Shot,
+}
+
+/// Points to acquire under one picture of the projector.
+#[derive(Debug, Clone)]
+pub struct Pass {
+    /// In order.
+    pub attempts: Vec<Attempt>,
+    /// Frames exposed earlier may still see the picture before.
+    pub not_before_ns: i64,
+}
+
+/// Buffers for frames on their way to the assembler: more than it ever holds while it waits for edges.
+const POOL_BUFFERS: usize = 24;
+/// One wait for a frame; orders are looked at in between.
+const POLL: Duration = Duration::from_millis(100);
+/// A camera without frames for so long, beyond its exposure, has lost its trigger.
+const PATIENCE_US: f64 = 2e6;
+/// Frames that pass before a run's first point and after a pass's last, so that the line is known around each frame.
+const MARGIN_FRAMES: u32 = 6;
+
+/// The camera's thread as the run sees it.
+pub struct CameraThread {
+    passes: SyncSender<Pass>,
+    ended: Receiver<Result<(), DeviceError>>,
+    thread: JoinHandle<()>,
+}
+
+impl CameraThread {
+    /// Arms the camera on its own thread.
+    ///
+    /// # Errors
+    /// When the camera cannot be armed or the system gives no thread.
+    pub fn start(
+        mut camera: Box<dyn Camera>,
+        input: Input<Event>,
+        pace: Pace,
+        orders: Arc<Orders>,
+    ) -> Result<Self, DeviceError> {
+        camera.arm()?;
+        let (passes, todo) = sync_channel::<Pass>(1);
+        let (done, ended) = sync_channel(1);
+        let thread = thread::Builder::new()
+            .name("camera".into())
+            .spawn(move || {
+                let mut sequencer = Sequencer::new(camera, input, pace, orders);
+                for pass in todo {
+                    if done.send(sequencer.pass(&pass)).is_err() {
+                        break;
+                    }
+                }
+                if let Err(error) = sequencer.camera.disarm() {
+                    tracing::warn!(%error, "camera not disarmed");
+                }
+            })
+            .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
+        Ok(Self { passes, ended, thread })
+    }
+
+    /// Acquires a pass and waits for its end. What became of its frames arrives at the pipeline's sink.
+    ///
+    /// # Errors
+    /// When the camera fails; the pass is flushed all the same.
+    pub fn acquire(&self, pass: Pass) -> Result<(), DeviceError> {
+        let gone =
+            || DeviceError::new("camera", DeviceErrorKind::Disconnected, "the camera's thread has ended");
+        self.passes.send(pass).map_err(|_closed| gone())?;
+        self.ended.recv().map_err(|_closed| gone())?
+    }
+
+    /// Disarms the camera and ends its thread.
+    pub fn join(self) {
+        drop(self.passes);
+        if self.thread.join().is_err() {
+            tracing::error!("the camera's thread panicked");
+        }
+    }
+}
+
+struct Sequencer {
+    camera: Box<dyn Camera>,
+    input: Input<Event>,
+    pace: Pace,
+    pool: FramePool,
+    /// Takes the frames that there is no room for.
+    spare: FrameBuf,
+    orders: Arc<Orders>,
+    warmed_up: bool,
+}
+
+/// What became of one wait for a frame.
+enum Taken {
+    /// It is with the assembler.
+    Passed(FrameStamp, Label),
+    /// There was no room for it.
+    Lost,
+    /// None came in time.
+    None,
+}
+
+impl Sequencer {
+    fn new(camera: Box<dyn Camera>, input: Input<Event>, pace: Pace, orders: Arc<Orders>) -> Self {
+        let capabilities = camera.capabilities();
+        let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
+        let pool = FramePool::new(POOL_BUFFERS, bytes);
+        let spare = pool.spare();
+        Self { camera, input, pace, pool, spare, orders, warmed_up: false }
+    }
+
+    /// Acquires a pass; always ends with a flush, so that nothing of it stays undecided.
+    fn pass(&mut self, pass: &Pass) -> Result<(), DeviceError> {
+        let acquired = self.attempts(pass);
+        let flushed = self.input.send(Event::Flush).map_err(closed);
+        acquired.and(flushed)
+    }
+
+    fn attempts(&mut self, pass: &Pass) -> Result<(), DeviceError> {
+        let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
+        self.pass_frames(margin, pass.not_before_ns)?;
+        self.warmed_up = true;
+        for attempt in &pass.attempts {
+            if self.orders.now() == Order::Pause {
+                self.input.send(Event::Idle).map_err(closed)?;
+                self.orders.wait_while_paused();
+            }
+            if !self.orders.go_on() {
+                return Ok(());
+            }
+            self.attempt(attempt)?;
+        }
+        self.pass_frames(MARGIN_FRAMES, i64::MIN)
+    }
+
+    fn attempt(&mut self, attempt: &Attempt) -> Result<(), DeviceError> {
+        let Attempt { id, point, shot } = *attempt;
+        let applied = self.camera.configure(id, &shot.settings)?;
+        let job = Job {
+            id,
+            frames: point.frames,
+            applied,
+            delay_us: point.delay_us,
+            light_edges_later: shot.light_edges_later,
+        };
+        self.input.send(Event::Begin(job)).map_err(closed)?;
+        let mut labeller = Labeller::new(&applied);
+        let mut passed = 0;
+        let mut watchdog = Watchdog::new(point.exposure_us);
+        // Frames that found no room are taken again within the attempt, but not for ever.
+        let mut spare_frames = 64 + 3 * point.frames;
+        while passed < point.frames && spare_frames > 0 && self.orders.go_on() {
+            match self.take(|stamp| labeller.label(stamp))? {
+                Taken::Passed(_, Label::Counted) => passed += 1,
+                Taken::Passed(..) => {}
+                Taken::Lost => spare_frames -= 1,
+                Taken::None => {
+                    watchdog.missed()?;
+                    continue;
+                }
+            }
+            watchdog.feed();
+        }
+        self.input.send(Event::End).map_err(closed)
+    }
+
+    /// Lets frames go by: at least `frames` of them, and until exposures start at `not_before_ns` or later.
+    fn pass_frames(&mut self, frames: u32, not_before_ns: i64) -> Result<(), DeviceError> {
+        let mut left = frames;
+        let mut watchdog = Watchdog::new(0.0);
+        let mut reached_ns = i64::MIN;
+        while (left > 0 || reached_ns < not_before_ns) && self.orders.go_on() {
+            match self.take(|_| Label::Cancelled)? {
+                Taken::Passed(stamp, _) => {
+                    left = left.saturating_sub(1);
+                    reached_ns = stamp.exposure_start_ns;
+                }
+                Taken::Lost => {}
+                Taken::None => {
+                    watchdog.missed()?;
+                    continue;
+                }
+            }
+            watchdog.feed();
+        }
+        Ok(())
+    }
+
+    fn take(&mut self, label: impl FnOnce(&FrameStamp) -> Label) -> Result<Taken, DeviceError> {
+        let room = match self.pace {
+            Pace::Pipeline => Some(self.pool.take()),
+            Pace::Devices => self.pool.try_take(),
+        };
+        let Some(mut data) = room else {
+            let stamp = self.camera.next_frame(&mut self.spare, POLL)?;
+            return match stamp {
+                Some(stamp) => self.lose(stamp, label(&stamp), LossCause::PoolEmpty),
+                None => Ok(Taken::None),
+            };
+        };
+        let Some(stamp) = self.camera.next_frame(&mut data, POLL)? else { return Ok(Taken::None) };
+        let label = label(&stamp);
+        let frame = Frame { data, format: self.camera.capabilities().format, stamp };
+        match self.input.offer(Event::Frame(frame, label)) {
+            Ok(()) => Ok(Taken::Passed(stamp, label)),
+            Err(QueueError::Full(_)) => self.lose(stamp, label, LossCause::QueueFull),
+            Err(error @ QueueError::Closed) => Err(closed(error)),
+        }
+    }
+
+    /// Only a frame that a point waits for is lost; the others are merely not looked at.
+    fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
+        let event = match label {
+            Label::Counted => Event::Lost(stamp, Some(cause)),
+            Label::Settling | Label::Cancelled => Event::Lost(stamp, None),
+        };
+        self.input.send(event).map_err(closed)?;
+        Ok(Taken::Lost)
+    }
+}
+
+/// Notices a camera that gives no frames.
+struct Watchdog {
+    patience: Duration,
+    waited: Duration,
+}
+
+impl Watchdog {
+    fn new(exposure_us: f64) -> Self {
+        Self {
+            patience: Duration::from_secs_f64((PATIENCE_US + 3.0 * exposure_us) / 1e6),
+            waited: Duration::ZERO,
+        }
+    }
+
+    fn feed(&mut self) {
+        self.waited = Duration::ZERO;
+    }
+
+    fn missed(&mut self) -> Result<(), DeviceError> {
+        self.waited += POLL;
+        if self.waited < self.patience {
+            return Ok(());
+        }
+        Err(DeviceError::new(
+            "camera",
+            DeviceErrorKind::Timeout,
+            format!(
+                "no frame for {:.1} s: is VSYNC on its trigger input, and is the trigger mode on?",
+                self.waited.as_secs_f64()
+            ),
+        ))
+    }
+}
+
+fn closed<T>(_: QueueError<T>) -> DeviceError {
+    DeviceError::new("camera", DeviceErrorKind::NotReady, "the pipeline has ended; the log says why")
+}

@@ -1,0 +1,271 @@
+//! One run: devices opened, passes acquired until nothing is missing, everything closed again.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, channel};
+
+use raysweep_core::{CameraCapabilities, DeviceError, Pattern, Projector, SettingsId, Shown, VsyncStats};
+use raysweep_pipeline::{
+    AssemblerConfig, Pipeline, PipelineConfig, PipelineError, Point, Policy, Role, Schedule,
+};
+use raysweep_proto::RunState;
+use raysweep_session::Session;
+use raysweep_session::ledger::{Entry, Ledger, State};
+
+use super::board::Board;
+use super::camera::{Attempt, CameraThread, Pass};
+use super::orders::Orders;
+use super::storage::{PaceMeter, Storage, Verdict};
+use super::vsync::VsyncThread;
+use crate::processing::{Processing, Task, place};
+use crate::rig::{Devices, Pace, Rig, RigError};
+
+/// Attempts at a point before it stays missing.
+const MAX_ATTEMPTS: u32 = 8;
+/// Events that may wait for the assembler.
+const QUEUE_EVENTS: usize = 64;
+/// Units between the assembler and the disk.
+const UNITS_UNDER_WAY: usize = 8;
+
+/// Why a run could not go to its end.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// A device failed.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// The rig cannot be opened.
+    #[error(transparent)]
+    Rig(#[from] RigError),
+    /// The session cannot be written.
+    #[error(transparent)]
+    Session(#[from] raysweep_session::Error),
+    /// The pipeline failed.
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    /// The camera is not the one that the session was begun with.
+    #[error(
+        "the camera has {found:?} rows and columns, the session {expected:?}: resume it on the rig that it was begun on"
+    )]
+    OtherCamera {
+        /// Of the camera.
+        found: (usize, usize),
+        /// Of the session.
+        expected: (usize, usize),
+    },
+    /// A point failed again and again.
+    #[error(
+        "{points} points failed {MAX_ATTEMPTS} times each; the ledger has their causes. Mend the cause and resume the session"
+    )]
+    Hopeless {
+        /// How many.
+        points: usize,
+    },
+    /// The run panicked: a defect.
+    #[error("the run panicked: {0}. What was stored stays stored; resume the session")]
+    Panicked(String),
+}
+
+/// Everything that one run needs.
+pub struct Run {
+    /// The rig.
+    pub rig: Arc<Rig>,
+    /// The plan on it.
+    pub task: Arc<Task>,
+    /// Its session.
+    pub session: Session,
+    /// Its ledger, locked for this run.
+    pub ledger: Ledger,
+    /// What the plan makes of the units.
+    pub processing: Processing,
+    /// Whether earlier runs have stored points of it.
+    pub resumed: bool,
+    /// What it is told.
+    pub orders: Arc<Orders>,
+    /// What it tells.
+    pub board: Arc<Board>,
+}
+
+/// What acquisition leaves behind.
+pub struct Acquired {
+    /// The session.
+    pub session: Session,
+    /// Its ledger, still locked.
+    pub ledger: Ledger,
+    /// The folds, which have seen every stored point.
+    pub processing: Processing,
+    /// The VSYNC line.
+    pub vsync: Option<VsyncStats>,
+    /// Why acquisition ended early, if a fault ended it.
+    pub fault: Option<RunError>,
+}
+
+/// Turns the light off when it goes out of scope, on every way out.
+struct Lit(Box<dyn Projector>);
+
+impl Drop for Lit {
+    fn drop(&mut self) {
+        if let Err(error) = self.0.blank() {
+            tracing::error!(%error, "projector not blanked");
+        }
+    }
+}
+
+impl Run {
+    /// Acquires what is missing.
+    ///
+    /// # Errors
+    /// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
+    pub fn acquire(mut self) -> Result<Acquired, RunError> {
+        self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: self.resumed })?;
+        let Devices { camera, vsync, projector, pace } = self.rig.open()?;
+        let projector = Lit(projector);
+        let assembler = self.assembler_config(camera.capabilities())?;
+        let stack = self.session.stack()?;
+        let state = self.ledger.state().clone();
+        if self.resumed {
+            self.processing.feed_stored(&self.task, &state, &stack)?;
+        }
+        let missing = missing(&self.task.schedule, &state);
+        let planned = self.task.schedule.points.len();
+        let (verdicts, results) = channel();
+        let stages = std::mem::take(&mut self.processing.stages);
+        let storage = Storage {
+            task: self.task.clone(),
+            stack,
+            ledger: self.ledger,
+            processing: self.processing,
+            verdicts,
+            board: self.board.clone(),
+            pace: PaceMeter::new(planned - missing.len(), planned),
+            vsync: None,
+            write_error: None,
+        };
+        let config = PipelineConfig {
+            queue_events: QUEUE_EVENTS,
+            policy: match pace {
+                Pace::Pipeline => Policy::Wait,
+                Pace::Devices => Policy::Fail,
+            },
+            units_under_way: UNITS_UNDER_WAY,
+            worker_threads: 0,
+        };
+        let trigger_latency_us = assembler.camera.trigger_latency_us;
+        let (pipeline, input) = Pipeline::start(config, assembler, stages, storage)?;
+
+        let vsync = VsyncThread::start(vsync, input.clone(), self.orders.clone())?;
+        let camera = CameraThread::start(camera, input, pace, self.orders.clone())?;
+        let _ = self.board.go(RunState::Armed);
+
+        let mut passes = Passes {
+            task: &self.task,
+            camera: &camera,
+            projector,
+            results: &results,
+            orders: &self.orders,
+            trigger_latency_us,
+        };
+        let _ = self.board.go(RunState::Running);
+        let acquired = passes.acquire(missing);
+        let _ = self.board.go(RunState::Draining);
+        drop(passes);
+        camera.join();
+        let watched = vsync.join();
+        let storage = pipeline.join()?;
+        // What failed first is the cause; what it brought down comes after.
+        let fault =
+            storage.write_error.map(RunError::from).or(watched.err().map(RunError::from)).or(acquired.err());
+        Ok(Acquired {
+            session: self.session,
+            ledger: storage.ledger,
+            processing: storage.processing,
+            vsync: storage.vsync,
+            fault,
+        })
+    }
+
+    fn assembler_config(&self, camera: &CameraCapabilities) -> Result<AssemblerConfig, RunError> {
+        let geometry = &self.task.geometry;
+        let size = (camera.height, camera.width);
+        if size != (geometry.height, geometry.width) {
+            return Err(RunError::OtherCamera { found: size, expected: (geometry.height, geometry.width) });
+        }
+        Ok(AssemblerConfig {
+            camera: camera.clone(),
+            raster: geometry.raster,
+            first_row: geometry.first_row,
+            max_jitter_us: self.task.plan.sweep.max_jitter_us,
+            edge_gate_us: self.rig.file.vsync.gate_us,
+        })
+    }
+}
+
+/// The points that the ledger does not know as stored, with the number of their next attempt.
+pub fn missing(schedule: &Schedule, state: &State) -> Vec<SettingsId> {
+    (0..)
+        .zip(&schedule.points)
+        .filter_map(|(ordinal, point)| {
+            let (array, index) = place(point.role);
+            let attempt = state.next_attempt(array, index);
+            state.point(array, index).is_none().then_some(SettingsId { point: ordinal, attempt })
+        })
+        .collect()
+}
+
+/// Passes over the missing points, until none is left.
+struct Passes<'a> {
+    task: &'a Task,
+    camera: &'a CameraThread,
+    projector: Lit,
+    results: &'a Receiver<Verdict>,
+    orders: &'a Orders,
+    trigger_latency_us: f64,
+}
+
+impl Passes<'_> {
+    fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
+        let mut todo = missing;
+        for _ in 0..MAX_ATTEMPTS {
+            let (dark, lit): (Vec<_>, Vec<_>) =
+                todo.iter().partition(|id| matches!(self.point(**id).role, Role::Dark(_)));
+            todo = Vec::new();
+            if !dark.is_empty() {
+                let shown = self.projector.0.blank()?;
+                todo.extend(self.pass(&dark, shown)?);
+            }
+            if !lit.is_empty() && self.orders.go_on() {
+                let shown = self.projector.0.show(&Pattern::White)?;
+                todo.extend(self.pass(&lit, shown)?);
+            }
+            if todo.is_empty() || !self.orders.go_on() {
+                return Ok(());
+            }
+        }
+        Err(RunError::Hopeless { points: todo.len() })
+    }
+
+    fn point(&self, id: SettingsId) -> Point {
+        self.task.schedule.points[id.point as usize]
+    }
+
+    /// Acquires points under one picture; returns those to take again.
+    fn pass(&self, ids: &[SettingsId], shown: Shown) -> Result<Vec<SettingsId>, RunError> {
+        let geometry = &self.task.geometry;
+        let attempts = ids
+            .iter()
+            .map(|&id| {
+                let point = self.point(id);
+                Attempt { id, point, shot: geometry.shot(&point, self.trigger_latency_us) }
+            })
+            .collect();
+        let acquired = self.camera.acquire(Pass { attempts, not_before_ns: shown.not_before_ns });
+        let mut again = Vec::new();
+        // The channel closes when the pipeline ends, so this waits for nothing that cannot come.
+        for verdict in self.results {
+            match verdict {
+                Verdict::Failed(id) => again.push(SettingsId { attempt: id.attempt + 1, ..id }),
+                Verdict::Flushed => break,
+            }
+        }
+        acquired?;
+        Ok(again)
+    }
+}

@@ -1,0 +1,145 @@
+//! The pipeline's sink: data first, then the ledger's line, then the folds.
+
+use std::sync::Arc;
+use std::sync::mpsc::Sender;
+use std::time::Instant;
+
+use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
+use raysweep_pipeline::{Ordered, Sink, StageError, Unit};
+use raysweep_proto::{Event, Progress};
+use raysweep_session::ledger::{Entry, Ledger, PointEntry};
+use raysweep_session::stack::Stack;
+
+use super::board::Board;
+use crate::processing::{Processing, Task, place};
+
+/// What the run is told of its points, in order.
+#[derive(Debug)]
+pub enum Verdict {
+    /// An attempt failed, or its data could not be stored.
+    Failed(SettingsId),
+    /// The pass is over.
+    Flushed,
+}
+
+/// Stores what the pipeline delivers.
+pub struct Storage {
+    pub(super) task: Arc<Task>,
+    pub(super) stack: Stack,
+    pub(super) ledger: Ledger,
+    pub(super) processing: Processing,
+    pub(super) verdicts: Sender<Verdict>,
+    pub(super) board: Arc<Board>,
+    pub(super) pace: PaceMeter,
+    pub(super) vsync: Option<VsyncStats>,
+    /// The first failure to write, after which nothing more is tried.
+    pub(super) write_error: Option<raysweep_session::Error>,
+}
+
+/// How fast a run goes.
+pub struct PaceMeter {
+    began: Instant,
+    stored_before: usize,
+    stored: usize,
+    planned: usize,
+    counts: Counts,
+}
+
+impl PaceMeter {
+    /// A run that begins now, with `stored_before` of `planned` points done.
+    pub fn new(stored_before: usize, planned: usize) -> Self {
+        Self { began: Instant::now(), stored_before, stored: 0, planned, counts: Counts::default() }
+    }
+
+    fn progress(&self) -> Progress {
+        let elapsed_s = self.began.elapsed().as_secs_f64();
+        let left = self.planned.saturating_sub(self.stored_before + self.stored);
+        Progress {
+            points_stored: self.stored_before + self.stored,
+            points_planned: self.planned,
+            counts: self.counts.clone(),
+            elapsed_s,
+            left_s: (self.stored > 0).then(|| elapsed_s / self.stored as f64 * left as f64),
+            frames_per_s: self.counts.averaged as f64 / elapsed_s.max(1e-9),
+        }
+    }
+}
+
+impl Sink for Storage {
+    fn take(&mut self, item: Ordered) {
+        match item {
+            Ordered::Unit(unit, image) => {
+                if let Err(error) = self.store(&unit) {
+                    tracing::error!(%error, point = unit.id.point, "point not stored");
+                    self.write_error.get_or_insert(error);
+                    let mut counts = unit.counts.clone();
+                    counts.forfeit(LossCause::WriterError);
+                    self.fail(unit.id, counts);
+                    return;
+                }
+                self.pace.stored += 1;
+                self.pace.counts.add(&unit.counts);
+                match image {
+                    Ok(image) => self.processing.push(&unit, &image),
+                    Err(error) => self.note_stage_error(&unit, &error),
+                }
+                self.board.publish(Event::Progress(self.pace.progress()));
+            }
+            Ordered::Failed(id, counts) => self.fail(id, counts),
+            Ordered::Flushed(outside, vsync) => {
+                if outside != Counts::default() {
+                    self.pace.counts.add(&outside);
+                    self.append(&Entry::Outside { counts: outside });
+                }
+                self.vsync = Some(vsync);
+                self.board.publish(Event::Progress(self.pace.progress()));
+                self.board.publish(Event::Vsync(vsync));
+                let _ = self.verdicts.send(Verdict::Flushed);
+            }
+        }
+    }
+}
+
+impl Storage {
+    fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
+        let point = self.task.schedule.points[unit.id.point as usize];
+        let (array, index) = place(point.role);
+        let crc32 = self.stack.write(array, index, unit.sum.view())?;
+        self.ledger.append(&Entry::Point(PointEntry {
+            array,
+            index,
+            attempt: unit.id.attempt,
+            frames: unit.frames,
+            exposure_us: unit.exposure_us,
+            delay_us: point.delay_us,
+            delays_us: unit.delays_us.clone(),
+            counts: unit.counts.clone(),
+            crc32,
+        }))
+    }
+
+    fn fail(&mut self, id: SettingsId, counts: Counts) {
+        let (array, index) = place(self.task.schedule.points[id.point as usize].role);
+        self.pace.counts.add(&counts);
+        self.append(&Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() });
+        // An attempt that a cancel cut short has lost nothing.
+        if counts.lost_total() > 0 {
+            self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts });
+        }
+        let _ = self.verdicts.send(Verdict::Failed(id));
+    }
+
+    fn note_stage_error(&mut self, unit: &Unit, error: &StageError) {
+        tracing::error!(%error, point = unit.id.point, "stored, but left out of the results");
+        let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
+        self.append(&Entry::StageFailed { array, index, attempt: unit.id.attempt, error: error.to_string() });
+    }
+
+    /// Appends what no data hangs on: a failure ends the run, but there is nothing to take back.
+    pub(super) fn append(&mut self, entry: &Entry) {
+        if let Err(error) = self.ledger.append(entry) {
+            tracing::error!(%error, "ledger not written");
+            self.write_error.get_or_insert(error);
+        }
+    }
+}

@@ -1,0 +1,200 @@
+//! One client: its lines in, its answers and events out.
+
+use std::io;
+use std::sync::Arc;
+use std::time::Duration;
+
+use raysweep_proto::{ErrorCode, Event, EventNotice, Id, Method, Request, Response, Role, RpcError};
+use serde::Serialize;
+use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::UnixStream;
+use tokio::net::unix::{OwnedReadHalf, OwnedWriteHalf};
+use tokio::sync::broadcast::{self, error::RecvError, error::TryRecvError};
+use tokio_util::bytes::BytesMut;
+use tokio_util::codec::{Decoder, LinesCodec, LinesCodecError};
+use tokio_util::sync::CancellationToken;
+
+use super::access::Peer;
+use super::{Desk, dispatch};
+
+/// Serves a client until it hangs up, breaks the rules of lines, does not read, or `stop`.
+pub(super) async fn attend(stream: UnixStream, desk: Arc<Desk>, stop: CancellationToken) {
+    let peer = match desk.access.peer(&stream) {
+        Ok(peer) => peer,
+        Err(error) => {
+            tracing::warn!(%error, "a client without credentials is dropped");
+            return;
+        }
+    };
+    let asked = desk.clone();
+    // Looking groups up may ask a server over the network.
+    let role = tokio::task::spawn_blocking(move || asked.access.role(peer)).await.unwrap_or(Role::Observer);
+    tracing::debug!(uid = peer.uid, ?role, "a client has connected");
+    let (reader, writer) = stream.into_split();
+    let lines = Lines::new(reader, desk.limits.message_bytes);
+    let mut connection = Connection { lines, writer, desk, peer, role, events: None };
+    match connection.converse(&stop).await {
+        Ok(()) => tracing::debug!(uid = peer.uid, "a client has gone"),
+        Err(error) => tracing::info!(%error, uid = peer.uid, "a client is dropped"),
+    }
+}
+
+struct Connection {
+    lines: Lines,
+    writer: OwnedWriteHalf,
+    desk: Arc<Desk>,
+    peer: Peer,
+    role: Role,
+    events: Option<broadcast::Receiver<Event>>,
+}
+
+impl Connection {
+    async fn converse(&mut self, stop: &CancellationToken) -> io::Result<()> {
+        loop {
+            tokio::select! {
+                () = stop.cancelled() => return self.farewell().await,
+                line = self.lines.next() => match line? {
+                    Line::Text(text) => self.answer(&text).await?,
+                    Line::NotUtf8 => {
+                        let message = "not UTF-8; JSON is UTF-8";
+                        self.refuse(ErrorCode::ParseError, message).await?;
+                    }
+                    Line::TooLong => {
+                        let bytes = self.desk.limits.message_bytes;
+                        let message = format!("a line is longer than {bytes} bytes, the longest allowed");
+                        return self.refuse(ErrorCode::TooLong, message).await;
+                    }
+                    Line::End => return Ok(()),
+                },
+                event = next_event(&mut self.events) => self.notify(event).await?,
+            }
+        }
+    }
+
+    async fn answer(&mut self, text: &str) -> io::Result<()> {
+        let request = match Request::parse(text) {
+            Ok(request) => request,
+            Err(response) => return self.send(&*response).await,
+        };
+        let id = request.id.clone();
+        let outcome = self.call(request).await;
+        match id {
+            Some(id) => self.send(&Response::new(id, outcome)).await,
+            None => Ok(()),
+        }
+    }
+
+    async fn call(&mut self, request: Request) -> Result<serde_json::Value, RpcError> {
+        let Some(method) = Method::from_name(&request.method) else {
+            let message = format!("there is no method `{}`; `describe` lists them", request.method);
+            return Err(RpcError::new(ErrorCode::MethodNotFound, message).of_field("method"));
+        };
+        if method.role() == Role::Operator && self.role != Role::Operator {
+            return Err(self.desk.access.forbidden(method, self.peer));
+        }
+        let control = self.desk.control.clone();
+        let call = move || dispatch::carry_out(&*control, method, request.params);
+        let reply = tokio::task::spawn_blocking(call).await.map_err(|error| {
+            let name = method.name();
+            tracing::error!(%error, method = name, "a call failed in the daemon");
+            let message = format!("`{name}` met a defect of the daemon, which goes on; its log says more");
+            RpcError::new(ErrorCode::Internal, message)
+        })??;
+        if let Some(events) = reply.events {
+            self.events = Some(events);
+        }
+        Ok(reply.result)
+    }
+
+    async fn notify(&mut self, event: Result<Event, RecvError>) -> io::Result<()> {
+        match event {
+            Ok(event) => self.send(&EventNotice::new(event)).await,
+            Err(RecvError::Lagged(events)) => self.send(&EventNotice::new(Event::Skipped { events })).await,
+            Err(RecvError::Closed) => {
+                self.events = None;
+                Ok(())
+            }
+        }
+    }
+
+    /// Sends the events that wait: how a run ended is among them when the daemon is stopped during one.
+    async fn farewell(&mut self) -> io::Result<()> {
+        let Some(mut events) = self.events.take() else { return Ok(()) };
+        loop {
+            match events.try_recv() {
+                Ok(event) => self.notify(Ok(event)).await?,
+                Err(TryRecvError::Lagged(skipped)) => self.notify(Err(RecvError::Lagged(skipped))).await?,
+                Err(TryRecvError::Empty | TryRecvError::Closed) => return Ok(()),
+            }
+        }
+    }
+
+    async fn refuse(&mut self, code: ErrorCode, message: impl Into<String>) -> io::Result<()> {
+        self.send(&Response::error(Id::Null, RpcError::new(code, message))).await
+    }
+
+    async fn send(&mut self, message: &impl Serialize) -> io::Result<()> {
+        send(&mut self.writer, message, self.desk.limits.write_timeout).await
+    }
+}
+
+/// The next event; for who has not subscribed there is none, ever.
+async fn next_event(events: &mut Option<broadcast::Receiver<Event>>) -> Result<Event, RecvError> {
+    match events {
+        Some(events) => events.recv().await,
+        None => std::future::pending().await,
+    }
+}
+
+/// Sends one message as one line.
+pub(super) async fn send(
+    writer: &mut (impl AsyncWrite + Unpin),
+    message: &impl Serialize,
+    timeout: Duration,
+) -> io::Result<()> {
+    let mut line = serde_json::to_vec(message)?;
+    line.push(b'\n');
+    tokio::time::timeout(timeout, writer.write_all(&line)).await?
+}
+
+enum Line {
+    Text(String),
+    NotUtf8,
+    TooLong,
+    End,
+}
+
+/// The lines of a client, each at most so long.
+struct Lines {
+    reader: OwnedReadHalf,
+    codec: LinesCodec,
+    buffer: BytesMut,
+}
+
+impl Lines {
+    fn new(reader: OwnedReadHalf, max_bytes: usize) -> Self {
+        Self { reader, codec: LinesCodec::new_with_max_length(max_bytes), buffer: BytesMut::new() }
+    }
+
+    /// The next line; nothing is lost when the wait for it is given up. What stands before the end without a line
+    /// feed counts as a line, so that a one-line script need not send one; half a message is no JSON anyway.
+    async fn next(&mut self) -> io::Result<Line> {
+        let mut ended = false;
+        loop {
+            let decoded = match ended {
+                true => self.codec.decode_eof(&mut self.buffer),
+                false => self.codec.decode(&mut self.buffer),
+            };
+            match decoded {
+                Ok(Some(text)) => return Ok(Line::Text(text)),
+                Ok(None) if ended => return Ok(Line::End),
+                Ok(None) => ended = self.reader.read_buf(&mut self.buffer).await? == 0,
+                Err(LinesCodecError::MaxLineLengthExceeded) => return Ok(Line::TooLong),
+                Err(LinesCodecError::Io(error)) if error.kind() == io::ErrorKind::InvalidData => {
+                    return Ok(Line::NotUtf8);
+                }
+                Err(LinesCodecError::Io(error)) => return Err(error),
+            }
+        }
+    }
+}

@@ -1,0 +1,56 @@
+//! From a method's name and parameters to a call of the daemon.
+
+use raysweep_proto::{
+    CheckParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams, describe, params,
+};
+use serde::Serialize;
+use serde_json::{Map, Value};
+use tokio::sync::broadcast;
+
+use crate::control::Control;
+
+/// What came of a call.
+pub(super) struct Reply {
+    /// The method's result.
+    pub result: Value,
+    /// For `subscribe`: what is to be sent from now on.
+    pub events: Option<broadcast::Receiver<Event>>,
+}
+
+/// Carries a call out; may block.
+pub(super) fn carry_out(
+    control: &dyn Control,
+    method: Method,
+    given: Map<String, Value>,
+) -> Result<Reply, RpcError> {
+    let result = match method {
+        Method::Check => control.check(&params::<CheckParams>(given)?.plan).and_then(value),
+        Method::Run => control.run(params::<RunParams>(given)?).and_then(value),
+        Method::Resume => control.resume(params::<ResumeParams>(given)?).and_then(value),
+        Method::Describe => none(given).and_then(|()| value(describe(env!("CARGO_PKG_VERSION")))),
+        Method::Status => none(given).and_then(|()| value(control.status())),
+        Method::Sessions => none(given).and_then(|()| control.sessions()).and_then(value),
+        Method::Pause => none(given).and_then(|()| control.pause()).and_then(done),
+        Method::Continue => none(given).and_then(|()| control.go_on()).and_then(done),
+        Method::Cancel => none(given).and_then(|()| control.cancel()).and_then(done),
+        Method::Subscribe => {
+            none(given)?;
+            return Ok(Reply { result: done(())?, events: Some(control.events()) });
+        }
+    };
+    Ok(Reply { result: result?, events: None })
+}
+
+/// Reads the parameters of a method that has none.
+fn none(given: Map<String, Value>) -> Result<(), RpcError> {
+    params::<Empty>(given).map(|Empty {}| ())
+}
+
+/// The result of a method that has nothing to say.
+fn done((): ()) -> Result<Value, RpcError> {
+    value(Empty {})
+}
+
+fn value(result: impl Serialize) -> Result<Value, RpcError> {
+    serde_json::to_value(result).map_err(|error| RpcError::new(ErrorCode::Internal, error.to_string()))
+}

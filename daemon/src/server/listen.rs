@@ -1,0 +1,172 @@
+//! Where clients come in: a socket of our own, or one that the service manager holds for us.
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::os::fd::{FromRawFd, OwnedFd};
+use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::net::{UnixListener as StdListener, UnixStream as StdStream};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use nix::sys::socket::{getsockopt, sockopt::AcceptConn};
+use tokio::net::UnixListener;
+
+/// Owner and group may connect; who of them may drive is decided by [`super::Access`].
+const SOCKET_MODE: u32 = 0o660;
+
+/// Why nobody can be listened to.
+#[derive(Debug, thiserror::Error)]
+pub enum ListenError {
+    /// Another daemon is there.
+    #[error("another raysweepd listens on {}: stop it, or choose another --socket", .0.display())]
+    Taken(PathBuf),
+    /// Something else is there.
+    #[error("{} exists and is no socket: remove it, or choose another --socket", .0.display())]
+    NotASocket(PathBuf),
+    /// The socket cannot be made.
+    #[error("cannot listen on {}: {source}; its folder must exist and be writable", path.display())]
+    Bind {
+        /// Where.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// What the service manager handed over is of no use.
+    #[error("socket activation: {0}")]
+    Inherited(String),
+}
+
+/// A listening socket. Must be made within a tokio runtime.
+#[derive(Debug)]
+pub struct Listening {
+    /// To be given to [`super::serve`].
+    pub listener: UnixListener,
+    /// The socket's file, if it is ours to remove.
+    pub file: Option<SocketFile>,
+}
+
+/// The file of a socket that we made; it is removed when this is dropped.
+#[derive(Debug)]
+pub struct SocketFile(PathBuf);
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        if let Err(error) = fs::remove_file(&self.0) {
+            tracing::warn!(%error, path = %self.0.display(), "cannot remove the socket");
+        }
+    }
+}
+
+impl Listening {
+    /// Makes a socket with mode 0660. One that a dead daemon left is replaced.
+    ///
+    /// # Errors
+    /// [`ListenError::Taken`], [`ListenError::NotASocket`], [`ListenError::Bind`].
+    pub fn bind(path: &Path) -> Result<Self, ListenError> {
+        remove_stale(path)?;
+        let failed = |source| ListenError::Bind { path: path.to_owned(), source };
+        let listener = UnixListener::bind(path).map_err(failed)?;
+        let file = SocketFile(path.to_owned());
+        fs::set_permissions(path, fs::Permissions::from_mode(SOCKET_MODE)).map_err(failed)?;
+        Ok(Self { listener, file: Some(file) })
+    }
+
+    /// Takes over the socket that the service manager passes (`LISTEN_FDS`, sd_listen_fds(3)); nothing if it passes
+    /// none, or if it was taken already.
+    ///
+    /// # Errors
+    /// [`ListenError::Inherited`] unless it is one listening Unix stream socket.
+    pub fn inherited() -> Result<Option<Self>, ListenError> {
+        static TAKEN: AtomicBool = AtomicBool::new(false);
+        let failed = |error: io::Error| ListenError::Inherited(error.to_string());
+        let mut passed = sd_notify::listen_fds().map_err(failed)?;
+        let fd = match (passed.next(), passed.next()) {
+            (None, _) => return Ok(None),
+            (Some(fd), None) => fd,
+            (Some(_), Some(_)) => {
+                let message = "several sockets were passed; the .socket unit must name one ListenStream=";
+                return Err(ListenError::Inherited(message.into()));
+            }
+        };
+        if TAKEN.swap(true, Ordering::Relaxed) {
+            return Ok(None);
+        }
+        #[expect(
+            unsafe_code,
+            reason = "nothing safe turns the number of an inherited descriptor into its owner"
+        )]
+        // SAFETY: `listen_fds` found our own process id in LISTEN_PID and could set a flag of this descriptor, so it
+        // is open and was passed to us to own; `TAKEN` sees to it that nobody else in this process owns it.
+        let fd = unsafe { OwnedFd::from_raw_fd(fd) };
+        if !getsockopt(&fd, AcceptConn).unwrap_or(false) {
+            let message =
+                "what was passed does not listen; the .socket unit needs ListenStream= and Accept=no";
+            return Err(ListenError::Inherited(message.into()));
+        }
+        let listener = StdListener::from(fd);
+        listener.local_addr().map_err(|error| {
+            ListenError::Inherited(format!(
+                "what was passed is no Unix socket ({error}); give ListenStream= a path"
+            ))
+        })?;
+        listener.set_nonblocking(true).map_err(failed)?;
+        Ok(Some(Self { listener: UnixListener::from_std(listener).map_err(failed)?, file: None }))
+    }
+}
+
+/// Removes a socket on which nobody listens.
+fn remove_stale(path: &Path) -> Result<(), ListenError> {
+    let Ok(metadata) = fs::symlink_metadata(path) else { return Ok(()) };
+    if !metadata.file_type().is_socket() {
+        return Err(ListenError::NotASocket(path.to_owned()));
+    }
+    match StdStream::connect(path) {
+        Err(error) if error.kind() == ErrorKind::ConnectionRefused => {
+            fs::remove_file(path).map_err(|source| ListenError::Bind { path: path.to_owned(), source })
+        }
+        // A full queue and a lack of permission too mean that somebody is there.
+        _ => Err(ListenError::Taken(path.to_owned())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_living_daemon_is_left_alone_and_a_dead_ones_socket_is_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("raysweepd.sock");
+        let first = Listening::bind(&path).unwrap();
+        assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o660);
+        let taken = Listening::bind(&path).unwrap_err();
+        assert!(taken.to_string().starts_with("another raysweepd listens on"), "{taken}");
+        StdStream::connect(&path).expect("the first is still there");
+
+        // A daemon that is killed removes nothing.
+        let Listening { listener, file } = first;
+        std::mem::forget(file);
+        drop(listener);
+        assert!(path.exists());
+        let second = Listening::bind(&path).unwrap();
+        StdStream::connect(&path).unwrap();
+        drop(second);
+        assert!(!path.exists(), "a daemon that ends in order leaves nothing");
+    }
+
+    #[tokio::test]
+    async fn what_is_no_socket_is_not_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("precious");
+        fs::write(&path, "data").unwrap();
+        assert!(matches!(Listening::bind(&path), Err(ListenError::NotASocket(_))));
+        assert_eq!(fs::read_to_string(&path).unwrap(), "data");
+        let nowhere = folder.path().join("no/such/folder.sock");
+        assert!(matches!(Listening::bind(&nowhere), Err(ListenError::Bind { .. })));
+    }
+
+    #[tokio::test]
+    async fn without_a_service_manager_nothing_is_inherited() {
+        assert!(Listening::inherited().unwrap().is_none());
+    }
+}

@@ -1,0 +1,202 @@
+//! The real daemon in a process of its own: killed at any moment, asked to end, activated by a socket.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use raysweep_proto::{Client, Event, RunParams};
+use raysweep_session::Session;
+use raysweep_session::ledger::State;
+use raysweep_session::stack::ArrayName;
+use tempfile::TempDir;
+
+/// 8 x 8 pixels, 9 points, and every fault whose traces could differ after a crash.
+const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
+                   [projector]\ndriver = \"sim\"\nrows = 16\n\
+                   [sim]\nscene = \"v-groove\"\nscene_rows = 16\nscene_columns = 16\nseed = 11\n\
+                   [sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\n\
+                   [sim.camera]\nlate_frames_max = 3\ndropped = 0.02\n\
+                   [sim.ambient]\nlevel = 0.001\nflicker = 0.5\n";
+const PLAN: &str = "kind = \"sweep\"\nname = \"crash\"\n[sweep]\naverage = 2\n\
+                    delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
+
+struct Daemon {
+    process: Child,
+    socket: PathBuf,
+}
+
+impl Daemon {
+    fn start(folder: &Path) -> Self {
+        let socket = folder.join("socket");
+        let process = Command::new(env!("CARGO_BIN_EXE_raysweepd"))
+            .arg("--rig")
+            .arg(folder.join("rig.toml"))
+            .arg("--socket")
+            .arg(&socket)
+            .arg("--data")
+            .arg(folder.join("sessions"))
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        Self { process, socket }
+    }
+
+    fn client(&mut self) -> Client {
+        let began = Instant::now();
+        loop {
+            if let Ok(client) = Client::connect(&self.socket) {
+                return client;
+            }
+            assert!(self.process.try_wait().unwrap().is_none(), "the daemon has ended");
+            assert!(began.elapsed() < Duration::from_secs(60), "the daemon does not listen");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    fn kill(mut self) {
+        self.process.kill().unwrap();
+        self.process.wait().unwrap();
+    }
+
+    fn terminate(&self) {
+        let status = Command::new("kill").args(["-TERM", &self.process.id().to_string()]).status().unwrap();
+        assert!(status.success());
+    }
+}
+
+fn folder(rig: &str) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    folder
+}
+
+fn plan(text: &str) -> RunParams {
+    RunParams { plan: text.into(), ..RunParams::default() }
+}
+
+/// Waits for the run's end.
+fn end(daemon: &mut Daemon, begin: impl FnOnce(&mut Client)) -> (PathBuf, String) {
+    let events = daemon.client().subscribe().unwrap();
+    begin(&mut daemon.client());
+    for event in events {
+        if let Event::Finished { session, state, .. } = event.unwrap() {
+            return (session, state);
+        }
+    }
+    panic!("the daemon ended before the run");
+}
+
+/// What must be the same after a crash: each point's attempt, settings, counts and data, and all products.
+fn outcome(session: &Path) -> (Vec<String>, Vec<(String, Vec<u8>)>) {
+    let state = Session::open(session).unwrap().state().unwrap();
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    let points =
+        ArrayName::ALL.into_iter().flat_map(|array| state.stored(array).cloned().collect::<Vec<_>>());
+    let points = points.map(|point| serde_json::to_string(&point).unwrap()).collect();
+    let mut files: Vec<_> = std::fs::read_dir(session.join("products"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .map(|path| (path.file_name().unwrap().to_string_lossy().into_owned(), std::fs::read(path).unwrap()))
+        .collect();
+    files.sort();
+    (points, files)
+}
+
+fn ledger_lines(session: &Path) -> usize {
+    std::fs::read_to_string(session.join("ledger.jsonl")).unwrap().lines().count()
+}
+
+fn stored(session: &Path) -> Option<State> {
+    Session::open(session).and_then(|session| session.state()).ok()
+}
+
+#[test]
+fn fifty_kills_and_resumes_end_like_a_run_without_any() {
+    let reference = folder(RIG);
+    let mut daemon = Daemon::start(reference.path());
+    let (session, state) = end(&mut daemon, |client| drop(client.run(&plan(PLAN)).unwrap()));
+    let lines = ledger_lines(&session);
+    assert_eq!(state, "complete");
+    let expected = outcome(&session);
+    assert_eq!(expected.0.len(), 9 + 4 + 1);
+    daemon.kill();
+
+    let mut seed = 0x1234_5678_9ABC_DEF0_u64;
+    let (mut killed_within, mut resumed_points) = (0, Vec::new());
+    for _ in 0..50 {
+        // Xorshift. The moment lies anywhere in the run: up to 3 ms after any line of its ledger.
+        seed ^= seed << 13;
+        seed ^= seed >> 7;
+        seed ^= seed << 17;
+        let (line, later) = (1 + seed as usize % lines, Duration::from_micros(seed / 1000 % 3000));
+        let crashed = folder(RIG);
+        let mut daemon = Daemon::start(crashed.path());
+        let mut client = daemon.client();
+        let session = client.run(&plan(PLAN)).unwrap().session;
+        let began = Instant::now();
+        while ledger_lines(&session) < line && began.elapsed() < Duration::from_secs(5) {}
+        std::thread::sleep(later);
+        daemon.kill();
+
+        let before = stored(&session).expect("a ledger that can be read after a crash");
+        killed_within += usize::from(before.end.is_none());
+        resumed_points.push(before.stored(ArrayName::Sum).count());
+        let mut daemon = Daemon::start(crashed.path());
+        let (session, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
+        assert_eq!(state, "complete");
+        assert!(outcome(&session) == expected, "killed {later:?} after line {line}: the session differs");
+        daemon.kill();
+    }
+    println!("killed {killed_within} of 50 within the run, with these points stored: {resumed_points:?}");
+    assert!(killed_within >= 25, "the moments do not lie within the run: only {killed_within} did");
+}
+
+#[test]
+fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
+    let folder = folder(&RIG.replace("seed = 11", "seed = 11\nrealtime = true"));
+    let mut daemon = Daemon::start(folder.path());
+    let events = daemon.client().subscribe().unwrap();
+    daemon.client().run(&plan(&PLAN.replace("average = 2", "average = 20"))).unwrap();
+    let mut finished = None;
+    for event in events {
+        match event.unwrap() {
+            Event::Progress(progress) if progress.points_stored == 6 => daemon.terminate(),
+            Event::Finished { session, state, .. } => {
+                finished = Some((session, state));
+                break;
+            }
+            _ => {}
+        }
+    }
+    let (session, state) = finished.expect("subscribers learn how the run ended");
+    assert_eq!(state, "cancelled");
+    assert!(daemon.process.wait().unwrap().success());
+    let state = stored(&session).unwrap();
+    assert!(state.stored(ArrayName::Dark).count() + state.stored(ArrayName::Sum).count() >= 5);
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    assert!(raysweep_session::manifest::verify(&Session::open(&session).unwrap()).unwrap().is_empty());
+}
+
+#[test]
+fn a_socket_passed_by_the_service_manager_is_served() {
+    let folder = folder(RIG);
+    let path = folder.path().join("activated");
+    // The service manager's own helper passes the socket and LISTEN_FDS, and starts the daemon at the first client.
+    let process = Command::new("systemd-socket-activate")
+        .arg("--listen")
+        .arg(&path)
+        .arg(env!("CARGO_BIN_EXE_raysweepd"))
+        .arg("--rig")
+        .arg(folder.path().join("rig.toml"))
+        .arg("--data")
+        .arg(folder.path().join("sessions"))
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("systemd-socket-activate: `cargo xtask test` installs it");
+    let mut daemon = Daemon { process, socket: path };
+    assert_eq!(daemon.client().status().unwrap().rig, "plane");
+    daemon.terminate();
+    assert!(daemon.process.wait().unwrap().success());
+}

@@ -1,0 +1,222 @@
+//! The program `raysweep` itself: what it prints and how it exits.
+
+use std::io::{BufRead, BufReader, Lines};
+use std::path::PathBuf;
+use std::process::{Child, ChildStdout, Command, Output, Stdio};
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use raysweep::server::{Access, Limits, Peer};
+use raysweep_core::VsyncStats;
+use raysweep_proto::{Event, RunState};
+use serde_json::Value;
+
+use crate::fake::{Daemon, session};
+
+fn command(daemon: &Daemon, arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_raysweep"));
+    command.env("RAYSWEEP_SOCKET", &daemon.path).args(arguments);
+    command
+}
+
+/// Exit code, standard output, standard error.
+fn run(daemon: &Daemon, arguments: &[&str]) -> (i32, String, String) {
+    let Output { status, stdout, stderr } = command(daemon, arguments).output().unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (status.code().unwrap(), text(stdout), text(stderr))
+}
+
+fn plan(daemon: &Daemon, text: &str) -> String {
+    let path: PathBuf = daemon.folder.path().join("plan.toml");
+    std::fs::write(&path, text).unwrap();
+    path.to_str().unwrap().into()
+}
+
+fn json_lines(text: &str) -> Vec<Value> {
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
+    let daemon = Daemon::start();
+    for (text, code, wanted) in
+        [("", 0, "complete: 75 points stored, 0 missing"), ("gaps", 3, "2 missing"), ("fault", 1, "faulted")]
+    {
+        let (exit, out, err) = run(&daemon, &["run", &plan(&daemon, text)]);
+        assert_eq!(exit, code, "{text}: {out}{err}");
+        assert!(out.contains(wanted) && out.contains(session().to_str().unwrap()), "{text}: {out}");
+        assert!(err.contains("37/75 points") && err.contains("4 lost (4 camera gap)"), "{text}: {err}");
+        assert_eq!(out.contains("report.html"), text != "fault", "{text}: {out}");
+        assert_eq!(err.contains("unplugged"), text == "fault", "{text}: {err}");
+    }
+}
+
+#[test]
+fn what_is_known_of_a_run_arrives_at_the_daemon() {
+    let daemon = Daemon::start();
+    let arguments =
+        ["--operator", "Ada", "--sample", "candle", "--note", "third try", "--tag", "a", "--tag", "b"];
+    let plan = plan(&daemon, "plan\ntext");
+    let (exit, out, _) = run(&daemon, &[&["run", &plan, "--detach", "--json"], &arguments[..]].concat());
+    assert_eq!((exit, json_lines(&out)[0]["session"].as_str()), (0, session().to_str()));
+    let runs = daemon.fake.runs.lock().unwrap();
+    let params = &runs[0];
+    assert_eq!(params.plan, "plan\ntext");
+    assert_eq!(params.operator.as_deref(), Some("Ada"));
+    assert_eq!(params.sample.as_deref(), Some("candle"));
+    assert_eq!(params.note.as_deref(), Some("third try"));
+    assert_eq!(params.tags, ["a", "b"]);
+}
+
+#[test]
+fn for_programs_every_event_is_a_line_and_the_end_is_the_last() {
+    let daemon = Daemon::start();
+    let (exit, out, err) = run(&daemon, &["--json", "run", &plan(&daemon, "")]);
+    assert_eq!((exit, err.as_str()), (0, ""));
+    let kinds: Vec<_> =
+        json_lines(&out).iter().map(|line| line["event"].as_str().unwrap().to_owned()).collect();
+    assert_eq!(kinds, ["state", "progress", "lost", "state", "finished"]);
+}
+
+#[test]
+fn every_other_command_prints_for_people_and_for_programs() {
+    let daemon = Daemon::start();
+    let plan = plan(&daemon, "hang");
+    for (arguments, human, json) in [
+        (vec!["status"], "37 of 75 stored", "/progress/points_stored"),
+        (vec!["describe"], "operator  Begins a run", "/methods/0/params/type"),
+        (vec!["check", &plan], "relative rows -94 to 94", "/warnings/0"),
+        (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),
+        (vec!["run", &plan, "--detach"], "/data/20260101-000000_fake", ""),
+        (vec!["pause"], "held", ""),
+        (vec!["continue"], "goes on", ""),
+        (vec!["cancel"], "kept", ""),
+        (vec!["resume", "old", "--detach"], "/data/20260101-000000_fake", ""),
+    ] {
+        let (exit, out, err) = run(&daemon, &arguments);
+        assert_eq!(exit, 0, "{arguments:?}: {out}{err}");
+        assert!(out.contains(human), "{arguments:?}: {out}");
+        if !json.is_empty() {
+            let (exit, out, _) = run(&daemon, &[&arguments[..], &["--json"]].concat());
+            assert_eq!(exit, 0, "{arguments:?}");
+            let lines = json_lines(&out);
+            assert!(lines.len() == 1 && lines[0].pointer(json).is_some(), "{arguments:?}: {out}");
+        }
+    }
+}
+
+#[test]
+fn a_bad_plan_is_shown_with_its_file_and_line() {
+    let daemon = Daemon::start();
+    let plan = plan(&daemon, "bad\n12 = count\n");
+    for name in ["check", "run"] {
+        let (exit, out, err) = run(&daemon, &[name, &plan]);
+        assert_eq!((exit, out.as_str()), (5, ""), "{err}");
+        for part in ["count is 0; 1 to 1000 is allowed", "plan.toml", "12 = count", "sweep.count"] {
+            assert!(err.contains(part), "{name}: {part} in {err}");
+        }
+        let (exit, out, err) = run(&daemon, &[name, &plan, "--json"]);
+        assert_eq!((exit, err.as_str()), (5, ""));
+        assert_eq!(json_lines(&out)[0]["error"]["data"]["name"], "invalid_plan");
+    }
+}
+
+#[test]
+fn what_cannot_be_done_has_its_exit_code() {
+    let mut daemon = Daemon::start();
+    let (exit, _, err) = run(&daemon, &["frobnicate"]);
+    assert_eq!(exit, 2, "{err}");
+    let (exit, _, err) = run(&daemon, &["run", "no/such/plan.toml"]);
+    assert!(exit == 2 && err.contains("no/such/plan.toml"), "{exit} {err}");
+    let (exit, _, err) = run(&daemon, &["cancel"]);
+    assert!(exit == 5 && err.contains("no run"), "{exit} {err}");
+    let (exit, _, err) = run(&daemon, &["watch"]);
+    assert!(exit == 5 && err.contains("no run is under way"), "{exit} {err}");
+    let (exit, _, err) = run(&daemon, &["resume", "none"]);
+    assert!(exit == 5 && err.contains("no session `none`"), "{exit} {err}");
+    let (exit, _, err) = run(&daemon, &["process", "no/such/session"]);
+    assert!(exit == 1 && !err.is_empty(), "{exit} {err}");
+
+    daemon.stop();
+    let (exit, out, err) = run(&daemon, &["status"]);
+    assert!(exit == 4 && out.is_empty() && err.contains("raysweepd.sock"), "{exit} {err}");
+    let (exit, out, _) = run(&daemon, &["status", "--json"]);
+    assert!(exit == 4 && json_lines(&out)[0]["error"]["message"].is_string(), "{exit} {out}");
+
+    let access = Access::identified_by(Some("raysweep".into()), |_| Ok(Peer { uid: 65534, gid: 65534 }));
+    let daemon = Daemon::with(Limits::default(), access);
+    let (exit, _, err) = run(&daemon, &["run", &plan(&daemon, "")]);
+    assert!(exit == 5 && err.contains("usermod -aG raysweep"), "{exit} {err}");
+}
+
+#[test]
+fn ctrl_c_cancels_the_run_and_the_client_sees_its_end() {
+    let daemon = Daemon::start();
+    let mut child =
+        command(&daemon, &["run", &plan(&daemon, "hang"), "--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    lines.next().unwrap().unwrap();
+    kill(Pid::from_raw(child.id() as i32), Signal::SIGINT).unwrap();
+    let last: Value = serde_json::from_str(&lines.last().unwrap().unwrap()).unwrap();
+    assert_eq!((&last["event"], &last["state"]), (&"finished".into(), &"cancelled".into()));
+    assert_eq!(child.wait().unwrap().code(), Some(3));
+    assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Idle);
+}
+
+#[test]
+fn a_second_ctrl_c_leaves_the_run_to_the_daemon() {
+    let daemon = Daemon::start();
+    let arguments = ["run", &plan(&daemon, "hang"), "--note", "stubborn"];
+    let mut child = command(&daemon, &arguments).stderr(Stdio::piped()).spawn().unwrap();
+    let pid = Pid::from_raw(child.id() as i32);
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
+    assert!(lines.any(|line| line.contains("running")));
+    kill(pid, Signal::SIGINT).unwrap();
+    assert!(lines.any(|line| line.contains("Ctrl-C again")));
+    kill(pid, Signal::SIGINT).unwrap();
+    assert!(lines.any(|line| line.contains("left to the daemon")));
+    assert_eq!(child.wait().unwrap().code(), Some(3));
+    assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Running);
+}
+
+#[test]
+fn watch_follows_anothers_run_and_ctrl_c_does_not_touch_it() {
+    let daemon = Daemon::start();
+    run(&daemon, &["run", &plan(&daemon, "hang"), "--detach"]);
+    let (mut left, _lines) = watching(&daemon);
+    let (mut stays, lines) = watching(&daemon);
+    kill(Pid::from_raw(left.id() as i32), Signal::SIGINT).unwrap();
+    assert_eq!(left.wait().unwrap().code(), Some(0));
+    assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Running);
+    run(&daemon, &["cancel"]);
+    assert!(lines.last().unwrap().unwrap().contains("cancelled"));
+    assert_eq!(stays.wait().unwrap().code(), Some(3));
+}
+
+/// Begins to watch, and waits until events arrive there.
+fn watching(daemon: &Daemon) -> (Child, Lines<BufReader<ChildStdout>>) {
+    let mut child = command(daemon, &["watch", "--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let first = std::thread::spawn(move || {
+        lines.next().unwrap().unwrap();
+        lines
+    });
+    while !first.is_finished() {
+        daemon.fake.publish(Event::Vsync(VsyncStats::default()));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    (child, first.join().unwrap())
+}
+
+#[test]
+fn a_daemon_that_goes_away_ends_the_client() {
+    let mut daemon = Daemon::start();
+    let mut child =
+        command(&daemon, &["run", &plan(&daemon, "hang"), "--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    lines.next().unwrap().unwrap();
+    daemon.stop();
+    assert!(lines.last().unwrap().unwrap().contains("was lost"));
+    assert_eq!(child.wait().unwrap().code(), Some(4));
+}

@@ -1,0 +1,257 @@
+//! A daemon without a rig: what it does is told by the plan's first word.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use raysweep::control::Control;
+use raysweep::server::{Access, Limits, Listening, serve_within};
+use raysweep_core::{Counts, LossCause, VsyncStats};
+use raysweep_proto::{
+    CheckReport, Client, ErrorCode, Event, Progress, ResumeParams, RpcError, RunParams, RunState,
+    SessionInfo, Started, Status,
+};
+use tokio::runtime::Runtime;
+use tokio::sync::{broadcast, oneshot};
+
+/// Events that the fake keeps for a subscriber.
+pub const KEPT_EVENTS: usize = 16;
+
+/// A complete [`Control`] whose state is all there is to it.
+pub struct Fake {
+    pub state: Mutex<RunState>,
+    pub runs: Mutex<Vec<RunParams>>,
+    pub resumed: Mutex<Vec<PathBuf>>,
+    /// A call of `check` on the plan `wait` holds until somebody lets go of this.
+    pub gate: Mutex<()>,
+    events: broadcast::Sender<Event>,
+}
+
+impl Fake {
+    fn new() -> Self {
+        Self {
+            state: Mutex::new(RunState::Idle),
+            runs: Mutex::default(),
+            resumed: Mutex::default(),
+            gate: Mutex::default(),
+            events: broadcast::Sender::new(KEPT_EVENTS),
+        }
+    }
+
+    pub fn publish(&self, event: Event) {
+        let _ = self.events.send(event);
+    }
+
+    fn go(&self, state: RunState) {
+        *self.state.lock().unwrap() = state;
+        self.publish(Event::State { state, session: Some(session()) });
+    }
+
+    fn finish(&self, state: &str, missing: usize) {
+        self.go(if state == "faulted" { RunState::Faulted } else { RunState::Idle });
+        let error = (state == "faulted").then(|| "camera: unplugged".to_owned());
+        let report = (state == "complete").then(|| session().join("report.html"));
+        let (session, state) = (session(), state.to_owned());
+        self.publish(Event::Finished { session, state, error, report, stored: 75 - missing, missing });
+    }
+
+    /// Begins a run and, unless the plan says `hang`, ends it as the plan says.
+    fn begin(&self, plan: &str) -> Result<Started, RpcError> {
+        if *self.state.lock().unwrap() == RunState::Running {
+            return Err(RpcError::new(ErrorCode::Busy, "the daemon is running: cancel the run"));
+        }
+        self.go(RunState::Running);
+        self.publish(Event::Progress(progress()));
+        self.publish(Event::Lost { point: 3, attempt: 0, counts: progress().counts });
+        match plan {
+            "hang" => {}
+            "fault" => self.finish("faulted", 40),
+            "gaps" => self.finish("complete", 2),
+            _ => self.finish("complete", 0),
+        }
+        Ok(Started { session: session() })
+    }
+
+    fn turn(&self, from: RunState, to: RunState) -> Result<(), RpcError> {
+        if *self.state.lock().unwrap() != from {
+            return Err(RpcError::new(ErrorCode::NotRunning, "there is no run"));
+        }
+        self.go(to);
+        Ok(())
+    }
+}
+
+pub fn session() -> PathBuf {
+    "/data/20260101-000000_fake".into()
+}
+
+pub fn progress() -> Progress {
+    let mut counts = Counts { expected: 300, averaged: 296, ..Counts::default() };
+    counts.lose(LossCause::CameraGap, 4);
+    Progress {
+        points_stored: 37,
+        points_planned: 75,
+        counts,
+        elapsed_s: 1.5,
+        left_s: Some(1.5),
+        frames_per_s: 200.0,
+    }
+}
+
+pub fn report() -> CheckReport {
+    CheckReport {
+        points: 75,
+        extra_points: 6,
+        frames: 648,
+        light_s: 10.8,
+        memory_bytes: 20 << 20,
+        disk_bytes: 30 << 20,
+        disk_free_bytes: 1 << 40,
+        reach_rows: (-94, 94),
+        condition: 1234.5,
+        warnings: vec!["few points".into()],
+    }
+}
+
+pub fn listed() -> SessionInfo {
+    SessionInfo {
+        session: session(),
+        name: "fake".into(),
+        created: "2026-01-01T00:00:00Z".into(),
+        stored: 75,
+        points: 75,
+        state: "complete".into(),
+    }
+}
+
+/// The error of the plan `bad ...`: its fifth and sixth byte are wrong.
+pub fn bad_plan() -> RpcError {
+    let mut error =
+        RpcError::new(ErrorCode::InvalidPlan, "count is 0; 1 to 1000 is allowed").of_field("sweep.count");
+    error.data.as_mut().unwrap().span = Some((4, 6));
+    error
+}
+
+impl Control for Fake {
+    fn status(&self) -> Status {
+        Status {
+            version: "1".into(),
+            rig: "plane".into(),
+            state: *self.state.lock().unwrap(),
+            session: Some(session()),
+            progress: Some(progress()),
+            vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
+            error: None,
+        }
+    }
+
+    fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
+        match plan.split_whitespace().next() {
+            Some("bad") => return Err(bad_plan()),
+            Some("panic") => panic!("a defect, on purpose"),
+            Some("wait") => drop(self.gate.lock()),
+            _ => {}
+        }
+        Ok(report())
+    }
+
+    fn run(&self, params: RunParams) -> Result<Started, RpcError> {
+        if params.plan.starts_with("bad") {
+            return Err(bad_plan());
+        }
+        self.runs.lock().unwrap().push(params.clone());
+        self.begin(&params.plan)
+    }
+
+    fn resume(&self, params: ResumeParams) -> Result<Started, RpcError> {
+        if params.session == Path::new("none") {
+            return Err(RpcError::new(ErrorCode::NoSession, "there is no session `none`"));
+        }
+        self.resumed.lock().unwrap().push(params.session);
+        self.begin("")
+    }
+
+    fn pause(&self) -> Result<(), RpcError> {
+        self.turn(RunState::Running, RunState::Paused)
+    }
+
+    fn go_on(&self) -> Result<(), RpcError> {
+        self.turn(RunState::Paused, RunState::Running)
+    }
+
+    /// Ends a run, unless it was begun with the note `stubborn`.
+    fn cancel(&self) -> Result<(), RpcError> {
+        if *self.state.lock().unwrap() != RunState::Running {
+            return Err(RpcError::new(ErrorCode::NotRunning, "there is no run"));
+        }
+        if self.runs.lock().unwrap().last().and_then(|run| run.note.clone()).as_deref() != Some("stubborn") {
+            self.finish("cancelled", 38);
+        }
+        Ok(())
+    }
+
+    fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
+        Ok(vec![listed()])
+    }
+
+    fn events(&self) -> broadcast::Receiver<Event> {
+        self.events.subscribe()
+    }
+}
+
+/// A server over a real socket, with the fake behind it.
+pub struct Daemon {
+    pub fake: Arc<Fake>,
+    pub path: PathBuf,
+    pub folder: tempfile::TempDir,
+    runtime: Option<Runtime>,
+    stop: Option<oneshot::Sender<()>>,
+    served: Option<tokio::task::JoinHandle<std::io::Result<()>>>,
+}
+
+impl Daemon {
+    pub fn start() -> Self {
+        Self::with(Limits::default(), Access::new(None))
+    }
+
+    pub fn with(limits: Limits, access: Access) -> Self {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("raysweepd.sock");
+        let fake = Arc::new(Fake::new());
+        let (stop, stopped) = oneshot::channel::<()>();
+        let Listening { listener, file } = {
+            let _within = runtime.enter();
+            Listening::bind(&path).unwrap()
+        };
+        let control = fake.clone();
+        let served = runtime.spawn(async move {
+            let served = serve_within(limits, listener, control, access, async { drop(stopped.await) }).await;
+            drop(file);
+            served
+        });
+        Self { fake, path, folder, runtime: Some(runtime), stop: Some(stop), served: Some(served) }
+    }
+
+    pub fn client(&self) -> Client {
+        Client::connect(&self.path).unwrap()
+    }
+
+    /// Stops the server and waits until it has ended.
+    pub fn stop(&mut self) {
+        if let (Some(runtime), Some(served)) = (&self.runtime, self.served.take()) {
+            drop(self.stop.take());
+            runtime.block_on(served).unwrap().unwrap();
+        }
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        // Clients that a failed test leaves behind must not keep the test from ending.
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_timeout(Duration::from_millis(100));
+        }
+    }
+}

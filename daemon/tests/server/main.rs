@@ -1,0 +1,8 @@
+//! The socket and the command line, over a real Unix socket, with a fake daemon behind them.
+#![expect(clippy::unwrap_used, reason = "a helper of a test fails the test")]
+
+mod command;
+mod docs;
+mod fake;
+mod malformed;
+mod socket;

@@ -1,0 +1,250 @@
+//! Methods, events, roles and limits.
+
+use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::unix::net::UnixStream;
+use std::time::{Duration, Instant};
+
+use raysweep::server::{Access, Limits, Peer};
+use raysweep_proto::{
+    Client, ClientError, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES, Method, Role, RunParams, RunState,
+};
+use serde_json::{Value, json};
+
+use crate::fake::{Daemon, KEPT_EVENTS, bad_plan, listed, progress, report, session};
+
+/// What takes so long has hung.
+const HANGS: Duration = Duration::from_secs(60);
+
+fn code(result: Result<impl std::fmt::Debug, ClientError>) -> ErrorCode {
+    match result {
+        Err(ClientError::Rpc(error)) => error.name().unwrap(),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn every_method_makes_the_round_trip() {
+    let daemon = Daemon::start();
+    let mut client = daemon.client();
+    let mut events = daemon.client().subscribe().unwrap();
+
+    assert_eq!(client.status().unwrap().state, RunState::Idle);
+    assert_eq!(client.check("fine").unwrap(), report());
+    let Err(ClientError::Rpc(error)) = client.check("bad plan") else { panic!("a bad plan passes") };
+    assert_eq!(error, bad_plan(), "an error arrives as the daemon made it");
+    assert_eq!(client.sessions().unwrap(), [listed()]);
+    assert_eq!(code(client.pause()), ErrorCode::NotRunning);
+    assert_eq!(code(client.go_on()), ErrorCode::NotRunning);
+    assert_eq!(code(client.cancel()), ErrorCode::NotRunning);
+    assert_eq!(code(client.resume("none")), ErrorCode::NoSession);
+
+    let params =
+        RunParams { plan: "hang".into(), tags: vec!["a".into(), "b".into()], ..RunParams::default() };
+    assert_eq!(client.run(&params).unwrap().session, session());
+    assert_eq!(daemon.fake.runs.lock().unwrap()[0].tags, ["a", "b"]);
+    assert_eq!(code(client.run(&params)), ErrorCode::Busy);
+    client.pause().unwrap();
+    assert_eq!(client.status().unwrap().state, RunState::Paused);
+    client.go_on().unwrap();
+    client.cancel().unwrap();
+    assert_eq!(client.resume("old").unwrap().session, session());
+    assert_eq!(*daemon.fake.resumed.lock().unwrap(), [std::path::Path::new("old")]);
+
+    let state = |state| Event::State { state, session: Some(session()) };
+    assert_eq!(events.next().unwrap().unwrap(), state(RunState::Running));
+    assert_eq!(events.next().unwrap().unwrap(), Event::Progress(progress()));
+    assert!(matches!(events.next().unwrap().unwrap(), Event::Lost { point: 3, .. }));
+    assert_eq!(events.next().unwrap().unwrap(), state(RunState::Paused));
+    assert_eq!(events.next().unwrap().unwrap(), state(RunState::Running));
+    assert_eq!(events.next().unwrap().unwrap(), state(RunState::Idle));
+    assert!(matches!(events.next().unwrap().unwrap(), Event::Finished { missing: 38, .. }));
+}
+
+#[test]
+fn describe_lists_every_method_with_its_schemas() {
+    let daemon = Daemon::start();
+    let description = daemon.client().describe().unwrap();
+    let names: Vec<_> = description.methods.iter().map(|method| method.name.as_str()).collect();
+    assert_eq!(names, Method::ALL.map(Method::name));
+    for method in &description.methods {
+        assert_eq!(method.params.get("type"), Some(&json!("object")), "{}", method.name);
+        assert!(method.result.get("type").is_some(), "{}", method.name);
+        assert!(!method.about.is_empty());
+    }
+    assert!(description.event.get("oneOf").is_some());
+    assert_eq!(
+        (description.limits.clients, description.limits.message_bytes),
+        (MAX_CLIENTS, MAX_MESSAGE_BYTES)
+    );
+}
+
+#[test]
+fn one_clients_long_call_does_not_hold_another() {
+    let daemon = Daemon::start();
+    let mut other = daemon.client();
+    let gate = daemon.fake.gate.lock().unwrap();
+    let mut waiting = UnixStream::connect(&daemon.path).unwrap();
+    waiting
+        .write_all(
+            b"{\"jsonrpc\":\"2.0\",\"id\":\"slow\",\"method\":\"check\",\"params\":{\"plan\":\"wait\"}}\n",
+        )
+        .unwrap();
+    // The call holds until the gate opens, so that this answer comes before the other.
+    assert_eq!(other.check("fine").unwrap(), report());
+    drop(gate);
+    let mut line = String::new();
+    BufReader::new(waiting).read_line(&mut line).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&line).unwrap()["id"], "slow");
+}
+
+#[test]
+fn a_slow_subscriber_skips_and_the_others_do_not_wait() {
+    // No time-out, so that it does not matter how long the quick one takes.
+    let limits = Limits { write_timeout: Duration::from_secs(3600), ..Limits::default() };
+    let daemon = Daemon::with(limits, Access::new(None));
+    let mut slow = daemon.client().subscribe().unwrap();
+    let mut quick = daemon.client().subscribe().unwrap();
+    // 400 events of 8 KiB are more than a socket's buffers and the fake's memory of events hold.
+    let event = |number: usize| {
+        let session = Some(format!("{number}/{}", "x".repeat(8192)).into());
+        Event::State { state: RunState::Running, session }
+    };
+    let total = 400;
+    for number in 0..total {
+        daemon.fake.publish(event(number));
+        assert_eq!(quick.next().unwrap().unwrap(), event(number));
+    }
+    let (mut seen, mut skipped) = (0, 0);
+    while seen + skipped < total {
+        match slow.next_within(HANGS).unwrap() {
+            Some(Event::Skipped { events }) => skipped += events as usize,
+            Some(_) => seen += 1,
+            None => panic!("{seen} seen, {skipped} skipped, and no more comes"),
+        }
+    }
+    assert!(skipped > total / 2 && seen > KEPT_EVENTS, "{seen} seen, {skipped} skipped");
+}
+
+#[test]
+fn a_client_that_does_not_read_is_dropped() {
+    let limits = Limits { write_timeout: Duration::from_millis(20), clients: 1, ..Limits::default() };
+    let daemon = Daemon::with(limits, Access::new(None));
+    let mut deaf = UnixStream::connect(&daemon.path).unwrap();
+    // The server stops reading once its answers find no room, and hangs up: then writing fails.
+    deaf.set_write_timeout(Some(HANGS)).unwrap();
+    let ask = b"{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"describe\"}\n".repeat(100);
+    let end = loop {
+        if let Err(error) = deaf.write_all(&ask) {
+            break error.kind();
+        }
+    };
+    assert!(matches!(end, ErrorKind::BrokenPipe | ErrorKind::ConnectionReset), "{end:?}");
+    // Its place is free again.
+    come_in(&daemon);
+}
+
+/// Connects and calls as soon as there is a place: the server learns of a hang-up soon, not at once.
+fn come_in(daemon: &Daemon) {
+    let since = Instant::now();
+    while let Err(error) = daemon.client().status() {
+        assert!(since.elapsed() < HANGS, "no place gets free");
+        assert_eq!(code(Err::<(), _>(error)), ErrorCode::TooManyClients);
+    }
+}
+
+#[test]
+fn one_client_more_than_allowed_is_turned_away() {
+    let daemon = Daemon::with(Limits { clients: 2, ..Limits::default() }, Access::new(None));
+    let mut first = daemon.client();
+    let mut second = daemon.client();
+    first.status().unwrap();
+    second.status().unwrap();
+    assert_eq!(code(daemon.client().status()), ErrorCode::TooManyClients);
+    first.status().unwrap();
+    drop(second);
+    come_in(&daemon);
+}
+
+#[test]
+fn a_defect_of_the_daemon_costs_one_answer() {
+    let daemon = Daemon::start();
+    let (mut client, mut other) = (daemon.client(), daemon.client());
+    assert_eq!(code(client.check("panic")), ErrorCode::Internal);
+    assert_eq!(client.check("fine").unwrap(), report());
+    other.status().unwrap();
+}
+
+#[test]
+fn who_only_observes_is_forbidden_to_drive() {
+    let access = Access::identified_by(Some("raysweep".into()), |_| Ok(Peer { uid: 65534, gid: 65534 }));
+    let daemon = Daemon::with(Limits::default(), access);
+    let mut client = daemon.client();
+    let driving = [
+        client.run(&RunParams::default()).map(drop),
+        client.resume("old").map(drop),
+        client.pause(),
+        client.go_on(),
+        client.cancel(),
+    ];
+    assert_eq!(driving.len(), Method::ALL.iter().filter(|method| method.role() == Role::Operator).count());
+    for result in driving {
+        let Err(ClientError::Rpc(error)) = result else { panic!("{result:?}") };
+        assert_eq!(error.name(), Some(ErrorCode::Forbidden));
+        assert!(error.message.contains("usermod -aG raysweep"), "{error}");
+    }
+    assert!(daemon.fake.runs.lock().unwrap().is_empty() && daemon.fake.resumed.lock().unwrap().is_empty());
+    client.describe().unwrap();
+    client.status().unwrap();
+    client.check("fine").unwrap();
+    client.sessions().unwrap();
+    client.subscribe().unwrap();
+}
+
+#[test]
+fn the_end_of_the_daemon_reaches_subscribers_after_their_events() {
+    let mut daemon = Daemon::start();
+    let mut events = daemon.client().subscribe().unwrap();
+    let idle = daemon.client();
+    // So many that most still wait when the end comes.
+    let event =
+        |number: usize| Event::State { state: RunState::Idle, session: Some(number.to_string().into()) };
+    for number in 0..KEPT_EVENTS {
+        daemon.fake.publish(event(number));
+    }
+    daemon.stop();
+    for number in 0..KEPT_EVENTS {
+        assert_eq!(events.next().unwrap().unwrap(), event(number));
+    }
+    assert!(matches!(events.next(), Some(Err(ClientError::Lost { .. }))));
+    drop(idle);
+    assert!(
+        matches!(Client::connect(&daemon.path), Err(ClientError::NotRunning { .. })),
+        "the socket is removed"
+    );
+}
+
+#[test]
+fn requests_sent_together_are_answered_in_order_and_notifications_not_at_all() {
+    let daemon = Daemon::start();
+    let mut stream = UnixStream::connect(&daemon.path).unwrap();
+    let text = concat!(
+        r#"{"jsonrpc":"2.0","id":1,"method":"status"}"#,
+        "\n",
+        r#"{"jsonrpc":"2.0","method":"run","params":{"plan":"hang"}}"#,
+        "\r\n",
+        r#"{"jsonrpc":"2.0","id":null,"method":"pause"}"#,
+        "\n",
+        r#"{"jsonrpc":"2.0","id":"last","method":"status"}"#,
+    );
+    stream.write_all(text.as_bytes()).unwrap();
+    stream.shutdown(std::net::Shutdown::Write).unwrap();
+    let mut answers = String::new();
+    stream.read_to_string(&mut answers).unwrap();
+    let answers: Vec<Value> = answers.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(
+        answers.iter().map(|answer| &answer["id"]).collect::<Vec<_>>(),
+        [&json!(1), &Value::Null, &json!("last")]
+    );
+    assert_eq!(answers[1]["result"], json!({}));
+    assert_eq!(answers[2]["result"]["state"], "paused", "the notification was carried out");
+}
