@@ -1,1 +1,136 @@
-//! Tests.
+//! What the tests of the whole have in common: a rig and a plan in a folder of their own, run through the daemon's
+//! core, and the session that comes out.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ndarray::Array2;
+use raysweep::control::Control;
+use raysweep::rig::Rig;
+use raysweep::run::Runner;
+use raysweep_pipeline::Registry;
+use raysweep_proto::{Event, ResumeParams, RunParams};
+use raysweep_session::Session;
+use raysweep_session::ledger::State;
+use raysweep_session::stack::ArrayName;
+use tempfile::TempDir;
+
+/// The folder of the tests' data.
+pub fn data(file: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(file)
+}
+
+/// A rig file for the simulated plane rig; `more` is appended, `sim` stands at the head of `[sim]`.
+pub fn rig_text(rows: usize, sim: &str, more: &str) -> String {
+    format!(
+        "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
+         [projector]\ndriver = \"sim\"\nrows = {rows}\nrow_time_us = 22.22\n[sim]\n{sim}\n{more}"
+    )
+}
+
+/// The rig of the rendered corner scene.
+pub fn corner_rig(more: &str) -> String {
+    rig_text(128, &format!("scene = {:?}", data("p2r_corner.npz")), more)
+}
+
+/// A daemon's core over a folder of its own.
+pub struct Bench {
+    /// Rig file and sessions.
+    pub folder: TempDir,
+    /// The daemon's core.
+    pub runner: Arc<Runner>,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone)]
+pub struct Ended {
+    /// Its session.
+    pub session: PathBuf,
+    /// `complete`, `cancelled`, `faulted`.
+    pub state: String,
+    /// Why it faulted.
+    pub error: Option<String>,
+}
+
+impl Bench {
+    /// A bench with this rig.
+    ///
+    /// # Panics
+    /// When the rig cannot be built.
+    pub fn new(rig: &str) -> Self {
+        Self::with_registry(rig, Registry::default())
+    }
+
+    /// A bench with this rig and these stages.
+    ///
+    /// # Panics
+    /// When the rig cannot be built.
+    pub fn with_registry(rig: &str, registry: Registry) -> Self {
+        let folder = TempDir::new().expect("a temporary folder");
+        let path = folder.path().join("rig.toml");
+        std::fs::write(&path, rig).expect("rig.toml written");
+        let rig = Rig::load(&path).unwrap_or_else(|error| panic!("{error}"));
+        let runner = Arc::new(Runner::new(rig, folder.path().join("sessions"), registry));
+        Self { folder, runner }
+    }
+
+    /// Runs a plan to its end.
+    ///
+    /// # Panics
+    /// When the plan is refused.
+    pub fn run(&self, plan: &str) -> Ended {
+        let mut events = self.runner.events();
+        let params = RunParams { plan: plan.into(), ..RunParams::default() };
+        self.runner.run(params).unwrap_or_else(|error| panic!("{error}"));
+        end_of(&mut events)
+    }
+
+    /// Acquires what a session lacks.
+    ///
+    /// # Panics
+    /// When the session is refused.
+    pub fn resume(&self, session: &Path) -> Ended {
+        let mut events = self.runner.events();
+        let params = ResumeParams { session: session.into() };
+        self.runner.resume(params).unwrap_or_else(|error| panic!("{error}"));
+        end_of(&mut events)
+    }
+}
+
+/// Waits for the end of the run.
+///
+/// # Panics
+/// When the daemon's core ends first.
+pub fn end_of(events: &mut tokio::sync::broadcast::Receiver<Event>) -> Ended {
+    use tokio::sync::broadcast::error::RecvError;
+    loop {
+        match events.blocking_recv() {
+            Ok(Event::Finished { session, state, error, .. }) => return Ended { session, state, error },
+            Ok(_) | Err(RecvError::Lagged(_)) => {}
+            Err(RecvError::Closed) => panic!("the daemon's core ended before the run"),
+        }
+    }
+}
+
+impl Ended {
+    /// The session on disk.
+    ///
+    /// # Panics
+    /// When it cannot be read.
+    pub fn open(&self) -> (Session, State) {
+        let session = Session::open(&self.session).expect("a session");
+        let state = session.state().expect("a ledger");
+        (session, state)
+    }
+
+    /// The mean counts of a stored point, `[t, s]`.
+    ///
+    /// # Panics
+    /// When it is not stored.
+    pub fn mean(&self, array: ArrayName, index: usize) -> Array2<f64> {
+        let (session, state) = self.open();
+        let point = state.point(array, index).expect("stored");
+        let sum = session.stack().and_then(|stack| stack.read_point(array, index)).expect("stored data");
+        sum.mapv(|sum| f64::from(sum) / f64::from(point.frames))
+    }
+}

@@ -1,0 +1,141 @@
+//! Simulated faults: whatever goes wrong with VSYNC, camera and settings, a stored image is the image of its settings.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::path::Path;
+
+use ndarray::Array2;
+use raysweep::config::{Plan, RigFile};
+use raysweep_core::{LossCause, PixelFormat};
+use raysweep_session::stack::ArrayName;
+use raysweep_sim::{PlaneRig, PlaneSetup};
+use raysweep_tests::{Bench, Ended, rig_text};
+
+/// Exposures far apart and delays far apart, so that no frame can pass for one of another point.
+const PLAN: &str = "kind = \"sweep\"\n[sweep]\naverage = 4\n\
+                    delay_us = [-900, -300, 150, 450, 1100]\nexposure_us = [300, 800, 1300]\n";
+
+/// A textured scene of 32 x 24 pixels without noise; jitter stays, and so does the line's 720-row frame.
+fn rig(faults: &str) -> String {
+    let sim = "scene = \"v-groove\"\nscene_rows = 32\nscene_columns = 24\nseed = 5";
+    rig_text(720, sim, &format!("[sim.sensor]\nnoise = false\n{faults}"))
+}
+
+/// The images that the stored points must be: noise-free light at the delays measured for their frames.
+fn truth(rig_toml: &str) -> PlaneRig {
+    let rig = RigFile::parse(rig_toml).unwrap();
+    let setup = PlaneSetup {
+        raster: rig.raster(),
+        camera_row_time_us: rig.camera_row_time_us(),
+        white_dn: rig.camera.white_dn,
+        black_dn: rig.camera.black_dn,
+        format: PixelFormat::Mono12,
+        first_row: None,
+    };
+    PlaneRig::new(rig.sim, setup, Path::new("")).unwrap()
+}
+
+fn assert_true(rig_toml: &str, ended: &Ended) {
+    let truth = truth(rig_toml);
+    let (_, state) = ended.open();
+    let plan = Plan::parse(PLAN).unwrap();
+    let (delays, exposures) = (plan.sweep.delay_us.values(), plan.sweep.exposure_us.values());
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    assert_eq!(state.stored(ArrayName::Sum).count(), 15, "every point is stored");
+    for point in state.stored(ArrayName::Sum) {
+        assert!(point.counts.balanced(), "{point:?}");
+        assert_eq!(point.exposure_us, exposures[point.index / 5]);
+        assert_eq!(point.delay_us, delays[point.index % 5]);
+        let mut expected = Array2::<f64>::zeros((32, 24));
+        for &delay_us in &point.delays_us {
+            assert!((delay_us - point.delay_us).abs() < 50.0);
+            expected += &truth.noise_free(delay_us, point.exposure_us).unwrap().mapv(f64::from);
+        }
+        expected *= 2500.0 / point.delays_us.len() as f64;
+        let stored = ended.mean(ArrayName::Sum, point.index) - 64.0;
+        let off = (&stored - &expected).iter().fold(0.0_f64, |most, x| x.abs().max(most));
+        assert!(
+            off < 2.0,
+            "point {} ({} us, {} us) is off by {off} counts",
+            point.index,
+            point.delay_us,
+            point.exposure_us
+        );
+    }
+}
+
+/// Runs the plan under faults; returns how often each loss happened.
+fn survive(faults: &str) -> std::collections::BTreeMap<LossCause, u64> {
+    let rig = rig(faults);
+    let bench = Bench::new(&rig);
+    let ended = bench.run(PLAN);
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    assert_true(&rig, &ended);
+    ended.open().1.counts.lost
+}
+
+#[test]
+fn without_faults_nothing_is_lost() {
+    assert!(survive("").is_empty());
+}
+
+#[test]
+fn settings_three_frames_late() {
+    survive("[sim.camera]\nlate_frames_min = 3\nlate_frames_max = 3\n");
+}
+
+#[test]
+fn settings_late_by_varying_numbers_of_frames() {
+    survive("[sim.camera]\nlate_frames_min = 0\nlate_frames_max = 3\n");
+    survive("[sim.camera]\nlate_frames_min = 0\nlate_frames_max = 3\nchunk_exposure = false\n");
+}
+
+#[test]
+fn missing_edges() {
+    let lost = survive("[sim.vsync]\nmissing = 0.05\n");
+    assert!(lost.contains_key(&LossCause::MissedTrigger), "{lost:?}");
+}
+
+#[test]
+fn false_edges_that_trigger_the_camera() {
+    let lost = survive("[sim.vsync]\nfalse_edges = 0.05\n");
+    assert!(lost.contains_key(&LossCause::FalseEdge), "{lost:?}");
+}
+
+#[test]
+fn edges_that_the_watcher_misses() {
+    let lost = survive("[sim.vsync]\nunseen = 0.05\n");
+    assert!(lost.contains_key(&LossCause::EdgeMissing), "{lost:?}");
+}
+
+#[test]
+fn frames_dropped_on_the_way() {
+    let lost = survive("[sim.camera]\ndropped = 0.05\n");
+    assert!(lost.contains_key(&LossCause::CameraGap), "{lost:?}");
+}
+
+#[test]
+fn everything_at_once() {
+    survive(
+        "[sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\njitter_us = 8\n\
+         [sim.camera]\nlate_frames_min = 0\nlate_frames_max = 3\ndropped = 0.02\n",
+    );
+}
+
+#[test]
+fn a_camera_whose_readout_overlaps_exposure() {
+    survive("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 16000\n");
+}
+
+#[test]
+fn a_camera_that_answers_every_second_edge() {
+    assert!(survive("[sim.camera]\nreadout_us = 16100\n").is_empty());
+}
+
+#[test]
+fn a_camera_without_a_trigger_faults_the_run_and_says_so() {
+    let bench = Bench::new(&rig("[sim.vsync]\nmissing = 1.0\n"));
+    let ended = bench.run(PLAN);
+    assert_eq!(ended.state, "faulted");
+    assert!(ended.error.unwrap().contains("VSYNC"), "the error says what to look at");
+}

@@ -1,0 +1,215 @@
+//! Runs through the daemon's core: the same bits whatever the threads, results made again, stages that fail, pause and
+//! cancel, and files that other programs read.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use ndarray::Array2;
+use raysweep::control::Control;
+use raysweep::process;
+use raysweep_pipeline::{Entry, Registry, Stage, StageError, Unit};
+use raysweep_proto::{ErrorCode, RunParams, RunState};
+use raysweep_session::ledger;
+use raysweep_session::stack::ArrayName;
+use raysweep_tests::{Bench, data, end_of, rig_text};
+
+const PLAN: &str = "kind = \"sweep\"\nname = \"flow\"\n[sweep]\naverage = 3\n\
+                    delay_us = { start = -200, stop = 200, count = 5 }\nexposure_us = [100, 250]\n";
+
+fn small_rig(more: &str) -> String {
+    rig_text(24, "scene = \"mix\"\nscene_rows = 24\nscene_columns = 16\nseed = 9", more)
+}
+
+/// Every file of a session that does not hold a time, with its bytes.
+fn lasting_files(session: &Path) -> BTreeMap<String, Vec<u8>> {
+    fn walk(folder: &Path, root: &Path, files: &mut BTreeMap<String, Vec<u8>>) {
+        for entry in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+            let name = entry.strip_prefix(root).unwrap().display().to_string();
+            match entry.is_dir() {
+                true => walk(&entry, root, files),
+                false if ["ledger.jsonl", "manifest.json", "report.html"].contains(&name.as_str()) => {}
+                false => drop(files.insert(name, std::fs::read(&entry).unwrap())),
+            }
+        }
+    }
+    let mut files = BTreeMap::new();
+    walk(session, session, &mut files);
+    assert!(files.keys().any(|name| name.starts_with("products/")) && files.len() > 20, "{:?}", files.keys());
+    files
+}
+
+/// The ledger without times.
+fn lasting_ledger(session: &Path) -> Vec<String> {
+    let entries = ledger::read(&session.join("ledger.jsonl")).unwrap();
+    let without_times = |entry: &ledger::Entry| {
+        let mut value = serde_json::to_value(entry).unwrap();
+        let object = value.as_object_mut().unwrap();
+        object.remove("created");
+        object.remove("started");
+        value.to_string()
+    };
+    entries.iter().map(without_times).collect()
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bits_with_one_thread_and_with_two() {
+    // The worker pool of the pipeline, the simulator and the solver all follow rayon's global pool or its variable.
+    let sessions = ["1", "2"].map(|threads| {
+        let folder = tempfile::tempdir().unwrap();
+        let status = Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "one_run_in_a_process_of_its_own", "--ignored"])
+            .env("RAYON_NUM_THREADS", threads)
+            .env("RAYSWEEP_TEST_KEEP", folder.path())
+            .output()
+            .unwrap();
+        assert!(status.status.success(), "{}", String::from_utf8_lossy(&status.stdout));
+        folder
+    });
+    let [one, two] = &sessions;
+    assert_eq!(lasting_files(&one.path().join("kept")), lasting_files(&two.path().join("kept")));
+    assert_eq!(lasting_ledger(&one.path().join("kept")), lasting_ledger(&two.path().join("kept")));
+}
+
+/// Not a test of its own: what the test above starts.
+#[test]
+#[ignore = "started by the_same_seed_gives_the_same_bits_with_one_thread_and_with_two"]
+fn one_run_in_a_process_of_its_own() {
+    let Some(keep) = std::env::var_os("RAYSWEEP_TEST_KEEP") else { return };
+    let faults = "[sim.vsync]\nmissing = 0.05\n[sim.camera]\nlate_frames_max = 3\ndropped = 0.05\n";
+    let bench = Bench::new(&small_rig(faults));
+    let ended = bench.run(PLAN);
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    std::fs::rename(ended.session, Path::new(&keep).join("kept")).unwrap();
+}
+
+#[test]
+fn processing_again_gives_the_same_bits() {
+    let bench = Bench::new(&small_rig(""));
+    let ended = bench.run(PLAN);
+    let before = lasting_files(&ended.session);
+    let report = std::fs::read(ended.session.join("report.html")).unwrap();
+    for name in ["products", "transport.zarr", "report.html", "manifest.json"] {
+        let path = ended.session.join(name);
+        let removed =
+            if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+        removed.unwrap();
+    }
+    let processed = process::process(&ended.session).unwrap();
+    assert_eq!((processed.stored, processed.points), (10, 10));
+    assert_eq!(lasting_files(&ended.session), before);
+    assert!(std::fs::read(ended.session.join("report.html")).unwrap() == report, "the report differs");
+}
+
+/// Fails on one point by error and on another by panic.
+struct Clumsy;
+
+impl Stage for Clumsy {
+    fn name(&self) -> &str {
+        "clumsy"
+    }
+
+    fn apply(&self, unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError> {
+        match unit.id.point {
+            8 => Err(StageError { stage: "clumsy".into(), what: "would not".into() }),
+            9 => panic!("could not"),
+            _ => Ok(image),
+        }
+    }
+}
+
+#[test]
+fn a_stage_that_fails_or_panics_costs_its_unit_only() {
+    let mut registry = Registry::default();
+    registry.register("clumsy", |_, _, _| Ok(Entry::Stage(Box::new(Clumsy))));
+    let bench = Bench::with_registry(&small_rig(""), registry);
+    let plan = format!("{PLAN}[[stage]]\nname = \"clumsy\"\n[[stage]]\nname = \"demux\"\n");
+    let ended = bench.run(&plan);
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    let (_, state) = ended.open();
+    assert_eq!(state.stored(ArrayName::Sum).count(), 10, "the raw images are stored all the same");
+    let failures: Vec<String> =
+        lasting_ledger(&ended.session).into_iter().filter(|line| line.contains("stage_failed")).collect();
+    assert_eq!(failures.len(), 2);
+    assert!(failures[0].contains("would not") && failures[1].contains("could not"), "{failures:?}");
+    let report = std::fs::read_to_string(ended.session.join("report.html")).unwrap();
+    assert!(report.contains("images demultiplexed"), "the other points have their results");
+}
+
+#[test]
+fn a_cancelled_run_keeps_what_it_has_and_resumes() {
+    let paced = small_rig("").replace("[sim]\n", "[sim]\nrealtime = true\n");
+    let bench = Bench::new(&paced);
+    let mut events = bench.runner.events();
+    bench.runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
+    wait_until(|| bench.runner.status().progress.is_some_and(|progress| progress.points_stored >= 6));
+    bench.runner.pause().unwrap();
+    assert_eq!(bench.runner.status().state, RunState::Paused);
+    let busy = bench.runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap_err();
+    assert_eq!(busy.name(), Some(ErrorCode::Busy));
+    bench.runner.go_on().unwrap();
+    bench.runner.cancel().unwrap();
+    let cancelled = end_of(&mut events);
+    assert_eq!(cancelled.state, "cancelled");
+    let (_, state) = cancelled.open();
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    let missing = state.missing(ArrayName::Sum).count();
+    assert!(missing > 0 && missing + state.stored(ArrayName::Sum).count() == 10);
+
+    let resumed = bench.resume(&cancelled.session);
+    assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
+    let (_, state) = resumed.open();
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    assert_eq!(state.missing(ArrayName::Sum).count(), 0);
+}
+
+fn wait_until(mut holds: impl FnMut() -> bool) {
+    let began = Instant::now();
+    while !holds() {
+        assert!(began.elapsed() < Duration::from_secs(60), "waited in vain");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn bad_plans_and_sessions_are_refused_and_the_daemon_goes_on() {
+    let bench = Bench::new(&small_rig(""));
+    let cases = [
+        ("kind = ", ErrorCode::InvalidPlan, "plan"),
+        ("kind = \"film\"", ErrorCode::InvalidPlan, "sweep"),
+        ("kind = \"sweep\"\n[sweep]\naverag = 3", ErrorCode::InvalidPlan, "averag"),
+        ("kind = \"sweep\"\n[sweep]\naverage = \"many\"", ErrorCode::InvalidPlan, "string"),
+        ("kind = \"sweep\"\n[sweep]\ndelay_us = [1e9]", ErrorCode::InvalidPlan, "period"),
+        ("kind = \"sweep\"\n[sweep]\ndelay_us = [15000]\nexposure_us = [1]", ErrorCode::InvalidPlan, "delay"),
+        ("kind = \"sweep\"\n[[stage]]\nname = \"denoise\"", ErrorCode::InvalidPlan, "demux"),
+        ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nprior = \"flat\"", ErrorCode::InvalidPlan, "split"),
+        ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nalpha = -1", ErrorCode::InvalidPlan, "alpha"),
+        ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\ngamma = 1", ErrorCode::InvalidPlan, "gamma"),
+    ];
+    for (plan, code, says) in cases {
+        let error = bench.runner.run(RunParams { plan: plan.into(), ..RunParams::default() }).unwrap_err();
+        assert_eq!(error.name(), Some(code), "{plan:?}: {error}");
+        assert!(error.message.contains(says) || plan == "kind = ", "{plan:?}: {error}");
+    }
+    let none = bench.runner.resume(raysweep_proto::ResumeParams { session: "nowhere".into() }).unwrap_err();
+    assert_eq!(none.name(), Some(ErrorCode::NoSession));
+    assert_eq!(bench.run(PLAN).state, "complete");
+    assert_eq!(bench.runner.pause().unwrap_err().name(), Some(ErrorCode::NotRunning));
+}
+
+#[test]
+fn zarr_numpy_and_openexr_read_every_file() {
+    let python = std::env::var_os("RAYSWEEP_PYTHON").expect(
+        "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
+    );
+    let bench = Bench::new(&small_rig(""));
+    let ended = bench.run(PLAN);
+    let script = data("").join("../python/read_session.py");
+    let output = Command::new(python).arg(script).arg(&ended.session).output().unwrap();
+    let said =
+        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{said}");
+}
