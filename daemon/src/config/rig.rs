@@ -226,4 +226,14 @@ mod tests {
             assert!(error.span.is_some(), "{text:?} has no place");
         }
     }
+
+    #[test]
+    fn the_documented_rig_file_is_the_defaults() {
+        let page = include_str!("../../../docs/rig.md");
+        let documented = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        assert_eq!(
+            format!("{:#?}", RigFile::parse(documented).unwrap()),
+            format!("{:#?}", RigFile::parse(MINIMAL).unwrap())
+        );
+    }
 }
