@@ -14,8 +14,8 @@ use tempfile::TempDir;
 
 /// 8 x 8 pixels, 9 points, and every fault whose traces could differ after a crash.
 const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
-                   [projector]\ndriver = \"sim\"\nrows = 16\n\
-                   [sim]\nscene = \"v-groove\"\nscene_rows = 16\nscene_columns = 16\nseed = 11\n\
+                   [projector]\ndriver = \"sim\"\nrows = 8\n\
+                   [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\nseed = 11\n\
                    [sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\n\
                    [sim.camera]\nlate_frames_max = 3\ndropped = 0.02\n\
                    [sim.ambient]\nlevel = 0.001\nflicker = 0.5\n";
@@ -29,6 +29,11 @@ struct Daemon {
 
 impl Daemon {
     fn start(folder: &Path) -> Self {
+        Self::start_with_threads(folder, 2)
+    }
+
+    /// Simulator, stages and solver all take their number of threads from rayon's variable.
+    fn start_with_threads(folder: &Path, threads: u32) -> Self {
         let socket = folder.join("socket");
         let process = Command::new(env!("CARGO_BIN_EXE_raysweepd"))
             .arg("--rig")
@@ -37,6 +42,7 @@ impl Daemon {
             .arg(&socket)
             .arg("--data")
             .arg(folder.join("sessions"))
+            .env("RAYON_NUM_THREADS", threads.to_string())
             .stderr(Stdio::null())
             .spawn()
             .unwrap();
@@ -151,6 +157,27 @@ fn fifty_kills_and_resumes_end_like_a_run_without_any() {
     }
     println!("killed {killed_within} of 50 within the run, with these points stored: {resumed_points:?}");
     assert!(killed_within >= 25, "the moments do not lie within the run: only {killed_within} did");
+}
+
+#[test]
+fn the_same_seed_gives_the_same_bits_with_one_thread_and_with_two() {
+    let [one, two] = [1, 2].map(|threads| {
+        let folder = folder(RIG);
+        let mut daemon = Daemon::start_with_threads(folder.path(), threads);
+        let (session, state) = end(&mut daemon, |client| drop(client.run(&plan(PLAN)).unwrap()));
+        assert_eq!(state, "complete");
+        daemon.kill();
+        let ledger = std::fs::read_to_string(session.join("ledger.jsonl")).unwrap();
+        let timeless = ledger.lines().map(|line| {
+            let mut entry: serde_json::Value = serde_json::from_str(line).unwrap();
+            let entry = entry.as_object_mut().unwrap();
+            (entry.remove("created"), entry.remove("started"));
+            serde_json::to_string(entry).unwrap()
+        });
+        let transport = std::fs::read(session.join("transport.zarr/transport/c.0.0.0")).unwrap();
+        (outcome(&session), timeless.collect::<Vec<_>>(), transport)
+    });
+    assert!(one == two, "the sessions differ");
 }
 
 #[test]

@@ -12,7 +12,7 @@ use serde::Deserialize;
 pub struct SimConfig {
     /// An `.npz` file with `T` (relative to the rig file), or the name of a built-in scene.
     pub scene: PathBuf,
-    /// Rows of a built-in scene, 1..=720; a file brings its own.
+    /// Rows of a built-in scene, 8..=720; a file brings its own.
     pub scene_rows: usize,
     /// Columns of a built-in scene; a file brings its own.
     pub scene_columns: usize,

@@ -38,7 +38,7 @@ pub use slab::slab_materials;
 pub const BUILTIN_NAMES: [&str; 5] = ["v-groove", "mirror-ball", "slab", "candle", "mix"];
 
 /// Fewest rows and columns of a built-in scene.
-pub const MIN_SIDE: usize = 16;
+pub const MIN_SIDE: usize = 8;
 
 /// Most entries of a built-in scene's transport: 2 GiB of float32, and 720 x 720 x 720 fits in mono.
 pub const MAX_ENTRIES: usize = 1 << 29;

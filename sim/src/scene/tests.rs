@@ -213,11 +213,21 @@ fn window_is_a_part_of_the_image() {
 }
 
 #[test]
+fn the_smallest_and_odd_sizes_have_light() {
+    for name in BUILTIN_NAMES {
+        for (rows, columns) in [(8, 8), (8, 19), (17, 8), (13, 11)] {
+            let scene = Scene::builtin(name, SceneSize { rows, columns }, 3).unwrap();
+            assert!(scene.transport.sum() > 0.0, "{name} at {rows} x {columns}");
+        }
+    }
+}
+
+#[test]
 fn unfit_requests_say_why() {
     let message = |error: SceneError| error.to_string();
     let unknown = message(Scene::builtin("teapot", SMALL, 0).unwrap_err());
     assert!(unknown.contains("\"teapot\"") && BUILTIN_NAMES.iter().all(|name| unknown.contains(name)));
-    for (rows, columns) in [(0, 40), (40, 0), (15, 40), (4000, 4000), (usize::MAX, usize::MAX)] {
+    for (rows, columns) in [(0, 40), (40, 0), (7, 40), (4000, 4000), (usize::MAX, usize::MAX)] {
         let error = Scene::builtin("slab", SceneSize { rows, columns }, 0).unwrap_err();
         assert!(matches!(error, SceneError::Size { .. }) && message(error).contains(&rows.to_string()));
     }
