@@ -35,11 +35,16 @@ pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<Ch
     let frames: u64 = task.schedule.points.iter().map(|point| u64::from(point.frames)).sum();
     let pixels = (geometry.height * geometry.width) as u64;
     let reach_rows = reach.clone().count() as u64;
-    // The stack as counts and as light, the transport, and its copy on the way to the disk.
-    let memory_bytes = pixels * 4 * (2 * task.schedule.points.len() as u64 + 2 * reach_rows);
+    // The stack twice while it changes hands, where pixels are valid, the transport and its copy on the way to the disk.
+    let memory_bytes = pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows);
     let disk_bytes = pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows) + 10_000_000;
     let existing = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
     let disk_free_bytes = durable::available_bytes(existing).unwrap_or(u64::MAX);
+
+    for point in &task.schedule.points {
+        let shot = geometry.shot(point, camera.trigger_latency_us);
+        camera.allows(&shot.settings).map_err(no_model)?;
+    }
 
     let mut warnings = Vec::new();
     let periods: Vec<u64> = task.schedule.points.iter().map(|point| periods(task, camera, point)).collect();
@@ -71,6 +76,17 @@ pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<Ch
             "a pixel saturates at {headroom:.2} of a white one over {brightest_rows:.0} rows: lower camera.white_dn (gain, aperture) to leave room for indirect light"
         ));
     }
+    let memory_free_bytes = memory_free_bytes().unwrap_or(u64::MAX);
+    for (what, needed, free) in
+        [("memory", memory_bytes, memory_free_bytes), ("disk", disk_bytes, disk_free_bytes)]
+    {
+        if needed > free {
+            let (needed, free) = (needed / 1_000_000, free / 1_000_000);
+            warnings.push(format!(
+                "{needed} MB of {what} are needed and {free} MB are free: the run would be refused"
+            ));
+        }
+    }
     Ok(CheckReport {
         points,
         extra_points: task.schedule.points.len() - points,
@@ -83,6 +99,7 @@ pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<Ch
             * geometry.raster.period_us
             * 1e-6,
         memory_bytes,
+        memory_free_bytes,
         disk_bytes,
         disk_free_bytes,
         reach_rows: (*reach.start(), *reach.end()),
@@ -96,4 +113,12 @@ pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<Ch
 fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
     let shot = task.geometry.shot(point, camera.trigger_latency_us);
     u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))
+}
+
+/// What the system says it can still give to programs.
+fn memory_free_bytes() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    let kilobytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kilobytes * 1024)
 }

@@ -66,9 +66,8 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
     let mut processing = task
         .processing(&Registry::default(), &plan_text)
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
-    let failed = processing.feed_stored(&task, state, &session.stack()?)?;
-    let (products, mut problems) = processing.finish();
-    problems.extend(failed.iter().map(ToString::to_string));
+    processing.feed_stored(&task, state, &session.stack()?, &|| true);
+    let (products, problems) = processing.finish(&|| true);
     results::write_products(&session, &task, &products)?;
     results::write_report(&session, state, &task, &products, &problems)?;
     results::write_manifest(&session, state, &task, &rig)?;
@@ -86,6 +85,9 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
 /// When the session cannot be read or `to` cannot be written.
 pub fn export(dir: &Path, to: &Path) -> Result<usize, ProcessError> {
     let session = Session::open(dir)?;
+    if to.exists() {
+        return Err(ProcessError::Config(format!("{} exists: give a folder that does not", to.display())));
+    }
     std::fs::create_dir(to).map_err(|source| ProcessError::Copy { path: to.to_owned(), source })?;
     let mut files =
         vec![session.report_path(), session.manifest_path(), session.plan_path(), session.rig_path()];

@@ -1,13 +1,16 @@
 //! The stages and folds of a plan, and what is known of the points that they work on.
 
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    Entry, Fold, Product, Registry, RegistryError, Role, Schedule, Stage, StageError, SweepGeometry, Unit,
+    Entry, Fold, Product, Registry, RegistryError, Role, Schedule, Stage, SweepGeometry, Unit, message_of,
     run_stages,
 };
 use raysweep_session::ledger::{PointEntry, State};
-use raysweep_session::stack::{ArrayName, Stack};
+use raysweep_session::stack::{ArrayName, Stack, crc32};
 
 use crate::config::{ConfigError, Plan, RigFile};
 
@@ -35,7 +38,7 @@ impl Task {
             first_row,
             height: size.0,
             width: size.1,
-            white_dn: rig.camera.white_dn,
+            white_dn: rig.camera.white_dn(),
             saturation_dn: SATURATION * f64::from(rig.camera.pixel_format.max_value()),
         };
         Self { plan, schedule, geometry }
@@ -46,13 +49,21 @@ impl Task {
     /// # Errors
     /// With the place in the plan's text of the stage that cannot be made.
     pub fn processing(&self, registry: &Registry, plan_text: &str) -> Result<Processing, ConfigError> {
-        let mut processing = Processing { stages: Vec::new(), folds: Vec::new() };
-        for stage in &self.plan.stage {
+        let mut processing = Processing { stages: Vec::new(), folds: Vec::new(), problems: Vec::new() };
+        for (index, stage) in self.plan.stage.iter().enumerate() {
+            let place = index.to_string();
+            let refused = |message: String| ConfigError::at(plan_text, &["stage", &place, "name"], message);
             let options = serde_json::Value::Object(stage.options.clone());
             let made = registry
                 .make(&stage.name, options, &self.schedule, &self.geometry)
-                .map_err(|error: RegistryError| ConfigError::at(plan_text, &["stage"], error.to_string()))?;
+                .map_err(|error: RegistryError| refused(error.to_string()))?;
             match made {
+                Entry::Fold(fold) if processing.folds.iter().any(|other| other.name() == fold.name()) => {
+                    let name = fold.name();
+                    return Err(refused(format!(
+                        "{name} stands twice: its products would overwrite each other; keep one"
+                    )));
+                }
                 Entry::Stage(stage) => processing.stages.push(stage),
                 Entry::Fold(fold) => processing.folds.push(fold),
             }
@@ -67,51 +78,73 @@ pub struct Processing {
     pub stages: Vec<Box<dyn Stage>>,
     /// Work on all units in order.
     pub folds: Vec<Box<dyn Fold>>,
+    /// What could not be done so far, and why.
+    pub problems: Vec<String>,
 }
 
 impl Processing {
-    /// Passes points that are stored already through the stages into the folds: those whose stage fails are left out
-    /// and named in the result.
-    ///
-    /// # Errors
-    /// When a stored point cannot be read.
+    /// Passes points that are stored already through the stages into the folds, for as long as `go_on` says yes. A
+    /// point whose stage fails is left out, and named among the problems; so are points whose data are damaged, which
+    /// are returned: they must be acquired again.
     pub fn feed_stored(
         &mut self,
         task: &Task,
         state: &State,
         stack: &Stack,
-    ) -> raysweep_session::Result<Vec<StageError>> {
-        let mut failed = Vec::new();
+        go_on: &dyn Fn() -> bool,
+    ) -> Vec<SettingsId> {
+        let mut damaged = Vec::new();
         for (ordinal, point) in (0..).zip(&task.schedule.points) {
             let (array, index) = place(point.role);
-            let Some(entry) = state.point(array, index) else { continue };
-            let unit = unit_of(ordinal, entry, stack.read_point(array, index)?);
+            let Some(entry) = state.point(array, index).filter(|_| go_on()) else { continue };
+            let sum = match stack.read_point(array, index) {
+                Ok(sum) if crc32(sum.view()) == entry.crc32 => sum,
+                read => {
+                    let why = read
+                        .err()
+                        .map_or("its checksum is not the ledger's".into(), |error| error.to_string());
+                    self.problems.push(format!(
+                        "{} {index} is damaged ({why}): `raysweep resume` acquires it again",
+                        array.as_str()
+                    ));
+                    damaged.push(SettingsId { point: ordinal, attempt: state.next_attempt(array, index) });
+                    continue;
+                }
+            };
+            let unit = unit_of(ordinal, entry, sum);
             match run_stages(&self.stages, &unit) {
                 Ok(image) => self.push(&unit, &image),
-                Err(error) => failed.push(error),
+                Err(error) => self.problems.push(error.to_string()),
             }
         }
-        Ok(failed)
+        damaged
     }
 
-    /// Gives the folds a unit's image.
+    /// Gives the folds a unit's image. A fold that panics is out, with its products; the others go on.
     pub fn push(&mut self, unit: &Unit, image: &Array2<f32>) {
-        for fold in &mut self.folds {
-            fold.push(unit, image.view());
-        }
+        let problems = &mut self.problems;
+        self.folds.retain_mut(|fold| {
+            let pushed = catch_unwind(AssertUnwindSafe(|| fold.push(unit, image.view())));
+            pushed.map_err(|panic| problems.push(panicked(fold.name(), &*panic))).is_ok()
+        });
     }
 
-    /// The products of all folds, and what went wrong in those that have none.
-    pub fn finish(&mut self) -> (Vec<Product>, Vec<String>) {
-        let (mut products, mut problems) = (Vec::new(), Vec::new());
+    /// The products of all folds, and everything that could not be done. Ends early soon after `go_on` says no.
+    pub fn finish(mut self, go_on: &(dyn Fn() -> bool + Sync)) -> (Vec<Product>, Vec<String>) {
+        let mut products = Vec::new();
         for fold in &mut self.folds {
-            match fold.finish() {
-                Ok(made) => products.extend(made),
-                Err(error) => problems.push(error.to_string()),
+            match catch_unwind(AssertUnwindSafe(|| fold.finish(go_on))) {
+                Ok(Ok(made)) => products.extend(made),
+                Ok(Err(error)) => self.problems.push(error.to_string()),
+                Err(panic) => self.problems.push(panicked(fold.name(), &*panic)),
             }
         }
-        (products, problems)
+        (products, self.problems)
     }
+}
+
+fn panicked(fold: &str, panic: &(dyn Any + Send)) -> String {
+    format!("{fold} panicked: {}", message_of(panic))
 }
 
 /// Where in the stack a point lies.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, ArrayView2, Axis};
-use raysweep_pipeline::{Product, Role};
+use raysweep_pipeline::{PREDICTED_SHARE, Product, Role};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
     Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table,
@@ -14,6 +14,7 @@ use raysweep_session::{Result, Session};
 use raysweep_transport::plane::Transport;
 
 use crate::processing::{Task, place};
+use crate::results;
 
 /// Share of pixels, in percent, that a picture's scale does not overexpose.
 const PERCENTILE: f64 = 99.5;
@@ -40,8 +41,10 @@ pub fn make(
     let markers = transport.map(mark).unwrap_or_default();
     let sweep = SweepImages { task, state, stack: &stack };
     let mut sections = Vec::new();
-    if !problems.is_empty() {
-        let blocks = problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone())).collect();
+    let errors = problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone()));
+    let warnings = results::warnings(products).into_iter().map(|text| Block::Note(NoteLevel::Warning, text));
+    let blocks: Vec<Block> = errors.chain(warnings).collect();
+    if !blocks.is_empty() {
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
     if let Some(transport) = transport {
@@ -259,7 +262,7 @@ impl SweepImages<'_> {
 }
 
 fn trust(state: &State, task: &Task, products: &[Product]) -> Section {
-    let mut blocks = Vec::new();
+    let mut blocks = vec![settings(state, task)];
     let figures: Vec<(String, String)> = products
         .iter()
         .filter_map(|product| match product {
@@ -361,23 +364,41 @@ fn jitter(state: &State) -> Vec<Plot> {
 }
 
 fn regular_note(products: &[Product]) -> Option<Block> {
-    let ratio = products.iter().find_map(|product| match product {
-        Product::Figure { name, value } if *name == "predicted / captured regular light" => Some(*value),
+    let share = products.iter().find_map(|product| match product {
+        Product::Figure { name, value } if *name == PREDICTED_SHARE => Some(*value),
         _ => None,
     })?;
-    let off_percent = (ratio - 1.0) * 100.0;
-    let (level, verdict) = if off_percent.abs() <= 2.0 {
-        (NoteLevel::Info, "the circle closes")
-    } else {
-        (
-            NoteLevel::Warning,
-            "more than 2 %: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
-        )
-    };
     Some(Block::Note(
-        level,
+        NoteLevel::Info,
         format!(
-            "Summed over all rows, the transport predicts the regular image within {off_percent:+.2} %: {verdict}."
+            "Summed over all rows, the transport predicts {:.2} % of the light of the regular image. This checks the sum of all light, not where it came from.",
+            share * 100.0
         ),
     ))
+}
+
+/// What the rig and the plan said, so that reports can be compared.
+fn settings(state: &State, task: &Task) -> Block {
+    let geometry = &task.geometry;
+    let stages = task.plan.stage.iter().map(|stage| {
+        let options: Vec<String> =
+            stage.options.iter().map(|(key, value)| format!("{key} = {value}")).collect();
+        if options.is_empty() {
+            stage.name.clone()
+        } else {
+            format!("{} ({})", stage.name, options.join(", "))
+        }
+    });
+    let entries = [
+        ("stages", stages.collect::<Vec<_>>().join(", ")),
+        ("row time", format!("{} µs", geometry.raster.row_time_us)),
+        ("first row after VSYNC", format!("{} µs", geometry.raster.first_row_us)),
+        (
+            "projector rows",
+            format!("{}, the camera's first sees row {}", geometry.raster.rows, geometry.first_row),
+        ),
+        ("white", format!("{} counts above black", geometry.white_dn)),
+        ("software", state.session.software.clone()),
+    ];
+    Block::Facts(entries.map(|(key, value)| (key.to_owned(), value)).to_vec())
 }

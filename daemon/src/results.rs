@@ -46,7 +46,7 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 files.volume("transport", found.t.view(), &metadata)?;
                 transport::write(&session.transport_path(), found.t.view(), &metadata)?;
             }
-            Product::Figure { .. } => {}
+            Product::Figure { .. } | Product::Warning(_) => {}
         }
     }
     Ok(())
@@ -66,6 +66,15 @@ fn common(task: &Task) -> Map<String, Value> {
         ("software", json!(crate::SOFTWARE)),
     ];
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+/// What the products say against themselves.
+pub fn warnings(products: &[Product]) -> Vec<String> {
+    let warning = |product: &Product| match product {
+        Product::Warning(text) => Some(text.clone()),
+        _ => None,
+    };
+    products.iter().filter_map(warning).collect()
 }
 
 /// Writes the report.
@@ -94,8 +103,8 @@ pub fn write_manifest(session: &Session, state: &State, task: &Task, rig: &RigFi
         "rig".into(),
         json!({
             "pixel_format": rig.camera.pixel_format,
-            "white_dn": rig.camera.white_dn,
-            "black_dn": rig.camera.black_dn,
+            "white_dn": rig.camera.white_dn(),
+            "black_dn": rig.camera.black_dn(),
             "period_us": rig.vsync.period_us,
             "rows": rig.projector.rows,
             "row_time_us": rig.projector.row_time_us,

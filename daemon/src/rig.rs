@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use raysweep_core::{Camera, DeviceError, Projector, Vsync};
-use raysweep_sim::{PlaneRig, PlaneSetup, SimError};
+use raysweep_sim::{PlaneRig, PlaneSetup};
 
 use crate::config::{ConfigError, Driver, RigFile};
 
@@ -22,9 +22,6 @@ pub enum RigError {
     /// The file is no rig.
     #[error("{0}")]
     Config(String),
-    /// The simulated rig cannot be built.
-    #[error(transparent)]
-    Sim(#[from] SimError),
     /// A device cannot be opened.
     #[error(transparent)]
     Device(#[from] DeviceError),
@@ -73,13 +70,17 @@ impl Rig {
         let setup = PlaneSetup {
             raster: file.raster(),
             camera_row_time_us: file.camera_row_time_us(),
-            white_dn: file.camera.white_dn,
-            black_dn: file.camera.black_dn,
+            white_dn: file.camera.white_dn(),
+            black_dn: file.camera.black_dn(),
             format: file.camera.pixel_format,
             first_row: file.camera.first_projector_row,
         };
         let folder = path.parent().unwrap_or(Path::new("."));
-        let sim = Arc::new(PlaneRig::new(file.sim.clone(), setup, folder)?);
+        let sim = PlaneRig::new(file.sim.clone(), setup, folder).map_err(|error| {
+            let path: Vec<&str> = ["sim"].into_iter().chain(error.key().split('.')).collect();
+            shown(ConfigError::at(&text, &path, error.to_string()))
+        })?;
+        let sim = Arc::new(sim);
         Ok(Self { file, text, sim })
     }
 

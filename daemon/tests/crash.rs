@@ -18,7 +18,8 @@ const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver
                    [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\nseed = 11\n\
                    [sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\n\
                    [sim.camera]\nlate_frames_max = 3\ndropped = 0.02\n\
-                   [sim.ambient]\nlevel = 0.001\nflicker = 0.5\n";
+                   [sim.ambient]\nlevel = 0.001\nflicker = 0.5\n\
+                   [sim.projector]\nphase_jitter_us = 5\n";
 const PLAN: &str = "kind = \"sweep\"\nname = \"crash\"\n[sweep]\naverage = 2\n\
                     delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
 
@@ -61,14 +62,21 @@ impl Daemon {
         }
     }
 
-    fn kill(mut self) {
-        self.process.kill().unwrap();
-        self.process.wait().unwrap();
+    fn kill(self) {
+        drop(self);
     }
 
     fn terminate(&self) {
         let status = Command::new("kill").args(["-TERM", &self.process.id().to_string()]).status().unwrap();
         assert!(status.success());
+    }
+}
+
+impl Drop for Daemon {
+    /// SIGKILL, also where a test fails: a daemon left behind would hold the test's output open.
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
     }
 }
 
@@ -159,6 +167,41 @@ fn fifty_kills_and_resumes_end_like_a_run_without_any() {
     assert!(killed_within >= 25, "the moments do not lie within the run: only {killed_within} did");
 }
 
+/// Kills a run after `line` lines of its ledger, resumes it, and compares with a run that nobody killed.
+fn resumes_to_the_same_bits(rig: &str, plan_text: &str, line: usize) {
+    let (whole, crashed) = (folder(rig), folder(rig));
+    let mut daemon = Daemon::start(whole.path());
+    let (session, state) = end(&mut daemon, |client| drop(client.run(&plan(plan_text)).unwrap()));
+    assert_eq!(state, "complete");
+    let expected = outcome(&session);
+    daemon.kill();
+    let mut daemon = Daemon::start(crashed.path());
+    let session = daemon.client().run(&plan(plan_text)).unwrap().session;
+    while ledger_lines(&session) < line {}
+    daemon.kill();
+    let mut daemon = Daemon::start(crashed.path());
+    let (session, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
+    assert_eq!(state, "complete");
+    assert!(outcome(&session) == expected, "killed after line {line}: the session differs");
+}
+
+#[test]
+fn cameras_that_are_busy_at_the_edge_resume_to_the_same_bits_too() {
+    // Overlapped readout: triggers are answered while the frame before is still on its way.
+    let overlapped =
+        RIG.replace("[sim.camera]\n", "[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 9000\n");
+    // The scene at the end of the frame: exposures end, and settings are written, just before the next edge.
+    let late = RIG
+        .replace("rows = 8\n[sim]", "rows = 720\n[sim]")
+        .replace("[camera]\n", "[camera]\nfirst_projector_row = 706\n");
+    assert_ne!(late, RIG);
+    let late_plan = PLAN.replace("[-60, 0, 60]", "[-350, -300, -250]");
+    for line in [3, 7, 8, 9, 10, 11, 13] {
+        resumes_to_the_same_bits(&overlapped, PLAN, line);
+        resumes_to_the_same_bits(&late, &late_plan, line);
+    }
+}
+
 #[test]
 fn the_same_seed_gives_the_same_bits_with_one_thread_and_with_two() {
     let [one, two] = [1, 2].map(|threads| {
@@ -171,7 +214,8 @@ fn the_same_seed_gives_the_same_bits_with_one_thread_and_with_two() {
         let timeless = ledger.lines().map(|line| {
             let mut entry: serde_json::Value = serde_json::from_str(line).unwrap();
             let entry = entry.as_object_mut().unwrap();
-            (entry.remove("created"), entry.remove("started"));
+            entry.remove("created");
+            entry.remove("started");
             serde_json::to_string(entry).unwrap()
         });
         let transport = std::fs::read(session.join("transport.zarr/transport/c.0.0.0")).unwrap();
@@ -203,7 +247,13 @@ fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
     let state = stored(&session).unwrap();
     assert!(state.stored(ArrayName::Dark).count() + state.stored(ArrayName::Sum).count() >= 5);
     assert!(state.counts.balanced(), "{:?}", state.counts);
-    assert!(raysweep_session::manifest::verify(&Session::open(&session).unwrap()).unwrap().is_empty());
+    let resumed = {
+        let mut daemon = Daemon::start(folder.path());
+        let (resumed, end) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
+        assert_eq!(end, "complete");
+        resumed
+    };
+    assert!(raysweep_session::manifest::verify(&Session::open(&resumed).unwrap()).unwrap().is_empty());
 }
 
 #[test]

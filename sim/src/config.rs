@@ -195,7 +195,7 @@ impl Default for SimCamera {
 pub struct SimSensor {
     /// `false`: no temporal noise, no pattern, no hot pixels; quantisation and saturation stay.
     pub noise: bool,
-    /// Electrons per count of the 12-bit scale.
+    /// Electrons per count of a 12-bit scale.
     pub electrons_per_dn: f64,
     /// Electrons at which a pixel saturates.
     pub full_well_e: f64,
@@ -211,7 +211,7 @@ pub struct SimSensor {
     pub hot_pixel_e_per_s: f64,
     /// Dark current of the others, electrons per second.
     pub dark_current_e_per_s: f64,
-    /// Real bits of the converter; the codes fill a 12-bit scale.
+    /// Real bits of the converter; its codes are spread over the pixel format's scale.
     pub adc_bits: u32,
     /// Loss of light in the corners of the picture, in percent.
     pub vignetting_percent: f64,

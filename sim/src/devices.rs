@@ -144,32 +144,17 @@ impl Camera for SimCamera {
             exposure_us: stepped(settings.exposure_us, camera.exposure_step_us),
             trigger_delay_us: stepped(settings.trigger_delay_us, camera.delay_step_us),
         };
-        if !(actual.exposure_us > 0.0 && actual.exposure_us <= 1e6) {
-            return Err(Self::error(
-                DeviceErrorKind::OutOfRange,
-                format!(
-                    "exposure_us = {}: the simulated camera takes more than 0 and at most 1000000",
-                    settings.exposure_us
-                ),
-            ));
+        if let Err(what) = self.capabilities.allows(&actual) {
+            return Err(Self::error(DeviceErrorKind::OutOfRange, what));
         }
-        if !(actual.trigger_delay_us >= 0.0 && actual.trigger_delay_us <= 16e6) {
-            return Err(Self::error(
-                DeviceErrorKind::OutOfRange,
-                format!(
-                    "trigger_delay_us = {}: the simulated camera takes 0 to 16000000",
-                    settings.trigger_delay_us
-                ),
-            ));
-        }
-        let written_ns = self.clock.now_ns();
-        self.line.lock().configure(written_ns, id, actual);
+        let next_seq = self.line.lock().configure(self.clock.now_ns(), id, actual);
+        let certain = next_seq + u64::from(camera.late_frames_max);
         let first_frame = if camera.late_frames_min == camera.late_frames_max {
-            FirstFrame::Exactly(camera.late_frames_max)
+            FirstFrame::Exactly(certain)
         } else {
-            FirstFrame::Within(camera.late_frames_max)
+            FirstFrame::Within(certain)
         };
-        Ok(Applied { actual, written_ns, first_frame })
+        Ok(Applied { actual, first_frame })
     }
 
     fn arm(&mut self) -> Result<(), DeviceError> {

@@ -59,6 +59,8 @@ pub struct Line {
     /// Periods drawn since the camera's last trigger, or since it became ready.
     draws: u64,
     was_ready: bool,
+    /// When settings were last written: the camera is asked then, not earlier, whether it is ready for what lies ahead.
+    configured_ns: i64,
     /// Edges on the line that lie ahead, in order.
     pending: VecDeque<PendingEdge>,
     /// Light of the recent periods and of the one ahead.
@@ -126,6 +128,7 @@ impl Line {
             config,
             draws: 0,
             was_ready: true,
+            configured_ns: now_ns,
             pending: VecDeque::new(),
             lights: VecDeque::new(),
             shown: None,
@@ -180,7 +183,7 @@ impl Line {
     /// resumed one.
     fn draw_period(&mut self) {
         let nominal_ns = self.nominal_ns(self.next_period);
-        let ready = self.camera.busy_until_ns <= nominal_ns - GUARD_NS;
+        let ready = self.camera.busy_until_ns <= (nominal_ns - GUARD_NS).max(self.configured_ns);
         if ready != self.was_ready {
             (self.was_ready, self.draws) = (ready, 0);
         }
@@ -284,8 +287,8 @@ impl Line {
         true
     }
 
-    /// Writes camera settings at `now_ns`; they take effect after `late_frames` more frames.
-    pub fn configure(&mut self, now_ns: i64, id: SettingsId, settings: CameraSettings) {
+    /// Writes camera settings at `now_ns`; returns the id of the next frame to be triggered.
+    pub fn configure(&mut self, now_ns: i64, id: SettingsId, settings: CameraSettings) -> u64 {
         self.advance(now_ns);
         let config = &self.config;
         let late = if config.camera.late_frames_min < config.camera.late_frames_max {
@@ -300,11 +303,13 @@ impl Line {
         self.camera.frames = 0;
         self.camera.written = Some((late, settings));
         self.redraw(now_ns);
+        self.camera.seq
     }
 
     /// What lies ahead was drawn for the settings before: draws it again for the new ones.
     fn redraw(&mut self, now_ns: i64) {
         self.pending.clear();
+        self.configured_ns = now_ns;
         self.draws = 0;
         self.was_ready = true;
         while self.lights.back().is_some_and(|light| light.edge_ns > now_ns) {

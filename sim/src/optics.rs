@@ -95,11 +95,6 @@ impl Optics {
         Ok(Self { row_starts_us, cumulative, flashes })
     }
 
-    /// Camera rows and columns.
-    pub fn size(&self) -> (usize, usize) {
-        (self.cumulative.dim().0, self.cumulative.dim().2)
-    }
-
     /// Adds to `light` what camera row `t` receives of one frame of the projector between `from_us` and `to_us` after
     /// that frame's edge.
     pub fn expose_row(&self, t: usize, from_us: f64, to_us: f64, light: &mut [f32]) {
@@ -189,17 +184,22 @@ fn filtered(scene: &Scene, mosaic: bool) -> Array3<f32> {
     seen
 }
 
-/// Projector row of the scene's first: as given, or such that the scene is a window in the middle of the frame.
+/// Projector row of the scene's first: as given, or such that the scene is a window in the middle of the frame, as far
+/// as the camera's rows allow.
 ///
 /// # Errors
-/// When the scene does not fit.
-pub fn first_scene_row(raster: &Raster, scene_rows: usize, given: Option<usize>) -> Result<usize, SimError> {
-    let first_row = given.unwrap_or(raster.rows.saturating_sub(scene_rows) / 2);
-    if first_row + scene_rows <= raster.rows {
-        Ok(first_row)
-    } else {
-        Err(SimError::SceneRows { scene_rows, first_row, projector_rows: raster.rows })
+/// When scene or camera do not fit.
+pub fn first_scene_row(raster: &Raster, scene: &Scene, given: Option<usize>) -> Result<usize, SimError> {
+    let (scene_rows, (camera_rows, _)) = (scene.rows(), scene.size());
+    let spare = |rows: usize| raster.rows.saturating_sub(rows);
+    let first_row = given.unwrap_or_else(|| (spare(scene_rows) / 2).min(spare(camera_rows)));
+    if first_row + scene_rows > raster.rows {
+        return Err(SimError::SceneRows { scene_rows, first_row, projector_rows: raster.rows });
     }
+    if first_row + camera_rows > raster.rows {
+        return Err(SimError::CameraRows { camera_rows, first_row, projector_rows: raster.rows });
+    }
+    Ok(first_row)
 }
 
 /// Start of each projector row's light after the VSYNC edge, and the last row's end: `[rows + 1]`.
@@ -255,7 +255,7 @@ fn beam_weights(beam: &Beam) -> Result<Vec<(isize, f32)>, SimError> {
                 .filter(|&(_, share)| share > 0.0)
                 .collect()
         }
-        _ => return Err(SimError::Beam(beam.clone())),
+        _ => return Err(SimError::Beam),
     };
     let total: f64 = weights.iter().map(|(_, share)| share).sum();
     Ok(weights.into_iter().map(|(d, share)| (d, (share / total) as f32)).collect())

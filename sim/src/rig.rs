@@ -6,13 +6,13 @@ use std::sync::{Arc, OnceLock};
 use ndarray::Array2;
 use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
 
-use crate::config::{Beam, SimConfig};
+use crate::config::SimConfig;
 use crate::devices::{self, Devices};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::line::{Exposure, Line, LineConfig};
 use crate::optics::{self, Optics};
 use crate::scene::{Scene, SceneError, SceneSize};
-use crate::sensor::Sensor;
+use crate::sensor::{Scale, Sensor};
 
 /// Why a simulated rig cannot be built.
 #[derive(Debug, thiserror::Error)]
@@ -32,6 +32,18 @@ pub enum SimError {
         /// Rows of the projector.
         projector_rows: usize,
     },
+    /// More camera rows than the projector has.
+    #[error(
+        "sim.scene has {camera_rows} camera rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows or set camera.first_projector_row"
+    )]
+    CameraRows {
+        /// Camera rows of the scene.
+        camera_rows: usize,
+        /// Projector row of its first.
+        first_row: usize,
+        /// Rows of the projector.
+        projector_rows: usize,
+    },
     /// Times must rise from row to row.
     #[error(
         "sim.projector.row_table: rows would be drawn in a different order; take a smaller percent or amplitude_us"
@@ -39,9 +51,9 @@ pub enum SimError {
     RowTable,
     /// A beam without extent, or wider than any.
     #[error(
-        "sim.projector.beam = {0:?}: sigma_rows must lie in 0..=100 (not 0), up_rows + down_rows in 0..=500 (not 0)"
+        "sim.projector.beam: sigma_rows must lie in 0..=100 (not 0), up_rows + down_rows in 0..=500 (not 0)"
     )]
-    Beam(Beam),
+    Beam,
     /// A pattern for another projector.
     #[error("the pattern has {given} rows, projector.rows = {rows}: give one weight in 0..=1 for each row")]
     Pattern {
@@ -60,6 +72,20 @@ pub enum SimError {
         /// What it may be.
         allowed: &'static str,
     },
+}
+
+impl SimError {
+    /// The key below `[sim]` that it is about.
+    pub fn key(&self) -> &'static str {
+        match self {
+            Self::Scene(_) | Self::SceneRows { .. } | Self::CameraRows { .. } | Self::Pattern { .. } => {
+                "scene"
+            }
+            Self::RowTable => "projector.row_table",
+            Self::Beam => "projector.beam",
+            Self::Range { key, .. } => key,
+        }
+    }
 }
 
 /// What the rest of the rig file says that the simulation needs.
@@ -109,9 +135,10 @@ impl PlaneRig {
             let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
             Scene::builtin(&config.scene.to_string_lossy(), size, config.seed)?
         };
-        let first_row = optics::first_scene_row(&setup.raster, scene.rows(), setup.first_row)?;
+        let first_row = optics::first_scene_row(&setup.raster, &scene, setup.first_row)?;
         let size = scene.size();
-        let sensor = Sensor::new(&config.sensor, size, setup.white_dn, setup.black_dn, config.seed);
+        let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
+        let sensor = Sensor::new(&config.sensor, size, scale, config.seed);
         let bench = Bench {
             config,
             setup,
@@ -225,7 +252,8 @@ impl Bench {
             trigger_latency_us: camera.trigger_latency_us,
             readout_us: self.readout_us(),
             readout: camera.readout,
-            exposure_step_us: camera.exposure_step_us,
+            exposure_us: camera.exposure_step_us..=1e6,
+            trigger_delay_us: 0.0..=16e6,
         }
     }
 
@@ -260,6 +288,8 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("projector.phase_jitter_us", config.projector.phase_jitter_us, not_negative),
         ("camera.trigger_latency_us", config.camera.trigger_latency_us, not_negative),
         ("camera.readout_us", config.camera.readout_us.unwrap_or(0.0), not_negative),
+        ("camera.exposure_step_us", config.camera.exposure_step_us, "0.001 to 1000"),
+        ("camera.delay_step_us", config.camera.delay_step_us, "0.001 to 1000"),
         ("sensor.electrons_per_dn", config.sensor.electrons_per_dn, "more than 0"),
         ("sensor.full_well_e", config.sensor.full_well_e, "more than 0"),
         ("sensor.read_noise_e", config.sensor.read_noise_e, not_negative),
@@ -267,12 +297,14 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("sensor.prnu_percent", config.sensor.prnu_percent, not_negative),
         ("sensor.vignetting_percent", config.sensor.vignetting_percent, "0 to 100"),
         ("sensor.adc_bits", f64::from(config.sensor.adc_bits), "1 to 12"),
+        ("camera.late_frames_max", f64::from(config.camera.late_frames_max), "0 to 100"),
         ("ambient.level", config.ambient.level, not_negative),
         ("ambient.flicker_hz", config.ambient.flicker_hz, "more than 0"),
     ];
     for (key, value, allowed) in rules {
         let range = match allowed {
             "0 to 1" => 0.0..=1.0,
+            "0.001 to 1000" => 0.001..=1000.0,
             "0 to 100" => 0.0..=100.0,
             "1 to 12" => 1.0..=12.0,
             "more than 0" => f64::MIN_POSITIVE..=f64::MAX,

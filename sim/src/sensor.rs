@@ -17,6 +17,17 @@ pub struct Exposed<'a> {
     pub key: [u64; 3],
 }
 
+/// The scale of the counts that a camera delivers.
+#[derive(Debug, Clone, Copy)]
+pub struct Scale {
+    /// Counts above black of a white pixel's row.
+    pub white_dn: f64,
+    /// Counts without light.
+    pub black_dn: f64,
+    /// Bits of a pixel.
+    pub bits: u32,
+}
+
 /// The constant properties of each pixel, drawn once.
 pub struct Sensor {
     config: SimSensor,
@@ -26,6 +37,7 @@ pub struct Sensor {
     electrons_per_light: Vec<f32>,
     /// Electrons without any light or time.
     offset_e: Vec<f32>,
+    electrons_per_dn: f32,
     /// Electrons per microsecond without light.
     dark_e_per_us: Vec<f32>,
     black_dn: f32,
@@ -35,10 +47,11 @@ pub struct Sensor {
 }
 
 impl Sensor {
-    /// A sensor of `size` (rows, columns) on whose 12-bit scale a white pixel's row gives `white_dn` counts above
-    /// `black_dn`.
-    pub fn new(config: &SimSensor, size: (usize, usize), white_dn: f64, black_dn: f64, seed: u64) -> Self {
+    /// A sensor of `size` (rows, columns).
+    pub fn new(config: &SimSensor, size: (usize, usize), scale: Scale, seed: u64) -> Self {
         let (height, width) = size;
+        // The same light fills the same share of the scale, whatever its bits.
+        let electrons_per_dn = config.electrons_per_dn * 2_f64.powi(12 - scale.bits as i32);
         let mut random = keyed(seed, Purpose::Pattern, &[]);
         let mut spread = |sigma: f64| -> f64 {
             let z: f64 = StandardNormal.sample(&mut random);
@@ -48,7 +61,7 @@ impl Sensor {
             // Light falls off with the square of the distance from the centre, as cos^4 does to first order.
             let (y, x) = ((t as f64 + 0.5) / height as f64 - 0.5, (s as f64 + 0.5) / width as f64 - 0.5);
             let vignetting = 1.0 - config.vignetting_percent / 100.0 * 2.0 * (x * x + y * y);
-            white_dn * config.electrons_per_dn * vignetting * (1.0 + spread(config.prnu_percent / 100.0))
+            scale.white_dn * electrons_per_dn * vignetting * (1.0 + spread(config.prnu_percent / 100.0))
         });
         let offset_e = (0..height * width).map(|_| spread(config.dsnu_e) as f32).collect();
         let dark_e_per_us = (0..height * width)
@@ -58,8 +71,7 @@ impl Sensor {
                 ((if hot { config.hot_pixel_e_per_s } else { dark }) * 1e-6) as f32
             })
             .collect();
-        let bits = config.adc_bits.clamp(1, 12);
-        let step_dn = (1_u32 << (12 - bits)) as f32;
+        let step_dn = 2_f32.powi(scale.bits.saturating_sub(config.adc_bits.max(1)) as i32);
         Self {
             config: config.clone(),
             seed,
@@ -67,13 +79,14 @@ impl Sensor {
             electrons_per_light: gain.iter().map(|&gain| gain as f32).collect(),
             offset_e,
             dark_e_per_us,
-            black_dn: black_dn as f32,
+            electrons_per_dn: electrons_per_dn as f32,
+            black_dn: scale.black_dn as f32,
             step_dn,
-            max_dn: 4096.0 - step_dn,
+            max_dn: 2_f32.powi(scale.bits as i32) - step_dn,
         }
     }
 
-    /// Turns light into counts of the 12-bit scale, `[t, s]` row-major.
+    /// Turns light into counts, `[t, s]` row-major.
     pub fn read(&self, exposed: Exposed<'_>, counts: &mut [u16]) {
         let Exposed { light, exposure_us, key } = exposed;
         let width = self.width;
@@ -95,7 +108,7 @@ impl Sensor {
                         electrons += variance.sqrt() * z;
                     }
                     let electrons = (electrons + offsets[s]).min(self.config.full_well_e as f32);
-                    let level = self.black_dn + electrons / self.config.electrons_per_dn as f32;
+                    let level = self.black_dn + electrons / self.electrons_per_dn;
                     *count = ((level / self.step_dn).round() * self.step_dn).clamp(0.0, self.max_dn) as u16;
                 }
             },
@@ -109,7 +122,8 @@ mod tests {
 
     /// Mean and variance over a uniform field of `light`, over pixels and frames.
     fn field(config: &SimSensor, light: f32, frames: u64) -> (f64, f64) {
-        let sensor = Sensor::new(config, (64, 64), 2500.0, 64.0, 3);
+        let scale = Scale { white_dn: 2500.0, black_dn: 64.0, bits: 12 };
+        let sensor = Sensor::new(config, (64, 64), scale, 3);
         let mut all = Vec::new();
         for frame in 0..frames {
             let mut counts = vec![0; 64 * 64];
@@ -142,6 +156,23 @@ mod tests {
         let config = SimSensor { adc_bits: 10, noise: false, ..SimSensor::default() };
         assert_eq!(field(&config, 0.1204, 1).0, 364.0);
         assert_eq!(field(&config, 100.0, 1).0, 4092.0);
+    }
+
+    #[test]
+    fn other_formats_have_the_same_light_on_their_own_scale() {
+        let config = SimSensor { noise: false, ..SimSensor::default() };
+        for (bits, black_dn, saturated) in [(8, 4.0, 255), (10, 16.0, 1023), (16, 1024.0, 65_520)] {
+            let white_dn = 2500.0 * 2_f64.powi(bits - 12);
+            let scale = Scale { white_dn, black_dn, bits: bits as u32 };
+            let sensor = Sensor::new(&config, (1, 2), scale, 1);
+            let mut counts = [0; 2];
+            sensor.read(Exposed { light: &mut [0.5, 9.0], exposure_us: 1.0, key: [0; 3] }, &mut counts);
+            assert!(
+                (f64::from(counts[0]) - black_dn - white_dn / 2.0).abs() <= 8.0,
+                "{bits} bits: {counts:?}"
+            );
+            assert_eq!(counts[1], saturated, "{bits} bits");
+        }
     }
 
     #[test]

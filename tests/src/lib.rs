@@ -67,11 +67,18 @@ impl Bench {
     /// When the rig cannot be built.
     pub fn with_registry(rig: &str, registry: Registry) -> Self {
         let folder = TempDir::new().expect("a temporary folder");
-        let path = folder.path().join("rig.toml");
-        std::fs::write(&path, rig).expect("rig.toml written");
-        let rig = Rig::load(&path).unwrap_or_else(|error| panic!("{error}"));
-        let runner = Arc::new(Runner::new(rig, folder.path().join("sessions"), registry));
+        std::fs::write(folder.path().join("rig.toml"), rig).expect("rig.toml written");
+        let runner = start(folder.path(), registry);
         Self { folder, runner }
+    }
+
+    /// Ends the daemon's core and starts another over the same folder.
+    ///
+    /// # Panics
+    /// When the rig cannot be built.
+    pub fn restart_with(&mut self, registry: Registry) {
+        self.runner.shut_down();
+        self.runner = start(self.folder.path(), registry);
     }
 
     /// Runs a plan to its end.
@@ -95,6 +102,12 @@ impl Bench {
         self.runner.resume(params).unwrap_or_else(|error| panic!("{error}"));
         end_of(&mut events)
     }
+}
+
+fn start(folder: &Path, registry: Registry) -> Arc<Runner> {
+    let rig = Rig::load(&folder.join("rig.toml")).unwrap_or_else(|error| panic!("{error}"));
+    let runner = Runner::new(rig, folder.join("sessions"), registry);
+    Arc::new(runner.unwrap_or_else(|error| panic!("{error}")))
 }
 
 /// Waits for the end of the run.

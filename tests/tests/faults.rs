@@ -27,8 +27,8 @@ fn truth(rig_toml: &str) -> PlaneRig {
     let setup = PlaneSetup {
         raster: rig.raster(),
         camera_row_time_us: rig.camera_row_time_us(),
-        white_dn: rig.camera.white_dn,
-        black_dn: rig.camera.black_dn,
+        white_dn: rig.camera.white_dn(),
+        black_dn: rig.camera.black_dn(),
         format: PixelFormat::Mono12,
         first_row: None,
     };

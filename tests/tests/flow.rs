@@ -11,8 +11,9 @@ use std::time::{Duration, Instant};
 use ndarray::Array2;
 use raysweep::control::Control;
 use raysweep::process;
-use raysweep_pipeline::{Entry, Registry, Stage, StageError, Unit};
-use raysweep_proto::{ErrorCode, RunParams, RunState};
+use raysweep_core::LossCause;
+use raysweep_pipeline::{Entry, HotPixels, Registry, Stage, StageError, Unit};
+use raysweep_proto::{ErrorCode, Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, data, end_of, rig_text};
 
@@ -92,6 +93,90 @@ fn a_stage_that_fails_or_panics_costs_its_unit_only() {
     assert!(failures[0].contains("would not") && failures[1].contains("could not"), "{failures:?}");
     let report = std::fs::read_to_string(ended.session.join("report.html")).unwrap();
     assert!(report.contains("images demultiplexed"), "the other points have their results");
+}
+
+/// Puts a file where the stack's folder is, so that nothing can be stored from point 9 on.
+struct Saboteur(std::path::PathBuf);
+
+impl Stage for Saboteur {
+    fn name(&self) -> &str {
+        "saboteur"
+    }
+
+    fn apply(&self, unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError> {
+        if unit.id.point == 9 {
+            for session in std::fs::read_dir(&self.0).unwrap() {
+                let sum = session.unwrap().path().join("stack.zarr/sum");
+                std::fs::rename(&sum, sum.with_extension("away")).unwrap();
+                std::fs::write(&sum, "in the way").unwrap();
+            }
+        }
+        Ok(image)
+    }
+}
+
+#[test]
+fn a_disk_that_refuses_ends_the_run_at_once_with_its_cause_and_the_rest_can_be_resumed() {
+    let mut bench = Bench::new(&small_rig(""));
+    let sessions = bench.folder.path().join("sessions");
+    let mut registry = Registry::default();
+    registry.register("saboteur", move |_, _, _| Ok(Entry::Stage(Box::new(Saboteur(sessions.clone())))));
+    bench.restart_with(registry);
+    let ended = bench.run(&format!("{PLAN}[[stage]]\nname = \"saboteur\"\n[[stage]]\nname = \"demux\"\n"));
+    assert_eq!(ended.state, "faulted");
+    assert!(ended.error.as_ref().unwrap().contains("stack.zarr"), "{:?}", ended.error);
+    let (session, state) = ended.open();
+    assert!(
+        state.counts.balanced() && state.counts.lost.contains_key(&LossCause::WriterError),
+        "{:?}",
+        state.counts
+    );
+    let stored = state.stored(ArrayName::Sum).count();
+    assert!(stored < 10, "what could not be written is not stored");
+
+    let sum = session.stack_path().join("sum");
+    std::fs::remove_file(&sum).unwrap();
+    std::fs::rename(sum.with_extension("away"), &sum).unwrap();
+    let mut harmless = Registry::default();
+    harmless.register("saboteur", |_, _, _| Ok(Entry::Stage(Box::new(HotPixels::default()))));
+    bench.restart_with(harmless);
+    let resumed = bench.resume(&ended.session);
+    assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
+}
+
+#[test]
+fn damaged_data_are_noticed_and_acquired_again() {
+    let bench = Bench::new(&small_rig(""));
+    let ended = bench.run(PLAN);
+    let chunk = ended.session.join("stack.zarr/sum/c.3.0.0");
+    let mut bytes = std::fs::read(&chunk).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    std::fs::write(&chunk, bytes).unwrap();
+    let processed = process::process(&ended.session).unwrap();
+    assert!(
+        processed.problems.iter().any(|problem| problem.contains("sum 3 is damaged")),
+        "{:?}",
+        processed.problems
+    );
+    let resumed = bench.resume(&ended.session);
+    assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
+    let (_, state) = resumed.open();
+    assert_eq!(state.point(ArrayName::Sum, 3).unwrap().attempt, 1);
+    assert!(process::process(&ended.session).unwrap().problems.is_empty());
+}
+
+#[test]
+fn light_beyond_the_cameras_range_is_said_in_the_runs_end() {
+    let bench = Bench::new(&small_rig("[sim.ambient]\nlevel = 0.05\n"));
+    let mut events = bench.runner.events();
+    bench.runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
+    loop {
+        if let Event::Finished { warnings, .. } = events.blocking_recv().unwrap() {
+            assert!(warnings.iter().any(|warning| warning.contains("saturated")), "{warnings:?}");
+            break;
+        }
+    }
 }
 
 #[test]

@@ -24,16 +24,14 @@ pub enum LossCause {
     PoolEmpty,
     /// The pipeline's queue was full.
     QueueFull,
-    /// A stage failed or panicked.
-    StageError,
     /// The data could not be written.
     WriterError,
 }
 
 /// Where the triggers of a point, an attempt or a run went.
 ///
-/// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` is counted
-/// from the camera's frame ids and the VSYNC edges, the other columns frame by frame where each is decided.
+/// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` grows with the
+/// camera's frame ids and with edges that stayed unanswered, the other columns where the fate of a frame is decided.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
     /// Triggers that the camera should have answered.

@@ -1,5 +1,6 @@
 //! What the devices of a rig must do. The traits are blocking: one named thread owns each device.
 
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use crate::{DeviceError, Edge, FrameBuf, FrameStamp, PixelFormat};
@@ -43,20 +44,20 @@ pub struct CameraSettings {
     pub trigger_delay_us: f64,
 }
 
-/// When new settings take effect, counted in frames triggered after they were written.
+/// When new settings take effect, as an id that frames carry ([`crate::FrameStamp::seq`]): no clock can confuse it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FirstFrame {
-    /// The first `n` frames still have the old settings, the next one has the new ones.
-    Exactly(u32),
-    /// Up to `n` frames may still have the old settings.
-    Within(u32),
+    /// This frame is the first with the new settings.
+    Exactly(u64),
+    /// This frame and all later ones have the new settings; some before it may have them already.
+    Within(u64),
 }
 
 impl FirstFrame {
-    /// How many frames after the change cannot be trusted to have the new settings.
-    pub fn settling_frames(self) -> u32 {
+    /// The first frame that is certain to have the new settings.
+    pub fn certain(self) -> u64 {
         match self {
-            Self::Exactly(n) | Self::Within(n) => n,
+            Self::Exactly(seq) | Self::Within(seq) => seq,
         }
     }
 }
@@ -66,8 +67,6 @@ impl FirstFrame {
 pub struct Applied {
     /// The settings as the hardware took them.
     pub actual: CameraSettings,
-    /// When the last of them had been written, on the host's clock: frames exposed earlier have the old ones.
-    pub written_ns: i64,
     /// When they take effect.
     pub first_frame: FirstFrame,
 }
@@ -91,11 +90,29 @@ pub struct CameraCapabilities {
     pub readout_us: f64,
     /// Whether that readout may overlap the next exposure.
     pub readout: Readout,
-    /// Exposures are multiples of this.
-    pub exposure_step_us: f64,
+    /// Exposures that it takes.
+    pub exposure_us: RangeInclusive<f64>,
+    /// Trigger delays that it takes.
+    pub trigger_delay_us: RangeInclusive<f64>,
 }
 
 impl CameraCapabilities {
+    /// Whether the camera takes these settings.
+    ///
+    /// # Errors
+    /// Field, value and what is allowed.
+    pub fn allows(&self, settings: &CameraSettings) -> Result<(), String> {
+        let rules = [
+            ("exposure_us", settings.exposure_us, &self.exposure_us),
+            ("trigger_delay_us", settings.trigger_delay_us, &self.trigger_delay_us),
+        ];
+        rules.into_iter().filter(|(_, value, range)| !range.contains(value)).try_for_each(
+            |(field, value, range)| {
+                Err(format!("{field} = {value}: {} takes {} to {}", self.model, range.start(), range.end()))
+            },
+        )
+    }
+
     /// How many VSYNC periods lie between two triggers that the camera can answer under these settings.
     pub fn periods_per_frame(&self, settings: &CameraSettings, period_us: f64) -> u32 {
         let exposed_us = match self.readout {

@@ -231,6 +231,14 @@ mod tests {
     }
 
     #[test]
+    fn codes_state_the_bits_that_a_pixel_occupies() {
+        for format in ALL {
+            let bits = format.pfnc() >> 16 & 0xFF;
+            assert_eq!(format.frame_bytes(80) * 8, 80 * bits as usize, "{format:?}");
+        }
+    }
+
+    #[test]
     fn unpacking_undoes_packing_at_every_length() {
         for format in ALL {
             for length in 1..40_usize {

@@ -1,5 +1,5 @@
-//! Frames and VSYNC edges in, averaged units out. A plain state machine: no thread, no clock, no channel; every
-//! decision hangs on stamps alone, never on who came first.
+//! Frames and VSYNC edges in, averaged units out. A plain state machine: no thread, no clock, no channel; what a frame
+//! is taken for hangs on its stamps, not on whether it or its edges came first.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -39,31 +39,10 @@ pub enum Label {
     Cancelled,
 }
 
-/// Tells the frames of a point from those that still carry old settings.
-#[derive(Debug, Clone, Copy)]
-pub struct Labeller {
-    written_ns: i64,
-    settling_frames: u64,
-    first_seq: Option<u64>,
-}
-
-impl Labeller {
-    /// For the frames that follow a change of settings.
-    pub fn new(applied: &Applied) -> Self {
-        Self {
-            written_ns: applied.written_ns,
-            settling_frames: u64::from(applied.first_frame.settling_frames()),
-            first_seq: None,
-        }
-    }
-
-    /// The label of the next frame. Frames are counted by the device's id, so that one lost on the way still counts.
-    pub fn label(&mut self, stamp: &FrameStamp) -> Label {
-        if stamp.exposure_start_ns < self.written_ns {
-            return Label::Settling;
-        }
-        let first_seq = *self.first_seq.get_or_insert(stamp.seq);
-        if stamp.seq - first_seq < self.settling_frames { Label::Settling } else { Label::Counted }
+impl Label {
+    /// The label of a frame that comes after a change of settings.
+    pub fn of(stamp: &FrameStamp, applied: &Applied) -> Self {
+        if stamp.seq < applied.first_frame.certain() { Self::Settling } else { Self::Counted }
     }
 }
 
@@ -244,6 +223,10 @@ impl Assembler {
             Waiting::Idle => self.idle = true,
             Waiting::Flush => {
                 self.idle = true;
+                // A device that failed may have left its attempt open.
+                if let Some(attempt) = self.attempt.take() {
+                    decide(attempt.finish());
+                }
                 decide(Decision::Flushed(std::mem::take(&mut self.outside), self.tracker.stats()));
             }
         }
@@ -360,7 +343,7 @@ impl Attempt {
     /// Notes which triggers stayed unanswered since the last frame that was tied to an edge.
     fn tie(&mut self, seq: u64, edge: TrueEdge, periods_per_frame: i64) {
         if let Some((last_seq, last_edge)) = self.tied {
-            let answered = i64::try_from(seq - last_seq).unwrap_or(i64::MAX) - self.untied;
+            let answered = i64::try_from(seq.saturating_sub(last_seq)).unwrap_or(i64::MAX) - self.untied;
             let unanswered = (edge.index - last_edge.index) - answered * periods_per_frame;
             let unanswered = u64::try_from(unanswered).unwrap_or(0);
             self.counts.expected += unanswered;

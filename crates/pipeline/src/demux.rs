@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis};
-use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting};
+use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
 use crate::registry::RegistryError;
@@ -56,6 +56,24 @@ impl DemuxOptions {
     }
 }
 
+/// Name of the figure that closes the circle: the light of the regular image, by the model over by the camera.
+pub const PREDICTED_SHARE: &str = "predicted / captured regular light";
+
+/// So well the transport must predict the regular image.
+const CLOSE_SHARE: f64 = 0.02;
+/// More saturated pixels than this deserve a warning: highlights are normal, fields are not.
+const SATURATED_SHARE: f64 = 0.01;
+
+fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<Product> {
+    let share = saturated as f64 / pixels as f64;
+    (share > SATURATED_SHARE).then(|| {
+        Product::Warning(format!(
+            "{:.1} % of the pixels of {what} are saturated: take less gain, a smaller aperture or less ambient light",
+            share * 100.0
+        ))
+    })
+}
+
 /// One image of the sweep, as it was taken.
 struct Taken {
     setting: Setting,
@@ -106,18 +124,41 @@ impl DemuxFold {
         Demux::new(self.timing, planned, self.prior)
     }
 
-    fn error(&self, what: impl Into<String>) -> FoldError {
-        FoldError { fold: self.name().into(), what: what.into() }
+    /// The regular image, and how well the transport predicts it where it is not saturated.
+    fn regular(&self, image: &Array2<f32>, dark: &Array2<f32>, transport: &Transport) -> Vec<Product> {
+        let valid = self.valid(image);
+        let saturated = valid.iter().filter(|valid| !**valid).count();
+        let light = (image - dark) / self.geometry.white_dn as f32;
+        let sum = |image: &Array2<f32>| -> f64 {
+            let pixels = image.iter().zip(&valid).filter(|&(_, &valid)| valid);
+            pixels.map(|(&light, _)| f64::from(light)).sum()
+        };
+        let (captured, predicted) = (sum(&light), sum(&transport.total()));
+        let mut products: Vec<Product> =
+            too_many_saturated("the regular image (a whole VSYNC period long)", saturated, valid.len())
+                .into_iter()
+                .collect();
+        if products.is_empty() && captured > 0.0 {
+            let share = predicted / captured;
+            products.push(Product::Figure { name: PREDICTED_SHARE, value: share });
+            if (share - 1.0).abs() > CLOSE_SHARE {
+                products.push(Product::Warning(format!(
+                    "the transport predicts {:.1} % of the light of the regular image: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
+                    share * 100.0
+                )));
+            }
+        }
+        products.push(Product::Image {
+            name: "regular",
+            about: "a captured exposure of one whole VSYNC period: every row lit once",
+            image: light,
+        });
+        products
     }
 
-    /// An image minus its dark image, in the scene's units, and which of its pixels are not saturated.
-    fn light(&self, role: Role, taken: &Taken) -> Option<(Array2<f32>, Array2<bool>)> {
-        let nominal_us = self.schedule.points.iter().find(|point| point.role == role)?.exposure_us;
-        let dark = self.taken.get(&self.schedule.dark_of(nominal_us)?)?;
-        let scale = (1.0 / self.geometry.white_dn) as f32;
-        let light = (&taken.image - &dark.image) * scale;
-        let valid = taken.image.mapv(|counts| f64::from(counts) < self.geometry.saturation_dn);
-        Some((light, valid))
+    /// Where an image is not saturated.
+    fn valid(&self, image: &Array2<f32>) -> Array2<bool> {
+        image.mapv(|counts| f64::from(counts) < self.geometry.saturation_dn)
     }
 }
 
@@ -132,30 +173,53 @@ impl Fold for DemuxFold {
         self.taken.insert(point.role, Taken { setting, image: image.to_owned() });
     }
 
-    fn finish(&mut self) -> Result<Vec<Product>, FoldError> {
-        let (mut settings, mut lights, mut valids) = (Vec::new(), Vec::new(), Vec::new());
-        for (&role, taken) in &self.taken {
-            if matches!(role, Role::Sweep(_))
-                && let Some((light, valid)) = self.light(role, taken)
-            {
-                settings.push(taken.setting.clone());
-                lights.push(light);
-                valids.push(valid);
-            }
+    fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError> {
+        let plane = |error: PlaneError| FoldError { fold: "demux".into(), what: error.to_string() };
+        let demux = self.demux().map_err(plane)?;
+        let scale = (1.0 / self.geometry.white_dn) as f32;
+        let mut taken = std::mem::take(&mut self.taken);
+        let darks: BTreeMap<Role, Array2<f32>> = taken
+            .extract_if(.., |role, _| matches!(role, Role::Dark(_)))
+            .map(|(role, taken)| (role, taken.image))
+            .collect();
+        let dark_of = |role: &Role| {
+            let point = self.schedule.points.iter().find(|point| point.role == *role)?;
+            darks.get(&self.schedule.dark_of(point.exposure_us)?)
+        };
+        let regular = taken.remove(&Role::Regular);
+        taken.retain(|role, _| dark_of(role).is_some());
+        if taken.is_empty() {
+            return Err(FoldError {
+                fold: "demux".into(),
+                what: "no point of the sweep is there with the dark image of its exposure: resume the run"
+                    .into(),
+            });
         }
-        if lights.is_empty() {
-            return Err(self.error(
-                "no point of the sweep, with the dark image of its exposure, is there: resume the run",
-            ));
-        }
-        let plane = |error: PlaneError| self.error(error.to_string());
-        // The reach is the plan's, so that jitter does not change the shape of the result.
-        let demux = self.demux().and_then(|demux| demux.with_settings(settings)).map_err(plane)?;
-        let stack = stacked(&lights);
-        let saturated = valids.iter().any(|valid| valid.iter().any(|&valid| !valid));
-        let valid = saturated.then(|| stacked(&valids));
-        let transport = demux.solve(stack.view(), valid.as_ref().map(|valid| valid.view())).map_err(plane)?;
 
+        let saturates = |taken: &Taken| self.valid(&taken.image).iter().any(|valid| !valid);
+        let shape = (taken.len(), self.geometry.height, self.geometry.width);
+        let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
+        let mut stack = Array3::zeros(shape);
+        let mut settings = Vec::with_capacity(taken.len());
+        // Each image is given up as soon as it is in the stack: a sweep is held once, not twice.
+        for (index, (role, Taken { setting, image })) in taken.into_iter().enumerate() {
+            if let Some(valid) = &mut valid {
+                valid.index_axis_mut(Axis(0), index).assign(&self.valid(&image));
+            }
+            if let Some(dark) = dark_of(&role) {
+                stack.index_axis_mut(Axis(0), index).assign(&((&image - dark) * scale));
+            }
+            settings.push(setting);
+        }
+        let images = settings.len();
+        let transport = demux
+            .with_settings(settings)
+            .and_then(|demux| {
+                demux.solve_while(stack.view(), valid.as_ref().map(|valid| valid.view()), go_on)
+            })
+            .map_err(plane)?;
+
+        let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![
             Product::Image {
                 name: "epipolar",
@@ -167,42 +231,14 @@ impl Fold for DemuxFold {
                 about: "light from all other rows within the sweep's reach",
                 image: transport.non_epipolar(1),
             },
-            Product::Figure { name: "images demultiplexed", value: lights.len() as f64 },
-            Product::Figure {
-                name: "saturated pixels",
-                value: transport.saturated.iter().filter(|&&saturated| saturated).count() as f64,
-            },
+            Product::Figure { name: "images demultiplexed", value: images as f64 },
+            Product::Figure { name: "saturated pixels", value: saturated as f64 },
         ];
-        if let Some((regular, valid)) =
-            self.taken.get(&Role::Regular).and_then(|taken| self.light(Role::Regular, taken))
-        {
-            let predicted = transport.total();
-            let (mut seen, mut expected) = (0.0, 0.0);
-            for ((&seen_here, &expected_here), _) in
-                regular.iter().zip(&predicted).zip(&valid).filter(|&(_, &valid)| valid)
-            {
-                seen += f64::from(seen_here);
-                expected += f64::from(expected_here);
-            }
-            products.push(Product::Image {
-                name: "regular",
-                about: "a captured exposure of one whole VSYNC period: every row lit once",
-                image: regular,
-            });
-            products
-                .push(Product::Figure { name: "predicted / captured regular light", value: expected / seen });
+        products.extend(too_many_saturated("the sweep", saturated, transport.saturated.len()));
+        if let Some((regular, dark)) = regular.zip(dark_of(&Role::Regular)) {
+            products.extend(self.regular(&regular.image, dark, &transport));
         }
         products.push(Product::Transport(Box::new(transport)));
         Ok(products)
     }
-}
-
-/// Images along a new first axis.
-fn stacked<T: Copy + Default>(images: &[Array2<T>]) -> Array3<T> {
-    let (height, width) = images.first().map_or((0, 0), Array2::dim);
-    let mut stack = Array3::default((images.len(), height, width));
-    for (mut plane, image) in stack.axis_iter_mut(Axis(0)).zip(images) {
-        plane.assign(image);
-    }
-    stack
 }

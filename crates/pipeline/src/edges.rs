@@ -46,7 +46,6 @@ pub struct EdgeTracker {
     candidates: VecDeque<i64>,
     false_in_a_row: u32,
     recent: VecDeque<(i64, Option<TrueEdge>)>,
-    first_ns: i64,
     stats: VsyncStats,
     periods: u64,
     sum_us: f64,
@@ -62,7 +61,6 @@ impl EdgeTracker {
             candidates: VecDeque::new(),
             false_in_a_row: 0,
             recent: VecDeque::new(),
-            first_ns: 0,
             stats: VsyncStats::default(),
             periods: 0,
             sum_us: 0.0,
@@ -88,6 +86,8 @@ impl EdgeTracker {
             if self.false_in_a_row >= RELOCK_AFTER {
                 self.last = None;
                 self.candidates.clear();
+                // Counting starts anew, and no index may mean two edges.
+                self.recent.iter_mut().for_each(|(_, edge)| *edge = None);
             }
         }
         self.remember(now_ns, true_edge);
@@ -128,7 +128,6 @@ impl EdgeTracker {
         }
         self.candidates.clear();
         self.stats.edges += 1;
-        self.first_ns = first_ns;
         Some((first, n))
     }
 
@@ -143,11 +142,6 @@ impl EdgeTracker {
             self.sum_us += deviation_us;
             self.sum_squares_us2 += deviation_us * deviation_us;
         }
-    }
-
-    /// Whether true edges can be told from false ones yet.
-    pub fn is_locked(&self) -> bool {
-        self.last.is_some()
     }
 
     /// The time up to which all edges are known.
@@ -181,7 +175,7 @@ impl EdgeTracker {
         self.line.gate_ns
     }
 
-    /// Statistics so far. Jitter is that of a single edge: a period's deviation carries two.
+    /// Statistics so far. Jitter is that of periods: where edges jitter independently, 1.41 times that of one edge.
     pub fn stats(&self) -> VsyncStats {
         let n = self.periods.max(1) as f64;
         let mean_us = self.sum_us / n;

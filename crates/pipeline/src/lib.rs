@@ -13,10 +13,10 @@ mod schedule;
 mod stage;
 mod unit;
 
-pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label, Labeller};
-pub use demux::{DemuxFold, DemuxOptions};
+pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
+pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
 pub use edges::{EdgeTracker, Line};
-pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, run_stages};
+pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
 pub use queue::{Input, Policy, QueueError};
 pub use registry::{Entry, Registry, RegistryError};
 pub use schedule::{Point, Role, Schedule, Shot, SweepGeometry};

@@ -58,6 +58,9 @@ pub enum Ordered {
 pub trait Sink: Send {
     /// Takes the next item.
     fn take(&mut self, item: Ordered);
+
+    /// Nothing more comes, in order or because the assembler has failed.
+    fn end(&mut self);
 }
 
 /// A running pipeline. It ends when every clone of its [`Input`] is dropped.
@@ -175,7 +178,8 @@ pub fn run_stages(stages: &[Box<dyn Stage>], unit: &Unit) -> Result<Array2<f32>,
     })
 }
 
-fn message_of(panic: &(dyn Any + Send)) -> &str {
+/// What a panic said.
+pub fn message_of(panic: &(dyn Any + Send)) -> &str {
     panic
         .downcast_ref::<&str>()
         .copied()
@@ -195,5 +199,6 @@ fn run_sink<S: Sink>(mut sink: S, items: &Receiver<Numbered>, give_back: &SyncSe
             let _ = give_back.send(());
         }
     }
+    sink.end();
     sink
 }

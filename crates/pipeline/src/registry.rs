@@ -58,6 +58,7 @@ impl Default for Registry {
         let mut registry = Self { makers: BTreeMap::new() };
         registry.register("hot-pixels", |options, _, _| {
             let stage: HotPixels = parse("hot-pixels", options)?;
+            stage.check().map_err(|what| RegistryError::Invalid { name: "hot-pixels".into(), what })?;
             Ok(Entry::Stage(Box::new(stage)))
         });
         registry.register("demux", |options, schedule, geometry| {

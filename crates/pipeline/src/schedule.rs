@@ -34,14 +34,6 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// The ordinal of a role.
-    pub fn ordinal(&self, role: Role) -> Option<u32> {
-        self.points
-            .iter()
-            .position(|point| point.role == role)
-            .and_then(|ordinal| u32::try_from(ordinal).ok())
-    }
-
     /// How many points the plan's sweep has.
     pub fn sweep_len(&self) -> usize {
         self.points.iter().filter(|point| matches!(point.role, Role::Sweep(_))).count()

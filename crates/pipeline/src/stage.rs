@@ -42,6 +42,8 @@ pub enum Product {
     },
     /// The light transport `[u, t, s]`.
     Transport(Box<Transport>),
+    /// Something that makes the others worse than they look.
+    Warning(String),
     /// A number that the report states.
     Figure {
         /// What it is, with its unit.
@@ -69,11 +71,11 @@ pub trait Fold: Send {
     /// Takes the next unit; a later attempt of a point replaces the earlier.
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>);
 
-    /// The products of what was taken.
+    /// The products of what was taken, which is given up for them. Ends early, with an error, soon after `go_on` says no.
     ///
     /// # Errors
-    /// When that is too little.
-    fn finish(&mut self) -> Result<Vec<Product>, FoldError>;
+    /// When too little was taken, or `go_on` said no.
+    fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError>;
 }
 
 /// Stage `hot-pixels`: a pixel that outshines all its neighbours by more than `threshold_dn` takes their median.
@@ -89,6 +91,19 @@ pub struct HotPixels {
 impl Default for HotPixels {
     fn default() -> Self {
         Self { threshold_dn: 100.0, step_px: 1 }
+    }
+}
+
+impl HotPixels {
+    /// Field, value and what is allowed, where an option makes no sense.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        if !(self.threshold_dn > 0.0 && self.threshold_dn.is_finite()) {
+            return Err(format!("threshold_dn = {}: give counts greater than 0", self.threshold_dn));
+        }
+        if !(1..=2).contains(&self.step_px) {
+            return Err(format!("step_px = {}: allowed are 1, and 2 on a Bayer mosaic", self.step_px));
+        }
+        Ok(())
     }
 }
 
@@ -116,5 +131,44 @@ impl Stage for HotPixels {
             }
         }
         Ok(repaired)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use raysweep_core::{Counts, SettingsId};
+
+    use super::*;
+
+    fn unit() -> Unit {
+        Unit {
+            id: SettingsId { point: 0, attempt: 0 },
+            frames: 1,
+            exposure_us: 1.0,
+            delays_us: vec![0.0],
+            sum: Arc::new(Array2::zeros((5, 5))),
+            counts: Counts::default(),
+        }
+    }
+
+    #[test]
+    fn a_hot_pixel_takes_its_neighbours_median_and_an_edge_stays() {
+        // A bright right half is no defect; single pixels at a border and in the middle are.
+        let mut image = Array2::from_shape_fn((5, 5), |(_, s)| if s >= 3 { 1000.0 } else { 10.0 });
+        let clean = image.clone();
+        (image[[0, 0]], image[[2, 1]]) = (500.0, 3000.0);
+        let repaired = HotPixels::default().apply(&unit(), image).unwrap();
+        assert_eq!(repaired, clean);
+    }
+
+    #[test]
+    fn options_out_of_range_are_refused_by_name() {
+        let check = |threshold_dn, step_px| HotPixels { threshold_dn, step_px }.check();
+        assert!(check(100.0, 2).is_ok());
+        assert!(check(-1.0, 1).unwrap_err().contains("threshold_dn = -1"));
+        assert!(check(100.0, 0).unwrap_err().contains("step_px = 0"));
+        assert!(check(100.0, usize::MAX).is_err());
     }
 }

@@ -133,6 +133,8 @@ pub struct CheckReport {
     pub light_s: f64,
     /// Memory for the images and the results.
     pub memory_bytes: u64,
+    /// Memory that the system can still give.
+    pub memory_free_bytes: u64,
     /// Disk space for the session.
     pub disk_bytes: u64,
     /// Disk space that is free.
@@ -236,6 +238,9 @@ pub enum Event {
         stored: usize,
         /// Points of the sweep missing.
         missing: usize,
+        /// What makes the results worse than they look.
+        #[serde(default)]
+        warnings: Vec<String>,
     },
     /// This many events were left out because the subscriber read too slowly.
     Skipped {

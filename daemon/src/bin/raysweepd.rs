@@ -1,6 +1,7 @@
 //! The daemon: owns a rig, serves a socket, and ends in order.
 
-use std::path::PathBuf;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
@@ -36,7 +37,8 @@ struct Arguments {
 }
 
 fn main() -> ExitCode {
-    tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).init();
+    let colours = std::io::stderr().is_terminal();
+    tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).with_ansi(colours).init();
     let arguments = Arguments::parse();
     match run(&arguments) {
         Ok(()) => ExitCode::SUCCESS,
@@ -49,10 +51,8 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let rig = Rig::load(&arguments.rig)?;
-    let devices = rig.open()?;
-    let camera = devices.camera.capabilities().clone();
-    // A run opens its own; between runs the devices are free for other programs.
-    drop(devices);
+    let runner = Arc::new(Runner::new(rig, arguments.data.clone(), Registry::default())?);
+    let camera = runner.camera();
     let opened = format!(
         "{} ({} x {} {:?}), rig {}",
         camera.model,
@@ -66,16 +66,23 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
         return Ok(());
     }
     tracing::info!("{opened}");
-    std::fs::create_dir_all(&arguments.data).map_err(|error| {
+    prepare_data(&arguments.data).map_err(|error| {
         format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
     })?;
-    let runner = Arc::new(Runner::new(rig, arguments.data.clone(), Registry::default()));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let served = runtime.block_on(serve(arguments, runner.clone()));
     // A server that failed leaves a run behind; after an orderly end there is none.
     runner.shut_down();
     runtime.shutdown_timeout(Duration::from_secs(1));
     served
+}
+
+/// Makes the data folder where it is missing, and makes sure that sessions can be kept in it.
+fn prepare_data(folder: &Path) -> std::io::Result<()> {
+    std::fs::create_dir_all(folder)?;
+    let probe = folder.join(format!(".raysweepd-{}", std::process::id()));
+    std::fs::create_dir(&probe)?;
+    std::fs::remove_dir(&probe)
 }
 
 async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn std::error::Error>> {

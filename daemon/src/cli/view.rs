@@ -52,19 +52,20 @@ impl View {
             Event::State { state: RunState::Idle | RunState::Faulted, .. } => {}
             Event::State { state, .. } => self.state(*state),
             Event::Progress(progress) => self.progress(progress),
-            // An attempt that a pause or a cancel cut short has lost nothing.
-            Event::Lost { counts, .. } if counts.lost_total() == 0 => {}
             Event::Lost { point, attempt, counts } => {
                 let lost = show::losses(counts);
                 self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
             Event::Vsync(_) => {}
-            Event::Finished { session, state, error, report, stored, missing } => {
+            Event::Finished { session, state, error, report, stored, missing, warnings } => {
                 if let Self::Bar(bar) = self {
                     bar.finish_and_clear();
                 }
                 if let Some(error) = error {
                     self.note(error);
+                }
+                for warning in warnings {
+                    self.note(&format!("warning: {warning}"));
                 }
                 let summary = show::ending(session, state, report.as_deref(), *stored, *missing);
                 writeln!(io::stdout(), "{summary}")?;

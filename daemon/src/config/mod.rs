@@ -5,6 +5,8 @@ mod rig;
 
 use std::ops::Range;
 
+use toml::de::DeValue;
+
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use rig::{CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
 
@@ -41,20 +43,25 @@ impl ConfigError {
     }
 }
 
-/// Where the value at a path of keys stands, or the deepest table on the way to it.
+/// Where the value at a path of keys (of an array: numbers) stands, or the deepest table on the way to it.
 fn span_of(text: &str, path: &[&str]) -> Option<Range<usize>> {
     let document = toml::de::DeTable::parse(text).ok()?;
-    let mut found = None;
-    let mut table = document.get_ref();
-    for key in path {
-        let Some((_, value)) = table.iter().find(|(name, _)| name.get_ref() == key) else { break };
-        found = Some(value.span());
-        match value.get_ref() {
-            toml::de::DeValue::Table(inner) => table = inner,
-            _ => break,
+    let (first, rest) = path.split_first()?;
+    let mut value = document.get_ref().iter().find(|(name, _)| name.get_ref() == first)?.1;
+    for key in rest {
+        let inner = match value.get_ref() {
+            DeValue::Table(table) => {
+                table.iter().find(|(name, _)| name.get_ref() == key).map(|(_, value)| value)
+            }
+            DeValue::Array(array) => key.parse::<usize>().ok().and_then(|index| array.get(index)),
+            _ => None,
+        };
+        match inner {
+            Some(inner) => value = inner,
+            None => break,
         }
     }
-    found
+    Some(value.span())
 }
 
 #[cfg(test)]
@@ -68,5 +75,7 @@ mod tests {
         assert_eq!(&text[span], "0");
         let table = span_of(text, &["sweep", "average"]).unwrap();
         assert!(text[table].contains("[sweep]"));
+        let stages = "[[stage]]\nname = \"a\"\n[[stage]]\nname = \"b\"\n";
+        assert_eq!(&stages[span_of(stages, &["stage", "1", "name"]).unwrap()], "\"b\"");
     }
 }

@@ -18,7 +18,7 @@ pub struct Plan {
     /// `[sweep]`
     #[serde(default)]
     pub sweep: Sweep,
-    /// `[[stage]]`, in order; none: `demux`.
+    /// `[[stage]]`: stages in order, then folds; none: `demux`.
     #[serde(default = "default_stages")]
     pub stage: Vec<StageTable>,
 }
@@ -158,6 +158,13 @@ impl Plan {
                 format!("the sweep has {points} points: at most {MAX_POINTS} are allowed; split it");
             return Err(ConfigError::at(text, &["sweep"], message));
         }
+        for (index, stage) in self.stage.iter().enumerate() {
+            // Options have passed through a form without NaN and infinity, in which these are null; TOML has no null.
+            if let Some((key, _)) = stage.options.iter().find(|(_, value)| value.is_null()) {
+                let message = format!("stage {}: {key} is not a finite number", stage.name);
+                return Err(ConfigError::at(text, &["stage", &index.to_string(), key], message));
+            }
+        }
         if !(1..=MAX_AVERAGE).contains(&sweep.average) {
             let message = format!("sweep.average = {}: 1 to {MAX_AVERAGE} frames are allowed", sweep.average);
             return Err(ConfigError::at(text, &["sweep", "average"], message));
@@ -227,6 +234,7 @@ mod tests {
             ("kind = \"sweep\"\n[sweep]\ndelay_us = [nan]", "finite"),
             ("kind = \"sweep\"\n[sweep]\nmax_jitter_us = -1", "greater than 0"),
             ("kind = \"sweep\"\nname = \"  \"", "empty"),
+            ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nalpha = nan", "alpha is not a finite number"),
             ("kind = \"sweep\"\n[[stage]]\nprior = \"split\"", "name"),
         ];
         for (text, expected) in cases {

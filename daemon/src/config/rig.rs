@@ -45,12 +45,10 @@ pub enum Driver {
 pub struct CameraSection {
     /// Which driver opens it.
     pub driver: Driver,
-    /// Counts, above black, of a white pixel in the time of one projector row.
-    #[serde(default = "default_white_dn")]
-    pub white_dn: f64,
-    /// Counts without light.
-    #[serde(default = "default_black_dn")]
-    pub black_dn: f64,
+    /// Counts, above black, of a white pixel in the time of one projector row; left out: 2500 of 4096 of the format's.
+    white_dn: Option<f64>,
+    /// Counts without light; left out: 64 of 4096 of the format's.
+    black_dn: Option<f64>,
     /// How frames are packed.
     #[serde(default = "default_pixel_format")]
     pub pixel_format: PixelFormat,
@@ -58,6 +56,22 @@ pub struct CameraSection {
     pub row_time_us: Option<f64>,
     /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
     pub first_projector_row: Option<usize>,
+}
+
+impl CameraSection {
+    /// Counts, above black, of a white pixel in the time of one projector row.
+    pub fn white_dn(&self) -> f64 {
+        self.white_dn.unwrap_or(2500.0 / 4096.0 * self.full_scale_dn())
+    }
+
+    /// Counts without light.
+    pub fn black_dn(&self) -> f64 {
+        self.black_dn.unwrap_or(64.0 / 4096.0 * self.full_scale_dn())
+    }
+
+    fn full_scale_dn(&self) -> f64 {
+        f64::from(self.pixel_format.max_value()) + 1.0
+    }
 }
 
 /// `[vsync]`
@@ -91,12 +105,6 @@ pub struct ProjectorSection {
     pub first_row_us: f64,
 }
 
-fn default_white_dn() -> f64 {
-    2500.0
-}
-fn default_black_dn() -> f64 {
-    64.0
-}
 fn default_pixel_format() -> PixelFormat {
     PixelFormat::Mono12
 }
@@ -151,14 +159,14 @@ impl RigFile {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
         let max_dn = f64::from(camera.pixel_format.max_value());
         let rules: [(&[&str], f64, f64, f64); 8] = [
-            (&["camera", "white_dn"], camera.white_dn, 1.0, max_dn),
-            (&["camera", "black_dn"], camera.black_dn, 0.0, max_dn / 2.0),
-            (&["camera", "row_time_us"], self.camera_row_time_us(), 0.1, 10_000.0),
-            (&["vsync", "period_us"], vsync.period_us, 100.0, 1e6),
+            (&["vsync", "period_us"], vsync.period_us, 4000.0, 1e6),
             (&["vsync", "gate_us"], vsync.gate_us, 1.0, vsync.period_us / 4.0),
             (&["projector", "rows"], projector.rows as f64, 1.0, MAX_ROWS as f64),
             (&["projector", "row_time_us"], projector.row_time_us, 0.1, 10_000.0),
             (&["projector", "first_row_us"], projector.first_row_us, 0.0, vsync.period_us),
+            (&["camera", "row_time_us"], self.camera_row_time_us(), 0.1, 10_000.0),
+            (&["camera", "white_dn"], camera.white_dn(), 1.0, max_dn),
+            (&["camera", "black_dn"], camera.black_dn(), 0.0, max_dn / 2.0),
         ];
         for (path, value, low, high) in rules {
             if !(low..=high).contains(&value) {

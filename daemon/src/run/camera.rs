@@ -6,9 +6,10 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use raysweep_core::{
-    Camera, DeviceError, DeviceErrorKind, Frame, FrameBuf, FramePool, FrameStamp, LossCause, SettingsId,
+    Camera, CameraSettings, DeviceError, DeviceErrorKind, Frame, FrameBuf, FramePool, FrameStamp, LossCause,
+    SettingsId,
 };
-use raysweep_pipeline::{Event, Input, Job, Label, Labeller, Point, QueueError, Shot};
+use raysweep_pipeline::{Event, Input, Job, Label, Point, QueueError, Shot, message_of};
 
 use super::orders::{Order, Orders};
 use crate::rig::Pace;
@@ -34,18 +35,30 @@ pub struct Pass {
 }
 
 /// Buffers for frames on their way to the assembler: more than it ever holds while it waits for edges.
-const POOL_BUFFERS: usize = 24;
+const POOL_BUFFERS: usize = 40;
 /// One wait for a frame; orders are looked at in between.
 const POLL: Duration = Duration::from_millis(100);
-/// A camera without frames for so long, beyond its exposure, has lost its trigger.
-const PATIENCE_US: f64 = 2e6;
+/// A camera without frames for so long, beyond the time that they take, has lost its trigger.
+const PATIENCE: Duration = Duration::from_secs(2);
 /// Frames that pass before a run's first point and after a pass's last, so that the line is known around each frame.
 const MARGIN_FRAMES: u32 = 6;
+
+/// How a pass ended.
+enum Ended {
+    /// Everything that it left is decided, or will be: the pipeline has its flush.
+    Flushed(Result<(), DeviceError>),
+    /// The pipeline takes nothing any more.
+    NotFlushed,
+}
+
+/// The camera's thread or the pipeline has failed: no verdict comes any more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Gone;
 
 /// The camera's thread as the run sees it.
 pub struct CameraThread {
     passes: SyncSender<Pass>,
-    ended: Receiver<Result<(), DeviceError>>,
+    ended: Receiver<Ended>,
     thread: JoinHandle<()>,
 }
 
@@ -58,6 +71,7 @@ impl CameraThread {
         mut camera: Box<dyn Camera>,
         input: Input<Event>,
         pace: Pace,
+        period_us: f64,
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         camera.arm()?;
@@ -66,7 +80,7 @@ impl CameraThread {
         let thread = thread::Builder::new()
             .name("camera".into())
             .spawn(move || {
-                let mut sequencer = Sequencer::new(camera, input, pace, orders);
+                let mut sequencer = Sequencer::new(camera, input, pace, period_us, orders);
                 for pass in todo {
                     if done.send(sequencer.pass(&pass)).is_err() {
                         break;
@@ -80,23 +94,29 @@ impl CameraThread {
         Ok(Self { passes, ended, thread })
     }
 
-    /// Acquires a pass and waits for its end. What became of its frames arrives at the pipeline's sink.
+    /// Acquires a pass and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
+    /// at the pipeline's sink, also when the camera failed (the inner error).
     ///
     /// # Errors
-    /// When the camera fails; the pass is flushed all the same.
-    pub fn acquire(&self, pass: Pass) -> Result<(), DeviceError> {
-        let gone =
-            || DeviceError::new("camera", DeviceErrorKind::Disconnected, "the camera's thread has ended");
-        self.passes.send(pass).map_err(|_closed| gone())?;
-        self.ended.recv().map_err(|_closed| gone())?
+    /// [`Gone`] when there will be no verdicts.
+    pub fn acquire(&self, pass: Pass) -> Result<Result<(), DeviceError>, Gone> {
+        self.passes.send(pass).map_err(|_closed| Gone)?;
+        match self.ended.recv() {
+            Ok(Ended::Flushed(acquired)) => Ok(acquired),
+            Ok(Ended::NotFlushed) | Err(_) => Err(Gone),
+        }
     }
 
     /// Disarms the camera and ends its thread.
-    pub fn join(self) {
+    ///
+    /// # Errors
+    /// When the thread panicked.
+    pub fn join(self) -> Result<(), DeviceError> {
         drop(self.passes);
-        if self.thread.join().is_err() {
-            tracing::error!("the camera's thread panicked");
-        }
+        self.thread.join().map_err(|panic| {
+            let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
+            DeviceError::new("camera", DeviceErrorKind::NotReady, what)
+        })
     }
 }
 
@@ -109,6 +129,9 @@ struct Sequencer {
     spare: FrameBuf,
     orders: Arc<Orders>,
     warmed_up: bool,
+    /// The longest that a frame has taken so far, from its edge to its last row.
+    longest_frame_us: f64,
+    period_us: f64,
 }
 
 /// What became of one wait for a frame.
@@ -122,19 +145,27 @@ enum Taken {
 }
 
 impl Sequencer {
-    fn new(camera: Box<dyn Camera>, input: Input<Event>, pace: Pace, orders: Arc<Orders>) -> Self {
+    fn new(
+        camera: Box<dyn Camera>,
+        input: Input<Event>,
+        pace: Pace,
+        period_us: f64,
+        orders: Arc<Orders>,
+    ) -> Self {
         let capabilities = camera.capabilities();
         let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
         let pool = FramePool::new(POOL_BUFFERS, bytes);
         let spare = pool.spare();
-        Self { camera, input, pace, pool, spare, orders, warmed_up: false }
+        Self { camera, input, pace, pool, spare, orders, warmed_up: false, longest_frame_us: 0.0, period_us }
     }
 
     /// Acquires a pass; always ends with a flush, so that nothing of it stays undecided.
-    fn pass(&mut self, pass: &Pass) -> Result<(), DeviceError> {
+    fn pass(&mut self, pass: &Pass) -> Ended {
         let acquired = self.attempts(pass);
-        let flushed = self.input.send(Event::Flush).map_err(closed);
-        acquired.and(flushed)
+        match self.input.send(Event::Flush) {
+            Ok(()) => Ended::Flushed(acquired),
+            Err(_) => Ended::NotFlushed,
+        }
     }
 
     fn attempts(&mut self, pass: &Pass) -> Result<(), DeviceError> {
@@ -165,13 +196,15 @@ impl Sequencer {
             light_edges_later: shot.light_edges_later,
         };
         self.input.send(Event::Begin(job)).map_err(closed)?;
-        let mut labeller = Labeller::new(&applied);
+        self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
         let mut passed = 0;
-        let mut watchdog = Watchdog::new(point.exposure_us);
+        let mut watchdog = self.watchdog();
+        // A point that has failed is taken with some frames to spare, the more the oftener it failed.
+        let wanted = point.frames + id.attempt * point.frames.div_ceil(4);
         // Frames that found no room are taken again within the attempt, but not for ever.
         let mut spare_frames = 64 + 3 * point.frames;
-        while passed < point.frames && spare_frames > 0 && self.orders.go_on() {
-            match self.take(|stamp| labeller.label(stamp))? {
+        while passed < wanted && spare_frames > 0 && self.orders.go_on() {
+            match self.take(|stamp| Label::of(stamp, &applied))? {
                 Taken::Passed(_, Label::Counted) => passed += 1,
                 Taken::Passed(..) => {}
                 Taken::Lost => spare_frames -= 1,
@@ -188,7 +221,7 @@ impl Sequencer {
     /// Lets frames go by: at least `frames` of them, and until exposures start at `not_before_ns` or later.
     fn pass_frames(&mut self, frames: u32, not_before_ns: i64) -> Result<(), DeviceError> {
         let mut left = frames;
-        let mut watchdog = Watchdog::new(0.0);
+        let mut watchdog = self.watchdog();
         let mut reached_ns = i64::MIN;
         while (left > 0 || reached_ns < not_before_ns) && self.orders.go_on() {
             match self.take(|_| Label::Cancelled)? {
@@ -205,6 +238,18 @@ impl Sequencer {
             watchdog.feed();
         }
         Ok(())
+    }
+
+    fn frame_us(&self, settings: &CameraSettings) -> f64 {
+        let periods = self.camera.capabilities().periods_per_frame(settings, self.period_us);
+        f64::from(periods) * self.period_us
+    }
+
+    fn watchdog(&self) -> Watchdog {
+        Watchdog {
+            patience: PATIENCE + Duration::from_secs_f64(3e-6 * self.longest_frame_us),
+            waited: Duration::ZERO,
+        }
     }
 
     fn take(&mut self, label: impl FnOnce(&FrameStamp) -> Label) -> Result<Taken, DeviceError> {
@@ -247,13 +292,6 @@ struct Watchdog {
 }
 
 impl Watchdog {
-    fn new(exposure_us: f64) -> Self {
-        Self {
-            patience: Duration::from_secs_f64((PATIENCE_US + 3.0 * exposure_us) / 1e6),
-            waited: Duration::ZERO,
-        }
-    }
-
     fn feed(&mut self) {
         self.waited = Duration::ZERO;
     }

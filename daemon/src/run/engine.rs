@@ -12,7 +12,7 @@ use raysweep_session::Session;
 use raysweep_session::ledger::{Entry, Ledger, State};
 
 use super::board::Board;
-use super::camera::{Attempt, CameraThread, Pass};
+use super::camera::{Attempt, CameraThread, Gone, Pass};
 use super::orders::Orders;
 use super::storage::{PaceMeter, Storage, Verdict};
 use super::vsync::VsyncThread;
@@ -59,6 +59,11 @@ pub enum RunError {
         /// How many.
         points: usize,
     },
+    /// A thread of the run is gone; another error says which and why.
+    #[error(
+        "a thread of the run has ended; the log has its message. What was stored stays stored; resume the session"
+    )]
+    Interrupted,
     /// The run panicked: a defect.
     #[error("the run panicked: {0}. What was stored stays stored; resume the session")]
     Panicked(String),
@@ -121,10 +126,13 @@ impl Run {
         let assembler = self.assembler_config(camera.capabilities())?;
         let stack = self.session.stack()?;
         let state = self.ledger.state().clone();
+        let mut missing = missing(&self.task.schedule, &state);
         if self.resumed {
-            self.processing.feed_stored(&self.task, &state, &stack)?;
+            missing.extend(self.processing.feed_stored(&self.task, &state, &stack, &|| self.orders.go_on()));
+            missing.sort_by_key(|id| id.point);
+            // What is damaged is about to be mended.
+            self.processing.problems.clear();
         }
-        let missing = missing(&self.task.schedule, &state);
         let planned = self.task.schedule.points.len();
         let (verdicts, results) = channel();
         let stages = std::mem::take(&mut self.processing.stages);
@@ -133,7 +141,8 @@ impl Run {
             stack,
             ledger: self.ledger,
             processing: self.processing,
-            verdicts,
+            verdicts: Some(verdicts),
+            orders: self.orders.clone(),
             board: self.board.clone(),
             pace: PaceMeter::new(planned - missing.len(), planned),
             vsync: None,
@@ -152,7 +161,8 @@ impl Run {
         let (pipeline, input) = Pipeline::start(config, assembler, stages, storage)?;
 
         let vsync = VsyncThread::start(vsync, input.clone(), self.orders.clone())?;
-        let camera = CameraThread::start(camera, input, pace, self.orders.clone())?;
+        let period_us = self.task.geometry.raster.period_us;
+        let camera = CameraThread::start(camera, input, pace, period_us, self.orders.clone())?;
         let _ = self.board.go(RunState::Armed);
 
         let mut passes = Passes {
@@ -167,12 +177,12 @@ impl Run {
         let acquired = passes.acquire(missing);
         let _ = self.board.go(RunState::Draining);
         drop(passes);
-        camera.join();
+        let imaged = camera.join();
         let watched = vsync.join();
         let storage = pipeline.join()?;
         // What failed first is the cause; what it brought down comes after.
-        let fault =
-            storage.write_error.map(RunError::from).or(watched.err().map(RunError::from)).or(acquired.err());
+        let device = watched.and(imaged).err().map(RunError::from);
+        let fault = storage.write_error.map(RunError::from).or(device).or(acquired.err());
         Ok(Acquired {
             session: self.session,
             ledger: storage.ledger,
@@ -256,9 +266,12 @@ impl Passes<'_> {
                 Attempt { id, point, shot: geometry.shot(&point, self.trigger_latency_us) }
             })
             .collect();
-        let acquired = self.camera.acquire(Pass { attempts, not_before_ns: shown.not_before_ns });
+        let acquired = self
+            .camera
+            .acquire(Pass { attempts, not_before_ns: shown.not_before_ns })
+            .map_err(|Gone| RunError::Interrupted)?;
         let mut again = Vec::new();
-        // The channel closes when the pipeline ends, so this waits for nothing that cannot come.
+        // The sink closes the channel when it ends, so this waits for nothing that cannot come.
         for verdict in self.results {
             match verdict {
                 Verdict::Failed(id) => again.push(SettingsId { attempt: id.attempt + 1, ..id }),

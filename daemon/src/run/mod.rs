@@ -7,14 +7,14 @@ mod orders;
 mod storage;
 mod vsync;
 
-use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
-use raysweep_pipeline::Registry;
+use raysweep_core::CameraCapabilities;
+use raysweep_pipeline::{Registry, message_of};
 use raysweep_proto::{
     CheckReport, ErrorCode, Event, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
@@ -31,11 +31,13 @@ use crate::config::{ConfigError, Plan};
 use crate::control::Control;
 use crate::processing::Task;
 use crate::results;
-use crate::rig::Rig;
+use crate::rig::{Rig, RigError};
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
     rig: Arc<Rig>,
+    /// The rig's camera, as it was when the daemon began.
+    camera: CameraCapabilities,
     data: PathBuf,
     registry: Arc<Registry>,
     board: Arc<Board>,
@@ -60,16 +62,37 @@ struct Prepared {
 }
 
 impl Runner {
-    /// A daemon for `rig` that keeps its sessions in `data`.
-    pub fn new(rig: Rig, data: PathBuf, registry: Registry) -> Self {
-        Self {
+    /// A daemon for `rig` that keeps its sessions in `data`. Opens all devices once, to know that they are there; each
+    /// run opens them anew, and between runs they are free for other programs.
+    ///
+    /// # Errors
+    /// The first device that does not open.
+    pub fn new(rig: Rig, data: PathBuf, registry: Registry) -> Result<Self, RigError> {
+        let camera = rig.open()?.camera.capabilities().clone();
+        Ok(Self {
             rig: Arc::new(rig),
+            camera,
             data,
             registry: Arc::new(registry),
             board: Arc::new(Board::new("plane")),
             current: Mutex::default(),
             closed: AtomicBool::new(false),
-        }
+        })
+    }
+
+    /// The rig's camera.
+    pub fn camera(&self) -> &CameraCapabilities {
+        &self.camera
+    }
+
+    /// A plan on this rig, and what it would do.
+    fn foresee(&self, plan: &str) -> Result<(Task, CheckReport), RpcError> {
+        let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
+        let size = (self.camera.height, self.camera.width);
+        let task = Task::new(parsed, &self.rig.file, self.rig.first_row(), size);
+        task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
+        let report = check::check(&task, &self.camera, &self.data).map_err(|error| invalid_plan(&error))?;
+        Ok((task, report))
     }
 
     /// Ends the run under way, if there is one, waits for it, and lets none begin any more.
@@ -116,11 +139,8 @@ impl Runner {
                 Ok(started)
             }
             Err(error) => {
-                let refused = matches!(error.name(), Some(ErrorCode::InvalidPlan | ErrorCode::NoSession));
-                if !refused {
-                    self.board.set_error(error.message.clone());
-                }
-                let _ = self.board.go(if refused { RunState::Idle } else { RunState::Faulted });
+                // Nothing has begun, so nothing has failed.
+                let _ = self.board.go(RunState::Idle);
                 Err(error)
             }
         }
@@ -155,20 +175,21 @@ impl Runner {
     }
 
     fn prepare_new(&self, params: &RunParams) -> Result<Prepared, RpcError> {
-        let plan = Plan::parse(&params.plan).map_err(|error| invalid_plan(&error))?;
-        let devices = self.rig.open().map_err(|error| RpcError::new(ErrorCode::Device, error.to_string()))?;
-        let camera = devices.camera.capabilities().clone();
-        drop(devices);
-        let size = (camera.height, camera.width);
-        let task = Task::new(plan, &self.rig.file, self.rig.first_row(), size);
-        task.processing(&self.registry, &params.plan).map_err(|error| invalid_plan(&error))?;
-        let report = check::check(&task, &camera, &self.data).map_err(|error| invalid_plan(&error))?;
+        let (task, report) = self.foresee(&params.plan)?;
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
                 "the session needs {} MB, {} has {} MB: free some space or give the daemon another --data",
                 report.disk_bytes / 1_000_000,
                 self.data.display(),
                 report.disk_free_bytes / 1_000_000
+            );
+            return Err(RpcError::new(ErrorCode::Storage, what));
+        }
+        if report.memory_bytes > report.memory_free_bytes {
+            let what = format!(
+                "the run needs {} MB of memory, {} MB are free: take fewer points, a smaller region, or a larger machine",
+                report.memory_bytes / 1_000_000,
+                report.memory_free_bytes / 1_000_000
             );
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
@@ -185,8 +206,8 @@ impl Runner {
             shape: StackShape {
                 points: task.schedule.sweep_len(),
                 exposures: task.schedule.dark_len(),
-                rows: size.0,
-                columns: size.1,
+                rows: self.camera.height,
+                columns: self.camera.width,
             },
             first_row: self.rig.first_row(),
         };
@@ -223,29 +244,26 @@ impl Runner {
 fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
     let task = run.task.clone();
     let rig = run.rig.clone();
-    let ended = catch_unwind(AssertUnwindSafe(|| -> Result<EndEntry, RunError> {
+    tracing::info!(session = %dir.display(), resumed = run.resumed, "run begins");
+    let ended = catch_unwind(AssertUnwindSafe(|| -> Result<(EndEntry, Vec<String>), RunError> {
         let acquired = run.acquire()?;
         conclude(acquired, &task, &rig, orders)
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
-    let (state, end) = match ended {
-        Ok(end) if end.state == EndState::Faulted => (RunState::Faulted, end),
-        Ok(end) => (RunState::Idle, end),
-        Err(error) => {
-            let points = task.schedule.sweep_len();
-            let stored = Session::open(dir).and_then(|session| session.state());
-            let stored = stored.map_or(0, |state| state.stored(ArrayName::Sum).count());
-            let error = Some(error.to_string());
-            (
-                RunState::Faulted,
-                EndEntry { state: EndState::Faulted, error, stored, missing: points - stored, vsync: None },
-            )
-        }
-    };
+    let (end, warnings) = ended.unwrap_or_else(|error| {
+        let points = task.schedule.sweep_len();
+        let stored = Session::open(dir).and_then(|session| session.state());
+        let stored = stored.map_or(0, |state| state.stored(ArrayName::Sum).count());
+        let error = Some(error.to_string());
+        let end = EndEntry { state: EndState::Faulted, error, stored, missing: points - stored, vsync: None };
+        (end, Vec::new())
+    });
+    let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
         tracing::error!(%error, session = %dir.display(), "run faulted");
         board.set_error(error.clone());
     }
+    tracing::info!(session = %dir.display(), state = results::name_of(end.state), stored = end.stored, missing = end.missing, "run ended");
     let report = dir.join("report.html");
     let finished = Event::Finished {
         session: dir.to_owned(),
@@ -254,6 +272,7 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
         report: report.exists().then_some(report),
         stored: end.stored,
         missing: end.missing,
+        warnings,
     };
     if board.status().state != RunState::Draining && state == RunState::Idle {
         let _ = board.go(RunState::Draining);
@@ -262,15 +281,21 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
     board.publish(finished);
 }
 
-/// Makes the results of what was acquired; a cancelled run has none, so that it ends soon.
-fn conclude(acquired: Acquired, task: &Task, rig: &Rig, orders: &Orders) -> Result<EndEntry, RunError> {
-    let Acquired { session, mut ledger, mut processing, vsync, fault } = acquired;
-    let missing = engine::missing(&task.schedule, ledger.state()).len();
-    let state = match (&fault, missing) {
+/// Makes the results of what was acquired, unless it is told to end: then there are none yet, so that it ends soon.
+fn conclude(
+    acquired: Acquired,
+    task: &Task,
+    rig: &Rig,
+    orders: &Orders,
+) -> Result<(EndEntry, Vec<String>), RunError> {
+    let Acquired { session, mut ledger, processing, vsync, fault } = acquired;
+    let whole = fault.is_none() && engine::missing(&task.schedule, ledger.state()).is_empty();
+    let results = whole.then(|| processing.finish(&|| orders.go_on()));
+    let state = match (&fault, &results) {
         (Some(_), _) => EndState::Faulted,
-        (None, 0) => EndState::Complete,
         (None, _) if orders.now() == Order::Cancel => EndState::Cancelled,
-        (None, _) => EndState::Faulted,
+        (None, Some(_)) => EndState::Complete,
+        (None, None) => EndState::Faulted,
     };
     let stored = ledger.state().stored(ArrayName::Sum).count();
     let end = EndEntry {
@@ -280,16 +305,19 @@ fn conclude(acquired: Acquired, task: &Task, rig: &Rig, orders: &Orders) -> Resu
         missing: task.schedule.sweep_len() - stored,
         vsync,
     };
-    if state == EndState::Complete {
-        let (products, problems) = processing.finish();
-        results::write_products(&session, task, &products)?;
+    if let (EndState::Complete, Some((products, problems))) = (state, &results) {
+        results::write_products(&session, task, products)?;
         ledger.append(&Entry::End(end.clone()))?;
-        results::write_report(&session, ledger.state(), task, &products, &problems)?;
+        results::write_report(&session, ledger.state(), task, products, problems)?;
+        results::write_manifest(&session, ledger.state(), task, &rig.file)?;
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    results::write_manifest(&session, ledger.state(), task, &rig.file)?;
-    Ok(end)
+    let warnings = results.map_or_else(Vec::new, |(products, mut problems)| {
+        problems.extend(results::warnings(&products));
+        problems
+    });
+    Ok((end, warnings))
 }
 
 impl Control for Runner {
@@ -298,13 +326,7 @@ impl Control for Runner {
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
-        let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
-        let devices = self.rig.open().map_err(|error| RpcError::new(ErrorCode::Device, error.to_string()))?;
-        let camera = devices.camera.capabilities();
-        let size = (camera.height, camera.width);
-        let task = Task::new(parsed, &self.rig.file, self.rig.first_row(), size);
-        task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
-        check::check(&task, camera, &self.data).map_err(|error| invalid_plan(&error))
+        self.foresee(plan).map(|(_, report)| report)
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
@@ -324,7 +346,8 @@ impl Control for Runner {
     }
 
     fn cancel(&self) -> Result<(), RpcError> {
-        let during = [RunState::Preparing, RunState::Armed, RunState::Running, RunState::Paused];
+        let during =
+            [RunState::Preparing, RunState::Armed, RunState::Running, RunState::Paused, RunState::Draining];
         self.order(Order::Cancel, &during, None)
     }
 
@@ -382,12 +405,4 @@ fn name_of(state: RunState) -> &'static str {
         RunState::Draining => "finishing a run",
         RunState::Faulted => "faulted",
     }
-}
-
-fn message_of(panic: &(dyn Any + Send)) -> &str {
-    panic
-        .downcast_ref::<&str>()
-        .copied()
-        .or_else(|| panic.downcast_ref::<String>().map(String::as_str))
-        .unwrap_or("without a message")
 }

@@ -11,6 +11,7 @@ use raysweep_session::ledger::{Entry, Ledger, PointEntry};
 use raysweep_session::stack::Stack;
 
 use super::board::Board;
+use super::orders::{Order, Orders};
 use crate::processing::{Processing, Task, place};
 
 /// What the run is told of its points, in order.
@@ -28,11 +29,13 @@ pub struct Storage {
     pub(super) stack: Stack,
     pub(super) ledger: Ledger,
     pub(super) processing: Processing,
-    pub(super) verdicts: Sender<Verdict>,
+    /// Until the pipeline has ended.
+    pub(super) verdicts: Option<Sender<Verdict>>,
+    pub(super) orders: Arc<Orders>,
     pub(super) board: Arc<Board>,
     pub(super) pace: PaceMeter,
     pub(super) vsync: Option<VsyncStats>,
-    /// The first failure to write, after which nothing more is tried.
+    /// The first failure to write, which ends the run.
     pub(super) write_error: Option<raysweep_session::Error>,
 }
 
@@ -71,7 +74,7 @@ impl Sink for Storage {
             Ordered::Unit(unit, image) => {
                 if let Err(error) = self.store(&unit) {
                     tracing::error!(%error, point = unit.id.point, "point not stored");
-                    self.write_error.get_or_insert(error);
+                    self.note_write_error(error);
                     let mut counts = unit.counts.clone();
                     counts.forfeit(LossCause::WriterError);
                     self.fail(unit.id, counts);
@@ -94,9 +97,13 @@ impl Sink for Storage {
                 self.vsync = Some(vsync);
                 self.board.publish(Event::Progress(self.pace.progress()));
                 self.board.publish(Event::Vsync(vsync));
-                let _ = self.verdicts.send(Verdict::Flushed);
+                self.tell(Verdict::Flushed);
             }
         }
+    }
+
+    fn end(&mut self) {
+        self.verdicts = None;
     }
 }
 
@@ -121,17 +128,31 @@ impl Storage {
     fn fail(&mut self, id: SettingsId, counts: Counts) {
         let (array, index) = place(self.task.schedule.points[id.point as usize].role);
         self.pace.counts.add(&counts);
-        self.append(&Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() });
-        // An attempt that a cancel cut short has lost nothing.
         if counts.lost_total() > 0 {
+            self.append(&Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() });
             self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts });
+        } else {
+            // Cut short by a cancel or a fault: not the point's failure, so a resumed run begins the same attempt.
+            self.append(&Entry::Outside { counts });
         }
-        let _ = self.verdicts.send(Verdict::Failed(id));
+        self.tell(Verdict::Failed(id));
+    }
+
+    fn tell(&self, verdict: Verdict) {
+        if let Some(verdicts) = &self.verdicts {
+            let _ = verdicts.send(verdict);
+        }
+    }
+
+    fn note_write_error(&mut self, error: raysweep_session::Error) {
+        self.orders.give(Order::Fault);
+        self.write_error.get_or_insert(error);
     }
 
     fn note_stage_error(&mut self, unit: &Unit, error: &StageError) {
         tracing::error!(%error, point = unit.id.point, "stored, but left out of the results");
         let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
+        self.processing.problems.push(error.to_string());
         self.append(&Entry::StageFailed { array, index, attempt: unit.id.attempt, error: error.to_string() });
     }
 
@@ -139,7 +160,7 @@ impl Storage {
     pub(super) fn append(&mut self, entry: &Entry) {
         if let Err(error) = self.ledger.append(entry) {
             tracing::error!(%error, "ledger not written");
-            self.write_error.get_or_insert(error);
+            self.note_write_error(error);
         }
     }
 }

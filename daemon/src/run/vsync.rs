@@ -15,7 +15,31 @@ const POLL: Duration = Duration::from_millis(100);
 /// The watcher's thread as the run sees it.
 pub struct VsyncThread {
     stop: Arc<AtomicBool>,
-    thread: JoinHandle<Result<(), DeviceError>>,
+    thread: Option<JoinHandle<Result<(), DeviceError>>>,
+}
+
+impl Drop for VsyncThread {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // Whoever wants to know how it ended has joined it.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Ends the run unless it is told that the watcher ended as it should: also where the watcher panics.
+struct Alarm {
+    orders: Arc<Orders>,
+    armed: bool,
+}
+
+impl Drop for Alarm {
+    fn drop(&mut self) {
+        if self.armed {
+            self.orders.give(Order::Fault);
+        }
+    }
 }
 
 impl VsyncThread {
@@ -34,6 +58,7 @@ impl VsyncThread {
             .spawn({
                 let stop = stop.clone();
                 move || {
+                    let mut alarm = Alarm { orders, armed: true };
                     while !stop.load(Ordering::Relaxed) {
                         match vsync.next_edge(POLL) {
                             Ok(Some(edge)) => {
@@ -42,26 +67,25 @@ impl VsyncThread {
                                 }
                             }
                             Ok(None) => {}
-                            Err(error) => {
-                                orders.give(Order::Fault);
-                                return Err(error);
-                            }
+                            Err(error) => return Err(error),
                         }
                     }
+                    alarm.armed = false;
                     Ok(())
                 }
             })
             .map_err(|error| DeviceError::new("vsync", DeviceErrorKind::NotReady, error))?;
-        Ok(Self { stop, thread })
+        Ok(Self { stop, thread: Some(thread) })
     }
 
     /// Ends the thread.
     ///
     /// # Errors
     /// What the watcher failed with, if it did.
-    pub fn join(self) -> Result<(), DeviceError> {
+    pub fn join(mut self) -> Result<(), DeviceError> {
         self.stop.store(true, Ordering::Relaxed);
-        self.thread.join().unwrap_or_else(|_panic| {
+        let Some(thread) = self.thread.take() else { return Ok(()) };
+        thread.join().unwrap_or_else(|_panic| {
             Err(DeviceError::new(
                 "vsync",
                 DeviceErrorKind::NotReady,

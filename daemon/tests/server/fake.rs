@@ -52,7 +52,15 @@ impl Fake {
         let error = (state == "faulted").then(|| "camera: unplugged".to_owned());
         let report = (state == "complete").then(|| session().join("report.html"));
         let (session, state) = (session(), state.to_owned());
-        self.publish(Event::Finished { session, state, error, report, stored: 75 - missing, missing });
+        self.publish(Event::Finished {
+            session,
+            state,
+            error,
+            report,
+            stored: 75 - missing,
+            missing,
+            warnings: Vec::new(),
+        });
     }
 
     /// Begins a run and, unless the plan says `hang`, ends it as the plan says.
@@ -105,6 +113,7 @@ pub fn report() -> CheckReport {
         frames: 648,
         light_s: 10.8,
         memory_bytes: 20 << 20,
+        memory_free_bytes: 8_000_000_000,
         disk_bytes: 30 << 20,
         disk_free_bytes: 1 << 40,
         reach_rows: (-94, 94),

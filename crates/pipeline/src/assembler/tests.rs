@@ -18,7 +18,8 @@ fn config() -> AssemblerConfig {
             trigger_latency_us: 0.0,
             readout_us: 1000.0,
             readout: Readout::Sequential,
-            exposure_step_us: 1.0,
+            exposure_us: 1.0..=1e6,
+            trigger_delay_us: 0.0..=1e6,
         },
         raster: Raster { rows: 2, row_time_us: 20.0, first_row_us: 990.0, period_us: 16_666.667 },
         first_row: 0,
@@ -60,7 +61,7 @@ impl Feed {
         self.push(Event::Begin(Job {
             id: SettingsId { point: 7, attempt: 0 },
             frames,
-            applied: Applied { actual, written_ns: 0, first_frame: FirstFrame::Exactly(0) },
+            applied: Applied { actual, first_frame: FirstFrame::Exactly(0) },
             delay_us: 0.0,
             light_edges_later,
         }));
@@ -249,19 +250,52 @@ fn settling_and_idle_frames_have_columns_of_their_own() {
 }
 
 #[test]
-fn old_settings_are_recognised_by_time_and_by_frame_id() {
+fn old_settings_are_told_by_frame_id() {
     let actual = CameraSettings { shutter: Shutter::Rolling, exposure_us: 1.0, trigger_delay_us: 0.0 };
-    let stamp = |seq, exposure_start_ns| FrameStamp {
-        seq,
-        device_ns: 0,
-        exposure_start_ns,
-        host_ns: 0,
-        exposure_us: None,
-    };
-    let applied = Applied { actual, written_ns: 1000, first_frame: FirstFrame::Within(2) };
-    let mut labeller = Labeller::new(&applied);
-    assert_eq!(labeller.label(&stamp(10, 900)), Label::Settling);
-    assert_eq!(labeller.label(&stamp(11, 1100)), Label::Settling);
-    // Frame 12 was lost on the way, and yet it was exposed.
-    assert_eq!(labeller.label(&stamp(13, 1300)), Label::Counted);
+    let mut feed = Feed::new();
+    let applied = Applied { actual, first_frame: FirstFrame::Within(3) };
+    let labels: Vec<Label> = (0..4).map(|_| Label::of(&feed.stamp(0), &applied)).collect();
+    assert_eq!(labels, [Label::Settling, Label::Settling, Label::Counted, Label::Counted]);
+}
+
+#[test]
+fn spare_frames_stand_in_for_unsound_ones_and_are_left_when_they_need_not() {
+    let mut feed = Feed::new();
+    feed.edges(0, 3);
+    feed.begin(2, 700.0, 0);
+    feed.frame_at(2 * PERIOD_NS, 700.0 + 60.0, 9, Label::Counted);
+    feed.edges(3, 7);
+    feed.frame(3, 10);
+    feed.frame(4, 20);
+    feed.frame(5, 1000);
+    feed.push(Event::End);
+    let unit = feed.unit();
+    assert_eq!(unit.sum[[0, 0]], 30);
+    assert_eq!((unit.counts.averaged, unit.counts.cancelled, unit.counts.lost_total()), (2, 1, 1));
+    assert!(unit.counts.balanced());
+}
+
+#[test]
+fn a_flush_ends_an_attempt_that_a_failing_device_left_open() {
+    let mut feed = Feed::new();
+    feed.edges(0, 3);
+    feed.begin(2, 700.0, 0);
+    feed.frame(2, 9);
+    feed.push(Event::Flush);
+    let [Decision::Failed(_, counts), Decision::Flushed(..)] = &feed.decisions[..] else { panic!() };
+    assert_eq!((counts.expected, counts.cancelled), (1, 1));
+}
+
+#[test]
+fn frame_ids_that_fall_back_do_no_harm() {
+    let mut feed = Feed::new();
+    feed.edges(0, 9);
+    feed.begin(3, 700.0, 0);
+    feed.seq = 65_535;
+    feed.frame(2, 1);
+    feed.seq = 0; // 16 bits are over
+    feed.frame(3, 1);
+    feed.frame(4, 1);
+    feed.push(Event::End);
+    assert!(feed.unit().counts.balanced());
 }

@@ -72,6 +72,19 @@ impl Demux {
         stack: ArrayView3<f32>,
         valid: Option<ArrayView3<bool>>,
     ) -> Result<Transport, PlaneError> {
+        self.solve_while(stack, valid, &|| true)
+    }
+
+    /// [`Self::solve`] for as long as `go_on` says yes; it is asked before each camera row.
+    ///
+    /// # Errors
+    /// Those of [`Self::solve`]; [`PlaneError::Stopped`] once `go_on` said no.
+    pub fn solve_while(
+        &self,
+        stack: ArrayView3<f32>,
+        valid: Option<ArrayView3<bool>>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, PlaneError> {
         let columns = stack.len_of(Axis(2));
         let rows = self.timing.camera_rows();
         let shape_of = |array, shape: &[usize]| {
@@ -94,6 +107,9 @@ impl Demux {
         let rows_in_reach = self.reach.clone().count();
         let mut t = Array3::zeros((rows_in_reach, rows, columns));
         t.axis_iter_mut(Axis(1)).into_par_iter().enumerate().try_for_each(|(row, profiles)| {
+            if !go_on() {
+                return Err(PlaneError::Stopped);
+            }
             let intensities = stack.index_axis(Axis(1), row).mapv(f64::from);
             self.solve_row(row, intensities, valid.map(|valid| valid.index_axis_move(Axis(1), row)), profiles)
         })?;

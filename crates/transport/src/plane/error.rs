@@ -40,6 +40,9 @@ pub enum PlaneError {
         "the objective is not convex in floating point: choose alpha nearer to 0.1, or shorter exposures"
     )]
     NotConvex,
+    /// The caller ended it.
+    #[error("ended before it was done; `raysweep process` makes the results again")]
+    Stopped,
     /// An array has another shape than the timing and the settings imply.
     #[error("{array} has shape {actual:?}, but {axes} must be {expected:?}")]
     Shape {
