@@ -182,7 +182,16 @@ fn resumes_to_the_same_bits(rig: &str, plan_text: &str, line: usize) {
     let mut daemon = Daemon::start(crashed.path());
     let (session, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
     assert_eq!(state, "complete");
-    assert!(outcome(&session) == expected, "killed after line {line}: the session differs");
+    let (points, files) = outcome(&session);
+    // How many frames were still on their way when settings were written is the run's history, not the point's.
+    let without_counts = |points: Vec<String>| -> Vec<serde_json::Value> {
+        let mut points: Vec<serde_json::Value> =
+            points.iter().map(|point| serde_json::from_str(point).unwrap()).collect();
+        points.iter_mut().for_each(|point| drop(point.as_object_mut().unwrap().remove("counts")));
+        points
+    };
+    assert_eq!(without_counts(points), without_counts(expected.0), "killed after line {line}");
+    assert!(files == expected.1, "killed after line {line}: the products differ");
 }
 
 #[test]
