@@ -17,7 +17,11 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// Capture daemon for light-transport rigs.
 #[derive(Parser)]
-#[command(version, after_help = "Exit status: 0 ended in order, 1 could not start or failed, 2 wrong usage.")]
+#[command(
+    name = "raysweepd",
+    version,
+    after_help = "Exit status: 0 ended in order, 1 could not start or failed, 2 wrong usage."
+)]
 struct Arguments {
     /// The rig file.
     #[arg(long, value_name = "FILE")]

@@ -243,4 +243,15 @@ mod tests {
             assert!(error.span.is_some(), "{text:?} has no place");
         }
     }
+
+    #[test]
+    fn the_documented_plan_file_is_the_defaults() {
+        let page = include_str!("../../../docs/plan.md");
+        let documented = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        let (documented, default) =
+            (Plan::parse(documented).unwrap(), Plan::parse("kind = \"sweep\"").unwrap());
+        assert_eq!(format!("{:?}", documented.sweep), format!("{:?}", default.sweep));
+        assert_eq!(documented.schedule(16_667.0), default.schedule(16_667.0));
+        assert_eq!((documented.name, &documented.stage[0].name), (default.name, &default.stage[0].name));
+    }
 }

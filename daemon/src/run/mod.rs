@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
+use std::time::Instant;
 
 use raysweep_core::CameraCapabilities;
 use raysweep_pipeline::{Registry, message_of};
@@ -290,7 +291,9 @@ fn conclude(
 ) -> Result<(EndEntry, Vec<String>), RunError> {
     let Acquired { session, mut ledger, processing, vsync, fault } = acquired;
     let whole = fault.is_none() && engine::missing(&task.schedule, ledger.state()).is_empty();
+    let began = Instant::now();
     let results = whole.then(|| processing.finish(&|| orders.go_on()));
+    let computed_s = began.elapsed().as_secs_f64();
     let state = match (&fault, &results) {
         (Some(_), _) => EndState::Faulted,
         (None, _) if orders.now() == Order::Cancel => EndState::Cancelled,
@@ -310,6 +313,8 @@ fn conclude(
         ledger.append(&Entry::End(end.clone()))?;
         results::write_report(&session, ledger.state(), task, products, problems)?;
         results::write_manifest(&session, ledger.state(), task, &rig.file)?;
+        let written_s = began.elapsed().as_secs_f64() - computed_s;
+        tracing::info!(computed_s, written_s, "results made");
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
