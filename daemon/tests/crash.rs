@@ -204,7 +204,7 @@ fn cameras_that_are_busy_at_the_edge_resume_to_the_same_bits_too() {
         .replace("rows = 8\n[sim]", "rows = 720\n[sim]")
         .replace("[camera]\n", "[camera]\nfirst_projector_row = 706\n");
     assert_ne!(late, RIG);
-    let late_plan = PLAN.replace("[-60, 0, 60]", "[-350, -300, -250]");
+    let late_plan = PLAN.replace("[-60, 0, 60]", "[-150, -100, -50]");
     for line in [3, 7, 8, 9, 10, 11, 13] {
         resumes_to_the_same_bits(&overlapped, PLAN, line);
         resumes_to_the_same_bits(&late, &late_plan, line);

@@ -14,5 +14,6 @@ pub mod scene;
 mod sensor;
 
 pub use config::SimConfig;
-pub use devices::Devices;
+pub use devices::{Devices, TruthProbe};
+pub use line::LineTruth;
 pub use rig::{PlaneRig, PlaneSetup, SimError};

@@ -133,6 +133,8 @@ fn a_disk_that_refuses_ends_the_run_at_once_with_its_cause_and_the_rest_can_be_r
     );
     let stored = state.stored(ArrayName::Sum).count();
     assert!(stored < 10, "what could not be written is not stored");
+    let tried_again = (0..10).filter(|&index| state.next_attempt(ArrayName::Sum, index) > 1).count();
+    assert_eq!(tried_again, 0, "a disk that has refused is not tried again and again");
 
     let sum = session.stack_path().join("sum");
     std::fs::remove_file(&sum).unwrap();
@@ -196,6 +198,9 @@ fn a_cancelled_run_keeps_what_it_has_and_resumes() {
     assert_eq!(cancelled.state, "cancelled");
     let (_, state) = cancelled.open();
     assert!(state.counts.balanced(), "{:?}", state.counts);
+    let ledger = std::fs::read_to_string(cancelled.session.join("ledger.jsonl")).unwrap();
+    let burnt = ledger.lines().filter(|line| line.contains("attempt_failed") && line.contains("\"lost\":{}"));
+    assert_eq!(burnt.count(), 0, "an attempt that was cut short is begun again, not counted as failed");
     let missing = state.missing(ArrayName::Sum).count();
     assert!(missing > 0 && missing + state.stored(ArrayName::Sum).count() == 10);
 
