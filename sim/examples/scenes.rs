@@ -1,4 +1,4 @@
-//! Renders the built-in scenes to PNG, for looking at:
+//! Renders the built-in scenes to PNG, for looking at, and writes their truth as the `.npz` that rig files name:
 //! `cargo run -p raysweep-sim --example scenes -- FOLDER [ROWS COLUMNS SEED]`.
 //!
 //! One picture per scene, in colour, left to right: floodlit, direct (v = t), |v - t| > 2 (four
@@ -29,6 +29,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         println!("{name}: {:.2} s, brightest floodlit pixel {:.2}", start.elapsed().as_secs_f64(), {
             mono.transport.sum_axis(Axis(0)).fold(0.0_f32, |a, &b| a.max(b))
         });
+        mono.save(&Path::new(folder).join(format!("{name}.npz")))?;
         drop(mono);
         let scene = Scene::builtin_rgb(name, size, number(2, 1) as u64)?;
         write_png(&Path::new(folder).join(format!("{name}.png")), &overview(&scene)?)?;

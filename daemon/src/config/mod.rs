@@ -78,4 +78,17 @@ mod tests {
         let stages = "[[stage]]\nname = \"a\"\n[[stage]]\nname = \"b\"\n";
         assert_eq!(&stages[span_of(stages, &["stage", "1", "name"]).unwrap()], "\"b\"");
     }
+
+    #[test]
+    fn the_example_files_are_what_they_say() {
+        let deploy = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy");
+        let texts = |folder: &str| {
+            let files = std::fs::read_dir(deploy.join(folder)).unwrap().map(|file| file.unwrap().path());
+            files.map(|file| std::fs::read_to_string(file).unwrap()).collect::<Vec<_>>()
+        };
+        let (rigs, plans) = (texts("rigs"), texts("plans"));
+        assert!(rigs.len() >= 2 && plans.len() >= 3);
+        rigs.iter().for_each(|text| drop(RigFile::parse(text).unwrap()));
+        plans.iter().for_each(|text| drop(Plan::parse(text).unwrap()));
+    }
 }

@@ -227,6 +227,13 @@ mod tests {
             (MINIMAL.replace("[camera]\n", "[camera]\nrow_time_us = 30\n"), "same speed"),
             (MINIMAL.replace("[projector]\n", "[projector]\nrows = 1000\n"), "longer than"),
             (format!("{MINIMAL}[sim.camera]\nlate_frames = 3\n"), "late_frames"),
+            (
+                MINIMAL.replace("[projector]\n", "[projector]\nrow_time_us = nan\n"),
+                "projector.row_time_us = NaN",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\npixel_format = \"Mono13\"\n"), "Mono12p"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nfirst_projector_row = 720\n"), "0 to 719"),
+            (format!("{MINIMAL}[sim]\nseed = -1\n"), "-1"),
         ];
         for (text, expected) in cases {
             let error = RigFile::parse(&text).unwrap_err();

@@ -112,7 +112,7 @@ impl Runner {
         let current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         let state = self.board.status().state;
         let Some(current) = current.as_ref().filter(|_| from.contains(&state)) else {
-            let what = format!("the daemon is {}: there is no run to do this to", name_of(state));
+            let what = format!("the daemon is {}: there is nothing to do this to", name_of(state));
             return Err(RpcError::new(ErrorCode::NotRunning, what));
         };
         if let Some(to) = to {

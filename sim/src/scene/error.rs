@@ -10,7 +10,7 @@ use super::{BUILTIN_NAMES, MAX_ENTRIES, MIN_SIDE, Window};
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
     /// No built-in scene of this name.
-    #[error("scene \"{name}\": no such built-in scene; choose one of {}", BUILTIN_NAMES.join(", "))]
+    #[error("scene \"{name}\": no such built-in scene; choose one of {}, or name a file that ends in .npz", BUILTIN_NAMES.join(", "))]
     UnknownName {
         /// The name asked for.
         name: String,
