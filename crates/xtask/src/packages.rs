@@ -4,7 +4,7 @@ use std::process::{Command, Stdio};
 
 use crate::run::{Done, root, run};
 
-/// One line of `tests/packages.txt`: the package, the file that shows it is there, and why it is needed.
+/// One line of `tests/packages.txt`: the package, what shows that it is there, and why it is needed.
 struct Package {
     name: String,
     shows: String,
@@ -57,10 +57,11 @@ fn list() -> Done<Vec<Package>> {
         .collect()
 }
 
-/// Whether a program is on the path or a file exists.
+/// Whether a program is on the path or, written `python3:MODULE`, Python has a module.
 fn is_there(shows: &str) -> bool {
-    if shows.starts_with('/') {
-        return std::path::Path::new(shows).exists();
+    if let Some(module) = shows.strip_prefix("python3:") {
+        let import = Command::new("python3").args(["-c", &format!("import {module}")]).output();
+        return import.is_ok_and(|output| output.status.success());
     }
     let path = std::env::var_os("PATH").unwrap_or_default();
     std::env::split_paths(&path).any(|folder| folder.join(shows).exists())
