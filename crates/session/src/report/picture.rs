@@ -155,7 +155,7 @@ impl Picture {
         let mut encoder = png::Encoder::new(&mut file, px(columns)?, px(rows)?);
         encoder.set_color(color);
         encoder.set_depth(png::BitDepth::Eight);
-        encoder.set_compression(png::Compression::High);
+        encoder.set_compression(png::Compression::Fast);
         let levels: Vec<u8> = self.levels.iter().copied().collect();
         encoder
             .write_header()
