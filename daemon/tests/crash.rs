@@ -118,6 +118,12 @@ fn outcome(session: &Path) -> (Vec<String>, Vec<(String, Vec<u8>)>) {
     (points, files)
 }
 
+/// Waits until the ledger has so many lines, or, bounded, until it is plain that the run has ended with fewer.
+fn wait_for_line(session: &Path, line: usize) {
+    let began = Instant::now();
+    while ledger_lines(session) < line && began.elapsed() < Duration::from_secs(5) {}
+}
+
 fn ledger_lines(session: &Path) -> usize {
     std::fs::read_to_string(session.join("ledger.jsonl")).unwrap().lines().count()
 }
@@ -149,8 +155,7 @@ fn fifty_kills_and_resumes_end_like_a_run_without_any() {
         let mut daemon = Daemon::start(crashed.path());
         let mut client = daemon.client();
         let session = client.run(&plan(PLAN)).unwrap().session;
-        let began = Instant::now();
-        while ledger_lines(&session) < line && began.elapsed() < Duration::from_secs(5) {}
+        wait_for_line(&session, line);
         std::thread::sleep(later);
         daemon.kill();
 
@@ -177,7 +182,7 @@ fn resumes_to_the_same_bits(rig: &str, plan_text: &str, line: usize) {
     daemon.kill();
     let mut daemon = Daemon::start(crashed.path());
     let session = daemon.client().run(&plan(plan_text)).unwrap().session;
-    while ledger_lines(&session) < line {}
+    wait_for_line(&session, line);
     daemon.kill();
     let mut daemon = Daemon::start(crashed.path());
     let (session, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));

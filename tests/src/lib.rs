@@ -89,7 +89,7 @@ impl Bench {
         let mut events = self.runner.events();
         let params = RunParams { plan: plan.into(), ..RunParams::default() };
         self.runner.run(params).unwrap_or_else(|error| panic!("{error}"));
-        end_of(&mut events)
+        end_of(&mut events).accounted_for()
     }
 
     /// Acquires what a session lacks.
@@ -100,7 +100,7 @@ impl Bench {
         let mut events = self.runner.events();
         let params = ResumeParams { session: session.into() };
         self.runner.resume(params).unwrap_or_else(|error| panic!("{error}"));
-        end_of(&mut events)
+        end_of(&mut events).accounted_for()
     }
 }
 
@@ -126,6 +126,16 @@ pub fn end_of(events: &mut tokio::sync::broadcast::Receiver<Event>) -> Ended {
 }
 
 impl Ended {
+    /// Holds the accounting, whatever the test is about: every trigger in one column, every point stored or missing.
+    fn accounted_for(self) -> Self {
+        let (_, state) = self.open();
+        assert!(state.counts.balanced(), "{:?}", state.counts);
+        let (stored, missing) = (state.stored(ArrayName::Sum).count(), state.missing(ArrayName::Sum).count());
+        assert_eq!(stored + missing, state.session.shape.points);
+        assert!(state.stored(ArrayName::Sum).all(|point| point.counts.balanced()));
+        self
+    }
+
     /// The session on disk.
     ///
     /// # Panics
