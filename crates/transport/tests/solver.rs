@@ -190,7 +190,7 @@ fn a_mask_of_whole_settings_equals_leaving_them_out() {
 }
 
 /// Light that a pixel of camera row `t` collects, by stepping through time: which row the projector lights at each
-/// instant follows from the clock alone.
+/// instant follows from the clock and the row table alone. A row sends `light_of_row` in all, evenly over its dwell.
 fn by_stepping_through_time(
     timing: &RowTiming,
     setting: &Setting,
@@ -199,15 +199,29 @@ fn by_stepping_through_time(
 ) -> f64 {
     const STEP_US: f64 = 0.01;
     let steps = (setting.exposure_us / STEP_US).round() as usize;
-    let own_us = (timing.first_row() + t) as f64 * timing.row_time_us();
-    let start_us = own_us + setting.delays_us[0] - setting.exposure_us / 2.0;
-    let instants_us = (0..steps).map(|step| start_us + (step as f64 + 0.5) * STEP_US);
-    let lit_rows = instants_us.map(|instant_us| {
-        let since_edge_us = (instant_us + timing.row_time_us() / 2.0).rem_euclid(timing.period_us());
-        (since_edge_us / timing.row_time_us()) as usize
-    });
-    let light = lit_rows.filter(|&row| row < timing.projector_rows()).map(light_of_row);
-    light.sum::<f64>() * STEP_US / timing.row_time_us()
+    let (camera, starts_us) = (timing.camera(), timing.row_starts_us());
+    let first_centre_us = (camera.first_row as f64 + 0.5) * timing.row_time_us();
+    let centre_us = first_centre_us + setting.delays_us[0] + t as f64 * camera.row_time_us;
+    let start_us = centre_us - setting.exposure_us / 2.0;
+    let mut row = 0;
+    let mut light = 0.0;
+    for step in 0..steps {
+        let instant_us = start_us + (step as f64 + 0.5) * STEP_US;
+        let into_frame_us = starts_us[0] + (instant_us - starts_us[0]).rem_euclid(timing.period_us());
+        // Rows follow one another, so that the search goes on where it ended.
+        if into_frame_us < starts_us[row] {
+            row = 0;
+        }
+        while row < timing.projector_rows() && into_frame_us >= starts_us[row + 1] {
+            row += 1;
+        }
+        if row < timing.projector_rows() {
+            light += light_of_row(row) * STEP_US / (starts_us[row + 1] - starts_us[row]);
+        } else {
+            row = 0;
+        }
+    }
+    light
 }
 
 #[test]
@@ -260,7 +274,7 @@ proptest! {
             .iter()
             .map(|&(delay, exposure_us)| Setting::new(delay * timing.period_us(), exposure_us))
             .collect();
-        let Ok(demux) = Demux::new(timing, settings.clone(), prior) else {
+        let Ok(demux) = Demux::new(timing.clone(), settings.clone(), prior) else {
             // Every delay may point into the retrace or beyond the border.
             prop_assert_eq!(reach(&timing, &settings), Err(PlaneError::NothingSeen));
             return Ok(());
@@ -272,9 +286,8 @@ proptest! {
         let estimate = demux.solve(stack.view(), None).unwrap();
         for t in 0..rows {
             for (n, setting) in settings.iter().enumerate() {
-                let weighted: f64 = (0..rows)
-                    .map(|v| timing.weight(timing.relative_row(v, t), setting) * f64::from(light[v]))
-                    .sum();
+                let weights = timing.weights(t, setting);
+                let weighted: f64 = weights.iter().zip(&light).map(|(w, &light)| w * f64::from(light)).sum();
                 prop_assert!((weighted - by_clock(n, t)).abs() < 0.01, "{weighted} is not {}", by_clock(n, t));
             }
             let objective = Objective::new(&timing, &settings, prior, t);
@@ -299,7 +312,7 @@ fn one_setting_alone_still_gives_the_minimum() {
     // Three unknowns, one sample: H is singular, and its inverse holds rounding only. Five periods of three rows.
     let timing = RowTiming::new(3, 20.0, 60.0).unwrap();
     let settings = [Setting::new(0.0, 306.2)];
-    let demux = Demux::new(timing, settings.to_vec(), Prior::SPLIT).unwrap();
+    let demux = Demux::new(timing.clone(), settings.to_vec(), Prior::SPLIT).unwrap();
     let stack = Array3::from_elem((1, 3, 1), 1.3);
     let estimate = demux.solve(stack.view(), None).unwrap();
     for t in 0..3 {
