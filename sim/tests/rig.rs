@@ -47,6 +47,7 @@ fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
     let setup = PlaneSetup {
         raster: RASTER,
         camera_row_time_us: TAU_US,
+        row_pitch: 1.0,
         white_dn: WHITE,
         black_dn: 0.0,
         format: PixelFormat::Mono12,

@@ -419,7 +419,7 @@ mod tests {
     fn rows_of_unequal_dwell_send_the_same_light() {
         // Rows 0..720 lit twice as fast as nominally in the first half of the sweep, and slower after it.
         let starts_us: Vec<f64> = (0..=720)
-            .map(|v| f64::from(v))
+            .map(f64::from)
             .map(|v| if v <= 360.0 { v / 2.0 * TAU_US } else { (180.0 + (v - 360.0) * 1.5) * TAU_US })
             .collect();
         let bent = timing().with_row_table(&starts_us).unwrap();
