@@ -13,17 +13,27 @@ use raysweep_core::{PixelFormat, Raster};
 use raysweep_sim::config::{Beam as SimBeam, RowTable, SimProjector};
 use raysweep_sim::{PlaneRig, PlaneSetup, SimConfig};
 use raysweep_tests::{Bench, corner_rig, data};
+use raysweep_transport::plane::advice::{Noise, SweepGrid, better_plan};
 use raysweep_transport::plane::{Beam, CameraRows, Demux, Prior, RowTiming, Setting};
 use raysweep_transport::quality::{median_profile_error, relative_l2};
 
 const TAU_US: f64 = 22.22;
-const RASTER: Raster = Raster { rows: 128, row_time_us: TAU_US, first_row_us: 2200.0, period_us: 50_000.0 / 3.0 };
+const RASTER: Raster =
+    Raster { rows: 128, row_time_us: TAU_US, first_row_us: 2200.0, period_us: 50_000.0 / 3.0 };
 
 /// Transport of the corner scene, `[v, t, s]`, every fourth column.
 fn corner() -> Array3<f32> {
     let mut npz = ndarray_npy::NpzReader::new(std::fs::File::open(data("p2r_corner.npz")).unwrap()).unwrap();
     let scene: Array3<f32> = npz.by_name("T").unwrap();
     scene.slice_move(s![.., .., ..;4])
+}
+
+/// The paper's sweep.
+fn paper_grid() -> SweepGrid {
+    SweepGrid {
+        delays_us: (0..15).map(|k| -1500.0 + 3000.0 / 14.0 * f64::from(k)).collect(),
+        exposures_us: (0..5).map(|k| 600.0 + 150.0 * f64::from(k)).collect(),
+    }
 }
 
 /// A simulated rig, and the transport `[v, t, s]` that is its truth.
@@ -82,17 +92,19 @@ impl Rig {
         self.timing().with_row_table(&table).unwrap()
     }
 
-    /// Median relative error of the profile and relative error of the u = 0 image, as recovered under `timing` from the
-    /// paper's sweep: 8 frames of a sensor with 8000 electrons, 15 of them read noise.
+    /// The errors of the paper's sweep with 8 frames.
     fn recover(&self, timing: &RowTiming) -> Errors {
-        let settings: Vec<Setting> = (0..75)
-            .map(|n| Setting::new(-1500.0 + 3000.0 / 14.0 * f64::from(n % 15), 600.0 + 150.0 * f64::from(n / 15)))
-            .collect();
+        self.recover_from(timing, paper_grid().settings(), 8)
+    }
+
+    /// Median relative error of the profile and relative error of the u = 0 image, as recovered under `timing` from
+    /// `frames` frames a setting of a sensor with 8000 electrons, 15 of them read noise.
+    fn recover_from(&self, timing: &RowTiming, settings: Vec<Setting>, frames: u32) -> Errors {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
         let mut photographed = |light: f32| {
             let electrons = f64::from(light) * 2500.0 / 4095.0 * 8000.0;
             let noise: f64 = StandardNormal.sample(&mut random);
-            let mean = electrons + noise * ((electrons + 15.0 * 15.0) / 8.0).sqrt();
+            let mean = electrons + noise * ((electrons + 15.0 * 15.0) / f64::from(frames)).sqrt();
             (mean / 8000.0 * 4095.0 / 2500.0) as f32
         };
         let images: Vec<Array2<f32>> = settings
@@ -231,4 +243,19 @@ fn a_camera_that_is_one_percent_slow() {
     let pace = known.clone().window(0, known.camera_rows()).unwrap();
     let unknown = rig.recover(&pace);
     assert!(unknown.own_row > 0.1, "the drift matters: {unknown:?}");
+}
+
+#[test]
+fn a_plan_that_is_expected_to_be_better_is() {
+    let rig = Rig::corner(SimProjector::default());
+    let timing = rig.timing();
+    let white_e = 8000.0 * 2500.0 / 4095.0;
+    for frames in [1, 8] {
+        let noise = Noise { read: 15.0 / white_e, gain: 1.0 / white_e, frames };
+        let (grid, expected) = better_plan(&timing, &paper_grid(), &Prior::SPLIT, &noise).unwrap();
+        println!("{} x {:?}, {expected:?}", grid.delays_us.len(), grid.exposures_us);
+        let paper = rig.recover_from(&timing, paper_grid().settings(), frames);
+        let better = rig.recover_from(&timing, grid.settings(), frames);
+        assert!(better.profile <= paper.profile, "{better:?} {paper:?}");
+    }
 }

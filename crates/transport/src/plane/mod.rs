@@ -15,6 +15,7 @@
 //! [`Beam`] spreads a row; it and [`Setting`] hold the quantities on the right. [`RowModel`] is `A` for one camera row
 //! with its borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
 
+pub mod advice;
 mod beam;
 mod cholesky;
 mod demux;
