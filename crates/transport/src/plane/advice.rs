@@ -232,10 +232,16 @@ mod tests {
 
     #[test]
     fn the_solver_errs_as_much_as_expected() {
+        // Noise decides with the usual alpha, smoothing with the second.
+        solver_errs_as_expected(0.1);
+        solver_errs_as_expected(30.0);
+    }
+
+    fn solver_errs_as_expected(alpha: f64) {
         // A profile so bright that T >= 0 never binds, of the roughness that is assumed, in many pixels.
         const PIXELS: usize = 300;
         let (timing, settings) = (timing().window(64, 1).unwrap(), paper_grid().settings());
-        let prior = Prior::Split { alpha: 0.1, beta: 0.0 };
+        let prior = Prior::Split { alpha, beta: 0.0 };
         let noise = noise(8);
         let demux = Demux::new(timing.clone(), settings.clone(), prior).unwrap();
         let expected = expected_error(&timing, &settings, &demux.reach(), &prior, &noise).unwrap();
