@@ -35,7 +35,12 @@ impl Task {
         let schedule = plan.schedule(rig.vsync.period_us);
         let geometry = SweepGeometry {
             raster: rig.raster(),
+            row_table_us: rig.projector.row_table.as_deref().map(Into::into),
+            beam_sigma_rows: rig.projector.beam_sigma_rows,
+            spot: rig.projector.spot(),
             first_row,
+            row_pitch: rig.camera.row_pitch,
+            camera_row_time_us: rig.camera_row_time_us(),
             height: size.0,
             width: size.1,
             white_dn: rig.camera.white_dn(),

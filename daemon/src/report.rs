@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, ArrayView2, Axis};
-use raysweep_pipeline::{PREDICTED_SHARE, Product, Role};
+use raysweep_pipeline::{PREDICTED_SHARE, Product, Role, Spot, SweepGeometry};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
     Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table,
@@ -392,14 +392,40 @@ fn settings(state: &State, task: &Task) -> Block {
     });
     let entries = [
         ("stages", stages.collect::<Vec<_>>().join(", ")),
-        ("row time", format!("{} µs", geometry.raster.row_time_us)),
+        ("row time", row_times(geometry)),
+        ("beam", beam(geometry)),
         ("first row after VSYNC", format!("{} µs", geometry.raster.first_row_us)),
         (
             "projector rows",
-            format!("{}, the camera's first sees row {}", geometry.raster.rows, geometry.first_row),
+            format!(
+                "{}, the camera's first sees row {}, each of its rows {} further",
+                geometry.raster.rows, geometry.first_row, geometry.row_pitch
+            ),
         ),
         ("white", format!("{} counts above black", geometry.white_dn)),
         ("software", state.session.software.clone()),
     ];
     Block::Facts(entries.map(|(key, value)| (key.to_owned(), value)).to_vec())
+}
+
+/// When rows are lit and exposed, as the model takes it.
+fn row_times(geometry: &SweepGeometry) -> String {
+    let table = if geometry.row_table_us.is_some() { ", by the measured table" } else { "" };
+    format!(
+        "projector {} µs{table}, camera {:.4} µs",
+        geometry.raster.row_time_us, geometry.camera_row_time_us
+    )
+}
+
+/// How a row's light spreads in space and time, as the model takes it.
+fn beam(geometry: &SweepGeometry) -> String {
+    let spot = match geometry.spot {
+        Spot::Uniform => "rows lit evenly",
+        Spot::Flying(_) => "a flying spot, modelled as rows lit evenly",
+    };
+    match geometry.beam_sigma_rows {
+        Some(0.0) => format!("ideal, {spot}"),
+        Some(sigma_rows) => format!("sigma {sigma_rows} rows, {spot}"),
+        None => format!("not stated by the rig, {spot}"),
+    }
 }

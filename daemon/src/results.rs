@@ -41,7 +41,7 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 metadata.insert("u_max".into(), json!(found.u_max()));
                 metadata.insert(
                     "about".into(),
-                    json!("light from projector row v = t + first_row + u to camera pixel (t, s); 0 where the projector has no such row"),
+                    json!("light from projector row v = u + round(first_row + row_pitch t) to camera pixel (t, s); 0 where the projector has no such row"),
                 );
                 files.volume("transport", found.t.view(), &metadata)?;
                 transport::write(&session.transport_path(), found.t.view(), &metadata)?;
@@ -61,7 +61,11 @@ fn common(task: &Task) -> Map<String, Value> {
         ("plan", json!(task.plan.name)),
         ("demux", json!(prior.map(|stage| &stage.options))),
         ("row_time_us", json!(geometry.raster.row_time_us)),
+        ("row_table", json!(geometry.row_table_us.is_some())),
+        ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
         ("first_row", json!(geometry.first_row)),
+        ("row_pitch", json!(geometry.row_pitch)),
+        ("camera_row_time_us", json!(geometry.camera_row_time_us)),
         ("white_dn", json!(geometry.white_dn)),
         ("software", json!(crate::SOFTWARE)),
     ];
@@ -109,7 +113,11 @@ pub fn write_manifest(session: &Session, state: &State, task: &Task, rig: &RigFi
             "rows": rig.projector.rows,
             "row_time_us": rig.projector.row_time_us,
             "first_row_us": rig.projector.first_row_us,
+            "row_table_us": rig.projector.row_table,
+            "beam_sigma_rows": rig.projector.beam_sigma_rows,
             "first_row": task.geometry.first_row,
+            "row_pitch": rig.camera.row_pitch,
+            "camera_row_time_us": rig.camera_row_time_us(),
         }),
     );
     settings.insert("exposures_us".into(), json!(taken_exposures(state, &task.schedule)));

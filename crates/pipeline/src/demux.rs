@@ -104,12 +104,9 @@ impl DemuxFold {
             |error: PlaneError| RegistryError::Invalid { name: "demux".into(), what: error.to_string() };
         let prior = options.prior();
         prior.check().map_err(invalid)?;
-        let raster = &geometry.raster;
-        let timing = RowTiming::new(raster.rows, raster.row_time_us, raster.period_us)
-            .and_then(|timing| timing.window(geometry.first_row, geometry.height))
-            .map_err(invalid)?;
-        let fold =
-            Self { prior, schedule: schedule.clone(), geometry: *geometry, timing, taken: BTreeMap::new() };
+        let timing = geometry.timing().map_err(invalid)?;
+        let (schedule, geometry) = (schedule.clone(), geometry.clone());
+        let fold = Self { prior, schedule, geometry, timing, taken: BTreeMap::new() };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -121,7 +118,7 @@ impl DemuxFold {
     pub fn demux(&self) -> Result<Demux, PlaneError> {
         let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
         let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
-        Demux::new(self.timing, planned, self.prior)
+        Demux::new(self.timing.clone(), planned, self.prior)
     }
 
     /// The regular image, and how well the transport predicts it where it is not saturated.

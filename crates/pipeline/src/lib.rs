@@ -19,6 +19,6 @@ pub use edges::{EdgeTracker, Line};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
 pub use queue::{Input, Policy, QueueError};
 pub use registry::{Entry, Registry, RegistryError};
-pub use schedule::{Point, Role, Schedule, Shot, SweepGeometry};
+pub use schedule::{Point, Role, Scan, Schedule, Shot, Spot, SweepGeometry};
 pub use stage::{Fold, FoldError, HotPixels, Product, Stage, StageError};
 pub use unit::Unit;

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
 mod common;
+mod stepping;
 
 use common::{corner, ideal_stack, paper_sweep, photographed, timing};
 use ndarray::{Array1, Array2, Array3, Axis, s};
@@ -12,6 +13,7 @@ use raysweep_transport::plane::{
     relative_rows,
 };
 use raysweep_transport::quality::{median_profile_error, relative_l2};
+use stepping::by_stepping_through_time;
 
 /// The objective of one camera row, assembled from its definition.
 struct Objective {
@@ -292,27 +294,6 @@ fn a_mask_of_whole_settings_equals_leaving_them_out() {
     assert!((&fewer.t - &masked.t).iter().all(|error| error.abs() < 1e-6));
 }
 
-/// Light that a pixel of camera row `t` collects, by stepping through time: which row the projector lights at each
-/// instant follows from the clock alone.
-fn by_stepping_through_time(
-    timing: &RowTiming,
-    setting: &Setting,
-    t: usize,
-    light_of_row: impl Fn(usize) -> f64,
-) -> f64 {
-    const STEP_US: f64 = 0.01;
-    let steps = (setting.exposure_us / STEP_US).round() as usize;
-    let own_us = (timing.first_row() + t) as f64 * timing.row_time_us();
-    let start_us = own_us + setting.delays_us[0] - setting.exposure_us / 2.0;
-    let instants_us = (0..steps).map(|step| start_us + (step as f64 + 0.5) * STEP_US);
-    let lit_rows = instants_us.map(|instant_us| {
-        let since_edge_us = (instant_us + timing.row_time_us() / 2.0).rem_euclid(timing.period_us());
-        (since_edge_us / timing.row_time_us()) as usize
-    });
-    let light = lit_rows.filter(|&row| row < timing.projector_rows()).map(light_of_row);
-    light.sum::<f64>() * STEP_US / timing.row_time_us()
-}
-
 #[test]
 fn exposures_over_the_retrace_see_what_the_clock_says() {
     // Camera rows 592..720 of the paper's projector; the light of the top rows is distinct from the bottom's.
@@ -363,7 +344,7 @@ proptest! {
             .iter()
             .map(|&(delay, exposure_us)| Setting::new(delay * timing.period_us(), exposure_us))
             .collect();
-        let Ok(demux) = Demux::new(timing, settings.clone(), prior) else {
+        let Ok(demux) = Demux::new(timing.clone(), settings.clone(), prior) else {
             // Every delay may point into the retrace or beyond the border.
             prop_assert_eq!(reach(&timing, &settings), Err(PlaneError::NothingSeen));
             return Ok(());
@@ -375,9 +356,8 @@ proptest! {
         let estimate = demux.solve(stack.view(), None).unwrap();
         for t in 0..rows {
             for (n, setting) in settings.iter().enumerate() {
-                let weighted: f64 = (0..rows)
-                    .map(|v| timing.weight(timing.relative_row(v, t), setting) * f64::from(light[v]))
-                    .sum();
+                let weights = timing.weights(t, setting);
+                let weighted: f64 = weights.iter().zip(&light).map(|(w, &light)| w * f64::from(light)).sum();
                 prop_assert!((weighted - by_clock(n, t)).abs() < 0.01, "{weighted} is not {}", by_clock(n, t));
             }
             let objective = Objective::new(&timing, &settings, prior, t);
@@ -402,7 +382,7 @@ fn one_setting_alone_still_gives_the_minimum() {
     // Three unknowns, one sample: H is singular, and its inverse holds rounding only. Five periods of three rows.
     let timing = RowTiming::new(3, 20.0, 60.0).unwrap();
     let settings = [Setting::new(0.0, 306.2)];
-    let demux = Demux::new(timing, settings.to_vec(), Prior::SPLIT).unwrap();
+    let demux = Demux::new(timing.clone(), settings.to_vec(), Prior::SPLIT).unwrap();
     let stack = Array3::from_elem((1, 3, 1), 1.3);
     let estimate = demux.solve(stack.view(), None).unwrap();
     for t in 0..3 {
