@@ -4,7 +4,7 @@ use raysweep_pipeline::{Point, Role, Schedule};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::ConfigError;
+use super::{ConfigError, ProductTable};
 
 /// A plan.
 #[derive(Debug, Clone, Deserialize)]
@@ -21,6 +21,8 @@ pub struct Plan {
     /// `[[stage]]`: stages in order, then folds; none: `demux`.
     #[serde(default = "default_stages")]
     pub stage: Vec<StageTable>,
+    /// `[[product]]`: what to make of the transport; left out: [`raysweep_pipeline::ProductSpec::defaults`].
+    pub product: Option<Vec<ProductTable>>,
 }
 
 /// The kinds of acquisition.
@@ -165,6 +167,9 @@ impl Plan {
                 return Err(ConfigError::at(text, &["stage", &index.to_string(), key], message));
             }
         }
+        for (index, product) in self.product.iter().flatten().enumerate() {
+            product.check(text, index)?;
+        }
         if !(1..=MAX_AVERAGE).contains(&sweep.average) {
             let message = format!("sweep.average = {}: 1 to {MAX_AVERAGE} frames are allowed", sweep.average);
             return Err(ConfigError::at(text, &["sweep", "average"], message));
@@ -236,6 +241,8 @@ mod tests {
             ("kind = \"sweep\"\nname = \"  \"", "empty"),
             ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nalpha = nan", "alpha is not a finite number"),
             ("kind = \"sweep\"\n[[stage]]\nprior = \"split\"", "name"),
+            ("kind = \"sweep\"\n[[product]]\nname = \"a\"", "kind"),
+            ("kind = \"sweep\"\n[[product]]\nkind = \"band\"\nfrom_rows = inf", "from_rows is not a finite"),
         ];
         for (text, expected) in cases {
             let error = Plan::parse(text).unwrap_err();

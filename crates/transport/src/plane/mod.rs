@@ -20,8 +20,10 @@ mod error;
 mod forward;
 mod pivot;
 mod prior;
+mod profile;
 mod quadratic;
 pub mod reference;
+mod relight;
 mod timing;
 mod transport;
 
@@ -29,5 +31,7 @@ pub use demux::Demux;
 pub use error::PlaneError;
 pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
 pub use prior::Prior;
+pub use profile::DelayProfile;
+pub use relight::relight;
 pub use timing::{RowTiming, Setting, delay_us, offset_us};
 pub use transport::Transport;
