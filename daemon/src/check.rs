@@ -44,8 +44,7 @@ pub fn check(
     let images = products.iter().map(|product| product.images(geometry) as u64);
     // Each image once, the largest sequence twice more: as EXR's channels and as the file's bytes.
     let product_images = images.clone().sum::<u64>() + 2 * images.clone().max().unwrap_or(0);
-    let memory_bytes =
-        pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows + 4 * product_images);
+    let memory_bytes = pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows + 4 * product_images);
     let files = 2 * images.sum::<u64>();
     let disk_bytes = pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows + files) + 10_000_000;
     let existing = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));

@@ -19,6 +19,9 @@ pub enum ProcessError {
     /// Its plan or rig file cannot be read.
     #[error("{0}")]
     Config(String),
+    /// A product that was asked for cannot be had.
+    #[error("{0}")]
+    Product(String),
     /// A file cannot be copied.
     #[error("cannot copy to {}: {source}", path.display())]
     Copy {
@@ -88,7 +91,7 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     }
     for argument in &asked.products {
         append_argument(&mut processing.products, argument, &task.schedule, &task.geometry)
-            .map_err(ProcessError::Config)?;
+            .map_err(ProcessError::Product)?;
     }
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let (products, problems) = processing.finish(&|| true);

@@ -49,7 +49,10 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 metadata.insert("axes".into(), json!(["delay", "column"]));
                 metadata.insert("about".into(), json!(profile.about));
                 metadata.insert("exposure_us".into(), json!(profile.exposure_us));
-                metadata.insert("columns".into(), json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()));
+                metadata.insert(
+                    "columns".into(),
+                    json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()),
+                );
                 files.table(&profile.name, &columns, &metadata)?;
             }
             Product::Transport(found) => {

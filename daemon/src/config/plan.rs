@@ -213,7 +213,11 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
+    use raysweep_pipeline::{ProductSpec, Registry};
+
     use super::*;
+    use crate::config::RigFile;
+    use crate::processing::Task;
 
     #[test]
     fn every_key_but_kind_has_a_default_and_it_is_the_papers_sweep() {
@@ -259,6 +263,10 @@ mod tests {
             (Plan::parse(documented).unwrap(), Plan::parse("kind = \"sweep\"").unwrap());
         assert_eq!(format!("{:?}", documented.sweep), format!("{:?}", default.sweep));
         assert_eq!(documented.schedule(16_667.0), default.schedule(16_667.0));
-        assert_eq!((documented.name, &documented.stage[0].name), (default.name, &default.stage[0].name));
+        assert_eq!((&documented.name, &documented.stage[0].name), (&default.name, &default.stage[0].name));
+        let rig = RigFile::parse(include_str!("../../../deploy/rigs/plane-sim.toml")).unwrap();
+        let task = Task::new(documented, &rig, 0, (128, 128));
+        let processing = task.processing(&Registry::default(), page).unwrap();
+        assert_eq!(processing.products, ProductSpec::defaults());
     }
 }

@@ -18,11 +18,11 @@ pub struct ProductTable {
     pub options: Map<String, Value>,
 }
 
-/// The text of an argument around which a document is built, so that errors can point into it.
+/// What stands in an argument, as a document, so that errors can point into it.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Argument {
-    product: [ProductTable; 1],
+    product: Vec<ProductTable>,
 }
 
 impl ProductTable {
@@ -51,7 +51,8 @@ impl ProductTable {
     ) -> Result<(), ConfigError> {
         let index = index.to_string();
         let refused = |path: &[String], message: String| {
-            let path: Vec<&str> = ["product", &index].into_iter().chain(path.iter().map(String::as_str)).collect();
+            let path: Vec<&str> =
+                ["product", &index].into_iter().chain(path.iter().map(String::as_str)).collect();
             ConfigError::at(text, &path, message)
         };
         let spec = ProductSpec::new(&self.kind, self.name.as_deref(), &self.options, schedule, geometry)
@@ -80,11 +81,13 @@ pub fn append_argument(
     geometry: &SweepGeometry,
 ) -> Result<(), String> {
     let text = format!("product = [{{ {argument} }}]");
-    let parsed: Result<Argument, _> = toml::from_str(&text).map_err(|error| ConfigError::parse(&error));
-    parsed
-        .and_then(|Argument { product: [table] }| {
-            table.check(&text, 0)?;
-            table.append_to(specs, &text, 0, schedule, geometry)
-        })
-        .map_err(|error| error.render("--product", &text))
+    let append = |specs: &mut Vec<ProductSpec>| {
+        let Argument { product } = toml::from_str(&text).map_err(|error| ConfigError::parse(&error))?;
+        for (index, table) in product.iter().enumerate() {
+            table.check(&text, index)?;
+            table.append_to(specs, &text, index, schedule, geometry)?;
+        }
+        Ok(())
+    };
+    append(specs).map_err(|error: ConfigError| error.render("--product", &text))
 }

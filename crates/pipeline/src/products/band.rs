@@ -61,7 +61,7 @@ impl Width {
         let about = match self.half() {
             0 => "light from all other rows within the sweep's reach".into(),
             half => {
-                format!("light from all rows more than {half} away (|u| > {half}); {}", reach_of(transport))
+                format!("light from all rows more than {half} away within the sweep's reach (|u| > {half})")
             }
         };
         Product::Image { name, about, image: transport.non_epipolar(self.width_rows) }
@@ -128,7 +128,11 @@ impl Band {
             Some(Side::Below) => "below the pixel's own",
             None => "away",
         };
-        let about = format!("light from projector rows {rows} {side}; {}", reach_of(transport));
+        let mut about = format!("light from projector rows {rows} {side}");
+        let known = transport.u_min.unsigned_abs().min(transport.u_max().unsigned_abs());
+        if self.to_rows.is_none_or(|to_rows| to_rows > known) {
+            about.push_str(&format!("; {}", reach_of(transport)));
+        }
         Product::Image { name, about, image: self.image(transport) }
     }
 

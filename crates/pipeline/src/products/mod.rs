@@ -203,13 +203,9 @@ impl Kind {
     }
 }
 
-/// What a transport does not know, for the texts of products that it cuts short.
+/// How far a transport knows its rows, for the texts of products that end there.
 fn reach_of(transport: &Transport) -> String {
-    format!(
-        "the sweep reaches relative rows {} to {}, what comes from others is missing",
-        transport.u_min,
-        transport.u_max()
-    )
+    format!("the sweep reaches u = {} to {}, beyond nothing is known", transport.u_min, transport.u_max())
 }
 
 fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Result<T, ProductError> {

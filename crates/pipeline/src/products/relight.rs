@@ -52,9 +52,10 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// The first lit row of each image.
-    fn first_rows(self, first_row: usize, camera_rows: usize) -> impl Iterator<Item = usize> {
-        (first_row..first_row + camera_rows).step_by(self.step_rows)
+    /// The first lit row of each image: from the projector row of the camera's first row to that of its last.
+    fn first_rows(self, timing: &RowTiming) -> Vec<usize> {
+        let own_row = |t: usize| timing.relative_row(0, t).unsigned_abs() as usize;
+        (own_row(0)..=own_row(timing.camera_rows() - 1)).step_by(self.step_rows).collect()
     }
 }
 
@@ -146,7 +147,7 @@ impl Pattern {
                 (about, Array1::from_shape_fn(rows, |row| if lit(row) { 1.0 } else { 0.0 }))
             }
             Self::Line(line) => {
-                let tops: Vec<usize> = line.first_rows(timing.first_row(), timing.camera_rows()).collect();
+                let tops = line.first_rows(timing);
                 let (_, height, width) = transport.t.dim();
                 let mut images = Array3::zeros((tops.len(), height, width));
                 for (mut image, &top) in images.axis_iter_mut(Axis(0)).zip(&tops) {

@@ -30,8 +30,9 @@ pub fn relight(
         let profiles = transport.t.index_axis(Axis(1), t);
         // In f64, because thousands of dim rows add up beside a bright one.
         let mut sum = Array1::<f64>::zeros(columns);
-        for (index, light) in profiles.outer_iter().enumerate() {
-            let v = timing.first_row() as i64 + t as i64 + i64::from(transport.u_min) + index as i64;
+        let u_of_row_0 = i64::from(timing.relative_row(0, t));
+        for (u, light) in (i64::from(transport.u_min)..).zip(profiles.outer_iter()) {
+            let v = u - u_of_row_0;
             let weight = usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
             if weight != 0.0 {
                 sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
