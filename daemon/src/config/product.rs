@@ -70,7 +70,7 @@ impl ProductTable {
     }
 }
 
-/// Appends the product of a command line argument, the keys of a `[[product]]` with commas between them.
+/// Appends what a command line argument asks for: the keys of a `[[product]]` with commas between them.
 ///
 /// # Errors
 /// As [`ProductTable::append_to`], with the argument's text.

@@ -63,17 +63,12 @@ impl Pattern {
     /// Keys and numbers that lead to a bad value, and what is allowed there.
     pub(super) fn check(&self, geometry: &SweepGeometry) -> Result<(), (Vec<String>, String)> {
         let rows = geometry.raster.rows;
-        let within = |path: &[&str], value: usize, lowest: usize, highest: usize, what: &str| match (lowest
-            ..=highest)
-            .contains(&value)
-        {
-            true => Ok(()),
-            false => {
-                let path: Vec<String> = path.iter().map(|&key| key.into()).collect();
-                let message =
-                    format!("{} = {value}: allowed are {lowest} to {highest}, {what}", path.join("."));
-                Err((path, message))
+        let within = |path: &[&str], value: usize, lowest: usize, highest: usize, what: &str| {
+            if (lowest..=highest).contains(&value) {
+                return Ok(());
             }
+            let message = format!("{} = {value}: allowed are {lowest} to {highest}, {what}", path.join("."));
+            Err((path.iter().map(|&key| key.to_owned()).collect::<Vec<_>>(), message))
         };
         match self {
             Self::Rows(pieces) => {

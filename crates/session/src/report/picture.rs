@@ -12,10 +12,10 @@ use crate::{Error, Result};
 const PICTURE_MAX_PX: usize = 1024;
 /// The same for the pictures of a contact sheet.
 const THUMBNAIL_MAX_PX: usize = 160;
-/// Pictures below this size are shown enlarged, with their pixels as squares.
-const PIXELATED_MAX_PX: usize = 512;
 /// The same for animations, which have many pictures.
 const ANIMATION_MAX_PX: usize = 400;
+/// Pictures below this size are shown enlarged, with their pixels as squares.
+const PIXELATED_MAX_PX: usize = 512;
 /// Pictures of an animation that are shown in a second.
 const ANIMATION_FRAMES_PER_S: u16 = 12;
 /// More values than this do not make a percentile better.
