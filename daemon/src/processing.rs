@@ -49,9 +49,8 @@ impl Task {
     /// # Errors
     /// With the place in the plan's text of the stage or product that cannot be made.
     pub fn processing(&self, registry: &Registry, plan_text: &str) -> Result<Processing, ConfigError> {
-        let products = self.products(plan_text)?;
         let mut processing =
-            Processing { stages: Vec::new(), folds: Vec::new(), products, problems: Vec::new() };
+            Processing { stages: Vec::new(), folds: Vec::new(), products: Vec::new(), problems: Vec::new() };
         for (index, stage) in self.plan.stage.iter().enumerate() {
             let place = index.to_string();
             let refused = |message: String| ConfigError::at(plan_text, &["stage", &place, "name"], message);
@@ -70,6 +69,8 @@ impl Task {
                 Entry::Fold(fold) => processing.folds.push(fold),
             }
         }
+        // After the folds, which refuse a rig that no product could be made on.
+        processing.products = self.products(plan_text)?;
         Ok(processing)
     }
 
