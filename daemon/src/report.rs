@@ -1,5 +1,7 @@
 //! The report of a sweep: what was taken, what came out, and how far to trust it.
 
+mod products;
+
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, ArrayView2, Axis};
@@ -48,8 +50,10 @@ pub fn make(
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
     if let Some(transport) = transport {
-        sections.push(images(products, transport, &markers));
+        sections.extend(products::images(products, &markers));
         sections.push(profiles(&sweep, transport, &markers)?);
+        sections.extend(products::sequences(products));
+        sections.extend(products::profiles(products));
     }
     sections.push(sweep.contact_sheet()?);
     sections.push(trust(state, task, products));
@@ -122,35 +126,6 @@ fn mark(transport: &Transport) -> Vec<Marker> {
         }
     }
     markers
-}
-
-fn images(products: &[Product], transport: &Transport, markers: &[Marker]) -> Section {
-    let mut pictures = Vec::new();
-    for wanted in ["regular", "epipolar", "non_epipolar"] {
-        for product in products {
-            if let Product::Image { name, about, image } = product
-                && *name == wanted
-            {
-                pictures.push(
-                    picture(image, &format!("{}: {about}", name.replace('_', "-")))
-                        .with_markers(markers.to_vec()),
-                );
-            }
-        }
-    }
-    let short = transport.band(-10..=10) - transport.epipolar(1);
-    let long = transport.non_epipolar(21);
-    pictures.push(picture(&short, "short range: light from 1 to 10 rows away"));
-    pictures.push(picture(&long, "long range: light from more than 10 rows away"));
-    Section {
-        title: "Light by where it came from".into(),
-        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below.".into(),
-        blocks: vec![Block::Pictures(pictures)],
-    }
-}
-
-fn picture(image: &Array2<f32>, caption: &str) -> Picture {
-    Picture::grey(image.view(), ToneMap::percentile(&[image.view()], PERCENTILE)).with_caption(caption)
 }
 
 fn profiles(sweep: &SweepImages<'_>, transport: &Transport, markers: &[Marker]) -> Result<Section> {

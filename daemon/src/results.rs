@@ -20,7 +20,7 @@ pub fn name_of(state: EndState) -> &'static str {
     }
 }
 
-/// Writes images (EXR, NPY) and the transport (NPY, Zarr).
+/// Writes images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY) and the transport (NPY, Zarr).
 ///
 /// # Errors
 /// When the disk refuses.
@@ -34,6 +34,27 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 metadata.insert("about".into(), json!(about));
                 files.image(name, image.view(), &metadata)?;
             }
+            Product::Sequence { name, about, axis, at, images } => {
+                let layers: Vec<String> = (0..at.len()).map(|k| format!("k{k:04}")).collect();
+                let mut metadata = common(task);
+                metadata.insert("axes".into(), json!(["k", "t", "s"]));
+                metadata.insert("about".into(), json!(about));
+                metadata.insert("k".into(), json!({ "is": axis, "at": at }));
+                metadata.insert("layers".into(), json!(layers));
+                files.sequence(name, images.view(), &layers, &metadata)?;
+            }
+            Product::Profile(profile) => {
+                let columns = profile.columns();
+                let mut metadata = common(task);
+                metadata.insert("axes".into(), json!(["delay", "column"]));
+                metadata.insert("about".into(), json!(profile.about));
+                metadata.insert("exposure_us".into(), json!(profile.exposure_us));
+                metadata.insert(
+                    "columns".into(),
+                    json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()),
+                );
+                files.table(&profile.name, &columns, &metadata)?;
+            }
             Product::Transport(found) => {
                 let mut metadata = common(task);
                 metadata.insert("axes".into(), json!(["u", "t", "s"]));
@@ -46,7 +67,7 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 files.volume("transport", found.t.view(), &metadata)?;
                 transport::write(&session.transport_path(), found.t.view(), &metadata)?;
             }
-            Product::Figure { .. } | Product::Warning(_) => {}
+            Product::Stack(_) | Product::Figure { .. } | Product::Warning(_) => {}
         }
     }
     Ok(())

@@ -6,6 +6,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
+use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
 use crate::stage::{Fold, FoldError, Product};
@@ -121,16 +122,15 @@ impl DemuxFold {
         Demux::new(self.timing.clone(), planned, self.prior)
     }
 
-    /// The regular image, and how well the transport predicts it where it is not saturated.
-    fn regular(&self, image: &Array2<f32>, dark: &Array2<f32>, transport: &Transport) -> Vec<Product> {
+    /// How well the transport predicts the light of the regular image (counts: `image`) where it is not saturated.
+    fn check_regular(&self, image: &Array2<f32>, light: &Array2<f32>, transport: &Transport) -> Vec<Product> {
         let valid = self.valid(image);
         let saturated = valid.iter().filter(|valid| !**valid).count();
-        let light = (image - dark) / self.geometry.white_dn as f32;
         let sum = |image: &Array2<f32>| -> f64 {
             let pixels = image.iter().zip(&valid).filter(|&(_, &valid)| valid);
             pixels.map(|(&light, _)| f64::from(light)).sum()
         };
-        let (captured, predicted) = (sum(&light), sum(&transport.total()));
+        let (captured, predicted) = (sum(light), sum(&transport.total()));
         let mut products: Vec<Product> =
             too_many_saturated("the regular image (a whole VSYNC period long)", saturated, valid.len())
                 .into_iter()
@@ -145,11 +145,6 @@ impl DemuxFold {
                 )));
             }
         }
-        products.push(Product::Image {
-            name: "regular",
-            about: "a captured exposure of one whole VSYNC period: every row lit once",
-            image: light,
-        });
         products
     }
 
@@ -198,6 +193,8 @@ impl Fold for DemuxFold {
         let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
         let mut stack = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
+        let point_of = |role: &Role| self.schedule.points.iter().find(|point| point.role == *role);
+        let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         // Each image is given up as soon as it is in the stack: a sweep is held once, not twice.
         for (index, (role, Taken { setting, image })) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
@@ -210,7 +207,7 @@ impl Fold for DemuxFold {
         }
         let images = settings.len();
         let transport = demux
-            .with_settings(settings)
+            .with_settings(settings.clone())
             .and_then(|demux| {
                 demux.solve_while(stack.view(), valid.as_ref().map(|valid| valid.view()), go_on)
             })
@@ -218,24 +215,24 @@ impl Fold for DemuxFold {
 
         let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![
-            Product::Image {
-                name: "epipolar",
-                about: "light from the pixel's own projector row (u = 0)",
-                image: transport.epipolar(1),
-            },
-            Product::Image {
-                name: "non_epipolar",
-                about: "light from all other rows within the sweep's reach",
-                image: transport.non_epipolar(1),
-            },
             Product::Figure { name: "images demultiplexed", value: images as f64 },
             Product::Figure { name: "saturated pixels", value: saturated as f64 },
         ];
         products.extend(too_many_saturated("the sweep", saturated, transport.saturated.len()));
-        if let Some((regular, dark)) = regular.zip(dark_of(&Role::Regular)) {
-            products.extend(self.regular(&regular.image, dark, &transport));
-        }
+        let regular = regular.zip(dark_of(&Role::Regular)).map(|(regular, dark)| {
+            let light = (&regular.image - dark) / self.geometry.white_dn as f32;
+            products.extend(self.check_regular(&regular.image, &light, &transport));
+            light
+        });
         products.push(Product::Transport(Box::new(transport)));
+        products.push(Product::Stack(Box::new(SweepStack {
+            timing: self.timing.clone(),
+            exposures_us,
+            settings,
+            images: stack,
+            valid,
+            regular,
+        })));
         Ok(products)
     }
 }

@@ -1,9 +1,10 @@
 //! What is done to units: stages, in parallel and each alone; folds, over all of them in order.
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, Array3, ArrayView2};
 use raysweep_transport::plane::Transport;
 use serde::{Deserialize, Serialize};
 
+use crate::products::{Profile, SweepStack};
 use crate::unit::Unit;
 
 /// Why a stage gave up on a unit.
@@ -34,14 +35,31 @@ pub enum Product {
     /// An image `[t, s]` in the scene's units (1 = a white pixel).
     Image {
         /// File name without extension.
-        name: &'static str,
+        name: String,
         /// What it shows, in a sentence.
-        about: &'static str,
+        about: String,
         /// The pixels.
         image: Array2<f32>,
     },
+    /// Images `[k, t, s]` in the scene's units.
+    Sequence {
+        /// File name without extension.
+        name: String,
+        /// What it shows, in a sentence.
+        about: String,
+        /// What the images differ in, with its unit.
+        axis: String,
+        /// The value of `axis` of each image.
+        at: Vec<f64>,
+        /// The pixels.
+        images: Array3<f32>,
+    },
+    /// Light over the delay.
+    Profile(Profile),
     /// The light transport `[u, t, s]`.
     Transport(Box<Transport>),
+    /// The images that it was made of: what [`crate::ProductSpec`] makes more of. It is not written.
+    Stack(Box<SweepStack>),
     /// Something that makes the others worse than they look.
     Warning(String),
     /// A number that the report states.

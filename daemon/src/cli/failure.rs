@@ -94,7 +94,7 @@ impl Failure {
             },
             Self::Client(_) => Exit::Unreachable,
             Self::Plan(_) => Exit::Refused,
-            Self::File { .. } => Exit::Usage,
+            Self::File { .. } | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             Self::Process(_) | Self::Signals(_) | Self::Output(_) => Exit::Failed,
         }
     }

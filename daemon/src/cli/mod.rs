@@ -19,7 +19,7 @@ use serde_json::json;
 use self::failure::Failure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::view::View;
-use crate::process::{export, process};
+use crate::process::{Asked, export, process_asked};
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -99,6 +99,12 @@ enum Command {
     Process {
         /// The session's folder
         session: PathBuf,
+        /// Make this too, a `[[product]]` in one line: 'kind = "epipolar", width_rows = 5'; may be given several times
+        #[arg(long = "product", value_name = "KEYS")]
+        products: Vec<String>,
+        /// Make the given products only, not the plan's
+        #[arg(long, requires = "products")]
+        only: bool,
     },
     /// Copy a session's products, report and manifest; needs no daemon
     Export {
@@ -183,8 +189,8 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
             printer.print(&Empty {}, |_| "the run is being ended; what was acquired is kept".into())?;
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
-        Command::Process { session } => {
-            let made = process(&session)?;
+        Command::Process { session, products, only } => {
+            let made = process_asked(&session, &Asked { products, only })?;
             let value = json!({
                 "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
             });

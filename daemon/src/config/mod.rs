@@ -1,6 +1,7 @@
 //! Rig and plan files: TOML with unknown keys refused and errors that point at the place in the text.
 
 mod plan;
+mod product;
 mod rig;
 
 use std::ops::Range;
@@ -8,6 +9,7 @@ use std::ops::Range;
 use toml::de::DeValue;
 
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
+pub use product::{ProductTable, append_argument};
 pub use rig::{CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
 
 /// What is wrong with a rig or plan file, and where.

@@ -91,8 +91,9 @@ impl Runner {
         let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
         let size = (self.camera.height, self.camera.width);
         let task = Task::new(parsed, &self.rig.file, self.rig.first_row(), size);
-        task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
-        let report = check::check(&task, &self.camera, &self.data).map_err(|error| invalid_plan(&error))?;
+        let processing = task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
+        let report = check::check(&task, &processing.products, &self.camera, &self.data)
+            .map_err(|error| invalid_plan(&error))?;
         Ok((task, report))
     }
 
