@@ -20,5 +20,5 @@ pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, messa
 pub use queue::{Input, Policy, QueueError};
 pub use registry::{Entry, Registry, RegistryError};
 pub use schedule::{Point, Role, Schedule, Shot, SweepGeometry};
-pub use stage::{Fold, FoldError, HotPixels, Product, Stage, StageError};
+pub use stage::{Fold, FoldError, HotPixels, Product, Snapshot, Stage, StageError};
 pub use unit::Unit;
