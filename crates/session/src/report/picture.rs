@@ -142,7 +142,11 @@ impl Picture {
         Ok(html! { img class=[class] src=(source) width=(columns) height=(rows) alt=(alt); })
     }
 
-    fn to_png(&self) -> Result<Vec<u8>> {
+    /// The picture as a PNG file, without caption and crosses.
+    ///
+    /// # Errors
+    /// [`Error::Codec`] for an empty picture.
+    pub fn to_png(&self) -> Result<Vec<u8>> {
         let (rows, columns, channels) = self.levels.dim();
         let failed = || format!("a picture of {columns} x {rows} pixels and {channels} channels");
         let color = match channels {
