@@ -68,6 +68,7 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let (products, problems) = processing.finish(&|| true);
+    results::write_transport(&session, &task, &products)?;
     results::write_products(&session, &task, &products)?;
     results::write_report(&session, state, &task, &products, &problems)?;
     results::write_manifest(&session, state, &task, &rig)?;

@@ -20,33 +20,42 @@ pub fn name_of(state: EndState) -> &'static str {
     }
 }
 
-/// Writes images (EXR, NPY) and the transport (NPY, Zarr).
+/// Writes the transport, as NPY and Zarr at the same time: somebody may be waiting for it.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write_transport(session: &Session, task: &Task, products: &[Product]) -> Result<()> {
+    for product in products {
+        let Product::Transport(found) = product else { continue };
+        let mut metadata = common(task);
+        metadata.insert("axes".into(), json!(["u", "t", "s"]));
+        metadata.insert("u_min".into(), json!(found.u_min));
+        metadata.insert("u_max".into(), json!(found.u_max()));
+        metadata.insert(
+            "about".into(),
+            json!("light from projector row v = t + first_row + u to camera pixel (t, s); 0 where the projector has no such row"),
+        );
+        let (npy, zarr) = rayon::join(
+            || session.products().volume("transport", found.t.view(), &metadata),
+            || transport::write(&session.transport_path(), found.t.view(), &metadata),
+        );
+        npy.and(zarr)?;
+    }
+    Ok(())
+}
+
+/// Writes everything but the transport: images as EXR and NPY.
 ///
 /// # Errors
 /// When the disk refuses.
 pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> Result<()> {
     let files = session.products();
     for product in products {
-        match product {
-            Product::Image { name, about, image } => {
-                let mut metadata = common(task);
-                metadata.insert("axes".into(), json!(["t", "s"]));
-                metadata.insert("about".into(), json!(about));
-                files.image(name, image.view(), &metadata)?;
-            }
-            Product::Transport(found) => {
-                let mut metadata = common(task);
-                metadata.insert("axes".into(), json!(["u", "t", "s"]));
-                metadata.insert("u_min".into(), json!(found.u_min));
-                metadata.insert("u_max".into(), json!(found.u_max()));
-                metadata.insert(
-                    "about".into(),
-                    json!("light from projector row v = t + first_row + u to camera pixel (t, s); 0 where the projector has no such row"),
-                );
-                files.volume("transport", found.t.view(), &metadata)?;
-                transport::write(&session.transport_path(), found.t.view(), &metadata)?;
-            }
-            Product::Figure { .. } | Product::Warning(_) => {}
+        if let Product::Image { name, about, image } = product {
+            let mut metadata = common(task);
+            metadata.insert("axes".into(), json!(["t", "s"]));
+            metadata.insert("about".into(), json!(about));
+            files.image(name, image.view(), &metadata)?;
         }
     }
     Ok(())

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raysweep::control::Control;
+use raysweep::live::LiveFile;
 use raysweep::rig::Rig;
 use raysweep::run::Runner;
 use raysweep::server::{self, Access, Listening};
@@ -29,6 +30,9 @@ struct Arguments {
     /// Where clients connect; not needed under systemd's socket activation.
     #[arg(long, value_name = "PATH", default_value = "/run/raysweep/raysweepd.sock")]
     socket: PathBuf,
+    /// File with the newest live images, which clients map [default: `live` in the socket's folder]
+    #[arg(long, value_name = "PATH")]
+    live: Option<PathBuf>,
     /// Where sessions are kept.
     #[arg(long, value_name = "DIR", default_value = "/var/lib/raysweep")]
     data: PathBuf,
@@ -55,7 +59,7 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let rig = Rig::load(&arguments.rig)?;
-    let runner = Arc::new(Runner::new(rig, arguments.data.clone(), Registry::default())?);
+    let runner = Runner::new(rig, arguments.data.clone(), Registry::default())?;
     let camera = runner.camera();
     let opened = format!(
         "{} ({} x {} {:?}), rig {}",
@@ -73,6 +77,8 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     prepare_data(&arguments.data).map_err(|error| {
         format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
     })?;
+    let live = arguments.live.clone().unwrap_or_else(|| arguments.socket.with_file_name("live"));
+    let runner = Arc::new(runner.with_live(LiveFile::create(&live)?));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let served = runtime.block_on(serve(arguments, runner.clone()));
     // A server that failed leaves a run behind; after an orderly end there is none.

@@ -60,6 +60,7 @@ impl Fake {
             stored: 75 - missing,
             missing,
             warnings: Vec::new(),
+            final_s: None,
         });
     }
 
@@ -151,6 +152,7 @@ impl Control for Fake {
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
             error: None,
+            live: Some("/run/raysweep/live".into()),
         }
     }
 
