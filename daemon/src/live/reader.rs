@@ -69,28 +69,16 @@ impl LiveReader {
     pub fn newest(&self, name: &str) -> Result<Option<LiveImage>, LiveError> {
         for _ in 0..ATTEMPTS {
             let mut newest: Option<(u64, Header)> = None;
-            let mut busy = false;
             for slot in 0..self.slots {
                 let at = self.first_slot + slot * self.slot_bytes;
                 let header = self.header(at)?;
-                busy |= u64_at(&header, 0) % 2 == 1;
-                let sequence = u64_at(&header, 8);
-                let beaten = newest.as_ref().is_some_and(|(_, newest)| u64_at(newest, 8) >= sequence);
-                if u64_at(&header, 0) % 2 == 0
-                    && sequence > 0
-                    && name_of(&header) == name.as_bytes()
-                    && !beaten
-                {
+                let whole = u64_at(&header, 0) % 2 == 0 && name_of(&header) == name.as_bytes();
+                let sequence = newest.as_ref().map_or(0, |(_, newest)| u64_at(newest, 8));
+                if whole && u64_at(&header, 8) > sequence {
                     newest = Some((at, header));
                 }
             }
-            let Some((at, header)) = newest else {
-                if busy {
-                    thread::yield_now();
-                    continue;
-                }
-                return Ok(None);
-            };
+            let Some((at, header)) = newest else { return Ok(None) };
             let image = self.image(at, &header);
             if self.header(at)? == header
                 && let Some(image) = image?
