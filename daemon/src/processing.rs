@@ -132,8 +132,7 @@ impl Processing {
     /// What the first fold that estimates while units come has so far.
     pub fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
         // A picture for between is no reason to lose a fold, let alone the run.
-        let so_far = |fold: &Box<dyn Fold>| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten();
-        self.folds.iter().find_map(so_far)
+        self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
     }
 
     /// The products of all folds, and everything that could not be done. Ends early soon after `go_on` says no.

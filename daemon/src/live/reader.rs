@@ -72,7 +72,7 @@ impl LiveReader {
             for slot in 0..self.slots {
                 let at = self.first_slot + slot * self.slot_bytes;
                 let header = self.header(at)?;
-                let whole = u64_at(&header, 0) % 2 == 0 && name_of(&header) == name.as_bytes();
+                let whole = u64_at(&header, 0).is_multiple_of(2) && name_of(&header) == name.as_bytes();
                 let sequence = newest.as_ref().map_or(0, |(_, newest)| u64_at(newest, 8));
                 if whole && u64_at(&header, 8) > sequence {
                     newest = Some((at, header));
