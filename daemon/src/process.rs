@@ -95,6 +95,7 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     }
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let (products, problems) = processing.finish(&|| true);
+    results::write_transport(&session, &task, &products)?;
     results::write_products(&session, &task, &products)?;
     results::write_report(&session, state, &task, &products, &problems)?;
     results::write_manifest(&session, state, &task, &rig)?;

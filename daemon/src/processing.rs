@@ -6,8 +6,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    Entry, Fold, Product, ProductSpec, Registry, RegistryError, Role, Schedule, Stage, SweepGeometry, Unit,
-    message_of, run_stages,
+    Entry, Fold, Product, ProductSpec, Registry, RegistryError, Role, Schedule, Snapshot, Stage,
+    SweepGeometry, Unit, message_of, run_stages,
 };
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::{ArrayName, Stack, crc32};
@@ -150,6 +150,12 @@ impl Processing {
             let pushed = catch_unwind(AssertUnwindSafe(|| fold.push(unit, image.view())));
             pushed.map_err(|panic| problems.push(panicked(fold.name(), &*panic))).is_ok()
         });
+    }
+
+    /// What the first fold that estimates while units come has so far.
+    pub fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
+        // A picture for between is no reason to lose a fold, let alone the run.
+        self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
     }
 
     /// The products of all folds and those that the plan names, and everything that could not be done. Ends early soon

@@ -20,7 +20,31 @@ pub fn name_of(state: EndState) -> &'static str {
     }
 }
 
-/// Writes images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY) and the transport (NPY, Zarr).
+/// Writes the transport, as NPY and Zarr at the same time: somebody may be waiting for it.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write_transport(session: &Session, task: &Task, products: &[Product]) -> Result<()> {
+    for product in products {
+        let Product::Transport(found) = product else { continue };
+        let mut metadata = common(task);
+        metadata.insert("axes".into(), json!(["u", "t", "s"]));
+        metadata.insert("u_min".into(), json!(found.u_min));
+        metadata.insert("u_max".into(), json!(found.u_max()));
+        metadata.insert(
+            "about".into(),
+            json!("light from projector row v = u + round(first_row + row_pitch t) to camera pixel (t, s); 0 where the projector has no such row"),
+        );
+        let (npy, zarr) = rayon::join(
+            || session.products().volume("transport", found.t.view(), &metadata),
+            || transport::write(&session.transport_path(), found.t.view(), &metadata),
+        );
+        npy.and(zarr)?;
+    }
+    Ok(())
+}
+
+/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY).
 ///
 /// # Errors
 /// When the disk refuses.
@@ -55,19 +79,7 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 );
                 files.table(&profile.name, &columns, &metadata)?;
             }
-            Product::Transport(found) => {
-                let mut metadata = common(task);
-                metadata.insert("axes".into(), json!(["u", "t", "s"]));
-                metadata.insert("u_min".into(), json!(found.u_min));
-                metadata.insert("u_max".into(), json!(found.u_max()));
-                metadata.insert(
-                    "about".into(),
-                    json!("light from projector row v = u + round(first_row + row_pitch t) to camera pixel (t, s); 0 where the projector has no such row"),
-                );
-                files.volume("transport", found.t.view(), &metadata)?;
-                transport::write(&session.transport_path(), found.t.view(), &metadata)?;
-            }
-            Product::Stack(_) | Product::Figure { .. } | Product::Warning(_) => {}
+            Product::Transport(_) | Product::Stack(_) | Product::Figure { .. } | Product::Warning(_) => {}
         }
     }
     Ok(())

@@ -22,5 +22,5 @@ pub use products::{NotMade, ProductError, ProductSpec, Profile, SweepStack};
 pub use queue::{Input, Policy, QueueError};
 pub use registry::{Entry, Registry, RegistryError};
 pub use schedule::{Point, Role, Scan, Schedule, Shot, Spot, SweepGeometry};
-pub use stage::{Fold, FoldError, HotPixels, Product, Stage, StageError};
+pub use stage::{Fold, FoldError, HotPixels, Product, Snapshot, Stage, StageError};
 pub use unit::Unit;

@@ -89,11 +89,29 @@ pub trait Fold: Send {
     /// Takes the next unit; a later attempt of a point replaces the earlier.
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>);
 
+    /// What was taken so far, for another thread to estimate from while more comes; nothing from a fold that estimates
+    /// nothing, or has too little. Cheap: images are shared, not copied.
+    fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
+        None
+    }
+
     /// The products of what was taken, which is given up for them. Ends early, with an error, soon after `go_on` says no.
     ///
     /// # Errors
     /// When too little was taken, or `go_on` said no.
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError>;
+}
+
+/// A fold's units at some moment.
+pub trait Snapshot: Send + Sync {
+    /// How many points of the sweep it can estimate from.
+    fn points(&self) -> usize;
+
+    /// The transport as these points tell it. Ends early, with an error, soon after `go_on` says no.
+    ///
+    /// # Errors
+    /// When it cannot be told, or `go_on` said no.
+    fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError>;
 }
 
 /// Stage `hot-pixels`: a pixel that outshines all its neighbours by more than `threshold_dn` takes their median.

@@ -6,7 +6,7 @@
 //! `NAME.json` with the metadata.
 //! Values are linear. Every file is written durably, and the same input gives the same bytes.
 
-use std::io::Cursor;
+use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
@@ -131,13 +131,12 @@ impl Products {
         values: &ArrayRef<f32, D>,
         metadata: &Map<String, Value>,
     ) -> Result<()> {
-        let mut npy = Cursor::new(Vec::new());
-        // An array in Fortran order would be written as such.
-        values
-            .as_standard_layout()
-            .write_npy(&mut npy)
-            .map_err(Error::codec("encode", format!("{name}.npy")))?;
-        self.write(name, "npy", npy.get_ref())?;
+        let path = self.path(name, "npy")?;
+        durable::create_dir_all(&self.dir)?;
+        durable::write_with(&path, |file| {
+            // An array in Fortran order would be written as such.
+            values.as_standard_layout().write_npy(BufWriter::new(file)).map_err(io::Error::other)
+        })?;
         let mut sidecar =
             serde_json::to_vec_pretty(metadata).map_err(Error::codec("encode", format!("{name}.json")))?;
         sidecar.push(b'\n');

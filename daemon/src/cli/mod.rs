@@ -2,6 +2,7 @@
 
 mod failure;
 mod follow;
+mod preview;
 mod show;
 mod view;
 
@@ -87,6 +88,15 @@ enum Command {
     },
     /// Follow the run that is under way to its end; Ctrl-C stops watching
     Watch,
+    /// Write the running estimate as a picture: epipolar light on the left, indirect light on the right
+    Preview {
+        /// The PNG file to write
+        #[arg(long, value_name = "FILE", default_value = "preview.png")]
+        output: PathBuf,
+        /// Write it again whenever the estimate is newer, to the end of the run
+        #[arg(long)]
+        follow: bool,
+    },
     /// Hold the run before its next point
     Pause,
     /// Go on with a run that is held
@@ -174,6 +184,9 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
             return begin_run(&socket, printer, detach, |client| Ok(client.resume(&session)?));
         }
         Command::Watch => return watch(&socket, printer),
+        Command::Preview { output, follow } => {
+            return preview::preview(&socket, &output, follow, printer);
+        }
         Command::Pause => {
             connect()?.pause()?;
             printer.print(&Empty {}, |_| {

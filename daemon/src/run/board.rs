@@ -30,6 +30,7 @@ impl Board {
             progress: None,
             vsync: None,
             error: None,
+            live: None,
         };
         Self { status: Mutex::new(status), events: broadcast::Sender::new(EVENTS) }
     }
@@ -70,6 +71,11 @@ impl Board {
     /// Names the session of the run that is being prepared.
     pub fn set_session(&self, session: PathBuf) {
         self.lock().session = Some(session);
+    }
+
+    /// Names the file with the live images.
+    pub fn set_live(&self, file: PathBuf) {
+        self.lock().live = Some(file);
     }
 
     /// Notes why a run faulted.

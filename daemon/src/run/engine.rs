@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
+use std::time::Instant;
 
 use raysweep_core::{CameraCapabilities, DeviceError, Pattern, Projector, SettingsId, Shown, VsyncStats};
 use raysweep_pipeline::{
@@ -16,6 +17,7 @@ use super::camera::{Attempt, CameraThread, Gone, Pass};
 use super::orders::Orders;
 use super::storage::{PaceMeter, Storage, Verdict};
 use super::vsync::VsyncThread;
+use crate::live::{LiveEstimate, Outlet};
 use crate::processing::{Processing, Task, place};
 use crate::rig::{Devices, Pace, Rig, RigError};
 
@@ -87,6 +89,8 @@ pub struct Run {
     pub orders: Arc<Orders>,
     /// What it tells.
     pub board: Arc<Board>,
+    /// Where its running estimate is shown, if anywhere.
+    pub live: Option<Outlet>,
 }
 
 /// What acquisition leaves behind.
@@ -99,6 +103,8 @@ pub struct Acquired {
     pub processing: Processing,
     /// The VSYNC line.
     pub vsync: Option<VsyncStats>,
+    /// When the exposure of the last frame that a point waited for ended.
+    pub exposed_until: Option<Instant>,
     /// Why acquisition ended early, if a fault ended it.
     pub fault: Option<RunError>,
 }
@@ -146,6 +152,7 @@ impl Run {
             board: self.board.clone(),
             pace: PaceMeter::new(planned - missing.len(), planned),
             vsync: None,
+            live: self.live.and_then(start_live),
             write_error: None,
         };
         let config = PipelineConfig {
@@ -181,6 +188,10 @@ impl Run {
         let watched = vsync.join();
         let storage = pipeline.join()?;
         // What failed first is the cause; what it brought down comes after.
+        let (exposed_until, imaged) = match imaged {
+            Ok(exposed_until) => (exposed_until, Ok(())),
+            Err(error) => (None, Err(error)),
+        };
         let device = watched.and(imaged).err().map(RunError::from);
         let fault = storage.write_error.map(RunError::from).or(device).or(acquired.err());
         Ok(Acquired {
@@ -188,6 +199,7 @@ impl Run {
             ledger: storage.ledger,
             processing: storage.processing,
             vsync: storage.vsync,
+            exposed_until,
             fault,
         })
     }
@@ -206,6 +218,12 @@ impl Run {
             edge_gate_us: self.rig.file.vsync.gate_us,
         })
     }
+}
+
+/// Starts the running estimate; a run is none the worse without.
+fn start_live(outlet: Outlet) -> Option<LiveEstimate> {
+    let started = outlet.file.clear().map_err(Into::into).and_then(|()| LiveEstimate::start(outlet));
+    started.map_err(|error| tracing::warn!(%error, "no live estimate of this run")).ok()
 }
 
 /// The points that the ledger does not know as stored, with the number of their next attempt.

@@ -12,6 +12,7 @@ use raysweep_session::stack::Stack;
 
 use super::board::Board;
 use super::orders::{Order, Orders};
+use crate::live::LiveEstimate;
 use crate::processing::{Processing, Task, place};
 
 /// What the run is told of its points, in order.
@@ -35,6 +36,8 @@ pub struct Storage {
     pub(super) board: Arc<Board>,
     pub(super) pace: PaceMeter,
     pub(super) vsync: Option<VsyncStats>,
+    /// Until the pipeline has ended: then the machine is for the results.
+    pub(super) live: Option<LiveEstimate>,
     /// The first failure to write, which ends the run.
     pub(super) write_error: Option<raysweep_session::Error>,
 }
@@ -83,7 +86,14 @@ impl Sink for Storage {
                 self.pace.stored += 1;
                 self.pace.counts.add(&unit.counts);
                 match image {
-                    Ok(image) => self.processing.push(&unit, &image),
+                    Ok(image) => {
+                        self.processing.push(&unit, &image);
+                        if let Some(live) = &self.live
+                            && let Some(snapshot) = self.processing.snapshot()
+                        {
+                            live.offer(snapshot);
+                        }
+                    }
                     Err(error) => self.note_stage_error(&unit, &error),
                 }
                 self.board.publish(Event::Progress(self.pace.progress()));
@@ -104,6 +114,7 @@ impl Sink for Storage {
 
     fn end(&mut self) {
         self.verdicts = None;
+        self.live = None;
     }
 }
 

@@ -159,6 +159,14 @@ impl Picture {
         Ok(html! { img class=[class] src=(source) width=(columns) height=(rows) alt=(alt); })
     }
 
+    /// The picture as a PNG file, without caption and crosses.
+    ///
+    /// # Errors
+    /// [`Error::Codec`] for an empty picture.
+    pub fn to_png(&self) -> Result<Vec<u8>> {
+        to_png(std::iter::once(self))
+    }
+
     fn overlay(&self) -> Markup {
         let (rows, columns) = self.size;
         let arm = 0.028 * columns as f64;
