@@ -14,6 +14,7 @@
 //! [`RowTiming`] and [`Setting`] hold the quantities on the right, [`RowModel`] is `A` for one camera row with its
 //! borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
 
+pub mod calibrate;
 mod cholesky;
 mod demux;
 mod error;
