@@ -1,6 +1,7 @@
 use std::collections::HashSet;
 
-use ndarray::Array1;
+use ndarray::{Array1, Axis};
+use rayon::prelude::*;
 
 use super::super::{PlaneError, Prior};
 use super::direct::direct_light;
@@ -13,14 +14,19 @@ const COARSE_ROWS: [f64; 7] = [0.0, 0.3, 0.45, 0.7, 1.05, 1.55, 2.3];
 
 /// Below this width a Gaussian sampled at the rows' centres keeps 99 % of the light in its own row, and no plan tells
 /// it from an ideal beam.
-const NARROWEST_ROWS: f64 = 0.3;
+const NARROWEST_ROWS: f64 = 0.28;
 const WIDEST_ROWS: f64 = 3.0;
 
-/// Factors between the widths that the refinement compares, coarse to fine.
-const STEPS: [f64; 3] = [1.3, 1.12, 1.12];
+/// Golden sections of the interval between the neighbours of the best coarse width: they leave 7 % of the width.
+const GOLDEN_STEPS: usize = 5;
+const GOLDEN_RATIO: f64 = 0.618_033_988_75;
 
-/// The width counts as determined when a beam 30 % wider or narrower raises the mean squared residual this much.
-const MIN_RISE: f64 = 0.1;
+/// Factor between the widths that the parabola of held-out residuals joins, and how often it may be moved.
+const FINE_STEP: f64 = 1.06;
+const FINE_ROUNDS: usize = 3;
+
+/// A width whose standard error is a larger share of it is not determined: the error of T grows with the width's.
+const MAX_RELATIVE_ERROR: f64 = 0.05;
 
 /// The width of the projector's beam across rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -55,19 +61,27 @@ pub fn estimate_optics(
     sample: &Sample,
     known_beam_sigma_rows: Option<f64>,
 ) -> Result<OpticsEstimate, CalibrateError> {
-    let Some(sigma_rows) = known_beam_sigma_rows else {
-        let rough = spike_offset(sample, coarse_sigma(&sample.thinned())?).ok();
-        let beam = beam_sigma(sample, rough.as_ref());
-        let sigma_rows = beam.as_ref().map_or(0.0, |beam| beam.sigma_rows);
-        let known = estimate_optics(sample, Some(sigma_rows))?;
-        return Ok(OpticsEstimate { beam: Some(beam), ..known });
+    let beam = match known_beam_sigma_rows {
+        Some(_) => None,
+        None => {
+            let thinned = sample.thinned();
+            // A place that is free within a row keeps an offset from being taken for a width.
+            let rough_rows = best_coarse(|sigma_rows| {
+                Ok(direct_light(&thinned, sigma_rows)?.iter().map(|light| log(light.objective)).sum())
+            })?;
+            let rough = spike_offset(&thinned, COARSE_ROWS[rough_rows]).ok();
+            Some(beam_sigma(sample, rough.as_ref()))
+        }
     };
-    let spike = spike_offset(sample, sigma_rows);
-    let optics = Optics { beam_sigma_rows: sigma_rows, spike: spike.as_ref().ok().cloned() };
-    Ok(OpticsEstimate { optics, beam: None, spike })
+    let estimated = || beam.as_ref()?.as_ref().ok().map(|beam| beam.sigma_rows);
+    let beam_sigma_rows = known_beam_sigma_rows.or_else(estimated).unwrap_or(0.0);
+    let spike = spike_offset(sample, beam_sigma_rows);
+    let optics = Optics { beam_sigma_rows, spike: spike.as_ref().ok().cloned() };
+    Ok(OpticsEstimate { optics, beam, spike })
 }
 
-/// Estimates the beam's width as the one under which held-out settings are predicted best.
+/// Estimates the beam's width: roughly as the one under which the split prior's objective is least, and then as the
+/// one under which held-out settings are predicted best, because the objective alone takes a width for smoothness.
 ///
 /// # Errors
 /// [`CalibrateError::NoDirectLight`] and [`CalibrateError::BeamUndetermined`] if the stack does not say it;
@@ -75,52 +89,106 @@ pub fn estimate_optics(
 pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstimate, CalibrateError> {
     let sample = sample.thinned();
     let folds = folds(&sample)?;
-    let coarse_rows = coarse_sigma(&sample)?;
-    let sample = with_direct_light(&sample, coarse_rows)?;
-    let pixels = sample.pixels().count();
-    let log_residual = |sigma_rows: f64| -> Result<Array1<f64>, PlaneError> {
-        let optics = Optics { beam_sigma_rows: sigma_rows, spike: spike.cloned() };
-        Ok(log_by_pixel(&held_out(&sample, &Prior::SPLIT, &optics, &folds)?))
+    let optics = |sigma_rows: f64| Optics { beam_sigma_rows: sigma_rows, spike: spike.cloned() };
+    let objective = |sample: &Sample, sigma_rows: f64| -> Result<f64, PlaneError> {
+        Ok(in_sample(sample, &optics(sigma_rows))?.into_iter().map(log).sum())
     };
+    let coarse = best_coarse(|sigma_rows| objective(&sample, sigma_rows))?;
+    let sample = with_direct_light(&sample, COARSE_ROWS[coarse])?;
+    let pixels = sample.pixels().count();
+    if coarse == 0 {
+        return Ok(BeamEstimate { sigma_rows: 0.0, standard_error_rows: NARROWEST_ROWS, pixels });
+    }
 
-    let mut sigma_rows = coarse_rows.max(NARROWEST_ROWS);
-    let (mut rise, mut standard_error) = (f64::INFINITY, 0.0);
-    for (round, step) in STEPS.into_iter().enumerate() {
-        let (narrower, middle, wider) =
-            (log_residual(sigma_rows / step)?, log_residual(sigma_rows)?, log_residual(sigma_rows * step)?);
-        // In ln(sigma), per pixel: half the second difference, and the slope.
-        let bend = (&wider + &narrower) / 2.0 - &middle;
-        let slope = (&wider - &narrower) / (2.0 * step.ln());
-        if round == 0 {
-            rise = bend.mean().unwrap_or_default().exp_m1();
+    let lowest = COARSE_ROWS[coarse - 1].max(NARROWEST_ROWS / 1.5);
+    let highest = COARSE_ROWS.get(coarse + 1).copied().unwrap_or(WIDEST_ROWS);
+    let mut sigma_rows = golden_section(lowest.ln(), highest.ln(), |ln| objective(&sample, ln.exp()))?.exp();
+
+    let log_residual = |sigma_rows: f64| -> Result<Array1<f64>, PlaneError> {
+        Ok(log_by_pixel(&held_out(&sample, &Prior::SPLIT, &optics(sigma_rows), &folds)?))
+    };
+    let step = FINE_STEP.ln();
+    let mut relative_error = f64::INFINITY;
+    for _ in 0..FINE_ROUNDS {
+        let middle = log_residual(sigma_rows)?;
+        let (narrower, wider) = (log_residual(sigma_rows / FINE_STEP)?, log_residual(sigma_rows * FINE_STEP)?);
+        // Per pixel, over ln(sigma).
+        let slope = (&wider - &narrower) / (2.0 * step);
+        let curvature = (&wider + &narrower - 2.0 * &middle).sum() / step.powi(2);
+        let change = match curvature > 0.0 {
+            true => (-slope.sum() / curvature).clamp(-step, step),
+            false => -step * slope.sum().signum(),
+        };
+        sigma_rows = (sigma_rows * change.exp()).min(WIDEST_ROWS);
+        relative_error = if curvature > 0.0 { slope.dot(&slope).sqrt() / curvature } else { f64::INFINITY };
+        if change.abs() < step / 2.0 || sigma_rows < NARROWEST_ROWS {
+            break;
         }
-        let curvature = 2.0 * bend.sum() / step.ln().powi(2);
-        let change = if curvature > 0.0 { -slope.sum() / curvature } else { -slope.sum().signum() * f64::INFINITY };
-        sigma_rows = (sigma_rows * change.clamp(-step.ln(), step.ln()).exp()).clamp(0.2, WIDEST_ROWS);
-        standard_error = slope.dot(&slope).sqrt() / curvature.max(f64::MIN_POSITIVE);
     }
     if sigma_rows < NARROWEST_ROWS {
         return Ok(BeamEstimate { sigma_rows: 0.0, standard_error_rows: NARROWEST_ROWS, pixels });
     }
-    if rise < MIN_RISE {
-        let (rise_percent, needed_percent) = (100.0 * rise, 100.0 * MIN_RISE);
-        return Err(CalibrateError::BeamUndetermined { rise_percent, needed_percent });
+    if relative_error > MAX_RELATIVE_ERROR {
+        return Err(CalibrateError::BeamUndetermined {
+            sigma_rows,
+            error_percent: 100.0 * relative_error,
+            allowed_percent: 100.0 * MAX_RELATIVE_ERROR,
+        });
     }
-    Ok(BeamEstimate { sigma_rows, standard_error_rows: standard_error * sigma_rows, pixels })
+    Ok(BeamEstimate { sigma_rows, standard_error_rows: relative_error * sigma_rows, pixels })
 }
 
-/// The best of a few widths by the objective's minimum. The place of direct light is free within a row, so an offset
-/// is not taken for a width.
-fn coarse_sigma(sample: &Sample) -> Result<f64, PlaneError> {
-    let mut best = (f64::INFINITY, 0.0);
-    for sigma_rows in COARSE_ROWS {
-        let light = direct_light(sample, sigma_rows)?;
-        let score: f64 = light.iter().map(|light| light.objective.max(f64::MIN_POSITIVE).ln()).sum();
-        if score < best.0 {
-            best = (score, sigma_rows);
+/// Index of the coarse width of the least score.
+fn best_coarse(score: impl Fn(f64) -> Result<f64, PlaneError>) -> Result<usize, PlaneError> {
+    let scores: Vec<f64> = COARSE_ROWS.into_iter().map(score).collect::<Result<_, _>>()?;
+    Ok((0..scores.len()).min_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0))
+}
+
+/// The middle of what a few golden sections leave of an interval about a minimum.
+fn golden_section(
+    mut from: f64,
+    mut to: f64,
+    f: impl Fn(f64) -> Result<f64, PlaneError>,
+) -> Result<f64, PlaneError> {
+    let mut low = to - GOLDEN_RATIO * (to - from);
+    let mut high = from + GOLDEN_RATIO * (to - from);
+    let (mut f_low, mut f_high) = (f(low)?, f(high)?);
+    for _ in 0..GOLDEN_STEPS - 1 {
+        if f_low < f_high {
+            (to, high, f_high) = (high, low, f_low);
+            low = to - GOLDEN_RATIO * (to - from);
+            f_low = f(low)?;
+        } else {
+            (from, low, f_low) = (low, high, f_high);
+            high = from + GOLDEN_RATIO * (to - from);
+            f_high = f(high)?;
         }
     }
-    Ok(best.1)
+    Ok(if f_low < f_high { low } else { high })
+}
+
+/// The split prior's objective at the minimum, for each pixel.
+fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
+    let by_row: Vec<Vec<f64>> = sample
+        .rows
+        .par_iter()
+        .map(|row| {
+            let mut objectives = vec![0.0; row.columns.len()];
+            for (problem, pixels) in row.problems(&Prior::SPLIT, optics)? {
+                let intensities = row.intensities.select(Axis(0), &pixels);
+                let x = problem.minimise(intensities.view(), &mut problem.all_free(pixels.len()));
+                let minima = problem.minima(x.view(), intensities.view());
+                pixels.iter().zip(minima).for_each(|(&pixel, minimum)| objectives[pixel] = minimum);
+            }
+            Ok(objectives)
+        })
+        .collect::<Result<_, PlaneError>>()?;
+    Ok(by_row.concat())
+}
+
+/// The logarithm lets each pixel count by its own noise.
+fn log(objective: f64) -> f64 {
+    objective.max(f64::MIN_POSITIVE).ln()
 }
 
 /// Only the pixels in which direct light stands out: the others say nothing of the beam, but have noise.

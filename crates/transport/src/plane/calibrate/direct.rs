@@ -59,9 +59,9 @@ fn of_row(row: &SampledRow, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, Pl
     let plan_variance = moment.dot(&problem.inverse.dot(&moment));
     let amount_variance = amount.dot(&problem.inverse.dot(&amount));
     let residual = x.dot(&problem.weights.t()) - &row.intensities;
-    let roughness = x.dot(&extended_differences.t());
-    let pixels = x.rows().into_iter().zip(residual.rows()).zip(roughness.rows()).zip(&row.columns);
-    let light = pixels.map(|(((x, residual), roughness), &s)| {
+    let minima = problem.minima(x.view(), row.intensities.view());
+    let pixels = x.rows().into_iter().zip(residual.rows()).zip(minima).zip(&row.columns);
+    let light = pixels.map(|(((x, residual), objective), &s)| {
         let noise_variance = residual.dot(&residual) / residual.len() as f64;
         let light = x.dot(&amount);
         DirectLight {
@@ -71,9 +71,7 @@ fn of_row(row: &SampledRow, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, Pl
             u0_rows: x.dot(&moment) / light,
             standard_error_rows: (noise_variance * plan_variance).sqrt() / light,
             plan_variance,
-            objective: residual.dot(&residual)
-                + prior.alpha() * roughness.dot(&roughness)
-                + prior.beta() * x.sum(),
+            objective,
         }
     });
     Ok(light.collect())

@@ -31,16 +31,18 @@ pub enum CalibrateError {
         /// How many it takes.
         needed: usize,
     },
-    /// The held-out residual does not depend on the beam's width.
+    /// The held-out residual hardly depends on the beam's width.
     #[error(
-        "a beam 30 % wider and narrower raises the held-out residual by only {rise_percent:.1} %, but it takes \
-         {needed_percent:.1} %: give the beam's width, or add settings whose edges fall near u = 0"
+        "the beam's width is {sigma_rows:.2} rows, uncertain by {error_percent:.0} %, but must be certain to \
+         {allowed_percent:.0} %: give the beam's width, or add settings whose edges fall near u = 0"
     )]
     BeamUndetermined {
-        /// Mean rise of the residual.
-        rise_percent: f64,
-        /// How much it takes.
-        needed_percent: f64,
+        /// The width that predicts held-out settings best.
+        sigma_rows: f64,
+        /// Its standard error.
+        error_percent: f64,
+        /// The largest that is of use.
+        allowed_percent: f64,
     },
     /// The settings do not tell direct light in row 0 from direct light in row 1 or -1.
     #[error(

@@ -81,6 +81,13 @@ impl RowProblem {
         x
     }
 
+    /// Value of `||A x - I||^2 + alpha ||D x||^2 + beta sum(x)` for each pixel at its minimiser.
+    pub fn minima(&self, x: ArrayView2<f64>, samples: ArrayView2<f64>) -> Array1<f64> {
+        // There x'(Hx - c) = 0, so of x'Hx - 2 c'x + I'I only I'I - c'x is left.
+        let linear = samples.dot(&self.weights) - self.half_beta;
+        (&samples * &samples).sum_axis(Axis(1)) - (&linear * &x).sum_axis(Axis(1))
+    }
+
     /// Block principal pivoting (Kim and Park, 2011, section 4) on the smaller side: either the free rows' system in
     /// `H`, or that of the zero rows in `H^-1`.
     fn minimise_one(&self, c: ArrayView1<f64>, unconstrained: ArrayView1<f64>, free: &mut FreeSet) -> Array1<f64> {
