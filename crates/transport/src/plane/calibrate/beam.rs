@@ -5,16 +5,16 @@ use rayon::prelude::*;
 
 use super::super::{PlaneError, Prior};
 use super::direct::direct_light;
-use super::holdout::{folds, held_out, log_by_pixel};
+use super::holdout::{folds, held_out, log_residuals};
 use super::spike::MIN_PIXELS;
 use super::{CalibrateError, Optics, Sample, SpikeMap, spike_offset};
 
 /// Widths that the search starts from, in rows; between neighbours the residual has one minimum.
 const COARSE_ROWS: [f64; 7] = [0.0, 0.3, 0.45, 0.7, 1.05, 1.55, 2.3];
 
-/// Below this width a Gaussian sampled at the rows' centres keeps 99 % of the light in its own row, and no plan tells
-/// it from an ideal beam.
-const NARROWEST_ROWS: f64 = 0.28;
+/// Below this width a Gaussian sampled at the rows' centres leaves 96 % of the light in its own row, and a cusp of
+/// subsurface light about u = 0 cannot be told from it: the beam counts as ideal.
+const NARROWEST_ROWS: f64 = 0.36;
 const WIDEST_ROWS: f64 = 3.0;
 
 /// Golden sections of the interval between the neighbours of the best coarse width: they leave 7 % of the width.
@@ -104,14 +104,17 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
     let highest = COARSE_ROWS.get(coarse + 1).copied().unwrap_or(WIDEST_ROWS);
     let mut sigma_rows = golden_section(lowest.ln(), highest.ln(), |ln| objective(&sample, ln.exp()))?.exp();
 
-    let log_residual = |sigma_rows: f64| -> Result<Array1<f64>, PlaneError> {
-        Ok(log_by_pixel(&held_out(&sample, &Prior::SPLIT, &optics(sigma_rows), &folds)?))
+    let held_out_log = |sigma_rows: f64| -> Result<_, PlaneError> {
+        Ok(log_residuals(&held_out(&sample, &Prior::SPLIT, &optics(sigma_rows), &folds)?))
     };
+    let log_residual =
+        |sigma_rows: f64| -> Result<Array1<f64>, PlaneError> { Ok(held_out_log(sigma_rows)?.by_pixel) };
     let step = FINE_STEP.ln();
     let mut relative_error = f64::INFINITY;
     for _ in 0..FINE_ROUNDS {
         let middle = log_residual(sigma_rows)?;
-        let (narrower, wider) = (log_residual(sigma_rows / FINE_STEP)?, log_residual(sigma_rows * FINE_STEP)?);
+        let (narrower, wider) =
+            (log_residual(sigma_rows / FINE_STEP)?, log_residual(sigma_rows * FINE_STEP)?);
         // Per pixel, over ln(sigma).
         let slope = (&wider - &narrower) / (2.0 * step);
         let curvature = (&wider + &narrower - 2.0 * &middle).sum() / step.powi(2);
@@ -125,7 +128,12 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
             break;
         }
     }
-    if sigma_rows < NARROWEST_ROWS {
+    // An ideal beam stays unless the width predicts better by more than one standard error.
+    let ideal = || -> Result<bool, PlaneError> {
+        let (log_ratio, standard_error) = held_out_log(sigma_rows)?.ratio_to(&held_out_log(0.0)?);
+        Ok(log_ratio > -standard_error)
+    };
+    if sigma_rows < NARROWEST_ROWS || ideal()? {
         return Ok(BeamEstimate { sigma_rows: 0.0, standard_error_rows: NARROWEST_ROWS, pixels });
     }
     if relative_error > MAX_RELATIVE_ERROR {

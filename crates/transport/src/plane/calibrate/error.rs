@@ -7,7 +7,9 @@ pub enum CalibrateError {
     #[error(transparent)]
     Plane(#[from] PlaneError),
     /// Masks leave nothing.
-    #[error("every pixel has masked samples: use shorter exposures, so that some pixels saturate in no setting")]
+    #[error(
+        "every pixel has masked samples: use shorter exposures, so that some pixels saturate in no setting"
+    )]
     NoPixels,
     /// The settings cannot be divided.
     #[error(

@@ -43,7 +43,8 @@ impl Choice {
 
     /// What was chosen and why, in a sentence for the report.
     pub fn reason(&self) -> String {
-        let name = |prior: Prior| format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta());
+        let name =
+            |prior: Prior| format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta());
         let best = self.best();
         let (chosen, default) = (self.curve[self.chosen], self.curve[0]);
         let change = |candidate: Candidate| 100.0 * ((candidate.log_ratio / 2.0).exp() - 1.0);
@@ -99,31 +100,26 @@ pub fn candidates() -> Vec<Prior> {
 /// # Errors
 /// [`CalibrateError::NoCandidates`], [`CalibrateError::TooFewSettings`], [`Prior::check`]'s, and
 /// [`PlaneError::NotConvex`].
-pub fn choose_prior(sample: &Sample, optics: &Optics, candidates: &[Prior]) -> Result<Choice, CalibrateError> {
+pub fn choose_prior(
+    sample: &Sample,
+    optics: &Optics,
+    candidates: &[Prior],
+) -> Result<Choice, CalibrateError> {
     candidates.iter().try_for_each(Prior::check)?;
     let sample = sample.thinned();
     let folds = folds(&sample)?;
     let errors: Vec<Array2<f64>> =
         candidates.iter().map(|prior| held_out(&sample, prior, optics, &folds)).collect::<Result<_, _>>()?;
     let default = errors.first().ok_or(CalibrateError::NoCandidates)?;
-    let log_default = log_by_pixel(default);
+    let default = log_residuals(default);
     let curve: Vec<Candidate> = candidates
         .iter()
         .zip(&errors)
-        .map(|(&prior, error)| {
-            let log = log_by_pixel(error);
-            let by_pixel = &log - &log_default;
-            let by_fold = (error.mapv(|error| error.max(LEAST_SQUARE).ln())
-                - default.mapv(|error| error.max(LEAST_SQUARE).ln()))
-            .mean_axis(Axis(0))
-            .unwrap_or_default();
-            let residual = (log.mean().unwrap_or_default() / 2.0).exp();
-            Candidate {
-                prior,
-                residual,
-                log_ratio: by_pixel.mean().unwrap_or_default(),
-                standard_error: standard_error(by_pixel.view()).hypot(standard_error(by_fold.view())),
-            }
+        .map(|(&prior, errors)| {
+            let log = log_residuals(errors);
+            let (log_ratio, standard_error) = log.ratio_to(&default);
+            let residual = (log.by_pixel.mean().unwrap_or_default() / 2.0).exp();
+            Candidate { prior, residual, log_ratio, standard_error }
         })
         .collect();
     let mut choice = Choice { curve, chosen: 0 };
@@ -134,9 +130,30 @@ pub fn choose_prior(sample: &Sample, optics: &Optics, candidates: &[Prior]) -> R
     Ok(choice)
 }
 
-/// Logarithm of each pixel's mean squared residual, from those of its folds.
-pub(super) fn log_by_pixel(errors: &Array2<f64>) -> Array1<f64> {
-    errors.mean_axis(Axis(1)).unwrap_or_default().mapv_into(|error| error.max(LEAST_SQUARE).ln())
+/// Logarithms of mean squared held-out residuals: of each pixel, and of each fold's typical pixel.
+pub(super) struct LogResiduals {
+    pub by_pixel: Array1<f64>,
+    by_fold: Array1<f64>,
+}
+
+/// From what [`held_out`] returns.
+pub(super) fn log_residuals(errors: &Array2<f64>) -> LogResiduals {
+    let log = |error: f64| error.max(LEAST_SQUARE).ln();
+    LogResiduals {
+        by_pixel: errors.mean_axis(Axis(1)).unwrap_or_default().mapv_into(log),
+        by_fold: errors.mapv(log).mean_axis(Axis(0)).unwrap_or_default(),
+    }
+}
+
+impl LogResiduals {
+    /// Mean over pixels of the logarithm of the ratio to `other`, and its standard error: that of the pixels and that
+    /// of the folds, because neither are all there could be.
+    pub fn ratio_to(&self, other: &Self) -> (f64, f64) {
+        let by_pixel = &self.by_pixel - &other.by_pixel;
+        let by_fold = &self.by_fold - &other.by_fold;
+        let standard_error = standard_error(by_pixel.view()).hypot(standard_error(by_fold.view()));
+        (by_pixel.mean().unwrap_or_default(), standard_error)
+    }
 }
 
 fn standard_error(values: ArrayView1<f64>) -> f64 {

@@ -31,7 +31,11 @@ pub(super) type FreeSet = Vec<bool>;
 
 impl RowProblem {
     /// `differences` is `D`, shape `[differences, slots]`.
-    pub fn new(weights: Array2<f64>, differences: ArrayView2<f64>, prior: &Prior) -> Result<Self, PlaneError> {
+    pub fn new(
+        weights: Array2<f64>,
+        differences: ArrayView2<f64>,
+        prior: &Prior,
+    ) -> Result<Self, PlaneError> {
         let mut h = weights.t().dot(&weights) + prior.alpha() * differences.t().dot(&differences);
         for diagonal in h.diag_mut() {
             // A slot that nothing sees or holds must not make H singular; its x is 0 in any case.
@@ -90,7 +94,12 @@ impl RowProblem {
 
     /// Block principal pivoting (Kim and Park, 2011, section 4) on the smaller side: either the free rows' system in
     /// `H`, or that of the zero rows in `H^-1`.
-    fn minimise_one(&self, c: ArrayView1<f64>, unconstrained: ArrayView1<f64>, free: &mut FreeSet) -> Array1<f64> {
+    fn minimise_one(
+        &self,
+        c: ArrayView1<f64>,
+        unconstrained: ArrayView1<f64>,
+        free: &mut FreeSet,
+    ) -> Array1<f64> {
         let slots = c.len();
         let gradient_tolerance = TOLERANCE * largest(c);
         let (mut fewest, mut patience) = (usize::MAX, PATIENCE);
@@ -187,8 +196,9 @@ mod tests {
     use super::*;
 
     fn problem(weights: Vec<f64>, prior: Prior) -> RowProblem {
-        let slots: Vec<_> =
-            (-3..4).map(|u| super::super::super::Slot { u, kind: super::super::super::SlotKind::Own }).collect();
+        let slots: Vec<_> = (-3..4)
+            .map(|u| super::super::super::Slot { u, kind: super::super::super::SlotKind::Own })
+            .collect();
         let weights = Array2::from_shape_vec((5, 7), weights).unwrap();
         RowProblem::new(weights, prior.differences(&slots).view(), &prior).unwrap()
     }

@@ -72,9 +72,10 @@ impl Sample {
         let reach = reach(&timing, &settings)?;
         let (_, height, columns) = stack.dim();
         let expected = [settings.len(), timing.camera_rows(), columns];
-        for (array, shape) in [Some(("stack", stack.shape())), valid.as_ref().map(|valid| ("valid", valid.shape()))]
-            .into_iter()
-            .flatten()
+        for (array, shape) in
+            [Some(("stack", stack.shape())), valid.as_ref().map(|valid| ("valid", valid.shape()))]
+                .into_iter()
+                .flatten()
         {
             if shape != expected {
                 let axes = "[settings, camera rows, columns]";
@@ -82,8 +83,9 @@ impl Sample {
                 return Err(PlaneError::Shape { array, axes, actual, expected }.into());
             }
         }
-        let usable =
-            |t: usize, column: &usize| valid.is_none_or(|valid| valid.slice(s![.., t, *column]).iter().all(|v| *v));
+        let usable = |t: usize, column: &usize| {
+            valid.is_none_or(|valid| valid.slice(s![.., t, *column]).iter().all(|v| *v))
+        };
         let rows: Vec<SampledRow> = strata(height, ROWS)
             .enumerate()
             .collect::<Vec<_>>()
@@ -101,7 +103,8 @@ impl Sample {
                 let intensities = Array2::from_shape_fn((columns.len(), settings.len()), |(pixel, n)| {
                     f64::from(stack[[n, t, columns[pixel]]])
                 });
-                if let Some(((pixel, setting), _)) = intensities.indexed_iter().find(|(_, value)| !value.is_finite())
+                if let Some(((pixel, setting), _)) =
+                    intensities.indexed_iter().find(|(_, value)| !value.is_finite())
                 {
                     return Err(PlaneError::NotFinite { setting, row: t, column: columns[pixel] });
                 }
@@ -169,7 +172,11 @@ impl SampledRow {
 
     /// The row's pixels by what they must be solved with: one problem for each place of direct light, with the
     /// indices of its pixels. The paper's prior knows no direct light, so it has one.
-    pub fn problems(&self, prior: &Prior, optics: &Optics) -> Result<Vec<(RowProblem, Vec<usize>)>, PlaneError> {
+    pub fn problems(
+        &self,
+        prior: &Prior,
+        optics: &Optics,
+    ) -> Result<Vec<(RowProblem, Vec<usize>)>, PlaneError> {
         let differences = prior.differences(&self.slots);
         let weights = self.weights(optics.beam_sigma_rows);
         let step = |pixel: usize| match prior {

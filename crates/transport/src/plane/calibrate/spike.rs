@@ -63,7 +63,9 @@ pub fn spike_offset(sample: &Sample, beam_sigma_rows: f64) -> Result<SpikeMap, C
     let (coefficients, covariance) = fit(&light, basis);
     let at = |(t, s): (usize, usize)| basis(t, s);
     Ok(SpikeMap {
-        u0: Array2::from_shape_fn((height, width), |pixel| at(pixel).dot(&coefficients).clamp(-1.0, 1.0) as f32),
+        u0: Array2::from_shape_fn((height, width), |pixel| {
+            at(pixel).dot(&coefficients).clamp(-1.0, 1.0) as f32
+        }),
         standard_error: Array2::from_shape_fn((height, width), |pixel| {
             at(pixel).dot(&covariance.dot(&at(pixel))).max(0.0).sqrt() as f32
         }),
@@ -78,10 +80,7 @@ fn centred(index: usize, length: usize) -> f64 {
 
 /// Coefficients of the basis by iteratively reweighted least squares, and their covariance from the residuals as they
 /// are, whatever their cause.
-fn fit(
-    light: &[&DirectLight],
-    basis: impl Fn(usize, usize) -> Array1<f64>,
-) -> (Array1<f64>, Array2<f64>) {
+fn fit(light: &[&DirectLight], basis: impl Fn(usize, usize) -> Array1<f64>) -> (Array1<f64>, Array2<f64>) {
     let rows: Vec<Array1<f64>> = light.iter().map(|light| basis(light.t, light.s)).collect();
     let terms = rows[0].len();
     let precision = |light: &DirectLight| light.standard_error_rows.hypot(PIXEL_SCATTER_ROWS).recip();
@@ -92,7 +91,8 @@ fn fit(
     for _ in 0..ROBUST_STEPS {
         let residuals: Vec<f64> =
             light.iter().zip(&rows).map(|(light, row)| light.u0_rows - row.dot(&coefficients)).collect();
-        let scaled: Vec<f64> = light.iter().zip(&residuals).map(|(light, r)| (r * precision(light)).abs()).collect();
+        let scaled: Vec<f64> =
+            light.iter().zip(&residuals).map(|(light, r)| (r * precision(light)).abs()).collect();
         let scatter = (1.4826 * median(scaled.clone())).max(f64::MIN_POSITIVE);
         let mut normal = Array2::<f64>::zeros((terms, terms));
         let mut right = Array1::<f64>::zeros(terms);

@@ -68,7 +68,8 @@ pub fn spike_weights(
         let passes = setting.delays_us.iter().map(|delay_us| {
             // Moments lie a period apart; those from the start on, less those from the end on.
             let periods_to = |edge_us: f64| ((edge_us - moment_us) / timing.period_us()).ceil();
-            periods_to(delay_us + setting.exposure_us / 2.0) - periods_to(delay_us - setting.exposure_us / 2.0)
+            periods_to(delay_us + setting.exposure_us / 2.0)
+                - periods_to(delay_us - setting.exposure_us / 2.0)
         });
         passes.sum::<f64>() / setting.delays_us.len() as f64
     };
@@ -86,12 +87,12 @@ mod tests {
     #[test]
     fn edges_on_the_row_are_found() {
         let settings = [
-            Setting::new(300.0, 600.0),    // starts at 0
-            Setting::new(-309.0, 600.0),   // ends at -9
-            Setting::new(311.0, 600.0),    // starts at 11: only with jitter
-            Setting::new(0.0, 600.0),      // holds the row whole
-            Setting::new(600.0, 600.0),    // starts after it
-            Setting::new(0.0, 32_000.0),   // ends a whole period away, on the row of the next frame
+            Setting::new(300.0, 600.0),  // starts at 0
+            Setting::new(-309.0, 600.0), // ends at -9
+            Setting::new(311.0, 600.0),  // starts at 11: only with jitter
+            Setting::new(0.0, 600.0),    // holds the row whole
+            Setting::new(600.0, 600.0),  // starts after it
+            Setting::new(0.0, 32_000.0), // ends a whole period away, on the row of the next frame
             Setting { delays_us: vec![320.0, 330.0, 305.0], exposure_us: 600.0 },
         ];
         assert_eq!(settings_on_direct_row(&timing(), &settings, 0.0), Ok(vec![0, 1, 5, 6]));
@@ -103,9 +104,9 @@ mod tests {
     fn the_spot_passes_at_its_column() {
         // Column 0.75 is passed 5 us after the row's centre, or before it where the row is drawn backwards.
         let settings = [
-            Setting::new(304.0, 600.0),  // from 4 us on
-            Setting::new(306.0, 600.0),  // from 6 us on
-            Setting::new(294.0, 600.0),  // from -6 us on
+            Setting::new(304.0, 600.0), // from 4 us on
+            Setting::new(306.0, 600.0), // from 6 us on
+            Setting::new(294.0, 600.0), // from -6 us on
             Setting { delays_us: vec![304.0, 304.5, 306.0, 290.0], exposure_us: 600.0 },
             Setting::new(0.0, 48_000.0), // three periods
         ];
@@ -119,7 +120,8 @@ mod tests {
 
     #[test]
     fn averaged_over_all_columns_it_is_the_uniform_rows_weight() {
-        let settings: Vec<Setting> = (-40..40).map(|step| Setting::new(300.0 + f64::from(step), 600.0)).collect();
+        let settings: Vec<Setting> =
+            (-40..40).map(|step| Setting::new(300.0 + f64::from(step), 600.0)).collect();
         let columns = 1000;
         let mut mean = vec![0.0; settings.len()];
         for column in 0..columns {
