@@ -17,7 +17,8 @@ use raysweep_transport::plane::{PlaneError, Prior, RowModel, Setting, reach, ref
 
 /// The paper's sweep and settings of 600 us that begin or end at each of `edges_rows`.
 fn plan_with_edges(edges_rows: &[f64]) -> Vec<Setting> {
-    let edge = |side: f64| edges_rows.iter().map(move |rows| Setting::new(side * 300.0 + rows * 22.22, 600.0));
+    let edge =
+        |side: f64| edges_rows.iter().map(move |rows| Setting::new(side * 300.0 + rows * 22.22, 600.0));
     paper_sweep().into_iter().chain(edge(-1.0)).chain(edge(1.0)).collect()
 }
 
@@ -183,7 +184,9 @@ fn the_width_of_the_beam_is_found() {
             let at = |t: usize, s: usize| f64::from(u0[[t, s]]);
             let error = profile_error(&truth, &stack, &settings, Prior::SPLIT, beam.sigma_rows, at);
             let known = profile_error(&truth, &stack, &settings, Prior::SPLIT, sigma_rows, at);
-            println!("{scene} offset {offset_rows} sigma {sigma_rows}: {beam:?}, T {error:.4}, width known {known:.4}");
+            println!(
+                "{scene} offset {offset_rows} sigma {sigma_rows}: {beam:?}, T {error:.4}, width known {known:.4}"
+            );
             assert!((beam.sigma_rows / sigma_rows - 1.0).abs() <= 0.05, "{scene} {sigma_rows}: {beam:?}");
             // Wax takes 0.034 with the true width; its light is not as smooth as the prior near u = 0.
             let allowed = if scene == "wax" { 0.05 } else { 0.04 };

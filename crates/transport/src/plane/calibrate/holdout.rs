@@ -36,6 +36,16 @@ pub struct Choice {
 }
 
 impl Choice {
+    /// The best candidate, unless the default comes within one standard error of it.
+    fn new(curve: Vec<Candidate>) -> Self {
+        let mut choice = Self { curve, chosen: 0 };
+        let best = choice.best();
+        if choice.curve[best].log_ratio < -choice.curve[best].standard_error {
+            choice.chosen = best;
+        }
+        choice
+    }
+
     /// The chosen prior.
     pub fn prior(&self) -> Prior {
         self.curve[self.chosen].prior
@@ -122,12 +132,7 @@ pub fn choose_prior(
             Candidate { prior, residual, log_ratio, standard_error }
         })
         .collect();
-    let mut choice = Choice { curve, chosen: 0 };
-    let best = choice.best();
-    if choice.curve[best].log_ratio < -choice.curve[best].standard_error {
-        choice.chosen = best;
-    }
-    Ok(choice)
+    Ok(Choice::new(curve))
 }
 
 /// Logarithms of mean squared held-out residuals: of each pixel, and of each fold's typical pixel.
@@ -234,4 +239,61 @@ pub(super) fn held_out(
         first += row.nrows();
     }
     Ok(all)
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array3;
+
+    use super::super::super::{RowTiming, reach};
+    use super::*;
+
+    fn candidate(prior: Prior, log_ratio: f64, standard_error: f64) -> Candidate {
+        Candidate { prior, residual: 0.003, log_ratio, standard_error }
+    }
+
+    #[test]
+    fn noise_does_not_switch_priors() {
+        let default = candidate(Prior::SPLIT, 0.0, 0.0);
+        let chosen = |log_ratio, standard_error| {
+            let choice = Choice::new(vec![default, candidate(Prior::PAPER, log_ratio, standard_error)]);
+            (choice.prior(), choice.reason())
+        };
+        let (prior, reason) = chosen(0.2, 0.1);
+        assert_eq!(prior, Prior::SPLIT);
+        assert!(reason.ends_with("predicts held-out settings best"), "{reason}");
+        let (prior, reason) = chosen(-0.2, 0.21);
+        assert_eq!(prior, Prior::SPLIT);
+        assert!(reason.contains("only 9.5 % better"), "{reason}");
+        let (prior, reason) = chosen(-0.2, 0.1);
+        assert_eq!(prior, Prior::PAPER);
+        assert!(reason.contains("9.5 % better") && reason.ends_with("by 2.0 standard errors"), "{reason}");
+    }
+
+    #[test]
+    fn folds_are_spread_over_the_plan_and_lose_sight_of_no_row() {
+        let timing = RowTiming::new(128, 22.22, 50_000.0 / 3.0).unwrap();
+        let settings: Vec<Setting> = (0..75)
+            .map(|n| Setting::new(-1500.0 + 3000.0 / 14.0 * (n % 15) as f64, 600.0 + 150.0 * (n / 15) as f64))
+            .collect();
+        let stack = Array3::zeros((75, 128, 4));
+        let sample = Sample::new(timing, settings.clone(), stack.view(), None).unwrap();
+        let folds = folds(&sample).unwrap();
+        assert_eq!(folds.len(), 5);
+        for fold in &folds {
+            let rest: Vec<Setting> =
+                (0..75).filter(|n| !fold.contains(n)).map(|n| settings[n].clone()).collect();
+            assert_eq!(reach(&timing, &rest), reach(&timing, &settings));
+            for exposure in 0..5 {
+                let delays: Vec<usize> =
+                    fold.iter().filter(|&n| n / 15 == exposure).map(|n| n % 15).collect();
+                assert!((2..=3).contains(&delays.len()), "{fold:?}");
+                assert!(delays.is_sorted_by(|a, b| a + 5 == *b), "{fold:?}");
+            }
+        }
+        let mut held: Vec<usize> = folds.concat();
+        held.sort_unstable();
+        // The longest exposures at the ends of the sweep alone see the outermost rows.
+        assert_eq!(held, (0..75).filter(|n| ![60, 74].contains(n)).collect::<Vec<_>>());
+    }
 }

@@ -11,6 +11,9 @@ use super::{CalibrateError, SpikeMap};
 const ROWS: usize = 16;
 const PIXELS_PER_ROW: usize = 64;
 
+/// Smaller samples are used whole.
+const MIN_PIXELS_TO_THIN: usize = 256;
+
 /// A Gaussian beam is followed this far, as the tails beyond hold less than a millionth.
 const BEAM_REACH_SIGMAS: f64 = 5.0;
 
@@ -122,8 +125,12 @@ impl Sample {
         Ok(Self { timing, settings, reach, columns, rows })
     }
 
-    /// A quarter of the rows and half the pixels of each: enough where every pixel is solved many times.
+    /// A quarter of the rows and half the pixels of each, unless that leaves few: enough where every pixel is solved
+    /// many times.
     pub(super) fn thinned(&self) -> Self {
+        if self.pixels().count() <= MIN_PIXELS_TO_THIN {
+            return self.clone();
+        }
         let rows = self.rows.iter().skip(self.rows.len().min(2) - 1).step_by(4);
         let rows = rows.map(|row| row.keep(|pixel| pixel % 2 == 0)).collect();
         Self { rows, ..self.clone() }

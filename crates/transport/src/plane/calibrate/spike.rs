@@ -29,7 +29,8 @@ const CAUCHY: f64 = 2.385;
 pub struct SpikeMap {
     /// `u0[t, s]` in rows, from -1 to 1: a polynomial of second order over the image.
     pub u0: Array2<f32>,
-    /// Its standard error in rows, `[t, s]`.
+    /// Its standard error in rows, `[t, s]`: that of the pixels' scatter. Indirect light with a cusp at `u = 0` adds a
+    /// bias of up to a few per cent of `u0`, towards 0.
     pub standard_error: Array2<f32>,
     /// Sampled pixels with direct light.
     pub pixels: usize,
