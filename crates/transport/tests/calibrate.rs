@@ -188,7 +188,7 @@ fn the_width_of_the_beam_is_found() {
                 "{scene} offset {offset_rows} sigma {sigma_rows}: {beam:?}, T {error:.4}, width known {known:.4}"
             );
             assert!((beam.sigma_rows / sigma_rows - 1.0).abs() <= 0.05, "{scene} {sigma_rows}: {beam:?}");
-            // Wax takes 0.034 with the true width; its light is not as smooth as the prior near u = 0.
+            // The cusp of wax about u = 0 widens the beam by 2 %: 0.043 measured, 0.027 with the true width.
             let allowed = if scene == "wax" { 0.05 } else { 0.04 };
             assert!(error <= allowed, "{scene} {sigma_rows}: {error}");
         }
@@ -221,7 +221,7 @@ fn direct_light_is_found_between_rows() {
         let calibrated = error(Prior::SPLIT, &|t, s| f64::from(map.u0[[t, s]]));
         let standard_error = map.standard_error[[64, 32]];
         println!(
-            "offset {offset_rows}: edges paper {papers:.4}, split {uncalibrated:.4}, calibrated {calibrated:.4}; \
+            "offset {offset_rows}: paper {papers:.4}, split {uncalibrated:.4}, calibrated {calibrated:.4}; \
              u0 off by at most {off:.4}, standard error {standard_error:.4}"
         );
         assert!(off <= 0.03, "{offset_rows}: off by {off}");
@@ -262,6 +262,18 @@ fn what_the_stack_does_not_say_is_said() {
     assert!(matches!(spike_offset(&sample_of_none, 0.0), Err(CalibrateError::NoDirectLight { .. })));
     let estimate = estimate_optics(&sample_of_none, None).unwrap();
     assert!(estimate.optics.beam_sigma_rows == 0.0 && estimate.optics.spike.is_none());
+
+    // Fifteen delays dense about 0, with all edges far from u = 0.
+    let film: Vec<Setting> = (-7..=7)
+        .map(|k: i32| {
+            Setting::new(1500.0 * f64::from(k.signum()) * (f64::from(k.abs()) / 7.0).powf(1.7), 600.0)
+        })
+        .collect();
+    for (transport, sigma_rows) in [(corner(), 0.7), (wax(), 0.0), (wax(), 1.5)] {
+        let sample_of_film = sample(&stack(&transport, &film, sigma_rows), &film);
+        let refused = beam_sigma(&sample_of_film, None);
+        assert!(matches!(refused, Err(CalibrateError::BeamUndetermined { .. })), "{refused:?}");
+    }
 
     let far_edges = |setting: &Setting| {
         [-0.5, 0.5].iter().all(|half| (setting.delays_us[0] + half * setting.exposure_us).abs() > 1.5 * 22.22)

@@ -25,8 +25,11 @@ const GOLDEN_RATIO: f64 = 0.618_033_988_75;
 const FINE_STEP: f64 = 1.06;
 const FINE_ROUNDS: usize = 3;
 
-/// A width whose standard error is a larger share of it is not determined: the error of T grows with the width's.
-const MAX_RELATIVE_ERROR: f64 = 0.05;
+/// The width counts as determined when beams wider and narrower by this factor, or one of twice the narrowest in
+/// place of an ideal one, raise the mean squared held-out residual by this share and by so many standard errors.
+const OTHER_WIDTH: f64 = 1.5;
+const MIN_RISE: f64 = 0.03;
+const MIN_STANDARD_ERRORS: f64 = 2.0;
 
 /// The width of the projector's beam across rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,8 +87,8 @@ pub fn estimate_optics(
 /// one under which held-out settings are predicted best, because the objective alone takes a width for smoothness.
 ///
 /// # Errors
-/// [`CalibrateError::NoDirectLight`] and [`CalibrateError::BeamUndetermined`] if the stack does not say it;
-/// [`CalibrateError::TooFewSettings`]; [`PlaneError::NotConvex`].
+/// [`CalibrateError::NoDirectLight`], [`CalibrateError::BeamUndetermined`] and [`CalibrateError::BeamTooWide`] if the
+/// stack does not say it; [`CalibrateError::TooFewSettings`]; [`PlaneError::NotConvex`].
 pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstimate, CalibrateError> {
     let sample = sample.thinned();
     let folds = folds(&sample)?;
@@ -96,26 +99,60 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
     let coarse = best_coarse(|sigma_rows| objective(&sample, sigma_rows))?;
     let sample = with_direct_light(&sample, COARSE_ROWS[coarse])?;
     let pixels = sample.pixels().count();
-    if coarse == 0 {
-        return Ok(BeamEstimate { sigma_rows: 0.0, standard_error_rows: NARROWEST_ROWS, pixels });
-    }
-
-    let lowest = COARSE_ROWS[coarse - 1].max(NARROWEST_ROWS / 1.5);
-    let highest = COARSE_ROWS.get(coarse + 1).copied().unwrap_or(WIDEST_ROWS);
-    let mut sigma_rows = golden_section(lowest.ln(), highest.ln(), |ln| objective(&sample, ln.exp()))?.exp();
-
     let held_out_log = |sigma_rows: f64| -> Result<_, PlaneError> {
         Ok(log_residuals(&held_out(&sample, &Prior::SPLIT, &optics(sigma_rows), &folds)?))
     };
-    let log_residual =
-        |sigma_rows: f64| -> Result<Array1<f64>, PlaneError> { Ok(held_out_log(sigma_rows)?.by_pixel) };
+    let mut estimate = BeamEstimate { sigma_rows: 0.0, standard_error_rows: NARROWEST_ROWS, pixels };
+    let mut best = held_out_log(0.0)?;
+    if coarse > 0 {
+        let lowest = COARSE_ROWS[coarse - 1].max(NARROWEST_ROWS / 1.5);
+        let highest = COARSE_ROWS.get(coarse + 1).copied().unwrap_or(WIDEST_ROWS);
+        let rough = golden_section(lowest.ln(), highest.ln(), |ln| objective(&sample, ln.exp()))?.exp();
+        let (sigma_rows, standard_error_rows) =
+            refine(rough, |sigma_rows| Ok(held_out_log(sigma_rows)?.by_pixel))?;
+        let residuals = held_out_log(sigma_rows)?;
+        // An ideal beam stays unless the width predicts better by more than one standard error.
+        let (log_ratio, standard_error) = residuals.ratio_to(&best);
+        if sigma_rows >= NARROWEST_ROWS && log_ratio < -standard_error {
+            estimate = BeamEstimate { sigma_rows, standard_error_rows, pixels };
+            best = residuals;
+        }
+    }
+    if estimate.sigma_rows >= WIDEST_ROWS {
+        return Err(CalibrateError::BeamTooWide { widest_rows: WIDEST_ROWS });
+    }
+    // Where the plan cannot tell, the least residual means nothing: clearly other widths must predict worse.
+    let others_rows = match estimate.sigma_rows {
+        0.0 => vec![2.0 * NARROWEST_ROWS],
+        sigma_rows => vec![sigma_rows / OTHER_WIDTH, sigma_rows * OTHER_WIDTH],
+    };
+    for other_rows in others_rows {
+        let (log_ratio, standard_error) = held_out_log(other_rows)?.ratio_to(&best);
+        let needed = MIN_RISE.ln_1p().max(MIN_STANDARD_ERRORS * standard_error);
+        if log_ratio < needed {
+            return Err(CalibrateError::BeamUndetermined {
+                sigma_rows: estimate.sigma_rows,
+                other_rows,
+                rise_percent: 100.0 * log_ratio.exp_m1(),
+                needed_percent: 100.0 * needed.exp_m1(),
+            });
+        }
+    }
+    Ok(estimate)
+}
+
+/// The minimum of held-out residuals about a rough width and its standard error, by a parabola over the logarithm of
+/// the width that moves until it holds its minimum.
+fn refine(
+    rough_rows: f64,
+    log_residual: impl Fn(f64) -> Result<Array1<f64>, PlaneError>,
+) -> Result<(f64, f64), PlaneError> {
     let step = FINE_STEP.ln();
-    let mut relative_error = f64::INFINITY;
+    let (mut sigma_rows, mut relative_error) = (rough_rows, f64::INFINITY);
     for _ in 0..FINE_ROUNDS {
         let middle = log_residual(sigma_rows)?;
-        let (narrower, wider) =
-            (log_residual(sigma_rows / FINE_STEP)?, log_residual(sigma_rows * FINE_STEP)?);
-        // Per pixel, over ln(sigma).
+        let narrower = log_residual(sigma_rows / FINE_STEP)?;
+        let wider = log_residual(sigma_rows * FINE_STEP)?;
         let slope = (&wider - &narrower) / (2.0 * step);
         let curvature = (&wider + &narrower - 2.0 * &middle).sum() / step.powi(2);
         let change = match curvature > 0.0 {
@@ -123,27 +160,12 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
             false => -step * slope.sum().signum(),
         };
         sigma_rows = (sigma_rows * change.exp()).min(WIDEST_ROWS);
-        relative_error = if curvature > 0.0 { slope.dot(&slope).sqrt() / curvature } else { f64::INFINITY };
+        relative_error = if curvature > 0.0 { slope.dot(&slope).sqrt() / curvature } else { 1.0 };
         if change.abs() < step / 2.0 || sigma_rows < NARROWEST_ROWS {
             break;
         }
     }
-    // An ideal beam stays unless the width predicts better by more than one standard error.
-    let ideal = || -> Result<bool, PlaneError> {
-        let (log_ratio, standard_error) = held_out_log(sigma_rows)?.ratio_to(&held_out_log(0.0)?);
-        Ok(log_ratio > -standard_error)
-    };
-    if sigma_rows < NARROWEST_ROWS || ideal()? {
-        return Ok(BeamEstimate { sigma_rows: 0.0, standard_error_rows: NARROWEST_ROWS, pixels });
-    }
-    if relative_error > MAX_RELATIVE_ERROR {
-        return Err(CalibrateError::BeamUndetermined {
-            sigma_rows,
-            error_percent: 100.0 * relative_error,
-            allowed_percent: 100.0 * MAX_RELATIVE_ERROR,
-        });
-    }
-    Ok(BeamEstimate { sigma_rows, standard_error_rows: relative_error * sigma_rows, pixels })
+    Ok((sigma_rows, relative_error * sigma_rows))
 }
 
 /// Index of the coarse width of the least score.

@@ -35,16 +35,27 @@ pub enum CalibrateError {
     },
     /// The held-out residual hardly depends on the beam's width.
     #[error(
-        "the beam's width is {sigma_rows:.2} rows, uncertain by {error_percent:.0} %, but must be certain to \
-         {allowed_percent:.0} %: give the beam's width, or add settings whose edges fall near u = 0"
+        "a beam of {other_rows:.2} rows raises the held-out residual of one of {sigma_rows:.2} rows by only \
+         {rise_percent:.1} %, but it takes {needed_percent:.1} %: give the beam's width, or add settings whose edges \
+         fall near u = 0"
     )]
     BeamUndetermined {
         /// The width that predicts held-out settings best.
         sigma_rows: f64,
-        /// Its standard error.
-        error_percent: f64,
-        /// The largest that is of use.
-        allowed_percent: f64,
+        /// A width that is clearly another.
+        other_rows: f64,
+        /// How much worse it predicts, in the mean square.
+        rise_percent: f64,
+        /// How much worse it must predict.
+        needed_percent: f64,
+    },
+    /// The best width lies at the end of the range.
+    #[error(
+        "the beam is wider than {widest_rows} rows, or looks so: focus the projector, or give the beam's width"
+    )]
+    BeamTooWide {
+        /// The widest beam that is looked for.
+        widest_rows: f64,
     },
     /// The settings do not tell direct light in row 0 from direct light in row 1 or -1.
     #[error(
