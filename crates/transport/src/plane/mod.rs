@@ -17,6 +17,7 @@
 
 pub mod advice;
 mod beam;
+pub mod calibrate;
 mod cholesky;
 mod demux;
 mod error;

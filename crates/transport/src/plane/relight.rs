@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_refused() {
         let (timing, transport) = scene();
-        let other = timing.window(0, 3).unwrap();
+        let other = timing.clone().window(0, 3).unwrap();
         assert!(matches!(
             relight(&timing, &transport, Array1::ones(4).view()),
             Err(PlaneError::Shape { array: "weights", .. })
