@@ -6,10 +6,10 @@
 //! of its own, whose peak memory is that case's alone.
 
 mod check;
-mod gemm;
 #[allow(clippy::unwrap_used, reason = "shared with the tests, where a helper that cannot go on may panic")]
 #[path = "../../tests/common/mod.rs"]
 mod common;
+mod gemm;
 mod peers;
 mod print;
 mod scene;
@@ -175,7 +175,9 @@ fn in_a_process_of_its_own(prior: Prior) -> Result<Figures, Box<dyn Error>> {
         .stderr(Stdio::inherit())
         .output()?;
     if !output.status.success() {
-        return Err(format!("the 1280x720 case ended with {}; its message stands above", output.status).into());
+        return Err(
+            format!("the 1280x720 case ended with {}; its message stands above", output.status).into()
+        );
     }
     Ok(serde_json::from_slice(&output.stdout)?)
 }

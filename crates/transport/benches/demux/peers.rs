@@ -43,7 +43,8 @@ pub fn time(
     std::fs::write(folder.join("prior.json"), weights.to_string())?;
 
     let program = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/python/peers.py");
-    let output = Command::new(python).arg(program).arg(&folder).stderr(Stdio::inherit()).output()?;
+    let started = Command::new(python).arg(program).arg(&folder).stderr(Stdio::inherit()).output();
+    let output = started.map_err(|error| format!("cannot start {}: {error}", python.display()))?;
     if !output.status.success() {
         return Err(format!("peers.py ended with {}; its message stands above", output.status).into());
     }

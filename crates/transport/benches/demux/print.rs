@@ -55,18 +55,40 @@ pub fn tables(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
     println!("where the flops of wrong guesses do not count; gap, error in T: against the f64 reference\n");
     println!(
         "{:<21} {:>3} {:>4} {:>7} {:>4} {:>8} {:>8} {:>9} {:>6} {:>6} {:>8} {:>8} {:>8} {:>8}",
-        "case, prior", "N", "V", "pixels", "reps", "least s", "median s", "MFLOP/px", "of f32", "of f64",
-        "checked", "gap max", "T median", "T max",
+        "case, prior",
+        "N",
+        "V",
+        "pixels",
+        "reps",
+        "least s",
+        "median s",
+        "MFLOP/px",
+        "of f32",
+        "of f64",
+        "checked",
+        "gap max",
+        "T median",
+        "T max",
     );
     for (figures, _) in measured {
         let accuracy = &figures.accuracy;
         let percent = |peak: f64| format!("{:.1}%", 100.0 * figures.useful_flops_per_second() / peak);
         println!(
             "{:<21} {:>3} {:>4} {:>7} {:>4} {:>8.3} {:>8.3} {:>9.3} {:>6} {:>6} {:>8} {:>8.0e} {:>8.0e} {:>8.0e}",
-            case(figures), figures.settings, figures.unknowns, figures.pixels, figures.repetitions,
-            figures.seconds_min, figures.seconds_median, figures.useful_mflops_per_pixel,
-            percent(peak.f32_flops), percent(peak.f64_flops), accuracy.pixels, accuracy.gap_largest,
-            accuracy.error_median, accuracy.error_largest,
+            case(figures),
+            figures.settings,
+            figures.unknowns,
+            figures.pixels,
+            figures.repetitions,
+            figures.seconds_min,
+            figures.seconds_median,
+            figures.useful_mflops_per_pixel,
+            percent(peak.f32_flops),
+            percent(peak.f64_flops),
+            accuracy.pixels,
+            accuracy.gap_largest,
+            accuracy.error_median,
+            accuracy.error_largest,
         );
     }
     println!();
@@ -83,12 +105,19 @@ pub fn tables(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
     }
     for (figures, peers) in measured.iter().filter(|(_, peers)| !peers.is_empty()) {
         println!("\n{}: peers in the same run, scaled from the pixels timed", case(figures));
-        println!("{:<48} {:>9} {:>9} {:>7} {:>10} {:>8}", "", "seconds", "ratio", "pixels", "gap median", "gap max");
+        println!(
+            "{:<48} {:>9} {:>9} {:>7} {:>10} {:>8}",
+            "", "seconds", "ratio", "pixels", "gap median", "gap max"
+        );
         for peer in peers {
             println!(
                 "{:<48} {:>9.2} {:>9.1} {:>7} {:>10.0e} {:>8.0e}",
-                peer.method, peer.seconds, peer.seconds / figures.seconds_min, peer.pixels_timed,
-                peer.gap_median, peer.gap_largest,
+                peer.method,
+                peer.seconds,
+                peer.seconds / figures.seconds_min,
+                peer.pixels_timed,
+                peer.gap_median,
+                peer.gap_largest,
             );
         }
     }

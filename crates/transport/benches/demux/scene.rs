@@ -72,9 +72,11 @@ pub fn whole_projector() -> Result<Case, Box<dyn Error>> {
         let height = TILE.min(rows - row);
         let tile = if height < TILE { &cut_tile } else { &whole_tile };
         for column in (0..columns).step_by(TILE) {
-            stack
-                .slice_mut(s![.., row..row + height, column..column + TILE])
-                .assign(&tile.slice(s![.., ..height, ..]));
+            stack.slice_mut(s![.., row..row + height, column..column + TILE]).assign(&tile.slice(s![
+                ..,
+                ..height,
+                ..
+            ]));
         }
     }
     Ok(Case {
