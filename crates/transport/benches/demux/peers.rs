@@ -16,8 +16,9 @@ use super::scene::Case;
 #[derive(Debug, Deserialize)]
 pub struct Peer {
     pub method: String,
-    /// For all pixels of the case, scaled from those that were timed.
+    /// For all pixels of the case, scaled from those that were timed: least and median of the repetitions.
     pub seconds: f64,
+    pub seconds_median: f64,
     pub pixels_timed: usize,
     pub gap_median: f64,
     pub gap_largest: f64,

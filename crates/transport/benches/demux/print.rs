@@ -4,8 +4,8 @@ use super::Figures;
 use super::gemm::Peak;
 use super::peers::Peer;
 
-/// One line for each figure; `ratio` is the method's seconds over raysweep's on the same stack, `gap` the largest
-/// relative distance from the least objective.
+/// One line for each method and case; `seconds` is the least of the repetitions, `ratio` the method's seconds over
+/// raysweep's on the same stack, `gap` the largest relative distance from the least objective.
 pub fn json_lines(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
     for (figures, peers) in measured {
         let mut own = json!({
@@ -33,6 +33,7 @@ pub fn json_lines(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
                     "seconds": peer.seconds,
                     "ratio": peer.seconds / figures.seconds_min,
                     "gap": peer.gap_largest,
+                    "seconds_median": peer.seconds_median,
                     "gap_median": peer.gap_median,
                     "pixels_timed": peer.pixels_timed,
                 })
@@ -104,16 +105,20 @@ pub fn tables(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
         }
     }
     for (figures, peers) in measured.iter().filter(|(_, peers)| !peers.is_empty()) {
-        println!("\n{}: peers in the same run, scaled from the pixels timed", case(figures));
         println!(
-            "{:<48} {:>9} {:>9} {:>7} {:>10} {:>8}",
-            "", "seconds", "ratio", "pixels", "gap median", "gap max"
+            "\n{}: peers in the same run, scaled from the pixels timed; ratio of least seconds",
+            case(figures)
+        );
+        println!(
+            "{:<50} {:>8} {:>8} {:>7} {:>7} {:>10} {:>8}",
+            "", "least s", "median s", "ratio", "pixels", "gap median", "gap max"
         );
         for peer in peers {
             println!(
-                "{:<48} {:>9.2} {:>9.1} {:>7} {:>10.0e} {:>8.0e}",
+                "{:<50} {:>8.2} {:>8.2} {:>7.1} {:>7} {:>10.0e} {:>8.0e}",
                 peer.method,
                 peer.seconds,
+                peer.seconds_median,
                 peer.seconds / figures.seconds_min,
                 peer.pixels_timed,
                 peer.gap_median,
