@@ -7,6 +7,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
+use crate::findings;
 use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
@@ -17,8 +18,9 @@ use crate::unit::Unit;
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemuxOptions {
-    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`.
-    pub prior: PriorName,
+    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`; left out, with its weights: the one that
+    /// predicts held-out settings best, `split` in doubt.
+    pub prior: Option<PriorName>,
     /// Weight of smoothness over rows; left out: the prior's own.
     pub alpha: Option<f64>,
     /// Weight of sparsity; left out: the prior's own.
@@ -27,7 +29,7 @@ pub struct DemuxOptions {
 
 impl Default for DemuxOptions {
     fn default() -> Self {
-        Self { prior: PriorName::Split, alpha: None, beta: None }
+        Self { prior: None, alpha: None, beta: None }
     }
 }
 
@@ -42,10 +44,15 @@ pub enum PriorName {
 }
 
 impl DemuxOptions {
+    /// Whether a plan leaves nothing of the prior open.
+    fn states_prior(&self) -> bool {
+        self.prior.is_some() || self.alpha.is_some() || self.beta.is_some()
+    }
+
     fn prior(&self) -> Prior {
         let prior = match self.prior {
-            PriorName::Split => Prior::SPLIT,
-            PriorName::Paper => Prior::PAPER,
+            None | Some(PriorName::Split) => Prior::SPLIT,
+            Some(PriorName::Paper) => Prior::PAPER,
         };
         match prior {
             Prior::Split { alpha, beta } => {
@@ -87,6 +94,8 @@ struct Taken {
 #[derive(Clone)]
 pub struct DemuxFold {
     prior: Prior,
+    /// Whether the plan states the prior, or leaves it to the stack.
+    prior_stated: bool,
     schedule: Arc<Schedule>,
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
@@ -112,7 +121,8 @@ impl DemuxFold {
         prior.check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { prior, schedule, geometry, timing, taken: BTreeMap::new() };
+        let prior_stated = options.states_prior();
+        let fold = Self { prior, prior_stated, schedule, geometry, timing, taken: BTreeMap::new() };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -227,7 +237,14 @@ impl Fold for DemuxFold {
         let regular = taken.get(&Role::Regular).cloned();
         let regular = regular.zip(self.dark_of(&taken, Role::Regular));
         let mut stack = self.stack(taken)?;
-        let transport = self.solve(&stack, go_on)?;
+        let refused = |error: PlaneError| FoldError { fold: "demux".into(), what: error.to_string() };
+        let (demux, findings) = self
+            .demux()
+            .and_then(|planned| findings::find(&planned, self.prior_stated, &self.geometry, &mut stack))
+            .map_err(refused)?;
+        stack.timing = demux.timing().clone();
+        let valid = stack.valid.as_ref().map(|valid| valid.view());
+        let transport = demux.solve_while(stack.images.view(), valid, go_on).map_err(refused)?;
 
         let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![
@@ -240,6 +257,7 @@ impl Fold for DemuxFold {
             products.extend(self.check_regular(&regular.image, &light, &transport));
             stack.regular = Some(light);
         }
+        products.push(Product::Findings(Box::new(findings)));
         products.push(Product::Transport(Box::new(transport)));
         products.push(Product::Stack(Box::new(stack)));
         Ok(products)

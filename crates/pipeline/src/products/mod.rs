@@ -5,7 +5,7 @@ mod band;
 mod profile;
 mod relight;
 
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, Axis};
 use raysweep_transport::plane::{RowTiming, Setting, Transport};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
@@ -34,6 +34,17 @@ pub struct SweepStack {
     pub valid: Option<Array3<bool>>,
     /// One whole VSYNC period of exposure, `[t, s]`, where it was taken.
     pub regular: Option<Array2<f32>>,
+}
+
+impl SweepStack {
+    /// Keeps the images whose index `kept` says yes to.
+    pub(crate) fn keep(&mut self, kept: impl Fn(usize) -> bool) {
+        let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
+        self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
+        self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();
+        self.images = self.images.select(Axis(0), &kept);
+        self.valid = self.valid.as_ref().map(|valid| valid.select(Axis(0), &kept));
+    }
 }
 
 /// Why a product cannot be asked for.
