@@ -15,9 +15,11 @@
 //! borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
 
 mod cholesky;
+mod coupling;
 mod demux;
 mod error;
 mod forward;
+mod noise;
 mod pivot;
 mod prior;
 mod quadratic;
@@ -25,9 +27,11 @@ pub mod reference;
 mod timing;
 mod transport;
 
+pub use coupling::{Coupled, Coupling};
 pub use demux::Demux;
 pub use error::PlaneError;
 pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
+pub use noise::NoiseModel;
 pub use prior::Prior;
 pub use timing::{RowTiming, Setting, delay_us, offset_us};
 pub use transport::Transport;
