@@ -12,7 +12,8 @@
 //! ```
 //!
 //! [`RowTiming`] and [`Setting`] hold the quantities on the right, [`RowModel`] is `A` for one camera row with its
-//! borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
+//! borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`]. [`Coupling`] averages like pixels
+//! beforehand, under a [`NoiseModel`], and [`Uncertainty`] says what noise is left in the result.
 
 mod cholesky;
 mod coupling;
@@ -26,6 +27,7 @@ mod quadratic;
 pub mod reference;
 mod timing;
 mod transport;
+mod uncertainty;
 
 pub use coupling::{Coupled, Coupling};
 pub use demux::Demux;
@@ -35,3 +37,4 @@ pub use noise::NoiseModel;
 pub use prior::Prior;
 pub use timing::{RowTiming, Setting, delay_us, offset_us};
 pub use transport::Transport;
+pub use uncertainty::{Samples, Uncertainty};
