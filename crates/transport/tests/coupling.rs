@@ -267,6 +267,9 @@ fn the_noise_is_found_in_the_stack() {
         close(fit.read_variance, truth.read_variance) && close(fit.gain, truth.gain)
     };
     assert!(near(fit(&stack, &[1; 75]), camera_noise(), 0.06));
+    // With few settings, each sample is a good part of the total that it is scaled by.
+    let few = ideal_stack(&corner(), &paper_sweep()).slice(s![3..12, .., ..]).to_owned();
+    assert!(near(fit(&photographed_in(1, &few, 4), &[1; 9]), camera_noise(), 0.08));
     // Frames that were averaged, in different numbers.
     let frames: Vec<usize> = (0..SETTINGS).map(|n| 1 + n % 4).collect();
     let ideal = two_surfaces();

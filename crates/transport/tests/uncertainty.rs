@@ -24,9 +24,10 @@ fn camera_noise() -> NoiseModel {
     }
 }
 
-/// Epipolar image, non-epipolar image, and bands of short and long range.
-fn bands() -> [Vec<RangeInclusive<i32>>; 4] {
-    [vec![0..=0], vec![i32::MIN..=-1, 1..=i32::MAX], vec![1..=6], vec![-30..=-7]]
+/// Epipolar image, non-epipolar image, bands of short and long range, and all light.
+fn bands() -> [Vec<RangeInclusive<i32>>; 5] {
+    let all = i32::MIN..=i32::MAX;
+    [vec![0..=0], vec![i32::MIN..=-1, 1..=i32::MAX], vec![1..=6], vec![-30..=-7], vec![all]]
 }
 
 fn light(transport: &Transport, band: &[RangeInclusive<i32>]) -> Array2<f32> {
@@ -36,7 +37,7 @@ fn light(transport: &Transport, band: &[RangeInclusive<i32>]) -> Array2<f32> {
 
 /// 68 % of the deviations of repeated measurements from their mean are below this many predicted standard deviations,
 /// for each band. Of the corner's camera rows `rows`, the outer `margin` are left out.
-fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Coupling>) -> [f64; 4] {
+fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Coupling>) -> [f64; 5] {
     const REPEATS: u64 = 8;
     let ideal = ideal_stack(&corner(), &paper_sweep()).slice(s![.., rows.clone(), ..]).to_owned();
     let timing = timing().window(rows.start, rows.len()).unwrap();
@@ -86,7 +87,7 @@ fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Cou
 
 #[test]
 fn repeated_measurements_spread_as_predicted() {
-    // Measured: 0.99 to 1.15.
+    // Measured: 0.94 to 1.15.
     for (rows, frames) in [(62..64, 8), (20..22, 8), (62..64, 1)] {
         let spread = spread(rows.clone(), 0, frames, None);
         assert!(spread.iter().all(|spread| (0.85..1.2).contains(spread)), "{rows:?}, {frames}: {spread:?}");
@@ -95,7 +96,7 @@ fn repeated_measurements_spread_as_predicted() {
 
 #[test]
 fn coupled_measurements_spread_as_predicted() {
-    // Measured: 1.00 to 1.30; neighbours are chosen by the same noise that they are to average out.
+    // Measured: 0.98 to 1.30; neighbours are chosen by the same noise that they are to average out.
     for frames in [1, 8] {
         let spread = spread(56..66, 3, frames, Some(Coupling::default()));
         assert!(spread.iter().all(|spread| (0.8..1.4).contains(spread)), "{frames}: {spread:?}");
@@ -191,7 +192,7 @@ fn dark_pixels_are_certain_and_misfits_are_refused() {
         let of = Uncertainty { timing: &timing, settings: &settings, prior: Prior::SPLIT, noise, frames };
         of.of_bands(&transport, samples, &bands())
     };
-    assert_eq!(of(&[1; 75], &samples), Ok(Array3::zeros((4, 2, 3))));
+    assert_eq!(of(&[1; 75], &samples), Ok(Array3::zeros((5, 2, 3))));
     let other = Array3::<f32>::zeros((75, 2, 4));
     let misfit = Samples { stack: other.view(), ..samples };
     assert!(matches!(of(&[1; 75], &misfit), Err(PlaneError::Shape { array: "stack", .. })));
