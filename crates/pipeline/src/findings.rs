@@ -3,8 +3,8 @@
 
 use ndarray::Array3;
 use raysweep_transport::plane::calibrate::{
-    BeamEstimate, CalibrateError, Choice, OpticsEstimate, Sample, candidates, choose_prior, estimate_optics,
-    settings_on_direct_row,
+    BeamEstimate, CalibrateError, Choice, OpticsEstimate, Sample, beam_is_needed, candidates, choose_prior,
+    estimate_optics, settings_on_direct_row,
 };
 use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior};
 
@@ -86,8 +86,18 @@ fn calibrate(
     let valid = stack.valid.as_ref().map(|valid| valid.view());
     let sample = Sample::new(stack.timing.clone(), stack.settings.clone(), stack.images.view(), valid)?;
     let OpticsEstimate { mut optics, beam, spike } = estimate_optics(&sample, geometry.beam_sigma_rows)?;
+    let estimated = beam.is_some() && optics.beam_sigma_rows > 0.0;
+    if estimated && !beam_is_needed(&sample, &optics, &candidates())? {
+        let what = format!(
+            "taken as ideal: a width of {:.2} rows explains the images no better than light that spreads under the surface; state the rig's own in projector.beam_sigma_rows if it is known",
+            optics.beam_sigma_rows
+        );
+        findings.remarks.push(("beam", what));
+        optics.beam_sigma_rows = 0.0;
+    } else {
+        findings.remarks.push(("beam", say_beam(beam.as_ref(), optics.beam_sigma_rows)));
+    }
     let sigma_rows = optics.beam_sigma_rows;
-    findings.remarks.push(("beam", say_beam(beam.as_ref(), sigma_rows)));
     let beam = Beam::of_sigma(sigma_rows);
     let mut demux = planned.with_timing(stack.timing.clone().with_beam(beam)?)?;
     findings.beam_sigma_rows = sigma_rows;

@@ -117,6 +117,8 @@ fn default_stages() -> Vec<StageTable> {
     vec![StageTable { name: "demux".into(), options: Map::new() }]
 }
 
+/// Fewest frames of a dark image: its noise is in all images of its exposure, so it should hardly have any.
+const MIN_DARK_AVERAGE: u32 = 8;
 /// Most values along an axis.
 const MAX_AXIS: usize = 1024;
 /// Most points of a sweep.
@@ -186,7 +188,10 @@ impl Plan {
     /// the outer loop, because some cameras take long to change it.
     pub fn schedule(&self, period_us: f64) -> Schedule {
         let frames = self.sweep.average;
-        let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames };
+        let point = |role, delay_us, exposure_us| {
+            let frames = if matches!(role, Role::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+            Point { role, delay_us, exposure_us, frames }
+        };
         let exposures = self.sweep.exposure_us.values();
         let delays = self.sweep.delay_us.values();
 
