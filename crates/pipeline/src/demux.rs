@@ -255,6 +255,7 @@ impl Fold for DemuxFold {
             products.extend(self.check_regular(&regular.image, &light, &transport));
             stack.regular = Some(light);
         }
+        products.extend(findings.warnings.iter().cloned().map(Product::Warning));
         products.push(Product::Findings(Box::new(findings)));
         products.push(Product::Transport(Box::new(transport)));
         products.push(Product::Stack(Box::new(stack)));

@@ -11,9 +11,6 @@ const FOLDS: usize = 5;
 /// the logarithm of a perfect prediction finite.
 const LEAST_SQUARE: f64 = 1e-12;
 
-/// Standard errors by which a beam must predict better than none.
-const BEYOND_DOUBT: f64 = 2.0;
-
 /// A prior and how well it predicts images that it has not seen.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Candidate {
@@ -136,32 +133,6 @@ pub fn choose_prior(
         })
         .collect();
     Ok(Choice::new(curve))
-}
-
-/// Whether a stack needs a beam: a wide one is believed only if, with the first candidate, it predicts held-out settings
-/// better than every candidate does with an ideal beam, beyond doubt. Light that spreads under a surface looks like a
-/// beam to a prior that expects direct light, but not to one that expects smoothness.
-///
-/// # Errors
-/// Those of [`choose_prior`].
-pub fn beam_is_needed(
-    sample: &Sample,
-    optics: &Optics,
-    candidates: &[Prior],
-) -> Result<bool, CalibrateError> {
-    let sample = sample.thinned();
-    let folds = folds(&sample)?;
-    let first = candidates.first().ok_or(CalibrateError::NoCandidates)?;
-    let wide = log_residuals(&held_out(&sample, first, optics, &folds)?);
-    let ideal = Optics { beam_sigma_rows: 0.0, ..optics.clone() };
-    for prior in candidates {
-        let (log_ratio, standard_error) =
-            wide.ratio_to(&log_residuals(&held_out(&sample, prior, &ideal, &folds)?));
-        if log_ratio > -BEYOND_DOUBT * standard_error {
-            return Ok(false);
-        }
-    }
-    Ok(true)
 }
 
 /// Logarithms of mean squared held-out residuals: of each pixel, and of each fold's typical pixel.

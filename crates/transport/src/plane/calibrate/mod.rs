@@ -19,7 +19,7 @@ mod spot;
 
 pub use beam::{BeamEstimate, OpticsEstimate, beam_sigma, estimate_optics};
 pub use error::CalibrateError;
-pub use holdout::{Candidate, Choice, beam_is_needed, candidates, choose_prior};
+pub use holdout::{Candidate, Choice, candidates, choose_prior};
 pub use sample::{Optics, Sample};
 pub use spike::{SpikeMap, spike_offset};
 pub use spot::{Scan, settings_on_direct_row, spike_weights};
