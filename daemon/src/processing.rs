@@ -162,6 +162,7 @@ fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
         frames: entry.frames,
         exposure_us: entry.exposure_us,
         delays_us: entry.delays_us.clone(),
+        last_exposure_ns: None,
         sum: std::sync::Arc::new(sum),
         counts: entry.counts.clone(),
     }

@@ -6,6 +6,7 @@
 mod assembler;
 mod demux;
 mod edges;
+mod film;
 mod pipeline;
 mod queue;
 mod registry;
@@ -15,6 +16,7 @@ mod unit;
 
 pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
 pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
+pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use edges::{EdgeTracker, Line};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
 pub use queue::{Input, Policy, QueueError};

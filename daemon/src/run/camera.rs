@@ -194,6 +194,7 @@ impl Sequencer {
             applied,
             delay_us: point.delay_us,
             light_edges_later: shot.light_edges_later,
+            periods_from_last: None,
         };
         self.input.send(Event::Begin(job)).map_err(closed)?;
         self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
@@ -277,8 +278,8 @@ impl Sequencer {
     /// Only a frame that a point waits for is lost; the others are merely not looked at.
     fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
         let event = match label {
-            Label::Counted => Event::Lost(stamp, Some(cause)),
-            Label::Settling | Label::Cancelled => Event::Lost(stamp, None),
+            Label::Counted => Event::Lost(stamp.seq, Some(cause)),
+            Label::Settling | Label::Cancelled => Event::Lost(stamp.seq, None),
         };
         self.input.send(event).map_err(closed)?;
         Ok(Taken::Lost)
