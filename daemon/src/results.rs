@@ -53,7 +53,7 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
 }
 
 /// What every product says of itself.
-fn common(task: &Task) -> Map<String, Value> {
+pub(crate) fn common(task: &Task) -> Map<String, Value> {
     let geometry = &task.geometry;
     let prior = task.plan.stage.iter().find(|stage| stage.name == "demux");
     let entries = [

@@ -1,5 +1,7 @@
 //! The camera's thread: sets the camera for one point after the other and hands its frames on.
 
+mod film;
+
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
@@ -11,6 +13,7 @@ use raysweep_core::{
 };
 use raysweep_pipeline::{Event, Input, Job, Label, Point, QueueError, Shot, message_of};
 
+pub use self::film::{FilmPass, FilmSetting};
 use super::orders::{Order, Orders};
 use crate::rig::Pace;
 
@@ -32,6 +35,15 @@ pub struct Pass {
     pub attempts: Vec<Attempt>,
     /// Frames exposed earlier may still see the picture before.
     pub not_before_ns: i64,
+}
+
+/// What the camera is for until its next flush.
+#[derive(Debug, Clone)]
+pub enum Work {
+    /// Points, each until all its frames are there.
+    Pass(Pass),
+    /// A film.
+    Film(FilmPass),
 }
 
 /// Buffers for frames on their way to the assembler: more than it ever holds while it waits for edges.
@@ -57,7 +69,7 @@ pub struct Gone;
 
 /// The camera's thread as the run sees it.
 pub struct CameraThread {
-    passes: SyncSender<Pass>,
+    work: SyncSender<Work>,
     ended: Receiver<Ended>,
     thread: JoinHandle<()>,
 }
@@ -75,14 +87,14 @@ impl CameraThread {
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         camera.arm()?;
-        let (passes, todo) = sync_channel::<Pass>(1);
+        let (work, todo) = sync_channel::<Work>(1);
         let (done, ended) = sync_channel(1);
         let thread = thread::Builder::new()
             .name("camera".into())
             .spawn(move || {
                 let mut sequencer = Sequencer::new(camera, input, pace, period_us, orders);
-                for pass in todo {
-                    if done.send(sequencer.pass(&pass)).is_err() {
+                for work in todo {
+                    if done.send(sequencer.work(&work)).is_err() {
                         break;
                     }
                 }
@@ -91,16 +103,16 @@ impl CameraThread {
                 }
             })
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
-        Ok(Self { passes, ended, thread })
+        Ok(Self { work, ended, thread })
     }
 
-    /// Acquires a pass and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
+    /// Does some work and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
     /// at the pipeline's sink, also when the camera failed (the inner error).
     ///
     /// # Errors
     /// [`Gone`] when there will be no verdicts.
-    pub fn acquire(&self, pass: Pass) -> Result<Result<(), DeviceError>, Gone> {
-        self.passes.send(pass).map_err(|_closed| Gone)?;
+    pub fn acquire(&self, work: Work) -> Result<Result<(), DeviceError>, Gone> {
+        self.work.send(work).map_err(|_closed| Gone)?;
         match self.ended.recv() {
             Ok(Ended::Flushed(acquired)) => Ok(acquired),
             Ok(Ended::NotFlushed) | Err(_) => Err(Gone),
@@ -112,7 +124,7 @@ impl CameraThread {
     /// # Errors
     /// When the thread panicked.
     pub fn join(self) -> Result<(), DeviceError> {
-        drop(self.passes);
+        drop(self.work);
         self.thread.join().map_err(|panic| {
             let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
             DeviceError::new("camera", DeviceErrorKind::NotReady, what)
@@ -132,6 +144,13 @@ struct Sequencer {
     /// The longest that a frame has taken so far, from its edge to its last row.
     longest_frame_us: f64,
     period_us: f64,
+}
+
+/// A frame off the camera.
+struct Received {
+    stamp: FrameStamp,
+    /// Nothing where no buffer was free.
+    data: Option<FrameBuf>,
 }
 
 /// What became of one wait for a frame.
@@ -159,9 +178,12 @@ impl Sequencer {
         Self { camera, input, pace, pool, spare, orders, warmed_up: false, longest_frame_us: 0.0, period_us }
     }
 
-    /// Acquires a pass; always ends with a flush, so that nothing of it stays undecided.
-    fn pass(&mut self, pass: &Pass) -> Ended {
-        let acquired = self.attempts(pass);
+    /// Always ends with a flush, so that nothing stays undecided.
+    fn work(&mut self, work: &Work) -> Ended {
+        let acquired = match work {
+            Work::Pass(pass) => self.attempts(pass),
+            Work::Film(film) => self.film(film),
+        };
         match self.input.send(Event::Flush) {
             Ok(()) => Ended::Flushed(acquired),
             Err(_) => Ended::NotFlushed,
@@ -169,9 +191,7 @@ impl Sequencer {
     }
 
     fn attempts(&mut self, pass: &Pass) -> Result<(), DeviceError> {
-        let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
-        self.pass_frames(margin, pass.not_before_ns)?;
-        self.warmed_up = true;
+        self.warm_up(pass.not_before_ns)?;
         for attempt in &pass.attempts {
             if self.orders.now() == Order::Pause {
                 self.input.send(Event::Idle).map_err(closed)?;
@@ -183,6 +203,14 @@ impl Sequencer {
             self.attempt(attempt)?;
         }
         self.pass_frames(MARGIN_FRAMES, i64::MIN)
+    }
+
+    /// Lets frames go by until the line is known and the picture is in the light.
+    fn warm_up(&mut self, not_before_ns: i64) -> Result<(), DeviceError> {
+        let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
+        self.pass_frames(margin, not_before_ns)?;
+        self.warmed_up = true;
+        Ok(())
     }
 
     fn attempt(&mut self, attempt: &Attempt) -> Result<(), DeviceError> {
@@ -254,19 +282,24 @@ impl Sequencer {
     }
 
     fn take(&mut self, label: impl FnOnce(&FrameStamp) -> Label) -> Result<Taken, DeviceError> {
-        let room = match self.pace {
+        let Some(received) = self.receive()? else { return Ok(Taken::None) };
+        let label = label(&received.stamp);
+        self.hand_on(received, label)
+    }
+
+    /// Waits for a frame.
+    fn receive(&mut self) -> Result<Option<Received>, DeviceError> {
+        let mut data = match self.pace {
             Pace::Pipeline => Some(self.pool.take()),
             Pace::Devices => self.pool.try_take(),
         };
-        let Some(mut data) = room else {
-            let stamp = self.camera.next_frame(&mut self.spare, POLL)?;
-            return match stamp {
-                Some(stamp) => self.lose(stamp, label(&stamp), LossCause::PoolEmpty),
-                None => Ok(Taken::None),
-            };
-        };
-        let Some(stamp) = self.camera.next_frame(&mut data, POLL)? else { return Ok(Taken::None) };
-        let label = label(&stamp);
+        let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), POLL)?;
+        Ok(stamp.map(|stamp| Received { stamp, data }))
+    }
+
+    /// Gives a frame to the assembler, or notes that there was no room for it.
+    fn hand_on(&mut self, Received { stamp, data }: Received, label: Label) -> Result<Taken, DeviceError> {
+        let Some(data) = data else { return self.lose(stamp, label, LossCause::PoolEmpty) };
         let frame = Frame { data, format: self.camera.capabilities().format, stamp };
         match self.input.offer(Event::Frame(frame, label)) {
             Ok(()) => Ok(Taken::Passed(stamp, label)),

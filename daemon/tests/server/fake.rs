@@ -59,6 +59,7 @@ impl Fake {
             report,
             stored: 75 - missing,
             missing,
+            film: None,
             warnings: Vec::new(),
         });
     }
@@ -118,6 +119,7 @@ pub fn report() -> CheckReport {
         disk_free_bytes: 1 << 40,
         reach_rows: (-94, 94),
         condition: 1234.5,
+        film: None,
         warnings: vec!["few points".into()],
     }
 }
@@ -150,6 +152,7 @@ impl Control for Fake {
             session: Some(session()),
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
+            film: None,
             error: None,
         }
     }
