@@ -7,6 +7,7 @@ use raysweep_session::Session;
 use raysweep_session::stack::ArrayName;
 
 use crate::config::{Plan, RigFile};
+use crate::film;
 use crate::processing::Task;
 use crate::results;
 
@@ -34,9 +35,9 @@ pub enum ProcessError {
 pub struct Processed {
     /// The report.
     pub report: PathBuf,
-    /// Points of the sweep that went into it.
+    /// Points of the sweep, or cycles of the film, that went into it.
     pub stored: usize,
-    /// Points of the sweep.
+    /// All of them.
     pub points: usize,
     /// What could not be made, and why.
     pub problems: Vec<String>,
@@ -66,6 +67,18 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
     let mut processing = task
         .processing(&Registry::default(), &plan_text)
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
+    if task.is_film() {
+        let mut problems = film::process(&session, &task, state, &processing)?;
+        results::write_film_report(&session, state, &task, &problems)?;
+        results::write_manifest(&session, state, &task, &rig)?;
+        problems.append(&mut processing.problems);
+        return Ok(Processed {
+            report: session.report_path(),
+            stored: state.stored_points(),
+            points: shape.points,
+            problems,
+        });
+    }
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let (products, problems) = processing.finish(&|| true);
     results::write_products(&session, &task, &products)?;

@@ -8,6 +8,7 @@ use raysweep_session::{Result, Session, manifest, transport};
 use serde_json::{Map, Value, json};
 
 use crate::config::RigFile;
+use crate::film;
 use crate::processing::Task;
 use crate::report;
 
@@ -89,6 +90,15 @@ pub fn write_report(
     problems: &[String],
 ) -> Result<()> {
     let page = report::make(session, state, task, products, problems)?.to_html()?;
+    raysweep_session::durable::write(&session.report_path(), page.as_bytes())
+}
+
+/// Writes the report of a film.
+///
+/// # Errors
+/// When its transports cannot be read or the disk refuses.
+pub fn write_film_report(session: &Session, state: &State, task: &Task, problems: &[String]) -> Result<()> {
+    let page = film::make_report(session, state, task, problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())
 }
 

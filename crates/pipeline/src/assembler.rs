@@ -333,7 +333,8 @@ impl Assembler {
     /// Adds a sound frame to the sum, or notes why it does not count.
     fn count(&mut self, frame: &Frame, verdict: Verdict) {
         self.follow(frame.stamp.seq);
-        let Some(periods_per_frame) = self.attempt.as_ref().map(|attempt| self.periods_per_frame(&attempt.job))
+        let Some(periods_per_frame) =
+            self.attempt.as_ref().map(|attempt| self.periods_per_frame(&attempt.job))
         else {
             return;
         };

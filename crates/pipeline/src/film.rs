@@ -1,5 +1,7 @@
 //! Films: a short sweep, one frame a setting, again and again without pause; each cycle has its own light transport.
 
+use std::sync::Arc;
+
 use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
 use raysweep_transport::plane::{Demux, Setting, Transport};
@@ -64,14 +66,14 @@ pub struct FilmFrame {
     /// Start of the exposure of row 0, on the host's clock.
     pub exposure_start_ns: i64,
     /// Raw counts, `[t, s]`.
-    pub raw: std::sync::Arc<Array2<u32>>,
+    pub raw: Arc<Array2<u32>>,
     /// Counts after all stages, `[t, s]`; nothing where a stage failed.
-    pub image: Option<Array2<f32>>,
+    pub image: Option<Arc<Array2<f32>>>,
 }
 
 impl FilmFrame {
     /// The only frame of a film's unit, with its image after all stages.
-    pub fn of(unit: &Unit, image: Option<Array2<f32>>) -> Option<Self> {
+    pub fn of(unit: &Unit, image: Option<Arc<Array2<f32>>>) -> Option<Self> {
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
         let exposure_start_ns = unit.last_exposure_ns?;
         Some(Self { setting, exposure_start_ns, raw: unit.sum.clone(), image })
@@ -144,7 +146,7 @@ impl FilmSolver {
     /// When a frame's delay makes no model, or `go_on` said no.
     pub fn solve(
         &self,
-        frames: &[(Setting, Array2<f32>)],
+        frames: &[(Setting, Arc<Array2<f32>>)],
         dark: &Array2<f32>,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, FoldError> {
@@ -159,7 +161,7 @@ impl FilmSolver {
             if let Some(valid) = &mut valid {
                 valid.index_axis_mut(Axis(0), index).assign(&image.mapv(is_valid));
             }
-            stack.index_axis_mut(Axis(0), index).assign(&((image - dark) * scale));
+            stack.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * scale));
         }
         let settings = frames.iter().map(|(setting, _)| setting.clone()).collect();
         self.demux
@@ -236,9 +238,8 @@ mod tests {
                 };
                 let periods = |order: &[usize]| -> u32 {
                     let next = order.iter().cycle().skip(1);
-                    let between = |(&a, &b): (&usize, &usize)| {
-                        camera.periods_between(&shots[a], &shots[b], PERIOD_US)
-                    };
+                    let between =
+                        |(&a, &b): (&usize, &usize)| camera.periods_between(&shots[a], &shots[b], PERIOD_US);
                     order.iter().zip(next).map(between).sum()
                 };
                 let (mut fewest, mut smallest) = (u32::MAX, f64::INFINITY);

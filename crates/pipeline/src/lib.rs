@@ -16,8 +16,8 @@ mod unit;
 
 pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
 pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
-pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use edges::{EdgeTracker, Line};
+pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
 pub use queue::{Input, Policy, QueueError};
 pub use registry::{Entry, Registry, RegistryError};

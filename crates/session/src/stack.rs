@@ -192,12 +192,7 @@ impl Stack {
                 allowed: format!("{:?}", [self.shape.rows, self.shape.columns]),
             });
         }
-        zarr::write_chunk(
-            stored,
-            [index as u64, 0, 0],
-            self.shape.shard(),
-            data.insert_axis(Axis(0)),
-        )?;
+        zarr::write_chunk(stored, [index as u64, 0, 0], self.shape.shard(), data.insert_axis(Axis(0)))?;
         Ok(crc32(data))
     }
 

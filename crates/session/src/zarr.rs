@@ -127,11 +127,7 @@ pub(crate) fn create_array(
 }
 
 /// Opens an array of so many axes.
-pub(crate) fn open_array(
-    store: &Arc<DurableStore>,
-    name: &str,
-    axes: usize,
-) -> Result<Array<DurableStore>> {
+pub(crate) fn open_array(store: &Arc<DurableStore>, name: &str, axes: usize) -> Result<Array<DurableStore>> {
     let path = store.root().join(name);
     let array = Array::open(store.clone(), &format!("/{name}")).map_err(Error::zarr("open", &path))?;
     if array.shape().len() != axes {

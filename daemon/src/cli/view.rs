@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use raysweep_proto::{Event, Progress, RunState};
+use raysweep_proto::{Event, FilmEstimate, Progress, RunState};
 
 use super::show;
 
@@ -56,8 +56,9 @@ impl View {
                 let lost = show::losses(counts);
                 self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
+            Event::Film(estimate) => self.film(estimate),
             Event::Vsync(_) => {}
-            Event::Finished { session, state, error, report, stored, missing, warnings } => {
+            Event::Finished { session, state, error, report, stored, missing, film, warnings } => {
                 if let Self::Bar(bar) = self {
                     bar.finish_and_clear();
                 }
@@ -67,7 +68,10 @@ impl View {
                 for warning in warnings {
                     self.note(&format!("warning: {warning}"));
                 }
-                let summary = show::ending(session, state, report.as_deref(), *stored, *missing);
+                let summary = match film {
+                    Some(film) => show::film_ending(session, state, report.as_deref(), film),
+                    None => show::ending(session, state, report.as_deref(), *stored, *missing),
+                };
                 writeln!(io::stdout(), "{summary}")?;
             }
             Event::Skipped { events } => {
@@ -89,6 +93,13 @@ impl View {
         match self {
             Self::Bar(bar) => bar.set_prefix(show::state(state)),
             _ => self.note(show::state(state)),
+        }
+    }
+
+    fn film(&mut self, estimate: &FilmEstimate) {
+        // Lines would be too many; how the film goes stands in the bar and in `raysweep status`.
+        if let Self::Bar(bar) = self {
+            bar.set_message(show::film(&estimate.film));
         }
     }
 

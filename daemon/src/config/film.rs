@@ -28,12 +28,7 @@ const DENSE_US: [f64; 15] = [
 
 impl Default for FilmPlan {
     fn default() -> Self {
-        Self {
-            delay_us: Axis::List(DENSE_US.to_vec()),
-            exposure_us: 600.0,
-            cycles: 240,
-            max_jitter_us: 50.0,
-        }
+        Self { delay_us: Axis::List(DENSE_US.to_vec()), exposure_us: 600.0, cycles: 240, max_jitter_us: 50.0 }
     }
 }
 
@@ -62,7 +57,8 @@ impl FilmPlan {
             return refused("delay_us", message);
         }
         if !(self.exposure_us > 0.0 && self.exposure_us.is_finite()) {
-            let message = format!("film.exposure_us = {}: give microseconds greater than 0", self.exposure_us);
+            let message =
+                format!("film.exposure_us = {}: give microseconds greater than 0", self.exposure_us);
             return refused("exposure_us", message);
         }
         if !(1..=MAX_CYCLES).contains(&self.cycles) {

@@ -15,7 +15,7 @@ use crate::processing::Task;
 use crate::results;
 
 pub use process::process;
-pub use report::make as make_report;
+pub use report::{make as make_report, shortcomings};
 
 /// How the settings of a film's cycle are taken on a camera.
 pub struct CyclePlan {

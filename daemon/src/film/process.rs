@@ -50,7 +50,7 @@ pub fn process(
             |((frame, (ordinal, _)), &delay_us)| {
                 let unit = frame_unit(ordinal, entry, delay_us, frame.mapv(u32::from));
                 let setting = Setting::new(delay_us, entry.exposure_us);
-                run_stages(&processing.stages, &unit).map(|image| (setting, image))
+                run_stages(&processing.stages, &unit).map(|image| (setting, Arc::new(image)))
             },
         );
         let solved = images

@@ -61,7 +61,10 @@ pub fn shortcomings(state: &State) -> Vec<String> {
 
 fn facts(state: &State, task: &Task) -> Vec<(String, String)> {
     let delays = task.plan.film.delay_us.values();
-    let (first, last) = (delays.iter().fold(f64::INFINITY, |a, &b| a.min(b)), delays.iter().fold(f64::NEG_INFINITY, |a, &b| a.max(b)));
+    let (first, last) = (
+        delays.iter().fold(f64::INFINITY, |a, &b| a.min(b)),
+        delays.iter().fold(f64::NEG_INFINITY, |a, &b| a.max(b)),
+    );
     let per_second = state.film.as_ref().and_then(|film| film.cycles_per_s);
     [
         ("delay", format!("{first:.0} … {last:.0} µs in {}", delays.len())),
@@ -144,7 +147,8 @@ fn pace(state: &State) -> Section {
     };
     Section {
         title: "Pace".into(),
-        intro: "Latency runs from the end of a cycle's last exposure to the publication of its transport.".into(),
+        intro: "Latency runs from the end of a cycle's last exposure to the publication of its transport."
+            .into(),
         blocks: vec![
             Block::Facts(entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()),
             Block::Plots(vec![plot]),

@@ -3,6 +3,7 @@
 mod board;
 mod camera;
 mod engine;
+mod film;
 mod orders;
 mod storage;
 mod vsync;
@@ -21,14 +22,15 @@ use raysweep_proto::{
 };
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger, SessionEntry};
-use raysweep_session::stack::{ArrayName, StackShape};
+use raysweep_session::stack::StackShape;
 use tokio::sync::broadcast;
 
 use self::board::{Board, WrongState};
 use self::engine::{Acquired, Run, RunError};
+pub use self::film::Views;
 use self::orders::{Order, Orders};
 use crate::check;
-use crate::config::{ConfigError, Plan};
+use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
 use crate::processing::Task;
 use crate::results;
@@ -45,6 +47,8 @@ pub struct Runner {
     current: Mutex<Option<Current>>,
     /// Set once, when no further run may begin.
     closed: AtomicBool,
+    /// Where a film's views are shown.
+    views: Option<Arc<dyn Views>>,
 }
 
 /// The run under way, or the last one.
@@ -78,7 +82,15 @@ impl Runner {
             board: Arc::new(Board::new("plane")),
             current: Mutex::default(),
             closed: AtomicBool::new(false),
+            views: None,
         })
+    }
+
+    /// Shows the views of films there.
+    #[must_use]
+    pub fn with_views(mut self, views: Arc<dyn Views>) -> Self {
+        self.views = Some(views);
+        self
     }
 
     /// The rig's camera.
@@ -162,6 +174,7 @@ impl Runner {
             resumed,
             orders: orders.clone(),
             board: self.board.clone(),
+            views: self.views.clone(),
         };
         let board = self.board.clone();
         let thread = thread::Builder::new()
@@ -197,7 +210,7 @@ impl Runner {
         let entry = SessionEntry {
             format: raysweep_session::ledger::FORMAT,
             name: task.plan.name.clone(),
-            kind: "sweep".into(),
+            kind: if task.is_film() { "film" } else { "sweep" }.into(),
             operator: params.operator.clone(),
             sample: params.sample.clone(),
             note: params.note.clone(),
@@ -205,7 +218,8 @@ impl Runner {
             created: jiff::Timestamp::now(),
             software: crate::SOFTWARE.into(),
             shape: StackShape {
-                points: task.schedule.sweep_len(),
+                points: task.points(),
+                settings: if task.is_film() { task.settings().count() } else { 0 },
                 exposures: task.schedule.dark_len(),
                 rows: self.camera.height,
                 columns: self.camera.width,
@@ -234,6 +248,12 @@ impl Runner {
             )));
         }
         let plan = Plan::parse(&plan_text).map_err(|error| invalid_plan(&error))?;
+        if plan.kind == PlanKind::Film {
+            return Err(no_session(format!(
+                "{} is a film, which cannot be resumed: its time has passed. `raysweep process` makes the transports of the cycles that are there; run the plan again for another film",
+                session.dir().display()
+            )));
+        }
         let ledger = session.resume().map_err(|error| storage(&error))?;
         let entry = &ledger.state().session;
         let task = Task::new(plan, &self.rig.file, entry.first_row, (entry.shape.rows, entry.shape.columns));
@@ -248,13 +268,14 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
     tracing::info!(session = %dir.display(), resumed = run.resumed, "run begins");
     let ended = catch_unwind(AssertUnwindSafe(|| -> Result<(EndEntry, Vec<String>), RunError> {
         let acquired = run.acquire()?;
+        let conclude = if task.is_film() { conclude_film } else { conclude };
         conclude(acquired, &task, &rig, orders)
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
     let (end, warnings) = ended.unwrap_or_else(|error| {
-        let points = task.schedule.sweep_len();
+        let points = task.points();
         let stored = Session::open(dir).and_then(|session| session.state());
-        let stored = stored.map_or(0, |state| state.stored(ArrayName::Sum).count());
+        let stored = stored.map_or(0, |state| state.stored_points());
         let error = Some(error.to_string());
         let end = EndEntry { state: EndState::Faulted, error, stored, missing: points - stored, vsync: None };
         (end, Vec::new())
@@ -273,6 +294,7 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
         report: report.exists().then_some(report),
         stored: end.stored,
         missing: end.missing,
+        film: board.status().film,
         warnings,
     };
     if board.status().state != RunState::Draining && state == RunState::Idle {
@@ -290,7 +312,7 @@ fn conclude(
     orders: &Orders,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
     let Acquired { session, mut ledger, processing, vsync, fault } = acquired;
-    let whole = fault.is_none() && engine::missing(&task.schedule, ledger.state()).is_empty();
+    let whole = fault.is_none() && engine::missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let results = whole.then(|| processing.finish(&|| orders.go_on()));
     let computed_s = began.elapsed().as_secs_f64();
@@ -300,12 +322,12 @@ fn conclude(
         (None, Some(_)) => EndState::Complete,
         (None, None) => EndState::Faulted,
     };
-    let stored = ledger.state().stored(ArrayName::Sum).count();
+    let stored = ledger.state().stored_points();
     let end = EndEntry {
         state,
         error: fault.map(|fault| fault.to_string()),
         stored,
-        missing: task.schedule.sweep_len() - stored,
+        missing: task.points() - stored,
         vsync,
     };
     if let (EndState::Complete, Some((products, problems))) = (state, &results) {
@@ -323,6 +345,32 @@ fn conclude(
         problems
     });
     Ok((end, warnings))
+}
+
+/// Writes a film's report: its transports are there already, so one that was ended early is as good as a short one.
+fn conclude_film(
+    acquired: Acquired,
+    task: &Task,
+    rig: &Rig,
+    orders: &Orders,
+) -> Result<(EndEntry, Vec<String>), RunError> {
+    let Acquired { session, mut ledger, processing, vsync, fault } = acquired;
+    let state = match &fault {
+        Some(_) => EndState::Faulted,
+        None if orders.now() == Order::Cancel => EndState::Cancelled,
+        None => EndState::Complete,
+    };
+    let stored = ledger.state().stored_points();
+    let error = fault.map(|fault| fault.to_string());
+    let end = EndEntry { state, error, stored, missing: task.points() - stored, vsync };
+    ledger.append(&Entry::End(end.clone()))?;
+    let mut problems = processing.problems;
+    if state != EndState::Faulted {
+        results::write_film_report(&session, ledger.state(), task, &problems)?;
+        results::write_manifest(&session, ledger.state(), task, &rig.file)?;
+    }
+    problems.extend(crate::film::shortcomings(ledger.state()));
+    Ok((end, problems))
 }
 
 impl Control for Runner {

@@ -59,7 +59,8 @@ mod tests {
     #[test]
     fn a_motion_goes_there_and_back_through_every_key() {
         let motion = Motion::new(4, 8.0);
-        let keys: Vec<usize> = (0..16).map(|second| motion.key(second * 1_000_000_000 + 500_000_000)).collect();
+        let keys: Vec<usize> =
+            (0..16).map(|second| motion.key(second * 1_000_000_000 + 500_000_000)).collect();
         assert_eq!(keys, [0, 1, 2, 3, 3, 2, 1, 0, 0, 1, 2, 3, 3, 2, 1, 0]);
         assert_eq!(motion.key(-500_000_000), 0, "clocks may read anything");
         assert_eq!(Motion::new(1, 4.0).key(1_234_567), 0);
