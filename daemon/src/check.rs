@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point, Role};
+use raysweep_pipeline::{DemuxFold, Point, ProductSpec, Role};
 use raysweep_proto::{CheckReport, FilmCheck};
 use raysweep_session::durable;
 
@@ -14,11 +14,16 @@ use crate::processing::Task;
 /// Condition number from which on noise is amplified more than the prior can hold.
 const ILL_CONDITIONED: f64 = 1e9;
 
-/// Foresees a task whose session will lie in `data`.
+/// Foresees a task that makes `products` and whose session will lie in `data`.
 ///
 /// # Errors
 /// When the plan makes no model on this rig.
-pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<CheckReport, ConfigError> {
+pub fn check(
+    task: &Task,
+    products: &[ProductSpec],
+    camera: &CameraCapabilities,
+    data: &Path,
+) -> Result<CheckReport, ConfigError> {
     let no_model = |message: String| ConfigError { message, field: Some("sweep".into()), span: None };
     let options = task.demux_options()?;
     let geometry = &task.geometry;
@@ -35,8 +40,14 @@ pub fn check(task: &Task, camera: &CameraCapabilities, data: &Path) -> Result<Ch
     let pixels = (geometry.height * geometry.width) as u64;
     let reach_rows = reach.clone().count() as u64;
     // The stack twice while it changes hands, where pixels are valid, the transport and its copy on the way to the disk.
-    let mut memory_bytes = pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows);
-    let mut disk_bytes = pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows) + 10_000_000;
+    let images = products.iter().map(|product| product.images(geometry) as u64);
+    // Each image once, the largest sequence twice more: as EXR's channels and as the file's bytes.
+    let product_images = images.clone().sum::<u64>() + 2 * images.clone().max().unwrap_or(0);
+    let mut memory_bytes =
+        pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows + 4 * product_images);
+    let files = 2 * images.sum::<u64>();
+    let mut disk_bytes =
+        pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows + files) + 10_000_000;
     let existing = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
     let disk_free_bytes = durable::available_bytes(existing).unwrap_or(u64::MAX);
 

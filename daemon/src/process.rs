@@ -6,7 +6,7 @@ use raysweep_pipeline::Registry;
 use raysweep_session::Session;
 use raysweep_session::stack::ArrayName;
 
-use crate::config::{Plan, RigFile};
+use crate::config::{Plan, RigFile, append_argument};
 use crate::film;
 use crate::processing::Task;
 use crate::results;
@@ -20,6 +20,9 @@ pub enum ProcessError {
     /// Its plan or rig file cannot be read.
     #[error("{0}")]
     Config(String),
+    /// A product that was asked for cannot be had.
+    #[error("{0}")]
+    Product(String),
     /// A file cannot be copied.
     #[error("cannot copy to {}: {source}", path.display())]
     Copy {
@@ -43,11 +46,28 @@ pub struct Processed {
     pub problems: Vec<String>,
 }
 
+/// Products that are asked for beside a session's plan.
+#[derive(Debug, Clone, Default)]
+pub struct Asked {
+    /// The keys of a `[[product]]` each, with commas between them.
+    pub products: Vec<String>,
+    /// Whether the plan's own products are left as they lie there.
+    pub only: bool,
+}
+
 /// Makes the products of a session again, with the plan and the rig file that lie in it: the same bits as the run's.
 ///
 /// # Errors
 /// When the session is being written by a run, or cannot be read.
 pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
+    process_asked(dir, &Asked::default())
+}
+
+/// [`process`], and products that the plan does not name. Files of products that are not made now stay.
+///
+/// # Errors
+/// Those of [`process`]; and when a product cannot be had of this session, before anything is written.
+pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessError> {
     let session = Session::open(dir)?;
     let ledger = session.resume()?;
     let read = |path: PathBuf| {
@@ -67,6 +87,13 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
     let mut processing = task
         .processing(&Registry::default(), &plan_text)
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
+    if asked.only {
+        processing.products.clear();
+    }
+    for argument in &asked.products {
+        append_argument(&mut processing.products, argument, &task.schedule, &task.geometry)
+            .map_err(ProcessError::Product)?;
+    }
     if task.is_film() {
         let mut problems = film::process(&session, &task, state, &processing)?;
         results::write_film_report(&session, state, &task, &problems)?;
@@ -81,6 +108,7 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
     }
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let (products, problems) = processing.finish(&|| true);
+    results::write_transport(&session, &task, &products)?;
     results::write_products(&session, &task, &products)?;
     results::write_report(&session, state, &task, &products, &problems)?;
     results::write_manifest(&session, state, &task, &rig)?;

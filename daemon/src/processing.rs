@@ -6,8 +6,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    DemuxOptions, Entry, FilmSolver, Fold, Point, Product, Registry, RegistryError, Role, Schedule, Stage,
-    SweepGeometry, Unit, message_of, run_stages,
+    DemuxOptions, Entry, FilmSolver, Fold, Point, Product, ProductSpec, Registry, RegistryError, Role,
+    Schedule, Snapshot, Stage, SweepGeometry, Unit, message_of, run_stages,
 };
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::{ArrayName, Stack, crc32};
@@ -36,7 +36,12 @@ impl Task {
         let schedule = plan.schedule(rig.vsync.period_us);
         let geometry = SweepGeometry {
             raster: rig.raster(),
+            row_table_us: rig.projector.row_table.as_deref().map(Into::into),
+            beam_sigma_rows: rig.projector.beam_sigma_rows,
+            spot: rig.projector.spot(),
             first_row,
+            row_pitch: rig.camera.row_pitch,
+            camera_row_time_us: rig.camera_row_time_us(),
             height: size.0,
             width: size.1,
             white_dn: rig.camera.white_dn(),
@@ -88,12 +93,13 @@ impl Task {
         })
     }
 
-    /// The stages and folds that the plan names; of a film, the stages alone.
+    /// The stages, folds and products that the plan names; of a film, the stages alone.
     ///
     /// # Errors
-    /// With the place in the plan's text of the stage that cannot be made.
+    /// With the place in the plan's text of the stage or product that cannot be made.
     pub fn processing(&self, registry: &Registry, plan_text: &str) -> Result<Processing, ConfigError> {
-        let mut processing = Processing { stages: Vec::new(), folds: Vec::new(), problems: Vec::new() };
+        let mut processing =
+            Processing { stages: Vec::new(), folds: Vec::new(), products: Vec::new(), problems: Vec::new() };
         for (index, stage) in self.plan.stage.iter().enumerate() {
             let place = index.to_string();
             let refused = |message: String| ConfigError::at(plan_text, &["stage", &place, "name"], message);
@@ -118,16 +124,33 @@ impl Task {
                 Entry::Fold(fold) => processing.folds.push(fold),
             }
         }
+        // After the folds, which refuse a rig that no product could be made on.
+        processing.products = self.products(plan_text)?;
         Ok(processing)
+    }
+
+    fn products(&self, plan_text: &str) -> Result<Vec<ProductSpec>, ConfigError> {
+        let Some(tables) = &self.plan.product else { return Ok(ProductSpec::defaults()) };
+        if !tables.is_empty() && !self.plan.stage.iter().any(|stage| stage.name == "demux") {
+            let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";
+            return Err(ConfigError::at(plan_text, &["product"], what));
+        }
+        let mut specs = Vec::new();
+        for (index, table) in tables.iter().enumerate() {
+            table.append_to(&mut specs, plan_text, index, &self.schedule, &self.geometry)?;
+        }
+        Ok(specs)
     }
 }
 
-/// The stages and folds of a plan.
+/// The stages, folds and products of a plan.
 pub struct Processing {
     /// Work on each unit alone.
     pub stages: Vec<Box<dyn Stage>>,
     /// Work on all units in order.
     pub folds: Vec<Box<dyn Fold>>,
+    /// What is made of the transport of the folds.
+    pub products: Vec<ProductSpec>,
     /// What could not be done so far, and why.
     pub problems: Vec<String>,
 }
@@ -179,7 +202,14 @@ impl Processing {
         });
     }
 
-    /// The products of all folds, and everything that could not be done. Ends early soon after `go_on` says no.
+    /// What the first fold that estimates while units come has so far.
+    pub fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
+        // A picture for between is no reason to lose a fold, let alone the run.
+        self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
+    }
+
+    /// The products of all folds and those that the plan names, and everything that could not be done. Ends early soon
+    /// after `go_on` says no.
     pub fn finish(mut self, go_on: &(dyn Fn() -> bool + Sync)) -> (Vec<Product>, Vec<String>) {
         let mut products = Vec::new();
         for fold in &mut self.folds {
@@ -189,7 +219,31 @@ impl Processing {
                 Err(panic) => self.problems.push(panicked(fold.name(), &*panic)),
             }
         }
+        products.extend(self.make_named(&products, go_on));
+        products.retain(|product| !matches!(product, Product::Stack(_)));
         (products, self.problems)
+    }
+
+    /// The products that the plan names, if the folds have made what they are made of.
+    fn make_named(&mut self, made: &[Product], go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
+        let transport = made.iter().find_map(|product| match product {
+            Product::Transport(transport) => Some(&**transport),
+            _ => None,
+        });
+        let stack = made.iter().find_map(|product| match product {
+            Product::Stack(stack) => Some(&**stack),
+            _ => None,
+        });
+        let Some((transport, stack)) = transport.zip(stack) else { return Vec::new() };
+        let mut products = Vec::new();
+        for spec in self.products.iter().take_while(|_| go_on()) {
+            match catch_unwind(AssertUnwindSafe(|| spec.make(stack, transport))) {
+                Ok(Ok(product)) => products.push(product),
+                Ok(Err(error)) => self.problems.push(error.to_string()),
+                Err(panic) => self.problems.push(panicked(spec.name(), &*panic)),
+            }
+        }
+        products
     }
 }
 

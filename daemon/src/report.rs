@@ -1,9 +1,11 @@
 //! The report of a sweep: what was taken, what came out, and how far to trust it.
 
+mod products;
+
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, ArrayView2, Axis};
-use raysweep_pipeline::{PREDICTED_SHARE, Product, Role};
+use raysweep_pipeline::{PREDICTED_SHARE, Product, Role, Spot, SweepGeometry};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
     Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table,
@@ -48,8 +50,10 @@ pub fn make(
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
     if let Some(transport) = transport {
-        sections.push(images(products, transport, &markers));
+        sections.extend(products::images(products, &markers));
         sections.push(profiles(&sweep, transport, &markers)?);
+        sections.extend(products::sequences(products));
+        sections.extend(products::profiles(products));
     }
     sections.push(sweep.contact_sheet()?);
     sections.push(trust(state, task, products));
@@ -122,35 +126,6 @@ fn mark(transport: &Transport) -> Vec<Marker> {
         }
     }
     markers
-}
-
-fn images(products: &[Product], transport: &Transport, markers: &[Marker]) -> Section {
-    let mut pictures = Vec::new();
-    for wanted in ["regular", "epipolar", "non_epipolar"] {
-        for product in products {
-            if let Product::Image { name, about, image } = product
-                && *name == wanted
-            {
-                pictures.push(
-                    picture(image, &format!("{}: {about}", name.replace('_', "-")))
-                        .with_markers(markers.to_vec()),
-                );
-            }
-        }
-    }
-    let short = transport.band(-10..=10) - transport.epipolar(1);
-    let long = transport.non_epipolar(21);
-    pictures.push(picture(&short, "short range: light from 1 to 10 rows away"));
-    pictures.push(picture(&long, "long range: light from more than 10 rows away"));
-    Section {
-        title: "Light by where it came from".into(),
-        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below.".into(),
-        blocks: vec![Block::Pictures(pictures)],
-    }
-}
-
-fn picture(image: &Array2<f32>, caption: &str) -> Picture {
-    Picture::grey(image.view(), ToneMap::percentile(&[image.view()], PERCENTILE)).with_caption(caption)
 }
 
 fn profiles(sweep: &SweepImages<'_>, transport: &Transport, markers: &[Marker]) -> Result<Section> {
@@ -397,14 +372,40 @@ pub(crate) fn settings(state: &State, task: &Task) -> Block {
     });
     let entries = [
         ("stages", stages.collect::<Vec<_>>().join(", ")),
-        ("row time", format!("{} µs", geometry.raster.row_time_us)),
+        ("row time", row_times(geometry)),
+        ("beam", beam(geometry)),
         ("first row after VSYNC", format!("{} µs", geometry.raster.first_row_us)),
         (
             "projector rows",
-            format!("{}, the camera's first sees row {}", geometry.raster.rows, geometry.first_row),
+            format!(
+                "{}, the camera's first sees row {}, each of its rows {} further",
+                geometry.raster.rows, geometry.first_row, geometry.row_pitch
+            ),
         ),
         ("white", format!("{} counts above black", geometry.white_dn)),
         ("software", state.session.software.clone()),
     ];
     Block::Facts(entries.map(|(key, value)| (key.to_owned(), value)).to_vec())
+}
+
+/// When rows are lit and exposed, as the model takes it.
+fn row_times(geometry: &SweepGeometry) -> String {
+    let table = if geometry.row_table_us.is_some() { ", by the measured table" } else { "" };
+    format!(
+        "projector {} µs{table}, camera {:.4} µs",
+        geometry.raster.row_time_us, geometry.camera_row_time_us
+    )
+}
+
+/// How a row's light spreads in space and time, as the model takes it.
+fn beam(geometry: &SweepGeometry) -> String {
+    let spot = match geometry.spot {
+        Spot::Uniform => "rows lit evenly",
+        Spot::Flying(_) => "a flying spot, modelled as rows lit evenly",
+    };
+    match geometry.beam_sigma_rows {
+        Some(0.0) => format!("ideal, {spot}"),
+        Some(sigma_rows) => format!("sigma {sigma_rows} rows, {spot}"),
+        None => format!("not stated by the rig, {spot}"),
+    }
 }

@@ -21,7 +21,31 @@ pub fn name_of(state: EndState) -> &'static str {
     }
 }
 
-/// Writes images (EXR, NPY) and the transport (NPY, Zarr).
+/// Writes the transport, as NPY and Zarr at the same time: somebody may be waiting for it.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write_transport(session: &Session, task: &Task, products: &[Product]) -> Result<()> {
+    for product in products {
+        let Product::Transport(found) = product else { continue };
+        let mut metadata = common(task);
+        metadata.insert("axes".into(), json!(["u", "t", "s"]));
+        metadata.insert("u_min".into(), json!(found.u_min));
+        metadata.insert("u_max".into(), json!(found.u_max()));
+        metadata.insert(
+            "about".into(),
+            json!("light from projector row v = u + round(first_row + row_pitch t) to camera pixel (t, s); 0 where the projector has no such row"),
+        );
+        let (npy, zarr) = rayon::join(
+            || session.products().volume("transport", found.t.view(), &metadata),
+            || transport::write(&session.transport_path(), found.t.view(), &metadata),
+        );
+        npy.and(zarr)?;
+    }
+    Ok(())
+}
+
+/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY).
 ///
 /// # Errors
 /// When the disk refuses.
@@ -35,19 +59,28 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 metadata.insert("about".into(), json!(about));
                 files.image(name, image.view(), &metadata)?;
             }
-            Product::Transport(found) => {
+            Product::Sequence { name, about, axis, at, images } => {
+                let layers: Vec<String> = (0..at.len()).map(|k| format!("k{k:04}")).collect();
                 let mut metadata = common(task);
-                metadata.insert("axes".into(), json!(["u", "t", "s"]));
-                metadata.insert("u_min".into(), json!(found.u_min));
-                metadata.insert("u_max".into(), json!(found.u_max()));
-                metadata.insert(
-                    "about".into(),
-                    json!("light from projector row v = t + first_row + u to camera pixel (t, s); 0 where the projector has no such row"),
-                );
-                files.volume("transport", found.t.view(), &metadata)?;
-                transport::write(&session.transport_path(), found.t.view(), &metadata)?;
+                metadata.insert("axes".into(), json!(["k", "t", "s"]));
+                metadata.insert("about".into(), json!(about));
+                metadata.insert("k".into(), json!({ "is": axis, "at": at }));
+                metadata.insert("layers".into(), json!(layers));
+                files.sequence(name, images.view(), &layers, &metadata)?;
             }
-            Product::Figure { .. } | Product::Warning(_) => {}
+            Product::Profile(profile) => {
+                let columns = profile.columns();
+                let mut metadata = common(task);
+                metadata.insert("axes".into(), json!(["delay", "column"]));
+                metadata.insert("about".into(), json!(profile.about));
+                metadata.insert("exposure_us".into(), json!(profile.exposure_us));
+                metadata.insert(
+                    "columns".into(),
+                    json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()),
+                );
+                files.table(&profile.name, &columns, &metadata)?;
+            }
+            Product::Transport(_) | Product::Stack(_) | Product::Figure { .. } | Product::Warning(_) => {}
         }
     }
     Ok(())
@@ -62,7 +95,11 @@ pub(crate) fn common(task: &Task) -> Map<String, Value> {
         ("plan", json!(task.plan.name)),
         ("demux", json!(prior.map(|stage| &stage.options))),
         ("row_time_us", json!(geometry.raster.row_time_us)),
+        ("row_table", json!(geometry.row_table_us.is_some())),
+        ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
         ("first_row", json!(geometry.first_row)),
+        ("row_pitch", json!(geometry.row_pitch)),
+        ("camera_row_time_us", json!(geometry.camera_row_time_us)),
         ("white_dn", json!(geometry.white_dn)),
         ("software", json!(crate::SOFTWARE)),
     ];
@@ -119,7 +156,11 @@ pub fn write_manifest(session: &Session, state: &State, task: &Task, rig: &RigFi
             "rows": rig.projector.rows,
             "row_time_us": rig.projector.row_time_us,
             "first_row_us": rig.projector.first_row_us,
+            "row_table_us": rig.projector.row_table,
+            "beam_sigma_rows": rig.projector.beam_sigma_rows,
             "first_row": task.geometry.first_row,
+            "row_pitch": rig.camera.row_pitch,
+            "camera_row_time_us": rig.camera_row_time_us(),
         }),
     );
     settings.insert("exposures_us".into(), json!(taken_exposures(state, &task.schedule)));

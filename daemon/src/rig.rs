@@ -70,6 +70,7 @@ impl Rig {
         let setup = PlaneSetup {
             raster: file.raster(),
             camera_row_time_us: file.camera_row_time_us(),
+            row_pitch: file.camera.row_pitch,
             white_dn: file.camera.white_dn(),
             black_dn: file.camera.black_dn(),
             format: file.camera.pixel_format,

@@ -14,9 +14,10 @@ use crate::scene::Scene;
 
 /// A scene under a raster projector, prepared so that an exposure costs two look-ups a camera row.
 pub struct Optics {
-    /// Start of each scene row's light after the VSYNC edge, and the last row's end: `[V + 1]`.
+    /// Start of each drawn row's light after the VSYNC edge, and the last row's end: the scene's rows and those beside
+    /// them whose beam reaches it.
     row_starts_us: Vec<f64>,
-    /// Light of the rows above `v`, `[t, v, s]` with `V + 1` entries of v.
+    /// Light of the drawn rows above `v`, `[t, v, s]` with one entry of v more than rows are drawn.
     cumulative: Array3<f32>,
     /// Light that arrives at one moment of its row, if the spot's flight is simulated.
     flashes: Option<Flashes>,
@@ -31,9 +32,11 @@ struct Flashes {
     /// Rows away from the pixel's own and the share of the beam that they send.
     beam: Vec<(isize, f32)>,
     bidirectional: bool,
-    /// Row of the projector that scene row 0 is.
-    first_row: usize,
-    /// What each scene row shows.
+    /// Row of the projector that is drawn first.
+    first_drawn: usize,
+    /// Drawn row that is scene row 0.
+    scene_offset: usize,
+    /// What each drawn row shows.
     pattern: Vec<f32>,
 }
 
@@ -54,9 +57,13 @@ impl Optics {
         let transport = filtered(scene, mosaic);
         let (rows, height, width) = transport.dim();
         let table = row_table(raster, &projector.row_table, seed)?;
-        let row_starts_us = table[first_row..=first_row + rows].to_vec();
         let beam = beam_weights(&projector.beam)?;
-        let pattern = pattern[first_row..first_row + rows].to_vec();
+        let beam_rows = beam.iter().map(|(offset, _)| offset.unsigned_abs()).max().unwrap_or(0);
+        let first_drawn = first_row.saturating_sub(beam_rows);
+        let end_drawn = (first_row + rows + beam_rows).min(raster.rows);
+        let scene_offset = first_row - first_drawn;
+        let row_starts_us = table[first_drawn..=end_drawn].to_vec();
+        let pattern = pattern[first_drawn..end_drawn].to_vec();
 
         let direct = match projector.spot {
             Spot::Uniform => None,
@@ -64,12 +71,13 @@ impl Optics {
                 if t < rows { transport[[t, t, s]] } else { 0.0 }
             })),
         };
-        let mut cumulative = Array3::<f32>::zeros((height, rows + 1, width));
+        let mut cumulative = Array3::<f32>::zeros((height, pattern.len() + 1, width));
         cumulative.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
             let mut sum = vec![0.0_f64; width];
             for (v, &shown) in pattern.iter().enumerate() {
                 for &(offset, share) in &beam {
-                    let Some(lit) = v.checked_add_signed(offset).filter(|&lit| lit < rows) else { continue };
+                    let lit = v.checked_add_signed(offset).and_then(|lit| lit.checked_sub(scene_offset));
+                    let Some(lit) = lit.filter(|&lit| lit < rows) else { continue };
                     let weight = f64::from(share * shown);
                     for (s, sum) in sum.iter_mut().enumerate() {
                         // Direct light under a flying spot is not spread over its row's time.
@@ -89,7 +97,8 @@ impl Optics {
             }),
             beam,
             bidirectional: projector.spot == Spot::Bidirectional,
-            first_row,
+            first_drawn,
+            scene_offset,
             pattern,
         });
         Ok(Self { row_starts_us, cumulative, flashes })
@@ -144,14 +153,13 @@ impl Between {
 impl Flashes {
     fn expose_row(&self, row_starts_us: &[f64], t: usize, from_us: f64, to_us: f64, light: &mut [f32]) {
         for &(offset, share) in &self.beam {
-            let Some(v) = t.checked_add_signed(-offset).filter(|&v| v + 1 < row_starts_us.len()) else {
-                continue;
-            };
+            let drawn = (t + self.scene_offset).checked_add_signed(-offset);
+            let Some(v) = drawn.filter(|&v| v + 1 < row_starts_us.len()) else { continue };
             let (start_us, dwell_us) = (row_starts_us[v], row_starts_us[v + 1] - row_starts_us[v]);
             if start_us + dwell_us <= from_us || start_us >= to_us {
                 continue;
             }
-            let backwards = self.bidirectional && (self.first_row + v) % 2 == 1;
+            let backwards = self.bidirectional && (self.first_drawn + v) % 2 == 1;
             let weight = share * self.pattern[v];
             for (s, light) in light.iter_mut().enumerate() {
                 let column = f64::from(self.column[[t, s]]);
@@ -185,12 +193,18 @@ fn filtered(scene: &Scene, mosaic: bool) -> Array3<f32> {
 }
 
 /// Projector row of the scene's first: as given, or such that the scene is a window in the middle of the frame, as far
-/// as the camera's rows allow.
+/// as the camera's rows, `row_pitch` projector rows each, allow.
 ///
 /// # Errors
 /// When scene or camera do not fit.
-pub fn first_scene_row(raster: &Raster, scene: &Scene, given: Option<usize>) -> Result<usize, SimError> {
-    let (scene_rows, (camera_rows, _)) = (scene.rows(), scene.size());
+pub fn first_scene_row(
+    raster: &Raster,
+    scene: &Scene,
+    row_pitch: f64,
+    given: Option<usize>,
+) -> Result<usize, SimError> {
+    let (scene_rows, (camera_height, _)) = (scene.rows(), scene.size());
+    let camera_rows = ((camera_height - 1) as f64 * row_pitch).round() as usize + 1;
     let spare = |rows: usize| raster.rows.saturating_sub(rows);
     let first_row = given.unwrap_or_else(|| (spare(scene_rows) / 2).min(spare(camera_rows)));
     if first_row + scene_rows > raster.rows {
@@ -203,7 +217,7 @@ pub fn first_scene_row(raster: &Raster, scene: &Scene, given: Option<usize>) -> 
 }
 
 /// Start of each projector row's light after the VSYNC edge, and the last row's end: `[rows + 1]`.
-fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64>, SimError> {
+pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64>, SimError> {
     let sweep_us = raster.rows as f64 * raster.row_time_us;
     let linear = |row: usize| raster.first_row_us + row as f64 * raster.row_time_us;
     let starts: Vec<f64> = match *table {

@@ -34,10 +34,10 @@ pub enum SimError {
     },
     /// More camera rows than the projector has.
     #[error(
-        "sim.scene has {camera_rows} camera rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows or set camera.first_projector_row"
+        "the camera rows of sim.scene look along {camera_rows} projector rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.row_pitch or set camera.first_projector_row"
     )]
     CameraRows {
-        /// Camera rows of the scene.
+        /// Projector rows that the scene's camera rows look along.
         camera_rows: usize,
         /// Projector row of its first.
         first_row: usize,
@@ -95,6 +95,8 @@ pub struct PlaneSetup {
     pub raster: Raster,
     /// Row time of the camera.
     pub camera_row_time_us: f64,
+    /// Projector rows from one camera row to the next, as the scene has them.
+    pub row_pitch: f64,
     /// Counts, above black, of a white pixel in the time of one projector row.
     pub white_dn: f64,
     /// Counts without light.
@@ -138,7 +140,8 @@ impl PlaneRig {
             Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?
         };
         let motion = Motion::new(scenes.len(), config.motion_period_s);
-        let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.first_row)?;
+        let first_row =
+            optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
         let size = scenes[0].size();
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
         let sensor = Sensor::new(&config.sensor, size, scale, config.seed);
@@ -170,6 +173,16 @@ impl PlaneRig {
     /// Projector row that camera row 0 sees.
     pub fn first_row(&self) -> usize {
         self.bench.first_row
+    }
+
+    /// When each projector row is lit in truth, and the last one's end, after the VSYNC edge: `[rows + 1]`. What a
+    /// measured row table is held against.
+    ///
+    /// # Errors
+    /// Never for a rig that was built; kept so that no caller has to trust that.
+    pub fn row_starts_us(&self) -> Result<Vec<f64>, SimError> {
+        let Bench { config, setup, .. } = &*self.bench;
+        optics::row_table(&setup.raster, &config.projector.row_table, config.seed)
     }
 
     /// Opens the devices, at time zero of their own clock.

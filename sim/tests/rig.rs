@@ -47,6 +47,7 @@ fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
     let setup = PlaneSetup {
         raster: RASTER,
         camera_row_time_us: TAU_US,
+        row_pitch: 1.0,
         white_dn: WHITE,
         black_dn: 0.0,
         format: PixelFormat::Mono12,
@@ -283,4 +284,30 @@ fn a_wait_ends_when_its_time_is_up() {
     drop(devices.camera);
     assert!(devices.vsync.next_edge(Duration::from_millis(1)).unwrap().is_none());
     assert_eq!(devices.clock.now_ns() - before_ns, 1_000_000);
+}
+
+#[test]
+fn rows_beside_the_scenes_window_shine_into_it() {
+    // A long exposure of the scene's first row, which the beam of sigma 0.5 takes 0.1065 + 0.0003 of its light from above.
+    let first_row = |projector_rows: usize, first_row: usize| {
+        let folder = tempfile::tempdir().unwrap();
+        let config = SimConfig {
+            scene: scene(folder.path()),
+            projector: SimProjector { beam: Beam::Gaussian { sigma_rows: 0.5 }, ..SimProjector::default() },
+            ..SimConfig::default()
+        };
+        let setup = PlaneSetup {
+            raster: Raster { rows: projector_rows, ..RASTER },
+            camera_row_time_us: TAU_US,
+            row_pitch: 1.0,
+            white_dn: WHITE,
+            black_dn: 0.0,
+            format: PixelFormat::Mono12,
+            first_row: Some(first_row),
+        };
+        let rig = PlaneRig::new(config, setup, Path::new("")).unwrap();
+        rig.noise_free(0.0, 4000.0).unwrap()[[0, 0]]
+    };
+    assert!((first_row(ROWS, 0) - (1.0 - 0.1068)).abs() < 1e-3, "nothing is drawn above the frame");
+    assert!((first_row(20, 6) - 1.0).abs() < 1e-3, "rows above the window are drawn");
 }

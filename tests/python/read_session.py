@@ -7,6 +7,7 @@
 Exits with 0 where all holds, and with 1 and one line a fault where something does not.
 """
 
+import csv
 import hashlib
 import json
 import pathlib
@@ -108,18 +109,30 @@ def check_exr(faults, path, values, metadata):
     # The file stays open: closing it empties its header.
     with OpenEXR.File(str(path), separate_channels=True) as file:
         header, channels = file.header(), file.channels()
-        names = {"Y"} if values.ndim == 2 else {"R", "G", "B"}
-        faults.equal(set(channels), names, f"channels of {path.name}")
+        if layers := metadata.get("layers"):
+            expected = {f"{layer}.Y": image for layer, image in zip(layers, values, strict=True)}
+        elif values.ndim == 2:
+            expected = {"Y": values}
+        else:
+            expected = {name: values[:, :, index] for index, name in enumerate("RGB")}
+        faults.equal(set(channels), set(expected), f"channels of {path.name}")
         faults.equal(header["compression"], OpenEXR.ZIP_COMPRESSION, f"compression of {path.name}")
         faults.equal(header["type"], OpenEXR.scanlineimage, f"storage of {path.name}")
         for name, channel in channels.items():
-            expected = values if values.ndim == 2 else values[:, :, "RGB".index(name)]
-            faults.same_array(channel.pixels, expected, f"{path.name} channel {name} against NPY")
+            faults.same_array(channel.pixels, expected[name], f"{path.name} channel {name} against NPY")
         for key, value in metadata.items():
             text = header.get(ATTRIBUTE_PREFIX + key)
             faults.check(text is not None, f"{path.name} lacks {ATTRIBUTE_PREFIX}{key}")
             if text is not None:
                 faults.equal(text if isinstance(value, str) else json.loads(text), value, f"{path.name} {key}")
+
+
+def check_csv(faults, path, values, metadata):
+    """The CSV file has the columns of the metadata and the values of the NPY file."""
+    with path.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    faults.equal(header, metadata["columns"], f"columns of {path.name}")
+    faults.same_array(np.array(rows, dtype=np.float64).astype(np.float32), values, f"{path.name} against NPY")
 
 
 def check_products(faults, session):
@@ -130,6 +143,9 @@ def check_products(faults, session):
         exr = path.with_suffix(".exr")
         if exr.exists():
             check_exr(faults, exr, values, metadata)
+        table = path.with_suffix(".csv")
+        if table.exists():
+            check_csv(faults, table, values, metadata)
     for exr in (session / "products").glob("*.exr"):
         faults.check(exr.stem in products, f"{exr.name} has no NPY beside it")
     return products
@@ -147,8 +163,9 @@ def check_transport(faults, session, header, products):
     depth = metadata["u_max"] - metadata["u_min"] + 1
     shape = header["shape"]
     faults.equal(volume.shape, (depth, shape["rows"], shape["columns"]), "shape of transport")
-    with OpenEXR.File(str(session / "products" / "epipolar.exr"), separate_channels=True) as file:
-        faults.same_array(file.channels()["Y"].pixels, volume[-metadata["u_min"]], "epipolar.exr against u = 0")
+    if "epipolar" in products:
+        epipolar, _ = products["epipolar"]
+        faults.same_array(epipolar, volume[-metadata["u_min"]], "epipolar.npy against u = 0")
 
 
 def check_manifest(faults, session, header):

@@ -33,6 +33,25 @@ pub fn corner_rig(more: &str) -> String {
     rig_text(128, &format!("scene = {:?}", data("p2r_corner.npz")), more)
 }
 
+/// Products of every kind that a camera of 24 x 16 pixels and a plan with an exposure of 250 us can have; one line each,
+/// as on the command line.
+pub const PRODUCTS: [&str; 9] = [
+    r#"kind = "regular""#,
+    r#"kind = "epipolar""#,
+    r#"kind = "epipolar", width_rows = 5"#,
+    r#"kind = "non-epipolar", width_rows = 5"#,
+    r#"kind = "band", from_rows = 1, to_rows = 4, side = "below", name = "just-below""#,
+    r#"kind = "relight", stripes = { period_rows = 6, lit_rows = 2 }"#,
+    r#"kind = "relight", line = { height_rows = 2, step_rows = 3 }, name = "line""#,
+    r#"kind = "delay-profile", pixel = [12, 8]"#,
+    r#"kind = "delay-profile", region = [2, 6, 3, 9], exposure_us = 250"#,
+];
+
+/// A plan with these products at its head.
+pub fn with_products(products: &[&str], plan: &str) -> String {
+    format!("product = [{{ {} }}]\n{plan}", products.join(" }, { "))
+}
+
 /// A daemon's core over a folder of its own.
 pub struct Bench {
     /// Rig file and sessions.

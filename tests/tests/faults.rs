@@ -27,6 +27,7 @@ fn truth(rig_toml: &str) -> PlaneRig {
     let setup = PlaneSetup {
         raster: rig.raster(),
         camera_row_time_us: rig.camera_row_time_us(),
+        row_pitch: 1.0,
         white_dn: rig.camera.white_dn(),
         black_dn: rig.camera.black_dn(),
         format: PixelFormat::Mono12,

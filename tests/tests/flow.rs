@@ -15,7 +15,7 @@ use raysweep_core::LossCause;
 use raysweep_pipeline::{Entry, HotPixels, Registry, Stage, StageError, Unit};
 use raysweep_proto::{ErrorCode, Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
-use raysweep_tests::{Bench, data, end_of, rig_text};
+use raysweep_tests::{Bench, PRODUCTS, data, end_of, rig_text, with_products};
 
 const PLAN: &str = "kind = \"sweep\"\nname = \"flow\"\n[sweep]\naverage = 3\n\
                     delay_us = { start = -200, stop = 200, count = 5 }\nexposure_us = [100, 250]\n";
@@ -45,7 +45,7 @@ fn lasting_files(session: &Path) -> BTreeMap<String, Vec<u8>> {
 #[test]
 fn processing_again_gives_the_same_bits() {
     let bench = Bench::new(&small_rig(""));
-    let ended = bench.run(PLAN);
+    let ended = bench.run(&with_products(&PRODUCTS, PLAN));
     let before = lasting_files(&ended.session);
     let report = std::fs::read(ended.session.join("report.html")).unwrap();
     for name in ["products", "transport.zarr", "report.html", "manifest.json"] {
@@ -233,6 +233,7 @@ fn bad_plans_and_sessions_are_refused_and_the_daemon_goes_on() {
         ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nprior = \"flat\"", ErrorCode::InvalidPlan, "split"),
         ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nalpha = -1", ErrorCode::InvalidPlan, "alpha"),
         ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\ngamma = 1", ErrorCode::InvalidPlan, "gamma"),
+        ("kind = \"sweep\"\n[[product]]\nkind = \"epipola\"", ErrorCode::InvalidPlan, "relight"),
     ];
     for (plan, code, says) in cases {
         let error = bench.runner.run(RunParams { plan: plan.into(), ..RunParams::default() }).unwrap_err();
@@ -251,7 +252,7 @@ fn zarr_numpy_and_openexr_read_every_file() {
         "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
     );
     let bench = Bench::new(&small_rig(""));
-    let ended = bench.run(PLAN);
+    let ended = bench.run(&with_products(&PRODUCTS, PLAN));
     let script = data("").join("../python/read_session.py");
     let output = Command::new(python).arg(script).arg(&ended.session).output().unwrap();
     let said =

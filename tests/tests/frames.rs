@@ -38,6 +38,7 @@ fn the_simulators_light_is_the_references() {
     let setup = PlaneSetup {
         raster: Raster { rows: 128, row_time_us: 22.22, first_row_us: 555.5, period_us: 16_666.667 },
         camera_row_time_us: 22.22,
+        row_pitch: 1.0,
         white_dn: 2500.0,
         black_dn: 64.0,
         format: PixelFormat::Mono12,

@@ -1,14 +1,16 @@
 //! Fold `demux`: from the averaged images of a sweep to its light transport.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
+use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
-use crate::stage::{Fold, FoldError, Product};
+use crate::stage::{Fold, FoldError, Product, Snapshot};
 use crate::unit::Unit;
 
 /// Options of `demux` in a plan.
@@ -81,14 +83,18 @@ struct Taken {
     image: Array2<f32>,
 }
 
-/// Collects a sweep and demultiplexes it.
+/// Collects a sweep and demultiplexes it. A copy shares the images.
+#[derive(Clone)]
 pub struct DemuxFold {
     prior: Prior,
-    schedule: Schedule,
-    geometry: SweepGeometry,
+    schedule: Arc<Schedule>,
+    geometry: Arc<SweepGeometry>,
     timing: RowTiming,
-    taken: BTreeMap<Role, Taken>,
+    taken: BTreeMap<Role, Arc<Taken>>,
 }
+
+/// Fewer points than this make no estimate worth a look.
+const MIN_LIVE_POINTS: usize = 5;
 
 impl DemuxFold {
     /// A fold for the sweep of `schedule`.
@@ -104,12 +110,9 @@ impl DemuxFold {
             |error: PlaneError| RegistryError::Invalid { name: "demux".into(), what: error.to_string() };
         let prior = options.prior();
         prior.check().map_err(invalid)?;
-        let raster = &geometry.raster;
-        let timing = RowTiming::new(raster.rows, raster.row_time_us, raster.period_us)
-            .and_then(|timing| timing.window(geometry.first_row, geometry.height))
-            .map_err(invalid)?;
-        let fold =
-            Self { prior, schedule: schedule.clone(), geometry: *geometry, timing, taken: BTreeMap::new() };
+        let timing = geometry.timing().map_err(invalid)?;
+        let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
+        let fold = Self { prior, schedule, geometry, timing, taken: BTreeMap::new() };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -121,19 +124,66 @@ impl DemuxFold {
     pub fn demux(&self) -> Result<Demux, PlaneError> {
         let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
         let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
-        Demux::new(self.timing, planned, self.prior)
+        Demux::new(self.timing.clone(), planned, self.prior)
     }
 
-    /// The regular image, and how well the transport predicts it where it is not saturated.
-    fn regular(&self, image: &Array2<f32>, dark: &Array2<f32>, transport: &Transport) -> Vec<Product> {
+    /// The dark image that belongs to the exposure of a role's image, if it was taken.
+    fn dark_of(&self, taken: &BTreeMap<Role, Arc<Taken>>, role: Role) -> Option<Arc<Taken>> {
+        let point = self.schedule.points.iter().find(|point| point.role == role)?;
+        taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
+    }
+
+    /// The sweep in these images, without those whose dark image is not among them. Each image is given up as soon as
+    /// it is in the stack: unless a copy of the fold shares it, a sweep is held once, not twice.
+    fn stack(&self, mut taken: BTreeMap<Role, Arc<Taken>>) -> Result<SweepStack, FoldError> {
+        let darks = taken.extract_if(.., |role, _| matches!(role, Role::Dark(_))).collect();
+        taken.retain(|role, _| matches!(role, Role::Sweep(_)) && self.dark_of(&darks, *role).is_some());
+        if taken.is_empty() {
+            return Err(FoldError {
+                fold: "demux".into(),
+                what: "no point of the sweep is there with the dark image of its exposure: resume the run"
+                    .into(),
+            });
+        }
+        let scale = (1.0 / self.geometry.white_dn) as f32;
+        let saturates = |taken: &Arc<Taken>| self.valid(&taken.image).iter().any(|valid| !valid);
+        let shape = (taken.len(), self.geometry.height, self.geometry.width);
+        let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
+        let mut images = Array3::zeros(shape);
+        let mut settings = Vec::with_capacity(taken.len());
+        let point_of = |role: &Role| self.schedule.points.iter().find(|point| point.role == *role);
+        let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
+        for (index, (role, sample)) in taken.into_iter().enumerate() {
+            if let Some(valid) = &mut valid {
+                valid.index_axis_mut(Axis(0), index).assign(&self.valid(&sample.image));
+            }
+            if let Some(dark) = self.dark_of(&darks, role) {
+                images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * scale));
+            }
+            settings.push(sample.setting.clone());
+        }
+        Ok(SweepStack { timing: self.timing.clone(), exposures_us, settings, images, valid, regular: None })
+    }
+
+    fn solve(&self, stack: &SweepStack, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
+        let SweepStack { settings, images, valid, .. } = stack;
+        self.demux()
+            .and_then(|demux| demux.with_settings(settings.clone()))
+            .and_then(|demux| {
+                demux.solve_while(images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
+            })
+            .map_err(|error| FoldError { fold: "demux".into(), what: error.to_string() })
+    }
+
+    /// How well the transport predicts the light of the regular image (counts: `image`) where it is not saturated.
+    fn check_regular(&self, image: &Array2<f32>, light: &Array2<f32>, transport: &Transport) -> Vec<Product> {
         let valid = self.valid(image);
         let saturated = valid.iter().filter(|valid| !**valid).count();
-        let light = (image - dark) / self.geometry.white_dn as f32;
         let sum = |image: &Array2<f32>| -> f64 {
             let pixels = image.iter().zip(&valid).filter(|&(_, &valid)| valid);
             pixels.map(|(&light, _)| f64::from(light)).sum()
         };
-        let (captured, predicted) = (sum(&light), sum(&transport.total()));
+        let (captured, predicted) = (sum(light), sum(&transport.total()));
         let mut products: Vec<Product> =
             too_many_saturated("the regular image (a whole VSYNC period long)", saturated, valid.len())
                 .into_iter()
@@ -148,11 +198,6 @@ impl DemuxFold {
                 )));
             }
         }
-        products.push(Product::Image {
-            name: "regular",
-            about: "a captured exposure of one whole VSYNC period: every row lit once",
-            image: light,
-        });
         products
     }
 
@@ -170,75 +215,46 @@ impl Fold for DemuxFold {
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
         let Some(point) = self.schedule.points.get(unit.id.point as usize) else { return };
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
-        self.taken.insert(point.role, Taken { setting, image: image.to_owned() });
+        self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() }));
+    }
+
+    fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
+        (self.points() >= MIN_LIVE_POINTS).then(|| Box::new(self.clone()) as Box<dyn Snapshot>)
     }
 
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError> {
-        let plane = |error: PlaneError| FoldError { fold: "demux".into(), what: error.to_string() };
-        let demux = self.demux().map_err(plane)?;
-        let scale = (1.0 / self.geometry.white_dn) as f32;
-        let mut taken = std::mem::take(&mut self.taken);
-        let darks: BTreeMap<Role, Array2<f32>> = taken
-            .extract_if(.., |role, _| matches!(role, Role::Dark(_)))
-            .map(|(role, taken)| (role, taken.image))
-            .collect();
-        let dark_of = |role: &Role| {
-            let point = self.schedule.points.iter().find(|point| point.role == *role)?;
-            darks.get(&self.schedule.dark_of(point.exposure_us)?)
-        };
-        let regular = taken.remove(&Role::Regular);
-        taken.retain(|role, _| dark_of(role).is_some());
-        if taken.is_empty() {
-            return Err(FoldError {
-                fold: "demux".into(),
-                what: "no point of the sweep is there with the dark image of its exposure: resume the run"
-                    .into(),
-            });
-        }
-
-        let saturates = |taken: &Taken| self.valid(&taken.image).iter().any(|valid| !valid);
-        let shape = (taken.len(), self.geometry.height, self.geometry.width);
-        let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
-        let mut stack = Array3::zeros(shape);
-        let mut settings = Vec::with_capacity(taken.len());
-        // Each image is given up as soon as it is in the stack: a sweep is held once, not twice.
-        for (index, (role, Taken { setting, image })) in taken.into_iter().enumerate() {
-            if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&self.valid(&image));
-            }
-            if let Some(dark) = dark_of(&role) {
-                stack.index_axis_mut(Axis(0), index).assign(&((&image - dark) * scale));
-            }
-            settings.push(setting);
-        }
-        let images = settings.len();
-        let transport = demux
-            .with_settings(settings)
-            .and_then(|demux| {
-                demux.solve_while(stack.view(), valid.as_ref().map(|valid| valid.view()), go_on)
-            })
-            .map_err(plane)?;
+        let taken = std::mem::take(&mut self.taken);
+        let regular = taken.get(&Role::Regular).cloned();
+        let regular = regular.zip(self.dark_of(&taken, Role::Regular));
+        let mut stack = self.stack(taken)?;
+        let transport = self.solve(&stack, go_on)?;
 
         let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![
-            Product::Image {
-                name: "epipolar",
-                about: "light from the pixel's own projector row (u = 0)",
-                image: transport.epipolar(1),
-            },
-            Product::Image {
-                name: "non_epipolar",
-                about: "light from all other rows within the sweep's reach",
-                image: transport.non_epipolar(1),
-            },
-            Product::Figure { name: "images demultiplexed", value: images as f64 },
+            Product::Figure { name: "images demultiplexed", value: stack.settings.len() as f64 },
             Product::Figure { name: "saturated pixels", value: saturated as f64 },
         ];
         products.extend(too_many_saturated("the sweep", saturated, transport.saturated.len()));
-        if let Some((regular, dark)) = regular.zip(dark_of(&Role::Regular)) {
-            products.extend(self.regular(&regular.image, dark, &transport));
+        if let Some((regular, dark)) = regular {
+            let light = (&regular.image - &dark.image) / self.geometry.white_dn as f32;
+            products.extend(self.check_regular(&regular.image, &light, &transport));
+            stack.regular = Some(light);
         }
         products.push(Product::Transport(Box::new(transport)));
+        products.push(Product::Stack(Box::new(stack)));
         Ok(products)
+    }
+}
+
+impl Snapshot for DemuxFold {
+    fn points(&self) -> usize {
+        let taken = |role: Role| self.taken.contains_key(&role);
+        let lit = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
+        lit.filter(|point| taken(point.role) && self.schedule.dark_of(point.exposure_us).is_some_and(taken))
+            .count()
+    }
+
+    fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
+        self.solve(&self.stack(self.taken.clone())?, go_on)
     }
 }

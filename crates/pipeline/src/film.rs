@@ -130,7 +130,7 @@ impl FilmSolver {
         let demux = DemuxFold::new(options, schedule, geometry)?
             .demux()
             .map_err(|error| RegistryError::Invalid { name: "demux".into(), what: error.to_string() })?;
-        Ok(Self { demux, geometry: *geometry })
+        Ok(Self { demux, geometry: geometry.clone() })
     }
 
     /// The relative rows that are estimated: first and last.

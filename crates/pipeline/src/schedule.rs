@@ -1,6 +1,10 @@
 //! What a sweep acquires, point by point, in the order of acquisition.
 
+use std::sync::Arc;
+
 use raysweep_core::{CameraSettings, Raster, Shutter};
+use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming};
+use serde::Deserialize;
 
 /// What a point's image is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -52,12 +56,23 @@ impl Schedule {
 }
 
 /// What turns counts and times into light transport: the rig, as the rig file states it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct SweepGeometry {
-    /// When the projector lights its rows.
+    /// When the projector lights its rows, nominally: delays are measured against it.
     pub raster: Raster,
+    /// When it lights them in truth: start of each row and end of the last, from the nominal start of row 0; none if no
+    /// table was measured.
+    pub row_table_us: Option<Arc<[f64]>>,
+    /// Standard deviation of the beam over projector rows, 0 for the ideal beam; none if it is not known.
+    pub beam_sigma_rows: Option<f64>,
+    /// When within its row a pixel's direct light arrives.
+    pub spot: Spot,
     /// Projector row that camera row 0 sees.
     pub first_row: usize,
+    /// Projector rows from one camera row to the next.
+    pub row_pitch: f64,
+    /// From the start of one camera row's exposure to the next row's.
+    pub camera_row_time_us: f64,
     /// Camera rows.
     pub height: usize,
     /// Camera columns.
@@ -66,6 +81,27 @@ pub struct SweepGeometry {
     pub white_dn: f64,
     /// Counts from which on a pixel counts as saturated.
     pub saturation_dn: f64,
+}
+
+/// How the light of a row is drawn, which decides when within its row a pixel's direct light arrives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Spot {
+    /// The whole row at once: evenly over the row's time.
+    Uniform,
+    /// By a spot that flies along the row: at the moment when it passes the projector column that the pixel sees.
+    Flying(Scan),
+}
+
+/// Which way a flying spot runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Scan {
+    /// Nobody knows.
+    Unknown,
+    /// Every row from the first column to the last.
+    OneWay,
+    /// Odd rows backwards.
+    Bidirectional,
 }
 
 /// How a camera must be set for a point.
@@ -78,6 +114,25 @@ pub struct Shot {
 }
 
 impl SweepGeometry {
+    /// When rows are lit and exposed, as the model takes it. A beam that is not known counts as ideal.
+    ///
+    /// # Errors
+    /// When table, beam or camera rows do not fit the raster.
+    pub fn timing(&self) -> Result<RowTiming, PlaneError> {
+        let raster = &self.raster;
+        let mut timing = RowTiming::new(raster.rows, raster.row_time_us, raster.period_us)?;
+        if let Some(table) = &self.row_table_us {
+            timing = timing.with_row_table(table)?;
+        }
+        let camera = CameraRows {
+            first_row: self.first_row,
+            rows: self.height,
+            pitch: self.row_pitch,
+            row_time_us: self.camera_row_time_us,
+        };
+        timing.with_camera(camera)?.with_beam(Beam::of_sigma(self.beam_sigma_rows.unwrap_or(0.0)))
+    }
+
     /// The settings for a point on a camera with this trigger latency.
     pub fn shot(&self, point: &Point, trigger_latency_us: f64) -> Shot {
         let trigger =

@@ -1,9 +1,10 @@
 //! What is done to units: stages, in parallel and each alone; folds, over all of them in order.
 
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, Array3, ArrayView2};
 use raysweep_transport::plane::Transport;
 use serde::{Deserialize, Serialize};
 
+use crate::products::{Profile, SweepStack};
 use crate::unit::Unit;
 
 /// Why a stage gave up on a unit.
@@ -34,14 +35,31 @@ pub enum Product {
     /// An image `[t, s]` in the scene's units (1 = a white pixel).
     Image {
         /// File name without extension.
-        name: &'static str,
+        name: String,
         /// What it shows, in a sentence.
-        about: &'static str,
+        about: String,
         /// The pixels.
         image: Array2<f32>,
     },
+    /// Images `[k, t, s]` in the scene's units.
+    Sequence {
+        /// File name without extension.
+        name: String,
+        /// What it shows, in a sentence.
+        about: String,
+        /// What the images differ in, with its unit.
+        axis: String,
+        /// The value of `axis` of each image.
+        at: Vec<f64>,
+        /// The pixels.
+        images: Array3<f32>,
+    },
+    /// Light over the delay.
+    Profile(Profile),
     /// The light transport `[u, t, s]`.
     Transport(Box<Transport>),
+    /// The images that it was made of: what [`crate::ProductSpec`] makes more of. It is not written.
+    Stack(Box<SweepStack>),
     /// Something that makes the others worse than they look.
     Warning(String),
     /// A number that the report states.
@@ -71,11 +89,29 @@ pub trait Fold: Send {
     /// Takes the next unit; a later attempt of a point replaces the earlier.
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>);
 
+    /// What was taken so far, for another thread to estimate from while more comes; nothing from a fold that estimates
+    /// nothing, or has too little. Cheap: images are shared, not copied.
+    fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
+        None
+    }
+
     /// The products of what was taken, which is given up for them. Ends early, with an error, soon after `go_on` says no.
     ///
     /// # Errors
     /// When too little was taken, or `go_on` said no.
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError>;
+}
+
+/// A fold's units at some moment.
+pub trait Snapshot: Send + Sync {
+    /// How many points of the sweep it can estimate from.
+    fn points(&self) -> usize;
+
+    /// The transport as these points tell it. Ends early, with an error, soon after `go_on` says no.
+    ///
+    /// # Errors
+    /// When it cannot be told, or `go_on` said no.
+    fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError>;
 }
 
 /// Stage `hot-pixels`: a pixel that outshines all its neighbours by more than `threshold_dn` takes their median.

@@ -4,6 +4,7 @@
 //! at most [`MAX_MESSAGE_BYTES`]; answers and events are one line each, of any length.
 
 mod client;
+pub mod live;
 mod messages;
 mod methods;
 mod rpc;

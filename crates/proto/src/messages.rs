@@ -179,6 +179,9 @@ pub struct Status {
     pub film: Option<FilmSummary>,
     /// Why the last run faulted.
     pub error: Option<String>,
+    /// The file with the newest live images, if there is one; `describe` has its layout.
+    #[serde(default)]
+    pub live: Option<PathBuf>,
 }
 
 /// Parameters of `check`.
@@ -298,6 +301,15 @@ pub enum Event {
     Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
     /// The light transport was estimated during a film.
     Film(FilmEstimate),
+    /// A running estimate is in the live file, made from the points stored so far.
+    Live {
+        /// Of its last image in the live file.
+        sequence: u64,
+        /// Points of the sweep that went into it.
+        points: usize,
+        /// How long the estimate took.
+        seconds: f64,
+    },
     /// A run has ended.
     Finished {
         /// The session's folder.
@@ -319,6 +331,9 @@ pub enum Event {
         /// What makes the results worse than they look.
         #[serde(default)]
         warnings: Vec<String>,
+        /// Seconds from the end of the last frame's exposure to the transport on disk; nothing where none was made.
+        #[serde(default)]
+        final_s: Option<f64>,
     },
     /// This many events were left out because the subscriber read too slowly.
     Skipped {

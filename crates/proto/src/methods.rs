@@ -3,6 +3,7 @@
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::{Deserialize, Serialize};
 
+use crate::live::{self, LiveLayout};
 use crate::{
     CheckParams, CheckReport, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES, ResumeParams, RunParams,
     SessionInfo, Started, Status,
@@ -148,6 +149,8 @@ pub struct Description {
     pub errors: Vec<ErrorInfo>,
     /// What is bounded.
     pub limits: LimitsInfo,
+    /// How to read the live file that `status` names.
+    pub live: LiveLayout,
 }
 
 /// A method for programs.
@@ -197,6 +200,7 @@ pub fn describe(version: &str) -> Description {
         event: schema::<Event>(),
         errors: error_codes(),
         limits: LimitsInfo { message_bytes: MAX_MESSAGE_BYTES, clients: MAX_CLIENTS },
+        live: live::layout(),
     }
 }
 

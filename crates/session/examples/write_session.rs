@@ -106,6 +106,7 @@ fn acquire(
         stored: shape.points,
         missing: 0,
         vsync: None,
+        final_s: None,
     }))?;
     Ok(session)
 }

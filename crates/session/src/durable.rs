@@ -22,10 +22,18 @@ pub const TEMPORARY_SUFFIX: &str = ".raysweep-tmp";
 /// # Errors
 /// [`Error::Io`] where the file system refuses; the file at `path` is then as before.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    write_with(path, |file| file.write_all(bytes))
+}
+
+/// As [`write`], with what `fill` writes into the temporary file.
+///
+/// # Errors
+/// What `fill` gives, or [`Error::Io`]; the file at `path` is then as before.
+pub fn write_with(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<()>) -> Result<()> {
     let temporary = temporary_path(path);
     let write_data = || {
         let mut file = File::create(&temporary)?;
-        file.write_all(bytes)?;
+        fill(&mut file)?;
         file.sync_all()
     };
     write_data().map_err(Error::io("write", &temporary))?;

@@ -157,6 +157,9 @@ pub struct EndEntry {
     /// The VSYNC line during the run, where it was watched.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vsync: Option<VsyncStats>,
+    /// Seconds from the end of the last frame's exposure to the transport on disk, where both were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub final_s: Option<f64>,
 }
 
 /// In which state a run ended.

@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::{self, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use rayon::prelude::*;
 use raysweep_core::Counts;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -130,13 +131,17 @@ pub fn verify(session: &Session) -> Result<Differences> {
 }
 
 fn scan(session: &Session) -> Result<BTreeMap<String, FileRecord>> {
-    let mut files = BTreeMap::new();
-    scan_dir(session.dir(), "", &mut files)?;
+    let mut paths = Vec::new();
+    list_files(session.dir(), "", &mut paths)?;
+    let record = |(name, path): (String, PathBuf)| {
+        checksum(&path).map(|record| (name, record)).map_err(Error::io("read", &path))
+    };
+    let mut files = paths.into_par_iter().map(record).collect::<Result<BTreeMap<_, _>>>()?;
     files.remove("manifest.json");
     Ok(files)
 }
 
-fn scan_dir(dir: &Path, prefix: &str, files: &mut BTreeMap<String, FileRecord>) -> Result<()> {
+fn list_files(dir: &Path, prefix: &str, files: &mut Vec<(String, PathBuf)>) -> Result<()> {
     for entry in fs::read_dir(dir).map_err(Error::io("list", dir))? {
         let entry = entry.map_err(Error::io("list", dir))?;
         let path = entry.path();
@@ -145,9 +150,9 @@ fn scan_dir(dir: &Path, prefix: &str, files: &mut BTreeMap<String, FileRecord>) 
         if durable::is_temporary(&path) {
             continue;
         } else if kind.is_dir() {
-            scan_dir(&path, &format!("{name}/"), files)?;
+            list_files(&path, &format!("{name}/"), files)?;
         } else {
-            files.insert(name, checksum(&path).map_err(Error::io("read", &path))?);
+            files.push((name, path));
         }
     }
     Ok(())

@@ -1,13 +1,15 @@
 //! `products/`: what was made from the stack, as files that other programs open.
 //!
 //! An image `NAME` is `NAME.exr` (channel Y, or R, G, B, metadata as text attributes `raysweep.KEY`) and `NAME.npy`
-//! (float32 `[t, s]`, or `[t, s, 3]`); a volume is `NAME.npy` alone. Beside each lies `NAME.json` with the metadata.
+//! (float32 `[t, s]`, or `[t, s, 3]`); a volume is `NAME.npy` alone. A sequence of images is `NAME.npy` (`[k, t, s]`) and
+//! one `NAME.exr` with a layer for each; a table is `NAME.npy` (`[row, column]`) and `NAME.csv`. Beside each lies
+//! `NAME.json` with the metadata.
 //! Values are linear. Every file is written durably, and the same input gives the same bytes.
 
-use std::io::Cursor;
+use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
-use ndarray::{ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
+use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
 use ndarray_npy::WriteNpyExt;
 use serde_json::{Map, Value};
 
@@ -61,11 +63,63 @@ impl Products {
         self.write_array(name, &values, metadata)
     }
 
+    /// Writes images `[k, t, s]` as `name.npy`, `name.json` and one `name.exr` whose layer `k` has the channel
+    /// `layers[k].Y`; layers are named in ascending order.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] where there are not as many layers as images; otherwise as [`Products::image`].
+    pub fn sequence(
+        &self,
+        name: &str,
+        values: ArrayView3<f32>,
+        layers: &[String],
+        metadata: &Map<String, Value>,
+    ) -> Result<()> {
+        if values.shape()[0] != layers.len() {
+            let (found, allowed) = (values.shape().to_vec(), format!("[{}, t, s]", layers.len()));
+            return Err(Error::Shape { what: format!("sequence `{name}`"), found, allowed });
+        }
+        let names: Vec<String> = layers.iter().map(|layer| format!("{layer}.Y")).collect();
+        let channels: Vec<_> = names.iter().map(String::as_str).zip(values.outer_iter()).collect();
+        self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
+        self.write_array(name, &values, metadata)
+    }
+
+    /// Writes columns of one length as `name.csv`, `name.npy` (`[row, column]`) and `name.json`. The first line of the
+    /// CSV file has the headers.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] where a column is shorter than the first; otherwise as [`Products::image`].
+    pub fn table(
+        &self,
+        name: &str,
+        columns: &[(&str, Vec<f64>)],
+        metadata: &Map<String, Value>,
+    ) -> Result<()> {
+        let rows = columns.first().map_or(0, |(_, values)| values.len());
+        if let Some((header, values)) = columns.iter().find(|(_, values)| values.len() != rows) {
+            return Err(Error::Shape {
+                what: format!("column `{header}` of table `{name}`"),
+                found: vec![values.len()],
+                allowed: format!("[{rows}]"),
+            });
+        }
+        let line = |cells: Vec<String>| cells.join(",") + "\n";
+        let mut csv = line(columns.iter().map(|(header, _)| (*header).to_owned()).collect());
+        for row in 0..rows {
+            csv.push_str(&line(columns.iter().map(|(_, values)| values[row].to_string()).collect()));
+        }
+        self.write(name, "csv", csv.as_bytes())?;
+        let values =
+            Array2::from_shape_fn((rows, columns.len()), |(row, column)| columns[column].1[row] as f32);
+        self.write_array(name, &values.view(), metadata)
+    }
+
     /// Reads back an image that [`Products::image`] wrote.
     ///
     /// # Errors
     /// [`Error::Io`] where there is none, [`Error::Codec`] where it is damaged.
-    pub fn read_image(&self, name: &str) -> Result<ndarray::Array2<f32>> {
+    pub fn read_image(&self, name: &str) -> Result<Array2<f32>> {
         let path = self.path(name, "npy")?;
         let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
         ndarray_npy::ReadNpyExt::read_npy(bytes.as_slice()).map_err(Error::codec("read", path.display()))
@@ -77,13 +131,12 @@ impl Products {
         values: &ArrayRef<f32, D>,
         metadata: &Map<String, Value>,
     ) -> Result<()> {
-        let mut npy = Cursor::new(Vec::new());
-        // An array in Fortran order would be written as such.
-        values
-            .as_standard_layout()
-            .write_npy(&mut npy)
-            .map_err(Error::codec("encode", format!("{name}.npy")))?;
-        self.write(name, "npy", npy.get_ref())?;
+        let path = self.path(name, "npy")?;
+        durable::create_dir_all(&self.dir)?;
+        durable::write_with(&path, |file| {
+            // An array in Fortran order would be written as such.
+            values.as_standard_layout().write_npy(BufWriter::new(file)).map_err(io::Error::other)
+        })?;
         let mut sidecar =
             serde_json::to_vec_pretty(metadata).map_err(Error::codec("encode", format!("{name}.json")))?;
         sidecar.push(b'\n');

@@ -7,6 +7,7 @@
 use std::path::Path;
 
 use ndarray::{Array3, ArrayView3, s};
+use rayon::prelude::*;
 use serde_json::{Map, Value};
 use zarrs::array::{ArrayBuilder, data_type};
 
@@ -41,15 +42,14 @@ pub fn write(dir: &Path, transport: ArrayView3<f32>, attributes: &Map<String, Va
         let store = DurableStore::new(fresh)?;
         zarr::create_group(&store, Map::new())?;
         let array = zarr::create_array(&store, NAME, &builder)?;
-        for (chunk_row, t) in (0..rows).step_by(chunk[1]).enumerate() {
-            for (chunk_column, s) in (0..columns).step_by(chunk[2]).enumerate() {
-                let t_end = rows.min(t + chunk[1]);
-                let s_end = columns.min(s + chunk[2]);
-                let part = transport.slice(s![.., t..t_end, s..s_end]);
-                zarr::write_chunk(&array, [0, chunk_row as u64, chunk_column as u64], chunk, part)?;
-            }
-        }
-        Ok(())
+        let chunks_across = columns.div_ceil(chunk[2]);
+        // While one chunk waits for the disk, others are compressed.
+        (0..rows.div_ceil(chunk[1]) * chunks_across).into_par_iter().try_for_each(|index| {
+            let (chunk_row, chunk_column) = (index / chunks_across, index % chunks_across);
+            let (t, s) = (chunk_row * chunk[1], chunk_column * chunk[2]);
+            let part = transport.slice(s![.., t..rows.min(t + chunk[1]), s..columns.min(s + chunk[2])]);
+            zarr::write_chunk(&array, [0, chunk_row as u64, chunk_column as u64], chunk, part)
+        })
     })
 }
 

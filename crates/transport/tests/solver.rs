@@ -3,13 +3,17 @@
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
 mod common;
+mod stepping;
 
 use common::{corner, ideal_stack, paper_sweep, photographed, timing};
 use ndarray::{Array1, Array2, Array3, Axis, s};
 use proptest::prelude::*;
 use raysweep_transport::plane::{
-    Demux, PlaneError, Prior, RowModel, RowTiming, Setting, SlotKind, Transport, reach, reference,
+    Demux, PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach, reference,
+    relative_rows,
 };
+use raysweep_transport::quality::{median_profile_error, relative_l2};
+use stepping::by_stepping_through_time;
 
 /// The objective of one camera row, assembled from its definition.
 struct Objective {
@@ -77,10 +81,14 @@ fn samples(stack: &Array3<f32>, t: usize, column: usize) -> Array1<f64> {
 }
 
 #[test]
-fn equals_the_reference_on_the_corner() {
+fn every_instruction_set_equals_the_reference_on_the_corner() {
     let stack = noisy_corner();
     for prior in [Prior::PAPER, Prior::SPLIT] {
-        let estimate = Demux::new(timing(), paper_sweep(), prior).unwrap().solve(stack.view(), None).unwrap();
+        let demux = Demux::new(timing(), paper_sweep(), prior).unwrap();
+        let estimates: Vec<(SimdLevel, Transport)> = SimdLevel::available()
+            .into_iter()
+            .map(|level| (level, demux.with_simd(level).solve(stack.view(), None).unwrap()))
+            .collect();
         let mut errors = Vec::new();
         for t in [0, 40, 64, 127] {
             let objective = Objective::new(&timing(), &paper_sweep(), prior, t);
@@ -89,19 +97,116 @@ fn equals_the_reference_on_the_corner() {
                 let expected = objective.reference(&samples);
                 let residual = objective.kkt_residual(&expected, &samples);
                 assert!(residual <= 1e-9, "{prior:?} {t} {column}: KKT residual {residual}");
-
-                let x = objective.profile(&estimate, t, column);
                 let best = objective.value(&expected, &samples);
-                let gap = (objective.value(&x, &samples) - best) / best;
-                assert!(gap <= 1e-6, "{prior:?} {t} {column}: objective gap {gap}");
-                let error = &x - &expected;
-                errors.push((error.dot(&error) / expected.dot(&expected)).sqrt());
+                for (level, estimate) in &estimates {
+                    let x = objective.profile(estimate, t, column);
+                    let gap = (objective.value(&x, &samples) - best) / best;
+                    assert!(gap <= 1e-6, "{} {prior:?} {t} {column}: objective gap {gap}", level.name());
+                    let error = &x - &expected;
+                    errors.push((error.dot(&error) / expected.dot(&expected)).sqrt());
+                }
             }
         }
         errors.sort_by(f64::total_cmp);
         assert!(errors[errors.len() / 2] <= 1e-3, "median {}", errors[errors.len() / 2]);
         assert!(errors[errors.len() - 1] <= 1e-2, "largest {}", errors[errors.len() - 1]);
     }
+}
+
+fn largest_difference(a: &Array3<f32>, b: &Array3<f32>) -> f32 {
+    assert_eq!(a.dim(), b.dim());
+    a.iter().zip(b).fold(0.0, |largest, (a, b)| largest.max((a - b).abs()))
+}
+
+#[test]
+fn a_start_from_another_estimate_ends_at_the_same_minimum() {
+    let corner = ideal_stack(&corner(), &paper_sweep());
+    let demux = Demux::new(timing(), paper_sweep(), Prior::PAPER).unwrap();
+    let earlier = demux.solve(photographed(&corner, 5).view(), None).unwrap();
+    let stack = photographed(&corner, 6);
+    let cold = demux.solve(stack.view(), None).unwrap();
+    let warm = demux.solve_from(&earlier, stack.view(), None, &|| true).unwrap();
+    assert!(largest_difference(&cold.t, &earlier.t) > 1e-3);
+    assert!(largest_difference(&cold.t, &warm.t) < 1e-6);
+
+    let narrow = demux.solve(stack.slice(s![.., .., ..5]), None).unwrap();
+    let refused = demux.solve_from(&narrow, stack.view(), None, &|| true);
+    assert!(matches!(refused, Err(PlaneError::Shape { array: "estimate", .. })));
+}
+
+#[test]
+fn some_rows_are_solved_as_all_are_and_predict_their_images() {
+    let ideal = ideal_stack(&corner(), &paper_sweep());
+    let demux = Demux::new(timing(), paper_sweep(), Prior::SPLIT).unwrap();
+    let rows = [3, 64, 65, 127];
+    let band = ideal.select(Axis(1), &rows);
+    let some = demux.solve_rows(&rows, band.view(), None, &|| true).unwrap();
+    let all = demux.solve(ideal.view(), None).unwrap();
+    assert_eq!(some.t, all.t.select(Axis(1), &rows));
+    assert_eq!(some.exists, all.exists.select(Axis(1), &rows));
+
+    let predicted = demux.predict_rows(&rows, &some).unwrap();
+    // Less 0.65 % of the light, which comes from beyond the reach.
+    let flat = |images: Array3<f32>| images.into_shape_with_order((75, 4 * 128)).unwrap();
+    let error = relative_l2(flat(predicted).view(), flat(band.as_standard_layout().into_owned()).view());
+    assert!(error < 0.02, "{error}");
+    assert_eq!(demux.predict_rows(&[128], &some), Err(PlaneError::Rows { row: 128, camera_rows: 128 }));
+}
+
+#[test]
+fn channels_are_columns() {
+    // Red, green and blue of the same pixels, interleaved as a camera sends them.
+    let red = noisy_corner().slice_move(s![.., .., ..11]);
+    let rgb = ndarray::stack(Axis(3), &[red.view(), (&red * 0.5).view(), (&red * 0.1).view()]).unwrap();
+    let interleaved = rgb.to_shape((75, 128, 33)).unwrap();
+    let demux = Demux::new(timing(), paper_sweep(), Prior::SPLIT).unwrap();
+    let estimate = demux.solve(interleaved.view(), None).unwrap();
+    for channel in 0..3 {
+        let alone = demux.solve(rgb.index_axis(Axis(3), channel), None).unwrap();
+        let of_channel = estimate.t.slice(s![.., .., channel..;3]).to_owned();
+        assert!(largest_difference(&of_channel, &alone.t) < 1e-6);
+    }
+}
+
+#[test]
+fn direct_light_between_rows_is_found_where_it_is_said_to_be() {
+    // 30 % of each pixel's direct light in the row below, as rectification leaves it; edges of exposures cut the rows.
+    let settings: Vec<Setting> = (0..60)
+        .map(|k| Setting::new(-1500.0 + 50.7 * f64::from(k), 600.0 + 7.0 * f64::from(k % 4)))
+        .collect();
+    let mut transport = Array3::zeros((128, 128, 2));
+    for t in 0..128 {
+        for v in 0..128_usize {
+            let distance = v.abs_diff(t) as f32;
+            transport[[v, t, 0]] = 0.02 * (-distance / 20.0).exp();
+            transport[[v, t, 1]] = transport[[v, t, 0]];
+        }
+        transport[[t, t, 0]] += 0.7;
+        transport[[t, t, 1]] += 1.0;
+        if t < 127 {
+            transport[[t + 1, t, 0]] += 0.3;
+        }
+    }
+    let stack = ideal_stack(&transport, &settings);
+    let centred = Demux::new(timing(), settings, Prior::SPLIT).unwrap();
+    let truth = relative_rows(transport.view(), &centred.reach());
+    let u0 = Array2::from_shape_fn((128, 2), |(_, s)| if s == 0 { 0.3 } else { 0.0 });
+    let estimate = centred.with_spike(u0.clone()).unwrap().solve(stack.view(), None).unwrap();
+    let error = |t: &Array3<f32>, s: usize| {
+        median_profile_error(t.slice(s![.., .., s..=s]), truth.slice(s![.., .., s..=s]))
+    };
+    assert!(error(&estimate.t, 0) < 0.01, "{}", error(&estimate.t, 0));
+    assert!(error(&estimate.t, 1) < 0.01, "{}", error(&estimate.t, 1));
+    let misplaced = centred.solve(stack.view(), None).unwrap();
+    assert!(error(&misplaced.t, 0) > 0.1, "{}", error(&misplaced.t, 0));
+    // The last row's neighbour does not exist: its 30 % are beyond the projector.
+    let last = estimate.t.slice(s![.., 127, 0]);
+    assert!((last[-centred.reach().start() as usize] - 0.72).abs() < 0.02, "{last}");
+
+    let far = centred.with_spike(u0.mapv(|u0| 4.0 * u0));
+    assert!(matches!(far, Err(PlaneError::OutOfRange { field: "u0_rows", .. })));
+    let narrow = centred.with_spike(Array2::zeros((128, 3))).unwrap().solve(stack.view(), None);
+    assert!(matches!(narrow, Err(PlaneError::Shape { array: "u0_rows", .. })));
 }
 
 #[test]
@@ -189,27 +294,6 @@ fn a_mask_of_whole_settings_equals_leaving_them_out() {
     assert!((&fewer.t - &masked.t).iter().all(|error| error.abs() < 1e-6));
 }
 
-/// Light that a pixel of camera row `t` collects, by stepping through time: which row the projector lights at each
-/// instant follows from the clock alone.
-fn by_stepping_through_time(
-    timing: &RowTiming,
-    setting: &Setting,
-    t: usize,
-    light_of_row: impl Fn(usize) -> f64,
-) -> f64 {
-    const STEP_US: f64 = 0.01;
-    let steps = (setting.exposure_us / STEP_US).round() as usize;
-    let own_us = (timing.first_row() + t) as f64 * timing.row_time_us();
-    let start_us = own_us + setting.delays_us[0] - setting.exposure_us / 2.0;
-    let instants_us = (0..steps).map(|step| start_us + (step as f64 + 0.5) * STEP_US);
-    let lit_rows = instants_us.map(|instant_us| {
-        let since_edge_us = (instant_us + timing.row_time_us() / 2.0).rem_euclid(timing.period_us());
-        (since_edge_us / timing.row_time_us()) as usize
-    });
-    let light = lit_rows.filter(|&row| row < timing.projector_rows()).map(light_of_row);
-    light.sum::<f64>() * STEP_US / timing.row_time_us()
-}
-
 #[test]
 fn exposures_over_the_retrace_see_what_the_clock_says() {
     // Camera rows 592..720 of the paper's projector; the light of the top rows is distinct from the bottom's.
@@ -260,7 +344,7 @@ proptest! {
             .iter()
             .map(|&(delay, exposure_us)| Setting::new(delay * timing.period_us(), exposure_us))
             .collect();
-        let Ok(demux) = Demux::new(timing, settings.clone(), prior) else {
+        let Ok(demux) = Demux::new(timing.clone(), settings.clone(), prior) else {
             // Every delay may point into the retrace or beyond the border.
             prop_assert_eq!(reach(&timing, &settings), Err(PlaneError::NothingSeen));
             return Ok(());
@@ -272,9 +356,8 @@ proptest! {
         let estimate = demux.solve(stack.view(), None).unwrap();
         for t in 0..rows {
             for (n, setting) in settings.iter().enumerate() {
-                let weighted: f64 = (0..rows)
-                    .map(|v| timing.weight(timing.relative_row(v, t), setting) * f64::from(light[v]))
-                    .sum();
+                let weights = timing.weights(t, setting);
+                let weighted: f64 = weights.iter().zip(&light).map(|(w, &light)| w * f64::from(light)).sum();
                 prop_assert!((weighted - by_clock(n, t)).abs() < 0.01, "{weighted} is not {}", by_clock(n, t));
             }
             let objective = Objective::new(&timing, &settings, prior, t);
@@ -299,7 +382,7 @@ fn one_setting_alone_still_gives_the_minimum() {
     // Three unknowns, one sample: H is singular, and its inverse holds rounding only. Five periods of three rows.
     let timing = RowTiming::new(3, 20.0, 60.0).unwrap();
     let settings = [Setting::new(0.0, 306.2)];
-    let demux = Demux::new(timing, settings.to_vec(), Prior::SPLIT).unwrap();
+    let demux = Demux::new(timing.clone(), settings.to_vec(), Prior::SPLIT).unwrap();
     let stack = Array3::from_elem((1, 3, 1), 1.3);
     let estimate = demux.solve(stack.view(), None).unwrap();
     for t in 0..3 {

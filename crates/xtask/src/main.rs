@@ -1,7 +1,9 @@
-//! `cargo xtask demo | test`: the project's own commands. Plain std, so that they build at once everywhere.
+//! `cargo xtask demo | test | bench`: the project's own commands. Plain std, so that they build at once everywhere.
 
+mod bench;
 mod demo;
 mod packages;
+mod python;
 mod run;
 mod test;
 
@@ -11,13 +13,16 @@ const USAGE: &str = "\
 usage: cargo xtask <command>
 
   demo    build, run the paper's sweep on the simulated rig, write a report
-  test    install what the tests need, then format, lints, tests";
+  test    install what the tests need, then format, lints, tests
+  bench   measure: without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {
-    let command = std::env::args().nth(1);
-    let done = match command.as_deref() {
-        Some("demo") => demo::demo(),
-        Some("test") => test::test(),
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let done = match arguments.as_slice() {
+        ["demo"] => demo::demo(),
+        ["test"] => test::test(),
+        ["bench", arguments @ ..] => bench::bench(arguments),
         _ => Err(USAGE.to_owned()),
     };
     match done {

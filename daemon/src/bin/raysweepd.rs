@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use clap::Parser;
 use raysweep::control::Control;
+use raysweep::live::{LiveError, LiveFile};
 use raysweep::rig::Rig;
 use raysweep::run::Runner;
 use raysweep::server::{self, Access, Listening};
@@ -29,6 +30,9 @@ struct Arguments {
     /// Where clients connect; not needed under systemd's socket activation.
     #[arg(long, value_name = "PATH", default_value = "/run/raysweep/raysweepd.sock")]
     socket: PathBuf,
+    /// File with the newest live images, which clients map [default: `live` in the socket's folder]
+    #[arg(long, value_name = "PATH")]
+    live: Option<PathBuf>,
     /// Where sessions are kept.
     #[arg(long, value_name = "DIR", default_value = "/var/lib/raysweep")]
     data: PathBuf,
@@ -55,7 +59,7 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let rig = Rig::load(&arguments.rig)?;
-    let runner = Arc::new(Runner::new(rig, arguments.data.clone(), Registry::default())?);
+    let runner = Runner::new(rig, arguments.data.clone(), Registry::default())?;
     let camera = runner.camera();
     let opened = format!(
         "{} ({} x {} {:?}), rig {}",
@@ -73,12 +77,25 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     prepare_data(&arguments.data).map_err(|error| {
         format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
     })?;
+    let runner = Arc::new(match live_file(arguments)? {
+        Some(file) => runner.with_live(file),
+        None => runner,
+    });
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let served = runtime.block_on(serve(arguments, runner.clone()));
     // A server that failed leaves a run behind; after an orderly end there is none.
     runner.shut_down();
     runtime.shutdown_timeout(Duration::from_secs(1));
     served
+}
+
+/// The live file where it was asked for; else beside the socket, if it can be made there: no run needs it.
+fn live_file(arguments: &Arguments) -> Result<Option<LiveFile>, LiveError> {
+    if let Some(path) = &arguments.live {
+        return LiveFile::create(path).map(Some);
+    }
+    let made = LiveFile::create(&arguments.socket.with_file_name("live"));
+    Ok(made.map_err(|error| tracing::warn!(%error, "there will be no live images")).ok())
 }
 
 /// Makes the data folder where it is missing, and makes sure that sessions can be kept in it.

@@ -8,6 +8,7 @@ use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
 use super::Exit;
+use crate::live::LiveError;
 use crate::process::ProcessError;
 
 /// Why the command did not do what it was asked for.
@@ -19,6 +20,14 @@ pub(super) enum Failure {
     Plan(Box<PlanProblem>),
     #[error("cannot read {}: {source}", path.display())]
     File { path: PathBuf, source: io::Error },
+    #[error("cannot write {}: {source}", path.display())]
+    Write { path: PathBuf, source: io::Error },
+    #[error(
+        "there is no live image: a run shows its first after some points; `raysweep preview --follow` waits for it"
+    )]
+    NoLiveImage,
+    #[error(transparent)]
+    Live(#[from] LiveError),
     #[error(transparent)]
     Process(#[from] ProcessError),
     #[error("cannot watch for Ctrl-C: {0}")]
@@ -94,8 +103,11 @@ impl Failure {
             },
             Self::Client(_) => Exit::Unreachable,
             Self::Plan(_) => Exit::Refused,
-            Self::File { .. } => Exit::Usage,
-            Self::Process(_) | Self::Signals(_) | Self::Output(_) => Exit::Failed,
+            Self::File { .. } | Self::Process(ProcessError::Product(_)) => Exit::Usage,
+            Self::NoLiveImage => Exit::Refused,
+            Self::Write { .. } | Self::Live(_) | Self::Process(_) | Self::Signals(_) | Self::Output(_) => {
+                Exit::Failed
+            }
         }
     }
 }

@@ -2,6 +2,7 @@
 
 mod failure;
 mod follow;
+mod preview;
 mod show;
 mod view;
 
@@ -19,7 +20,7 @@ use serde_json::json;
 use self::failure::Failure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::view::View;
-use crate::process::{export, process};
+use crate::process::{Asked, export, process_asked};
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -87,6 +88,15 @@ enum Command {
     },
     /// Follow the run that is under way to its end; Ctrl-C stops watching
     Watch,
+    /// Write the running estimate as a picture: epipolar light on the left, indirect light on the right
+    Preview {
+        /// The PNG file to write
+        #[arg(long, value_name = "FILE", default_value = "preview.png")]
+        output: PathBuf,
+        /// Write it again whenever the estimate is newer, to the end of the run
+        #[arg(long)]
+        follow: bool,
+    },
     /// Hold the run before its next point
     Pause,
     /// Go on with a run that is held
@@ -99,6 +109,12 @@ enum Command {
     Process {
         /// The session's folder
         session: PathBuf,
+        /// Make this too, a `[[product]]` in one line: 'kind = "epipolar", width_rows = 5'; may be given several times
+        #[arg(long = "product", value_name = "KEYS")]
+        products: Vec<String>,
+        /// Make the given products only, not the plan's
+        #[arg(long, requires = "products")]
+        only: bool,
     },
     /// Copy a session's products, report and manifest; needs no daemon
     Export {
@@ -168,6 +184,9 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
             return begin_run(&socket, printer, detach, |client| Ok(client.resume(&session)?));
         }
         Command::Watch => return watch(&socket, printer),
+        Command::Preview { output, follow } => {
+            return preview::preview(&socket, &output, follow, printer);
+        }
         Command::Pause => {
             connect()?.pause()?;
             printer.print(&Empty {}, |_| {
@@ -183,8 +202,8 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
             printer.print(&Empty {}, |_| "the run is being ended; what was acquired is kept".into())?;
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
-        Command::Process { session } => {
-            let made = process(&session)?;
+        Command::Process { session, products, only } => {
+            let made = process_asked(&session, &Asked { products, only })?;
             let value = json!({
                 "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
             });

@@ -121,9 +121,11 @@ pub(super) fn ending(
     report: Option<&Path>,
     stored: usize,
     missing: usize,
+    final_s: Option<f64>,
 ) -> String {
     let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
     lines.push(format!("session: {}", session.display()));
+    lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
     lines.extend(report.map(|report| format!("report: {}", report.display())));
     if missing > 0 {
         lines.push(format!("`raysweep resume {}` takes what is missing", name(session)));
@@ -240,9 +242,10 @@ mod tests {
     #[test]
     fn an_unfinished_session_is_told_how_to_go_on() {
         let folder = Path::new("/data/20260101-000000_corner");
-        let unfinished = ending(folder, "cancelled", None, 40, 35);
+        let unfinished = ending(folder, "cancelled", None, 40, 35, None);
         assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
-        let complete = ending(folder, "complete", Some(&folder.join("report.html")), 75, 0);
+        let complete = ending(folder, "complete", Some(&folder.join("report.html")), 75, 0, Some(0.25));
+        assert!(complete.contains("0.25 s after the last frame"));
         assert!(complete.ends_with("report.html") && !complete.contains("resume"), "{complete}");
     }
 }

@@ -14,7 +14,14 @@ const PACE: Duration = Duration::from_secs(5);
 const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} points  {msg}";
 
 /// How a run's events are shown.
-pub(super) enum View {
+pub(super) struct View {
+    place: Place,
+    /// Points that the newest live estimate is made from.
+    live: Option<usize>,
+}
+
+/// Where they are shown.
+enum Place {
     /// Drawn on standard error.
     Bar(ProgressBar),
     /// Told on standard error, at times.
@@ -29,22 +36,12 @@ pub(super) enum View {
 impl View {
     /// The view that suits where we print.
     pub fn new(json: bool) -> Self {
-        if json {
-            return Self::Json;
-        }
-        if !io::stderr().is_terminal() {
-            return Self::Lines { told: None };
-        }
-        let bar = ProgressBar::new(0);
-        if let Ok(style) = ProgressStyle::with_template(BAR) {
-            bar.set_style(style.progress_chars("=> "));
-        }
-        Self::Bar(bar)
+        Self { place: Place::new(json), live: None }
     }
 
     /// Shows an event; what a run came to goes to standard output, all else to standard error.
     pub fn show(&mut self, event: &Event) -> io::Result<()> {
-        if let Self::Json = self {
+        if let Place::Json = self.place {
             return writeln!(io::stdout(), "{}", serde_json::to_string(event)?);
         }
         match event {
@@ -58,8 +55,9 @@ impl View {
             }
             Event::Film(estimate) => self.film(estimate),
             Event::Vsync(_) => {}
-            Event::Finished { session, state, error, report, stored, missing, film, warnings } => {
-                if let Self::Bar(bar) = self {
+            Event::Live { points, .. } => self.live = Some(*points),
+            Event::Finished { session, state, error, report, stored, missing, film, warnings, final_s } => {
+                if let Place::Bar(bar) = &self.place {
                     bar.finish_and_clear();
                 }
                 if let Some(error) = error {
@@ -70,7 +68,7 @@ impl View {
                 }
                 let summary = match film {
                     Some(film) => show::film_ending(session, state, report.as_deref(), film),
-                    None => show::ending(session, state, report.as_deref(), *stored, *missing),
+                    None => show::ending(session, state, report.as_deref(), *stored, *missing, *final_s),
                 };
                 writeln!(io::stdout(), "{summary}")?;
             }
@@ -83,39 +81,58 @@ impl View {
 
     /// Says something beside the run's events.
     pub fn note(&mut self, text: &str) {
-        match self {
-            Self::Bar(bar) => bar.suspend(|| eprintln!("{text}")),
-            Self::Lines { .. } | Self::Json => eprintln!("{text}"),
+        match &self.place {
+            Place::Bar(bar) => bar.suspend(|| eprintln!("{text}")),
+            Place::Lines { .. } | Place::Json => eprintln!("{text}"),
         }
     }
 
     fn state(&mut self, state: RunState) {
-        match self {
-            Self::Bar(bar) => bar.set_prefix(show::state(state)),
+        match &self.place {
+            Place::Bar(bar) => bar.set_prefix(show::state(state)),
             _ => self.note(show::state(state)),
         }
     }
 
     fn film(&mut self, estimate: &FilmEstimate) {
         // Lines would be too many; how the film goes stands in the bar and in `raysweep status`.
-        if let Self::Bar(bar) = self {
+        if let Place::Bar(bar) = &self.place {
             bar.set_message(show::film(&estimate.film));
         }
     }
 
     fn progress(&mut self, progress: &Progress) {
-        let details = show::pace(progress);
-        match self {
-            Self::Bar(bar) => {
+        let mut details = show::pace(progress);
+        if let Some(points) = self.live {
+            details.push_str(&format!("  live estimate of {points}"));
+        }
+        match &mut self.place {
+            Place::Bar(bar) => {
                 bar.set_length(progress.points_planned as u64);
                 bar.set_position(progress.points_stored as u64);
                 bar.set_message(details);
             }
-            Self::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
+            Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
                 *told = Some(Instant::now());
                 eprintln!("{}/{} points  {details}", progress.points_stored, progress.points_planned);
             }
-            Self::Lines { .. } | Self::Json => {}
+            Place::Lines { .. } | Place::Json => {}
         }
+    }
+}
+
+impl Place {
+    fn new(json: bool) -> Self {
+        if json {
+            return Self::Json;
+        }
+        if !io::stderr().is_terminal() {
+            return Self::Lines { told: None };
+        }
+        let bar = ProgressBar::new(0);
+        if let Ok(style) = ProgressStyle::with_template(BAR) {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        Self::Bar(bar)
     }
 }

@@ -89,8 +89,6 @@ impl FilmPlan {
 mod tests {
     use crate::config::Plan;
 
-    use super::*;
-
     #[test]
     fn the_default_film_is_the_documented_one_and_its_delays_follow_their_law() {
         let page = include_str!("../../../docs/plan.md");

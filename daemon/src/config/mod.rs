@@ -2,6 +2,7 @@
 
 mod film;
 mod plan;
+mod product;
 mod rig;
 
 use std::ops::Range;
@@ -10,6 +11,7 @@ use toml::de::DeValue;
 
 pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
+pub use product::{ProductTable, append_argument};
 pub use rig::{CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
 
 /// What is wrong with a rig or plan file, and where.

@@ -4,7 +4,7 @@ use raysweep_pipeline::{Point, Role, Schedule};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::{ConfigError, FilmPlan, span_of};
+use super::{ConfigError, FilmPlan, ProductTable, span_of};
 
 /// A plan.
 #[derive(Debug, Clone, Deserialize)]
@@ -24,6 +24,8 @@ pub struct Plan {
     /// `[[stage]]`: stages in order, then folds; none: `demux`.
     #[serde(default = "default_stages")]
     pub stage: Vec<StageTable>,
+    /// `[[product]]`: what to make of the transport; left out: [`raysweep_pipeline::ProductSpec::defaults`].
+    pub product: Option<Vec<ProductTable>>,
 }
 
 /// The kinds of acquisition.
@@ -190,6 +192,9 @@ impl Plan {
                 return Err(ConfigError::at(text, &["stage", &index.to_string(), key], message));
             }
         }
+        for (index, product) in self.product.iter().flatten().enumerate() {
+            product.check(text, index)?;
+        }
         if !(1..=MAX_AVERAGE).contains(&sweep.average) {
             let message = format!("sweep.average = {}: 1 to {MAX_AVERAGE} frames are allowed", sweep.average);
             return Err(ConfigError::at(text, &["sweep", "average"], message));
@@ -236,7 +241,11 @@ impl Plan {
 
 #[cfg(test)]
 mod tests {
+    use raysweep_pipeline::{ProductSpec, Registry};
+
     use super::*;
+    use crate::config::RigFile;
+    use crate::processing::Task;
 
     #[test]
     fn every_key_but_kind_has_a_default_and_it_is_the_papers_sweep() {
@@ -264,6 +273,8 @@ mod tests {
             ("kind = \"sweep\"\nname = \"  \"", "empty"),
             ("kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nalpha = nan", "alpha is not a finite number"),
             ("kind = \"sweep\"\n[[stage]]\nprior = \"split\"", "name"),
+            ("kind = \"sweep\"\n[[product]]\nname = \"a\"", "kind"),
+            ("kind = \"sweep\"\n[[product]]\nkind = \"band\"\nfrom_rows = inf", "from_rows is not a finite"),
         ];
         for (text, expected) in cases {
             let error = Plan::parse(text).unwrap_err();
@@ -280,6 +291,10 @@ mod tests {
             (Plan::parse(documented).unwrap(), Plan::parse("kind = \"sweep\"").unwrap());
         assert_eq!(format!("{:?}", documented.sweep), format!("{:?}", default.sweep));
         assert_eq!(documented.schedule(16_667.0), default.schedule(16_667.0));
-        assert_eq!((documented.name, &documented.stage[0].name), (default.name, &default.stage[0].name));
+        assert_eq!((&documented.name, &documented.stage[0].name), (&default.name, &default.stage[0].name));
+        let rig = RigFile::parse(include_str!("../../../deploy/rigs/plane-sim.toml")).unwrap();
+        let task = Task::new(documented, &rig, 0, (128, 128));
+        let processing = task.processing(&Registry::default(), page).unwrap();
+        assert_eq!(processing.products, ProductSpec::defaults());
     }
 }

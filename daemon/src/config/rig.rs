@@ -1,7 +1,10 @@
 //! `rig.toml`: what the rig is made of and what is known of its timing.
 
 use raysweep_core::{PixelFormat, Raster};
+use raysweep_pipeline::{Scan, Spot};
 use raysweep_sim::SimConfig;
+use raysweep_sim::config::Spot as SimSpot;
+use raysweep_transport::plane::{PlaneError, RowTiming};
 use serde::Deserialize;
 
 use super::ConfigError;
@@ -52,8 +55,11 @@ pub struct CameraSection {
     /// How frames are packed.
     #[serde(default = "default_pixel_format")]
     pub pixel_format: PixelFormat,
-    /// From the start of one row's exposure to the next row's; left out: the projector's row time, as rectified.
+    /// From the start of one row's exposure to the next row's; left out: `row_pitch` times the projector's row time.
     pub row_time_us: Option<f64>,
+    /// Projector rows from one camera row to the next, on the epipolar planes.
+    #[serde(default = "default_row_pitch")]
+    pub row_pitch: f64,
     /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
     pub first_projector_row: Option<usize>,
 }
@@ -103,8 +109,39 @@ pub struct ProjectorSection {
     /// From the VSYNC edge to the start of row 0.
     #[serde(default = "default_first_row_us")]
     pub first_row_us: f64,
+    /// Measured start of each row's light and end of the last's, from `first_row_us` on; left out: rows of one row time.
+    pub row_table: Option<Vec<f64>>,
+    /// Standard deviation of the beam over rows, 0 for an ideal one; left out: not known.
+    pub beam_sigma_rows: Option<f64>,
+    /// How the light of a row is drawn.
+    #[serde(default)]
+    spot: SpotKind,
+    /// Which way a flying spot runs; left out: not known.
+    scan: Option<Scan>,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum SpotKind {
+    #[default]
+    Uniform,
+    Flying,
+}
+
+impl ProjectorSection {
+    /// When within its row a pixel's direct light arrives.
+    pub fn spot(&self) -> Spot {
+        match self.spot {
+            SpotKind::Uniform => Spot::Uniform,
+            SpotKind::Flying => Spot::Flying(self.scan.unwrap_or(Scan::Unknown)),
+        }
+    }
+}
+
+/// Rectified rows of the same height.
+fn default_row_pitch() -> f64 {
+    1.0
+}
 fn default_pixel_format() -> PixelFormat {
     PixelFormat::Mono12
 }
@@ -129,6 +166,10 @@ fn default_first_row_us() -> f64 {
 /// Largest number of rows a raster projector is taken to have.
 const MAX_ROWS: usize = 8192;
 
+/// Part of the row time by which camera and projector may differ. The model follows the drift of the delay; beyond this
+/// a sweep would no longer be one around the epipolar planes of all rows.
+const ROW_TIME_TOLERANCE: f64 = 0.01;
+
 impl RigFile {
     /// Reads a rig file.
     ///
@@ -150,20 +191,27 @@ impl RigFile {
         }
     }
 
-    /// The camera's row time: as stated, or the projector's.
+    /// The camera's row time: as stated, or that which keeps pace with the projector.
     pub fn camera_row_time_us(&self) -> f64 {
-        self.camera.row_time_us.unwrap_or(self.projector.row_time_us)
+        self.camera.row_time_us.unwrap_or_else(|| self.pace_us())
+    }
+
+    /// The camera's row time that keeps pace with the projector.
+    fn pace_us(&self) -> f64 {
+        self.camera.row_pitch * self.projector.row_time_us
     }
 
     fn check(&self, text: &str) -> Result<(), ConfigError> {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
         let max_dn = f64::from(camera.pixel_format.max_value());
-        let rules: [(&[&str], f64, f64, f64); 8] = [
+        let rules: [(&[&str], f64, f64, f64); 10] = [
             (&["vsync", "period_us"], vsync.period_us, 4000.0, 1e6),
             (&["vsync", "gate_us"], vsync.gate_us, 1.0, vsync.period_us / 4.0),
             (&["projector", "rows"], projector.rows as f64, 1.0, MAX_ROWS as f64),
             (&["projector", "row_time_us"], projector.row_time_us, 0.1, 10_000.0),
             (&["projector", "first_row_us"], projector.first_row_us, 0.0, vsync.period_us),
+            (&["projector", "beam_sigma_rows"], projector.beam_sigma_rows.unwrap_or(0.0), 0.0, 100.0),
+            (&["camera", "row_pitch"], camera.row_pitch, 0.01, 100.0),
             (&["camera", "row_time_us"], self.camera_row_time_us(), 0.1, 10_000.0),
             (&["camera", "white_dn"], camera.white_dn(), 1.0, max_dn),
             (&["camera", "black_dn"], camera.black_dn(), 0.0, max_dn / 2.0),
@@ -183,14 +231,24 @@ impl RigFile {
             );
             return Err(ConfigError::at(text, &["projector", "row_time_us"], message));
         }
-        if (self.camera_row_time_us() - projector.row_time_us).abs() > 1e-3 * projector.row_time_us {
+        if (self.camera_row_time_us() - self.pace_us()).abs() > ROW_TIME_TOLERANCE * self.pace_us() {
             let message = format!(
-                "camera.row_time_us = {} differs from projector.row_time_us = {}: the rows must run at the same speed; set the camera's pixel clock or lens so that they do",
+                "camera.row_time_us = {} differs by more than {} % from camera.row_pitch x projector.row_time_us = {}: the rows must run at the same speed; set the camera's pixel clock or lens so that they do",
                 self.camera_row_time_us(),
-                projector.row_time_us
+                100.0 * ROW_TIME_TOLERANCE,
+                self.pace_us()
             );
             return Err(ConfigError::at(text, &["camera", "row_time_us"], message));
         }
+        if projector.spot == SpotKind::Uniform && projector.scan.is_some() {
+            let message = "projector.scan says which way a flying spot runs: set projector.spot = \"flying\" or leave scan out";
+            return Err(ConfigError::at(text, &["projector", "scan"], message));
+        }
+        if self.sim.projector.spot != SimSpot::Uniform && camera.row_pitch != 1.0 {
+            let message = "sim.projector.spot: flying spots are simulated for camera.row_pitch = 1 only; take \"uniform\"";
+            return Err(ConfigError::at(text, &["sim", "projector", "spot"], message));
+        }
+        self.check_row_table(text)?;
         if camera.first_projector_row.is_some_and(|row| row >= projector.rows) {
             let message = format!(
                 "camera.first_projector_row = {}: allowed is 0 to {}",
@@ -201,6 +259,22 @@ impl RigFile {
         }
         Ok(())
     }
+
+    fn check_row_table(&self, text: &str) -> Result<(), ConfigError> {
+        let Some(table) = &self.projector.row_table else { return Ok(()) };
+        let refused = |message: String| ConfigError::at(text, &["projector", "row_table"], message);
+        let Raster { rows, row_time_us, first_row_us, period_us } = self.raster();
+        let timing =
+            RowTiming::new(rows, row_time_us, period_us).and_then(|timing| timing.with_row_table(table));
+        timing.map_err(|error: PlaneError| refused(format!("projector.{error}")))?;
+        let (start_us, end_us) = (first_row_us + table[0], first_row_us + table[rows]);
+        if start_us < 0.0 || end_us > period_us {
+            return Err(refused(format!(
+                "projector.row_table + first_row_us = {start_us:.1} to {end_us:.1} us after the edge: a frame's rows must be drawn from 0 to vsync.period_us = {period_us}"
+            )));
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -208,6 +282,28 @@ mod tests {
     use super::*;
 
     const MINIMAL: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n";
+
+    fn table(row_table: &str) -> String {
+        MINIMAL.replace("[projector]\n", &format!("[projector]\nrows = 3\nrow_table = {row_table}\n"))
+    }
+
+    #[test]
+    fn what_is_known_of_the_light_is_read() {
+        let rig = RigFile::parse(&table("[0, 21.5, 44, 66.66]")).unwrap();
+        assert_eq!(rig.projector.row_table, Some(vec![0.0, 21.5, 44.0, 66.66]));
+        let projector = |keys: &str| {
+            RigFile::parse(&MINIMAL.replace("[projector]\n", &format!("[projector]\n{keys}\n")))
+                .unwrap()
+                .projector
+        };
+        assert_eq!(projector("").spot(), Spot::Uniform);
+        assert_eq!(projector("spot = \"flying\"").spot(), Spot::Flying(Scan::Unknown));
+        let both_ways = projector("spot = \"flying\"\nscan = \"bidirectional\"");
+        assert_eq!(both_ways.spot(), Spot::Flying(Scan::Bidirectional));
+        assert_eq!(projector("beam_sigma_rows = 0").beam_sigma_rows, Some(0.0));
+        let halved = RigFile::parse(&MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0.5\n")).unwrap();
+        assert_eq!(halved.camera_row_time_us(), 11.11);
+    }
 
     #[test]
     fn every_key_but_kind_and_drivers_has_a_default() {
@@ -225,7 +321,21 @@ mod tests {
             (MINIMAL.replace("[camera]\n", "[camera]\ngain = 3\n"), "gain"),
             (MINIMAL.replace("[camera]\n", "[camera]\nwhite_dn = 5000\n"), "4095"),
             (MINIMAL.replace("[camera]\n", "[camera]\nrow_time_us = 30\n"), "same speed"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 2\nrow_time_us = 22.22\n"), "44.44"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0\n"), "camera.row_pitch = 0"),
             (MINIMAL.replace("[projector]\n", "[projector]\nrows = 1000\n"), "longer than"),
+            (MINIMAL.replace("[projector]\n", "[projector]\nbeam_sigma_rows = -1\n"), "beam_sigma_rows = -1"),
+            (MINIMAL.replace("[projector]\n", "[projector]\nscan = \"one-way\"\n"), "flying"),
+            (
+                format!(
+                    "{}[sim.projector]\nspot = \"one-way\"\n",
+                    MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0.5\n")
+                ),
+                "row_pitch = 1 only",
+            ),
+            (table("[0.0, 20.0]"), "projector.row_table is 2"),
+            (table("[0, 20, 20, 40]"), "later than the entry before"),
+            (table("[-600, 20, 30, 40]"), "-44.5 to 595.5"),
             (format!("{MINIMAL}[sim.camera]\nlate_frames = 3\n"), "late_frames"),
             (
                 MINIMAL.replace("[projector]\n", "[projector]\nrow_time_us = nan\n"),

@@ -8,8 +8,7 @@ use raysweep_pipeline::{CycleOrder, Shot};
 use raysweep_proto::FilmCheck;
 use raysweep_session::film::TransportFilm;
 use raysweep_session::{Result, Session};
-use raysweep_transport::plane::Transport;
-use serde_json::{Map, Value, json};
+use serde_json::json;
 
 use crate::processing::Task;
 use crate::results;
@@ -83,20 +82,4 @@ pub fn create_transports(session: &Session, task: &Task, reach_rows: (i32, i32))
     );
     let cycle = [(u_max - u_min + 1) as usize, geometry.height, geometry.width];
     TransportFilm::create(&session.transport_film_path(), task.points(), cycle, &attributes)
-}
-
-/// The views of a transport that people look at: their names, and the images `[t, s]`.
-pub fn views(transport: &Transport) -> [(&'static str, ndarray::Array2<f32>); 2] {
-    [("epipolar", transport.epipolar(1)), ("indirect", transport.non_epipolar(1))]
-}
-
-/// What a view's image says of itself.
-pub fn view_metadata(cycle: u32, sliding: bool, start_s: f64, latency_ms: Option<f64>) -> Map<String, Value> {
-    let entries = [
-        ("cycle", json!(cycle)),
-        ("sliding", json!(sliding)),
-        ("start_s", json!(start_s)),
-        ("latency_ms", json!(latency_ms)),
-    ];
-    entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }

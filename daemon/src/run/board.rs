@@ -32,6 +32,7 @@ impl Board {
             vsync: None,
             film: None,
             error: None,
+            live: None,
         };
         Self { status: Mutex::new(status), events: broadcast::Sender::new(EVENTS) }
     }
@@ -78,6 +79,11 @@ impl Board {
     /// Notes how a film went.
     pub fn set_film(&self, film: FilmSummary) {
         self.lock().film = Some(film);
+    }
+
+    /// Names the file with the live images.
+    pub fn set_live(&self, file: PathBuf) {
+        self.lock().live = Some(file);
     }
 
     /// Notes why a run faulted.

@@ -5,11 +5,11 @@ mod film;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use raysweep_core::{
     Camera, CameraSettings, DeviceError, DeviceErrorKind, Frame, FrameBuf, FramePool, FrameStamp, LossCause,
-    SettingsId,
+    SettingsId, ns_from_us,
 };
 use raysweep_pipeline::{Event, Input, Job, Label, Point, QueueError, Shot, message_of};
 
@@ -71,7 +71,7 @@ pub struct Gone;
 pub struct CameraThread {
     work: SyncSender<Work>,
     ended: Receiver<Ended>,
-    thread: JoinHandle<()>,
+    thread: JoinHandle<Option<Instant>>,
 }
 
 impl CameraThread {
@@ -101,6 +101,7 @@ impl CameraThread {
                 if let Err(error) = sequencer.camera.disarm() {
                     tracing::warn!(%error, "camera not disarmed");
                 }
+                sequencer.exposed_until
             })
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
         Ok(Self { work, ended, thread })
@@ -119,11 +120,11 @@ impl CameraThread {
         }
     }
 
-    /// Disarms the camera and ends its thread.
+    /// Disarms the camera and ends its thread; says when the exposure of the last frame ended that a point waited for.
     ///
     /// # Errors
     /// When the thread panicked.
-    pub fn join(self) -> Result<(), DeviceError> {
+    pub fn join(self) -> Result<Option<Instant>, DeviceError> {
         drop(self.work);
         self.thread.join().map_err(|panic| {
             let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
@@ -144,6 +145,8 @@ struct Sequencer {
     /// The longest that a frame has taken so far, from its edge to its last row.
     longest_frame_us: f64,
     period_us: f64,
+    /// When the exposure of the last counted frame ended.
+    exposed_until: Option<Instant>,
 }
 
 /// A frame off the camera.
@@ -175,7 +178,18 @@ impl Sequencer {
         let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
         let pool = FramePool::new(POOL_BUFFERS, bytes);
         let spare = pool.spare();
-        Self { camera, input, pace, pool, spare, orders, warmed_up: false, longest_frame_us: 0.0, period_us }
+        Self {
+            camera,
+            input,
+            pace,
+            pool,
+            spare,
+            orders,
+            warmed_up: false,
+            longest_frame_us: 0.0,
+            period_us,
+            exposed_until: None,
+        }
     }
 
     /// Always ends with a flush, so that nothing stays undecided.
@@ -234,7 +248,10 @@ impl Sequencer {
         let mut spare_frames = 64 + 3 * point.frames;
         while passed < wanted && spare_frames > 0 && self.orders.go_on() {
             match self.take(|stamp| Label::of(stamp, &applied))? {
-                Taken::Passed(_, Label::Counted) => passed += 1,
+                Taken::Passed(stamp, Label::Counted) => {
+                    passed += 1;
+                    self.exposed_until = self.end_of_exposure(&stamp, &applied.actual);
+                }
                 Taken::Passed(..) => {}
                 Taken::Lost => spare_frames -= 1,
                 Taken::None => {
@@ -272,6 +289,15 @@ impl Sequencer {
     fn frame_us(&self, settings: &CameraSettings) -> f64 {
         let periods = self.camera.capabilities().periods_per_frame(settings, self.period_us);
         f64::from(periods) * self.period_us
+    }
+
+    /// When the last row of a frame that has just come ended its exposure. The camera's clock may be a virtual one, so
+    /// that only its differences count.
+    fn end_of_exposure(&self, stamp: &FrameStamp, settings: &CameraSettings) -> Option<Instant> {
+        let capabilities = self.camera.capabilities();
+        let rows_us = capabilities.height.saturating_sub(1) as f64 * capabilities.row_time_us;
+        let since_ns = stamp.host_ns - stamp.exposure_start_ns - ns_from_us(settings.exposure_us + rows_us);
+        Instant::now().checked_sub(Duration::from_nanos(since_ns.try_into().unwrap_or(0)))
     }
 
     fn watchdog(&self) -> Watchdog {

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
+use std::time::Instant;
 
 use raysweep_core::{
     CameraCapabilities, DeviceError, Pattern, Projector, SettingsId, Shown, VsyncStats, ns_from_us,
@@ -15,12 +16,13 @@ use raysweep_session::ledger::{Entry, Ledger, State};
 
 use super::board::Board;
 use super::camera::{Attempt, CameraThread, FilmPass, FilmSetting, Gone, Pass, Work};
-use super::film::{Account, CycleTiming, FilmSink, Solving, Views, Worker};
+use super::film::{Account, CycleTiming, FilmSink, Solving, Worker};
 use super::orders::Orders;
 use super::storage::{PaceMeter, Storage, Verdict};
 use super::vsync::VsyncThread;
 use crate::config::ConfigError;
 use crate::film::{self, CyclePlan};
+use crate::live::{LiveEstimate, Outlet};
 use crate::processing::{Processing, Task, place};
 use crate::rig::{Devices, Pace, Rig, RigError};
 
@@ -97,8 +99,8 @@ pub struct Run {
     pub orders: Arc<Orders>,
     /// What it tells.
     pub board: Arc<Board>,
-    /// Where a film's views are shown.
-    pub views: Option<Arc<dyn Views>>,
+    /// Where its running estimate is shown, if anywhere.
+    pub live: Option<Outlet>,
 }
 
 /// What acquisition leaves behind.
@@ -111,6 +113,8 @@ pub struct Acquired {
     pub processing: Processing,
     /// The VSYNC line.
     pub vsync: Option<VsyncStats>,
+    /// When the exposure of the last frame that a point waited for ended.
+    pub exposed_until: Option<Instant>,
     /// Why acquisition ended early, if a fault ended it.
     pub fault: Option<RunError>,
 }
@@ -168,6 +172,8 @@ impl Run {
             pace: PaceMeter::new(planned - missing.len() - cycles, planned),
             film,
             vsync: None,
+            // A film is its own running estimate.
+            live: self.live.filter(|_| cycle_plan.is_none()).and_then(start_live),
             write_error: None,
         };
         let config = PipelineConfig {
@@ -220,6 +226,10 @@ impl Run {
             }
         }
         // What failed first is the cause; what it brought down comes after.
+        let (exposed_until, imaged) = match imaged {
+            Ok(exposed_until) => (exposed_until, Ok(())),
+            Err(error) => (None, Err(error)),
+        };
         let device = watched.and(imaged).err().map(RunError::from);
         let fault = storage.write_error.map(RunError::from).or(device).or(acquired.err());
         Ok(Acquired {
@@ -227,6 +237,7 @@ impl Run {
             ledger: storage.ledger,
             processing: storage.processing,
             vsync: storage.vsync,
+            exposed_until,
             fault,
         })
     }
@@ -244,7 +255,7 @@ impl Run {
         let worker = Worker::start(Solving {
             solver,
             transports,
-            views: self.views.clone(),
+            live: self.live.clone(),
             board: self.board.clone(),
             account: account.clone(),
             orders: self.orders.clone(),
@@ -272,6 +283,12 @@ impl Run {
             edge_gate_us: self.rig.file.vsync.gate_us,
         })
     }
+}
+
+/// Starts the running estimate; a run is none the worse without.
+fn start_live(outlet: Outlet) -> Option<LiveEstimate> {
+    let started = outlet.file.clear().map_err(Into::into).and_then(|()| LiveEstimate::start(outlet));
+    started.map_err(|error| tracing::warn!(%error, "no live estimate of this run")).ok()
 }
 
 /// The points that the ledger does not know as stored, with the number of their next attempt; of a film those that are

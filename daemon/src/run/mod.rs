@@ -13,10 +13,10 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{Registry, message_of};
+use raysweep_pipeline::{Product, Registry, message_of};
 use raysweep_proto::{
     CheckReport, ErrorCode, Event, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
@@ -25,13 +25,14 @@ use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger, SessionEntry};
 use raysweep_session::stack::StackShape;
 use tokio::sync::broadcast;
 
-use self::board::{Board, WrongState};
+pub(crate) use self::board::Board;
+use self::board::WrongState;
 use self::engine::{Acquired, Run, RunError};
-pub use self::film::Views;
 use self::orders::{Order, Orders};
 use crate::check;
 use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
+use crate::live::{LiveFile, Outlet};
 use crate::processing::Task;
 use crate::results;
 use crate::rig::{Rig, RigError};
@@ -44,11 +45,10 @@ pub struct Runner {
     data: PathBuf,
     registry: Arc<Registry>,
     board: Arc<Board>,
+    live: Option<Arc<LiveFile>>,
     current: Mutex<Option<Current>>,
     /// Set once, when no further run may begin.
     closed: AtomicBool,
-    /// Where a film's views are shown.
-    views: Option<Arc<dyn Views>>,
 }
 
 /// The run under way, or the last one.
@@ -80,16 +80,17 @@ impl Runner {
             data,
             registry: Arc::new(registry),
             board: Arc::new(Board::new("plane")),
+            live: None,
             current: Mutex::default(),
             closed: AtomicBool::new(false),
-            views: None,
         })
     }
 
-    /// Shows the views of films there.
+    /// The same, with a file for the running estimates of its runs.
     #[must_use]
-    pub fn with_views(mut self, views: Arc<dyn Views>) -> Self {
-        self.views = Some(views);
+    pub fn with_live(mut self, file: LiveFile) -> Self {
+        self.board.set_live(file.path().to_owned());
+        self.live = Some(Arc::new(file));
         self
     }
 
@@ -103,8 +104,9 @@ impl Runner {
         let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
         let size = (self.camera.height, self.camera.width);
         let task = Task::new(parsed, &self.rig.file, self.rig.first_row(), size);
-        task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
-        let report = check::check(&task, &self.camera, &self.data).map_err(|error| invalid_plan(&error))?;
+        let processing = task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
+        let report = check::check(&task, &processing.products, &self.camera, &self.data)
+            .map_err(|error| invalid_plan(&error))?;
         Ok((task, report))
     }
 
@@ -174,7 +176,11 @@ impl Runner {
             resumed,
             orders: orders.clone(),
             board: self.board.clone(),
-            views: self.views.clone(),
+            live: self.live.as_ref().map(|file| Outlet {
+                file: file.clone(),
+                board: self.board.clone(),
+                session: dir.display().to_string(),
+            }),
         };
         let board = self.board.clone();
         let thread = thread::Builder::new()
@@ -265,11 +271,14 @@ impl Runner {
 fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
     let task = run.task.clone();
     let rig = run.rig.clone();
+    let live = run.live.clone();
     tracing::info!(session = %dir.display(), resumed = run.resumed, "run begins");
     let ended = catch_unwind(AssertUnwindSafe(|| -> Result<(EndEntry, Vec<String>), RunError> {
         let acquired = run.acquire()?;
-        let conclude = if task.is_film() { conclude_film } else { conclude };
-        conclude(acquired, &task, &rig, orders)
+        match task.is_film() {
+            true => conclude_film(acquired, &task, &rig, orders),
+            false => conclude(acquired, &task, &rig, orders, live.as_ref()),
+        }
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
     let (end, warnings) = ended.unwrap_or_else(|error| {
@@ -277,7 +286,14 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
         let stored = Session::open(dir).and_then(|session| session.state());
         let stored = stored.map_or(0, |state| state.stored_points());
         let error = Some(error.to_string());
-        let end = EndEntry { state: EndState::Faulted, error, stored, missing: points - stored, vsync: None };
+        let end = EndEntry {
+            state: EndState::Faulted,
+            error,
+            stored,
+            missing: points - stored,
+            vsync: None,
+            final_s: None,
+        };
         (end, Vec::new())
     });
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
@@ -296,6 +312,7 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
         missing: end.missing,
         film: board.status().film,
         warnings,
+        final_s: end.final_s,
     };
     if board.status().state != RunState::Draining && state == RunState::Idle {
         let _ = board.go(RunState::Draining);
@@ -310,12 +327,13 @@ fn conclude(
     task: &Task,
     rig: &Rig,
     orders: &Orders,
+    live: Option<&Outlet>,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
-    let Acquired { session, mut ledger, processing, vsync, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
     let whole = fault.is_none() && engine::missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let results = whole.then(|| processing.finish(&|| orders.go_on()));
-    let computed_s = began.elapsed().as_secs_f64();
+    let computed = began.elapsed();
     let state = match (&fault, &results) {
         (Some(_), _) => EndState::Faulted,
         (None, _) if orders.now() == Order::Cancel => EndState::Cancelled,
@@ -323,20 +341,24 @@ fn conclude(
         (None, None) => EndState::Faulted,
     };
     let stored = ledger.state().stored_points();
-    let end = EndEntry {
+    let mut end = EndEntry {
         state,
         error: fault.map(|fault| fault.to_string()),
         stored,
         missing: task.points() - stored,
         vsync,
+        final_s: None,
     };
     if let (EndState::Complete, Some((products, problems))) = (state, &results) {
+        results::write_transport(&session, task, products)?;
+        end.final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+        show_last(live, products, stored, computed);
         results::write_products(&session, task, products)?;
         ledger.append(&Entry::End(end.clone()))?;
         results::write_report(&session, ledger.state(), task, products, problems)?;
         results::write_manifest(&session, ledger.state(), task, &rig.file)?;
-        let written_s = began.elapsed().as_secs_f64() - computed_s;
-        tracing::info!(computed_s, written_s, "results made");
+        let (computed_s, written_s) = (computed.as_secs_f64(), (began.elapsed() - computed).as_secs_f64());
+        tracing::info!(computed_s, written_s, final_s = end.final_s, "results made");
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
@@ -354,7 +376,7 @@ fn conclude_film(
     rig: &Rig,
     orders: &Orders,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
-    let Acquired { session, mut ledger, processing, vsync, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
     let state = match &fault {
         Some(_) => EndState::Faulted,
         None if orders.now() == Order::Cancel => EndState::Cancelled,
@@ -362,7 +384,9 @@ fn conclude_film(
     };
     let stored = ledger.state().stored_points();
     let error = fault.map(|fault| fault.to_string());
-    let end = EndEntry { state, error, stored, missing: task.points() - stored, vsync };
+    let final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+    let missing = task.points() - stored;
+    let end = EndEntry { state, error, stored, missing, vsync, final_s };
     ledger.append(&Entry::End(end.clone()))?;
     let mut problems = processing.problems;
     if state != EndState::Faulted {
@@ -371,6 +395,17 @@ fn conclude_film(
     }
     problems.extend(crate::film::shortcomings(ledger.state()));
     Ok((end, problems))
+}
+
+/// Shows the result where the estimates before it were shown.
+fn show_last(live: Option<&Outlet>, products: &[Product], points: usize, took: Duration) {
+    for product in products {
+        if let (Some(live), Product::Transport(transport)) = (live, product)
+            && let Err(error) = live.show(transport, points, took, true)
+        {
+            tracing::warn!(%error, "the result is not among the live images");
+        }
+    }
 }
 
 impl Control for Runner {

@@ -13,6 +13,7 @@ use raysweep_session::stack::Stack;
 use super::board::Board;
 use super::film::FilmSink;
 use super::orders::{Order, Orders};
+use crate::live::LiveEstimate;
 use crate::processing::{Processing, Task, place};
 
 /// What the run is told of its points, in order.
@@ -38,6 +39,8 @@ pub struct Storage {
     /// Where the run is a film.
     pub(super) film: Option<FilmSink>,
     pub(super) vsync: Option<VsyncStats>,
+    /// Until the pipeline has ended: then the machine is for the results.
+    pub(super) live: Option<LiveEstimate>,
     /// The first failure to write, which ends the run.
     pub(super) write_error: Option<raysweep_session::Error>,
 }
@@ -88,7 +91,14 @@ impl Sink for Storage {
                 self.pace.stored += 1;
                 self.pace.counts.add(&unit.counts);
                 match image {
-                    Ok(image) => self.processing.push(&unit, &image),
+                    Ok(image) => {
+                        self.processing.push(&unit, &image);
+                        if let Some(live) = &self.live
+                            && let Some(snapshot) = self.processing.snapshot()
+                        {
+                            live.offer(snapshot);
+                        }
+                    }
                     Err(error) => self.note_stage_error(&unit, &error),
                 }
                 self.board.publish(Event::Progress(self.pace.progress()));
@@ -110,6 +120,7 @@ impl Sink for Storage {
 
     fn end(&mut self) {
         self.verdicts = None;
+        self.live = None;
     }
 }
 

@@ -1,5 +1,6 @@
 //! The program `raysweep` itself: what it prints and how it exits.
 
+use std::fs;
 use std::io::{BufRead, BufReader, Lines};
 use std::path::PathBuf;
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
@@ -7,6 +8,7 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile};
 use raysweep::server::{Access, Limits, Peer};
 use raysweep_core::VsyncStats;
 use raysweep_proto::{Event, RunState};
@@ -104,6 +106,42 @@ fn every_other_command_prints_for_people_and_for_programs() {
             assert!(lines.len() == 1 && lines[0].pointer(json).is_some(), "{arguments:?}: {out}");
         }
     }
+}
+
+#[test]
+fn the_preview_is_a_picture_of_both_images_and_is_followed_to_the_result() {
+    let daemon = Daemon::start();
+    let output = daemon.folder.path().join("seen.png");
+    let arguments = ["preview", "--output", output.to_str().unwrap()];
+    let (exit, _, err) = run(&daemon, &arguments);
+    assert!(exit == 5 && err.contains("no live image"), "{exit} {err}");
+    let live = LiveFile::create(&daemon.fake.live).unwrap();
+    let (exit, _, err) = run(&daemon, &arguments);
+    assert!(exit == 5 && err.contains("no live image") && !output.exists(), "{exit} {err}");
+
+    let show = |points: u32, last: bool| {
+        let metadata = serde_json::json!({ "points": points, "last": last });
+        for (name, light) in [(EPIPOLAR, 0.5), (INDIRECT, 0.01)] {
+            let image = ndarray::Array2::from_elem((6, 8), light).into_dyn();
+            live.publish(name, image.view(), metadata.as_object().unwrap()).unwrap();
+        }
+    };
+    show(5, false);
+    let (exit, out, err) = run(&daemon, &[&arguments[..], &["--json"]].concat());
+    assert_eq!((exit, json_lines(&out)[0]["points"].as_u64()), (0, Some(5)), "{out}{err}");
+    // Width and height stand in the first chunk of a PNG file.
+    let size = |at: usize| u32::from_be_bytes(fs::read(&output).unwrap()[at..at + 4].try_into().unwrap());
+    assert_eq!((size(16), size(20)), (8 + 4 + 8, 6));
+
+    let mut child = command(&daemon, &[&arguments[..], &["--follow", "--json"]].concat())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    assert_eq!(json_lines(&lines.next().unwrap().unwrap())[0]["sequence"], 2);
+    show(9, true);
+    assert_eq!(json_lines(&lines.next().unwrap().unwrap())[0]["points"], 9);
+    assert_eq!(child.wait().unwrap().code(), Some(0));
 }
 
 #[test]

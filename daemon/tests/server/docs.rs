@@ -24,9 +24,21 @@ fn the_tables_have_every_method_and_every_error() {
 }
 
 #[test]
+fn the_tables_have_every_field_of_the_live_file() {
+    let live = describe("").live;
+    for field in live.header.iter().chain(&live.slot) {
+        let count = if field.count > 1 { format!(" x {}", field.count) } else { String::new() };
+        let dtype = field.dtype.replace('|', "\\|");
+        let row = format!("| `{}` | {} | `{dtype}`{count} |", field.name, field.offset);
+        assert!(DOCS.contains(&row), "{row}");
+    }
+}
+
+#[test]
 fn the_python_example_runs_a_plan_to_its_end() {
     let daemon = Daemon::start();
-    let (_, example) = DOCS.split_once("```python\n").unwrap();
+    let (_, section) = DOCS.split_once("## From Python").unwrap();
+    let (_, example) = section.split_once("```python\n").unwrap();
     let (example, _) = example.split_once("```").unwrap();
     let plan = daemon.folder.path().join("plan.toml");
     let python = |text: &str| {

@@ -24,16 +24,19 @@ pub struct Fake {
     pub resumed: Mutex<Vec<PathBuf>>,
     /// A call of `check` on the plan `wait` holds until somebody lets go of this.
     pub gate: Mutex<()>,
+    /// Where the file of live images is, if there is one.
+    pub live: PathBuf,
     events: broadcast::Sender<Event>,
 }
 
 impl Fake {
-    fn new() -> Self {
+    fn new(live: PathBuf) -> Self {
         Self {
             state: Mutex::new(RunState::Idle),
             runs: Mutex::default(),
             resumed: Mutex::default(),
             gate: Mutex::default(),
+            live,
             events: broadcast::Sender::new(KEPT_EVENTS),
         }
     }
@@ -61,6 +64,7 @@ impl Fake {
             missing,
             film: None,
             warnings: Vec::new(),
+            final_s: None,
         });
     }
 
@@ -154,6 +158,7 @@ impl Control for Fake {
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
             film: None,
             error: None,
+            live: self.live.exists().then(|| self.live.clone()),
         }
     }
 
@@ -231,7 +236,7 @@ impl Daemon {
             tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("raysweepd.sock");
-        let fake = Arc::new(Fake::new());
+        let fake = Arc::new(Fake::new(folder.path().join("live")));
         let (stop, stopped) = oneshot::channel::<()>();
         let Listening { listener, file } = {
             let _within = runtime.enter();

@@ -45,7 +45,7 @@ fn failed(index: usize, attempt: u32) -> Entry {
 }
 
 fn end(state: EndState) -> Entry {
-    Entry::End(EndEntry { state, error: None, stored: 1, missing: 3, vsync: None })
+    Entry::End(EndEntry { state, error: None, stored: 1, missing: 3, vsync: None, final_s: None })
 }
 
 fn all_kinds() -> Vec<Entry> {

@@ -57,6 +57,35 @@ fn an_image_is_the_same_in_exr_and_npy_with_its_metadata() {
 }
 
 #[test]
+fn a_sequence_has_a_layer_for_each_image() {
+    let (_dir, products) = products();
+    let values = Array3::from_shape_fn((3, 5, 4), |(k, t, s)| (100 * k + 10 * t + s) as f32);
+    let layers = ["k0", "k1", "k2"].map(str::to_owned);
+    products.sequence("line", values.view(), &layers, &metadata()).unwrap();
+    let plane = |k: usize| values.index_axis(Axis(0), k).iter().copied().collect::<Vec<f32>>();
+    let expected: Vec<_> =
+        layers.iter().enumerate().map(|(k, layer)| (format!("{layer}.Y"), plane(k))).collect();
+    assert_eq!(exr_channels(&products.dir().join("line.exr")), expected);
+    let back: Array3<f32> = read_npy(products.dir().join("line.npy")).unwrap();
+    assert_eq!(back, values);
+    let short = products.sequence("line", values.view(), &layers[..2], &metadata());
+    assert!(matches!(short, Err(Error::Shape { .. })));
+}
+
+#[test]
+fn a_table_says_the_same_in_csv_and_npy() {
+    let (_dir, products) = products();
+    let columns = [("delay_us", vec![-1.5, 0.1]), ("light", vec![0.25, f64::NAN])];
+    products.table("profile", &columns, &metadata()).unwrap();
+    let csv = fs::read_to_string(products.dir().join("profile.csv")).unwrap();
+    assert_eq!(csv, "delay_us,light\n-1.5,0.25\n0.1,NaN\n");
+    let back: Array2<f32> = read_npy(products.dir().join("profile.npy")).unwrap();
+    assert_eq!((back.dim(), back[[0, 0]], back[[1, 0]], back[[0, 1]]), ((2, 2), -1.5, 0.1, 0.25));
+    let uneven = [("delay_us", vec![-1.5, 0.1]), ("light", vec![0.25])];
+    assert!(matches!(products.table("profile", &uneven, &metadata()), Err(Error::Shape { .. })));
+}
+
+#[test]
 fn colours_keep_their_places() {
     let (_dir, products) = products();
     let values = Array3::from_shape_fn((4, 5, 3), |(t, s, c)| (c * 100 + t * 10 + s) as f32);

@@ -12,8 +12,12 @@ use crate::{Error, Result};
 const PICTURE_MAX_PX: usize = 1024;
 /// The same for the pictures of a contact sheet.
 const THUMBNAIL_MAX_PX: usize = 160;
+/// The same for animations, which have many pictures.
+const ANIMATION_MAX_PX: usize = 400;
 /// Pictures below this size are shown enlarged, with their pixels as squares.
 const PIXELATED_MAX_PX: usize = 512;
+/// Pictures of an animation that are shown in a second.
+const ANIMATION_FRAMES_PER_S: u16 = 12;
 /// More values than this do not make a percentile better.
 const PERCENTILE_SAMPLES: usize = 1 << 20;
 
@@ -70,6 +74,8 @@ pub struct Picture {
     tone_map: ToneMap,
     caption: String,
     markers: Vec<Marker>,
+    /// The further pictures of an animation.
+    next: Vec<Picture>,
 }
 
 impl Picture {
@@ -86,6 +92,15 @@ impl Picture {
     /// A grey picture for a contact sheet.
     pub fn thumbnail(image: ArrayView2<f32>, tone_map: ToneMap) -> Picture {
         Picture::new(image.insert_axis(Axis(2)), tone_map, THUMBNAIL_MAX_PX)
+    }
+
+    /// Images `[t, s]` of one size on one scale, shown one after the other in a loop; `None` where there are none.
+    pub fn animation(images: &[ArrayView2<f32>], tone_map: ToneMap) -> Option<Picture> {
+        let frame = |image: &ArrayView2<f32>| {
+            Picture::new(image.view().insert_axis(Axis(2)), tone_map, ANIMATION_MAX_PX)
+        };
+        let (first, next) = images.split_first()?;
+        Some(Picture { next: next.iter().map(frame).collect(), ..frame(first) })
     }
 
     /// With a caption; scale and size are added to it.
@@ -114,6 +129,7 @@ impl Picture {
             tone_map,
             caption: String::new(),
             markers: Vec::new(),
+            next: Vec::new(),
         }
     }
 
@@ -137,34 +153,18 @@ impl Picture {
 
     pub(super) fn to_img(&self, alt: &str) -> Result<Markup> {
         let (rows, columns, _) = self.levels.dim();
-        let source = format!("data:image/png;base64,{}", STANDARD.encode(self.to_png()?));
+        let frames = std::iter::once(self).chain(&self.next);
+        let source = format!("data:image/png;base64,{}", STANDARD.encode(to_png(frames)?));
         let class = (rows.max(columns) <= PIXELATED_MAX_PX).then_some("pixelated");
         Ok(html! { img class=[class] src=(source) width=(columns) height=(rows) alt=(alt); })
     }
 
-    fn to_png(&self) -> Result<Vec<u8>> {
-        let (rows, columns, channels) = self.levels.dim();
-        let failed = || format!("a picture of {columns} x {rows} pixels and {channels} channels");
-        let color = match channels {
-            1 => png::ColorType::Grayscale,
-            3 => png::ColorType::Rgb,
-            _ => return Err(Error::codec("draw", failed())("pictures have 1 or 3 channels")),
-        };
-        let px = |len: usize| u32::try_from(len).map_err(Error::codec("draw", failed()));
-        let mut file = Vec::new();
-        let mut encoder = png::Encoder::new(&mut file, px(columns)?, px(rows)?);
-        encoder.set_color(color);
-        encoder.set_depth(png::BitDepth::Eight);
-        encoder.set_compression(png::Compression::Fast);
-        let levels: Vec<u8> = self.levels.iter().copied().collect();
-        encoder
-            .write_header()
-            .and_then(|mut writer| {
-                writer.write_image_data(&levels)?;
-                writer.finish()
-            })
-            .map_err(Error::codec("draw", failed()))?;
-        Ok(file)
+    /// The picture as a PNG file, without caption and crosses.
+    ///
+    /// # Errors
+    /// [`Error::Codec`] for an empty picture.
+    pub fn to_png(&self) -> Result<Vec<u8>> {
+        to_png(std::iter::once(self))
     }
 
     fn overlay(&self) -> Markup {
@@ -189,6 +189,38 @@ impl Picture {
             }
         }
     }
+}
+
+/// A PNG file; with more than one frame an animated one, which programs without animation show the first frame of.
+fn to_png<'a>(frames: impl Iterator<Item = &'a Picture>) -> Result<Vec<u8>> {
+    let frames: Vec<&Array3<u8>> = frames.map(|frame| &frame.levels).collect();
+    let (rows, columns, channels) = frames.first().map_or((0, 0, 0), |levels| levels.dim());
+    let failed = || format!("a picture of {columns} x {rows} pixels and {channels} channels");
+    let color = match channels {
+        1 => png::ColorType::Grayscale,
+        3 => png::ColorType::Rgb,
+        _ => return Err(Error::codec("draw", failed())("pictures have 1 or 3 channels")),
+    };
+    let px = |len: usize| u32::try_from(len).map_err(Error::codec("draw", failed()));
+    let (width, height, count) = (px(columns)?, px(rows)?, px(frames.len())?);
+    let encode = || {
+        let mut file = Vec::new();
+        let mut encoder = png::Encoder::new(&mut file, width, height);
+        encoder.set_color(color);
+        encoder.set_depth(png::BitDepth::Eight);
+        encoder.set_compression(png::Compression::Fast);
+        if count > 1 {
+            encoder.set_animated(count, 0)?;
+            encoder.set_frame_delay(1, ANIMATION_FRAMES_PER_S)?;
+        }
+        let mut writer = encoder.write_header()?;
+        for levels in &frames {
+            writer.write_image_data(&levels.iter().copied().collect::<Vec<u8>>())?;
+        }
+        writer.finish()?;
+        Ok(file)
+    };
+    encode().map_err(|error: png::EncodingError| Error::codec("draw", failed())(error))
 }
 
 /// Three significant digits.

@@ -56,6 +56,25 @@ fn a_large_picture_is_reduced_by_averaging() {
 }
 
 #[test]
+fn an_animation_holds_every_picture_in_order() {
+    let images = [0.0, 1.0, 0.25].map(|light: f32| Array2::from_elem((2, 3), light));
+    let views: Vec<_> = images.iter().map(|image| image.view()).collect();
+    let picture = Picture::animation(&views, ToneMap { white: 1.0 }).unwrap();
+    let html = page(vec![Block::Pictures(vec![picture])]);
+    let encoded = html.split("data:image/png;base64,").nth(1).unwrap().split('"').next().unwrap();
+    let mut reader =
+        png::Decoder::new(std::io::Cursor::new(STANDARD.decode(encoded).unwrap())).read_info().unwrap();
+    assert_eq!(reader.info().animation_control.unwrap().num_frames, 3);
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let mut shown = Vec::new();
+    while reader.next_frame(&mut pixels).is_ok() {
+        shown.push(pixels.clone());
+    }
+    assert_eq!(shown, [vec![0; 6], vec![255; 6], vec![137; 6]]);
+    assert!(Picture::animation(&[], ToneMap { white: 1.0 }).is_none());
+}
+
+#[test]
 fn colours_keep_their_places() {
     let mut image = Array3::<f32>::zeros((1, 2, 3));
     image[[0, 0, 0]] = 1.0;

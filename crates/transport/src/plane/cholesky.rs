@@ -5,6 +5,7 @@
 pub(super) struct NotPositiveDefinite;
 
 /// Replaces the lower triangle of the row-major `n` x `n` matrix `a` by its Cholesky factor; the rest is not read.
+#[inline(always)]
 pub(super) fn factor(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
     for i in 0..n {
         let (above, rest) = a.split_at_mut(i * n);
@@ -36,7 +37,41 @@ pub(super) fn solve(l: &[f64], n: usize, b: &mut [f64]) {
     }
 }
 
+/// Replaces the lower triangle of the symmetric positive definite `n` x `n` matrix `a` by that of its inverse; the rest
+/// is left undefined.
+#[inline(always)]
+pub(super) fn invert(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
+    factor(a, n)?;
+    // Row by row, so that all inner loops run along rows: first L^-1, which is lower triangular too,
+    let mut inverse = vec![0.0; n * n];
+    for i in 0..n {
+        let (above, rest) = inverse.split_at_mut(i * n);
+        let row = &mut rest[..n];
+        row[i] = 1.0;
+        for k in 0..i {
+            let factor = a[i * n + k];
+            row[..=k].iter_mut().zip(&above[k * n..]).for_each(|(row, above)| *row -= factor * above);
+        }
+        let reciprocal = a[i * n + i].recip();
+        row[..=i].iter_mut().for_each(|row| *row *= reciprocal);
+    }
+    // then L'^-1 times that, of which the lower triangle is enough.
+    for i in (0..n).rev() {
+        let (upto, below) = inverse.split_at_mut((i + 1) * n);
+        let row = &mut upto[i * n..=i * n + i];
+        for k in i + 1..n {
+            let factor = a[k * n + i];
+            row.iter_mut().zip(&below[(k - i - 1) * n..]).for_each(|(row, below)| *row -= factor * below);
+        }
+        let reciprocal = a[i * n + i].recip();
+        row.iter_mut().for_each(|row| *row *= reciprocal);
+    }
+    a.copy_from_slice(&inverse);
+    Ok(())
+}
+
 /// Scalar product with eight partial sums, which the compiler can keep in vector registers.
+#[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut sums = [0.0; 8];
     let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
@@ -64,6 +99,19 @@ mod tests {
             factor(&mut l, n).unwrap();
             solve(&l, n, &mut b);
             assert!(b.iter().zip(&x).all(|(b, x)| (b - x).abs() < 1e-12), "n = {n}");
+        }
+    }
+
+    #[test]
+    fn the_inverse_undoes_the_matrix() {
+        for n in [1, 2, 7, 8, 9, 30] {
+            let a = |i: usize, j: usize| if i == j { n as f64 } else { 1.0 / (1.0 + i.abs_diff(j) as f64) };
+            let mut inverse: Vec<f64> = (0..n * n).map(|k| a(k / n, k % n)).collect();
+            invert(&mut inverse, n).unwrap();
+            for (i, j) in (0..n).flat_map(|i| (0..n).map(move |j| (i, j))) {
+                let product: f64 = (0..n).map(|k| a(i, k) * inverse[k.max(j) * n + k.min(j)]).sum();
+                assert!((product - f64::from(i == j)).abs() < 1e-12, "n = {n}");
+            }
         }
     }
 

@@ -1,24 +1,28 @@
 use std::ops::RangeInclusive;
+use std::sync::Arc;
 
-use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, Axis, s};
+use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axis, s};
 use rayon::prelude::*;
 
-use super::pivot::{Outcome, Pivoting};
 use super::quadratic::Quadratic;
-use super::{PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind, Transport};
-use super::{reach, reference};
+use super::row::{Row, RowSolver};
+use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach};
 
 /// Demultiplexes delay-exposure stacks: for each pixel, the exact minimiser of
 /// `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` over `T >= 0` (the paper's section 4).
 ///
-/// All pixels of a camera row share one model, factored once, so a pixel costs a few small triangular systems. Rows
-/// are solved in parallel, and a row's result does not depend on how many threads there are.
+/// All pixels of a camera row share one model, and rows whose model is the same share its factors, so a pixel costs a
+/// few small triangular systems. Rows are solved in parallel, and the result does not depend, to the bit, on how many
+/// threads there are. Channels are pixels too: an RGB stack is solved as one with three times the columns, a Bayer
+/// mosaic as it is.
 #[derive(Debug, Clone)]
 pub struct Demux {
     timing: RowTiming,
     settings: Vec<Setting>,
     prior: Prior,
     reach: RangeInclusive<i32>,
+    u0_rows: Option<Arc<Array2<f32>>>,
+    simd: SimdLevel,
 }
 
 impl Demux {
@@ -29,7 +33,7 @@ impl Demux {
     pub fn new(timing: RowTiming, settings: Vec<Setting>, prior: Prior) -> Result<Self, PlaneError> {
         prior.check()?;
         let reach = reach(&timing, &settings)?;
-        Ok(Self { timing, settings, prior, reach })
+        Ok(Self { timing, settings, prior, reach, u0_rows: None, simd: SimdLevel::best() })
     }
 
     /// The same unknowns and prior for other settings: those of the points captured so far, or the planned ones with
@@ -42,9 +46,64 @@ impl Demux {
         Ok(Self { settings, ..self.clone() })
     }
 
+    /// The same unknowns and settings under another prior.
+    ///
+    /// # Errors
+    /// Those of [`Prior::check`].
+    pub fn with_prior(&self, prior: Prior) -> Result<Self, PlaneError> {
+        prior.check()?;
+        Ok(Self { prior, ..self.clone() })
+    }
+
+    /// The same unknowns, settings and prior with another timing, such as one with another beam.
+    ///
+    /// # Errors
+    /// Those of [`RowTiming::check`].
+    pub fn with_timing(&self, timing: RowTiming) -> Result<Self, PlaneError> {
+        timing.check(&self.settings)?;
+        Ok(Self { timing, ..self.clone() })
+    }
+
+    /// Where each pixel's direct light lies, `u0_rows[t, s]` in projector rows from the pixel's own, -1..=1: what
+    /// rectification leaves. Between rows it is shared between the two, `1 - |u0|` in row 0 and `|u0|` in its
+    /// neighbour, and estimated as one unknown; without this it lies in row 0.
+    ///
+    /// # Errors
+    /// [`PlaneError::OutOfRange`] for an offset that is not within -1..=1.
+    pub fn with_spike(&self, u0_rows: Array2<f32>) -> Result<Self, PlaneError> {
+        if let Some(&value) = u0_rows.iter().find(|u0| !(-1.0..=1.0).contains(*u0)) {
+            return Err(PlaneError::OutOfRange {
+                field: "u0_rows",
+                value: value.into(),
+                allowed: "within -1 to 1: rectify camera and projector better",
+            });
+        }
+        Ok(Self { u0_rows: Some(Arc::new(u0_rows)), ..self.clone() })
+    }
+
+    /// The same, solved with other instructions than the fastest.
+    pub fn with_simd(&self, simd: SimdLevel) -> Self {
+        Self { simd, ..self.clone() }
+    }
+
     /// The relative rows that are estimated.
     pub fn reach(&self) -> RangeInclusive<i32> {
         self.reach.clone()
+    }
+
+    /// When rows are lit and exposed.
+    pub fn timing(&self) -> &RowTiming {
+        &self.timing
+    }
+
+    /// The settings, in the order of the stack.
+    pub fn settings(&self) -> &[Setting] {
+        &self.settings
+    }
+
+    /// The prior.
+    pub fn prior(&self) -> Prior {
+        self.prior
     }
 
     /// Condition number (2-norm) of the objective's quadratic part `H = A'A + alpha D'D` for one camera row.
@@ -52,9 +111,13 @@ impl Demux {
     /// # Errors
     /// [`PlaneError::NotConvex`].
     pub fn condition(&self, row: usize) -> Result<f64, PlaneError> {
-        let model = RowModel::new(&self.timing, &self.settings, &self.reach, row);
+        let model = self.model(row);
         let quadratic = Quadratic::new(model.weights.view(), &model.slots, &self.prior)?;
-        Ok(largest_eigenvalue(&quadratic.h) * largest_eigenvalue(&quadratic.inverse))
+        Ok(largest_eigenvalue(quadratic.h()) * largest_eigenvalue(quadratic.inverse()))
+    }
+
+    fn model(&self, row: usize) -> RowModel {
+        RowModel::new(&self.timing, &self.settings, &self.reach, row)
     }
 
     /// Estimates the transport from `stack`, shape `[settings, camera_rows, columns]`, in units of the light that a
@@ -62,7 +125,7 @@ impl Demux {
     ///
     /// `valid`, of the same shape, tells which samples may be used; saturated ones may not. A pixel with masked
     /// samples is estimated from the others and flagged in [`Transport::saturated`]; it takes many times longer,
-    /// because it cannot share the row's model.
+    /// because its model differs from its row's.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if an array does not fit the timing and the settings; [`PlaneError::NotFinite`] for a
@@ -85,76 +148,188 @@ impl Demux {
         valid: Option<ArrayView3<bool>>,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, PlaneError> {
+        self.run(&self.all_rows(), stack, valid, None, go_on)
+    }
+
+    /// [`Self::solve_while`], started from an estimate: faster, where the light has changed little since. The minimum
+    /// is the same, but not to the bit.
+    ///
+    /// # Errors
+    /// Those of [`Self::solve_while`]; [`PlaneError::Shape`] if the estimate has another reach or size.
+    pub fn solve_from(
+        &self,
+        estimate: &Transport,
+        stack: ArrayView3<f32>,
+        valid: Option<ArrayView3<bool>>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, PlaneError> {
+        self.run(&self.all_rows(), stack, valid, Some(estimate), go_on)
+    }
+
+    /// [`Self::solve_while`] of some camera rows, ascending: a sample of the image, or a part of one that is larger than
+    /// the memory. The stack and the transport hold these rows alone.
+    ///
+    /// # Errors
+    /// Those of [`Self::solve_while`]; [`PlaneError::Rows`] for rows that the camera does not have.
+    pub fn solve_rows(
+        &self,
+        rows: &[usize],
+        stack: ArrayView3<f32>,
+        valid: Option<ArrayView3<bool>>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, PlaneError> {
+        self.run(rows, stack, valid, None, go_on)
+    }
+
+    /// The images that the model predicts for the settings, `[settings, rows, columns]`, from a transport of these
+    /// camera rows. Light from beyond the reach is not in it.
+    ///
+    /// # Errors
+    /// [`PlaneError::Shape`] if the transport does not fit the rows and the reach; [`PlaneError::Rows`].
+    pub fn predict_rows(&self, rows: &[usize], transport: &Transport) -> Result<Array3<f32>, PlaneError> {
+        self.check_rows(rows)?;
+        let columns = transport.t.len_of(Axis(2));
+        let expected = [self.reach.clone().count(), rows.len(), columns];
+        check_shape("transport", "[reach, camera rows, columns]", transport.t.shape(), &expected)?;
+        let mut images = Array3::zeros((self.settings.len(), rows.len(), columns));
+        images.axis_iter_mut(Axis(1)).into_par_iter().zip(rows).enumerate().for_each(
+            |(at, (mut image, &row))| {
+                let model = self.model(row);
+                let profiles = transport.t.index_axis(Axis(1), at);
+                let own = model
+                    .slots
+                    .iter()
+                    .zip(model.weights.columns())
+                    .filter(|(slot, _)| slot.kind == SlotKind::Own);
+                let mut sums = Array2::<f64>::zeros(image.dim());
+                for (slot, weights) in own {
+                    let light = profiles.row((slot.u - self.reach.start()) as usize);
+                    for (mut sums, &weight) in sums.rows_mut().into_iter().zip(weights) {
+                        if weight != 0.0 {
+                            sums.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+                        }
+                    }
+                }
+                image.zip_mut_with(&sums, |image, &sum| *image = sum as f32);
+            },
+        );
+        Ok(images)
+    }
+
+    fn all_rows(&self) -> Vec<usize> {
+        (0..self.timing.camera_rows()).collect()
+    }
+
+    fn check_rows(&self, rows: &[usize]) -> Result<(), PlaneError> {
+        let camera_rows = self.timing.camera_rows();
+        match rows.iter().find(|&&row| row >= camera_rows) {
+            Some(&row) => Err(PlaneError::Rows { row, camera_rows }),
+            None => Ok(()),
+        }
+    }
+
+    fn run(
+        &self,
+        rows: &[usize],
+        stack: ArrayView3<f32>,
+        valid: Option<ArrayView3<bool>>,
+        estimate: Option<&Transport>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, PlaneError> {
+        self.check_rows(rows)?;
         let columns = stack.len_of(Axis(2));
-        let rows = self.timing.camera_rows();
-        let shape_of = |array, shape: &[usize]| {
-            let expected = vec![self.settings.len(), rows, columns];
-            let axes = "[settings, camera rows, columns]";
-            match shape == expected {
-                true => Ok(()),
-                false => Err(PlaneError::Shape { array, axes, actual: shape.to_vec(), expected }),
-            }
-        };
-        shape_of("stack", stack.shape())?;
-        valid.map_or(Ok(()), |valid| shape_of("valid", valid.shape()))?;
+        let expected = [self.settings.len(), rows.len(), columns];
+        let axes = "[settings, camera rows, columns]";
+        check_shape("stack", axes, stack.shape(), &expected)?;
+        valid.map_or(Ok(()), |valid| check_shape("valid", axes, valid.shape(), &expected))?;
+        let u_min = *self.reach.start();
+        let shape = [self.reach.clone().count(), rows.len(), columns];
+        if let Some(estimate) = estimate {
+            check_shape("estimate", "[reach, camera rows, columns]", estimate.t.shape(), &shape)?;
+        }
+        if let Some(u0_rows) = &self.u0_rows {
+            let expected = [self.timing.camera_rows(), columns];
+            check_shape("u0_rows", "[camera rows, columns]", u0_rows.shape(), &expected)?;
+        }
         if let Some(((setting, row, column), _)) =
             stack.indexed_iter().find(|(_, sample)| !sample.is_finite())
         {
-            return Err(PlaneError::NotFinite { setting, row, column });
+            return Err(PlaneError::NotFinite { setting, row: rows[row], column });
         }
 
-        let u_min = *self.reach.start();
-        let rows_in_reach = self.reach.clone().count();
-        let mut t = Array3::zeros((rows_in_reach, rows, columns));
-        t.axis_iter_mut(Axis(1)).into_par_iter().enumerate().try_for_each(|(row, profiles)| {
-            if !go_on() {
-                return Err(PlaneError::Stopped);
-            }
-            let intensities = stack.index_axis(Axis(1), row).mapv(f64::from);
-            self.solve_row(row, intensities, valid.map(|valid| valid.index_axis_move(Axis(1), row)), profiles)
+        let mut t = Array3::zeros(shape);
+        let mut tasks: Vec<Task> = t
+            .axis_iter_mut(Axis(1))
+            .zip(rows)
+            .enumerate()
+            .map(|(at, (profiles, &row))| Task { at, row, class: 0, profiles })
+            .collect();
+        let models = self.classify(&mut tasks);
+        // A class of rows with the same model at a time, so that its factors live no longer than they are needed.
+        tasks.par_chunk_by_mut(|a, b| a.class == b.class).try_for_each(|tasks| {
+            let solver = RowSolver::new(&models[tasks[0].class], &self.prior, &self.reach, self.simd)?;
+            tasks.par_iter_mut().try_for_each(|Task { at, row, profiles, .. }| {
+                if !go_on() {
+                    return Err(PlaneError::Stopped);
+                }
+                solver.solve(Row {
+                    stack: stack.index_axis(Axis(1), *at),
+                    valid: valid.map(|valid| valid.index_axis_move(Axis(1), *at)),
+                    u0_rows: self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(*row)),
+                    estimate: estimate.map(|estimate| estimate.t.index_axis(Axis(1), *at)),
+                    profiles: profiles.view_mut(),
+                })
+            })
         })?;
-        let exists = Array2::from_shape_fn((rows_in_reach, rows), |(index, row)| {
-            self.timing.row_exists(u_min + index as i32, row)
+        let exists = Array2::from_shape_fn((shape[0], rows.len()), |(index, at)| {
+            self.timing.row_exists(u_min + index as i32, rows[at])
         });
-        let saturated = Array2::from_shape_fn((rows, columns), |(row, column)| {
-            valid.is_some_and(|valid| valid.slice(s![.., row, column]).iter().any(|valid| !valid))
+        let saturated = Array2::from_shape_fn((rows.len(), columns), |(at, column)| {
+            valid.is_some_and(|valid| valid.slice(s![.., at, column]).iter().any(|valid| !valid))
         });
         Ok(Transport { t, u_min, exists, saturated })
     }
 
-    /// Solves one camera row: `intensities` and `valid` `[settings, columns]`, `profiles` `[U, columns]`.
-    fn solve_row(
-        &self,
-        row: usize,
-        intensities: Array2<f64>,
-        valid: Option<ArrayView2<bool>>,
-        mut profiles: ArrayViewMut2<f32>,
-    ) -> Result<(), PlaneError> {
-        let model = RowModel::new(&self.timing, &self.settings, &self.reach, row);
-        let quadratic = Quadratic::new(model.weights.view(), &model.slots, &self.prior)?;
-        let linear = quadratic.linear(model.weights.view(), intensities.t());
-        let unconstrained = linear.dot(&quadratic.inverse);
-        let mut pivoting = Pivoting::new(model.slots.len());
-        let mut masked = MaskedQuadratic { demux: self, model: &model, last: None };
-
-        for (column, mut profile) in profiles.axis_iter_mut(Axis(1)).enumerate() {
-            let mask = valid.map(|valid| valid.index_axis_move(Axis(1), column));
-            let x = match mask.filter(|mask| mask.iter().any(|valid| !valid)) {
-                None => minimise(&mut pivoting, &quadratic, linear.row(column), unconstrained.row(column)),
-                Some(mask) => masked.minimise(&mut pivoting, intensities.column(column), mask)?,
-            };
-            for (Slot { u, kind }, x) in model.slots.iter().zip(x) {
-                if *kind == SlotKind::Own {
-                    profile[(u - self.reach.start()) as usize] = x as f32;
-                }
+    /// Gives neighbouring rows with the same model the same class, and returns each class's model.
+    fn classify(&self, tasks: &mut [Task]) -> Vec<RowModel> {
+        let mut models: Vec<RowModel> = Vec::new();
+        for task in tasks {
+            let model = self.model(task.row);
+            if models.last() != Some(&model) {
+                models.push(model);
             }
+            task.class = models.len() - 1;
         }
-        Ok(())
+        models
+    }
+}
+
+/// A camera row that is to be solved.
+struct Task<'a> {
+    /// Its place in the stack.
+    at: usize,
+    /// The camera's row.
+    row: usize,
+    /// The model that it shares with its neighbours.
+    class: usize,
+    /// Its part of the transport, `[reach, columns]`.
+    profiles: ArrayViewMut2<'a, f32>,
+}
+
+fn check_shape(
+    array: &'static str,
+    axes: &'static str,
+    actual: &[usize],
+    expected: &[usize],
+) -> Result<(), PlaneError> {
+    match actual == expected {
+        true => Ok(()),
+        false => Err(PlaneError::Shape { array, axes, actual: actual.to_vec(), expected: expected.to_vec() }),
     }
 }
 
 /// Of a symmetric positive definite matrix, by power iteration to about 1 %.
-fn largest_eigenvalue(matrix: &Array2<f64>) -> f64 {
+fn largest_eigenvalue(matrix: ArrayView2<f64>) -> f64 {
     // A start without symmetry is orthogonal to no eigenvector.
     let mut vector = Array1::from_shape_fn(matrix.nrows(), |i| 1.0 + (i as f64 * 0.7).sin());
     let mut eigenvalue = 0.0;
@@ -164,49 +339,4 @@ fn largest_eigenvalue(matrix: &Array2<f64>) -> f64 {
         vector = next / eigenvalue;
     }
     eigenvalue
-}
-
-/// The minimiser of one pixel: by pivoting, or by the reference solver in the rare case that it does not end.
-fn minimise(
-    pivoting: &mut Pivoting,
-    quadratic: &Quadratic,
-    c: ArrayView1<f64>,
-    unconstrained: ArrayView1<f64>,
-) -> Vec<f64> {
-    let (c, unconstrained) = (c.to_vec(), unconstrained.to_vec());
-    match pivoting.minimise(quadratic, &c, &unconstrained) {
-        Outcome::Minimum => pivoting.x.clone(),
-        Outcome::GaveUp => reference::minimise(quadratic.h.view(), &c),
-    }
-}
-
-/// The objective of the latest mask. Neighbouring pixels of a highlight mostly lose the same settings.
-struct MaskedQuadratic<'a> {
-    demux: &'a Demux,
-    model: &'a RowModel,
-    last: Option<(Vec<usize>, Array2<f64>, Quadratic)>,
-}
-
-impl MaskedQuadratic<'_> {
-    fn minimise(
-        &mut self,
-        pivoting: &mut Pivoting,
-        intensities: ArrayView1<f64>,
-        valid: ArrayView1<bool>,
-    ) -> Result<Vec<f64>, PlaneError> {
-        let used: Vec<usize> = valid.indexed_iter().filter(|(_, valid)| **valid).map(|(n, _)| n).collect();
-        let known = self.last.take().filter(|(settings, ..)| *settings == used);
-        let (_, weights, quadratic) = match known {
-            Some(known) => self.last.insert(known),
-            None => {
-                let weights = self.model.weights.select(Axis(0), &used);
-                let quadratic = Quadratic::new(weights.view(), &self.model.slots, &self.demux.prior)?;
-                self.last.insert((used.clone(), weights, quadratic))
-            }
-        };
-        let samples = intensities.select(Axis(0), &used).insert_axis(Axis(0));
-        let linear = quadratic.linear(weights.view(), samples.view());
-        let unconstrained = linear.dot(&quadratic.inverse);
-        Ok(minimise(pivoting, quadratic, linear.row(0), unconstrained.row(0)))
-    }
 }

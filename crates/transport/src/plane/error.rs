@@ -24,6 +24,14 @@ pub enum PlaneError {
         /// Rows of the projector.
         projector_rows: usize,
     },
+    /// A camera row that does not exist.
+    #[error("row {row} is asked for, but the camera has rows 0..{camera_rows}")]
+    Rows {
+        /// The row asked for.
+        row: usize,
+        /// How many there are.
+        camera_rows: usize,
+    },
     /// No settings, or a setting without a delay.
     #[error(
         "setting {index} has no delays: give the true delay of each averaged frame, and at least one setting"

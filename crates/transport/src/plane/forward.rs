@@ -8,19 +8,29 @@ use super::{PlaneError, RowTiming, Setting};
 /// A row belongs to the unknowns when some setting collects at least this share of its dwell.
 pub const MIN_WEIGHT: f64 = 0.05;
 
-/// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings,
-/// in the frame that the delays are measured against, is at least [`MIN_WEIGHT`].
+/// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings and
+/// camera rows, in the frame that the delays are measured against, is at least [`MIN_WEIGHT`].
+///
+/// The beam does not count here: it sends light of the rows drawn to their neighbours, but what is drawn decides what is
+/// asked for, so that the transport has the same shape whatever is known of the beam.
 ///
 /// # Errors
 /// Those of [`RowTiming::check`]; [`PlaneError::NothingSeen`] if no row qualifies.
 pub fn reach(timing: &RowTiming, settings: &[Setting]) -> Result<RangeInclusive<i32>, PlaneError> {
     timing.check(settings)?;
-    let lowest = timing.relative_row(0, timing.camera_rows() - 1);
-    let highest = timing.relative_row(timing.projector_rows() - 1, 0);
-    let seen = |u: &i32| settings.iter().any(|setting| timing.weight_in_frame(*u, 0, setting) >= MIN_WEIGHT);
-    let first = (lowest..=highest).find(seen);
-    let last = (lowest..=highest).rfind(seen);
-    first.zip(last).map(|(first, last)| first..=last).ok_or(PlaneError::NothingSeen)
+    let mut reach: Option<(i32, i32)> = None;
+    for t in 0..timing.camera_rows() {
+        for setting in settings {
+            for (v, share) in timing.shares_in_frame(t, 0, setting) {
+                if share >= MIN_WEIGHT {
+                    let u = timing.relative_row(v, t);
+                    let (first, last) = reach.unwrap_or((u, u));
+                    reach = Some((first.min(u), last.max(u)));
+                }
+            }
+        }
+    }
+    reach.map(|(first, last)| first..=last).ok_or(PlaneError::NothingSeen)
 }
 
 /// An unknown of one camera row: the light it receives from one projector row.
@@ -37,8 +47,8 @@ pub struct Slot {
 pub enum SlotKind {
     /// Inside the plan's reach: part of the transport.
     Own,
-    /// Outside the reach, but lit while an exposure reached over the retrace into the next or previous frame: solved
-    /// for, because the exposure saw it, and then dropped.
+    /// Outside the reach, but lit while an exposure reached over the retrace into the next or previous frame, or by the
+    /// beam of a row that was drawn during it: solved for, because the exposure saw it, and then dropped.
     Wrapped,
 }
 
@@ -48,55 +58,57 @@ pub struct RowModel {
     /// The unknowns: own slots by ascending `u`, then wrapped slots by ascending `u`. Rows that the projector does
     /// not have are not among them.
     pub slots: Vec<Slot>,
-    /// `A`: weight of each slot in each setting, shape `[settings, slots]`.
+    /// `A' = A B`: weight of each slot in each setting, shape `[settings, slots]`.
     pub weights: Array2<f64>,
 }
 
 impl RowModel {
     /// The model of camera row `t` under the plan's settings; `reach` is that of the whole plan.
     pub fn new(timing: &RowTiming, settings: &[Setting], reach: &RangeInclusive<i32>, t: usize) -> Self {
-        let rows = (0..timing.projector_rows()).map(|v| timing.relative_row(v, t));
-        let (own, outside): (Vec<i32>, Vec<i32>) = rows.partition(|u| reach.contains(u));
-        let seen = |u: &i32| settings.iter().any(|setting| timing.weight(*u, setting) >= MIN_WEIGHT);
-        // Rows just outside the reach stay below the threshold in their own frame, so those left are wrapped.
-        let wrapped = outside.into_iter().filter(seen).map(|u| Slot { u, kind: SlotKind::Wrapped });
-        let slots: Vec<Slot> =
-            own.into_iter().map(|u| Slot { u, kind: SlotKind::Own }).chain(wrapped).collect();
-        let weights = Array2::from_shape_fn((settings.len(), slots.len()), |(n, slot)| {
-            timing.weight(slots[slot].u, &settings[n])
-        });
+        let seen: Vec<Vec<f64>> = settings.iter().map(|setting| timing.weights(t, setting)).collect();
+        let (own, outside): (Vec<usize>, Vec<usize>) =
+            (0..timing.projector_rows()).partition(|&v| reach.contains(&timing.relative_row(v, t)));
+        let wrapped = outside.into_iter().filter(|&v| seen.iter().any(|weights| weights[v] >= MIN_WEIGHT));
+        let rows: Vec<(usize, SlotKind)> = own
+            .into_iter()
+            .map(|v| (v, SlotKind::Own))
+            .chain(wrapped.map(|v| (v, SlotKind::Wrapped)))
+            .collect();
+        let slots = rows.iter().map(|&(v, kind)| Slot { u: timing.relative_row(v, t), kind }).collect();
+        let weights = Array2::from_shape_fn((settings.len(), rows.len()), |(n, slot)| seen[n][rows[slot].0]);
         Self { slots, weights }
     }
 }
 
 /// The image that the model predicts for one setting.
 ///
-/// `transport` is `[v, t, s]` over the projector rows of the camera's window, shape
-/// `[camera_rows, camera_rows, columns]`; projector rows outside the window send no light. Returns `[t, s]`.
+/// `transport` is `[v, t, s]` over the projector rows from the camera's first on, shape
+/// `[rows, camera_rows, columns]`; nothing else is lit by the projector. Returns `[t, s]`.
 ///
 /// # Errors
-/// Those of [`RowTiming::check`]; [`PlaneError::Shape`] if the transport does not fit the window.
+/// Those of [`RowTiming::check`]; [`PlaneError::Shape`] if the transport does not fit the window, or leaves the
+/// projector.
 pub fn predict(
     timing: &RowTiming,
     transport: ArrayView3<f32>,
     setting: &Setting,
 ) -> Result<Array2<f32>, PlaneError> {
     timing.check(std::slice::from_ref(setting))?;
-    let rows = timing.camera_rows();
-    let (_, _, columns) = transport.dim();
-    if transport.dim() != (rows, rows, columns) {
+    let (rows, camera_rows, columns) = transport.dim();
+    let most_rows = timing.projector_rows() - timing.first_row();
+    if camera_rows != timing.camera_rows() || rows > most_rows {
         return Err(PlaneError::Shape {
             array: "transport",
-            axes: "[projector rows of the window, camera rows, columns]",
+            axes: "[projector rows from the camera's first on, camera rows, columns]",
             actual: transport.shape().to_vec(),
-            expected: vec![rows, rows, columns],
+            expected: vec![rows.min(most_rows), timing.camera_rows(), columns],
         });
     }
-    let mut image = Array2::zeros((rows, columns));
+    let mut image = Array2::zeros((camera_rows, columns));
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut image_row)| {
         let mut sum = vec![0.0; columns];
-        for v in 0..rows {
-            let weight = timing.weight(v as i32 - t as i32, setting);
+        let weights = timing.weights(t, setting);
+        for (v, &weight) in weights[timing.first_row()..].iter().enumerate().take(rows) {
             if weight > 0.0 {
                 let light = transport.slice(s![v, t, ..]);
                 sum.iter_mut().zip(light).for_each(|(sum, &light)| *sum += weight * f64::from(light));
@@ -108,7 +120,7 @@ pub fn predict(
 }
 
 /// A transport `[v, t, s]` over a window's projector rows, by relative row: `[u, t, s]` for `u` in `reach`, zero where
-/// the window has no such row.
+/// the window has no such row. For cameras whose rows have the projector's pitch.
 pub fn relative_rows(transport: ArrayView3<f32>, reach: &RangeInclusive<i32>) -> Array3<f32> {
     let (rows, camera_rows, columns) = transport.dim();
     let mut relative = Array3::zeros((reach.clone().count(), camera_rows, columns));
@@ -228,7 +240,7 @@ mod tests {
             assert!((image[[t, 1]] - expected).abs() < 1e-3 * (1.0 + expected));
         }
         assert!(matches!(
-            predict(&timing, transport.slice(s![..5, .., ..]), &Setting::new(0.0, 100.0)),
+            predict(&timing, transport.slice(s![.., ..5, ..]), &Setting::new(0.0, 100.0)),
             Err(PlaneError::Shape { .. })
         ));
     }

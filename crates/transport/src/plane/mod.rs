@@ -11,23 +11,38 @@
 //! A(u)    = |[u tau - t_p/2, u tau + t_p/2] ∩ [t_d - t_e/2, t_d + t_e/2]| / t_p,    t_p = tau
 //! ```
 //!
-//! [`RowTiming`] and [`Setting`] hold the quantities on the right, [`RowModel`] is `A` for one camera row with its
-//! borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
+//! where the rows of projector and camera run at one constant speed. [`RowTiming`] knows when they do not, and how the
+//! [`Beam`] spreads a row; it and [`Setting`] hold the quantities on the right. [`RowModel`] is `A` for one camera row
+//! with its borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
 
+pub mod advice;
+mod beam;
+pub mod calibrate;
 mod cholesky;
 mod demux;
 mod error;
 mod forward;
+mod lanes;
 mod pivot;
 mod prior;
+mod profile;
 mod quadratic;
 pub mod reference;
+mod relight;
+mod row;
+mod setting;
+mod simd;
 mod timing;
 mod transport;
 
+pub use beam::Beam;
 pub use demux::Demux;
 pub use error::PlaneError;
 pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
 pub use prior::Prior;
-pub use timing::{RowTiming, Setting, delay_us, offset_us};
+pub use profile::DelayProfile;
+pub use relight::relight;
+pub use setting::{Setting, delay_us, offset_us};
+pub use simd::SimdLevel;
+pub use timing::{CameraRows, RowTiming};
 pub use transport::Transport;

@@ -1,14 +1,16 @@
+use ndarray::{ArrayView1, ArrayView2};
+
 use super::cholesky;
 use super::quadratic::Quadratic;
 
 /// Full exchanges allowed without progress before the backup rule takes over (Kim and Park recommend 3).
-const PATIENCE: usize = 3;
+pub(super) const PATIENCE: usize = 3;
 
 /// Steps after which a pixel is left to the reference solver; ordinary pixels take about five.
-const MAX_STEPS: usize = 300;
+pub(super) const MAX_STEPS: usize = 300;
 
 /// Infeasibility below this share of the problem's own scale is rounding.
-const TOLERANCE: f64 = 1e-11;
+pub(super) const TOLERANCE: f64 = 1e-11;
 
 /// Minimises `x'Hx - 2 c'x` over `x >= 0` by block principal pivoting: exact in finitely many steps (Kim and Park,
 /// "Fast Nonnegative Matrix Factorization: An Active-Set-Like Method and Comparisons", 2011, section 4).
@@ -91,9 +93,9 @@ impl Pivoting {
         self.zero_rows.clear();
         (0..slots).for_each(|i| if self.free[i] { &mut self.free_rows } else { &mut self.zero_rows }.push(i));
 
-        if quadratic.well_conditioned && self.zero_rows.len() <= self.free_rows.len() {
+        if quadratic.well_conditioned() && self.zero_rows.len() <= self.free_rows.len() {
             // x = H^-1 (c + g) with g != 0 only in the zero rows, where x = 0 determines it.
-            let inverse = &quadratic.inverse;
+            let inverse = quadratic.inverse();
             self.values.clear();
             self.values.extend(self.zero_rows.iter().map(|&i| -unconstrained[i]));
             gather(inverse, &self.zero_rows, &mut self.matrix);
@@ -107,7 +109,7 @@ impl Pivoting {
             }
             self.zero_rows.iter().for_each(|&i| self.x[i] = 0.0);
         } else {
-            let h = &quadratic.h;
+            let h = quadratic.h();
             self.values.clear();
             self.values.extend(self.free_rows.iter().map(|&i| c[i]));
             gather(h, &self.free_rows, &mut self.matrix);
@@ -129,7 +131,7 @@ fn largest(values: &[f64]) -> f64 {
 }
 
 /// The lower triangle of the rows and columns `rows` of a symmetric matrix.
-fn gather(symmetric: &ndarray::Array2<f64>, rows: &[usize], into: &mut Vec<f64>) {
+fn gather(symmetric: ArrayView2<f64>, rows: &[usize], into: &mut Vec<f64>) {
     into.clear();
     for (k, &i) in rows.iter().enumerate() {
         let row = symmetric.row(i);
@@ -138,7 +140,7 @@ fn gather(symmetric: &ndarray::Array2<f64>, rows: &[usize], into: &mut Vec<f64>)
     }
 }
 
-fn add_scaled(sum: &mut [f64], factor: f64, row: ndarray::ArrayView1<f64>) {
+fn add_scaled(sum: &mut [f64], factor: f64, row: ArrayView1<f64>) {
     sum.iter_mut().zip(row).for_each(|(sum, row)| *sum += factor * row);
 }
 
@@ -167,12 +169,12 @@ mod tests {
                 if split { Prior::Split { alpha: 0.01, beta } } else { Prior::Paper { alpha: 0.01, beta } };
             let quadratic = Quadratic::new(weights.view(), &slots, &prior).unwrap();
             let linear = quadratic.linear(weights.view(), Array2::from_shape_vec((4, 12), pixels).unwrap().view());
-            let unconstrained = linear.dot(&quadratic.inverse);
+            let unconstrained = linear.dot(&quadratic.inverse());
             let mut pivoting = Pivoting::new(slots.len());
             for (c, unconstrained) in linear.rows().into_iter().zip(unconstrained.rows()) {
                 let (c, unconstrained) = (c.to_vec(), unconstrained.to_vec());
                 prop_assert_eq!(pivoting.minimise(&quadratic, &c, &unconstrained), Outcome::Minimum);
-                let expected = reference::minimise(quadratic.h.view(), &c);
+                let expected = reference::minimise(quadratic.h(), &c);
                 let tolerance = 1e-8 * (1.0 + largest(&expected));
                 for (x, expected) in pivoting.x.iter().zip(&expected) {
                     prop_assert!((x - expected).abs() < tolerance, "{x} is not {expected}");

@@ -1,4 +1,4 @@
-use ndarray::{Array2, ArrayView2};
+use ndarray::{Array2, ArrayView2, Axis, s};
 
 use super::{PlaneError, Prior, Slot, cholesky};
 
@@ -13,13 +13,13 @@ const WELL_CONDITIONED: f64 = 1e7;
 /// `H = A'A + alpha D'D` and `c = A'I - beta/2`.
 #[derive(Debug, Clone)]
 pub(super) struct Quadratic {
-    /// `H`, shape `[slots, slots]`.
-    pub h: Array2<f64>,
-    /// The inverse of `H`.
-    pub inverse: Array2<f64>,
+    /// `H`, then a row and a column of zeros: see [`Self::padded_h`].
+    h: Array2<f64>,
+    /// The inverse of `H`, padded likewise.
+    inverse: Array2<f64>,
     /// Whether solutions may be taken from the inverse. Settings that leave rows undetermined give it entries so
     /// large that nothing but rounding would remain.
-    pub well_conditioned: bool,
+    well_conditioned: bool,
     half_beta: f64,
 }
 
@@ -29,18 +29,95 @@ impl Quadratic {
     /// # Errors
     /// [`PlaneError::NotConvex`] if the numbers leave the range of floating point.
     pub fn new(weights: ArrayView2<f64>, slots: &[Slot], prior: &Prior) -> Result<Self, PlaneError> {
-        let differences = prior.differences(slots);
-        let mut h = weights.t().dot(&weights) + prior.alpha() * differences.t().dot(&differences);
-        for diagonal in h.diag_mut() {
+        let n = slots.len();
+        let mut h = Array2::zeros((n + 1, n + 1));
+        h.slice_mut(s![..n, ..n]).assign(&weights.t().dot(&weights));
+        for difference in prior.differences(slots).rows() {
+            let touched: Vec<(usize, f64)> = difference
+                .indexed_iter()
+                .filter(|(_, weight)| **weight != 0.0)
+                .map(|(i, w)| (i, *w))
+                .collect();
+            for &(i, a) in &touched {
+                touched.iter().for_each(|&(j, b)| h[[i, j]] += prior.alpha() * a * b);
+            }
+        }
+        for diagonal in h.diag_mut().slice_mut(s![..n]) {
             // A slot that no setting sees and no difference holds must not make H singular; its T is 0 in any case.
             *diagonal = if *diagonal > 0.0 { *diagonal * (1.0 + RIDGE) } else { 1.0 };
         }
-        let inverse = invert(&h)?;
+        let inverse = invert(h.slice(s![..n, ..n]))?;
+        Ok(Self::from_parts(h, inverse, prior.beta() / 2.0))
+    }
+
+    fn from_parts(h: Array2<f64>, inverse: Array2<f64>, half_beta: f64) -> Self {
         // The diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
         let condition =
             h.diag().iter().zip(inverse.diag()).fold(1.0_f64, |most, (h, inverse)| most.max(h * inverse));
-        let well_conditioned = condition < WELL_CONDITIONED;
-        Ok(Self { h, inverse, well_conditioned, half_beta: prior.beta() / 2.0 })
+        Self { h, inverse, well_conditioned: condition < WELL_CONDITIONED, half_beta }
+    }
+
+    /// The same objective without some of its settings, whose weights are `dropped`, shape `[dropped settings, slots]`:
+    /// a downdate of `H` and of its inverse (Sherman, Morrison and Woodbury), much cheaper than a new factorisation.
+    /// None where too little would remain to be accurate.
+    pub fn without(&self, dropped: ArrayView2<f64>) -> Option<Self> {
+        let n = self.slots();
+        let (settings, _) = dropped.dim();
+        let mut h = self.h.clone();
+        h.slice_mut(s![..n, ..n]).zip_mut_with(&dropped.t().dot(&dropped), |h, lost| *h -= lost);
+        // The ridge and rounding are all that is left of rows that only the dropped settings saw.
+        let lost = h.diag().iter().zip(self.h.diag()).take(n).any(|(left, had)| *left <= 1e-9 * had);
+        let seen = dropped.dot(&self.inverse());
+        let mut core = (Array2::<f64>::eye(settings) - seen.dot(&dropped.t())).into_raw_vec_and_offset().0;
+        let well_posed = (0..settings).all(|k| core[k * settings + k] > 1e-6);
+        if lost || !well_posed || !self.well_conditioned || cholesky::factor(&mut core, settings).is_err() {
+            return None;
+        }
+        // L^-1 of the core times `seen`, whose own product is the update.
+        let mut update = seen;
+        for i in 0..settings {
+            for k in 0..i {
+                let factor = core[i * settings + k];
+                let (done, mut rest) = update.view_mut().split_at(Axis(0), i);
+                rest.row_mut(0).scaled_add(-factor, &done.row(k));
+            }
+            update.row_mut(i).mapv_inplace(|value| value / core[i * settings + i]);
+        }
+        let mut inverse = self.inverse.clone();
+        inverse
+            .slice_mut(s![..n, ..n])
+            .zip_mut_with(&update.t().dot(&update), |inverse, more| *inverse += more);
+        Some(Self::from_parts(h, inverse, self.half_beta)).filter(|downdated| downdated.well_conditioned)
+    }
+
+    /// How many unknowns there are.
+    pub fn slots(&self) -> usize {
+        self.h.nrows() - 1
+    }
+
+    /// `H`, shape `[slots, slots]`.
+    pub fn h(&self) -> ArrayView2<'_, f64> {
+        self.h.slice(s![..-1, ..-1])
+    }
+
+    /// The inverse of `H`.
+    pub fn inverse(&self) -> ArrayView2<'_, f64> {
+        self.inverse.slice(s![..-1, ..-1])
+    }
+
+    /// `H` row by row, with a zero after each row and a row of zeros at the end: what is gathered for want of a slot.
+    pub fn padded_h(&self) -> &[f64] {
+        self.h.as_slice().unwrap_or_default()
+    }
+
+    /// The inverse, as [`Self::padded_h`], where solutions may be taken from it.
+    pub fn padded_inverse(&self) -> Option<&[f64]> {
+        self.inverse.as_slice().filter(|_| self.well_conditioned)
+    }
+
+    /// Whether solutions may be taken from the inverse.
+    pub fn well_conditioned(&self) -> bool {
+        self.well_conditioned
     }
 
     /// `c` of each pixel, shape `[pixels, slots]`, from intensities of shape `[pixels, settings]`.
@@ -49,22 +126,19 @@ impl Quadratic {
     }
 }
 
-/// The inverse of a symmetric positive definite matrix.
-fn invert(h: &Array2<f64>) -> Result<Array2<f64>, PlaneError> {
+/// The inverse of a symmetric positive definite matrix of shape `[n, n]`, padded by a row and a column of zeros.
+fn invert(h: ArrayView2<f64>) -> Result<Array2<f64>, PlaneError> {
     let n = h.nrows();
     // Scaled to a unit diagonal, because smoothness far from u = 0 weighs a million times more than the data.
     let scale: Vec<f64> = h.diag().iter().map(|diagonal| diagonal.sqrt().recip()).collect();
-    let mut factor: Vec<f64> = h.indexed_iter().map(|((i, j), value)| value * scale[i] * scale[j]).collect();
-    cholesky::factor(&mut factor, n).map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
-    let mut inverse = Vec::with_capacity(n * n);
-    let mut column = vec![0.0; n];
-    for i in 0..n {
-        column.fill(0.0);
-        column[i] = scale[i];
-        cholesky::solve(&factor, n, &mut column);
-        inverse.extend(column.iter().zip(&scale).map(|(value, scale)| value * scale));
-    }
-    Ok(Array2::from_shape_fn((n, n), |(i, j)| inverse[i * n + j]))
+    let mut matrix: Vec<f64> = h.indexed_iter().map(|((i, j), value)| value * scale[i] * scale[j]).collect();
+    pulp::Arch::new()
+        .dispatch(|| cholesky::invert(&mut matrix, n))
+        .map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
+    Ok(Array2::from_shape_fn((n + 1, n + 1), |(i, j)| match i < n && j < n {
+        true => matrix[i.max(j) * n + i.min(j)] * scale[i] * scale[j],
+        false => 0.0,
+    }))
 }
 
 #[cfg(test)]
@@ -85,7 +159,7 @@ mod tests {
             Quadratic::new(weights.view(), &slots(), &Prior::Split { alpha: 2.0, beta: 0.2 }).unwrap();
         // A'A plus twice the bridge between -1 and 1.
         let expected = array![[1.0 + 2.0, 0.5, -2.0], [0.5, 0.5, 0.5], [-2.0, 0.5, 1.0 + 2.0]];
-        assert!((&quadratic.h - &expected).iter().all(|difference| difference.abs() < 1e-10));
+        assert!((&quadratic.h() - &expected).iter().all(|difference| difference.abs() < 1e-10));
         let linear = quadratic.linear(weights.view(), array![[4.0, 8.0]].view());
         assert_eq!(linear, array![[4.0 - 0.1, 6.0 - 0.1, 8.0 - 0.1]]);
     }
@@ -94,8 +168,25 @@ mod tests {
     fn the_inverse_undoes_h() {
         let weights = array![[1.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.3, 0.0, 0.0]];
         let quadratic = Quadratic::new(weights.view(), &slots(), &Prior::PAPER).unwrap();
-        let product = quadratic.h.dot(&quadratic.inverse) - Array2::<f64>::eye(3);
+        let product = quadratic.h().dot(&quadratic.inverse()) - Array2::<f64>::eye(3);
         assert!(product.iter().all(|entry| entry.abs() < 1e-12), "{product}");
+    }
+
+    #[test]
+    fn a_downdate_equals_leaving_the_settings_out() {
+        let weights =
+            array![[1.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.3, 0.0, 0.9], [0.4, 1.0, 0.1], [0.2, 0.7, 1.0]];
+        let whole = Quadratic::new(weights.view(), &slots(), &Prior::PAPER).unwrap();
+        for dropped in [vec![1], vec![0, 3], vec![2, 4]] {
+            let kept: Vec<usize> = (0..5).filter(|n| !dropped.contains(n)).collect();
+            let downdated = whole.without(weights.select(Axis(0), &dropped).view()).unwrap();
+            let expected =
+                Quadratic::new(weights.select(Axis(0), &kept).view(), &slots(), &Prior::PAPER).unwrap();
+            let close =
+                |a: ArrayView2<f64>, b: ArrayView2<f64>| (&a - &b).iter().all(|error| error.abs() < 1e-8);
+            assert!(close(downdated.h(), expected.h()) && close(downdated.inverse(), expected.inverse()));
+        }
+        assert!(whole.without(weights.view()).is_none(), "nothing is left");
     }
 
     #[test]

@@ -1,18 +1,56 @@
-use super::PlaneError;
+use std::cmp::Ordering::Less;
+use std::sync::Arc;
 
-/// When each projector row is lit, and which projector rows the camera's rows look along.
+use super::{Beam, PlaneError, Setting};
+
+/// When each projector row is lit, how its light spreads, and which projector rows the camera's rows look along.
 ///
-/// Rows are lit for `row_time_us` each, one after the other, once per VSYNC period; the rest of the period is the
-/// retrace, in which nothing is lit. Camera row `t` lies on the epipolar plane of projector row `first_row + t`, and
-/// its exposure keeps pace with the rows, so that a delay means the same for every row. A scene with fewer rows than
-/// the projector is a window in the middle of its frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// Nominally, rows are lit for `row_time_us` each, one after the other, once per VSYNC period; the rest of the period
+/// is the retrace, in which nothing is lit. [`Self::with_row_table`] says when they are lit in truth. A row sends the
+/// same light whatever its dwell, evenly over it: `T` is the light of one whole row.
+///
+/// Camera row `t` lies on the epipolar plane of the projector place `first_row + pitch t`, and its exposure begins
+/// `row_time_us` of the camera after that of row `t - 1`. Relative rows count from the projector row nearest to that
+/// place. Delays are measured for camera row 0, against the nominal raster: centre of its exposure minus nominal centre
+/// of row `first_row`. With the camera's row time at `pitch` times the projector's, that is the delay of every row
+/// against its own place; otherwise it drifts from row to row, by the difference, and the weights follow.
+///
+/// A scene with fewer rows than the projector is a window in the middle of its frame.
+#[derive(Debug, Clone, PartialEq)]
 pub struct RowTiming {
-    projector_rows: usize,
     row_time_us: f64,
     period_us: f64,
-    first_row: usize,
-    camera_rows: usize,
+    /// Row `v` is lit from entry `v` to entry `v + 1`, from the nominal start of row 0 on.
+    row_starts_us: Arc<[f64]>,
+    camera: CameraRows,
+    beam: Beam,
+}
+
+/// Which places of the projector the camera's rows look along, and when they are exposed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraRows {
+    /// Projector row on whose epipolar plane camera row 0 lies.
+    pub first_row: usize,
+    /// Camera rows.
+    pub rows: usize,
+    /// Projector rows from one camera row to the next.
+    pub pitch: f64,
+    /// From the start of one camera row's exposure to the next row's.
+    pub row_time_us: f64,
+}
+
+impl CameraRows {
+    /// Place, in projector rows, on whose epipolar plane camera row `t` lies; between two rows where the pitch is not
+    /// whole.
+    pub fn place(&self, t: usize) -> f64 {
+        self.first_row as f64 + self.pitch * t as f64
+    }
+
+    /// The projector row nearest to [`Self::place`], from which relative rows count; the lower on the screen of two
+    /// that are as near.
+    pub fn own_row(&self, t: usize) -> usize {
+        self.place(t).round() as usize
+    }
 }
 
 impl RowTiming {
@@ -38,21 +76,78 @@ impl RowTiming {
                 allowed: "at least the projector's rows times row_time_us: check both against the VSYNC rate",
             });
         }
-        let timing =
-            Self { projector_rows, row_time_us, period_us, first_row: 0, camera_rows: projector_rows };
-        timing.window(0, projector_rows)
+        let row_starts_us = (0..=projector_rows).map(|v| v as f64 * row_time_us).collect();
+        let camera = CameraRows { first_row: 0, rows: projector_rows, pitch: 1.0, row_time_us };
+        Self { row_time_us, period_us, row_starts_us, camera, beam: Beam::Ideal }.with_camera(camera)
     }
 
-    /// The same projector, seen by `camera_rows` rows that start on projector row `first_row`.
+    /// The same projector, each of whose rows `v` is lit from `starts_us[v]` to `starts_us[v + 1]`, counted from the
+    /// nominal start of row 0. The camera, and with it the delays, keep to the nominal raster.
+    ///
+    /// # Errors
+    /// [`PlaneError::OutOfRange`] for a table that has not one entry more than the projector has rows, does not rise
+    /// throughout, or begins or lasts longer than a VSYNC period.
+    pub fn with_row_table(self, starts_us: &[f64]) -> Result<Self, PlaneError> {
+        let refused = |value, allowed| Err(PlaneError::OutOfRange { field: "row_table", value, allowed });
+        if starts_us.len() != self.projector_rows() + 1 {
+            let allowed = "as many entries as the projector has rows, and one more for the end of the last";
+            return refused(starts_us.len() as f64, allowed);
+        }
+        let falling = starts_us.windows(2).find(|pair| pair[0].partial_cmp(&pair[1]) != Some(Less));
+        if let Some(&[_, start_us]) = falling {
+            return refused(
+                start_us,
+                "finite, and later than the entry before: rows are lit one after the other",
+            );
+        }
+        let (start_us, end_us) = (starts_us[0], starts_us[starts_us.len() - 1]);
+        if start_us.abs() >= self.period_us || end_us - start_us > self.period_us * (1.0 + 1e-9) {
+            return refused(end_us, "in microseconds, with all rows within one VSYNC period");
+        }
+        Ok(Self { row_starts_us: starts_us.into(), ..self })
+    }
+
+    /// The same projector with a beam that spreads its rows.
+    ///
+    /// # Errors
+    /// Those of [`Beam::check`].
+    pub fn with_beam(self, beam: Beam) -> Result<Self, PlaneError> {
+        beam.check()?;
+        Ok(Self { beam, ..self })
+    }
+
+    /// The same projector, seen by `camera`.
+    ///
+    /// # Errors
+    /// [`PlaneError::OutOfRange`] for a pitch or a row time that is not positive; [`PlaneError::Window`] if there are
+    /// no camera rows, or they leave the projector.
+    pub fn with_camera(self, camera: CameraRows) -> Result<Self, PlaneError> {
+        for (field, value) in [("row_pitch", camera.pitch), ("camera row_time_us", camera.row_time_us)] {
+            if !(value.is_finite() && value > 0.0) {
+                let allowed =
+                    "positive: 1 and the projector's row time for rectified rows of the same height";
+                return Err(PlaneError::OutOfRange { field, value, allowed });
+            }
+        }
+        let projector_rows = self.projector_rows();
+        let end = camera
+            .rows
+            .checked_sub(1)
+            .map_or(camera.first_row, |last| camera.own_row(last).saturating_add(1));
+        if camera.rows == 0 || end > projector_rows {
+            return Err(PlaneError::Window { first_row: camera.first_row, end, projector_rows });
+        }
+        Ok(Self { camera, ..self })
+    }
+
+    /// The same projector, seen by `camera_rows` rows of its own pitch and row time that start on projector row
+    /// `first_row`.
     ///
     /// # Errors
     /// [`PlaneError::Window`] if the window is empty or leaves the projector.
     pub fn window(self, first_row: usize, camera_rows: usize) -> Result<Self, PlaneError> {
-        let end = first_row.saturating_add(camera_rows);
-        if camera_rows == 0 || end > self.projector_rows {
-            return Err(PlaneError::Window { first_row, end, projector_rows: self.projector_rows });
-        }
-        Ok(Self { first_row, camera_rows, ..self })
+        let row_time_us = self.row_time_us;
+        self.with_camera(CameraRows { first_row, rows: camera_rows, pitch: 1.0, row_time_us })
     }
 
     /// The same projector, seen by `camera_rows` rows in the middle of its frame.
@@ -60,15 +155,16 @@ impl RowTiming {
     /// # Errors
     /// [`PlaneError::Window`] if there are no camera rows, or more than projector rows.
     pub fn centred(self, camera_rows: usize) -> Result<Self, PlaneError> {
-        self.window(self.projector_rows.saturating_sub(camera_rows) / 2, camera_rows)
+        let first_row = self.projector_rows().saturating_sub(camera_rows) / 2;
+        self.window(first_row, camera_rows)
     }
 
     /// Rows of the projector.
     pub fn projector_rows(&self) -> usize {
-        self.projector_rows
+        self.row_starts_us.len() - 1
     }
 
-    /// Time per projector row (`tau`), which is also the time a row is lit (`t_p`).
+    /// Nominal time per projector row (`tau`), which is also the time a row is lit (`t_p`) without a row table.
     pub fn row_time_us(&self) -> f64 {
         self.row_time_us
     }
@@ -78,55 +174,116 @@ impl RowTiming {
         self.period_us
     }
 
+    /// Start of each row's light and end of the last's, counted from the nominal start of row 0, `[projector_rows + 1]`.
+    pub fn row_starts_us(&self) -> &[f64] {
+        &self.row_starts_us
+    }
+
+    /// How the projector's light spreads over rows.
+    pub fn beam(&self) -> Beam {
+        self.beam
+    }
+
+    /// Which places of the projector the camera's rows look along.
+    pub fn camera(&self) -> CameraRows {
+        self.camera
+    }
+
     /// Projector row on the epipolar plane of camera row 0.
     pub fn first_row(&self) -> usize {
-        self.first_row
+        self.camera.first_row
     }
 
     /// Rows of the camera's window.
     pub fn camera_rows(&self) -> usize {
-        self.camera_rows
+        self.camera.rows
     }
 
-    /// Relative row of projector row `v` seen from camera row `t`: `v - (first_row + t)`.
+    /// Relative row of projector row `v` seen from camera row `t`: `v` minus the row nearest to the camera row's place.
     pub fn relative_row(&self, v: usize, t: usize) -> i32 {
-        v as i32 - (self.first_row + t) as i32
+        v as i32 - self.camera.own_row(t) as i32
     }
 
     /// Whether relative row `u` of camera row `t` is a row of the projector.
     pub fn row_exists(&self, u: i32, t: usize) -> bool {
-        let v = i64::from(u) + (self.first_row + t) as i64;
-        (0..self.projector_rows as i64).contains(&v)
+        let v = i64::from(u) + self.camera.own_row(t) as i64;
+        (0..self.projector_rows() as i64).contains(&v)
     }
 
-    /// Share of the dwell of relative row `u` that falls inside the exposure: a box with fractional ends, averaged
-    /// over the delays of the setting.
+    /// What camera row `t` collects of each projector row under a setting: one row of `A' = A B`, `[projector_rows]`.
     ///
-    /// `frame` says which lighting of the row is meant: 0 in the frame that the delay is measured against, 1 in the
-    /// next VSYNC period, -1 in the one before.
-    pub fn weight_in_frame(&self, u: i32, frame: i32, setting: &Setting) -> f64 {
-        let lit_centre_us = f64::from(u) * self.row_time_us + f64::from(frame) * self.period_us;
-        let half_lit_us = self.row_time_us / 2.0;
-        let half_exposure_us = setting.exposure_us / 2.0;
-        let overlap_us = |delay_us: f64| {
-            let start_us = (lit_centre_us - half_lit_us).max(delay_us - half_exposure_us);
-            let end_us = (lit_centre_us + half_lit_us).min(delay_us + half_exposure_us);
-            (end_us - start_us).max(0.0)
-        };
-        let sum_us: f64 = setting.delays_us.iter().map(|&delay_us| overlap_us(delay_us)).sum();
-        sum_us / (setting.delays_us.len() as f64 * self.row_time_us)
+    /// `A` is the share of the row's dwell that falls inside the exposure, averaged over the delays of the setting: a
+    /// box with fractional ends. An exposure that reaches over the retrace also collects from the neighbouring VSYNC
+    /// periods; shares are above 1 only where it is longer than a period and sees the row more than once. `B` is the
+    /// beam.
+    pub fn weights(&self, t: usize, setting: &Setting) -> Vec<f64> {
+        let rows = self.projector_rows();
+        let (from_us, to_us) = self.exposed_us(t, setting);
+        let first = ((from_us - self.row_starts_us[rows]) / self.period_us).ceil() as i32;
+        let last = ((to_us - self.row_starts_us[0]) / self.period_us).floor() as i32;
+        let mut drawn = vec![0.0; rows];
+        for frame in first..=last {
+            self.shares_in_frame(t, frame, setting).for_each(|(v, share)| drawn[v] += share);
+        }
+        self.beam.spread(drawn)
     }
 
-    /// [`Self::weight_in_frame`] summed over all frames: what the exposure collects of row `u` in all. Above 1 only
-    /// where an exposure is longer than a period and sees the row more than once.
-    pub fn weight(&self, u: i32, setting: &Setting) -> f64 {
-        let margin_us = (setting.exposure_us + self.row_time_us) / 2.0;
-        let relative_us = f64::from(u) * self.row_time_us;
-        let earliest_us = setting.delays_us.iter().fold(f64::INFINITY, |a, &b| a.min(b)) - margin_us;
-        let latest_us = setting.delays_us.iter().fold(f64::NEG_INFINITY, |a, &b| a.max(b)) + margin_us;
-        let first = ((earliest_us - relative_us) / self.period_us).ceil() as i32;
-        let last = ((latest_us - relative_us) / self.period_us).floor() as i32;
-        (first..=last).map(|frame| self.weight_in_frame(u, frame, setting)).sum()
+    /// The share of each projector row's dwell that falls inside the exposure of camera row `t`, for rows that may be
+    /// seen at all; averaged over the delays of the setting, and without the beam.
+    ///
+    /// `frame` says which lighting of the rows is meant: 0 in the frame that the delay is measured against, 1 in the
+    /// next VSYNC period, -1 in the one before.
+    pub(super) fn shares_in_frame(
+        &self,
+        t: usize,
+        frame: i32,
+        setting: &Setting,
+    ) -> impl Iterator<Item = (usize, f64)> {
+        let own = self.camera.own_row(t) as f64;
+        let frame_us = f64::from(frame) * self.period_us;
+        let exposure_shift_us = self.exposure_shift_us(t);
+        let half_exposure_us = setting.exposure_us / 2.0;
+        let half_row_us = self.row_time_us / 2.0;
+        let (from_us, to_us) = self.exposed_us(t, setting);
+        let first = self.row_starts_us.partition_point(|&start_us| start_us + frame_us < from_us);
+        let end = self.row_starts_us.partition_point(|&start_us| start_us + frame_us < to_us);
+        (first.saturating_sub(1)..end.min(self.projector_rows())).map(move |v| {
+            // Relative to the nominal centre of the camera row's own row, so that rows of one and the same timing have
+            // one and the same weights, to the bit.
+            let centre_us = (v as f64 - own) * self.row_time_us + frame_us;
+            let (late_us, next_late_us) = (self.late_us(v), self.late_us(v + 1));
+            let overlap_us = |delay_us: f64| {
+                let start_us = (centre_us - half_row_us + late_us).max(delay_us - half_exposure_us);
+                let end_us = (centre_us + half_row_us + next_late_us).min(delay_us + half_exposure_us);
+                (end_us - start_us).max(0.0)
+            };
+            let sum_us: f64 =
+                setting.delays_us.iter().map(|&delay_us| overlap_us(delay_us + exposure_shift_us)).sum();
+            let dwell_us = self.row_time_us + (next_late_us - late_us);
+            (v, sum_us / (setting.delays_us.len() as f64 * dwell_us))
+        })
+    }
+
+    /// When camera row `t` is exposed at some delay of the setting, counted from the nominal start of row 0.
+    fn exposed_us(&self, t: usize, setting: &Setting) -> (f64, f64) {
+        let own_centre_us =
+            (self.camera.own_row(t) as f64 + 0.5) * self.row_time_us + self.exposure_shift_us(t);
+        let earliest_us = setting.delays_us.iter().fold(f64::INFINITY, |a, &b| a.min(b));
+        let latest_us = setting.delays_us.iter().fold(f64::NEG_INFINITY, |a, &b| a.max(b));
+        let half_exposure_us = setting.exposure_us / 2.0;
+        (own_centre_us + earliest_us - half_exposure_us, own_centre_us + latest_us + half_exposure_us)
+    }
+
+    /// How much later than its setting's delay camera row `t` is exposed, against the nominal centre of its own row:
+    /// nothing for rows of the projector's pitch and row time.
+    fn exposure_shift_us(&self, t: usize) -> f64 {
+        let rows = self.camera.own_row(t) - self.camera.first_row;
+        t as f64 * self.camera.row_time_us - rows as f64 * self.row_time_us
+    }
+
+    /// How much later than nominally row `v` begins.
+    fn late_us(&self, v: usize) -> f64 {
+        self.row_starts_us[v] - v as f64 * self.row_time_us
     }
 
     /// Checks that the settings can be used with this timing.
@@ -163,37 +320,6 @@ impl RowTiming {
     }
 }
 
-/// How one image of a stack was exposed: the mean of one frame per delay, all with the same exposure.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Setting {
-    /// True delay `t_d` of each averaged frame: centre of a row's exposure minus centre of its illumination, measured
-    /// against the VSYNC edge of that frame. Positive: the camera row sees rows below its own (`u > 0`).
-    pub delays_us: Vec<f64>,
-    /// Exposure of a camera row, `t_e`.
-    pub exposure_us: f64,
-}
-
-impl Setting {
-    /// A setting whose frames all have the same delay.
-    pub fn new(delay_us: f64, exposure_us: f64) -> Self {
-        Self { delays_us: vec![delay_us], exposure_us }
-    }
-}
-
-/// Delay `t_d` from the offset `t'_o` between the start of a row's exposure and the start of its illumination.
-///
-/// `t_d = (t_e - t_p)/2 - t'_o`. The paper's Eq. 1 prints `(t_e - t'_o)/2`, which contradicts its own text: light in
-/// the middle of the exposure must give 0. For `t_e` = 600 us and `t_p` = 20 us, light centred in the exposure starts
-/// at `t'_o` = 290 us and gives 0; light at the very start gives +290 us.
-pub fn delay_us(exposure_us: f64, offset_us: f64, lit_us: f64) -> f64 {
-    (exposure_us - lit_us) / 2.0 - offset_us
-}
-
-/// The offset `t'_o` that yields the delay `t_d`; the inverse of [`delay_us`].
-pub fn offset_us(exposure_us: f64, delay_us: f64, lit_us: f64) -> f64 {
-    (exposure_us - lit_us) / 2.0 - delay_us
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -204,16 +330,13 @@ mod tests {
         RowTiming::new(720, TAU_US, 50_000.0 / 3.0).unwrap()
     }
 
-    fn close(a: f64, b: f64) {
-        assert!((a - b).abs() < 1e-9, "{a} is not {b}");
+    /// Weight of relative row `u` seen from camera row `t`.
+    fn weight(timing: &RowTiming, t: usize, u: i32, setting: &Setting) -> f64 {
+        timing.weights(t, setting)[(timing.camera().own_row(t) as i32 + u) as usize]
     }
 
-    #[test]
-    fn eq_1_by_hand() {
-        close(delay_us(600.0, 290.0, 20.0), 0.0);
-        close(delay_us(600.0, 0.0, 20.0), 290.0);
-        close(delay_us(600.0, 580.0, 20.0), -290.0);
-        close(offset_us(600.0, delay_us(600.0, 123.0, 20.0), 20.0), 123.0);
+    fn close(a: f64, b: f64) {
+        assert!((a - b).abs() < 1e-9, "{a} is not {b}");
     }
 
     #[test]
@@ -221,32 +344,31 @@ mod tests {
         // 100 us around the row's own light: rows 0, ±1 whole (66.66 us), and 16.67 us of each of rows ±2.
         let setting = Setting::new(0.0, 100.0);
         let expected = [(0, 1.0), (1, 1.0), (2, 16.67 / 22.22), (3, 0.0)];
-        for (u, weight) in expected {
-            close(timing().weight(u, &setting), weight);
-            close(timing().weight(-u, &setting), weight);
+        for (u, share) in expected {
+            close(weight(&timing(), 360, u, &setting), share);
+            close(weight(&timing(), 360, -u, &setting), share);
         }
     }
 
     #[test]
     fn an_exposure_shorter_than_a_row_sees_part_of_it() {
-        close(timing().weight(0, &Setting::new(2.0, 5.0)), 5.0 / TAU_US);
-        close(timing().weight(0, &Setting::new(TAU_US / 2.0, 6.0)), 3.0 / TAU_US);
+        close(weight(&timing(), 360, 0, &Setting::new(2.0, 5.0)), 5.0 / TAU_US);
+        close(weight(&timing(), 360, 0, &Setting::new(TAU_US / 2.0, 6.0)), 3.0 / TAU_US);
     }
 
     #[test]
     fn a_positive_delay_sees_lower_rows() {
         let setting = Setting::new(375.0, 600.0);
         // Light of u = 20 is centred at 444.4 us, inside 75..675 us; u = -20 is not.
-        close(timing().weight(20, &setting), 1.0);
-        close(timing().weight(-20, &setting), 0.0);
+        close(weight(&timing(), 360, 20, &setting), 1.0);
+        close(weight(&timing(), 360, -20, &setting), 0.0);
     }
 
     #[test]
     fn weights_sum_to_exposure_over_row_time() {
         for (delay_us, exposure_us) in [(0.0, 600.0), (-1500.0, 1200.0), (777.7, 3.0), (12.3, 611.1)] {
             let setting = Setting::new(delay_us, exposure_us);
-            let sum: f64 = (-300..=300).map(|u| timing().weight_in_frame(u, 0, &setting)).sum();
-            close(sum, exposure_us / TAU_US);
+            close(timing().weights(360, &setting).iter().sum(), exposure_us / TAU_US);
         }
     }
 
@@ -254,9 +376,9 @@ mod tests {
     fn weights_are_the_mean_over_the_frames_averaged() {
         let delays_us = [371.0, 378.5, 390.0];
         let mean = Setting { delays_us: delays_us.to_vec(), exposure_us: 600.0 };
-        for u in -40..=40 {
-            let each = delays_us.map(|delay_us| timing().weight(u, &Setting::new(delay_us, 600.0)));
-            close(timing().weight(u, &mean), each.iter().sum::<f64>() / 3.0);
+        let each = delays_us.map(|delay_us| timing().weights(360, &Setting::new(delay_us, 600.0)));
+        for (v, share) in timing().weights(360, &mean).into_iter().enumerate() {
+            close(share, each.iter().map(|shares| shares[v]).sum::<f64>() / 3.0);
         }
     }
 
@@ -264,20 +386,23 @@ mod tests {
     fn neighbouring_frames_are_a_period_away() {
         // From row 700 the next frame's row 0 is lit (16666.67 - 700 * 22.22) us = 1112.67 us later.
         let late = Setting::new(1112.67, 10.0);
-        close(timing().weight_in_frame(-700, 0, &late), 0.0);
-        close(timing().weight_in_frame(-700, 1, &late), 10.0 / TAU_US);
-        close(timing().weight(-700, &late), 10.0 / TAU_US);
+        assert_eq!(timing().shares_in_frame(700, 0, &late).filter(|(_, share)| *share > 0.0).count(), 0);
+        let next: Vec<usize> = timing()
+            .shares_in_frame(700, 1, &late)
+            .filter(|(_, share)| *share > 0.0)
+            .map(|(v, _)| v)
+            .collect();
+        assert_eq!(next, [0]);
+        close(weight(&timing(), 700, -700, &late), 10.0 / TAU_US);
         // From row 10 the previous frame's row 719 was lit (16666.67 - 709 * 22.22) us = 912.69 us earlier.
-        close(timing().weight(709, &Setting::new(-912.69, 10.0)), 10.0 / TAU_US);
+        close(weight(&timing(), 10, 709, &Setting::new(-912.69, 10.0)), 10.0 / TAU_US);
     }
 
     #[test]
     fn an_exposure_of_whole_periods_sees_every_row_as_often() {
         for periods in [1.0, 3.0] {
             let setting = Setting::new(1234.5, periods * timing().period_us());
-            for u in [-719, -1, 0, 350, 719] {
-                close(timing().weight(u, &setting), periods);
-            }
+            timing().weights(360, &setting).into_iter().for_each(|share| close(share, periods));
         }
     }
 
@@ -291,6 +416,87 @@ mod tests {
     }
 
     #[test]
+    fn rows_of_unequal_dwell_send_the_same_light() {
+        // Rows 0..720 lit twice as fast as nominally in the first half of the sweep, and slower after it.
+        let starts_us: Vec<f64> = (0..=720)
+            .map(f64::from)
+            .map(|v| if v <= 360.0 { v / 2.0 * TAU_US } else { (180.0 + (v - 360.0) * 1.5) * TAU_US })
+            .collect();
+        let bent = timing().with_row_table(&starts_us).unwrap();
+        // Row 100 is lit from 50 tau on for tau/2. Camera row 100 keeps to the nominal raster: its own light comes
+        // 100.5 - 50.25 rows early.
+        let own = Setting::new(-50.25 * TAU_US, 0.5 * TAU_US);
+        close(weight(&bent, 100, 0, &own), 1.0);
+        close(bent.weights(100, &own).iter().sum(), 1.0);
+        // A tenth of a nominal row time is a fifth of row 100's dwell and a fifteenth of row 500's.
+        close(weight(&bent, 100, 0, &Setting::new(-50.25 * TAU_US, 0.1 * TAU_US)), 0.2);
+        // Row 500 is lit from 390 tau to 391.5 tau; its nominal centre is at 500.5 tau.
+        close(weight(&bent, 500, 0, &Setting::new((390.75 - 500.5) * TAU_US, 0.1 * TAU_US)), 0.1 / 1.5);
+        // All rows are lit once a period, whatever their dwell.
+        let period = Setting::new(0.0, timing().period_us());
+        bent.weights(300, &period).into_iter().for_each(|share| close(share, 1.0));
+    }
+
+    #[test]
+    fn a_table_of_equal_rows_changes_no_bit() {
+        let starts_us: Vec<f64> = (0..=720).map(|v| f64::from(v) * TAU_US).collect();
+        assert_eq!(timing().with_row_table(&starts_us), Ok(timing()));
+        let setting = Setting::new(371.0, 611.1);
+        for t in [0, 17, 360, 719] {
+            let (shares, middle) = (timing().weights(t, &setting), timing().weights(360, &setting));
+            for u in -40..40_i32 {
+                let Ok(v) = usize::try_from(t as i32 + u) else { continue };
+                assert!(v >= 720 || shares[v].to_bits() == middle[(360 + u) as usize].to_bits());
+            }
+        }
+    }
+
+    #[test]
+    fn a_camera_of_another_pitch_looks_between_rows() {
+        let pitch = 1.5;
+        let camera = CameraRows { first_row: 10, rows: 200, pitch, row_time_us: pitch * TAU_US };
+        let timing = timing().with_camera(camera).unwrap();
+        // Camera row 3 looks along place 14.5, half a row above the centre of row 15, its own.
+        assert_eq!((camera.place(3), camera.own_row(3), timing.relative_row(15, 3)), (14.5, 15, 0));
+        // An exposure of one row time around the place holds half of each row beside it.
+        let short = Setting::new(0.0, TAU_US);
+        close(weight(&timing, 3, -1, &short), 0.5);
+        close(weight(&timing, 3, 0, &short), 0.5);
+        // The delay is measured from the place: half a row later, it is row 15 alone.
+        close(weight(&timing, 3, 0, &Setting::new(TAU_US / 2.0, TAU_US)), 1.0);
+    }
+
+    #[test]
+    fn a_camera_of_another_row_time_drifts() {
+        let camera = CameraRows { first_row: 0, rows: 500, pitch: 1.0, row_time_us: 1.01 * TAU_US };
+        let timing = timing().with_camera(camera).unwrap();
+        // After 400 rows its exposures come four rows late.
+        let setting = Setting::new(0.0, TAU_US);
+        close(weight(&timing, 0, 0, &setting), 1.0);
+        close(weight(&timing, 400, 4, &setting), 1.0);
+        close(weight(&timing, 250, 2, &setting), 0.5);
+    }
+
+    #[test]
+    fn a_beam_weighs_rows_by_the_rows_drawn_near_them() {
+        let setting = Setting::new(0.0, 10.0 * TAU_US);
+        let beam = Beam::Gaussian { sigma_rows: 1.5 };
+        let (sharp, wide) =
+            (timing().weights(360, &setting), timing().with_beam(beam).unwrap().weights(360, &setting));
+        close(sharp.iter().sum(), wide.iter().sum());
+        // Rows -4..=4 and half of ±5 are drawn: the edge is a Gaussian's integral, the middle stays full.
+        assert!(
+            (wide[360] - 0.9987).abs() < 1e-3 && (wide[365] - 0.5).abs() < 1e-3,
+            "{} {}",
+            wide[360],
+            wide[365]
+        );
+        assert_eq!(sharp[366], 0.0);
+        // g = 0.2130, 0.1093, 0.0360, 0.0076, 0.0010, 0.0001 at 1.. rows; half of the first and all of the others.
+        assert!((wide[366] - 0.2605).abs() < 2e-4, "{}", wide[366]);
+    }
+
+    #[test]
     fn bad_values_are_refused_by_name() {
         let field = |result: Result<RowTiming, PlaneError>| match result {
             Err(PlaneError::OutOfRange { field, .. }) => field,
@@ -301,6 +507,24 @@ mod tests {
         assert!(matches!(RowTiming::new(0, 22.22, 16_667.0), Err(PlaneError::Window { .. })));
         assert!(matches!(timing().centred(721), Err(PlaneError::Window { .. })));
         assert!(matches!(timing().window(usize::MAX, 2), Err(PlaneError::Window { .. })));
+
+        let table = |change: fn(&mut Vec<f64>)| {
+            let mut starts_us: Vec<f64> = (0..=720).map(|v| f64::from(v) * TAU_US).collect();
+            change(&mut starts_us);
+            field(timing().with_row_table(&starts_us))
+        };
+        assert_eq!(table(|starts| starts.truncate(720)), "row_table");
+        assert_eq!(table(|starts| starts[7] = starts[6]), "row_table");
+        assert_eq!(table(|starts| starts[7] = f64::NAN), "row_table");
+        assert_eq!(table(|starts| starts[720] = 17_000.0), "row_table");
+        assert_eq!(table(|starts| starts.iter_mut().for_each(|start| *start -= 17_000.0)), "row_table");
+        let camera = |pitch, row_time_us| {
+            timing().with_camera(CameraRows { first_row: 0, rows: 2, pitch, row_time_us })
+        };
+        assert_eq!(field(camera(0.0, 22.22)), "row_pitch");
+        assert_eq!(field(camera(1.0, f64::INFINITY)), "camera row_time_us");
+        assert!(matches!(camera(720.0, 22.22), Err(PlaneError::Window { end: 721, .. })));
+        assert!(timing().with_beam(Beam::Gaussian { sigma_rows: 0.0 }).is_err());
 
         let check = |setting: Setting| timing().check(&[setting]);
         assert_eq!(check(Setting::new(0.0, 600.0)), Ok(()));

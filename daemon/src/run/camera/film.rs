@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use raysweep_core::{DeviceError, FirstFrame, FrameStamp, LossCause, SettingsId};
 use raysweep_pipeline::{Event, Job, Label, Point, Shot};
 
-use super::{MARGIN_FRAMES, Received, Sequencer, closed};
+use super::{MARGIN_FRAMES, Received, Sequencer, Taken, closed};
 use crate::run::orders::Order;
 
 /// A film to take under one picture of the projector.
@@ -179,7 +179,9 @@ impl Sequencer {
         match ahead.pop_seen(seq) {
             Some(Written { job, .. }) => {
                 self.input.send(Event::Begin(job)).map_err(closed)?;
-                self.hand_on(received, Label::Counted)?;
+                if let Taken::Passed(stamp, _) = self.hand_on(received, Label::Counted)? {
+                    self.exposed_until = self.end_of_exposure(&stamp, &job.applied.actual);
+                }
                 self.input.send(Event::End).map_err(closed)?;
             }
             // Exposed once more under settings that have their frame: the next ones came too late for it.

@@ -13,7 +13,7 @@ use raysweep_session::film::{CycleEntry, Film, crc32};
 use raysweep_session::ledger::Entry;
 use raysweep_transport::plane::Setting;
 
-pub use self::worker::{Account, Exposed, Solving, Views, Worker};
+pub use self::worker::{Account, Exposed, Solving, Worker};
 use super::storage::Storage;
 use crate::processing::Task;
 use crate::rig::Pace;

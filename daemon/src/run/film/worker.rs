@@ -5,27 +5,21 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use ndarray::{Array2, ArrayViewD};
+use ndarray::Array2;
 use raysweep_core::{Clock, FilmSummary, Percentiles};
 use raysweep_pipeline::{FilmSolver, PipelineError};
 use raysweep_proto::{Event, FilmEstimate};
 use raysweep_session::film::TransportFilm;
 use raysweep_transport::plane::{Setting, Transport};
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
-use crate::film;
+use crate::live::{EPIPOLAR, INDIRECT, Outlet};
 use crate::rig::Pace;
 use crate::run::board::Board;
 use crate::run::orders::{Order, Orders};
 
 /// Cycles that may wait for the solver.
 const WAITING_CYCLES: usize = 4;
-
-/// Where the views of a film go that somebody may be looking at.
-pub trait Views: Send + Sync {
-    /// Shows an image under a name, in place of the one before. Must neither block nor fail: nobody may be there.
-    fn publish(&self, name: &str, image: ArrayViewD<'_, f32>, metadata: &Map<String, Value>);
-}
 
 /// One frame of each setting, to be made into a transport.
 pub struct Exposed {
@@ -130,8 +124,8 @@ pub struct Solving {
     pub solver: FilmSolver,
     /// Where those of whole cycles are stored.
     pub transports: TransportFilm,
-    /// Where their views are shown.
-    pub views: Option<Arc<dyn Views>>,
+    /// Where their views are shown, if anywhere.
+    pub live: Option<Outlet>,
     /// Told of each.
     pub board: Arc<Board>,
     /// Counts them.
@@ -252,15 +246,26 @@ impl Solving {
     }
 
     fn publish(&self, exposed: &Exposed, is_sliding: bool, transport: &Transport, solve_time: Duration) {
-        let latency_ms = (self.pace == Pace::Devices)
-            .then(|| (Clock::real().now_ns().saturating_sub(exposed.end_ns)) as f64 * 1e-6);
-        let metadata = film::view_metadata(exposed.cycle, is_sliding, exposed.start_s, latency_ms);
-        let views = film::views(transport);
-        if let Some(outlet) = &self.views {
+        let views = [(EPIPOLAR, transport.epipolar(1)), (INDIRECT, transport.non_epipolar(1))];
+        if let Some(Outlet { file, session, .. }) = &self.live {
+            let entries = [
+                ("axes", json!(["t", "s"])),
+                ("units", json!("1 = a white pixel lit by its own projector row")),
+                ("session", json!(session)),
+                ("cycle", json!(exposed.cycle)),
+                ("sliding", json!(is_sliding)),
+                ("start_s", json!(exposed.start_s)),
+            ];
+            let metadata: Map<String, Value> =
+                entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
             for (name, image) in &views {
-                outlet.publish(name, image.view().into_dyn(), &metadata);
+                if let Err(error) = file.publish(name, image.view().into_dyn(), &metadata) {
+                    tracing::warn!(%error, "a view of the film is not shown");
+                }
             }
         }
+        let latency_ms = (self.pace == Pace::Devices)
+            .then(|| Clock::real().now_ns().saturating_sub(exposed.end_ns) as f64 * 1e-6);
         if is_sliding {
             self.account.note(|film| film.sliding_estimates += 1);
         } else {

@@ -1,0 +1,151 @@
+//! Light by the distance of its projector row: `epipolar`, `non-epipolar`, `band`.
+
+use ndarray::Array2;
+use raysweep_transport::plane::Transport;
+use serde::Deserialize;
+
+use super::reach_of;
+use crate::stage::Product;
+
+/// Options of `epipolar` and `non-epipolar`: the rows that count as the pixel's own.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Width {
+    /// Odd, so that they lie symmetrically about u = 0.
+    width_rows: u32,
+}
+
+impl Default for Width {
+    fn default() -> Self {
+        Self { width_rows: 1 }
+    }
+}
+
+impl Width {
+    pub(super) fn check(self) -> Result<Self, (&'static str, String)> {
+        match self.width_rows % 2 {
+            1 => Ok(self),
+            _ => {
+                let what = format!(
+                    "width_rows = {}: give an odd number of rows, so that as many lie above as below",
+                    self.width_rows
+                );
+                Err(("width_rows", what))
+            }
+        }
+    }
+
+    /// The name of a product of this width where the plan gives none.
+    pub(super) fn named(self, name: &str) -> String {
+        match self.width_rows {
+            1 => name.into(),
+            width_rows => format!("{name}_{width_rows}"),
+        }
+    }
+
+    fn half(self) -> u32 {
+        self.width_rows / 2
+    }
+
+    pub(super) fn epipolar(self, name: String, transport: &Transport) -> Product {
+        let about = match self.half() {
+            0 => "light from the pixel's own projector row (u = 0)".into(),
+            half => {
+                format!("light from the pixel's own projector row and {half} to either side (|u| <= {half})")
+            }
+        };
+        Product::Image { name, about, image: transport.epipolar(self.width_rows) }
+    }
+
+    pub(super) fn non_epipolar(self, name: String, transport: &Transport) -> Product {
+        let about = match self.half() {
+            0 => "light from all other rows within the sweep's reach".into(),
+            half => {
+                format!("light from all rows more than {half} away within the sweep's reach (|u| > {half})")
+            }
+        };
+        Product::Image { name, about, image: transport.non_epipolar(self.width_rows) }
+    }
+}
+
+/// Options of `band`: how far away the rows are.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Band {
+    /// Smallest |u|.
+    from_rows: u32,
+    /// Largest |u|; left out: as far as the sweep reaches.
+    to_rows: Option<u32>,
+    /// Left out: both.
+    side: Option<Side>,
+}
+
+/// Where rows lie, seen from the pixel's own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Side {
+    /// u < 0.
+    Above,
+    /// u > 0.
+    Below,
+}
+
+impl Band {
+    pub(super) fn new(from_rows: u32, to_rows: Option<u32>) -> Self {
+        Self { from_rows, to_rows, side: None }
+    }
+
+    pub(super) fn check(self) -> Result<Self, (&'static str, String)> {
+        match self.to_rows {
+            Some(to_rows) if to_rows < self.from_rows => {
+                let what =
+                    format!("to_rows = {to_rows}: give at least from_rows, which is {}", self.from_rows);
+                Err(("to_rows", what))
+            }
+            _ => Ok(self),
+        }
+    }
+
+    pub(super) fn default_name(self) -> String {
+        let side = match self.side {
+            Some(Side::Above) => "_above",
+            Some(Side::Below) => "_below",
+            None => "",
+        };
+        match self.to_rows {
+            Some(to_rows) => format!("band_{}_to_{to_rows}{side}", self.from_rows),
+            None => format!("band_from_{}{side}", self.from_rows),
+        }
+    }
+
+    pub(super) fn make(self, name: String, transport: &Transport) -> Product {
+        let rows = match self.to_rows {
+            Some(to_rows) => format!("{} to {to_rows} rows", self.from_rows),
+            None => format!("{} rows and more", self.from_rows),
+        };
+        let side = match self.side {
+            Some(Side::Above) => "above the pixel's own",
+            Some(Side::Below) => "below the pixel's own",
+            None => "away",
+        };
+        let mut about = format!("light from projector rows {rows} {side}");
+        let known = transport.u_min.unsigned_abs().min(transport.u_max().unsigned_abs());
+        if self.to_rows.is_none_or(|to_rows| to_rows > known) {
+            about.push_str(&format!("; {}", reach_of(transport)));
+        }
+        Product::Image { name, about, image: self.image(transport) }
+    }
+
+    fn image(self, transport: &Transport) -> Array2<f32> {
+        // No reach is as long as i32::MAX rows.
+        let rows = |rows: u32| i32::try_from(rows).unwrap_or(i32::MAX);
+        let (from, to) = (rows(self.from_rows), self.to_rows.map_or(i32::MAX, rows));
+        match self.side {
+            Some(Side::Above) => transport.band(-to..=-from),
+            Some(Side::Below) => transport.band(from..=to),
+            // Both sides hold the pixel's own row, which counts once.
+            None if from == 0 => transport.band(-to..=to),
+            None => transport.band(-to..=-from) + transport.band(from..=to),
+        }
+    }
+}

@@ -1,0 +1,243 @@
+//! Products by the names that plans use: what a `[[product]]` asks for, checked before anything moves, and made of the
+//! transport and the stack at the end of the run or long after it.
+
+mod band;
+mod profile;
+mod relight;
+
+use ndarray::{Array2, Array3};
+use raysweep_transport::plane::{RowTiming, Setting, Transport};
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
+
+use self::band::{Band, Width};
+use self::profile::{ProfileOptions, ProfileTable};
+use self::relight::Pattern;
+use crate::schedule::{Schedule, SweepGeometry};
+use crate::stage::Product;
+
+pub use self::profile::Profile;
+
+/// The images that a transport was made of.
+#[derive(Debug, Clone)]
+pub struct SweepStack {
+    /// The rows that the camera looks along, and when they are lit.
+    pub timing: RowTiming,
+    /// The exposure that the plan asked for, of each image.
+    pub exposures_us: Vec<f64>,
+    /// How each image was taken.
+    pub settings: Vec<Setting>,
+    /// `[settings, t, s]`, dark image subtracted, 1 = a white pixel lit by its own projector row.
+    pub images: Array3<f32>,
+    /// Which samples are not saturated, of the same shape; none: all.
+    pub valid: Option<Array3<bool>>,
+    /// One whole VSYNC period of exposure, `[t, s]`, where it was taken.
+    pub regular: Option<Array2<f32>>,
+}
+
+/// Why a product cannot be asked for.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("product {kind}: {what}")]
+pub struct ProductError {
+    /// The kind that the plan names.
+    pub kind: String,
+    /// Keys and numbers that lead to the option within the product's table.
+    pub path: Vec<String>,
+    /// Field, value, what is allowed.
+    pub what: String,
+}
+
+/// Why a product could not be made.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("product {name}: {what}")]
+pub struct NotMade {
+    /// The product's name.
+    pub name: String,
+    /// What is missing, and what to do.
+    pub what: String,
+}
+
+/// A product that can be made of every sweep of its plan.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProductSpec {
+    name: String,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Kind {
+    Regular,
+    Epipolar(Width),
+    NonEpipolar(Width),
+    Band(Band),
+    Relight(Pattern),
+    DelayProfile(ProfileOptions),
+}
+
+/// The kinds as plans name them.
+const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile";
+
+/// The name that the transport itself has among the files.
+const TAKEN_NAME: &str = "transport";
+
+/// Longest name; with its extension it is a file name on every file system.
+const MAX_NAME: usize = 64;
+
+/// `kind = "regular"` has none.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoOptions {}
+
+impl ProductSpec {
+    /// The product of a plan's table: its kind, its name if it has one, and all other keys.
+    ///
+    /// # Errors
+    /// With the option that this plan on this rig cannot have.
+    pub fn new(
+        kind: &str,
+        name: Option<&str>,
+        options: &Map<String, Value>,
+        schedule: &Schedule,
+        geometry: &SweepGeometry,
+    ) -> Result<Self, ProductError> {
+        let refused = |path: Vec<String>, what: String| ProductError { kind: kind.into(), path, what };
+        let one = |(field, what): (&str, String)| refused(vec![field.into()], what);
+        let made = match kind {
+            "regular" => {
+                let NoOptions {} = parse(kind, options)?;
+                Kind::Regular
+            }
+            "epipolar" => Kind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
+            "non-epipolar" => Kind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
+            "band" => Kind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "relight" => {
+                if options.len() != 1 {
+                    let what = "give exactly one of rows, stripes and line".to_owned();
+                    return Err(refused(Vec::new(), what));
+                }
+                let pattern: Pattern = parse(kind, options)?;
+                pattern.check(geometry).map_err(|(path, what)| refused(path, what))?;
+                Kind::Relight(pattern)
+            }
+            "delay-profile" => {
+                let table: ProfileTable = parse(kind, options)?;
+                Kind::DelayProfile(table.check(schedule, geometry).map_err(one)?)
+            }
+            _ => {
+                return Err(refused(vec!["kind".into()], format!("kind = {kind:?}: known are {KINDS}")));
+            }
+        };
+        let name = match name {
+            Some(name) => checked_name(name).map_err(|what| refused(vec!["name".into()], what))?,
+            None => made.default_name(),
+        };
+        Ok(Self { name, kind: made })
+    }
+
+    /// What is made where a plan asks for nothing else.
+    pub fn defaults() -> Vec<Self> {
+        let spec = |name: &str, kind| Self { name: name.into(), kind };
+        vec![
+            spec("regular", Kind::Regular),
+            spec("epipolar", Kind::Epipolar(Width::default())),
+            spec("non_epipolar", Kind::NonEpipolar(Width::default())),
+            spec("short_range", Kind::Band(Band::new(1, Some(10)))),
+            spec("long_range", Kind::Band(Band::new(11, None))),
+        ]
+    }
+
+    /// The name of its files, without extension.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// How many images it consists of on this rig.
+    pub fn images(&self, geometry: &SweepGeometry) -> usize {
+        match &self.kind {
+            Kind::Relight(pattern) => pattern.images(geometry),
+            Kind::DelayProfile(_) => 0,
+            Kind::Regular | Kind::Epipolar(_) | Kind::NonEpipolar(_) | Kind::Band(_) => 1,
+        }
+    }
+
+    /// Makes it.
+    ///
+    /// # Errors
+    /// When what it needs was not taken, or saturates.
+    pub fn make(&self, stack: &SweepStack, transport: &Transport) -> Result<Product, NotMade> {
+        let name = self.name.clone();
+        let not_made = |what: String| NotMade { name: self.name.clone(), what };
+        match &self.kind {
+            Kind::Regular => match &stack.regular {
+                Some(image) => Ok(Product::Image {
+                    name,
+                    about: "a captured exposure of one whole VSYNC period: every row lit once".into(),
+                    image: image.clone(),
+                }),
+                None => {
+                    Err(not_made("the regular image or its dark image is not there: resume the run".into()))
+                }
+            },
+            Kind::Epipolar(width) => Ok(width.epipolar(name, transport)),
+            Kind::NonEpipolar(width) => Ok(width.non_epipolar(name, transport)),
+            Kind::Band(band) => Ok(band.make(name, transport)),
+            Kind::Relight(pattern) => {
+                pattern.make(name, &stack.timing, transport).map_err(|error| not_made(error.to_string()))
+            }
+            Kind::DelayProfile(options) => options.make(name, stack, transport).map_err(not_made),
+        }
+    }
+}
+
+impl Kind {
+    fn default_name(&self) -> String {
+        match self {
+            Self::Regular => "regular".into(),
+            Self::Epipolar(width) => width.named("epipolar"),
+            Self::NonEpipolar(width) => width.named("non_epipolar"),
+            Self::Band(band) => band.default_name(),
+            Self::Relight(_) => "relight".into(),
+            Self::DelayProfile(options) => options.default_name(),
+        }
+    }
+}
+
+/// How far a transport knows its rows, for the texts of products that end there.
+fn reach_of(transport: &Transport) -> String {
+    format!("the sweep reaches u = {} to {}, beyond nothing is known", transport.u_min, transport.u_max())
+}
+
+fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Result<T, ProductError> {
+    serde_path_to_error::deserialize(Value::Object(options.clone())).map_err(|error| {
+        use serde_path_to_error::Segment;
+        let key = |segment: &Segment| match segment {
+            Segment::Seq { index } => Some(index.to_string()),
+            Segment::Map { key } => Some(key.clone()),
+            Segment::Enum { .. } | Segment::Unknown => None,
+        };
+        let path: Vec<String> = error.path().iter().filter_map(key).collect();
+        let what = match path.is_empty() {
+            true => error.inner().to_string(),
+            false => format!("{}: {}", path.join("."), error.inner()),
+        };
+        ProductError { kind: kind.into(), path, what }
+    })
+}
+
+/// A name becomes a file's and so must not lead anywhere else.
+fn checked_name(name: &str) -> Result<String, String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+    if name.is_empty() || name.len() > MAX_NAME || !name.chars().all(plain) {
+        return Err(format!(
+            "name = {name:?}: it becomes a file's, so give 1 to {MAX_NAME} letters, digits, `-` and `_`"
+        ));
+    }
+    if name == TAKEN_NAME {
+        return Err(format!("name = {name:?}: that is the light transport itself; give another"));
+    }
+    Ok(name.into())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,168 @@
+//! Product `relight`: the scene under another pattern of projector rows than all of them.
+
+use ndarray::{Array1, Array3, Axis};
+use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight};
+use serde::Deserialize;
+
+use super::reach_of;
+use crate::schedule::SweepGeometry;
+use crate::stage::Product;
+
+/// Options of `relight`: how bright each projector row is.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Pattern {
+    /// Pieces of rows; where they overlap, their weights add up.
+    Rows(Vec<Piece>),
+    /// Stripes over the whole projector.
+    Stripes(Stripes),
+    /// A sequence of images: a line that moves from the first row that the camera sees to the last.
+    Line(Line),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Piece {
+    first: usize,
+    /// Included.
+    last: usize,
+    #[serde(default = "full_weight")]
+    weight: f64,
+}
+
+fn full_weight() -> f64 {
+    1.0
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Stripes {
+    period_rows: usize,
+    lit_rows: usize,
+    /// First lit row of the first whole stripe.
+    #[serde(default)]
+    phase_rows: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Line {
+    height_rows: usize,
+    step_rows: usize,
+}
+
+impl Line {
+    /// The first lit row of each image: from the projector row of the camera's first row to that of its last.
+    fn first_rows(self, timing: &RowTiming) -> Vec<usize> {
+        let own_row = |t: usize| timing.relative_row(0, t).unsigned_abs() as usize;
+        (own_row(0)..=own_row(timing.camera_rows() - 1)).step_by(self.step_rows).collect()
+    }
+}
+
+impl Pattern {
+    /// Keys and numbers that lead to a bad value, and what is allowed there.
+    pub(super) fn check(&self, geometry: &SweepGeometry) -> Result<(), (Vec<String>, String)> {
+        let rows = geometry.raster.rows;
+        let within = |path: &[&str], value: usize, lowest: usize, highest: usize, what: &str| {
+            if (lowest..=highest).contains(&value) {
+                return Ok(());
+            }
+            let message = format!("{} = {value}: allowed are {lowest} to {highest}, {what}", path.join("."));
+            Err((path.iter().map(|&key| key.to_owned()).collect::<Vec<_>>(), message))
+        };
+        match self {
+            Self::Rows(pieces) => {
+                if pieces.is_empty() {
+                    return Err((vec!["rows".into()], "rows is empty: give { first, last, weight }".into()));
+                }
+                for (index, piece) in pieces.iter().enumerate() {
+                    let index = index.to_string();
+                    within(&["rows", &index, "first"], piece.first, 0, rows - 1, "the projector's rows")?;
+                    within(
+                        &["rows", &index, "last"],
+                        piece.last,
+                        piece.first,
+                        rows - 1,
+                        "first to the projector's last row",
+                    )?;
+                    if !(piece.weight.is_finite() && piece.weight >= 0.0) {
+                        let what = format!("rows.{index}.weight = {}: give light of 0 or more", piece.weight);
+                        return Err((vec!["rows".into(), index, "weight".into()], what));
+                    }
+                }
+            }
+            Self::Stripes(stripes) => {
+                let Stripes { period_rows, lit_rows, phase_rows } = *stripes;
+                within(&["stripes", "period_rows"], period_rows, 1, rows, "the projector's rows")?;
+                within(&["stripes", "lit_rows"], lit_rows, 1, period_rows, "the period")?;
+                within(&["stripes", "phase_rows"], phase_rows, 0, period_rows - 1, "less than the period")?;
+            }
+            Self::Line(line) => {
+                within(&["line", "height_rows"], line.height_rows, 1, rows, "the projector's rows")?;
+                within(&["line", "step_rows"], line.step_rows, 1, rows, "the projector's rows")?;
+            }
+        }
+        Ok(())
+    }
+
+    /// How many images it gives.
+    pub(super) fn images(&self, geometry: &SweepGeometry) -> usize {
+        match self {
+            Self::Rows(_) | Self::Stripes(_) => 1,
+            Self::Line(line) => geometry.height.div_ceil(line.step_rows),
+        }
+    }
+
+    pub(super) fn make(
+        &self,
+        name: String,
+        timing: &RowTiming,
+        transport: &Transport,
+    ) -> Result<Product, PlaneError> {
+        let rows = timing.projector_rows();
+        let reach = reach_of(transport);
+        let under = |weights: &Array1<f64>| relight(timing, transport, weights.view());
+        let (about, weights) = match self {
+            Self::Rows(pieces) => {
+                let mut weights = Array1::zeros(rows);
+                for piece in pieces {
+                    weights
+                        .iter_mut()
+                        .take(piece.last + 1)
+                        .skip(piece.first)
+                        .for_each(|w| *w += piece.weight);
+                }
+                let lit = weights.iter().filter(|&&weight| weight > 0.0).count();
+                (format!("relit by {lit} of the projector's {rows} rows"), weights)
+            }
+            Self::Stripes(Stripes { period_rows, lit_rows, phase_rows }) => {
+                let lit =
+                    |row: usize| (row % period_rows + period_rows - phase_rows) % period_rows < *lit_rows;
+                let about = format!("relit by stripes of {lit_rows} rows, {period_rows} rows apart");
+                (about, Array1::from_shape_fn(rows, |row| if lit(row) { 1.0 } else { 0.0 }))
+            }
+            Self::Line(line) => {
+                let tops = line.first_rows(timing);
+                let (_, height, width) = transport.t.dim();
+                let mut images = Array3::zeros((tops.len(), height, width));
+                for (mut image, &top) in images.axis_iter_mut(Axis(0)).zip(&tops) {
+                    let lit = top..top + line.height_rows;
+                    let weights =
+                        Array1::from_shape_fn(rows, |row| if lit.contains(&row) { 1.0 } else { 0.0 });
+                    image.assign(&under(&weights)?);
+                }
+                return Ok(Product::Sequence {
+                    name,
+                    about: format!(
+                        "relit by a line of {} rows that moves down the projector; {reach}",
+                        line.height_rows
+                    ),
+                    axis: "first lit projector row".into(),
+                    at: tops.into_iter().map(|top| top as f64).collect(),
+                    images,
+                });
+            }
+        };
+        Ok(Product::Image { name, about: format!("{about}; {reach}"), image: under(&weights)? })
+    }
+}

@@ -1,0 +1,284 @@
+use ndarray::{Axis, s};
+use raysweep_core::Raster;
+use raysweep_transport::plane::predict;
+use serde_json::json;
+
+use super::*;
+use crate::schedule::{Point, Role};
+
+/// A camera of 6 rows and 3 columns that sees the rows from 2 on of a projector with 10.
+fn geometry() -> SweepGeometry {
+    let raster = Raster { rows: 10, row_time_us: 20.0, period_us: 2000.0, first_row_us: 0.0 };
+    SweepGeometry { raster, first_row: 2, height: 6, width: 3, white_dn: 1000.0, saturation_dn: 4000.0 }
+}
+
+/// Two exposures at three delays, and a third at one.
+fn schedule() -> Schedule {
+    let grid = [100.0, 200.0].into_iter().flat_map(|us| [-60.0, 0.0, 60.0].map(|delay_us| (delay_us, us)));
+    let points = (0..).zip(grid.chain([(0.0, 300.0)])).map(|(index, (delay_us, exposure_us))| Point {
+        role: Role::Sweep(index),
+        delay_us,
+        exposure_us,
+        frames: 1,
+    });
+    Schedule { points: points.collect() }
+}
+
+fn timing() -> RowTiming {
+    RowTiming::new(10, 20.0, 2000.0).unwrap().window(2, 6).unwrap()
+}
+
+/// Values of few bits, so that sums of them are exact in any order.
+fn transport() -> Transport {
+    let row = |index: usize, t: usize| timing().row_exists(index as i32 - 4, t);
+    let t = Array3::from_shape_fn((9, 6, 3), |(index, t, s)| match row(index, t) {
+        true => ((5 * index + 3 * t + s) % 17) as f32 / 16.0,
+        false => 0.0,
+    });
+    let exists = Array2::from_shape_fn((9, 6), |(index, t)| row(index, t));
+    Transport { t, u_min: -4, exists, saturated: Array2::from_elem((6, 3), false) }
+}
+
+/// What a camera sees of the transport, without noise.
+fn stack() -> SweepStack {
+    let points = schedule().points;
+    let settings: Vec<Setting> =
+        points.iter().map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
+    // Seen by a camera as high as the projector, of which ours is a window.
+    let all = Array3::from_shape_fn((10, 10, 3), |(v, t, s)| {
+        let known = t.checked_sub(2).zip((v + 4).checked_sub(t));
+        known.and_then(|(t, index)| transport().t.get([index, t, s]).copied()).unwrap_or(0.0)
+    });
+    let whole = RowTiming::new(10, 20.0, 2000.0).unwrap();
+    let seen = |setting| predict(&whole, all.view(), setting).unwrap().slice_move(s![2..8, ..]);
+    let images: Vec<_> = settings.iter().map(seen).collect();
+    let views: Vec<_> = images.iter().map(|image| image.view()).collect();
+    SweepStack {
+        timing: timing(),
+        exposures_us: points.iter().map(|point| point.exposure_us).collect(),
+        settings,
+        images: ndarray::stack(Axis(0), &views).unwrap(),
+        valid: None,
+        regular: None,
+    }
+}
+
+fn spec(table: &Value) -> Result<ProductSpec, ProductError> {
+    let mut options = table.as_object().unwrap().clone();
+    let take = |options: &mut Map<String, Value>, key: &str| {
+        options.remove(key).map(|value| value.as_str().unwrap().to_owned())
+    };
+    let (kind, name) = (take(&mut options, "kind").unwrap(), take(&mut options, "name"));
+    ProductSpec::new(&kind, name.as_deref(), &options, &schedule(), &geometry())
+}
+
+fn image(table: Value) -> Array2<f32> {
+    match spec(&table).unwrap().make(&stack(), &transport()).unwrap() {
+        Product::Image { image, .. } => image,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn bands_of_both_sides_add_up_to_the_total() {
+    let parts = [
+        json!({ "kind": "band", "from_rows": 0, "to_rows": 0 }),
+        json!({ "kind": "band", "from_rows": 1, "to_rows": 2, "side": "above" }),
+        json!({ "kind": "band", "from_rows": 1, "to_rows": 2, "side": "below" }),
+        json!({ "kind": "band", "from_rows": 3 }),
+    ];
+    let sum = parts.into_iter().map(image).reduce(|a, b| a + b).unwrap();
+    assert_eq!(sum, transport().total());
+    let near = image(json!({ "kind": "band", "from_rows": 0, "to_rows": 2 }));
+    assert_eq!(near, image(json!({ "kind": "epipolar", "width_rows": 5 })));
+    let far = image(json!({ "kind": "band", "from_rows": 3, "to_rows": u32::MAX }));
+    assert_eq!(far, image(json!({ "kind": "non-epipolar", "width_rows": 5 })));
+    // u = -2 and -1 are indices 2 and 3.
+    let above = image(json!({ "kind": "band", "from_rows": 1, "to_rows": 2, "side": "above" }));
+    assert_eq!(above, transport().t.slice(s![2..4, .., ..]).sum_axis(Axis(0)));
+}
+
+#[test]
+fn a_band_and_what_lies_on_either_side_of_it_are_all_light() {
+    for (from, to) in (0..6).flat_map(|from| (from..6).map(move |to| (from, to))) {
+        let inner = match from {
+            0 => Array2::zeros((6, 3)),
+            _ => image(json!({ "kind": "band", "from_rows": 0, "to_rows": from - 1 })),
+        };
+        let band = image(json!({ "kind": "band", "from_rows": from, "to_rows": to }));
+        let outer = image(json!({ "kind": "band", "from_rows": to + 1 }));
+        assert_eq!(inner + band + outer, transport().total(), "{from} to {to}");
+    }
+}
+
+#[test]
+fn relighting_by_all_rows_by_pieces_and_by_complementary_stripes_agree() {
+    let all = image(json!({ "kind": "relight", "rows": [{ "first": 0, "last": 9 }] }));
+    assert_eq!(all, transport().total());
+    let overlapping = json!([{ "first": 0, "last": 9, "weight": 0.5 }, { "first": 0, "last": 6, "weight": 0.5 },
+        { "first": 7, "last": 9, "weight": 0.5 }]);
+    assert_eq!(image(json!({ "kind": "relight", "rows": overlapping })), all);
+    let stripes = |phase: usize, lit: usize| {
+        image(
+            json!({ "kind": "relight", "stripes": { "period_rows": 4, "lit_rows": lit, "phase_rows": phase } }),
+        )
+    };
+    assert_eq!(stripes(3, 1) + stripes(0, 3), all);
+    // Rows 3 and 7, which are u = 1 and 5 of camera row 0.
+    assert_eq!(stripes(3, 1)[[0, 2]], transport().t[[5, 0, 2]]);
+}
+
+#[test]
+fn a_line_lights_each_row_of_the_cameras_once() {
+    let line = spec(&json!({ "kind": "relight", "line": { "height_rows": 2, "step_rows": 2 } })).unwrap();
+    assert_eq!(line.images(&geometry()), 3);
+    let Product::Sequence { images, at, .. } = line.make(&stack(), &transport()).unwrap() else { panic!() };
+    assert_eq!((images.dim(), at.as_slice()), ((3, 6, 3), [2.0, 4.0, 6.0].as_slice()));
+    let camera_rows = image(json!({ "kind": "relight", "rows": [{ "first": 2, "last": 7 }] }));
+    assert_eq!(images.sum_axis(Axis(0)), camera_rows);
+}
+
+#[test]
+fn a_delay_profile_is_what_the_forward_model_says_of_its_pixels() {
+    let table = json!({ "kind": "delay-profile", "region": [2, 4, 1, 3], "exposure_us": 200 });
+    let Product::Profile(profile) = spec(&table).unwrap().make(&stack(), &transport()).unwrap() else {
+        panic!()
+    };
+    assert_eq!((profile.name.as_str(), profile.exposure_us), ("delay_profile_t2_4_s1_3", 200.0));
+    assert_eq!(profile.measured.delays_us, [-60.0, 0.0, 60.0]);
+    for (index, light) in profile.measured.light.iter().enumerate() {
+        let mean = f64::from(stack().images.slice(s![3 + index, 2..4, 1..3]).mean().unwrap());
+        let predicted = profile.predicted.light[index];
+        assert!(mean > 0.5 && (light - mean).abs() < 1e-6, "{light} is not {mean}");
+        assert!((predicted - mean).abs() < 1e-6, "{predicted} is not {mean}");
+    }
+    let shortest = spec(&json!({ "kind": "delay-profile", "pixel": [5, 0] })).unwrap();
+    let Product::Profile(profile) = shortest.make(&stack(), &transport()).unwrap() else { panic!() };
+    assert_eq!(profile.exposure_us, 100.0);
+    assert_eq!(profile.measured.light[0], f64::from(stack().images[[0, 5, 0]]));
+}
+
+#[test]
+fn saturated_pixels_are_left_out_of_a_profile_and_said_to_be() {
+    let mut stack = stack();
+    let mut valid = Array3::from_elem(stack.images.dim(), true);
+    valid[[1, 0, 0]] = false;
+    stack.valid = Some(valid);
+    stack.images[[0, 0, 0]] = 1e9;
+    let make = |table: Value| spec(&table).unwrap().make(&stack, &transport());
+    let Product::Profile(profile) = make(json!({ "kind": "delay-profile", "region": [0, 1, 0, 2] })).unwrap()
+    else {
+        panic!()
+    };
+    assert_eq!(profile.measured.light[0], f64::from(stack.images[[0, 0, 1]]));
+    assert!(profile.about.contains("1 pixels that saturate"), "{}", profile.about);
+    let refused = make(json!({ "kind": "delay-profile", "pixel": [0, 0] })).unwrap_err();
+    assert!(refused.to_string().contains("saturates"), "{refused}");
+    assert!(make(json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 200 })).is_ok());
+}
+
+#[test]
+fn what_was_not_taken_is_not_made() {
+    let mut stack = stack();
+    stack.images = stack.images.slice(s![..1, .., ..]).to_owned();
+    stack.settings.truncate(1);
+    stack.exposures_us.truncate(1);
+    for table in [json!({ "kind": "regular" }), json!({ "kind": "delay-profile", "pixel": [0, 0] })] {
+        let refused = spec(&table).unwrap().make(&stack, &transport()).unwrap_err();
+        assert!(refused.to_string().contains("resume the run"), "{refused}");
+    }
+}
+
+#[test]
+fn bad_tables_are_refused_by_field_and_value() {
+    let cases = [
+        (json!({ "kind": "epipola" }), "kind", "known are epipolar"),
+        (json!({ "kind": "epipolar", "width_rows": 4 }), "width_rows", "odd"),
+        (json!({ "kind": "epipolar", "width_rows": -1 }), "width_rows", "-1"),
+        (json!({ "kind": "epipolar", "width_rows": "wide" }), "width_rows", "wide"),
+        (json!({ "kind": "non-epipolar", "width": 3 }), "width", "width_rows"),
+        (json!({ "kind": "regular", "width_rows": 1 }), "width_rows", "unknown field"),
+        (json!({ "kind": "band" }), "", "from_rows"),
+        (json!({ "kind": "band", "from_rows": 5, "to_rows": 4 }), "to_rows", "at least from_rows"),
+        (json!({ "kind": "band", "from_rows": 5, "side": "left" }), "side", "above"),
+        (json!({ "kind": "relight" }), "", "exactly one"),
+        (json!({ "kind": "relight", "rows": [], "stripes": {} }), "", "exactly one"),
+        (json!({ "kind": "relight", "rows": [] }), "rows", "empty"),
+        (
+            json!({ "kind": "relight", "rows": [{ "first": 0, "last": 1 }, { "first": 4, "last": 10 }] }),
+            "rows.1.last",
+            "4 to 9",
+        ),
+        (json!({ "kind": "relight", "rows": [{ "first": 5, "last": 4 }] }), "rows.0.last", "5 to 9"),
+        (json!({ "kind": "relight", "rows": [{ "first": 10, "last": 12 }] }), "rows.0.first", "0 to 9"),
+        (
+            json!({ "kind": "relight", "rows": [{ "first": 0, "last": 1, "weight": -0.5 }] }),
+            "rows.0.weight",
+            "0 or more",
+        ),
+        (
+            json!({ "kind": "relight", "stripes": { "period_rows": 0, "lit_rows": 1 } }),
+            "stripes.period_rows",
+            "1 to 10",
+        ),
+        (
+            json!({ "kind": "relight", "stripes": { "period_rows": 4, "lit_rows": 5 } }),
+            "stripes.lit_rows",
+            "1 to 4",
+        ),
+        (
+            json!({ "kind": "relight", "stripes": { "period_rows": 4, "lit_rows": 1, "phase_rows": 4 } }),
+            "stripes.phase_rows",
+            "0 to 3",
+        ),
+        (
+            json!({ "kind": "relight", "line": { "height_rows": 1, "step_rows": 0 } }),
+            "line.step_rows",
+            "1 to 10",
+        ),
+        (
+            json!({ "kind": "relight", "line": { "height_rows": 11, "step_rows": 1 } }),
+            "line.height_rows",
+            "1 to 10",
+        ),
+        (json!({ "kind": "delay-profile" }), "pixel", "either pixel"),
+        (json!({ "kind": "delay-profile", "pixel": [6, 0] }), "pixel", "6 rows and 3 columns"),
+        (json!({ "kind": "delay-profile", "pixel": [0] }), "pixel", "length 1"),
+        (json!({ "kind": "delay-profile", "region": [0, 6, 0, 4] }), "region", "3 columns"),
+        (json!({ "kind": "delay-profile", "region": [3, 3, 0, 1] }), "region", "t0 < t1"),
+        (
+            json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 150 }),
+            "exposure_us",
+            "[100.0, 200.0, 300.0]",
+        ),
+        (
+            json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 300 }),
+            "exposure_us",
+            "takes 2 delays",
+        ),
+        (json!({ "kind": "regular", "name": "../x" }), "name", "letters"),
+        (json!({ "kind": "regular", "name": "" }), "name", "letters"),
+        (json!({ "kind": "regular", "name": "x".repeat(65) }), "name", "64"),
+        (json!({ "kind": "regular", "name": "transport" }), "name", "give another"),
+    ];
+    for (table, path, says) in cases {
+        let error = spec(&table).expect_err(&table.to_string());
+        assert_eq!(error.path.join("."), path, "{table}: {error}");
+        assert!(error.what.contains(says), "{table}: {error}");
+    }
+}
+
+#[test]
+fn names_tell_products_of_one_kind_apart() {
+    let name = |table: Value| spec(&table).unwrap().name().to_owned();
+    assert_eq!(name(json!({ "kind": "epipolar" })), "epipolar");
+    assert_eq!(name(json!({ "kind": "epipolar", "width_rows": 5 })), "epipolar_5");
+    assert_eq!(name(json!({ "kind": "non-epipolar", "width_rows": 5 })), "non_epipolar_5");
+    assert_eq!(name(json!({ "kind": "band", "from_rows": 11 })), "band_from_11");
+    assert_eq!(
+        name(json!({ "kind": "band", "from_rows": 1, "to_rows": 3, "side": "below" })),
+        "band_1_to_3_below"
+    );
+    assert_eq!(name(json!({ "kind": "delay-profile", "pixel": [1, 2] })), "delay_profile_t1_s2");
+    assert_eq!(name(json!({ "kind": "band", "from_rows": 1, "name": "far-1_a" })), "far-1_a");
+}

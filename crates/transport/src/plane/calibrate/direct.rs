@@ -1,0 +1,84 @@
+use ndarray::{Array1, Array2, Axis, s};
+use rayon::prelude::*;
+
+use super::super::{PlaneError, Prior};
+use super::Sample;
+use super::problem::RowProblem;
+use super::sample::SampledRow;
+
+/// Direct light counts where it exceeds the light of the neighbouring rows by so many standard errors.
+const STANDS_OUT: f64 = 5.0;
+
+/// The direct light of one sampled pixel, when it is free to lie in rows -1, 0 and 1.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct DirectLight {
+    pub t: usize,
+    pub s: usize,
+    /// Whether the direct row is brighter than its neighbours beyond doubt.
+    pub stands_out: bool,
+    /// Its mean place, and the standard error that the samples' noise gives it.
+    pub u0_rows: f64,
+    pub standard_error_rows: f64,
+    /// Variance of the place for light and noise of 1: what the plan alone says. Where no setting tells the rows
+    /// apart, only rounding keeps it finite.
+    pub plan_variance: f64,
+    /// Minimum of the objective.
+    pub objective: f64,
+}
+
+/// Estimates the direct light of all pixels of the sample under a beam, each with two more unknowns than the split
+/// prior has: light in rows 1 and -1 that no smoothness binds. Pixels at the border, whose row 1 or -1 does not exist,
+/// are left out.
+pub(super) fn direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, PlaneError> {
+    let by_row: Vec<Vec<DirectLight>> =
+        sample.rows.par_iter().map(|row| of_row(row, beam_sigma_rows)).collect::<Result<_, _>>()?;
+    Ok(by_row.concat())
+}
+
+fn of_row(row: &SampledRow, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, PlaneError> {
+    let (Some(above), Some(own), Some(below)) = (row.slot(-1), row.slot(0), row.slot(1)) else {
+        return Ok(Vec::new());
+    };
+    let prior = Prior::SPLIT;
+    let weights = row.weights(beam_sigma_rows);
+    let slots = row.slots.len();
+    let neighbours = weights.select(Axis(1), &[above, below]);
+    let mut extended = Array2::zeros((weights.nrows(), slots + 2));
+    extended.slice_mut(s![.., ..slots]).assign(&weights);
+    extended.slice_mut(s![.., slots..]).assign(&neighbours);
+    let differences = prior.differences(&row.slots);
+    let mut extended_differences = Array2::zeros((differences.nrows(), slots + 2));
+    extended_differences.slice_mut(s![.., ..slots]).assign(&differences);
+    let problem = RowProblem::new(extended, extended_differences.view(), &prior)?;
+    let x = problem.minimise(row.intensities.view(), &mut problem.all_free(row.columns.len()));
+
+    let moment = combination(slots + 2, &[(slots, -1.0), (slots + 1, 1.0)]);
+    // What lies at u = 0 is direct light on top of indirect light, which is about that of the neighbours.
+    let amount =
+        combination(slots + 2, &[(slots, 1.0), (own, 1.0), (slots + 1, 1.0), (above, -0.5), (below, -0.5)]);
+    let plan_variance = moment.dot(&problem.inverse.dot(&moment));
+    let amount_variance = amount.dot(&problem.inverse.dot(&amount));
+    let residual = x.dot(&problem.weights.t()) - &row.intensities;
+    let minima = problem.minima(x.view(), row.intensities.view());
+    let pixels = x.rows().into_iter().zip(residual.rows()).zip(minima).zip(&row.columns);
+    let light = pixels.map(|(((x, residual), objective), &s)| {
+        let noise_variance = residual.dot(&residual) / residual.len() as f64;
+        let light = x.dot(&amount);
+        DirectLight {
+            t: row.t,
+            s,
+            stands_out: light > STANDS_OUT * (noise_variance * amount_variance).sqrt(),
+            u0_rows: x.dot(&moment) / light,
+            standard_error_rows: (noise_variance * plan_variance).sqrt() / light,
+            plan_variance,
+            objective,
+        }
+    });
+    Ok(light.collect())
+}
+
+fn combination(length: usize, terms: &[(usize, f64)]) -> Array1<f64> {
+    let mut vector = Array1::zeros(length);
+    terms.iter().for_each(|&(index, factor)| vector[index] = factor);
+    vector
+}

@@ -1,0 +1,234 @@
+use std::ops::RangeInclusive;
+
+use ndarray::{Array2, ArrayView3, s};
+use rayon::prelude::*;
+
+use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, reach};
+use super::problem::RowProblem;
+use super::{CalibrateError, SpikeMap};
+
+/// Camera rows and pixels in each that a sample holds at most.
+const ROWS: usize = 16;
+const PIXELS_PER_ROW: usize = 64;
+
+/// Smaller samples are used whole.
+const MIN_PIXELS_TO_THIN: usize = 256;
+
+/// A Gaussian beam is followed this far, as the tails beyond hold less than a millionth.
+const BEAM_REACH_SIGMAS: f64 = 5.0;
+
+/// Places of direct light are told apart to this many rows; a finer step would only cost time.
+const U0_STEP_ROWS: f64 = 1.0 / 32.0;
+
+/// Pixels spread evenly over a stack, from which calibration is computed: at most 64 in each of 16 camera rows.
+///
+/// The choice depends on the image's size and the mask alone. Pixels with masked samples are left out.
+#[derive(Debug, Clone)]
+pub struct Sample {
+    pub(super) timing: RowTiming,
+    pub(super) settings: Vec<Setting>,
+    pub(super) reach: RangeInclusive<i32>,
+    pub(super) columns: usize,
+    pub(super) rows: Vec<SampledRow>,
+}
+
+#[derive(Debug, Clone)]
+pub(super) struct SampledRow {
+    pub t: usize,
+    pub columns: Vec<usize>,
+    /// Shape `[pixels, settings]`.
+    pub intensities: Array2<f64>,
+    pub slots: Vec<Slot>,
+    /// Weight of every row of the projector under an ideal beam, shape `[settings, projector rows]`.
+    ideal: Array2<f64>,
+    own_row: usize,
+}
+
+/// What is known, or supposed, of the light that the projector's rows send.
+#[derive(Debug, Clone, Default)]
+pub struct Optics {
+    /// Standard deviation of the beam's Gaussian profile over rows; 0 for rows that light only themselves.
+    pub beam_sigma_rows: f64,
+    /// Where direct light arrives; `None` for `u = 0` everywhere.
+    pub spike: Option<SpikeMap>,
+}
+
+impl Optics {
+    fn u0(&self, t: usize, s: usize) -> f64 {
+        self.spike.as_ref().map_or(0.0, |spike| f64::from(spike.u0[[t, s]]))
+    }
+}
+
+impl Sample {
+    /// Takes a sample of `stack`, shape `[settings, camera_rows, columns]`, in the units of [`super::super::Demux`];
+    /// `valid`, of the same shape, is false where a sample may not be used.
+    ///
+    /// # Errors
+    /// Those of [`reach`]; [`PlaneError::Shape`]; [`PlaneError::NotFinite`] for a chosen sample;
+    /// [`CalibrateError::NoPixels`] if masks leave no whole pixel.
+    pub fn new(
+        timing: RowTiming,
+        settings: Vec<Setting>,
+        stack: ArrayView3<f32>,
+        valid: Option<ArrayView3<bool>>,
+    ) -> Result<Self, CalibrateError> {
+        let reach = reach(&timing, &settings)?;
+        let (_, height, columns) = stack.dim();
+        let expected = [settings.len(), timing.camera_rows(), columns];
+        for (array, shape) in
+            [Some(("stack", stack.shape())), valid.as_ref().map(|valid| ("valid", valid.shape()))]
+                .into_iter()
+                .flatten()
+        {
+            if shape != expected {
+                let axes = "[settings, camera rows, columns]";
+                let (actual, expected) = (shape.to_vec(), expected.to_vec());
+                return Err(PlaneError::Shape { array, axes, actual, expected }.into());
+            }
+        }
+        let usable = |t: usize, column: &usize| {
+            valid.is_none_or(|valid| valid.slice(s![.., t, *column]).iter().all(|v| *v))
+        };
+        let unspread = timing.clone().with_beam(Beam::Ideal)?;
+        let rows: Vec<SampledRow> = strata(height, ROWS)
+            .enumerate()
+            .collect::<Vec<_>>()
+            .into_par_iter()
+            .map(|(index, rows)| {
+                let t = (rows.start + rows.end) / 2;
+                // Golden-ratio places in the strata: no two rows sample the same columns, and no pattern is aliased.
+                let place = (index as f64 * 0.618_033_988_75).fract();
+                let columns: Vec<usize> = strata(columns, PIXELS_PER_ROW)
+                    .filter_map(|columns| {
+                        let first = columns.start + (place * columns.len() as f64) as usize;
+                        (first..columns.end).chain(columns.start..first).find(|column| usable(t, column))
+                    })
+                    .collect();
+                let intensities = Array2::from_shape_fn((columns.len(), settings.len()), |(pixel, n)| {
+                    f64::from(stack[[n, t, columns[pixel]]])
+                });
+                if let Some(((pixel, setting), _)) =
+                    intensities.indexed_iter().find(|(_, value)| !value.is_finite())
+                {
+                    return Err(PlaneError::NotFinite { setting, row: t, column: columns[pixel] });
+                }
+                let slots = RowModel::new(&timing, &settings, &reach, t).slots;
+                let ideal = settings.iter().flat_map(|setting| unspread.weights(t, setting)).collect();
+                let ideal = Array2::from_shape_vec((settings.len(), timing.projector_rows()), ideal)
+                    .unwrap_or_default();
+                let own_row = timing.camera().own_row(t);
+                Ok(SampledRow { t, columns, intensities, slots, ideal, own_row })
+            })
+            .collect::<Result<_, _>>()?;
+        let rows: Vec<SampledRow> = rows.into_iter().filter(|row| !row.columns.is_empty()).collect();
+        if rows.is_empty() {
+            return Err(CalibrateError::NoPixels);
+        }
+        Ok(Self { timing, settings, reach, columns, rows })
+    }
+
+    /// A quarter of the rows and half the pixels of each, unless that leaves few: enough where every pixel is solved
+    /// many times.
+    pub(super) fn thinned(&self) -> Self {
+        if self.pixels().count() <= MIN_PIXELS_TO_THIN {
+            return self.clone();
+        }
+        let rows = self.rows.iter().skip(self.rows.len().min(2) - 1).step_by(4);
+        let rows = rows.map(|row| row.keep(|pixel| pixel % 2 == 0)).collect();
+        Self { rows, ..self.clone() }
+    }
+
+    /// The pixels of the sample, `(t, s)`, in the order of all per-pixel results.
+    pub fn pixels(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        self.rows.iter().flat_map(|row| row.columns.iter().map(|&s| (row.t, s)))
+    }
+}
+
+impl SampledRow {
+    /// The row with only those of its pixels whose index is kept.
+    pub fn keep(&self, kept: impl Fn(usize) -> bool) -> Self {
+        let kept: Vec<usize> = (0..self.columns.len()).filter(|&pixel| kept(pixel)).collect();
+        Self {
+            columns: kept.iter().map(|&pixel| self.columns[pixel]).collect(),
+            intensities: self.intensities.select(ndarray::Axis(0), &kept),
+            ..self.clone()
+        }
+    }
+
+    /// Index of the slot of relative row `u` of the projector's own frame.
+    pub fn slot(&self, u: i32) -> Option<usize> {
+        self.slots.iter().position(|slot| slot.u == u)
+    }
+
+    /// `A`, shape `[settings, slots]`, under a Gaussian beam: a row's light is that of the rows about it while they
+    /// are drawn.
+    pub fn weights(&self, beam_sigma_rows: f64) -> Array2<f64> {
+        let beam = beam_shares(beam_sigma_rows);
+        let projector_rows = self.ideal.ncols();
+        let mut weights = Array2::zeros((self.ideal.nrows(), self.slots.len()));
+        for (mut weights, slot) in weights.columns_mut().into_iter().zip(&self.slots) {
+            let lit = self.own_row as i64 + i64::from(slot.u);
+            for &(offset_rows, share) in &beam {
+                if let Ok(drawn) = usize::try_from(lit - offset_rows)
+                    && drawn < projector_rows
+                {
+                    weights.scaled_add(share, &self.ideal.column(drawn));
+                }
+            }
+        }
+        weights
+    }
+
+    /// The row's pixels by what they must be solved with: one problem for each place of direct light, with the
+    /// indices of its pixels. The paper's prior knows no direct light, so it has one.
+    pub fn problems(
+        &self,
+        prior: &Prior,
+        optics: &Optics,
+    ) -> Result<Vec<(RowProblem, Vec<usize>)>, PlaneError> {
+        let differences = prior.differences(&self.slots);
+        let weights = self.weights(optics.beam_sigma_rows);
+        let step = |pixel: usize| match prior {
+            Prior::Paper { .. } => 0,
+            Prior::Split { .. } => (optics.u0(self.t, self.columns[pixel]) / U0_STEP_ROWS).round() as i32,
+        };
+        let mut places: Vec<i32> = (0..self.columns.len()).map(step).collect();
+        places.sort_unstable();
+        places.dedup();
+        let problem = |place: i32| {
+            let weights = self.with_spike_at(&weights, f64::from(place) * U0_STEP_ROWS);
+            let pixels = (0..self.columns.len()).filter(|&pixel| step(pixel) == place).collect();
+            Ok((RowProblem::new(weights, differences.view(), prior)?, pixels))
+        };
+        places.into_iter().map(problem).collect()
+    }
+
+    /// `weights` with the light of the direct row split between row 0 and its neighbour on the side of `u0_rows`.
+    fn with_spike_at(&self, weights: &Array2<f64>, u0_rows: f64) -> Array2<f64> {
+        let mut placed = weights.clone();
+        let neighbour = self.slot(if u0_rows < 0.0 { -1 } else { 1 });
+        if let (Some(own), Some(neighbour)) = (self.slot(0), neighbour) {
+            let share = u0_rows.abs().min(1.0);
+            let mixed = (1.0 - share) * &weights.column(own) + share * &weights.column(neighbour);
+            placed.column_mut(own).assign(&mixed);
+        }
+        placed
+    }
+}
+
+/// Shares of a row's light that reach the rows `offset` away; they sum to 1.
+fn beam_shares(sigma_rows: f64) -> Vec<(i64, f64)> {
+    if sigma_rows <= 0.0 {
+        return vec![(0, 1.0)];
+    }
+    let reach = (BEAM_REACH_SIGMAS * sigma_rows).ceil() as i64;
+    let share = |offset: i64| (-0.5 * (offset as f64 / sigma_rows).powi(2)).exp();
+    let total: f64 = (-reach..=reach).map(share).sum();
+    (-reach..=reach).map(|offset| (offset, share(offset) / total)).collect()
+}
+
+/// `0..length` cut into at most `count` ranges of nearly the same length, none empty.
+fn strata(length: usize, count: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
+    let count = count.min(length);
+    (0..count).map(move |index| index * length / count..(index + 1) * length / count)
+}

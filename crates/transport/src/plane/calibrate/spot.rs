@@ -1,0 +1,136 @@
+use super::super::{PlaneError, RowTiming, Setting};
+
+/// How a flying spot draws its rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scan {
+    /// Every row from column 0 on.
+    OneWay,
+    /// Even rows of the projector from column 0 on, odd rows backwards.
+    Bidirectional,
+}
+
+/// Settings that a flying spot makes unreliable when a pixel's projector column is unknown: those with an edge within
+/// half a row time and half the jitter of the centre of the direct row, where the spot may or may not have passed.
+/// Their indices ascend.
+///
+/// A projector that lights its rows uniformly needs none of them dropped.
+///
+/// # Errors
+/// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] for a jitter that is negative or not finite.
+pub fn settings_on_direct_row(
+    timing: &RowTiming,
+    settings: &[Setting],
+    jitter_us: f64,
+) -> Result<Vec<usize>, PlaneError> {
+    timing.check(settings)?;
+    if !(jitter_us.is_finite() && jitter_us >= 0.0) {
+        let allowed = "finite and not negative: give the spread of the measured delays, in microseconds";
+        return Err(PlaneError::OutOfRange { field: "jitter_us", value: jitter_us, allowed });
+    }
+    let half_width_us = (timing.row_time_us() + jitter_us) / 2.0;
+    let on_row = |setting: &Setting| {
+        setting.delays_us.iter().any(|delay_us| {
+            [delay_us - setting.exposure_us / 2.0, delay_us + setting.exposure_us / 2.0]
+                // The direct row is drawn again in each period, which long exposures reach.
+                .map(|edge_us| (edge_us - timing.period_us() * (edge_us / timing.period_us()).round()).abs())
+                .iter()
+                .any(|distance_us| *distance_us < half_width_us)
+        })
+    };
+    Ok((0..settings.len()).filter(|&n| on_row(&settings[n])).collect())
+}
+
+/// Weight of the direct light of a pixel in camera row `t` in each setting, under a flying spot: the share of the
+/// frames averaged whose exposure holds the moment when the spot passes the pixel's projector column, counted once per
+/// period. It stands for the column of `A` at `u = 0`.
+///
+/// `projector_column` is the column that the pixel sees, 0..1 over the projector's width. Direct light arrives
+/// `tau (projector_column - 1/2)` after the centre of its row, or as much before it where the row is drawn backwards.
+///
+/// # Errors
+/// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] for a column outside 0..=1.
+pub fn spike_weights(
+    timing: &RowTiming,
+    settings: &[Setting],
+    t: usize,
+    projector_column: f64,
+    scan: Scan,
+) -> Result<Vec<f64>, PlaneError> {
+    timing.check(settings)?;
+    if !(0.0..=1.0).contains(&projector_column) {
+        let allowed = "from 0 to 1: divide the projector's column by its width";
+        return Err(PlaneError::OutOfRange { field: "projector_column", value: projector_column, allowed });
+    }
+    let backwards = scan == Scan::Bidirectional && (timing.first_row() + t) % 2 == 1;
+    let column = if backwards { 1.0 - projector_column } else { projector_column };
+    let moment_us = timing.row_time_us() * (column - 0.5);
+    let weight = |setting: &Setting| {
+        let passes = setting.delays_us.iter().map(|delay_us| {
+            // Moments lie a period apart; those from the start on, less those from the end on.
+            let periods_to = |edge_us: f64| ((edge_us - moment_us) / timing.period_us()).ceil();
+            periods_to(delay_us + setting.exposure_us / 2.0)
+                - periods_to(delay_us - setting.exposure_us / 2.0)
+        });
+        passes.sum::<f64>() / setting.delays_us.len() as f64
+    };
+    Ok(settings.iter().map(weight).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn timing() -> RowTiming {
+        RowTiming::new(128, 20.0, 16_000.0).unwrap()
+    }
+
+    #[test]
+    fn edges_on_the_row_are_found() {
+        let settings = [
+            Setting::new(300.0, 600.0),  // starts at 0
+            Setting::new(-309.0, 600.0), // ends at -9
+            Setting::new(311.0, 600.0),  // starts at 11: only with jitter
+            Setting::new(0.0, 600.0),    // holds the row whole
+            Setting::new(600.0, 600.0),  // starts after it
+            Setting::new(0.0, 32_000.0), // ends a whole period away, on the row of the next frame
+            Setting { delays_us: vec![320.0, 330.0, 305.0], exposure_us: 600.0 },
+        ];
+        assert_eq!(settings_on_direct_row(&timing(), &settings, 0.0), Ok(vec![0, 1, 5, 6]));
+        assert_eq!(settings_on_direct_row(&timing(), &settings, 4.0), Ok(vec![0, 1, 2, 5, 6]));
+        assert!(settings_on_direct_row(&timing(), &settings, f64::NAN).is_err());
+    }
+
+    #[test]
+    fn the_spot_passes_at_its_column() {
+        // Column 0.75 is passed 5 us after the row's centre, or before it where the row is drawn backwards.
+        let settings = [
+            Setting::new(304.0, 600.0), // from 4 us on
+            Setting::new(306.0, 600.0), // from 6 us on
+            Setting::new(294.0, 600.0), // from -6 us on
+            Setting { delays_us: vec![304.0, 304.5, 306.0, 290.0], exposure_us: 600.0 },
+            Setting::new(0.0, 48_000.0), // three periods
+        ];
+        let weights = |t, scan| spike_weights(&timing(), &settings, t, 0.75, scan).unwrap();
+        assert_eq!(weights(0, Scan::OneWay), [1.0, 0.0, 1.0, 0.75, 3.0]);
+        assert_eq!(weights(1, Scan::OneWay), weights(0, Scan::OneWay));
+        assert_eq!(weights(0, Scan::Bidirectional), weights(0, Scan::OneWay));
+        assert_eq!(weights(1, Scan::Bidirectional), [0.0, 0.0, 1.0, 0.25, 3.0]);
+        assert!(spike_weights(&timing(), &settings, 0, 1.5, Scan::OneWay).is_err());
+    }
+
+    #[test]
+    fn averaged_over_all_columns_it_is_the_uniform_rows_weight() {
+        let settings: Vec<Setting> =
+            (-40..40).map(|step| Setting::new(300.0 + f64::from(step), 600.0)).collect();
+        let columns = 1000;
+        let mut mean = vec![0.0; settings.len()];
+        for column in 0..columns {
+            let column = (f64::from(column) + 0.5) / f64::from(columns);
+            let weights = spike_weights(&timing(), &settings, 7, column, Scan::Bidirectional).unwrap();
+            mean.iter_mut().zip(weights).for_each(|(mean, weight)| *mean += weight / f64::from(columns));
+        }
+        for (mean, setting) in mean.iter().zip(&settings) {
+            assert!((mean - timing().weights(7, setting)[7]).abs() < 1e-3);
+        }
+    }
+}

@@ -1,0 +1,95 @@
+use ndarray::{Array1, Array2, ArrayView1, Axis};
+use rayon::prelude::*;
+
+use super::{PlaneError, RowTiming, Transport};
+
+/// The image `[t, s]` under a projector that shows each of its rows with one weight, shape `[projector_rows]`:
+/// `sum over v of weights[v] T(v, t, s)`, 1.0 for a white surface under its own row at weight 1.
+///
+/// Rows outside the transport's reach are unknown and add nothing, so all rows at weight 1 give
+/// [`Transport::total`].
+///
+/// # Errors
+/// [`PlaneError::Shape`] if the weights are not those of the projector's rows, or the transport not that of the
+/// camera's.
+pub fn relight(
+    timing: &RowTiming,
+    transport: &Transport,
+    weights: ArrayView1<f64>,
+) -> Result<Array2<f32>, PlaneError> {
+    let shape = |array, axes, actual, expected| match actual == expected {
+        true => Ok(()),
+        false => Err(PlaneError::Shape { array, axes, actual: vec![actual], expected: vec![expected] }),
+    };
+    shape("weights", "[projector rows]", weights.len(), timing.projector_rows())?;
+    let (_, rows, columns) = transport.t.dim();
+    shape("transport", "its camera rows", rows, timing.camera_rows())?;
+
+    let mut image = Array2::zeros((rows, columns));
+    image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut image_row)| {
+        let profiles = transport.t.index_axis(Axis(1), t);
+        // In f64, because thousands of dim rows add up beside a bright one.
+        let mut sum = Array1::<f64>::zeros(columns);
+        let u_of_row_0 = i64::from(timing.relative_row(0, t));
+        for (u, light) in (i64::from(transport.u_min)..).zip(profiles.outer_iter()) {
+            let v = u - u_of_row_0;
+            let weight = usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
+            if weight != 0.0 {
+                sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+            }
+        }
+        image_row.zip_mut_with(&sum, |pixel, &sum| *pixel = sum as f32);
+    });
+    Ok(image)
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array3;
+
+    use super::*;
+
+    /// A projector of 8 rows whose rows 2..6 the camera sees, with `T(v, t, s) = 1 + 100 v + 10 t + s` for |u| <= 2.
+    fn scene() -> (RowTiming, Transport) {
+        let timing = RowTiming::new(8, 20.0, 200.0).unwrap().window(2, 4).unwrap();
+        let light = |(index, t, s): (usize, usize, usize)| (1 + 100 * (index + t) + 10 * t + s) as f32;
+        let t = Array3::from_shape_fn((5, 4, 3), light);
+        let (exists, saturated) = (Array2::from_elem((5, 4), true), Array2::from_elem((4, 3), false));
+        (timing, Transport { t, u_min: -2, exists, saturated })
+    }
+
+    #[test]
+    fn all_rows_give_the_total_to_the_bit() {
+        let (timing, transport) = scene();
+        let image = relight(&timing, &transport, Array1::ones(8).view()).unwrap();
+        assert_eq!(image, transport.total());
+    }
+
+    #[test]
+    fn one_row_gives_its_slice_and_rows_out_of_reach_are_dark() {
+        let (timing, transport) = scene();
+        for v in 0..8_usize {
+            let weights = Array1::from_shape_fn(8, |row| if row == v { 0.5 } else { 0.0 });
+            let image = relight(&timing, &transport, weights.view()).unwrap();
+            for ((t, s), &light) in image.indexed_iter() {
+                let within_reach = v.abs_diff(2 + t) <= 2;
+                let expected = if within_reach { 0.5 * (1 + 100 * v + 10 * t + s) as f32 } else { 0.0 };
+                assert_eq!(light, expected, "row {v} at ({t}, {s})");
+            }
+        }
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused() {
+        let (timing, transport) = scene();
+        let other = timing.clone().window(0, 3).unwrap();
+        assert!(matches!(
+            relight(&timing, &transport, Array1::ones(4).view()),
+            Err(PlaneError::Shape { array: "weights", .. })
+        ));
+        assert!(matches!(
+            relight(&other, &transport, Array1::ones(8).view()),
+            Err(PlaneError::Shape { array: "transport", .. })
+        ));
+    }
+}

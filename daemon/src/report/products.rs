@@ -1,0 +1,115 @@
+//! The products that a plan names, as pictures and plots.
+
+use ndarray::{Array2, Array3, ArrayView2};
+use raysweep_pipeline::{Product, Profile};
+use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Section, Series, ToneMap};
+
+use super::PERCENTILE;
+
+/// Pictures of a sequence side by side.
+const SHEET_PICTURES: usize = 12;
+/// Pictures of a sequence one after the other; more would make the page heavy.
+const ANIMATION_PICTURES: usize = 48;
+
+/// The images, unless there are none.
+pub(super) fn images(products: &[Product], markers: &[Marker]) -> Option<Section> {
+    let pictures: Vec<Picture> = products
+        .iter()
+        .filter_map(|product| match product {
+            Product::Image { name, about, image } => {
+                Some(picture(image, &format!("{name}: {about}")).with_markers(markers.to_vec()))
+            }
+            _ => None,
+        })
+        .collect();
+    (!pictures.is_empty()).then(|| Section {
+        title: "Light by where it came from".into(),
+        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below.".into(),
+        blocks: vec![Block::Pictures(pictures)],
+    })
+}
+
+fn picture(image: &Array2<f32>, caption: &str) -> Picture {
+    Picture::grey(image.view(), ToneMap::percentile(&[image.view()], PERCENTILE)).with_caption(caption)
+}
+
+/// A section for each sequence: some images side by side, more of them in motion.
+pub(super) fn sequences(products: &[Product]) -> impl Iterator<Item = Section> {
+    products.iter().filter_map(|product| match product {
+        Product::Sequence { name, about, axis, at, images } => Some(sequence(name, about, axis, at, images)),
+        _ => None,
+    })
+}
+
+fn sequence(name: &str, about: &str, axis: &str, at: &[f64], images: &Array3<f32>) -> Section {
+    let views: Vec<ArrayView2<'_, f32>> = images.outer_iter().collect();
+    let tone_map = ToneMap::percentile(&views, PERCENTILE);
+    let shown = spread(at.len(), SHEET_PICTURES);
+    let sheet = ContactSheet {
+        column_title: axis.into(),
+        columns: shown.iter().map(|&k| at[k].to_string()).collect(),
+        row_title: String::new(),
+        rows: vec![name.into()],
+        pictures: shown.iter().map(|&k| Some(Picture::thumbnail(views[k], tone_map))).collect(),
+    };
+    let moving: Vec<_> = spread(views.len(), ANIMATION_PICTURES).into_iter().map(|k| views[k]).collect();
+    let caption = format!("{} of {} images", moving.len(), views.len());
+    let animation = Picture::animation(&moving, tone_map).map(|picture| picture.with_caption(caption));
+    Section {
+        title: format!("Sequence {name}"),
+        intro: format!("{}.", capitalised(about)),
+        blocks: vec![Block::ContactSheet(sheet), Block::Pictures(animation.into_iter().collect())],
+    }
+}
+
+/// At most `most` of `len` indices, evenly spread, the first and the last among them.
+fn spread(len: usize, most: usize) -> Vec<usize> {
+    let count = len.min(most);
+    (0..count).map(|k| if count > 1 { k * (len - 1) / (count - 1) } else { k }).collect()
+}
+
+/// The delay profiles that were asked for, unless there are none.
+pub(super) fn profiles(products: &[Product]) -> Option<Section> {
+    let profiles: Vec<&Profile> = products
+        .iter()
+        .filter_map(|product| match product {
+            Product::Profile(profile) => Some(profile),
+            _ => None,
+        })
+        .collect();
+    let points = |profile: &Profile, values: &[f64]| {
+        profile.measured.delays_us.iter().copied().zip(values.iter().copied()).collect::<Vec<_>>()
+    };
+    let plot = |title: String, y_label: &str, series| Plot {
+        title,
+        x_label: "delay t_d / µs".into(),
+        y_label: y_label.into(),
+        series,
+        guides: Vec::new(),
+    };
+    let each = profiles.iter().map(|profile| {
+        let series = vec![
+            Series::line("measured", points(profile, &profile.measured.light)),
+            Series::line("predicted from the transport", points(profile, &profile.predicted.light)),
+        ];
+        plot(format!("{}, {} µs", profile.name, profile.exposure_us), "light", series)
+    });
+    let together = profiles.iter().map(|profile| {
+        Series::line(profile.name.as_str(), points(profile, &profile.measured.normalised_per_us()))
+    });
+    let together = plot("All, each over its area".into(), "light / area / µs⁻¹", together.collect());
+    let about = profiles.iter().map(|profile| format!("{}: {}.", profile.name, profile.about));
+    (!profiles.is_empty()).then(|| Section {
+        title: "Delay profiles".into(),
+        intro: format!(
+            "{} Over its area a profile no longer depends on albedo.",
+            about.collect::<Vec<_>>().join(" ")
+        ),
+        blocks: vec![Block::Plots(each.chain([together]).collect())],
+    })
+}
+
+fn capitalised(sentence: &str) -> String {
+    let mut letters = sentence.chars();
+    letters.next().map_or_else(String::new, |first| first.to_uppercase().chain(letters).collect())
+}
