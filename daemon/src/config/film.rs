@@ -92,7 +92,8 @@ mod tests {
     #[test]
     fn the_default_film_is_the_documented_one_and_its_delays_follow_their_law() {
         let page = include_str!("../../../docs/plan.md");
-        let documented = page.split("```toml\n").nth(2).and_then(|rest| rest.split("```").next()).unwrap();
+        let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
+        let documented = blocks.find(|block| block.contains("kind = \"film\"")).unwrap();
         let documented = Plan::parse(documented).unwrap();
         let default = Plan::parse("kind = \"film\"").unwrap();
         assert_eq!(format!("{:?}", documented.film), format!("{:?}", default.film));
