@@ -7,6 +7,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
+use crate::findings::{self, Prepared};
 use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
@@ -17,17 +18,20 @@ use crate::unit::Unit;
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemuxOptions {
-    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`.
-    pub prior: PriorName,
+    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`; left out, with its weights: the one that
+    /// predicts held-out settings best, `split` in doubt.
+    pub prior: Option<PriorName>,
     /// Weight of smoothness over rows; left out: the prior's own.
     pub alpha: Option<f64>,
     /// Weight of sparsity; left out: the prior's own.
     pub beta: Option<f64>,
+    /// Whether neighbouring pixels that see the same kind of light are averaged before they are solved.
+    pub coupling: bool,
 }
 
 impl Default for DemuxOptions {
     fn default() -> Self {
-        Self { prior: PriorName::Split, alpha: None, beta: None }
+        Self { prior: None, alpha: None, beta: None, coupling: true }
     }
 }
 
@@ -42,10 +46,15 @@ pub enum PriorName {
 }
 
 impl DemuxOptions {
+    /// Whether a plan leaves nothing of the prior open.
+    pub(crate) fn states_prior(&self) -> bool {
+        self.prior.is_some() || self.alpha.is_some() || self.beta.is_some()
+    }
+
     fn prior(&self) -> Prior {
         let prior = match self.prior {
-            PriorName::Split => Prior::SPLIT,
-            PriorName::Paper => Prior::PAPER,
+            None | Some(PriorName::Split) => Prior::SPLIT,
+            Some(PriorName::Paper) => Prior::PAPER,
         };
         match prior {
             Prior::Split { alpha, beta } => {
@@ -86,7 +95,7 @@ struct Taken {
 /// Collects a sweep and demultiplexes it. A copy shares the images.
 #[derive(Clone)]
 pub struct DemuxFold {
-    prior: Prior,
+    options: DemuxOptions,
     schedule: Arc<Schedule>,
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
@@ -108,11 +117,10 @@ impl DemuxFold {
     ) -> Result<Self, RegistryError> {
         let invalid =
             |error: PlaneError| RegistryError::Invalid { name: "demux".into(), what: error.to_string() };
-        let prior = options.prior();
-        prior.check().map_err(invalid)?;
+        options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { prior, schedule, geometry, timing, taken: BTreeMap::new() };
+        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new() };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -124,7 +132,7 @@ impl DemuxFold {
     pub fn demux(&self) -> Result<Demux, PlaneError> {
         let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
         let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
-        Demux::new(self.timing.clone(), planned, self.prior)
+        Demux::new(self.timing.clone(), planned, self.options.prior())
     }
 
     /// The dark image that belongs to the exposure of a role's image, if it was taken.
@@ -162,7 +170,17 @@ impl DemuxFold {
             }
             settings.push(sample.setting.clone());
         }
-        Ok(SweepStack { timing: self.timing.clone(), exposures_us, settings, images, valid, regular: None })
+        Ok(SweepStack {
+            timing: self.timing.clone(),
+            prior: self.options.prior(),
+            exposures_us,
+            settings,
+            images,
+            valid,
+            regular: None,
+            noise: None,
+            variance_ratio: None,
+        })
     }
 
     fn solve(&self, stack: &SweepStack, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
@@ -227,7 +245,15 @@ impl Fold for DemuxFold {
         let regular = taken.get(&Role::Regular).cloned();
         let regular = regular.zip(self.dark_of(&taken, Role::Regular));
         let mut stack = self.stack(taken)?;
-        let transport = self.solve(&stack, go_on)?;
+        let refused = |error: PlaneError| FoldError { fold: "demux".into(), what: error.to_string() };
+        let prepared = self
+            .demux()
+            .and_then(|planned| findings::prepare(&planned, &self.options, &self.geometry, &mut stack))
+            .map_err(refused)?;
+        let Prepared { demux, coupled, findings } = prepared;
+        let images = coupled.as_ref().unwrap_or(&stack.images);
+        let valid = stack.valid.as_ref().map(|valid| valid.view());
+        let transport = demux.solve_while(images.view(), valid, go_on).map_err(refused)?;
 
         let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![
@@ -240,6 +266,7 @@ impl Fold for DemuxFold {
             products.extend(self.check_regular(&regular.image, &light, &transport));
             stack.regular = Some(light);
         }
+        products.push(Product::Findings(Box::new(findings)));
         products.push(Product::Transport(Box::new(transport)));
         products.push(Product::Stack(Box::new(stack)));
         Ok(products)

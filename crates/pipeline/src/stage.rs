@@ -4,6 +4,7 @@ use ndarray::{Array2, Array3, ArrayView2};
 use raysweep_transport::plane::Transport;
 use serde::{Deserialize, Serialize};
 
+use crate::findings::Findings;
 use crate::products::{Profile, SweepStack};
 use crate::unit::Unit;
 
@@ -60,6 +61,8 @@ pub enum Product {
     Transport(Box<Transport>),
     /// The images that it was made of: what [`crate::ProductSpec`] makes more of. It is not written.
     Stack(Box<SweepStack>),
+    /// How the transport was found.
+    Findings(Box<Findings>),
     /// Something that makes the others worse than they look.
     Warning(String),
     /// A number that the report states.

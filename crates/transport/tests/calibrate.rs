@@ -232,11 +232,21 @@ fn direct_light_is_found_between_rows() {
         let known = Optics { spike: Some(map.clone()), ..Optics::default() };
         for (optics, split) in [(Optics::default(), uncalibrated), (known, calibrated)] {
             let choice = choose_prior(&sample, &optics, &[Prior::SPLIT, Prior::PAPER]).unwrap();
+            assert!(optics.spike.is_none() || choice.curve[1].log_ratio > 0.5, "{offset_rows}: {choice:?}");
             println!("   {}", choice.reason());
             let chosen = if choice.prior() == Prior::PAPER { papers } else { split };
             assert!(chosen <= 1.05 * papers, "{offset_rows}: {}", choice.reason());
         }
     }
+}
+
+#[test]
+fn indirect_light_on_the_direct_row_does_not_draw_it_back() {
+    // A tenth of wax's light at u = 0 is scattered; counted as direct, it would leave the place at -0.45.
+    let stack = stack(&shifted(&wax(), |_, _| -0.5), &edge_plan(), 0.0);
+    let map = spike_offset(&sample(&stack, &edge_plan()), 0.0).unwrap();
+    let mean = map.u0.mean().unwrap();
+    assert!((mean + 0.5).abs() <= 0.035, "{mean}");
 }
 
 #[test]

@@ -76,6 +76,17 @@ pub enum PlaneError {
         /// Camera column.
         column: usize,
     },
+    /// A stack is too small, too dark or too much masked to tell its noise.
+    #[error(
+        "the noise cannot be fitted from {samples} samples, it takes {needed}: \
+         give read_variance and gain, or use a larger window with fewer masked pixels"
+    )]
+    TooFewSamples {
+        /// Samples that could be used.
+        samples: usize,
+        /// Samples needed.
+        needed: usize,
+    },
     /// A name that no prior has.
     #[error("prior is \"{name}\", but must be \"paper\" or \"split\"")]
     UnknownPrior {

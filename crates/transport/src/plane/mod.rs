@@ -13,16 +13,20 @@
 //!
 //! where the rows of projector and camera run at one constant speed. [`RowTiming`] knows when they do not, and how the
 //! [`Beam`] spreads a row; it and [`Setting`] hold the quantities on the right. [`RowModel`] is `A` for one camera row
-//! with its borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`].
+//! with its borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`]. [`Coupling`] averages like
+//! pixels beforehand, under a [`NoiseModel`], and [`Uncertainty`] says what noise is left in the result; [`calibrate`]
+//! finds in the stack itself what the model needs to know.
 
 pub mod advice;
 mod beam;
 pub mod calibrate;
 mod cholesky;
+mod coupling;
 mod demux;
 mod error;
 mod forward;
 mod lanes;
+mod noise;
 mod pivot;
 mod prior;
 mod profile;
@@ -34,11 +38,14 @@ mod setting;
 mod simd;
 mod timing;
 mod transport;
+mod uncertainty;
 
 pub use beam::Beam;
+pub use coupling::{Coupled, Coupling};
 pub use demux::Demux;
 pub use error::PlaneError;
 pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
+pub use noise::NoiseModel;
 pub use prior::Prior;
 pub use profile::DelayProfile;
 pub use relight::relight;
@@ -46,3 +53,4 @@ pub use setting::{Setting, delay_us, offset_us};
 pub use simd::SimdLevel;
 pub use timing::{CameraRows, RowTiming};
 pub use transport::Transport;
+pub use uncertainty::{Samples, Uncertainty};

@@ -29,10 +29,22 @@ impl Quadratic {
     /// # Errors
     /// [`PlaneError::NotConvex`] if the numbers leave the range of floating point.
     pub fn new(weights: ArrayView2<f64>, slots: &[Slot], prior: &Prior) -> Result<Self, PlaneError> {
-        let n = slots.len();
+        Self::with_differences(weights, prior.differences(slots).view(), prior)
+    }
+
+    /// The objective under a `D` of one's own, shape `[differences, slots]`.
+    ///
+    /// # Errors
+    /// Those of [`Self::new`].
+    pub fn with_differences(
+        weights: ArrayView2<f64>,
+        differences: ArrayView2<f64>,
+        prior: &Prior,
+    ) -> Result<Self, PlaneError> {
+        let n = weights.ncols();
         let mut h = Array2::zeros((n + 1, n + 1));
         h.slice_mut(s![..n, ..n]).assign(&weights.t().dot(&weights));
-        for difference in prior.differences(slots).rows() {
+        for difference in differences.rows() {
             let touched: Vec<(usize, f64)> = difference
                 .indexed_iter()
                 .filter(|(_, weight)| **weight != 0.0)

@@ -40,14 +40,20 @@ pub fn ideal_stack(transport: &Array3<f32>, settings: &[Setting]) -> Array3<f32>
     ndarray::stack(Axis(0), &views).unwrap()
 }
 
+pub const WHITE_COUNTS: f64 = 2500.0;
+pub const ELECTRONS_PER_COUNT: f64 = 8000.0 / 4095.0;
+pub const READ_NOISE_ELECTRONS: f64 = 15.0;
+
 /// The mean of 8 frames of a camera with 8000 e- full well, 15 e- read noise and 12 bits, in which a white pixel
 /// collects 2500 of 4095 counts per row dwell.
 pub fn photographed(ideal: &Array3<f32>, seed: u64) -> Array3<f32> {
-    const FRAMES: usize = 8;
-    const WHITE_COUNTS: f64 = 2500.0;
-    const ELECTRONS_PER_COUNT: f64 = 8000.0 / 4095.0;
+    photographed_in(8, ideal, seed)
+}
+
+/// [`photographed`] as the mean of another number of frames.
+pub fn photographed_in(frames: usize, ideal: &Array3<f32>, seed: u64) -> Array3<f32> {
     let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
-    let read_noise = Normal::new(0.0, 15.0).unwrap();
+    let read_noise = Normal::new(0.0, READ_NOISE_ELECTRONS).unwrap();
     ideal.mapv(|light| {
         let electrons = (f64::from(light) * WHITE_COUNTS * ELECTRONS_PER_COUNT).max(1e-9);
         let shot_noise = Poisson::new(electrons).unwrap();
@@ -55,7 +61,7 @@ pub fn photographed(ideal: &Array3<f32>, seed: u64) -> Array3<f32> {
             let collected: f64 = shot_noise.sample(&mut random) + read_noise.sample(&mut random);
             (collected / ELECTRONS_PER_COUNT).round().min(4095.0)
         };
-        let mean = (0..FRAMES).map(|_| frame()).sum::<f64>() / FRAMES as f64;
+        let mean = (0..frames).map(|_| frame()).sum::<f64>() / frames as f64;
         (mean / WHITE_COUNTS) as f32
     })
 }

@@ -206,7 +206,7 @@ fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
             let mut objectives = vec![0.0; row.columns.len()];
             for (problem, pixels) in row.problems(&Prior::SPLIT, optics)? {
                 let intensities = row.intensities.select(Axis(0), &pixels);
-                let x = problem.minimise(intensities.view(), &mut problem.all_free(pixels.len()));
+                let x = problem.minimise(intensities.view(), None);
                 let minima = problem.minima(x.view(), intensities.view());
                 pixels.iter().zip(minima).for_each(|(&pixel, minimum)| objectives[pixel] = minimum);
             }

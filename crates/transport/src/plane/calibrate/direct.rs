@@ -49,15 +49,15 @@ fn of_row(row: &SampledRow, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, Pl
     let differences = prior.differences(&row.slots);
     let mut extended_differences = Array2::zeros((differences.nrows(), slots + 2));
     extended_differences.slice_mut(s![.., ..slots]).assign(&differences);
-    let problem = RowProblem::new(extended, extended_differences.view(), &prior)?;
-    let x = problem.minimise(row.intensities.view(), &mut problem.all_free(row.columns.len()));
+    let problem = RowProblem::new(extended, extended_differences, &prior)?;
+    let x = problem.minimise(row.intensities.view(), None);
 
     let moment = combination(slots + 2, &[(slots, -1.0), (slots + 1, 1.0)]);
     // What lies at u = 0 is direct light on top of indirect light, which is about that of the neighbours.
     let amount =
         combination(slots + 2, &[(slots, 1.0), (own, 1.0), (slots + 1, 1.0), (above, -0.5), (below, -0.5)]);
-    let plan_variance = moment.dot(&problem.inverse.dot(&moment));
-    let amount_variance = amount.dot(&problem.inverse.dot(&amount));
+    let plan_variance = moment.dot(&problem.inverse().dot(&moment));
+    let amount_variance = amount.dot(&problem.inverse().dot(&amount));
     let residual = x.dot(&problem.weights.t()) - &row.intensities;
     let minima = problem.minima(x.view(), row.intensities.view());
     let pixels = x.rows().into_iter().zip(residual.rows()).zip(minima).zip(&row.columns);

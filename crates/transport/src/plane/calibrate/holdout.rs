@@ -220,12 +220,11 @@ pub(super) fn held_out(
             let mut errors = Array2::zeros((row.columns.len(), folds.len()));
             for (problem, pixels) in row.problems(prior, optics)? {
                 let intensities = row.intensities.select(Axis(0), &pixels);
-                let mut free = problem.all_free(pixels.len());
-                problem.minimise(intensities.view(), &mut free);
+                let whole = problem.minimise(intensities.view(), None);
                 for (fold, held) in folds.iter().enumerate() {
                     let kept: Vec<usize> = (0..settings).filter(|n| !held.contains(n)).collect();
                     let part = problem.without(&kept, held)?;
-                    let x = part.minimise(intensities.select(Axis(1), &kept).view(), &mut free);
+                    let x = part.minimise(intensities.select(Axis(1), &kept).view(), Some(&whole));
                     let predicted = x.dot(&problem.weights.select(Axis(0), held).t());
                     let residual = predicted - intensities.select(Axis(1), held);
                     for (residual, &pixel) in residual.rows().into_iter().zip(&pixels) {

@@ -198,7 +198,7 @@ impl SampledRow {
         let problem = |place: i32| {
             let weights = self.with_spike_at(&weights, f64::from(place) * U0_STEP_ROWS);
             let pixels = (0..self.columns.len()).filter(|&pixel| step(pixel) == place).collect();
-            Ok((RowProblem::new(weights, differences.view(), prior)?, pixels))
+            Ok((RowProblem::new(weights, differences.clone(), prior)?, pixels))
         };
         places.into_iter().map(problem).collect()
     }

@@ -61,7 +61,7 @@ pub fn spike_weights(
         let allowed = "from 0 to 1: divide the projector's column by its width";
         return Err(PlaneError::OutOfRange { field: "projector_column", value: projector_column, allowed });
     }
-    let backwards = scan == Scan::Bidirectional && (timing.first_row() + t) % 2 == 1;
+    let backwards = scan == Scan::Bidirectional && timing.camera().own_row(t) % 2 == 1;
     let column = if backwards { 1.0 - projector_column } else { projector_column };
     let moment_us = timing.row_time_us() * (column - 0.5);
     let weight = |setting: &Setting| {
