@@ -252,6 +252,9 @@ impl Run {
         let task = &self.task;
         let solver = task.film_solver()?;
         let transports = film::create_transports(&self.session, task, solver.reach_rows())?;
+        if let Some(Err(error)) = self.live.as_ref().map(|outlet| outlet.file.clear()) {
+            tracing::warn!(%error, "the live file still shows the run before");
+        }
         let worker = Worker::start(Solving {
             solver,
             transports,
