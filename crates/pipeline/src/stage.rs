@@ -192,6 +192,7 @@ mod tests {
             frames: 1,
             exposure_us: 1.0,
             delays_us: vec![0.0],
+            last_exposure_ns: None,
             sum: Arc::new(Array2::zeros((5, 5))),
             counts: Counts::default(),
         }

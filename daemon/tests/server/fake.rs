@@ -62,6 +62,7 @@ impl Fake {
             report,
             stored: 75 - missing,
             missing,
+            film: None,
             warnings: Vec::new(),
             final_s: None,
         });
@@ -122,6 +123,7 @@ pub fn report() -> CheckReport {
         disk_free_bytes: 1 << 40,
         reach_rows: (-94, 94),
         condition: 1234.5,
+        film: None,
         warnings: vec!["few points".into()],
     }
 }
@@ -154,6 +156,7 @@ impl Control for Fake {
             session: Some(session()),
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
+            film: None,
             error: None,
             live: self.live.exists().then(|| self.live.clone()),
         }
