@@ -39,6 +39,7 @@ impl Task {
             row_table_us: rig.projector.row_table.as_deref().map(Into::into),
             beam_sigma_rows: rig.projector.beam_sigma_rows,
             spot: rig.projector.spot(),
+            projector_columns: rig.camera.projector_columns,
             first_row,
             row_pitch: rig.camera.row_pitch,
             camera_row_time_us: rig.camera_row_time_us(),

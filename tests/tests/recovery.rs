@@ -172,6 +172,15 @@ fn a_flying_spot_costs_the_settings_that_it_cuts_and_nothing_else() {
     let (ignored, _) = recover(&Bench::new(&rig), &plan, corner().view(), longest());
     assert!(dropped.profile < ignored.profile, "{dropped:?} {ignored:?}");
     assert!(dropped.profile < 0.03, "{dropped:?}");
-    let report = std::fs::read_to_string(ended.session.join("report.html")).unwrap();
-    assert!(report.contains("images are left out"));
+    let report = |ended: &Ended| std::fs::read_to_string(ended.session.join("report.html")).unwrap();
+    assert!(report(&ended).contains("images are left out"));
+
+    // With the spot's way known they all count.
+    let modelled = known
+        .replace("spot = \"flying\"", "spot = \"flying\"\nscan = \"bidirectional\"\nbeam_sigma_rows = 0.0")
+        .replace("[vsync]", "projector_columns = [0, 1]\n[vsync]");
+    let bench = Bench::new(&modelled);
+    let (modelled, ended) = recover(&bench, &plan, corner().view(), longest());
+    assert!(modelled.profile < 0.02 && modelled.own_row < 0.1, "{modelled:?}");
+    assert!(report(&ended).contains("modelled in the"));
 }

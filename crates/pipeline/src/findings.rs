@@ -1,10 +1,10 @@
 //! What the stack of a sweep says of the rig and of the scene, before it is demultiplexed: settings that cannot be
 //! trusted, the beam's width, the place of direct light, the prior, the noise.
 
-use ndarray::Array3;
+use ndarray::{Array3, Axis};
 use raysweep_transport::plane::calibrate::{
-    BeamEstimate, CalibrateError, Choice, OpticsEstimate, Sample, candidates, choose_prior, estimate_optics,
-    settings_on_direct_row,
+    BeamEstimate, CalibrateError, Choice, FlyingSpot, OpticsEstimate, Sample, candidates, choose_prior,
+    estimate_optics, settings_on_direct_row,
 };
 use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior};
 
@@ -63,16 +63,29 @@ pub fn prepare(
         remarks: Vec::new(),
         warnings: Vec::new(),
     };
-    leave_out(geometry, stack, &mut findings)?;
+    let spot = leave_out(geometry, stack, &mut findings)?;
     let planned = planned.with_settings(stack.settings.clone())?;
-    let coupled = couple(options, stack, &mut findings)?;
-    let demux = match calibrate(&planned, options, geometry, stack, coupled.as_ref(), &mut findings) {
+    let mut coupled = couple(options, stack, &mut findings)?;
+    let mut demux = match calibrate(&planned, options, geometry, stack, coupled.as_ref(), &mut findings) {
         Ok(demux) => demux,
         Err(error) => {
             findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
             planned
         }
     };
+    if let Some((spot, mut whole, cut)) = spot {
+        // Neighbours see other moments of the spot, so images that depend on it are solved as they were taken.
+        if let Some(steady) = coupled.take() {
+            let mut all = whole.images.clone();
+            let kept = (0..whole.settings.len()).filter(|n| !cut.contains(n));
+            kept.zip(steady.outer_iter())
+                .for_each(|(n, image)| all.index_axis_mut(Axis(0), n).assign(&image));
+            coupled = Some(all);
+        }
+        (whole.noise, whole.variance_ratio) = (stack.noise, stack.variance_ratio.take());
+        *stack = whole;
+        demux = demux.with_settings(stack.settings.clone())?.with_spot(spot)?;
+    }
     stack.timing = demux.timing().clone();
     stack.prior = demux.prior();
     Ok(Prepared { demux, coupled, findings })
@@ -209,30 +222,41 @@ pub fn name(prior: Prior) -> String {
     format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta())
 }
 
-/// Leaves out settings whose edge cuts the direct row while a flying spot draws it: whether the spot has passed a pixel
-/// by then depends on a projector column that nobody knows.
+/// Leaves out of `stack` the images whose edge cuts the direct row while a flying spot draws it. If the rig knows when the
+/// spot passes each pixel's column, and the beam lets that be modelled, they are left out of the calibration only: then
+/// the spot's way, the whole stack and the images' indices come back.
 fn leave_out(
     geometry: &SweepGeometry,
     stack: &mut SweepStack,
     findings: &mut Findings,
-) -> Result<(), PlaneError> {
-    let Spot::Flying(_) = geometry.spot else { return Ok(()) };
+) -> Result<Option<(FlyingSpot, SweepStack, Vec<usize>)>, PlaneError> {
+    let Spot::Flying(_) = geometry.spot else { return Ok(None) };
     let cut = settings_on_direct_row(&stack.timing, &stack.settings, 0.0)?;
-    if cut.len() == stack.settings.len() {
-        let what = "every exposure begins or ends while the direct row is drawn, so none is left out and direct light is not to be trusted: move the delays by a row";
-        findings.remarks.push(("flying spot", what.into()));
-        return Ok(());
+    let mut say = |what: String| findings.remarks.push(("flying spot", what));
+    if cut.is_empty() {
+        say("no exposure begins or ends while it draws the direct row".into());
+        return Ok(None);
     }
+    if cut.len() == stack.settings.len() {
+        say("every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into());
+        return Ok(None);
+    }
+    if let Some(spot) = geometry.flying_spot().filter(|_| geometry.beam_sigma_rows == Some(0.0)) {
+        say(format!(
+            "modelled in the {} images whose exposure begins or ends while it draws the direct row",
+            cut.len()
+        ));
+        let whole = stack.clone();
+        stack.keep(|n| !cut.contains(&n));
+        return Ok(Some((spot, whole, cut)));
+    }
+    say(format!(
+        "{} images are left out, because their exposure begins or ends while it draws the direct row, and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0); {} are kept",
+        cut.len(),
+        stack.settings.len() - cut.len()
+    ));
     let at = |&n: &usize| (stack.settings[n].delays_us[0], stack.settings[n].exposure_us);
     findings.left_out_us = cut.iter().map(at).collect();
     stack.keep(|n| !cut.contains(&n));
-    findings.remarks.push((
-        "flying spot",
-        format!(
-            "{} images are left out, because their exposure begins or ends while the spot draws the direct row; {} are kept",
-            cut.len(),
-            stack.settings.len()
-        ),
-    ));
-    Ok(())
+    Ok(None)
 }

@@ -62,6 +62,8 @@ pub struct CameraSection {
     pub row_pitch: f64,
     /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
     pub first_projector_row: Option<usize>,
+    /// Projector columns, 0 to 1 over its width, that the image's left and right edges see; left out: not known.
+    pub projector_columns: Option<[f64; 2]>,
 }
 
 impl CameraSection {
@@ -240,6 +242,12 @@ impl RigFile {
             );
             return Err(ConfigError::at(text, &["camera", "row_time_us"], message));
         }
+        if let Some(column) = camera.projector_columns.iter().flatten().find(|c| !(0.0..=1.0).contains(*c)) {
+            let message = format!(
+                "camera.projector_columns contains {column}: give 0 to 1, in parts of the projector's width"
+            );
+            return Err(ConfigError::at(text, &["camera", "projector_columns"], message));
+        }
         if projector.spot == SpotKind::Uniform && projector.scan.is_some() {
             let message = "projector.scan says which way a flying spot runs: set projector.spot = \"flying\" or leave scan out";
             return Err(ConfigError::at(text, &["projector", "scan"], message));
@@ -325,6 +333,7 @@ mod tests {
             (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0\n"), "camera.row_pitch = 0"),
             (MINIMAL.replace("[projector]\n", "[projector]\nrows = 1000\n"), "longer than"),
             (MINIMAL.replace("[projector]\n", "[projector]\nbeam_sigma_rows = -1\n"), "beam_sigma_rows = -1"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nprojector_columns = [0, 1.5]\n"), "0 to 1"),
             (MINIMAL.replace("[projector]\n", "[projector]\nscan = \"one-way\"\n"), "flying"),
             (
                 format!(
