@@ -140,8 +140,7 @@ impl PlaneRig {
             Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?
         };
         let motion = Motion::new(scenes.len(), config.motion_period_s);
-        let first_row =
-            optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
+        let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
         let size = scenes[0].size();
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
         let sensor = Sensor::new(&config.sensor, size, scale, config.seed);

@@ -117,7 +117,7 @@ fn settings_that_take_effect_frames_later_are_written_ahead() {
     for late in [1, 2, 3] {
         let rig = rig(2.1, &format!("[sim.camera]\nlate_frames_min = {late}\nlate_frames_max = {late}\n"));
         let bench = Bench::new(&rig);
-    let ended = bench.run(&plan(3));
+        let ended = bench.run(&plan(3));
         let (_, state) = ended.open();
         assert_eq!(state.cycles().count(), 3);
         let starts: Vec<f64> = state.cycles().map(|cycle| cycle.start_s).collect();
@@ -335,7 +335,7 @@ fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
     for (readout_us, periods) in [(16_100, 15), (16_500, 16)] {
         let rig = rig(60.0, &format!("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = {readout_us}\n"));
         let bench = Bench::new(&rig);
-    let ended = bench.run(&plan(3));
+        let ended = bench.run(&plan(3));
         let (_, state) = ended.open();
         let counts = &state.counts;
         assert_eq!((state.cycles().count(), counts.lost_total()), (3, 0), "{counts:?}");
