@@ -224,7 +224,9 @@ fn bad_plans_and_sessions_are_refused_and_the_daemon_goes_on() {
     let bench = Bench::new(&small_rig(""));
     let cases = [
         ("kind = ", ErrorCode::InvalidPlan, "plan"),
-        ("kind = \"film\"", ErrorCode::InvalidPlan, "sweep"),
+        ("kind = \"flim\"", ErrorCode::InvalidPlan, "film"),
+        ("kind = \"film\"\n[sweep]\naverage = 3", ErrorCode::InvalidPlan, "[film]"),
+        ("kind = \"film\"\n[film]\ndelay_us = [0, 1e9]", ErrorCode::InvalidPlan, "period"),
         ("kind = \"sweep\"\n[sweep]\naverag = 3", ErrorCode::InvalidPlan, "averag"),
         ("kind = \"sweep\"\n[sweep]\naverage = \"many\"", ErrorCode::InvalidPlan, "string"),
         ("kind = \"sweep\"\n[sweep]\ndelay_us = [1e9]", ErrorCode::InvalidPlan, "period"),

@@ -34,8 +34,6 @@ pub fn process(
     let film = session.film()?;
     let transports = super::create_transports(session, task, solver.reach_rows())?;
     let mut problems = Vec::new();
-    // As during the film: each from the one before, so that the bits are the same where none was left out.
-    let mut last = None;
     for entry in state.cycles() {
         let frames = match film.read(entry.cycle) {
             Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,
@@ -55,15 +53,12 @@ pub fn process(
                 run_stages(&processing.stages, &unit).map(|image| (setting, Arc::new(image)))
             },
         );
-        let solved =
-            images.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string()).and_then(|images| {
-                solver.solve(&images, &dark, last.as_ref(), &|| true).map_err(|error| error.to_string())
-            });
+        let solved = images
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(|error| error.to_string())
+            .and_then(|images| solver.solve(&images, &dark, &|| true).map_err(|error| error.to_string()));
         match solved {
-            Ok(transport) => {
-                transports.write(entry.cycle, transport.t.view())?;
-                last = Some(transport);
-            }
+            Ok(transport) => transports.write(entry.cycle, transport.t.view())?,
             Err(error) => problems.push(format!("cycle {}: {error}", entry.cycle)),
         }
     }

@@ -145,6 +145,8 @@ struct Sequencer {
     /// The longest that a frame has taken so far, from its edge to its last row.
     longest_frame_us: f64,
     period_us: f64,
+    /// Id of the newest frame.
+    newest_seq: Option<u64>,
     /// When the exposure of the last counted frame ended.
     exposed_until: Option<Instant>,
 }
@@ -188,6 +190,7 @@ impl Sequencer {
             warmed_up: false,
             longest_frame_us: 0.0,
             period_us,
+            newest_seq: None,
             exposed_until: None,
         }
     }
@@ -320,6 +323,7 @@ impl Sequencer {
             Pace::Devices => self.pool.try_take(),
         };
         let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), POLL)?;
+        self.newest_seq = stamp.map(|stamp| stamp.seq).or(self.newest_seq);
         Ok(stamp.map(|stamp| Received { stamp, data }))
     }
 

@@ -52,8 +52,9 @@ struct Written {
 struct Ahead {
     written: VecDeque<Written>,
     newest_seq: Option<u64>,
-    /// How many frames that are still to come have their settings already when new ones are written: what the camera
-    /// says of its first frames tells. 0 where it cannot say exactly.
+    /// Frames after the newest one that have their settings already when new ones are written, because they are on
+    /// their way to the host or their settings on their way into the sensor: what the camera says of its first frames
+    /// tells. 0 where it cannot say exactly.
     lead_frames: Option<u64>,
     /// Whether settings were written before, without a pause since.
     running: bool,
@@ -82,7 +83,8 @@ impl Ahead {
     fn push(&mut self, job: Job) {
         let (first_seq, lead_frames) = match job.applied.first_frame {
             FirstFrame::Exactly(seq) => {
-                // A frame that went unnoticed between the newest and the write makes the lead look longer than it is.
+                // Where the write was late, the lead looks longer than it is, and settings that are written too soon
+                // would take the place of others.
                 let lead = seq.saturating_sub(self.newest_seq.unwrap_or(seq) + 1);
                 (seq, self.lead_frames.map_or(lead, |known| known.min(lead)))
             }
@@ -116,7 +118,7 @@ impl Sequencer {
     pub(super) fn film(&mut self, film: &FilmPass) -> Result<(), DeviceError> {
         self.warm_up(film.not_before_ns)?;
         let mut slots = film.slots().peekable();
-        let mut ahead = Ahead::default();
+        let mut ahead = Ahead { newest_seq: self.newest_seq, ..Ahead::default() };
         let mut watchdog = self.watchdog();
         while self.orders.go_on() {
             let is_held =

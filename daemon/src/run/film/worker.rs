@@ -222,12 +222,10 @@ impl Drop for Worker {
 impl Solving {
     fn run(self, inbox: &Inbox, workers: &rayon::ThreadPool) -> raysweep_session::Result<()> {
         let mut solve_time = Duration::ZERO;
-        // Of the last whole cycle, so that what is stored does not hang on which sliding estimates there was time for.
-        let mut last: Option<Transport> = None;
         while let Some((exposed, is_sliding)) = inbox.next(solve_time * 3 / 2) {
             let began = Instant::now();
             let Exposed { cycle, frames, dark, .. } = &exposed;
-            let solved = workers.install(|| self.solver.solve(frames, dark, last.as_ref(), &|| true));
+            let solved = workers.install(|| self.solver.solve(frames, dark, &|| true));
             solve_time = began.elapsed();
             let transport = match solved {
                 Ok(transport) => transport,
@@ -238,15 +236,11 @@ impl Solving {
                 }
             };
             self.publish(&exposed, is_sliding, &transport, solve_time);
-            if is_sliding {
-                continue;
-            }
-            if let Err(error) = self.transports.write(*cycle as usize, transport.t.view()) {
+            if !is_sliding && let Err(error) = self.transports.write(*cycle as usize, transport.t.view()) {
                 tracing::error!(%error, cycle, "transport not stored");
                 self.orders.give(Order::Fault);
                 return Err(error);
             }
-            last = Some(transport);
         }
         Ok(())
     }
