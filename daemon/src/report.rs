@@ -1,5 +1,6 @@
 //! The report of a sweep: what was taken, what came out, and how far to trust it.
 
+mod findings;
 mod products;
 
 use std::collections::BTreeMap;
@@ -56,6 +57,7 @@ pub fn make(
         sections.extend(products::profiles(products));
     }
     sections.push(sweep.contact_sheet()?);
+    sections.extend(findings::section(products));
     sections.push(trust(state, task, products));
     Ok(Report {
         title: state.session.name.clone(),

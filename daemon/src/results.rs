@@ -28,6 +28,7 @@ pub fn write_transport(session: &Session, task: &Task, products: &[Product]) -> 
     for product in products {
         let Product::Transport(found) = product else { continue };
         let mut metadata = common(task);
+        metadata.extend(model(products));
         metadata.insert("axes".into(), json!(["u", "t", "s"]));
         metadata.insert("u_min".into(), json!(found.u_min));
         metadata.insert("u_max".into(), json!(found.u_max()));
@@ -79,10 +80,36 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
                 );
                 files.table(&profile.name, &columns, &metadata)?;
             }
-            Product::Transport(_) | Product::Stack(_) | Product::Figure { .. } | Product::Warning(_) => {}
+            Product::Transport(_)
+            | Product::Stack(_)
+            | Product::Findings(_)
+            | Product::Figure { .. }
+            | Product::Warning(_) => {}
         }
     }
     Ok(())
+}
+
+/// What the transport was found with.
+fn model(products: &[Product]) -> Map<String, Value> {
+    let findings = products.iter().find_map(|product| match product {
+        Product::Findings(findings) => Some(findings),
+        _ => None,
+    });
+    let Some(found) = findings else { return Map::new() };
+    let remarks: Map<String, Value> =
+        found.remarks.iter().map(|(key, said)| ((*key).to_owned(), json!(said))).collect();
+    let entries = [
+        (
+            "prior",
+            json!({ "name": found.prior.name(), "alpha": found.prior.alpha(), "beta": found.prior.beta() }),
+        ),
+        ("beam_sigma_rows", json!(found.beam_sigma_rows)),
+        ("u0_rows", json!(found.u0_rows)),
+        ("left_out_us", json!(found.left_out_us)),
+        ("findings", json!(remarks)),
+    ];
+    entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
 /// What every product says of itself.

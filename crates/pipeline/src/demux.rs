@@ -7,7 +7,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
-use crate::findings;
+use crate::findings::{self, Prepared};
 use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
@@ -25,11 +25,13 @@ pub struct DemuxOptions {
     pub alpha: Option<f64>,
     /// Weight of sparsity; left out: the prior's own.
     pub beta: Option<f64>,
+    /// Whether neighbouring pixels that see the same kind of light are averaged before they are solved.
+    pub coupling: bool,
 }
 
 impl Default for DemuxOptions {
     fn default() -> Self {
-        Self { prior: None, alpha: None, beta: None }
+        Self { prior: None, alpha: None, beta: None, coupling: true }
     }
 }
 
@@ -45,7 +47,7 @@ pub enum PriorName {
 
 impl DemuxOptions {
     /// Whether a plan leaves nothing of the prior open.
-    fn states_prior(&self) -> bool {
+    pub(crate) fn states_prior(&self) -> bool {
         self.prior.is_some() || self.alpha.is_some() || self.beta.is_some()
     }
 
@@ -93,9 +95,7 @@ struct Taken {
 /// Collects a sweep and demultiplexes it. A copy shares the images.
 #[derive(Clone)]
 pub struct DemuxFold {
-    prior: Prior,
-    /// Whether the plan states the prior, or leaves it to the stack.
-    prior_stated: bool,
+    options: DemuxOptions,
     schedule: Arc<Schedule>,
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
@@ -117,12 +117,10 @@ impl DemuxFold {
     ) -> Result<Self, RegistryError> {
         let invalid =
             |error: PlaneError| RegistryError::Invalid { name: "demux".into(), what: error.to_string() };
-        let prior = options.prior();
-        prior.check().map_err(invalid)?;
+        options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let prior_stated = options.states_prior();
-        let fold = Self { prior, prior_stated, schedule, geometry, timing, taken: BTreeMap::new() };
+        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new() };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -134,7 +132,7 @@ impl DemuxFold {
     pub fn demux(&self) -> Result<Demux, PlaneError> {
         let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
         let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
-        Demux::new(self.timing.clone(), planned, self.prior)
+        Demux::new(self.timing.clone(), planned, self.options.prior())
     }
 
     /// The dark image that belongs to the exposure of a role's image, if it was taken.
@@ -172,7 +170,17 @@ impl DemuxFold {
             }
             settings.push(sample.setting.clone());
         }
-        Ok(SweepStack { timing: self.timing.clone(), exposures_us, settings, images, valid, regular: None })
+        Ok(SweepStack {
+            timing: self.timing.clone(),
+            prior: self.options.prior(),
+            exposures_us,
+            settings,
+            images,
+            valid,
+            regular: None,
+            noise: None,
+            variance_ratio: None,
+        })
     }
 
     fn solve(&self, stack: &SweepStack, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
@@ -238,13 +246,14 @@ impl Fold for DemuxFold {
         let regular = regular.zip(self.dark_of(&taken, Role::Regular));
         let mut stack = self.stack(taken)?;
         let refused = |error: PlaneError| FoldError { fold: "demux".into(), what: error.to_string() };
-        let (demux, findings) = self
+        let prepared = self
             .demux()
-            .and_then(|planned| findings::find(&planned, self.prior_stated, &self.geometry, &mut stack))
+            .and_then(|planned| findings::prepare(&planned, &self.options, &self.geometry, &mut stack))
             .map_err(refused)?;
-        stack.timing = demux.timing().clone();
+        let Prepared { demux, coupled, findings } = prepared;
+        let images = coupled.as_ref().unwrap_or(&stack.images);
         let valid = stack.valid.as_ref().map(|valid| valid.view());
-        let transport = demux.solve_while(stack.images.view(), valid, go_on).map_err(refused)?;
+        let transport = demux.solve_while(images.view(), valid, go_on).map_err(refused)?;
 
         let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![

@@ -1,16 +1,19 @@
 //! What the stack of a sweep says of the rig and of the scene, before it is demultiplexed: settings that cannot be
-//! trusted, the beam's width, the place of direct light, the prior.
+//! trusted, the beam's width, the place of direct light, the prior, the noise.
 
+use ndarray::Array3;
 use raysweep_transport::plane::calibrate::{
-    CalibrateError, Choice, Optics, Sample, candidates, choose_prior, estimate_optics, settings_on_direct_row,
+    BeamEstimate, CalibrateError, Choice, OpticsEstimate, Sample, candidates, choose_prior, estimate_optics,
+    settings_on_direct_row,
 };
-use raysweep_transport::plane::{Beam, Demux, PlaneError, Prior};
+use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior};
 
+use crate::demux::DemuxOptions;
 use crate::products::SweepStack;
 use crate::schedule::{Spot, SweepGeometry};
 
 /// Offsets of direct light below this are not worth a model of their own: they cost less than the noise.
-const NEGLIGIBLE_U0_ROWS: f64 = 0.01;
+const NEGLIGIBLE_U0_ROWS: f32 = 0.01;
 
 /// How a sweep was demultiplexed, and why so.
 #[derive(Debug, Clone, PartialEq)]
@@ -29,48 +32,112 @@ pub struct Findings {
     pub remarks: Vec<(&'static str, String)>,
 }
 
-/// Chooses how to demultiplex a stack, leaves out of it what cannot be used, and says why. `planned` is the plan's
-/// demultiplexer; `stated` says that the plan names its prior.
+/// A stack made ready for the solver.
+pub struct Prepared {
+    /// Solves it.
+    pub demux: Demux,
+    /// The stack after spatial coupling, `[settings, t, s]`; none: as it was taken.
+    pub coupled: Option<Array3<f32>>,
+    /// Why so.
+    pub findings: Findings,
+}
+
+/// Chooses how to demultiplex a stack, and leaves out of it what cannot be used. `planned` is the plan's demultiplexer.
 ///
 /// # Errors
 /// When the stack makes no model.
-pub fn find(
+pub fn prepare(
     planned: &Demux,
-    stated: bool,
+    options: &DemuxOptions,
     geometry: &SweepGeometry,
     stack: &mut SweepStack,
-) -> Result<(Demux, Findings), PlaneError> {
-    let mut remarks = Vec::new();
-    let left_out_us = leave_out(geometry, stack, &mut remarks)?;
+) -> Result<Prepared, PlaneError> {
     let mut findings = Findings {
         prior: planned.prior(),
         choice: None,
         beam_sigma_rows: geometry.beam_sigma_rows.unwrap_or(0.0),
         u0_rows: 0.0,
-        left_out_us,
-        remarks,
+        left_out_us: Vec::new(),
+        remarks: Vec::new(),
     };
-    let mut demux = planned.with_settings(stack.settings.clone())?;
-    let valid = stack.valid.as_ref().map(|valid| valid.view());
-    let sample = match Sample::new(stack.timing.clone(), stack.settings.clone(), stack.images.view(), valid) {
-        Ok(sample) => sample,
+    leave_out(geometry, stack, &mut findings)?;
+    let planned = planned.with_settings(stack.settings.clone())?;
+    let demux = match calibrate(&planned, options, geometry, stack, &mut findings) {
+        Ok(demux) => demux,
         Err(error) => {
             findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
-            return Ok((demux, findings));
+            planned
         }
     };
+    stack.timing = demux.timing().clone();
+    stack.prior = demux.prior();
+    let coupled = couple(options, stack, &mut findings)?;
+    Ok(Prepared { demux, coupled, findings })
+}
 
-    let estimate = match estimate_optics(&sample, geometry.beam_sigma_rows) {
-        Ok(estimate) => estimate,
-        Err(error) => {
-            findings.remarks.push(("beam", format!("not estimated: {error}")));
-            return Ok((demux, findings));
+/// Estimates the optics and chooses the prior.
+fn calibrate(
+    planned: &Demux,
+    options: &DemuxOptions,
+    geometry: &SweepGeometry,
+    stack: &SweepStack,
+    findings: &mut Findings,
+) -> Result<Demux, CalibrateError> {
+    let valid = stack.valid.as_ref().map(|valid| valid.view());
+    let sample = Sample::new(stack.timing.clone(), stack.settings.clone(), stack.images.view(), valid)?;
+    let OpticsEstimate { mut optics, beam, spike } = estimate_optics(&sample, geometry.beam_sigma_rows)?;
+    let sigma_rows = optics.beam_sigma_rows;
+    findings.remarks.push(("beam", say_beam(beam.as_ref(), sigma_rows)));
+    let beam = Beam::of_sigma(sigma_rows);
+    let mut demux = planned.with_timing(stack.timing.clone().with_beam(beam)?)?;
+    findings.beam_sigma_rows = sigma_rows;
+
+    let said = match &spike {
+        Err(error) => format!("taken to lie in its own row: {error}"),
+        Ok(map) => {
+            let mut places: Vec<f32> = map.u0.iter().copied().collect();
+            places.sort_by(f32::total_cmp);
+            let (low, median, high) = (places[0], places[places.len() / 2], places[places.len() - 1]);
+            let error = map.standard_error.iter().fold(0.0_f32, |most, &error| most.max(error));
+            if low.abs().max(high.abs()) < error.max(NEGLIGIBLE_U0_ROWS) {
+                optics.spike = None;
+                format!("in its own row within {error:.3} rows, from {} pixels", map.pixels)
+            } else {
+                demux = demux.with_spike(map.u0.clone())?;
+                findings.u0_rows = median.into();
+                format!(
+                    "{low:.3} to {high:.3} rows beside its own row (median {median:.3}, standard error up to {error:.3}), from {} pixels: what rectification leaves",
+                    map.pixels
+                )
+            }
         }
     };
-    let optics = estimate.optics;
-    findings.beam_sigma_rows = optics.beam_sigma_rows;
-    let beam = match &estimate.beam {
-        None => format!("{} rows, as the rig file says", optics.beam_sigma_rows),
+    findings.remarks.push(("direct light", said));
+
+    let prior = match options.states_prior() {
+        true => format!("{}, as the plan says", name(findings.prior)),
+        false => {
+            let default = findings.prior;
+            let others = candidates().into_iter().filter(|prior| *prior != default);
+            let compared: Vec<Prior> = std::iter::once(default).chain(others).collect();
+            match choose_prior(&sample, &optics, &compared) {
+                Ok(choice) => {
+                    findings.prior = choice.prior();
+                    let reason = choice.reason();
+                    findings.choice = Some(choice);
+                    reason
+                }
+                Err(error) => format!("the default {}: {error}", name(default)),
+            }
+        }
+    };
+    findings.remarks.push(("prior", prior));
+    Ok(demux.with_prior(findings.prior)?)
+}
+
+fn say_beam(estimate: Option<&Result<BeamEstimate, CalibrateError>>, sigma_rows: f64) -> String {
+    match estimate {
+        None => format!("{sigma_rows} rows, as the rig file says"),
         Some(Ok(found)) if found.sigma_rows == 0.0 => {
             format!("no wider than a row, from {} pixels with direct light", found.pixels)
         }
@@ -79,62 +146,47 @@ pub fn find(
             found.sigma_rows, found.standard_error_rows, found.pixels
         ),
         Some(Err(error)) => format!("taken as ideal: {error}"),
-    };
-    findings.remarks.push(("beam", beam));
-    demux = demux.with_timing(stack.timing.clone().with_beam(Beam::of_sigma(optics.beam_sigma_rows))?)?;
-
-    let mut optics = optics;
-    match &estimate.spike {
-        Ok(map) => {
-            let mut places: Vec<f32> = map.u0.iter().copied().collect();
-            places.sort_by(f32::total_cmp);
-            let at = |share: f64| f64::from(places[((places.len() - 1) as f64 * share) as usize]);
-            findings.u0_rows = at(0.5);
-            let (low, high) = (at(0.0), at(1.0));
-            let error = map.standard_error.iter().fold(0.0_f32, |most, &error| most.max(error));
-            if low.abs().max(high.abs()) < NEGLIGIBLE_U0_ROWS.max(f64::from(error)) {
-                optics.spike = None;
-                findings.u0_rows = 0.0;
-                findings.remarks.push((
-                    "direct light",
-                    format!("in its own row within {error:.3} rows, from {} pixels", map.pixels),
-                ));
-            } else {
-                demux = demux.with_spike(map.u0.clone())?;
-                findings.remarks.push((
-                    "direct light",
-                    format!(
-                        "{low:.3} to {high:.3} rows beside its own row (median {:.3}, standard error up to {error:.3}), from {} pixels: what rectification leaves",
-                        findings.u0_rows, map.pixels
-                    ),
-                ));
-            }
-        }
-        Err(error) => {
-            findings.remarks.push(("direct light", format!("taken to lie in its own row: {error}")));
-        }
     }
-
-    let prior = match stated {
-        true => format!("{}, as the plan says", name(findings.prior)),
-        false => match choose(&sample, &optics, findings.prior) {
-            Ok(choice) => {
-                findings.prior = choice.prior();
-                let reason = choice.reason();
-                findings.choice = Some(choice);
-                reason
-            }
-            Err(error) => format!("the default {}: {error}", name(findings.prior)),
-        },
-    };
-    findings.remarks.push(("prior", prior));
-    Ok((demux.with_prior(findings.prior)?, findings))
 }
 
-fn choose(sample: &Sample, optics: &Optics, default: Prior) -> Result<Choice, CalibrateError> {
-    let mut compared = vec![default];
-    compared.extend(candidates().into_iter().filter(|prior| *prior != default));
-    choose_prior(sample, optics, &compared)
+/// Fits the noise and averages like pixels, if the plan wants that.
+fn couple(
+    options: &DemuxOptions,
+    stack: &mut SweepStack,
+    findings: &mut Findings,
+) -> Result<Option<Array3<f32>>, PlaneError> {
+    let frames: Vec<usize> = stack.settings.iter().map(|setting| setting.delays_us.len()).collect();
+    let valid = stack.valid.as_ref().map(|valid| valid.view());
+    let noise = match NoiseModel::fit(stack.images.view(), valid, &frames) {
+        Ok(noise) => noise,
+        Err(error) => {
+            findings.remarks.push(("noise", format!("not fitted, and pixels not coupled: {error}")));
+            return Ok(None);
+        }
+    };
+    findings.remarks.push((
+        "noise of a frame",
+        format!(
+            "{:.4} in the dark, {:.4} at the light of one white row",
+            noise.variance(0.0, 1).sqrt(),
+            noise.variance(1.0, 1).sqrt()
+        ),
+    ));
+    stack.noise = Some(noise);
+    if !options.coupling {
+        return Ok(None);
+    }
+    let Coupled { stack: images, variance_ratio } =
+        Coupling::default().apply(stack.images.view(), valid, &noise, &frames)?;
+    findings.remarks.push((
+        "spatial coupling",
+        format!(
+            "like neighbours averaged before demultiplexing: the variance of noise falls to {:.0} % on average",
+            100.0 * variance_ratio.mean().unwrap_or(1.0)
+        ),
+    ));
+    stack.variance_ratio = Some(variance_ratio);
+    Ok(Some(images))
 }
 
 /// A prior with its weights.
@@ -147,27 +199,25 @@ pub fn name(prior: Prior) -> String {
 fn leave_out(
     geometry: &SweepGeometry,
     stack: &mut SweepStack,
-    remarks: &mut Vec<(&'static str, String)>,
-) -> Result<Vec<(f64, f64)>, PlaneError> {
-    let Spot::Flying(_) = geometry.spot else { return Ok(Vec::new()) };
+    findings: &mut Findings,
+) -> Result<(), PlaneError> {
+    let Spot::Flying(_) = geometry.spot else { return Ok(()) };
     let cut = settings_on_direct_row(&stack.timing, &stack.settings, 0.0)?;
     if cut.len() == stack.settings.len() {
-        remarks.push((
-            "flying spot",
-            "every exposure begins or ends while the direct row is drawn, so none is left out: direct light is not to be trusted; move the delays by a row".into(),
-        ));
-        return Ok(Vec::new());
+        let what = "every exposure begins or ends while the direct row is drawn, so none is left out and direct light is not to be trusted: move the delays by a row";
+        findings.remarks.push(("flying spot", what.into()));
+        return Ok(());
     }
-    let at = |n: usize| (stack.settings[n].delays_us[0], stack.settings[n].exposure_us);
-    let left_out: Vec<(f64, f64)> = cut.iter().map(|&n| at(n)).collect();
+    let at = |&n: &usize| (stack.settings[n].delays_us[0], stack.settings[n].exposure_us);
+    findings.left_out_us = cut.iter().map(at).collect();
     stack.keep(|n| !cut.contains(&n));
-    remarks.push((
+    findings.remarks.push((
         "flying spot",
         format!(
             "{} images are left out, because their exposure begins or ends while the spot draws the direct row; {} are kept",
-            left_out.len(),
+            cut.len(),
             stack.settings.len()
         ),
     ));
-    Ok(left_out)
+    Ok(())
 }

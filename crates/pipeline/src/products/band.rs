@@ -1,5 +1,7 @@
 //! Light by the distance of its projector row: `epipolar`, `non-epipolar`, `band`.
 
+use std::ops::RangeInclusive;
+
 use ndarray::Array2;
 use raysweep_transport::plane::Transport;
 use serde::Deserialize;
@@ -118,7 +120,8 @@ impl Band {
         }
     }
 
-    pub(super) fn make(self, name: String, transport: &Transport) -> Product {
+    /// The rows in words.
+    pub(super) fn says(self) -> String {
         let rows = match self.to_rows {
             Some(to_rows) => format!("{} to {to_rows} rows", self.from_rows),
             None => format!("{} rows and more", self.from_rows),
@@ -128,7 +131,11 @@ impl Band {
             Some(Side::Below) => "below the pixel's own",
             None => "away",
         };
-        let mut about = format!("light from projector rows {rows} {side}");
+        format!("light from projector rows {rows} {side}")
+    }
+
+    pub(super) fn make(self, name: String, transport: &Transport) -> Product {
+        let mut about = self.says();
         let known = transport.u_min.unsigned_abs().min(transport.u_max().unsigned_abs());
         if self.to_rows.is_none_or(|to_rows| to_rows > known) {
             about.push_str(&format!("; {}", reach_of(transport)));
@@ -136,16 +143,22 @@ impl Band {
         Product::Image { name, about, image: self.image(transport) }
     }
 
-    fn image(self, transport: &Transport) -> Array2<f32> {
+    /// The relative rows, none twice.
+    pub(super) fn ranges(self) -> Vec<RangeInclusive<i32>> {
         // No reach is as long as i32::MAX rows.
         let rows = |rows: u32| i32::try_from(rows).unwrap_or(i32::MAX);
         let (from, to) = (rows(self.from_rows), self.to_rows.map_or(i32::MAX, rows));
         match self.side {
-            Some(Side::Above) => transport.band(-to..=-from),
-            Some(Side::Below) => transport.band(from..=to),
+            Some(Side::Above) => vec![-to..=-from],
+            Some(Side::Below) => vec![from..=to],
             // Both sides hold the pixel's own row, which counts once.
-            None if from == 0 => transport.band(-to..=to),
-            None => transport.band(-to..=-from) + transport.band(from..=to),
+            None if from == 0 => vec![-to..=to],
+            None => vec![-to..=-from, from..=to],
         }
+    }
+
+    fn image(self, transport: &Transport) -> Array2<f32> {
+        let bands = self.ranges().into_iter().map(|rows| transport.band(rows));
+        bands.reduce(|sum, band| sum + band).unwrap_or_default()
     }
 }

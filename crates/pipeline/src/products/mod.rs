@@ -4,9 +4,10 @@
 mod band;
 mod profile;
 mod relight;
+mod uncertainty;
 
 use ndarray::{Array2, Array3, Axis};
-use raysweep_transport::plane::{RowTiming, Setting, Transport};
+use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
@@ -24,6 +25,8 @@ pub use self::profile::Profile;
 pub struct SweepStack {
     /// The rows that the camera looks along, and when they are lit.
     pub timing: RowTiming,
+    /// The prior that the transport was found under.
+    pub prior: Prior,
     /// The exposure that the plan asked for, of each image.
     pub exposures_us: Vec<f64>,
     /// How each image was taken.
@@ -34,6 +37,10 @@ pub struct SweepStack {
     pub valid: Option<Array3<bool>>,
     /// One whole VSYNC period of exposure, `[t, s]`, where it was taken.
     pub regular: Option<Array2<f32>>,
+    /// The noise of a frame, where it could be fitted.
+    pub noise: Option<NoiseModel>,
+    /// Share of the noise's variance that spatial coupling left, `[t, s]`; none: not coupled.
+    pub variance_ratio: Option<Array2<f32>>,
 }
 
 impl SweepStack {
@@ -84,10 +91,11 @@ enum Kind {
     Band(Band),
     Relight(Pattern),
     DelayProfile(ProfileOptions),
+    Uncertainty(Band),
 }
 
 /// The kinds as plans name them.
-const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile";
+const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile, uncertainty";
 
 /// The name that the transport itself has among the files.
 const TAKEN_NAME: &str = "transport";
@@ -122,6 +130,7 @@ impl ProductSpec {
             "epipolar" => Kind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "non-epipolar" => Kind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "band" => Kind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "uncertainty" => Kind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
             "relight" => {
                 if options.len() != 1 {
                     let what = "give exactly one of rows, stripes and line".to_owned();
@@ -155,6 +164,7 @@ impl ProductSpec {
             spec("non_epipolar", Kind::NonEpipolar(Width::default())),
             spec("short_range", Kind::Band(Band::new(1, Some(10)))),
             spec("long_range", Kind::Band(Band::new(11, None))),
+            spec("uncertainty", Kind::Uncertainty(Band::new(0, Some(0)))),
         ]
     }
 
@@ -168,7 +178,11 @@ impl ProductSpec {
         match &self.kind {
             Kind::Relight(pattern) => pattern.images(geometry),
             Kind::DelayProfile(_) => 0,
-            Kind::Regular | Kind::Epipolar(_) | Kind::NonEpipolar(_) | Kind::Band(_) => 1,
+            Kind::Regular
+            | Kind::Epipolar(_)
+            | Kind::NonEpipolar(_)
+            | Kind::Band(_)
+            | Kind::Uncertainty(_) => 1,
         }
     }
 
@@ -197,6 +211,7 @@ impl ProductSpec {
                 pattern.make(name, &stack.timing, transport).map_err(|error| not_made(error.to_string()))
             }
             Kind::DelayProfile(options) => options.make(name, stack, transport).map_err(not_made),
+            Kind::Uncertainty(band) => uncertainty::make(name, *band, stack, transport).map_err(not_made),
         }
     }
 }
@@ -210,6 +225,7 @@ impl Kind {
             Self::Band(band) => band.default_name(),
             Self::Relight(_) => "relight".into(),
             Self::DelayProfile(options) => options.default_name(),
+            Self::Uncertainty(band) => format!("uncertainty_{}", band.default_name()),
         }
     }
 }

@@ -4,12 +4,24 @@ use raysweep_transport::plane::predict;
 use serde_json::json;
 
 use super::*;
-use crate::schedule::{Point, Role};
+use crate::schedule::{Point, Role, Spot};
 
 /// A camera of 6 rows and 3 columns that sees the rows from 2 on of a projector with 10.
 fn geometry() -> SweepGeometry {
     let raster = Raster { rows: 10, row_time_us: 20.0, period_us: 2000.0, first_row_us: 0.0 };
-    SweepGeometry { raster, first_row: 2, height: 6, width: 3, white_dn: 1000.0, saturation_dn: 4000.0 }
+    SweepGeometry {
+        raster,
+        row_table_us: None,
+        beam_sigma_rows: None,
+        spot: Spot::Uniform,
+        first_row: 2,
+        row_pitch: 1.0,
+        camera_row_time_us: 20.0,
+        height: 6,
+        width: 3,
+        white_dn: 1000.0,
+        saturation_dn: 4000.0,
+    }
 }
 
 /// Two exposures at three delays, and a third at one.
@@ -55,11 +67,14 @@ fn stack() -> SweepStack {
     let views: Vec<_> = images.iter().map(|image| image.view()).collect();
     SweepStack {
         timing: timing(),
+        prior: Prior::SPLIT,
         exposures_us: points.iter().map(|point| point.exposure_us).collect(),
         settings,
         images: ndarray::stack(Axis(0), &views).unwrap(),
         valid: None,
         regular: None,
+        noise: None,
+        variance_ratio: None,
     }
 }
 

@@ -1,0 +1,34 @@
+//! `uncertainty`: what noise leaves of the certainty of a band's light.
+
+use ndarray::Axis;
+use raysweep_transport::plane::{Samples, Transport, Uncertainty};
+
+use super::SweepStack;
+use super::band::Band;
+use crate::stage::Product;
+
+pub(super) fn make(
+    name: String,
+    band: Band,
+    stack: &SweepStack,
+    transport: &Transport,
+) -> Result<Product, String> {
+    let noise = stack.noise.ok_or("the stack's noise could not be fitted, the report says why")?;
+    let frames: Vec<usize> = stack.settings.iter().map(|setting| setting.delays_us.len()).collect();
+    let samples = Samples {
+        stack: stack.images.view(),
+        valid: stack.valid.as_ref().map(|valid| valid.view()),
+        variance_ratio: stack.variance_ratio.as_ref().map(|ratio| ratio.view()),
+    };
+    let model = Uncertainty {
+        timing: &stack.timing,
+        settings: &stack.settings,
+        prior: stack.prior,
+        noise,
+        frames: &frames,
+    };
+    let sd = model.of_bands(transport, &samples, &[band.ranges()]).map_err(|error| error.to_string())?;
+    let about =
+        format!("standard deviation, through noise alone, of {}; the prior's bias is not in it", band.says());
+    Ok(Product::Image { name, about, image: sd.index_axis_move(Axis(0), 0) })
+}

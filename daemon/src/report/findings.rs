@@ -1,0 +1,53 @@
+//! How the transport was found: what the stack said of rig and scene, and the held-out error of the priors.
+
+use raysweep_pipeline::{Findings, Product, prior_name};
+use raysweep_session::report::{Block, Section, Table};
+
+/// The section, unless nothing was demultiplexed.
+pub(super) fn section(products: &[Product]) -> Option<Section> {
+    let findings = products.iter().find_map(|product| match product {
+        Product::Findings(findings) => Some(&**findings),
+        _ => None,
+    })?;
+    let facts = findings.remarks.iter().map(|(key, said)| ((*key).to_owned(), said.clone())).collect();
+    let mut blocks = vec![Block::Facts(facts)];
+    blocks.extend(curve(findings));
+    if !findings.left_out_us.is_empty() {
+        let row = |(delay_us, exposure_us): &(f64, f64)| {
+            vec![format!("{delay_us:.1}"), format!("{exposure_us:.1}")]
+        };
+        blocks.push(Block::Table(Table {
+            headers: vec!["left out: delay / µs".into(), "exposure / µs".into()],
+            rows: findings.left_out_us.iter().map(row).collect(),
+        }));
+    }
+    Some(Section {
+        title: "How it was demultiplexed".into(),
+        intro: "What the images say of themselves: some are held out, predicted from the others, and the model that predicts them best is taken.".into(),
+        blocks,
+    })
+}
+
+/// The priors compared.
+fn curve(findings: &Findings) -> Option<Block> {
+    let choice = findings.choice.as_ref()?;
+    let row = |(index, candidate): (usize, &raysweep_transport::plane::calibrate::Candidate)| {
+        let better = 100.0 * ((candidate.log_ratio / 2.0).exp() - 1.0);
+        let error = 100.0 * candidate.standard_error / 2.0;
+        vec![
+            prior_name(candidate.prior),
+            format!("{:.5}", candidate.residual),
+            if index == 0 { "—".into() } else { format!("{better:+.1} ± {error:.1} %") },
+            if index == choice.chosen { "taken".into() } else { String::new() },
+        ]
+    };
+    Some(Block::Table(Table {
+        headers: vec![
+            "prior".into(),
+            "held-out residual".into(),
+            "against the default".into(),
+            String::new(),
+        ],
+        rows: choice.curve.iter().enumerate().map(row).collect(),
+    }))
+}
