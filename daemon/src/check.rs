@@ -24,10 +24,7 @@ pub fn check(
     data: &Path,
 ) -> Result<CheckReport, ConfigError> {
     let no_model = |message: String| ConfigError { message, field: Some("sweep".into()), span: None };
-    let options = task.plan.stage.iter().find(|stage| stage.name == "demux").map(|stage| {
-        serde_json::from_value::<DemuxOptions>(serde_json::Value::Object(stage.options.clone()))
-    });
-    let options = options.transpose().map_err(|error| no_model(error.to_string()))?.unwrap_or_default();
+    let options = demux_options(task).map_err(|error| no_model(error.to_string()))?;
     let geometry = &task.geometry;
     let demux = DemuxFold::new(options, &task.schedule, geometry)
         .map_err(|error| no_model(error.to_string()))?
@@ -114,12 +111,21 @@ pub fn check(
         reach_rows: (*reach.start(), *reach.end()),
         // JSON has no infinity.
         condition: condition.min(f64::MAX),
+        // Worked out on request alone: a run must not wait for it.
+        advice: None,
         warnings,
     })
 }
 
+/// The options of `demux` as the plan states them.
+pub(crate) fn demux_options(task: &Task) -> Result<DemuxOptions, serde_json::Error> {
+    let stage = task.plan.stage.iter().find(|stage| stage.name == "demux");
+    let options = stage.map(|stage| serde_json::from_value(serde_json::Value::Object(stage.options.clone())));
+    options.transpose().map(Option::unwrap_or_default)
+}
+
 /// VSYNC periods that each frame of a point takes.
-fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
+pub(crate) fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
     let shot = task.geometry.shot(point, camera.trigger_latency_us);
     u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))
 }

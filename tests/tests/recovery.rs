@@ -2,7 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, Axis, s};
+use raysweep::control::Control;
 use raysweep_tests::{Bench, Ended, corner_rig, data};
 use raysweep_transport::plane::{RowTiming, Setting, reach, relative_rows};
 use raysweep_transport::quality::{median_profile_error, relative_l2, share_near};
@@ -49,4 +50,33 @@ fn the_split_prior_recovers_the_rendered_scene_through_the_daemon() {
     let regular: Array2<f32> = product(&ended, "regular.npy");
     let predicted = total(&found) / regular.iter().map(|&x| f64::from(x)).sum::<f64>();
     assert!((predicted - 1.0).abs() < 0.02, "the model predicts {predicted} of the regular image");
+}
+
+#[test]
+fn the_sweep_that_check_proposes_errs_less_than_the_papers() {
+    let bench = Bench::new(&corner_rig(""));
+    let rest = "kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nprior = \"split\"\ncoupling = false\n";
+    let own = format!("{rest}[sweep]\naverage = 1\n");
+    let advice = bench.runner.check(&own).unwrap().advice.unwrap();
+    let better = advice.better.unwrap();
+    let proposed = format!("{rest}{}", better.sweep);
+    assert_eq!(bench.runner.check(&proposed).unwrap().advice.unwrap().expected.epipolar, 0.0);
+
+    let truth = truth();
+    let errors = |plan: &str| {
+        let ended = bench.run(plan);
+        assert_eq!(ended.state, "complete", "{:?}", ended.error);
+        let found: Array3<f32> = product(&ended, "transport.npy");
+        // The proposed sweep may reach less far.
+        let beyond = (189 - found.len_of(Axis(0))) / 2;
+        let truth = truth.slice(s![beyond..189 - beyond, .., ..]);
+        let own_row = found.len_of(Axis(0)) / 2;
+        let direct = relative_l2(found.index_axis(Axis(0), own_row), truth.index_axis(Axis(0), own_row));
+        let errors = (median_profile_error(found.view(), truth), direct);
+        println!("{errors:?}");
+        errors
+    };
+    println!("{:?} {:?}", advice.expected, better);
+    let (paper, better) = (errors(&own), errors(&proposed));
+    assert!(better.0 < 0.9 * paper.0 && better.1 < 0.9 * paper.1, "{better:?} {paper:?}");
 }

@@ -6,6 +6,8 @@ use raysweep_core::{Counts, VsyncStats};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
+use crate::SweepAdvice;
+
 /// What the daemon is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -146,6 +148,9 @@ pub struct CheckReport {
     pub reach_rows: (i32, i32),
     /// Condition number of the demultiplexing of a camera row in the middle, with its prior.
     pub condition: f64,
+    /// What error to expect, and what to do better; nothing where a warning says why.
+    #[serde(default)]
+    pub advice: Option<SweepAdvice>,
     /// What an operator should know; none of it stops the run.
     pub warnings: Vec<String>,
 }

@@ -10,7 +10,7 @@ use toml::de::DeValue;
 
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};
-pub use rig::{CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
+pub use rig::{CameraNoise, CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
 
 /// What is wrong with a rig or plan file, and where.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

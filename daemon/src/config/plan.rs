@@ -135,7 +135,11 @@ impl Plan {
         Ok(plan)
     }
 
-    fn check(&self, text: &str) -> Result<(), ConfigError> {
+    /// Whether it can be run; `text` is what it was read from.
+    ///
+    /// # Errors
+    /// Those of [`Self::parse`].
+    pub(crate) fn check(&self, text: &str) -> Result<(), ConfigError> {
         let sweep = &self.sweep;
         if self.name.trim().is_empty() {
             return Err(ConfigError::at(text, &["name"], "name is empty: give the session a name"));
