@@ -68,15 +68,7 @@ pub fn advise(task: &Task, rig: &RigFile, camera: &CameraCapabilities) -> Result
     let noise = Noise { read, gain, frames, dark_frames: Some(frames) };
 
     let plan = grid_of(&task.plan.sweep);
-    let ceiling = (task.geometry.saturation_dn - rig.camera.black_dn()) / white_dn;
-    let limits = Limits {
-        task,
-        camera,
-        timing,
-        ceiling,
-        saturated: saturated(timing, &plan.settings(), ceiling),
-        periods: total_periods(task, camera),
-    };
+    let limits = Limits::new(task, rig, camera, timing);
     let advised = advice::advise(timing, &plan, &prior, &noise, |grid| limits.usable(grid));
     let advised = advised.map_err(|error| match error {
         PlaneError::NoDelays { .. } => NoAdvice::NothingUsable,
@@ -114,7 +106,13 @@ struct Limits<'a> {
     periods: u64,
 }
 
-impl Limits<'_> {
+impl<'a> Limits<'a> {
+    fn new(task: &'a Task, rig: &RigFile, camera: &'a CameraCapabilities, timing: &'a RowTiming) -> Self {
+        let ceiling = (task.geometry.saturation_dn - rig.camera.black_dn()) / task.geometry.white_dn;
+        let saturated = saturated(timing, &grid_of(&task.plan.sweep).settings(), ceiling);
+        Self { task, camera, timing, ceiling, saturated, periods: total_periods(task, camera) }
+    }
+
     /// The settings of a grid whose images will serve; none where it cannot be taken, or not in the plan's time, or
     /// saturates more than the plan.
     fn usable(&self, grid: &SweepGrid) -> Option<Vec<Setting>> {
@@ -284,17 +282,29 @@ mod tests {
 
     #[test]
     fn no_more_points_saturate_than_in_the_plan() {
-        // 54 rows of 1200 us bring 0.16 beside the direct light, 27 rows of 600 us half as much.
+        // 54 rows in 1200 us bring 0.16 beside the direct light, 27 rows in 600 us half as much.
         let plan = "kind = \"sweep\"\n[sweep]\nexposure_us = [600, 1200]\n";
-        let exposures = |white_dn: f64, plan: &str| {
-            let rig = RIG.replace("[camera]\n", &format!("[camera]\nwhite_dn = {white_dn}\n"));
-            let advice = advised(&rig, plan, &camera()).unwrap();
-            task(&RigFile::parse(&rig).unwrap(), &proposed(&advice, plan)).plan.sweep.exposure_us.values()
+        let rig = |white_dn: f64| {
+            let text = RIG.replace("[camera]\n", &format!("[camera]\nwhite_dn = {white_dn}\n"));
+            RigFile::parse(&text).unwrap()
         };
-        assert!(exposures(3000.0, plan).contains(&1200.0));
-        assert_eq!(exposures(3500.0, plan), [600.0]);
-        let rig = RIG.replace("[camera]\n", "[camera]\nwhite_dn = 4000\n");
-        let error = advised(&rig, plan, &camera()).unwrap_err();
+        // Saturation is at 3972 counts, of which 64 are black. Of the plan, 5 delays of 1200 us hold the own row.
+        let usable = |white_dn: f64, delays: i32| {
+            let (rig, camera) = (rig(white_dn), camera());
+            let task = task(&rig, plan);
+            let timing = task.geometry.timing().unwrap();
+            let limits = Limits::new(&task, &rig, &camera, &timing);
+            let delays_us = (0..delays).map(f64::from).collect();
+            limits.usable(&SweepGrid { delays_us, exposures_us: vec![600.0, 1200.0] })
+        };
+        assert_eq!(usable(3300.0, 8).unwrap().len(), 16);
+        let short = usable(3500.0, 5).unwrap();
+        assert!(short.len() == 5 && short.iter().all(|setting| setting.exposure_us == 600.0), "{short:?}");
+        assert_eq!(usable(3500.0, 8), None);
+
+        let rig = rig(4000.0);
+        let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = [0]\n";
+        let error = advise(&task(&rig, plan), &rig, &camera()).unwrap_err();
         assert!(error.to_string().contains("saturates a white pixel"), "{error}");
     }
 

@@ -60,7 +60,9 @@ fn the_sweep_that_check_proposes_errs_less_than_the_papers() {
     let advice = bench.runner.check(&own).unwrap().advice.unwrap();
     let better = advice.better.unwrap();
     let proposed = format!("{rest}{}", better.sweep);
-    assert_eq!(bench.runner.check(&proposed).unwrap().advice.unwrap().expected.epipolar, 0.0);
+    // Its error is told over the reach of the first.
+    let again = bench.runner.check(&proposed).unwrap().advice.unwrap();
+    assert!((again.expected.profile / better.expected.profile - 1.0).abs() < 0.05, "{again:?}");
 
     let truth = truth();
     let errors = |plan: &str| {
