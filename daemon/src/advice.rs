@@ -7,7 +7,7 @@ use raysweep_transport::plane::advice::{self, Noise, SweepGrid, white_light};
 use raysweep_transport::plane::calibrate::settings_on_direct_row;
 use raysweep_transport::plane::{PlaneError, RowTiming, Setting, reach};
 
-use crate::check::{demux_options, periods};
+use crate::check::periods;
 use crate::config::{Axis, Plan, RigFile, Sweep};
 use crate::processing::Task;
 
@@ -43,13 +43,13 @@ impl From<PlaneError> for NoAdvice {
 /// Multiplications, (points + rows) rows^2, of one foreseen error up to which two dozen of them take about a second.
 const MAX_WORK: f64 = 1e9;
 
-/// Foresees a task's sweep, and looks for a better one that takes no more frames and no more time.
+/// Foresees the sweep of a task, which is no film, and looks for a better one that takes no more frames and no more time.
 ///
 /// # Errors
 /// Where no error can be foreseen.
 pub fn advise(task: &Task, rig: &RigFile, camera: &CameraCapabilities) -> Result<SweepAdvice, NoAdvice> {
     let no_model = |error: &dyn std::fmt::Display| NoAdvice::NoModel(error.to_string());
-    let options = demux_options(task).map_err(|error| no_model(&error))?;
+    let options = task.demux_options().map_err(|error| no_model(&error))?;
     let demux =
         DemuxFold::new(options, &task.schedule, &task.geometry).map_err(|error| no_model(&error))?.demux()?;
     let (timing, prior) = (demux.timing(), demux.prior());

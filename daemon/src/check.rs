@@ -3,11 +3,12 @@
 use std::path::Path;
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, DemuxOptions, Point, ProductSpec};
-use raysweep_proto::CheckReport;
+use raysweep_pipeline::{DemuxFold, Point, ProductSpec, Role};
+use raysweep_proto::{CheckReport, FilmCheck};
 use raysweep_session::durable;
 
 use crate::config::ConfigError;
+use crate::film;
 use crate::processing::Task;
 
 /// Condition number from which on noise is amplified more than the prior can hold.
@@ -24,7 +25,7 @@ pub fn check(
     data: &Path,
 ) -> Result<CheckReport, ConfigError> {
     let no_model = |message: String| ConfigError { message, field: Some("sweep".into()), span: None };
-    let options = demux_options(task).map_err(|error| no_model(error.to_string()))?;
+    let options = task.demux_options()?;
     let geometry = &task.geometry;
     let demux = DemuxFold::new(options, &task.schedule, geometry)
         .map_err(|error| no_model(error.to_string()))?
@@ -33,17 +34,20 @@ pub fn check(
     let condition = demux.condition(geometry.height / 2).map_err(|error| no_model(error.to_string()))?;
     let reach = demux.reach();
 
-    let points = task.schedule.sweep_len();
-    let frames: u64 = task.schedule.points.iter().map(|point| u64::from(point.frames)).sum();
+    let points = task.points();
+    let planned = task.schedule.points.iter().map(|point| (point, times_taken(task, point)));
+    let frames: u64 = planned.clone().map(|(point, times)| times * u64::from(point.frames)).sum();
     let pixels = (geometry.height * geometry.width) as u64;
     let reach_rows = reach.clone().count() as u64;
     // The stack twice while it changes hands, where pixels are valid, the transport and its copy on the way to the disk.
     let images = products.iter().map(|product| product.images(geometry) as u64);
     // Each image once, the largest sequence twice more: as EXR's channels and as the file's bytes.
     let product_images = images.clone().sum::<u64>() + 2 * images.clone().max().unwrap_or(0);
-    let memory_bytes = pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows + 4 * product_images);
+    let mut memory_bytes =
+        pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows + 4 * product_images);
     let files = 2 * images.sum::<u64>();
-    let disk_bytes = pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows + files) + 10_000_000;
+    let mut disk_bytes =
+        pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows + files) + 10_000_000;
     let existing = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
     let disk_free_bytes = durable::available_bytes(existing).unwrap_or(u64::MAX);
 
@@ -53,15 +57,22 @@ pub fn check(
     }
 
     let mut warnings = Vec::new();
+    let film = task.is_film().then(|| film::check(task, camera, reach_rows));
+    if let Some(film) = &film {
+        // Frames and images of the cycles under way, a stack and its mask, the transport and its copies to the disk.
+        memory_bytes = pixels * (80 * film.settings as u64 + 16 * reach_rows);
+        let minutes = points as f64 / film.transports_per_s / 60.0;
+        disk_bytes = (film.disk_bytes_per_minute as f64 * minutes) as u64 + 10_000_000;
+    }
     let periods: Vec<u64> = task.schedule.points.iter().map(|point| periods(task, camera, point)).collect();
     let slow = periods.iter().filter(|&&periods| periods > 1).count();
-    if slow > 0 {
+    if slow > 0 && film.is_none() {
         warnings.push(format!(
             "{slow} of {} points take more than one VSYNC period a frame, because trigger delay, exposure and readout together are longer: a faster or overlapped readout would save time",
             periods.len()
         ));
     }
-    if points < reach_rows as usize / 8 {
+    if film.is_none() && points < reach_rows as usize / 8 {
         warnings.push(format!(
             "{points} points for {reach_rows} rows: expect smooth profiles only; take more delays"
         ));
@@ -95,15 +106,9 @@ pub fn check(
     }
     Ok(CheckReport {
         points,
-        extra_points: task.schedule.points.len() - points,
+        extra_points: task.schedule.points.len() - task.settings().count(),
         frames,
-        light_s: periods
-            .iter()
-            .zip(&task.schedule.points)
-            .map(|(n, point)| n * u64::from(point.frames))
-            .sum::<u64>() as f64
-            * geometry.raster.period_us
-            * 1e-6,
+        light_s: light_periods(&periods, task, film.as_ref()) as f64 * geometry.raster.period_us * 1e-6,
         memory_bytes,
         memory_free_bytes,
         disk_bytes,
@@ -113,15 +118,28 @@ pub fn check(
         condition: condition.min(f64::MAX),
         // Worked out on request alone: a run must not wait for it.
         advice: None,
+        film,
         warnings,
     })
 }
 
-/// The options of `demux` as the plan states them.
-pub(crate) fn demux_options(task: &Task) -> Result<DemuxOptions, serde_json::Error> {
-    let stage = task.plan.stage.iter().find(|stage| stage.name == "demux");
-    let options = stage.map(|stage| serde_json::from_value(serde_json::Value::Object(stage.options.clone())));
-    options.transpose().map(Option::unwrap_or_default)
+/// How often a point is taken where nothing goes wrong: those of a film's cycle once a cycle.
+fn times_taken(task: &Task, point: &Point) -> u64 {
+    let in_cycle = task.is_film() && matches!(point.role, Role::Sweep(_));
+    if in_cycle { task.points() as u64 } else { 1 }
+}
+
+/// VSYNC periods of the whole run, at `periods` a frame of each point.
+fn light_periods(periods: &[u64], task: &Task, film: Option<&FilmCheck>) -> u64 {
+    let points = periods.iter().zip(&task.schedule.points);
+    match film {
+        Some(film) => {
+            let dark = points.filter(|(_, point)| matches!(point.role, Role::Dark(_)));
+            let dark: u64 = dark.map(|(n, point)| n * u64::from(point.frames)).sum();
+            dark + film.cycles as u64 * u64::from(film.periods_per_cycle)
+        }
+        None => points.map(|(n, point)| n * u64::from(point.frames)).sum(),
+    }
 }
 
 /// VSYNC periods that each frame of a point takes.

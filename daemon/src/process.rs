@@ -7,6 +7,7 @@ use raysweep_session::Session;
 use raysweep_session::stack::ArrayName;
 
 use crate::config::{Plan, RigFile, append_argument};
+use crate::film;
 use crate::processing::Task;
 use crate::results;
 
@@ -37,9 +38,9 @@ pub enum ProcessError {
 pub struct Processed {
     /// The report.
     pub report: PathBuf,
-    /// Points of the sweep that went into it.
+    /// Points of the sweep, or cycles of the film, that went into it.
     pub stored: usize,
-    /// Points of the sweep.
+    /// All of them.
     pub points: usize,
     /// What could not be made, and why.
     pub problems: Vec<String>,
@@ -92,6 +93,18 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     for argument in &asked.products {
         append_argument(&mut processing.products, argument, &task.schedule, &task.geometry)
             .map_err(ProcessError::Product)?;
+    }
+    if task.is_film() {
+        let mut problems = film::process(&session, &task, state, &processing)?;
+        results::write_film_report(&session, state, &task, &problems)?;
+        results::write_manifest(&session, state, &task, &rig)?;
+        problems.append(&mut processing.problems);
+        return Ok(Processed {
+            report: session.report_path(),
+            stored: state.stored_points(),
+            points: shape.points,
+            problems,
+        });
     }
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let (products, problems) = processing.finish(&|| true);

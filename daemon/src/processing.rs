@@ -6,13 +6,14 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    Entry, Fold, Product, ProductSpec, Registry, RegistryError, Role, Schedule, Snapshot, Stage,
-    SweepGeometry, Unit, message_of, run_stages,
+    DemuxOptions, Entry, FilmSolver, Fold, Point, Product, ProductSpec, Registry, RegistryError, Role,
+    Schedule, Snapshot, Stage, SweepGeometry, Unit, message_of, run_stages,
 };
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::{ArrayName, Stack, crc32};
+use serde_json::Value;
 
-use crate::config::{ConfigError, Plan, RigFile};
+use crate::config::{ConfigError, Plan, PlanKind, RigFile};
 
 /// A plan on a rig: everything that acquisition and processing have in common.
 #[derive(Clone)]
@@ -49,7 +50,50 @@ impl Task {
         Self { plan, schedule, geometry }
     }
 
-    /// The stages, folds and products that the plan names.
+    /// Whether it is a film.
+    pub fn is_film(&self) -> bool {
+        self.plan.kind == PlanKind::Film
+    }
+
+    /// How many points it stores: the sweep's, or the film's cycles.
+    pub fn points(&self) -> usize {
+        if self.is_film() { self.plan.film.cycles as usize } else { self.schedule.sweep_len() }
+    }
+
+    /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
+    pub fn settings(&self) -> impl Iterator<Item = (u32, &Point)> {
+        (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, Role::Sweep(_)))
+    }
+
+    /// The options of `demux` as the plan states them.
+    ///
+    /// # Errors
+    /// When it has others.
+    pub fn demux_options(&self) -> Result<DemuxOptions, ConfigError> {
+        let Some(stage) = self.plan.stage.iter().find(|stage| stage.name == "demux") else {
+            return Ok(DemuxOptions::default());
+        };
+        serde_json::from_value(Value::Object(stage.options.clone())).map_err(|error| ConfigError {
+            message: format!("stage demux: {error}"),
+            field: Some("stage".into()),
+            span: None,
+        })
+    }
+
+    /// What makes transports of a film's cycles.
+    ///
+    /// # Errors
+    /// When delays and exposure make no model on this rig.
+    pub fn film_solver(&self) -> Result<FilmSolver, ConfigError> {
+        let made = FilmSolver::new(self.demux_options()?, &self.schedule, &self.geometry);
+        made.map_err(|error| ConfigError {
+            message: error.to_string(),
+            field: Some("film".into()),
+            span: None,
+        })
+    }
+
+    /// The stages, folds and products that the plan names; of a film, the stages alone.
     ///
     /// # Errors
     /// With the place in the plan's text of the stage or product that cannot be made.
@@ -64,6 +108,12 @@ impl Task {
                 .make(&stage.name, options, &self.schedule, &self.geometry)
                 .map_err(|error: RegistryError| refused(error.to_string()))?;
             match made {
+                Entry::Fold(fold) if self.is_film() && fold.name() != "demux" => {
+                    let name = fold.name();
+                    return Err(refused(format!("{name} is not for films: their only fold is demux")));
+                }
+                // Each cycle has a transport of its own, which no fold over the whole run makes.
+                Entry::Fold(_) if self.is_film() => {}
                 Entry::Fold(fold) if processing.folds.iter().any(|other| other.name() == fold.name()) => {
                     let name = fold.name();
                     return Err(refused(format!(
@@ -214,12 +264,14 @@ pub fn place(role: Role) -> (ArrayName, usize) {
     }
 }
 
-fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
+/// A stored point as the pipeline gave it.
+pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.attempt },
         frames: entry.frames,
         exposure_us: entry.exposure_us,
         delays_us: entry.delays_us.clone(),
+        last_exposure_ns: None,
         sum: std::sync::Arc::new(sum),
         counts: entry.counts.clone(),
     }

@@ -67,7 +67,7 @@ pub fn make(
     })
 }
 
-fn subtitle(state: &State, session: &Session) -> String {
+pub(crate) fn subtitle(state: &State, session: &Session) -> String {
     let entry = &state.session;
     let parts = [
         Some(entry.created.strftime("%Y-%m-%d %H:%M UTC").to_string()),
@@ -251,6 +251,28 @@ fn trust(state: &State, task: &Task, products: &[Product]) -> Section {
     if !figures.is_empty() {
         blocks.push(Block::Facts(figures));
     }
+    blocks.extend(accounts(state));
+    let deviation = |point: &PointEntry| {
+        let delay_us = point.delay_us;
+        point.delays_us.iter().map(move |true_us| true_us - delay_us).collect::<Vec<_>>()
+    };
+    blocks.push(Block::Plots(jitter(&state.stored(ArrayName::Sum).flat_map(deviation).collect::<Vec<_>>())));
+    if let Some(note) = regular_note(products) {
+        blocks.push(note);
+    }
+    let sweep = &task.plan.sweep;
+    Section {
+        title: "How far to trust it".into(),
+        intro: format!(
+            "Every frame is tied to the VSYNC edge of its light; a frame further than {:.0} µs from the wanted delay was taken again. The model uses the measured delays.",
+            sweep.max_jitter_us
+        ),
+        blocks,
+    }
+}
+
+/// Where the frames went, and what the VSYNC line was like.
+pub(crate) fn accounts(state: &State) -> Vec<Block> {
     let counts = &state.counts;
     let mut rows = vec![
         vec!["expected triggers".to_owned(), counts.expected.to_string()],
@@ -264,7 +286,7 @@ fn trust(state: &State, task: &Task, products: &[Product]) -> Section {
             .and_then(|value| value.as_str().map(|name| name.replace('_', " ")));
         rows.push(vec![format!("lost: {}", cause.unwrap_or_default()), frames.to_string()]);
     }
-    blocks.push(Block::Table(Table { headers: vec!["frames".into(), "count".into()], rows }));
+    let mut blocks = vec![Block::Table(Table { headers: vec!["frames".into(), "count".into()], rows })];
     if !counts.balanced() {
         blocks.push(Block::Note(
             NoteLevel::Error,
@@ -285,19 +307,7 @@ fn trust(state: &State, task: &Task, products: &[Product]) -> Section {
             .to_vec(),
         ));
     }
-    blocks.push(Block::Plots(jitter(state)));
-    if let Some(note) = regular_note(products) {
-        blocks.push(note);
-    }
-    let sweep = &task.plan.sweep;
-    Section {
-        title: "How far to trust it".into(),
-        intro: format!(
-            "Every frame is tied to the VSYNC edge of its light; a frame further than {:.0} µs from the wanted delay was taken again. The model uses the measured delays.",
-            sweep.max_jitter_us
-        ),
-        blocks,
-    }
+    blocks
 }
 
 /// A number with four decimals at the most.
@@ -306,14 +316,9 @@ fn short(value: f64) -> String {
 }
 
 /// How far the delays of single frames lay from those wanted: over time, and how often.
-fn jitter(state: &State) -> Vec<Plot> {
-    let deviation = |point: &PointEntry| {
-        let delay_us = point.delay_us;
-        point.delays_us.iter().map(move |true_us| true_us - delay_us).collect::<Vec<_>>()
-    };
-    let deviations_us: Vec<f64> = state.stored(ArrayName::Sum).flat_map(deviation).collect();
+pub(crate) fn jitter(deviations_us: &[f64]) -> Vec<Plot> {
     let mut histogram: BTreeMap<i64, f64> = BTreeMap::new();
-    for us in &deviations_us {
+    for us in deviations_us {
         *histogram.entry(us.round() as i64).or_default() += 1.0;
     }
     let plot = |title: &str, x: &str, y: &str, style, points| Plot {
@@ -326,7 +331,7 @@ fn jitter(state: &State) -> Vec<Plot> {
     vec![
         plot(
             "Delay of each frame, measured minus wanted",
-            "frame of the sweep",
+            "frame",
             "deviation / µs",
             SeriesStyle::Dots,
             deviations_us.iter().enumerate().map(|(index, &us)| (index as f64, us)).collect(),
@@ -356,7 +361,7 @@ fn regular_note(products: &[Product]) -> Option<Block> {
 }
 
 /// What the rig and the plan said, so that reports can be compared.
-fn settings(state: &State, task: &Task) -> Block {
+pub(crate) fn settings(state: &State, task: &Task) -> Block {
     let geometry = &task.geometry;
     let stages = task.plan.stage.iter().map(|stage| {
         let options: Vec<String> =

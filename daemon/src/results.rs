@@ -8,6 +8,7 @@ use raysweep_session::{Result, Session, manifest, transport};
 use serde_json::{Map, Value, json};
 
 use crate::config::RigFile;
+use crate::film;
 use crate::processing::Task;
 use crate::report;
 
@@ -113,7 +114,7 @@ fn model(products: &[Product]) -> Map<String, Value> {
 }
 
 /// What every product says of itself.
-fn common(task: &Task) -> Map<String, Value> {
+pub(crate) fn common(task: &Task) -> Map<String, Value> {
     let geometry = &task.geometry;
     let prior = task.plan.stage.iter().find(|stage| stage.name == "demux");
     let entries = [
@@ -153,6 +154,15 @@ pub fn write_report(
     problems: &[String],
 ) -> Result<()> {
     let page = report::make(session, state, task, products, problems)?.to_html()?;
+    raysweep_session::durable::write(&session.report_path(), page.as_bytes())
+}
+
+/// Writes the report of a film.
+///
+/// # Errors
+/// When its transports cannot be read or the disk refuses.
+pub fn write_film_report(session: &Session, state: &State, task: &Task, problems: &[String]) -> Result<()> {
+    let page = film::make_report(session, state, task, problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())
 }
 

@@ -18,6 +18,8 @@ pub struct SimConfig {
     pub scene_columns: usize,
     /// Seeds everything that is random: the same seed gives the same bits.
     pub seed: u64,
+    /// Time in which a built-in scene that moves goes there and back, 0.1..=1e6.
+    pub motion_period_s: f64,
     /// Pace by the host's clock instead of as fast as it can.
     pub realtime: bool,
     /// `[sim.projector]`
@@ -39,6 +41,7 @@ impl Default for SimConfig {
             scene_rows: 128,
             scene_columns: 128,
             seed: 1,
+            motion_period_s: 4.0,
             realtime: false,
             projector: SimProjector::default(),
             vsync: SimVsync::default(),

@@ -10,6 +10,10 @@ use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, Shutter, ns_from_
 use crate::config::{SimCamera, SimProjector, SimVsync};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::optics::Optics;
+use crate::scene::Motion;
+
+/// What the projector shows: the scene under its pattern, in each key position of the scene's motion.
+pub type Shown = Arc<[Arc<Optics>]>;
 
 /// One frame of the projector: when its edge was and what it shows (`None`: dark).
 #[derive(Clone)]
@@ -45,6 +49,7 @@ pub struct LineConfig {
     pub vsync: SimVsync,
     pub projector: SimProjector,
     pub camera: SimCamera,
+    pub motion: Motion,
     /// From the end of row 0's exposure until the last row is read.
     pub readout_ns: i64,
     /// From the end of row 0's exposure to the end of the last row's.
@@ -65,9 +70,9 @@ pub struct Line {
     pending: VecDeque<PendingEdge>,
     /// Light of the recent periods and of the one ahead.
     lights: VecDeque<Light>,
-    shown: Option<Arc<Optics>>,
+    shown: Option<Shown>,
     /// What the projector will show from an edge on.
-    next_shown: Option<(i64, Option<Arc<Optics>>)>,
+    next_shown: Option<(i64, Option<Shown>)>,
     seen: VecDeque<Edge>,
     edges: u64,
     camera: CameraLine,
@@ -89,14 +94,32 @@ enum EdgeKind {
 
 struct CameraLine {
     armed: bool,
-    busy_until_ns: i64,
+    /// Triggers before this are not heard.
+    deaf_until_ns: i64,
+    /// No exposure may start before this.
+    occupied_until_ns: i64,
     id: SettingsId,
     in_force: CameraSettings,
-    written: Option<(u32, CameraSettings)>,
+    /// Settings on their way into the sensor, each with the first frame that will have them, in that order.
+    written: VecDeque<(u64, CameraSettings)>,
     /// Triggers answered since the settings were written.
     frames: u64,
     seq: u64,
     exposures: VecDeque<Exposure>,
+}
+
+impl CameraLine {
+    /// The settings of the next frame to be triggered.
+    fn due(&self) -> CameraSettings {
+        let due = self.written.iter().rev().find(|(first_seq, _)| *first_seq <= self.seq);
+        due.map_or(self.in_force, |(_, settings)| *settings)
+    }
+
+    /// Whether an edge at `edge_ns` would be answered.
+    fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
+        let start_ns = edge_ns + ns_from_us(latency_us + self.due().trigger_delay_us);
+        edge_ns >= self.deaf_until_ns && start_ns >= self.occupied_until_ns
+    }
 }
 
 /// What really happened, for tests alone.
@@ -137,10 +160,11 @@ impl Line {
             edges: 0,
             camera: CameraLine {
                 armed: false,
-                busy_until_ns: 0,
+                deaf_until_ns: 0,
+                occupied_until_ns: 0,
                 id: SettingsId { point: u32::MAX, attempt: 0 },
                 in_force: idle,
-                written: None,
+                written: VecDeque::new(),
                 frames: 0,
                 seq: 0,
                 exposures: VecDeque::new(),
@@ -183,7 +207,8 @@ impl Line {
     /// resumed one.
     fn draw_period(&mut self) {
         let nominal_ns = self.nominal_ns(self.next_period);
-        let ready = self.camera.busy_until_ns <= (nominal_ns - GUARD_NS).max(self.configured_ns);
+        let asked_ns = (nominal_ns - GUARD_NS).max(self.configured_ns);
+        let ready = self.camera.is_ready(asked_ns, self.config.camera.trigger_latency_us);
         if ready != self.was_ready {
             (self.was_ready, self.draws) = (ready, 0);
         }
@@ -207,7 +232,8 @@ impl Line {
         if let Some((_, shown)) = self.next_shown.take_if(|(from, _)| *from <= self.next_period) {
             self.shown = shown;
         }
-        self.lights.push_back(Light { edge_ns, start_ns: edge_ns + phase_ns, optics: self.shown.clone() });
+        let optics = self.shown.as_ref().map(|keys| keys[self.config.motion.key(nominal_ns)].clone());
+        self.lights.push_back(Light { edge_ns, start_ns: edge_ns + phase_ns, optics });
         let kind = match (missing, unseen) {
             (true, _) => EdgeKind::Missing,
             (false, true) => EdgeKind::Unseen,
@@ -251,27 +277,22 @@ impl Line {
 
     /// Whether the camera answered.
     fn trigger(&mut self, edge_ns: i64) -> bool {
+        let config = &self.config;
         let camera = &mut self.camera;
-        if !camera.armed || camera.busy_until_ns > edge_ns {
+        if !camera.armed || !camera.is_ready(edge_ns, config.camera.trigger_latency_us) {
             return false;
         }
-        match &mut camera.written {
-            Some((0, settings)) => {
-                camera.in_force = *settings;
-                camera.written = None;
-            }
-            Some((frames_left, _)) => *frames_left -= 1,
-            None => {}
-        }
-        let config = &self.config;
+        camera.in_force = camera.due();
+        let seq = camera.seq;
+        camera.written.retain(|(first_seq, _)| *first_seq > seq);
         let settings = camera.in_force;
         let start_ns = edge_ns + ns_from_us(config.camera.trigger_latency_us + settings.trigger_delay_us);
         let exposure_ns = ns_from_us(settings.exposure_us);
         let key = [u64::from(camera.id.point), u64::from(camera.id.attempt), camera.frames];
         let delivered = uniform(&mut keyed(config.seed, Purpose::Drop, &key)) >= config.camera.dropped;
-        camera.busy_until_ns = match config.camera.readout {
-            Readout::Sequential => start_ns + exposure_ns + config.readout_ns,
-            Readout::Overlapped => start_ns + exposure_ns.max(config.readout_ns),
+        (camera.deaf_until_ns, camera.occupied_until_ns) = match config.camera.readout {
+            Readout::Sequential => (start_ns + exposure_ns + config.readout_ns, 0),
+            Readout::Overlapped => (start_ns, start_ns + exposure_ns.max(config.readout_ns)),
         };
         let done_ns = start_ns + exposure_ns + config.rolling_ns.max(config.readout_ns);
         if camera.exposures.len() == CAMERA_BUFFERS {
@@ -299,9 +320,12 @@ impl Line {
         } else {
             config.camera.late_frames_max
         };
+        let first_seq = self.camera.seq + u64::from(late);
         self.camera.id = id;
         self.camera.frames = 0;
-        self.camera.written = Some((late, settings));
+        // Registers are read in the order in which they were written: the latest word stands.
+        self.camera.written.retain(|(earlier_seq, _)| *earlier_seq < first_seq);
+        self.camera.written.push_back((first_seq, settings));
         self.redraw(now_ns);
         self.camera.seq
     }
@@ -355,10 +379,10 @@ impl Line {
     }
 
     /// Shows something else (`None`: dark); returns from when on it is in the light.
-    pub fn show(&mut self, now_ns: i64, optics: Option<Arc<Optics>>) -> i64 {
+    pub fn show(&mut self, now_ns: i64, shown: Option<Shown>) -> i64 {
         self.advance(now_ns);
         let from_period = self.next_period + i64::from(self.config.projector.video_latency_frames);
-        self.next_shown = Some((from_period, optics));
+        self.next_shown = Some((from_period, shown));
         self.nominal_ns(from_period)
     }
 }

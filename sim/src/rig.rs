@@ -9,9 +9,9 @@ use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shu
 use crate::config::SimConfig;
 use crate::devices::{self, Devices};
 use crate::keyed::{Purpose, keyed, uniform};
-use crate::line::{Exposure, Line, LineConfig};
+use crate::line::{Exposure, Line, LineConfig, Shown};
 use crate::optics::{self, Optics};
-use crate::scene::{Scene, SceneError, SceneSize};
+use crate::scene::{Motion, Scene, SceneError, SceneSize};
 use crate::sensor::{Scale, Sensor};
 
 /// Why a simulated rig cannot be built.
@@ -116,12 +116,14 @@ pub struct PlaneRig {
 pub(crate) struct Bench {
     pub config: SimConfig,
     setup: PlaneSetup,
-    scene: Scene,
+    /// The scene in each key position of its motion; all of one size.
+    scenes: Vec<Scene>,
+    motion: Motion,
     first_row: usize,
     pub size: (usize, usize),
     pub format: PixelFormat,
     pub sensor: Sensor,
-    white: OnceLock<Arc<Optics>>,
+    white: OnceLock<Shown>,
 }
 
 impl PlaneRig {
@@ -131,20 +133,22 @@ impl PlaneRig {
     /// When the scene cannot be read or a key is out of range; the message names the key.
     pub fn new(config: SimConfig, setup: PlaneSetup, folder: &Path) -> Result<Self, SimError> {
         check_ranges(&config)?;
-        let scene = if config.scene.extension().is_some_and(|extension| extension == "npz") {
-            Scene::load(&folder.join(&config.scene))?
+        let scenes = if config.scene.extension().is_some_and(|extension| extension == "npz") {
+            vec![Scene::load(&folder.join(&config.scene))?]
         } else {
             let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
-            Scene::builtin(&config.scene.to_string_lossy(), size, config.seed)?
+            Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?
         };
-        let first_row = optics::first_scene_row(&setup.raster, &scene, setup.row_pitch, setup.first_row)?;
-        let size = scene.size();
+        let motion = Motion::new(scenes.len(), config.motion_period_s);
+        let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
+        let size = scenes[0].size();
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
         let sensor = Sensor::new(&config.sensor, size, scale, config.seed);
         let bench = Bench {
             config,
             setup,
-            scene,
+            scenes,
+            motion,
             first_row,
             size,
             format: setup.format,
@@ -155,9 +159,14 @@ impl PlaneRig {
         Ok(Self { bench: Arc::new(bench) })
     }
 
-    /// The scene: the truth that a recovery is held against.
+    /// The scene, at time zero where it moves: the truth that a recovery is held against.
     pub fn scene(&self) -> &Scene {
-        &self.bench.scene
+        self.scene_at(0)
+    }
+
+    /// The scene as it is in the frame of light that begins at a time of the devices' clock.
+    pub fn scene_at(&self, time_ns: i64) -> &Scene {
+        &self.bench.scenes[self.bench.motion.key(time_ns)]
     }
 
     /// Projector row that camera row 0 sees.
@@ -187,7 +196,21 @@ impl PlaneRig {
     /// # Errors
     /// Never for a rig that was built; kept so that no caller has to trust that.
     pub fn noise_free(&self, delay_us: f64, exposure_us: f64) -> Result<Array2<f32>, SimError> {
-        let optics = self.bench.optics_of(&Pattern::White)?;
+        self.noise_free_at(0, delay_us, exposure_us)
+    }
+
+    /// [`Self::noise_free`] in the frame of light that begins at a time of the devices' clock.
+    ///
+    /// # Errors
+    /// Those of [`Self::noise_free`].
+    pub fn noise_free_at(
+        &self,
+        time_ns: i64,
+        delay_us: f64,
+        exposure_us: f64,
+    ) -> Result<Array2<f32>, SimError> {
+        let shown = self.bench.optics_of(&Pattern::White)?;
+        let optics = &shown[self.bench.motion.key(time_ns)];
         let start_us = self.bench.setup.raster.row_centre_us(self.first_row()) + delay_us - exposure_us / 2.0;
         let mut image = Array2::zeros(self.bench.size);
         for (t, mut row) in image.rows_mut().into_iter().enumerate() {
@@ -201,13 +224,16 @@ impl PlaneRig {
 }
 
 impl Bench {
-    pub fn optics_of(&self, pattern: &Pattern) -> Result<Arc<Optics>, SimError> {
+    pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
         let rows = self.setup.raster.rows;
         let build = |weights: &[f32]| {
             let mosaic = self.format.is_mosaic();
             let (raster, projector) = (&self.setup.raster, &self.config.projector);
-            Optics::new(&self.scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)
-                .map(Arc::new)
+            let optics = |scene| {
+                Optics::new(scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)
+                    .map(Arc::new)
+            };
+            self.scenes.iter().map(optics).collect::<Result<Shown, SimError>>()
         };
         match pattern {
             Pattern::White => {
@@ -280,6 +306,7 @@ impl Bench {
             vsync: self.config.vsync.clone(),
             projector: self.config.projector.clone(),
             camera: self.config.camera.clone(),
+            motion: self.motion,
             readout_ns: ns_from_us(self.readout_us()),
             rolling_ns: ns_from_us(self.size.0.saturating_sub(1) as f64 * self.setup.camera_row_time_us),
         }
@@ -311,6 +338,7 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("sensor.adc_bits", f64::from(config.sensor.adc_bits), "1 to 12"),
         ("camera.late_frames_max", f64::from(config.camera.late_frames_max), "0 to 100"),
         ("ambient.level", config.ambient.level, not_negative),
+        ("motion_period_s", config.motion_period_s, "0.1 to 1e6"),
         ("ambient.flicker_hz", config.ambient.flicker_hz, "more than 0"),
     ];
     for (key, value, allowed) in rules {
@@ -319,6 +347,7 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
             "0.001 to 1000" => 0.001..=1000.0,
             "0 to 100" => 0.0..=100.0,
             "1 to 12" => 1.0..=12.0,
+            "0.1 to 1e6" => 0.1..=1e6,
             "more than 0" => f64::MIN_POSITIVE..=f64::MAX,
             _ => 0.0..=f64::MAX,
         };

@@ -76,6 +76,8 @@ def check_stack(faults, session, header, entries):
         "dark": ((shape["exposures"], *frame), ("exposure", "t", "s")),
         "regular": ((1, *frame), ("frame", "t", "s")),
     }
+    if header["kind"] == "film":
+        expected = {"dark": expected["dark"]}
     faults.equal(sorted(group.array_keys()), sorted(expected), "arrays of stack.zarr")
     faults.equal(group.attrs["kind"], header["kind"], "kind of stack.zarr")
     stored = {(entry["array"], entry["index"]): entry for entry in entries if entry["event"] == "point"}
@@ -182,6 +184,34 @@ def check_manifest(faults, session, header):
         faults.equal(hashlib.sha256(content).hexdigest(), record["sha256"], f"checksum of {name}")
 
 
+def check_film(faults, session, header, entries):
+    """Shapes, types, names of axes, the checksum of every stored cycle, and a transport for each."""
+    film = zarr.open_group(session / "film.zarr", mode="r", zarr_format=3)["film"]
+    transport = zarr.open_group(session / "transport_film.zarr", mode="r", zarr_format=3)["transport"]
+    shape = header["shape"]
+    frame = (shape["rows"], shape["columns"])
+    faults.equal(film.shape, (shape["points"], shape["settings"], *frame), "shape of film")
+    faults.equal(film.dtype, np.dtype("uint16"), "type of film")
+    faults.equal(film.metadata.dimension_names, ("cycle", "setting", "t", "s"), "axes of film")
+    depth = transport.attrs["u_max"] - transport.attrs["u_min"] + 1
+    faults.equal(transport.shape, (shape["points"], depth, *frame), "shape of the film's transport")
+    faults.equal(transport.dtype, np.dtype("float32"), "type of the film's transport")
+    faults.equal(transport.metadata.dimension_names, ("cycle", "u", "t", "s"), "axes of the film's transport")
+    for name, array in (("film", film), ("transport", transport)):
+        faults.equal(array.shards[0], 1, f"cycles in a shard of {name}")
+    cycles = {entry["cycle"]: entry for entry in entries if entry["event"] == "cycle"}
+    faults.check(cycles, "no cycle is stored")
+    for cycle in range(shape["points"]):
+        estimate = transport[cycle]
+        if cycle not in cycles:
+            faults.check(np.isnan(estimate).all(), f"transport of cycle {cycle}, which is not stored")
+            continue
+        crc32 = zlib.crc32(film[cycle].astype("<u2").tobytes())
+        faults.equal(crc32, cycles[cycle]["crc32"], f"checksum of cycle {cycle}")
+        faults.equal(len(cycles[cycle]["delays_us"]), shape["settings"], f"delays of cycle {cycle}")
+        faults.check(np.isfinite(estimate).all() and (estimate >= 0).all(), f"transport of cycle {cycle}")
+
+
 class ReportParser(HTMLParser):
     """Finds what a report would load from elsewhere."""
 
@@ -211,8 +241,11 @@ def check_session(session):
     entries = read_ledger(session)
     header = check_ledger(faults, entries)
     check_stack(faults, session, header, entries)
-    products = check_products(faults, session)
-    check_transport(faults, session, header, products)
+    if header["kind"] == "film":
+        check_film(faults, session, header, entries)
+    else:
+        products = check_products(faults, session)
+        check_transport(faults, session, header, products)
     check_manifest(faults, session, header)
     check_report(faults, session)
     return faults

@@ -61,7 +61,14 @@ fn observe(faults: &str) -> (Counts, Truth) {
             counts.add(&account);
         });
     };
-    push(Event::Begin(Job { id, frames: FRAMES + 1, applied, delay_us, light_edges_later: 0 }));
+    push(Event::Begin(Job {
+        id,
+        frames: FRAMES + 1,
+        applied,
+        delay_us,
+        light_edges_later: 0,
+        periods_from_last: None,
+    }));
     let mut last_seq = 0;
     for _ in 0..FRAMES {
         let mut data = pool.take();

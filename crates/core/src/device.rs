@@ -29,7 +29,7 @@ pub enum Readout {
 pub struct SettingsId {
     /// Ordinal of the point in the order of acquisition.
     pub point: u32,
-    /// 0 for the first attempt.
+    /// 0 for the first attempt; a film begins each of its points once a cycle, so there it is the cycle's number.
     pub attempt: u32,
 }
 
@@ -115,11 +115,22 @@ impl CameraCapabilities {
 
     /// How many VSYNC periods lie between two triggers that the camera can answer under these settings.
     pub fn periods_per_frame(&self, settings: &CameraSettings, period_us: f64) -> u32 {
-        let exposed_us = match self.readout {
-            Readout::Sequential => settings.exposure_us + self.readout_us,
-            Readout::Overlapped => settings.exposure_us.max(self.readout_us),
+        self.periods_between(settings, settings, period_us)
+    }
+
+    /// How many VSYNC periods after the trigger of a frame under `settings` the camera can answer the trigger of one
+    /// under `next`.
+    pub fn periods_between(&self, settings: &CameraSettings, next: &CameraSettings, period_us: f64) -> u32 {
+        let start_us = self.trigger_latency_us + settings.trigger_delay_us;
+        let busy_us = match self.readout {
+            Readout::Sequential => start_us + settings.exposure_us + self.readout_us,
+            // A trigger may come during the readout, as long as the exposure that it starts comes late enough; the
+            // delay of one trigger is over before the next is heard.
+            Readout::Overlapped => {
+                let next_start_us = self.trigger_latency_us + next.trigger_delay_us;
+                (start_us + settings.exposure_us.max(self.readout_us) - next_start_us).max(start_us)
+            }
         };
-        let busy_us = self.trigger_latency_us + settings.trigger_delay_us + exposed_us;
         (busy_us / period_us).ceil().max(1.0) as u32
     }
 }

@@ -8,6 +8,7 @@ mod clock;
 mod counts;
 mod device;
 mod error;
+mod film;
 mod frame;
 mod pixel;
 mod raster;
@@ -20,6 +21,7 @@ pub use device::{
     Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
+pub use film::{FilmSummary, Percentiles};
 pub use frame::{Edge, Frame, FrameBuf, FramePool, FrameStamp};
 pub use pixel::{PixelError, PixelFormat};
 pub use raster::{Raster, Trigger};

@@ -26,6 +26,9 @@ pub struct Job {
     pub delay_us: f64,
     /// Which edge's light is measured: the trigger's own (0) or a later one.
     pub light_edges_later: u32,
+    /// In a film, VSYNC periods from the trigger of the job before to this one's first; nothing after a pause and
+    /// where jobs stand alone.
+    pub periods_from_last: Option<u32>,
 }
 
 /// What a frame is taken for, before it is known whether it is sound.
@@ -54,8 +57,8 @@ pub enum Event {
     Begin(Job),
     /// A frame.
     Frame(Frame, Label),
-    /// A frame that there was no room for; without a cause, one that no point waited for.
-    Lost(FrameStamp, Option<LossCause>),
+    /// The id of a frame that there was no room for, or that never came; without a cause, one that no point waited for.
+    Lost(u64, Option<LossCause>),
     /// The attempt is over: complete, or given up.
     End,
     /// Nobody takes frames for a while: those that pass are nobody's loss.
@@ -102,6 +105,8 @@ pub struct Assembler {
     tracker: EdgeTracker,
     waiting: VecDeque<Waiting>,
     attempt: Option<Attempt>,
+    /// Of the attempt before.
+    chain: Chain,
     outside: Counts,
     last_seq: Option<u64>,
     /// Whether frames may have passed that nobody asked for.
@@ -114,7 +119,7 @@ pub struct Assembler {
 enum Waiting {
     Begin(Job),
     Frame(Frame, Label),
-    Lost(FrameStamp, Option<LossCause>),
+    Lost(u64, Option<LossCause>),
     End,
     Idle,
     Flush,
@@ -126,9 +131,19 @@ struct Attempt {
     averaged: u32,
     delays_us: Vec<f64>,
     counts: Counts,
-    /// The last frame that was tied to an edge, and frames since then that were triggered by none.
+    last_exposure_ns: Option<i64>,
+    chain: Chain,
+}
+
+/// Follows the triggers from frame to frame, so that those that no frame answered show.
+#[derive(Default)]
+struct Chain {
+    /// The last frame that was tied to an edge.
     tied: Option<(u64, TrueEdge)>,
+    /// Frames since then that were triggered by no true edge.
     untied: i64,
+    /// Periods that changes of settings have taken since then, beyond those of the frames.
+    extra_periods: i64,
 }
 
 /// The light of a frame, or why it does not count.
@@ -149,6 +164,7 @@ impl Assembler {
             tracker: EdgeTracker::new(line),
             waiting: VecDeque::new(),
             attempt: None,
+            chain: Chain::default(),
             outside: Counts::default(),
             last_seq: None,
             idle: true,
@@ -169,7 +185,7 @@ impl Assembler {
                 self.newest_ns = self.newest_ns.max(frame.stamp.host_ns);
                 self.waiting.push_back(Waiting::Frame(frame, label));
             }
-            Event::Lost(stamp, cause) => self.waiting.push_back(Waiting::Lost(stamp, cause)),
+            Event::Lost(seq, cause) => self.waiting.push_back(Waiting::Lost(seq, cause)),
             Event::End => self.waiting.push_back(Waiting::End),
             Event::Idle => self.waiting.push_back(Waiting::Idle),
             Event::Flush => self.waiting.push_back(Waiting::Flush),
@@ -192,14 +208,11 @@ impl Assembler {
     ) -> Option<Waiting> {
         match item {
             Waiting::Begin(job) => self.begin(job),
-            Waiting::Lost(stamp, cause) => {
-                self.follow(stamp.seq);
+            Waiting::Lost(seq, cause) => {
+                self.follow(seq);
                 match cause {
                     Some(cause) => self.counts().lose(cause, 1),
                     None => self.counts().cancelled += 1,
-                }
-                if let Some(attempt) = &mut self.attempt {
-                    attempt.untied += 1;
                 }
             }
             Waiting::Frame(frame, Label::Counted) => match self.judge(&frame.stamp, flushing) {
@@ -216,7 +229,8 @@ impl Assembler {
                 }
             }
             Waiting::End => {
-                if let Some(attempt) = self.attempt.take() {
+                if let Some(mut attempt) = self.attempt.take() {
+                    self.chain = std::mem::take(&mut attempt.chain);
                     decide(attempt.finish());
                 }
             }
@@ -234,15 +248,25 @@ impl Assembler {
     }
 
     fn begin(&mut self, job: Job) {
+        let mut chain = std::mem::take(&mut self.chain);
+        match job.periods_from_last {
+            Some(periods) => chain.extra_periods += i64::from(periods) - self.periods_per_frame(&job),
+            None => chain = Chain::default(),
+        }
         self.attempt = Some(Attempt {
             job,
             sum: Array2::zeros((self.config.camera.height, self.config.camera.width)),
             averaged: 0,
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
-            tied: None,
-            untied: 0,
+            last_exposure_ns: None,
+            chain,
         });
+    }
+
+    fn periods_per_frame(&self, job: &Job) -> i64 {
+        let Raster { period_us, .. } = self.config.raster;
+        i64::from(self.config.camera.periods_per_frame(&job.applied.actual, period_us))
     }
 
     /// The account that the present belongs to.
@@ -309,17 +333,24 @@ impl Assembler {
     /// Adds a sound frame to the sum, or notes why it does not count.
     fn count(&mut self, frame: &Frame, verdict: Verdict) {
         self.follow(frame.stamp.seq);
+        let Some(periods_per_frame) =
+            self.attempt.as_ref().map(|attempt| self.periods_per_frame(&attempt.job))
+        else {
+            return;
+        };
         let Some(attempt) = &mut self.attempt else { return };
-        let settings = &attempt.job.applied.actual;
-        let periods_per_frame = self.config.camera.periods_per_frame(settings, self.config.raster.period_us);
         let (trigger, sound) = match verdict {
             Verdict::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
             Verdict::Unsound { trigger, cause } => (trigger, Err(cause)),
             Verdict::Undecided => return,
         };
         match trigger {
-            Some(edge) => attempt.tie(frame.stamp.seq, edge, i64::from(periods_per_frame)),
-            None => attempt.untied += 1,
+            Some(edge) => {
+                let unanswered = attempt.chain.tie(frame.stamp.seq, edge, periods_per_frame);
+                attempt.counts.expected += unanswered;
+                attempt.counts.lose(LossCause::MissedTrigger, unanswered);
+            }
+            None => attempt.chain.untied += 1,
         }
         let summed = sound.and_then(|delay_us| {
             frame.format.unpack_into(&frame.data, &mut self.pixels).map(|()| delay_us).map_err(|error| {
@@ -332,6 +363,7 @@ impl Assembler {
             Ok(delay_us) => {
                 attempt.averaged += 1;
                 attempt.delays_us.push(delay_us);
+                attempt.last_exposure_ns = Some(frame.stamp.exposure_start_ns);
                 attempt.sum.iter_mut().zip(&self.pixels).for_each(|(sum, &pixel)| *sum += u32::from(pixel));
             }
             Err(cause) => attempt.counts.lose(cause, 1),
@@ -339,20 +371,18 @@ impl Assembler {
     }
 }
 
-impl Attempt {
-    /// Notes which triggers stayed unanswered since the last frame that was tied to an edge.
-    fn tie(&mut self, seq: u64, edge: TrueEdge, periods_per_frame: i64) {
-        if let Some((last_seq, last_edge)) = self.tied {
-            let answered = i64::try_from(seq.saturating_sub(last_seq)).unwrap_or(i64::MAX) - self.untied;
-            let unanswered = (edge.index - last_edge.index) - answered * periods_per_frame;
-            let unanswered = u64::try_from(unanswered).unwrap_or(0);
-            self.counts.expected += unanswered;
-            self.counts.lose(LossCause::MissedTrigger, unanswered);
-        }
-        self.tied = Some((seq, edge));
-        self.untied = 0;
+impl Chain {
+    /// How many triggers stayed unanswered since the last frame that was tied to an edge.
+    fn tie(&mut self, seq: u64, edge: TrueEdge, periods_per_frame: i64) -> u64 {
+        let last = std::mem::replace(self, Self { tied: Some((seq, edge)), ..Self::default() });
+        let Some((last_seq, last_edge)) = last.tied else { return 0 };
+        let answered = i64::try_from(seq.saturating_sub(last_seq)).unwrap_or(i64::MAX) - last.untied;
+        let taken = answered.saturating_mul(periods_per_frame).saturating_add(last.extra_periods);
+        u64::try_from((edge.index - last_edge.index).saturating_sub(taken)).unwrap_or(0)
     }
+}
 
+impl Attempt {
     fn finish(mut self) -> Decision {
         self.counts.averaged = u64::from(self.averaged);
         if self.averaged < self.job.frames {
@@ -365,6 +395,7 @@ impl Attempt {
             frames: self.averaged,
             exposure_us: self.job.applied.actual.exposure_us,
             delays_us: self.delays_us,
+            last_exposure_ns: self.last_exposure_ns,
             sum: Arc::new(self.sum),
             counts: self.counts,
         })

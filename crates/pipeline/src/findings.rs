@@ -30,6 +30,8 @@ pub struct Findings {
     pub left_out_us: Vec<(f64, f64)>,
     /// What was found, as a key and a sentence each.
     pub remarks: Vec<(&'static str, String)>,
+    /// What makes the result worse than it looks.
+    pub warnings: Vec<String>,
 }
 
 /// A stack made ready for the solver.
@@ -59,10 +61,12 @@ pub fn prepare(
         u0_rows: 0.0,
         left_out_us: Vec::new(),
         remarks: Vec::new(),
+        warnings: Vec::new(),
     };
     leave_out(geometry, stack, &mut findings)?;
     let planned = planned.with_settings(stack.settings.clone())?;
-    let demux = match calibrate(&planned, options, geometry, stack, &mut findings) {
+    let coupled = couple(options, stack, &mut findings)?;
+    let demux = match calibrate(&planned, options, geometry, stack, coupled.as_ref(), &mut findings) {
         Ok(demux) => demux,
         Err(error) => {
             findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
@@ -71,23 +75,32 @@ pub fn prepare(
     };
     stack.timing = demux.timing().clone();
     stack.prior = demux.prior();
-    let coupled = couple(options, stack, &mut findings)?;
     Ok(Prepared { demux, coupled, findings })
 }
 
-/// Estimates the optics and chooses the prior.
+/// Estimates the optics from the images as they were taken, and chooses the prior for those that are solved.
 fn calibrate(
     planned: &Demux,
     options: &DemuxOptions,
     geometry: &SweepGeometry,
     stack: &SweepStack,
+    coupled: Option<&Array3<f32>>,
     findings: &mut Findings,
 ) -> Result<Demux, CalibrateError> {
     let valid = stack.valid.as_ref().map(|valid| valid.view());
-    let sample = Sample::new(stack.timing.clone(), stack.settings.clone(), stack.images.view(), valid)?;
+    let sample_of = |images: &Array3<f32>| {
+        Sample::new(stack.timing.clone(), stack.settings.clone(), images.view(), valid)
+    };
+    let sample = sample_of(&stack.images)?;
     let OpticsEstimate { mut optics, beam, spike } = estimate_optics(&sample, geometry.beam_sigma_rows)?;
+    if beam.is_some() && optics.beam_sigma_rows > 0.0 {
+        findings.warnings.push(format!(
+            "the beam's width, {:.2} rows, was estimated from this scene, and light that spreads by about a row under the surface looks the same: measure it once on a matt white surface and state it as projector.beam_sigma_rows in the rig file",
+            optics.beam_sigma_rows
+        ));
+    }
+    findings.remarks.push(("beam", say_beam(beam.as_ref(), optics.beam_sigma_rows)));
     let sigma_rows = optics.beam_sigma_rows;
-    findings.remarks.push(("beam", say_beam(beam.as_ref(), sigma_rows)));
     let beam = Beam::of_sigma(sigma_rows);
     let mut demux = planned.with_timing(stack.timing.clone().with_beam(beam)?)?;
     findings.beam_sigma_rows = sigma_rows;
@@ -120,7 +133,9 @@ fn calibrate(
             let default = findings.prior;
             let others = candidates().into_iter().filter(|prior| *prior != default);
             let compared: Vec<Prior> = std::iter::once(default).chain(others).collect();
-            match choose_prior(&sample, &optics, &compared) {
+            // Noise asks for smoothness, and coupling has taken most of it.
+            let solved = coupled.map_or(Ok(sample), sample_of);
+            match solved.and_then(|solved| choose_prior(&solved, &optics, &compared)) {
                 Ok(choice) => {
                     findings.prior = choice.prior();
                     let reason = choice.reason();

@@ -6,6 +6,7 @@
 mod assembler;
 mod demux;
 mod edges;
+mod film;
 mod findings;
 mod pipeline;
 mod products;
@@ -18,6 +19,7 @@ mod unit;
 pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
 pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
 pub use edges::{EdgeTracker, Line};
+pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
 pub use products::{NotMade, ProductError, ProductSpec, Profile, SweepStack};

@@ -16,6 +16,8 @@ pub struct Unit {
     pub exposure_us: f64,
     /// True t_d of each frame, measured against the VSYNC edge of its light.
     pub delays_us: Vec<f64>,
+    /// Start of the exposure of row 0 in the last frame, on the host's clock; nothing in a unit that is read back.
+    pub last_exposure_ns: Option<i64>,
     /// Sum of counts, `[t, s]`.
     pub sum: Arc<Array2<u32>>,
     /// Where the attempt's triggers went.

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use raysweep_core::{Counts, VsyncStats};
+use raysweep_core::{Counts, FilmSummary, VsyncStats};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -94,6 +94,71 @@ fn vsync_schema(_: &mut SchemaGenerator) -> Schema {
     })
 }
 
+fn film_schema(_: &mut SchemaGenerator) -> Schema {
+    let cycles = json_schema!({ "type": "integer", "minimum": 0 });
+    json_schema!({
+        "type": ["object", "null"],
+        "description": "A film's account: cycles planned = stored + incomplete + those not taken.",
+        "properties": {
+            "cycles_planned": cycles,
+            "cycles_stored": cycles,
+            "cycles_incomplete": cycles,
+            "transports": cycles,
+            "transports_missing": cycles,
+            "sliding_estimates": cycles,
+            "cycles_per_s": { "type": ["number", "null"] },
+            "latency_ms": {
+                "type": ["object", "null"],
+                "description": "Percentiles p50, p95, p99 and max: from the end of a cycle's last exposure to its transport.",
+                "additionalProperties": { "type": "number" },
+            },
+        },
+        "required": [
+            "cycles_planned", "cycles_stored", "cycles_incomplete", "transports", "transports_missing",
+            "sliding_estimates", "cycles_per_s", "latency_ms",
+        ],
+    })
+}
+
+/// An estimate of the light transport during a film; the images themselves are not in it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct FilmEstimate {
+    /// The cycle that its newest frame belongs to, counted from 0.
+    pub cycle: u32,
+    /// Whether it is made of the newest frame of each setting rather than of one cycle: published, not stored.
+    pub sliding: bool,
+    /// Start of its oldest exposure, in seconds after that of the film's first.
+    pub start_s: f64,
+    /// From the end of its newest exposure to its publication; nothing on a virtual clock.
+    pub latency_ms: Option<f64>,
+    /// Time that the solver took.
+    pub solve_ms: f64,
+    /// Mean over all pixels of the light from the pixel's own projector row, 1 = white.
+    pub epipolar: f64,
+    /// The same of the light from all other rows.
+    pub non_epipolar: f64,
+    /// The film so far.
+    #[schemars(schema_with = "film_schema")]
+    pub film: FilmSummary,
+}
+
+/// What `check` says of a film.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct FilmCheck {
+    /// Settings of a cycle.
+    pub settings: usize,
+    /// Cycles.
+    pub cycles: usize,
+    /// VSYNC periods that a cycle takes on this camera.
+    pub periods_per_cycle: u32,
+    /// Light transports a second, if the machine keeps up.
+    pub transports_per_s: f64,
+    /// Disk space that a minute takes, uncompressed.
+    pub disk_bytes_per_minute: u64,
+    /// What the pace hangs on.
+    pub reason: String,
+}
+
 /// `status`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Status {
@@ -110,6 +175,10 @@ pub struct Status {
     /// Its VSYNC line, as of the last pass.
     #[schemars(schema_with = "vsync_schema")]
     pub vsync: Option<VsyncStats>,
+    /// The film, where the run is one.
+    #[serde(default)]
+    #[schemars(schema_with = "film_schema")]
+    pub film: Option<FilmSummary>,
     /// Why the last run faulted.
     pub error: Option<String>,
     /// The file with the newest live images, if there is one; `describe` has its layout.
@@ -128,7 +197,7 @@ pub struct CheckParams {
 /// Result of `check`: what a plan would do, before anything moves.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CheckReport {
-    /// Points of the sweep.
+    /// Points of the sweep; of a film, its cycles.
     pub points: usize,
     /// Further points: dark images and the regular image.
     pub extra_points: usize,
@@ -148,9 +217,12 @@ pub struct CheckReport {
     pub reach_rows: (i32, i32),
     /// Condition number of the demultiplexing of a camera row in the middle, with its prior.
     pub condition: f64,
-    /// What error to expect, and what to do better; nothing where a warning says why.
+    /// What error to expect of a sweep, and what to do better; nothing where a warning says why, and for films.
     #[serde(default)]
     pub advice: Option<SweepAdvice>,
+    /// Where the plan is a film.
+    #[serde(default)]
+    pub film: Option<FilmCheck>,
     /// What an operator should know; none of it stops the run.
     pub warnings: Vec<String>,
 }
@@ -220,11 +292,11 @@ pub enum Event {
     },
     /// A point was stored or given up.
     Progress(Progress),
-    /// An attempt at a point failed; the point is taken again.
+    /// An attempt at a point failed; the point is taken again. In a film a frame is lost, and is not.
     Lost {
         /// Ordinal of the point in the order of acquisition.
         point: u32,
-        /// Counted from 0.
+        /// Counted from 0; in a film the cycle.
         attempt: u32,
         /// Where its triggers went.
         #[schemars(schema_with = "counts_schema")]
@@ -232,6 +304,8 @@ pub enum Event {
     },
     /// The VSYNC line at the end of a pass.
     Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
+    /// The light transport was estimated during a film.
+    Film(FilmEstimate),
     /// A running estimate is in the live file, made from the points stored so far.
     Live {
         /// Of its last image in the live file.
@@ -251,10 +325,14 @@ pub enum Event {
         error: Option<String>,
         /// The report, if one was made.
         report: Option<PathBuf>,
-        /// Points of the sweep stored.
+        /// Points of the sweep, or cycles of the film, stored.
         stored: usize,
         /// Points of the sweep missing.
         missing: usize,
+        /// How the film went, where the run was one.
+        #[serde(default)]
+        #[schemars(schema_with = "film_schema")]
+        film: Option<FilmSummary>,
         /// What makes the results worse than they look.
         #[serde(default)]
         warnings: Vec<String>,

@@ -220,7 +220,7 @@ fn error_codes() -> Vec<ErrorInfo> {
 mod tests {
     use std::collections::BTreeSet;
 
-    use raysweep_core::{Counts, LossCause, VsyncStats};
+    use raysweep_core::{Counts, FilmSummary, LossCause, VsyncStats};
     use serde_json::{Value, json};
 
     use super::*;
@@ -272,5 +272,7 @@ mod tests {
         );
         let vsync = serde_json::to_value(VsyncStats::default()).unwrap();
         assert_eq!(described(schema::<Status>(), "vsync"), keys(&vsync));
+        let film = serde_json::to_value(FilmSummary::default()).unwrap();
+        assert_eq!(described(schema::<Status>(), "film"), keys(&film));
     }
 }

@@ -64,6 +64,7 @@ fn acquire(
         exposures: exposures_us.len(),
         rows,
         columns,
+        settings: 0,
     };
     let header = SessionEntry {
         format: raysweep_session::ledger::FORMAT,

@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
 
+use crate::film::Film;
 use crate::ledger::{self, EndState, Ledger, SessionEntry, State};
 use crate::products::Products;
-use crate::stack::{ArrayName, Stack};
+use crate::stack::Stack;
 use crate::{Error, Result, durable};
 
 /// Bytes of a session's name that go into its folder's name.
@@ -42,6 +43,9 @@ impl Session {
         durable::write(&created.rig_path(), rig.as_bytes())?;
         durable::create_dir(&created.products_path())?;
         Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
+        if session.shape.is_film() {
+            Film::create(&created.film_path(), &session.shape)?;
+        }
         let ledger = Ledger::create(&created.ledger_path(), session)?;
         Ok((created, ledger))
     }
@@ -86,21 +90,17 @@ impl Session {
     /// The stack, to read it and to add to it.
     ///
     /// # Errors
-    /// As [`Stack::open`], and [`Error::Shape`] where it is not the stack that the ledger speaks of.
+    /// As [`Stack::open`]: it must be the stack that the ledger speaks of.
     pub fn stack(&self) -> Result<Stack> {
-        let stack = Stack::open(&self.stack_path())?;
-        let expected = self.state()?.session.shape;
-        if *stack.shape() != expected {
-            return Err(Error::Shape {
-                what: self.stack_path().display().to_string(),
-                found: stack.shape().to_vec(),
-                allowed: format!(
-                    "{:?} [points, exposures, rows, columns], as its ledger says",
-                    expected.to_vec()
-                ),
-            });
-        }
-        Ok(stack)
+        Stack::open(&self.stack_path(), &self.state()?.session.shape)
+    }
+
+    /// The frames of a film, to read them and to add to them.
+    ///
+    /// # Errors
+    /// As [`Film::open`]: it must be the film that the ledger speaks of.
+    pub fn film(&self) -> Result<Film> {
+        Film::open(&self.film_path(), &self.state()?.session.shape)
     }
 
     /// The folder of the products.
@@ -138,6 +138,16 @@ impl Session {
         self.dir.join("transport.zarr")
     }
 
+    /// `film.zarr`, see [`crate::film`].
+    pub fn film_path(&self) -> PathBuf {
+        self.dir.join("film.zarr")
+    }
+
+    /// `transport_film.zarr`, see [`crate::film`].
+    pub fn transport_film_path(&self) -> PathBuf {
+        self.dir.join("transport_film.zarr")
+    }
+
     /// `products`, see [`crate::products`].
     pub fn products_path(&self) -> PathBuf {
         self.dir.join("products")
@@ -165,9 +175,9 @@ pub struct SessionSummary {
     pub kind: String,
     /// UTC.
     pub created: Timestamp,
-    /// Sweep points planned.
+    /// Points of the sweep, or cycles of the film, that are planned.
     pub points: usize,
-    /// Sweep points stored.
+    /// Those of them that are stored.
     pub stored: usize,
     /// How its latest run ended; `None` while one is running and after a crash.
     pub end: Option<EndState>,
@@ -196,7 +206,7 @@ pub fn list(root: &Path) -> Result<Listing> {
         let Ok(session) = Session::open(&dir) else { continue };
         match session.state() {
             Ok(state) => listing.sessions.push(SessionSummary {
-                stored: state.stored(ArrayName::Sum).count(),
+                stored: state.stored_points(),
                 points: state.session.shape.points,
                 end: state.end.as_ref().map(|end| end.state),
                 name: state.session.name,
@@ -260,7 +270,7 @@ mod tests {
             tags: vec!["test".into()],
             created: "2026-03-04T05:06:07Z".parse().unwrap(),
             software: "raysweep 0.1.0".into(),
-            shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5 },
+            shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0 },
             first_row: 0,
         }
     }

@@ -10,9 +10,10 @@ use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
-use raysweep_core::{Counts, VsyncStats};
+use raysweep_core::{Counts, FilmSummary, VsyncStats};
 use serde::{Deserialize, Serialize};
 
+use crate::film::CycleEntry;
 use crate::stack::{ArrayName, StackShape};
 use crate::{Error, Result};
 
@@ -56,6 +57,19 @@ pub enum Entry {
         /// Which stage, and what it said.
         error: String,
     },
+    /// A cycle of a film is durable in `film.zarr`.
+    Cycle(CycleEntry),
+    /// A cycle of a film lacks frames and is not stored: a film does not take them again.
+    CycleLost {
+        /// Counted from 0.
+        cycle: usize,
+        /// The settings without a sound frame.
+        missing: Vec<usize>,
+        /// What became of its frames.
+        counts: Counts,
+    },
+    /// A film is over; its cycles have lines of their own.
+    Film(FilmSummary),
     /// Frames outside any point: drained, in a pause, after a cancel.
     Outside {
         /// What became of them.
@@ -171,7 +185,10 @@ pub struct State {
     pub counts: Counts,
     /// How the latest run ended; `None` before the first, while one is running and after a crash.
     pub end: Option<EndEntry>,
+    /// How the film went, once it is over.
+    pub film: Option<FilmSummary>,
     stored: BTreeMap<(ArrayName, usize), PointEntry>,
+    cycles: BTreeMap<usize, CycleEntry>,
     next_attempts: BTreeMap<(ArrayName, usize), u32>,
 }
 
@@ -189,7 +206,9 @@ impl State {
             runs: 0,
             counts: Counts::default(),
             end: None,
+            film: None,
             stored: BTreeMap::new(),
+            cycles: BTreeMap::new(),
             next_attempts: BTreeMap::new(),
         };
         for (entry, line) in rest.iter().zip(1..) {
@@ -201,6 +220,16 @@ impl State {
     /// The stored points of an array, by index: the latest line of each.
     pub fn stored(&self, array: ArrayName) -> impl Iterator<Item = &PointEntry> {
         self.stored.range((array, 0)..=(array, usize::MAX)).map(|(_, point)| point)
+    }
+
+    /// The stored cycles of a film, in order.
+    pub fn cycles(&self) -> impl Iterator<Item = &CycleEntry> {
+        self.cycles.values()
+    }
+
+    /// How many of the plan's points are stored: of a sweep's points, or of a film's cycles.
+    pub fn stored_points(&self) -> usize {
+        self.stored(ArrayName::Sum).count() + self.cycles.len()
     }
 
     /// A stored point.
@@ -235,7 +264,15 @@ impl State {
                     ))
                 }
             }
-            Entry::Run { .. } | Entry::Outside { .. } | Entry::End(_) => Ok(()),
+            Entry::Cycle(CycleEntry { cycle, .. }) | Entry::CycleLost { cycle, .. } => {
+                let cycles = self.session.shape.points * usize::from(self.session.shape.is_film());
+                if *cycle < cycles {
+                    Ok(())
+                } else {
+                    Err(format!("cycle {cycle} is outside of the film, which has {cycles} cycles"))
+                }
+            }
+            Entry::Run { .. } | Entry::Film(_) | Entry::Outside { .. } | Entry::End(_) => Ok(()),
         }
     }
 
@@ -256,6 +293,12 @@ impl State {
                 self.counts.add(counts);
                 self.note_attempt(*array, *index, *attempt);
             }
+            Entry::Cycle(cycle) => {
+                self.counts.add(&cycle.counts);
+                self.cycles.insert(cycle.cycle, cycle.clone());
+            }
+            Entry::CycleLost { counts, .. } => self.counts.add(counts),
+            Entry::Film(film) => self.film = Some(film.clone()),
             Entry::Outside { counts } => self.counts.add(counts),
             Entry::StageFailed { .. } => {}
             Entry::End(end) => self.end = Some(end.clone()),

@@ -6,6 +6,7 @@
 //! | `ledger.jsonl` | what was acquired: one JSON object a line, append-only ([`ledger`]) |
 //! | `stack.zarr` | the summed frames, Zarr v3 ([`stack`]) |
 //! | `transport.zarr` | the light transport, Zarr v3 ([`transport`]) |
+//! | `film.zarr`, `transport_film.zarr` | of a film: the frames and the light transport of each cycle, Zarr v3 ([`film`]) |
 //! | `products/` | images as EXR and NPY, volumes as NPY, each with a JSON sidecar ([`products`]) |
 //! | `report.html` | one self-contained page ([`report`]) |
 //! | `manifest.json` | versions, settings, counts and checksums ([`manifest`]) |
@@ -16,6 +17,7 @@
 pub mod durable;
 mod error;
 mod exr_file;
+pub mod film;
 mod folder;
 pub mod ledger;
 pub mod manifest;

@@ -13,7 +13,6 @@ use sha2::{Digest, Sha256};
 
 use crate::folder::Session;
 use crate::ledger::{FORMAT, State};
-use crate::stack::ArrayName;
 use crate::{Error, Result, durable};
 
 /// The content of `manifest.json`.
@@ -33,7 +32,7 @@ pub struct Manifest {
     pub files: BTreeMap<String, FileRecord>,
 }
 
-/// Sweep points: planned = stored + missing.
+/// Sweep points, or cycles of a film: planned = stored + missing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PointCounts {
     /// In the plan.
@@ -81,7 +80,7 @@ pub fn write(
     software: BTreeMap<String, String>,
     settings: Map<String, Value>,
 ) -> Result<Manifest> {
-    let stored = state.stored(ArrayName::Sum).count();
+    let stored = state.stored_points();
     let planned = state.session.shape.points;
     let manifest = Manifest {
         format: FORMAT,

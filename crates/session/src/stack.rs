@@ -6,10 +6,13 @@
 //! | `dark` | uint32 | `[exposure, t, s]` | projector off, one per exposure |
 //! | `regular` | uint32 | `[1, t, s]` | all rows lit by a long exposure |
 //!
+//! The stack of a film has `dark` alone: its frames are in `film.zarr`, see [`crate::film`].
+//!
 //! t is the camera row (the top one is 0), s the camera column. Values are camera counts (DN), summed over the frames
 //! that the ledger names. One shard is one point, with inner chunks of 64 x 64 pixels. A point without a line in the
 //! ledger is not stored, whatever the array holds there.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -58,7 +61,7 @@ impl ArrayName {
 /// The shapes of the stack's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StackShape {
-    /// Planned points of the sweep.
+    /// Planned points of the sweep; of a film, its cycles.
     pub points: usize,
     /// Exposures, each with a dark frame.
     pub exposures: usize,
@@ -66,20 +69,37 @@ pub struct StackShape {
     pub rows: usize,
     /// Camera columns, axis s.
     pub columns: usize,
+    /// Settings of a film's cycle; 0 where it is a sweep.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub settings: usize,
+}
+
+fn is_zero(settings: &usize) -> bool {
+    *settings == 0
 }
 
 impl StackShape {
     /// Points of an array.
     pub fn len(&self, array: ArrayName) -> usize {
         match array {
-            ArrayName::Sum => self.points,
+            ArrayName::Sum => self.points * usize::from(!self.is_film()),
             ArrayName::Dark => self.exposures,
-            ArrayName::Regular => 1,
+            ArrayName::Regular => usize::from(!self.is_film()),
         }
     }
 
+    /// Whether the points are cycles, whose frames are in `film.zarr`.
+    pub fn is_film(&self) -> bool {
+        self.settings > 0
+    }
+
+    /// The arrays of the stack.
+    fn arrays(&self) -> &'static [ArrayName] {
+        if self.is_film() { &[ArrayName::Dark] } else { &ArrayName::ALL }
+    }
+
     pub(crate) fn check(&self) -> Result<()> {
-        let found = self.to_vec();
+        let found = vec![self.points, self.exposures, self.rows, self.columns];
         if found.contains(&0) {
             return Err(Error::Shape {
                 what: "the stack [points, exposures, rows, columns]".into(),
@@ -88,10 +108,6 @@ impl StackShape {
             });
         }
         Ok(())
-    }
-
-    pub(crate) fn to_vec(self) -> Vec<usize> {
-        vec![self.points, self.exposures, self.rows, self.columns]
     }
 
     fn chunk(&self) -> [usize; 3] {
@@ -109,7 +125,7 @@ impl StackShape {
 pub struct Stack {
     dir: PathBuf,
     shape: StackShape,
-    arrays: [Array<DurableStore>; 3],
+    arrays: BTreeMap<ArrayName, Array<DurableStore>>,
 }
 
 impl Stack {
@@ -126,25 +142,23 @@ impl Stack {
             "units": "camera counts (DN), summed over frames; ledger.jsonl says how many frames and at which delays",
         });
         zarr::create_group(&store, into_map(attributes))?;
-        let create = |name| create_array(&store, name, shape);
-        let arrays = [create(ArrayName::Sum)?, create(ArrayName::Dark)?, create(ArrayName::Regular)?];
+        let create = |&name: &ArrayName| Ok((name, create_array(&store, name, shape)?));
+        let arrays = shape.arrays().iter().map(create).collect::<Result<_>>()?;
         Ok(Stack { dir: dir.to_owned(), shape: *shape, arrays })
     }
 
-    /// Opens the stack at `dir`.
+    /// Opens the stack at `dir`, which must have this shape.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where it cannot be read, [`Error::Shape`] where its arrays do not belong together.
-    pub fn open(dir: &Path) -> Result<Stack> {
-        let store = DurableStore::new(dir)?;
-        let open = |name: ArrayName| zarr::open_array(&store, name.as_str());
-        let arrays = [open(ArrayName::Sum)?, open(ArrayName::Dark)?, open(ArrayName::Regular)?];
-        let [sum, dark, _] = arrays.each_ref().map(zarr::shape_of);
-        let shape = StackShape { points: sum[0], exposures: dark[0], rows: sum[1], columns: sum[2] };
+    /// [`Error::Zarr`] where it cannot be read, [`Error::Shape`] where it is another stack.
+    pub fn open(dir: &Path, shape: &StackShape) -> Result<Stack> {
         shape.check()?;
-        for (name, array) in ArrayName::ALL.into_iter().zip(&arrays) {
+        let store = DurableStore::new(dir)?;
+        let mut arrays = BTreeMap::new();
+        for &name in shape.arrays() {
+            let array = zarr::open_array(&store, name.as_str(), 3)?;
             let expected = [shape.len(name), shape.rows, shape.columns];
-            let found = zarr::shape_of(array);
+            let found = zarr::shape_of(&array);
             if found != expected {
                 let what = dir.join(name.as_str()).display().to_string();
                 return Err(Error::Shape { what, found, allowed: format!("{expected:?}") });
@@ -154,8 +168,9 @@ impl Stack {
                 let what = format!("a shard of {}", dir.join(name.as_str()).display());
                 return Err(Error::Shape { what, found: shard, allowed: format!("{:?}", shape.shard()) });
             }
+            arrays.insert(name, array);
         }
-        Ok(Stack { dir: dir.to_owned(), shape, arrays })
+        Ok(Stack { dir: dir.to_owned(), shape: *shape, arrays })
     }
 
     /// The shapes of the arrays.
@@ -169,7 +184,7 @@ impl Stack {
     /// # Errors
     /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] where the file system refuses.
     pub fn write(&self, array: ArrayName, index: usize, data: ArrayView2<u32>) -> Result<u32> {
-        self.check_index(array, index)?;
+        let stored = self.array(array, index)?;
         if data.dim() != (self.shape.rows, self.shape.columns) {
             return Err(Error::Shape {
                 what: format!("a point of array `{}`", array.as_str()),
@@ -177,12 +192,7 @@ impl Stack {
                 allowed: format!("{:?}", [self.shape.rows, self.shape.columns]),
             });
         }
-        zarr::write_chunk(
-            self.array(array),
-            [index as u64, 0, 0],
-            self.shape.shard(),
-            data.insert_axis(Axis(0)),
-        )?;
+        zarr::write_chunk(stored, [index as u64, 0, 0], self.shape.shard(), data.insert_axis(Axis(0)))?;
         Ok(crc32(data))
     }
 
@@ -191,9 +201,8 @@ impl Stack {
     /// # Errors
     /// [`Error::NotStored`] where nothing was written, [`Error::Index`], or [`Error::Zarr`] for damaged data.
     pub fn read_point(&self, array: ArrayName, index: usize) -> Result<Array2<u32>> {
-        self.check_index(array, index)?;
         let shard = self
-            .array(array)
+            .array(array, index)?
             .retrieve_chunk_if_exists_opt::<Array3<u32>>(&[index as u64, 0, 0], &zarr::codec_options())
             .map_err(Error::zarr("read", &self.dir.join(array.as_str())))?;
         let Some(shard) = shard else {
@@ -207,23 +216,15 @@ impl Stack {
     /// Reads a whole array `[point, t, s]`; points that were never written are 0.
     ///
     /// # Errors
-    /// [`Error::Zarr`] for damaged data.
+    /// [`Error::Index`] for an array that a film does not have, [`Error::Zarr`] for damaged data.
     pub fn read(&self, array: ArrayName) -> Result<Array3<u32>> {
-        zarr::read_all(self.array(array))
+        zarr::read_all(self.array(array, 0)?)
     }
 
-    fn array(&self, array: ArrayName) -> &Array<DurableStore> {
-        let [sum, dark, regular] = &self.arrays;
-        match array {
-            ArrayName::Sum => sum,
-            ArrayName::Dark => dark,
-            ArrayName::Regular => regular,
-        }
-    }
-
-    fn check_index(&self, array: ArrayName, index: usize) -> Result<()> {
+    fn array(&self, array: ArrayName, index: usize) -> Result<&Array<DurableStore>> {
         let len = self.shape.len(array);
-        if index < len { Ok(()) } else { Err(Error::Index { array: array.as_str(), index, len }) }
+        let found = self.arrays.get(&array).filter(|_| index < len);
+        found.ok_or(Error::Index { array: array.as_str(), index, len })
     }
 }
 

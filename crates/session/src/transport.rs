@@ -58,7 +58,7 @@ pub fn write(dir: &Path, transport: ArrayView3<f32>, attributes: &Map<String, Va
 /// # Errors
 /// [`Error::Zarr`] or [`Error::Shape`] where there is none or it is damaged.
 pub fn read(dir: &Path) -> Result<(Array3<f32>, Map<String, Value>)> {
-    let array = zarr::open_array(&DurableStore::new(dir)?, NAME)?;
+    let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
     Ok((zarr::read_all(&array)?, array.attributes().clone()))
 }
 

@@ -126,13 +126,13 @@ pub(crate) fn create_array(
     Ok(array)
 }
 
-/// Opens an array of three axes.
-pub(crate) fn open_array(store: &Arc<DurableStore>, name: &str) -> Result<Array<DurableStore>> {
+/// Opens an array of so many axes.
+pub(crate) fn open_array(store: &Arc<DurableStore>, name: &str, axes: usize) -> Result<Array<DurableStore>> {
     let path = store.root().join(name);
     let array = Array::open(store.clone(), &format!("/{name}")).map_err(Error::zarr("open", &path))?;
-    if array.shape().len() != 3 {
-        let found = shape_of(&array);
-        return Err(Error::Shape { what: path.display().to_string(), found, allowed: "three axes".into() });
+    if array.shape().len() != axes {
+        let (what, found) = (path.display().to_string(), shape_of(&array));
+        return Err(Error::Shape { what, found, allowed: format!("{axes} axes") });
     }
     Ok(array.with_codec_specific_options(&in_fixed_order()))
 }

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
-use raysweep_core::Counts;
+use raysweep_core::{Counts, FilmSummary, Percentiles};
 use raysweep_proto::{
     CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo, Status,
     SweepAdvice,
@@ -25,6 +25,9 @@ pub(super) fn status(status: &Status) -> String {
         rows.push(("points", format!("{} of {} stored", progress.points_stored, progress.points_planned)));
         rows.push(("pace", pace(progress)));
         rows.push(("elapsed", duration(progress.elapsed_s)));
+    }
+    if let Some(film) = &status.film {
+        rows.push(("film", self::film(film)));
     }
     if let Some(vsync) = &status.vsync {
         rows.push((
@@ -57,6 +60,19 @@ pub(super) fn check(report: &CheckReport) -> String {
         ("condition", format!("{:.3e}", report.condition)),
     ];
     rows.extend(report.advice.iter().flat_map(advice));
+    if let Some(film) = &report.film {
+        rows[0] = (
+            "cycles",
+            format!("{} of {} settings, and {} dark image", film.cycles, film.settings, report.extra_points),
+        );
+        let pace = format!(
+            "{:.2} transports/s, {} VSYNC periods each: {}",
+            film.transports_per_s, film.periods_per_cycle, film.reason
+        );
+        let minute = BinaryBytes(film.disk_bytes_per_minute);
+        rows.insert(1, ("pace", pace));
+        rows.insert(2, ("a minute", format!("{minute} on disk, uncompressed; latency hangs on the machine")));
+    }
     rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
     better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.sweep.trim_end()))
@@ -83,7 +99,7 @@ fn advice(advice: &SweepAdvice) -> Vec<(&'static str, String)> {
                 |better| {
                     let (first, last) = better.reach_rows;
                     format!(
-                        "{}, with {} points, {} frames, relative rows {first} to {last}:",
+                        "{}, with {} points, {} frames, relative rows {first} to {last}; see [sweep] below",
                         errors(&better.expected),
                         better.points,
                         better.frames
@@ -169,6 +185,28 @@ pub(super) fn ending(
         lines.push(format!("`raysweep resume {}` takes what is missing", name(session)));
     }
     lines.join("\n")
+}
+
+/// How a film has ended.
+pub(super) fn film_ending(session: &Path, state: &str, report: Option<&Path>, film: &FilmSummary) -> String {
+    let mut lines = vec![format!("{state}: {}", self::film(film))];
+    lines.push(format!("session: {}", session.display()));
+    lines.extend(report.map(|report| format!("report: {}", report.display())));
+    lines.join("\n")
+}
+
+/// How a film goes, or went.
+pub(super) fn film(film: &FilmSummary) -> String {
+    let mut parts = vec![format!("{} of {} cycles stored", film.cycles_stored, film.cycles_planned)];
+    parts.extend(film.cycles_per_s.map(|pace| format!("{pace:.2} a second")));
+    parts.push(format!("{} incomplete", film.cycles_incomplete));
+    if film.transports_missing > 0 {
+        parts.push(format!("{} without transport", film.transports_missing));
+    }
+    parts.extend(film.latency_ms.map(|Percentiles { p50, p95, p99, max }| {
+        format!("latency {p50:.0} / {p95:.0} / {p99:.0} / {max:.0} ms (p50 / p95 / p99 / max)")
+    }));
+    parts.join(", ")
 }
 
 /// `process`

@@ -4,7 +4,7 @@ use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use raysweep_proto::{Event, Progress, RunState};
+use raysweep_proto::{Event, FilmEstimate, Progress, RunState};
 
 use super::show;
 
@@ -53,9 +53,10 @@ impl View {
                 let lost = show::losses(counts);
                 self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
+            Event::Film(estimate) => self.film(estimate),
             Event::Vsync(_) => {}
             Event::Live { points, .. } => self.live = Some(*points),
-            Event::Finished { session, state, error, report, stored, missing, warnings, final_s } => {
+            Event::Finished { session, state, error, report, stored, missing, film, warnings, final_s } => {
                 if let Place::Bar(bar) = &self.place {
                     bar.finish_and_clear();
                 }
@@ -65,7 +66,10 @@ impl View {
                 for warning in warnings {
                     self.note(&format!("warning: {warning}"));
                 }
-                let summary = show::ending(session, state, report.as_deref(), *stored, *missing, *final_s);
+                let summary = match film {
+                    Some(film) => show::film_ending(session, state, report.as_deref(), film),
+                    None => show::ending(session, state, report.as_deref(), *stored, *missing, *final_s),
+                };
                 writeln!(io::stdout(), "{summary}")?;
             }
             Event::Skipped { events } => {
@@ -87,6 +91,13 @@ impl View {
         match &self.place {
             Place::Bar(bar) => bar.set_prefix(show::state(state)),
             _ => self.note(show::state(state)),
+        }
+    }
+
+    fn film(&mut self, estimate: &FilmEstimate) {
+        // Lines would be too many; how the film goes stands in the bar and in `raysweep status`.
+        if let Place::Bar(bar) = &self.place {
+            bar.set_message(show::film(&estimate.film));
         }
     }
 

@@ -1,5 +1,6 @@
 //! Rig and plan files: TOML with unknown keys refused and errors that point at the place in the text.
 
+mod film;
 mod plan;
 mod product;
 mod rig;
@@ -8,6 +9,7 @@ use std::ops::Range;
 
 use toml::de::DeValue;
 
+pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};
 pub use rig::{CameraNoise, CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};

@@ -4,7 +4,7 @@ use raysweep_pipeline::{Point, Role, Schedule};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::{ConfigError, ProductTable};
+use super::{ConfigError, FilmPlan, ProductTable, span_of};
 
 /// A plan.
 #[derive(Debug, Clone, Deserialize)]
@@ -15,9 +15,12 @@ pub struct Plan {
     /// Names the session.
     #[serde(default = "default_name")]
     pub name: String,
-    /// `[sweep]`
+    /// `[sweep]`, where it is one.
     #[serde(default)]
     pub sweep: Sweep,
+    /// `[film]`, where it is one.
+    #[serde(default)]
+    pub film: FilmPlan,
     /// `[[stage]]`: stages in order, then folds; none: `demux`.
     #[serde(default = "default_stages")]
     pub stage: Vec<StageTable>,
@@ -31,6 +34,8 @@ pub struct Plan {
 pub enum PlanKind {
     /// A delay-exposure sweep of the plane rig.
     Sweep,
+    /// A short sweep again and again, each time with a light transport of its own.
+    Film,
 }
 
 /// `[sweep]`: the grid of delays and exposures; the defaults are the paper's.
@@ -91,7 +96,7 @@ impl Axis {
         }
     }
 
-    fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         match self {
             Self::List(values) => values.len(),
             Self::Range { count, .. } => *count,
@@ -117,6 +122,8 @@ fn default_stages() -> Vec<StageTable> {
     vec![StageTable { name: "demux".into(), options: Map::new() }]
 }
 
+/// Fewest frames of a dark image: its noise is in all images of its exposure, so it should hardly have any.
+const MIN_DARK_AVERAGE: u32 = 8;
 /// Most values along an axis.
 const MAX_AXIS: usize = 1024;
 /// Most points of a sweep.
@@ -130,9 +137,20 @@ impl Plan {
     /// # Errors
     /// With the place in the text, for anything that is not a plan that can be run.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let plan: Self = toml::from_str(text).map_err(|error| ConfigError::parse(&error))?;
+        let mut plan: Self = toml::from_str(text).map_err(|error| ConfigError::parse(&error))?;
+        if plan.kind == PlanKind::Film && span_of(text, &["name"]).is_none() {
+            plan.name = "film".into();
+        }
         plan.check(text)?;
         Ok(plan)
+    }
+
+    /// Frames whose measured delay is further off do not count.
+    pub fn max_jitter_us(&self) -> f64 {
+        match self.kind {
+            PlanKind::Sweep => self.sweep.max_jitter_us,
+            PlanKind::Film => self.film.max_jitter_us,
+        }
     }
 
     /// Whether it can be run; `text` is what it was read from.
@@ -141,6 +159,15 @@ impl Plan {
     /// Those of [`Self::parse`].
     pub(crate) fn check(&self, text: &str) -> Result<(), ConfigError> {
         let sweep = &self.sweep;
+        let (kind, own, other) = match self.kind {
+            PlanKind::Sweep => ("sweep", "sweep", "film"),
+            PlanKind::Film => ("film", "film", "sweep"),
+        };
+        if span_of(text, &[other]).is_some() {
+            let message = format!("kind = \"{kind}\" has no [{other}]: give [{own}], or another kind");
+            return Err(ConfigError::at(text, &[other], message));
+        }
+        self.film.check(text)?;
         if self.name.trim().is_empty() {
             return Err(ConfigError::at(text, &["name"], "name is empty: give the session a name"));
         }
@@ -189,8 +216,14 @@ impl Plan {
     /// The points of the plan: dark images of each exposure, the regular image, then the sweep with the exposure in
     /// the outer loop, because some cameras take long to change it.
     pub fn schedule(&self, period_us: f64) -> Schedule {
+        if self.kind == PlanKind::Film {
+            return self.film.schedule();
+        }
         let frames = self.sweep.average;
-        let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames };
+        let point = |role, delay_us, exposure_us| {
+            let frames = if matches!(role, Role::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+            Point { role, delay_us, exposure_us, frames }
+        };
         let exposures = self.sweep.exposure_us.values();
         let delays = self.sweep.delay_us.values();
 

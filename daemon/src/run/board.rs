@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use raysweep_core::FilmSummary;
 use raysweep_proto::{Event, RunState, Status};
 use tokio::sync::broadcast;
 
@@ -29,6 +30,7 @@ impl Board {
             session: None,
             progress: None,
             vsync: None,
+            film: None,
             error: None,
             live: None,
         };
@@ -61,6 +63,7 @@ impl Board {
         status.state = next;
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
+            status.film = None;
         }
         let event = Event::State { state: next, session: status.session.clone() };
         // Sent under the lock, so that subscribers see states in their true order.
@@ -71,6 +74,11 @@ impl Board {
     /// Names the session of the run that is being prepared.
     pub fn set_session(&self, session: PathBuf) {
         self.lock().session = Some(session);
+    }
+
+    /// Notes how a film went.
+    pub fn set_film(&self, film: FilmSummary) {
+        self.lock().film = Some(film);
     }
 
     /// Names the file with the live images.
@@ -89,6 +97,7 @@ impl Board {
         match &event {
             Event::Progress(progress) => status.progress = Some(progress.clone()),
             Event::Vsync(vsync) => status.vsync = Some(*vsync),
+            Event::Film(estimate) => status.film = Some(estimate.film.clone()),
             _ => {}
         }
         let _ = self.events.send(event);

@@ -1,5 +1,7 @@
 //! The camera's thread: sets the camera for one point after the other and hands its frames on.
 
+mod film;
+
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
@@ -11,6 +13,7 @@ use raysweep_core::{
 };
 use raysweep_pipeline::{Event, Input, Job, Label, Point, QueueError, Shot, message_of};
 
+pub use self::film::{FilmPass, FilmSetting};
 use super::orders::{Order, Orders};
 use crate::rig::Pace;
 
@@ -32,6 +35,15 @@ pub struct Pass {
     pub attempts: Vec<Attempt>,
     /// Frames exposed earlier may still see the picture before.
     pub not_before_ns: i64,
+}
+
+/// What the camera is for until its next flush.
+#[derive(Debug, Clone)]
+pub enum Work {
+    /// Points, each until all its frames are there.
+    Pass(Pass),
+    /// A film.
+    Film(FilmPass),
 }
 
 /// Buffers for frames on their way to the assembler: more than it ever holds while it waits for edges.
@@ -57,7 +69,7 @@ pub struct Gone;
 
 /// The camera's thread as the run sees it.
 pub struct CameraThread {
-    passes: SyncSender<Pass>,
+    work: SyncSender<Work>,
     ended: Receiver<Ended>,
     thread: JoinHandle<Option<Instant>>,
 }
@@ -75,14 +87,14 @@ impl CameraThread {
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         camera.arm()?;
-        let (passes, todo) = sync_channel::<Pass>(1);
+        let (work, todo) = sync_channel::<Work>(1);
         let (done, ended) = sync_channel(1);
         let thread = thread::Builder::new()
             .name("camera".into())
             .spawn(move || {
                 let mut sequencer = Sequencer::new(camera, input, pace, period_us, orders);
-                for pass in todo {
-                    if done.send(sequencer.pass(&pass)).is_err() {
+                for work in todo {
+                    if done.send(sequencer.work(&work)).is_err() {
                         break;
                     }
                 }
@@ -92,16 +104,16 @@ impl CameraThread {
                 sequencer.exposed_until
             })
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
-        Ok(Self { passes, ended, thread })
+        Ok(Self { work, ended, thread })
     }
 
-    /// Acquires a pass and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
+    /// Does some work and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
     /// at the pipeline's sink, also when the camera failed (the inner error).
     ///
     /// # Errors
     /// [`Gone`] when there will be no verdicts.
-    pub fn acquire(&self, pass: Pass) -> Result<Result<(), DeviceError>, Gone> {
-        self.passes.send(pass).map_err(|_closed| Gone)?;
+    pub fn acquire(&self, work: Work) -> Result<Result<(), DeviceError>, Gone> {
+        self.work.send(work).map_err(|_closed| Gone)?;
         match self.ended.recv() {
             Ok(Ended::Flushed(acquired)) => Ok(acquired),
             Ok(Ended::NotFlushed) | Err(_) => Err(Gone),
@@ -113,7 +125,7 @@ impl CameraThread {
     /// # Errors
     /// When the thread panicked.
     pub fn join(self) -> Result<Option<Instant>, DeviceError> {
-        drop(self.passes);
+        drop(self.work);
         self.thread.join().map_err(|panic| {
             let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
             DeviceError::new("camera", DeviceErrorKind::NotReady, what)
@@ -135,6 +147,13 @@ struct Sequencer {
     period_us: f64,
     /// When the exposure of the last counted frame ended.
     exposed_until: Option<Instant>,
+}
+
+/// A frame off the camera.
+struct Received {
+    stamp: FrameStamp,
+    /// Nothing where no buffer was free.
+    data: Option<FrameBuf>,
 }
 
 /// What became of one wait for a frame.
@@ -173,9 +192,12 @@ impl Sequencer {
         }
     }
 
-    /// Acquires a pass; always ends with a flush, so that nothing of it stays undecided.
-    fn pass(&mut self, pass: &Pass) -> Ended {
-        let acquired = self.attempts(pass);
+    /// Always ends with a flush, so that nothing stays undecided.
+    fn work(&mut self, work: &Work) -> Ended {
+        let acquired = match work {
+            Work::Pass(pass) => self.attempts(pass),
+            Work::Film(film) => self.film(film),
+        };
         match self.input.send(Event::Flush) {
             Ok(()) => Ended::Flushed(acquired),
             Err(_) => Ended::NotFlushed,
@@ -183,9 +205,7 @@ impl Sequencer {
     }
 
     fn attempts(&mut self, pass: &Pass) -> Result<(), DeviceError> {
-        let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
-        self.pass_frames(margin, pass.not_before_ns)?;
-        self.warmed_up = true;
+        self.warm_up(pass.not_before_ns)?;
         for attempt in &pass.attempts {
             if self.orders.now() == Order::Pause {
                 self.input.send(Event::Idle).map_err(closed)?;
@@ -199,6 +219,14 @@ impl Sequencer {
         self.pass_frames(MARGIN_FRAMES, i64::MIN)
     }
 
+    /// Lets frames go by until the line is known and the picture is in the light.
+    fn warm_up(&mut self, not_before_ns: i64) -> Result<(), DeviceError> {
+        let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
+        self.pass_frames(margin, not_before_ns)?;
+        self.warmed_up = true;
+        Ok(())
+    }
+
     fn attempt(&mut self, attempt: &Attempt) -> Result<(), DeviceError> {
         let Attempt { id, point, shot } = *attempt;
         let applied = self.camera.configure(id, &shot.settings)?;
@@ -208,6 +236,7 @@ impl Sequencer {
             applied,
             delay_us: point.delay_us,
             light_edges_later: shot.light_edges_later,
+            periods_from_last: None,
         };
         self.input.send(Event::Begin(job)).map_err(closed)?;
         self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
@@ -279,19 +308,24 @@ impl Sequencer {
     }
 
     fn take(&mut self, label: impl FnOnce(&FrameStamp) -> Label) -> Result<Taken, DeviceError> {
-        let room = match self.pace {
+        let Some(received) = self.receive()? else { return Ok(Taken::None) };
+        let label = label(&received.stamp);
+        self.hand_on(received, label)
+    }
+
+    /// Waits for a frame.
+    fn receive(&mut self) -> Result<Option<Received>, DeviceError> {
+        let mut data = match self.pace {
             Pace::Pipeline => Some(self.pool.take()),
             Pace::Devices => self.pool.try_take(),
         };
-        let Some(mut data) = room else {
-            let stamp = self.camera.next_frame(&mut self.spare, POLL)?;
-            return match stamp {
-                Some(stamp) => self.lose(stamp, label(&stamp), LossCause::PoolEmpty),
-                None => Ok(Taken::None),
-            };
-        };
-        let Some(stamp) = self.camera.next_frame(&mut data, POLL)? else { return Ok(Taken::None) };
-        let label = label(&stamp);
+        let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), POLL)?;
+        Ok(stamp.map(|stamp| Received { stamp, data }))
+    }
+
+    /// Gives a frame to the assembler, or notes that there was no room for it.
+    fn hand_on(&mut self, Received { stamp, data }: Received, label: Label) -> Result<Taken, DeviceError> {
+        let Some(data) = data else { return self.lose(stamp, label, LossCause::PoolEmpty) };
         let frame = Frame { data, format: self.camera.capabilities().format, stamp };
         match self.input.offer(Event::Frame(frame, label)) {
             Ok(()) => Ok(Taken::Passed(stamp, label)),
@@ -303,8 +337,8 @@ impl Sequencer {
     /// Only a frame that a point waits for is lost; the others are merely not looked at.
     fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
         let event = match label {
-            Label::Counted => Event::Lost(stamp, Some(cause)),
-            Label::Settling | Label::Cancelled => Event::Lost(stamp, None),
+            Label::Counted => Event::Lost(stamp.seq, Some(cause)),
+            Label::Settling | Label::Cancelled => Event::Lost(stamp.seq, None),
         };
         self.input.send(event).map_err(closed)?;
         Ok(Taken::Lost)

@@ -4,19 +4,24 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Instant;
 
-use raysweep_core::{CameraCapabilities, DeviceError, Pattern, Projector, SettingsId, Shown, VsyncStats};
+use raysweep_core::{
+    CameraCapabilities, DeviceError, Pattern, Projector, SettingsId, Shown, VsyncStats, ns_from_us,
+};
 use raysweep_pipeline::{
-    AssemblerConfig, Pipeline, PipelineConfig, PipelineError, Point, Policy, Role, Schedule,
+    AssemblerConfig, CycleOrder, Pipeline, PipelineConfig, PipelineError, Point, Policy, Role,
 };
 use raysweep_proto::RunState;
 use raysweep_session::Session;
 use raysweep_session::ledger::{Entry, Ledger, State};
 
 use super::board::Board;
-use super::camera::{Attempt, CameraThread, Gone, Pass};
+use super::camera::{Attempt, CameraThread, FilmPass, FilmSetting, Gone, Pass, Work};
+use super::film::{Account, CycleTiming, FilmSink, Solving, Worker};
 use super::orders::Orders;
 use super::storage::{PaceMeter, Storage, Verdict};
 use super::vsync::VsyncThread;
+use crate::config::ConfigError;
+use crate::film::{self, CyclePlan};
 use crate::live::{LiveEstimate, Outlet};
 use crate::processing::{Processing, Task, place};
 use crate::rig::{Devices, Pace, Rig, RigError};
@@ -27,6 +32,8 @@ const MAX_ATTEMPTS: u32 = 8;
 const QUEUE_EVENTS: usize = 64;
 /// Units between the assembler and the disk.
 const UNITS_UNDER_WAY: usize = 8;
+/// The same of a film, in cycles.
+const CYCLES_UNDER_WAY: usize = 4;
 
 /// Why a run could not go to its end.
 #[derive(Debug, thiserror::Error)]
@@ -53,6 +60,9 @@ pub enum RunError {
         /// Of the session.
         expected: (usize, usize),
     },
+    /// The plan makes no model on this rig.
+    #[error("{0}")]
+    Plan(#[from] ConfigError),
     /// A point failed again and again.
     #[error(
         "{points} points failed {MAX_ATTEMPTS} times each; the ledger has their causes. Mend the cause and resume the session"
@@ -132,14 +142,23 @@ impl Run {
         let assembler = self.assembler_config(camera.capabilities())?;
         let stack = self.session.stack()?;
         let state = self.ledger.state().clone();
-        let mut missing = missing(&self.task.schedule, &state);
+        let mut missing = missing(&self.task, &state);
         if self.resumed {
             missing.extend(self.processing.feed_stored(&self.task, &state, &stack, &|| self.orders.go_on()));
             missing.sort_by_key(|id| id.point);
             // What is damaged is about to be mended.
             self.processing.problems.clear();
         }
-        let planned = self.task.schedule.points.len();
+        // A film is never resumed: none of its cycles is there yet.
+        let cycles = if self.task.is_film() { self.task.points() } else { 0 };
+        let extra = self.task.schedule.points.len() - self.task.settings().count();
+        let planned = extra + self.task.points();
+        let account = Arc::new(Account::new(self.task.points()));
+        let cycle_plan = self.task.is_film().then(|| CyclePlan::new(&self.task, &assembler.camera));
+        let film = match &cycle_plan {
+            Some(cycle_plan) => Some(self.film_sink(cycle_plan, &assembler.camera, pace, &account)?),
+            None => None,
+        };
         let (verdicts, results) = channel();
         let stages = std::mem::take(&mut self.processing.stages);
         let storage = Storage {
@@ -150,9 +169,11 @@ impl Run {
             verdicts: Some(verdicts),
             orders: self.orders.clone(),
             board: self.board.clone(),
-            pace: PaceMeter::new(planned - missing.len(), planned),
+            pace: PaceMeter::new(planned - missing.len() - cycles, planned),
+            film,
             vsync: None,
-            live: self.live.and_then(start_live),
+            // A film is its own running estimate.
+            live: self.live.filter(|_| cycle_plan.is_none()).and_then(start_live),
             write_error: None,
         };
         let config = PipelineConfig {
@@ -161,7 +182,11 @@ impl Run {
                 Pace::Pipeline => Policy::Wait,
                 Pace::Devices => Policy::Fail,
             },
-            units_under_way: UNITS_UNDER_WAY,
+            // While a film's sink stores a cycle, frames of the next ones come.
+            units_under_way: match &cycle_plan {
+                Some(cycle_plan) => CYCLES_UNDER_WAY * cycle_plan.shots.len(),
+                None => UNITS_UNDER_WAY,
+            },
             worker_threads: 0,
         };
         let trigger_latency_us = assembler.camera.trigger_latency_us;
@@ -181,12 +206,25 @@ impl Run {
             trigger_latency_us,
         };
         let _ = self.board.go(RunState::Running);
-        let acquired = passes.acquire(missing);
+        let acquired = passes.acquire(missing).and_then(|()| match &cycle_plan {
+            Some(cycle_plan) if self.orders.go_on() => passes.film(cycle_plan),
+            _ => Ok(()),
+        });
         let _ = self.board.go(RunState::Draining);
         drop(passes);
         let imaged = camera.join();
         let watched = vsync.join();
-        let storage = pipeline.join()?;
+        let mut storage = pipeline.join()?;
+        if let Some(film) = storage.film.take() {
+            let solved = film.finish();
+            let summary = account.summary();
+            storage.append(&Entry::Film(summary.clone()));
+            self.board.set_film(summary);
+            match solved {
+                Ok(ended) => ended?,
+                Err(error) => storage.note_write_error(error),
+            }
+        }
         // What failed first is the cause; what it brought down comes after.
         let (exposed_until, imaged) = match imaged {
             Ok(exposed_until) => (exposed_until, Ok(())),
@@ -204,6 +242,36 @@ impl Run {
         })
     }
 
+    fn film_sink(
+        &self,
+        cycle_plan: &CyclePlan,
+        camera: &CameraCapabilities,
+        pace: Pace,
+        account: &Arc<Account>,
+    ) -> Result<FilmSink, RunError> {
+        let task = &self.task;
+        let solver = task.film_solver()?;
+        let transports = film::create_transports(&self.session, task, solver.reach_rows())?;
+        if let Some(Err(error)) = self.live.as_ref().map(|outlet| outlet.file.clear()) {
+            tracing::warn!(%error, "the live file still shows the run before");
+        }
+        let worker = Worker::start(Solving {
+            solver,
+            transports,
+            live: self.live.clone(),
+            board: self.board.clone(),
+            account: account.clone(),
+            orders: self.orders.clone(),
+            pace,
+        })?;
+        let rolling_us = task.geometry.height.saturating_sub(1) as f64 * camera.row_time_us;
+        let timing = CycleTiming {
+            cycle_ns: f64::from(cycle_plan.order.cycle_periods()) * task.geometry.raster.period_us * 1e3,
+            frame_ns: ns_from_us(task.plan.film.exposure_us + rolling_us),
+        };
+        Ok(FilmSink::new(task, self.session.film()?, worker, account.clone(), pace, timing))
+    }
+
     fn assembler_config(&self, camera: &CameraCapabilities) -> Result<AssemblerConfig, RunError> {
         let geometry = &self.task.geometry;
         let size = (camera.height, camera.width);
@@ -214,7 +282,7 @@ impl Run {
             camera: camera.clone(),
             raster: geometry.raster,
             first_row: geometry.first_row,
-            max_jitter_us: self.task.plan.sweep.max_jitter_us,
+            max_jitter_us: self.task.plan.max_jitter_us(),
             edge_gate_us: self.rig.file.vsync.gate_us,
         })
     }
@@ -226,10 +294,13 @@ fn start_live(outlet: Outlet) -> Option<LiveEstimate> {
     started.map_err(|error| tracing::warn!(%error, "no live estimate of this run")).ok()
 }
 
-/// The points that the ledger does not know as stored, with the number of their next attempt.
-pub fn missing(schedule: &Schedule, state: &State) -> Vec<SettingsId> {
+/// The points that the ledger does not know as stored, with the number of their next attempt; of a film those that are
+/// not in its cycles.
+pub fn missing(task: &Task, state: &State) -> Vec<SettingsId> {
+    let in_cycles = |point: &Point| task.is_film() && matches!(point.role, Role::Sweep(_));
     (0..)
-        .zip(&schedule.points)
+        .zip(&task.schedule.points)
+        .filter(|(_, point)| !in_cycles(point))
         .filter_map(|(ordinal, point)| {
             let (array, index) = place(point.role);
             let attempt = state.next_attempt(array, index);
@@ -270,6 +341,27 @@ impl Passes<'_> {
         Err(RunError::Hopeless { points: todo.len() })
     }
 
+    /// Takes the film; what became of its cycles, the ledger says.
+    fn film(&mut self, cycle_plan: &CyclePlan) -> Result<(), RunError> {
+        let shown = self.projector.0.show(&Pattern::White)?;
+        let points: Vec<(u32, Point)> =
+            self.task.settings().map(|(ordinal, point)| (ordinal, *point)).collect();
+        let CycleOrder { settings, periods } = &cycle_plan.order;
+        let before = periods.iter().cycle().skip(periods.len() - 1);
+        let settings = settings.iter().zip(before).map(|(&setting, &periods_from_last)| {
+            let (ordinal, point) = points[setting];
+            FilmSetting { ordinal, point, shot: cycle_plan.shots[setting], periods_from_last }
+        });
+        let film = FilmPass {
+            settings: settings.collect(),
+            cycles: self.task.plan.film.cycles,
+            not_before_ns: shown.not_before_ns,
+        };
+        let acquired = self.camera.acquire(Work::Film(film)).map_err(|Gone| RunError::Interrupted)?;
+        self.results.iter().find(|verdict| matches!(verdict, Verdict::Flushed));
+        Ok(acquired?)
+    }
+
     fn point(&self, id: SettingsId) -> Point {
         self.task.schedule.points[id.point as usize]
     }
@@ -286,7 +378,7 @@ impl Passes<'_> {
             .collect();
         let acquired = self
             .camera
-            .acquire(Pass { attempts, not_before_ns: shown.not_before_ns })
+            .acquire(Work::Pass(Pass { attempts, not_before_ns: shown.not_before_ns }))
             .map_err(|Gone| RunError::Interrupted)?;
         let mut again = Vec::new();
         // The sink closes the channel when it ends, so this waits for nothing that cannot come.

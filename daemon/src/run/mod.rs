@@ -3,6 +3,7 @@
 mod board;
 mod camera;
 mod engine;
+mod film;
 mod orders;
 mod storage;
 mod vsync;
@@ -21,7 +22,7 @@ use raysweep_proto::{
 };
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger, SessionEntry};
-use raysweep_session::stack::{ArrayName, StackShape};
+use raysweep_session::stack::StackShape;
 use tokio::sync::broadcast;
 
 pub(crate) use self::board::Board;
@@ -30,7 +31,7 @@ use self::engine::{Acquired, Run, RunError};
 use self::orders::{Order, Orders};
 use crate::advice;
 use crate::check;
-use crate::config::{ConfigError, Plan};
+use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
 use crate::live::{LiveFile, Outlet};
 use crate::processing::Task;
@@ -216,7 +217,7 @@ impl Runner {
         let entry = SessionEntry {
             format: raysweep_session::ledger::FORMAT,
             name: task.plan.name.clone(),
-            kind: "sweep".into(),
+            kind: if task.is_film() { "film" } else { "sweep" }.into(),
             operator: params.operator.clone(),
             sample: params.sample.clone(),
             note: params.note.clone(),
@@ -224,7 +225,8 @@ impl Runner {
             created: jiff::Timestamp::now(),
             software: crate::SOFTWARE.into(),
             shape: StackShape {
-                points: task.schedule.sweep_len(),
+                points: task.points(),
+                settings: if task.is_film() { task.settings().count() } else { 0 },
                 exposures: task.schedule.dark_len(),
                 rows: self.camera.height,
                 columns: self.camera.width,
@@ -253,6 +255,12 @@ impl Runner {
             )));
         }
         let plan = Plan::parse(&plan_text).map_err(|error| invalid_plan(&error))?;
+        if plan.kind == PlanKind::Film {
+            return Err(no_session(format!(
+                "{} is a film, which cannot be resumed: its time has passed. `raysweep process` makes the transports of the cycles that are there; run the plan again for another film",
+                session.dir().display()
+            )));
+        }
         let ledger = session.resume().map_err(|error| storage(&error))?;
         let entry = &ledger.state().session;
         let task = Task::new(plan, &self.rig.file, entry.first_row, (entry.shape.rows, entry.shape.columns));
@@ -268,13 +276,16 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
     tracing::info!(session = %dir.display(), resumed = run.resumed, "run begins");
     let ended = catch_unwind(AssertUnwindSafe(|| -> Result<(EndEntry, Vec<String>), RunError> {
         let acquired = run.acquire()?;
-        conclude(acquired, &task, &rig, orders, live.as_ref())
+        match task.is_film() {
+            true => conclude_film(acquired, &task, &rig, orders),
+            false => conclude(acquired, &task, &rig, orders, live.as_ref()),
+        }
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
     let (end, warnings) = ended.unwrap_or_else(|error| {
-        let points = task.schedule.sweep_len();
+        let points = task.points();
         let stored = Session::open(dir).and_then(|session| session.state());
-        let stored = stored.map_or(0, |state| state.stored(ArrayName::Sum).count());
+        let stored = stored.map_or(0, |state| state.stored_points());
         let error = Some(error.to_string());
         let end = EndEntry {
             state: EndState::Faulted,
@@ -300,6 +311,7 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
         report: report.exists().then_some(report),
         stored: end.stored,
         missing: end.missing,
+        film: board.status().film,
         warnings,
         final_s: end.final_s,
     };
@@ -319,7 +331,7 @@ fn conclude(
     live: Option<&Outlet>,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
     let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
-    let whole = fault.is_none() && engine::missing(&task.schedule, ledger.state()).is_empty();
+    let whole = fault.is_none() && engine::missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let results = whole.then(|| processing.finish(&|| orders.go_on()));
     let computed = began.elapsed();
@@ -329,12 +341,12 @@ fn conclude(
         (None, Some(_)) => EndState::Complete,
         (None, None) => EndState::Faulted,
     };
-    let stored = ledger.state().stored(ArrayName::Sum).count();
+    let stored = ledger.state().stored_points();
     let mut end = EndEntry {
         state,
         error: fault.map(|fault| fault.to_string()),
         stored,
-        missing: task.schedule.sweep_len() - stored,
+        missing: task.points() - stored,
         vsync,
         final_s: None,
     };
@@ -358,6 +370,34 @@ fn conclude(
     Ok((end, warnings))
 }
 
+/// Writes a film's report: its transports are there already, so one that was ended early is as good as a short one.
+fn conclude_film(
+    acquired: Acquired,
+    task: &Task,
+    rig: &Rig,
+    orders: &Orders,
+) -> Result<(EndEntry, Vec<String>), RunError> {
+    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
+    let state = match &fault {
+        Some(_) => EndState::Faulted,
+        None if orders.now() == Order::Cancel => EndState::Cancelled,
+        None => EndState::Complete,
+    };
+    let stored = ledger.state().stored_points();
+    let error = fault.map(|fault| fault.to_string());
+    let final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+    let missing = task.points() - stored;
+    let end = EndEntry { state, error, stored, missing, vsync, final_s };
+    ledger.append(&Entry::End(end.clone()))?;
+    let mut problems = processing.problems;
+    if state != EndState::Faulted {
+        results::write_film_report(&session, ledger.state(), task, &problems)?;
+        results::write_manifest(&session, ledger.state(), task, &rig.file)?;
+    }
+    problems.extend(crate::film::shortcomings(ledger.state()));
+    Ok((end, problems))
+}
+
 /// Shows the result where the estimates before it were shown.
 fn show_last(live: Option<&Outlet>, products: &[Product], points: usize, took: Duration) {
     for product in products {
@@ -376,9 +416,11 @@ impl Control for Runner {
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
         let (task, mut report) = self.foresee(plan)?;
-        match advice::advise(&task, &self.rig.file, &self.camera) {
-            Ok(advice) => report.advice = Some(advice),
-            Err(none) => report.warnings.push(none.to_string()),
+        if !task.is_film() {
+            match advice::advise(&task, &self.rig.file, &self.camera) {
+                Ok(advice) => report.advice = Some(advice),
+                Err(none) => report.warnings.push(none.to_string()),
+            }
         }
         Ok(report)
     }

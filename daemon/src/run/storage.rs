@@ -11,6 +11,7 @@ use raysweep_session::ledger::{Entry, Ledger, PointEntry};
 use raysweep_session::stack::Stack;
 
 use super::board::Board;
+use super::film::FilmSink;
 use super::orders::{Order, Orders};
 use crate::live::LiveEstimate;
 use crate::processing::{Processing, Task, place};
@@ -35,6 +36,8 @@ pub struct Storage {
     pub(super) orders: Arc<Orders>,
     pub(super) board: Arc<Board>,
     pub(super) pace: PaceMeter,
+    /// Where the run is a film.
+    pub(super) film: Option<FilmSink>,
     pub(super) vsync: Option<VsyncStats>,
     /// Until the pipeline has ended: then the machine is for the results.
     pub(super) live: Option<LiveEstimate>,
@@ -46,9 +49,9 @@ pub struct Storage {
 pub struct PaceMeter {
     began: Instant,
     stored_before: usize,
-    stored: usize,
+    pub(super) stored: usize,
     planned: usize,
-    counts: Counts,
+    pub(super) counts: Counts,
 }
 
 impl PaceMeter {
@@ -57,7 +60,7 @@ impl PaceMeter {
         Self { began: Instant::now(), stored_before, stored: 0, planned, counts: Counts::default() }
     }
 
-    fn progress(&self) -> Progress {
+    pub(super) fn progress(&self) -> Progress {
         let elapsed_s = self.began.elapsed().as_secs_f64();
         let left = self.planned.saturating_sub(self.stored_before + self.stored);
         Progress {
@@ -74,6 +77,8 @@ impl PaceMeter {
 impl Sink for Storage {
     fn take(&mut self, item: Ordered) {
         match item {
+            Ordered::Unit(unit, image) if self.film_frame(&unit, &image) => {}
+            Ordered::Failed(id, counts) if self.film_frame_lost(id, &counts) => {}
             Ordered::Unit(unit, image) => {
                 if let Err(error) = self.store(&unit) {
                     tracing::error!(%error, point = unit.id.point, "point not stored");
@@ -100,6 +105,7 @@ impl Sink for Storage {
             }
             Ordered::Failed(id, counts) => self.fail(id, counts),
             Ordered::Flushed(outside, vsync) => {
+                self.film_over();
                 if outside != Counts::default() {
                     self.pace.counts.add(&outside);
                     self.append(&Entry::Outside { counts: outside });
@@ -155,7 +161,7 @@ impl Storage {
         }
     }
 
-    fn note_write_error(&mut self, error: raysweep_session::Error) {
+    pub(super) fn note_write_error(&mut self, error: raysweep_session::Error) {
         self.orders.give(Order::Fault);
         self.write_error.get_or_insert(error);
     }

@@ -62,6 +62,7 @@ impl Fake {
             report,
             stored: 75 - missing,
             missing,
+            film: None,
             warnings: Vec::new(),
             final_s: None,
         });
@@ -136,6 +137,7 @@ pub fn report() -> CheckReport {
                 sweep: "[sweep]\naverage = 8\n".into(),
             }),
         }),
+        film: None,
         warnings: vec!["few points".into()],
     }
 }
@@ -168,6 +170,7 @@ impl Control for Fake {
             session: Some(session()),
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
+            film: None,
             error: None,
             live: self.live.exists().then(|| self.live.clone()),
         }

@@ -66,14 +66,18 @@ struct Stage {
 }
 
 pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Object {
+    build_swung(size, bands, seed, 0.0)
+}
+
+/// The ball as a pendulum's bob, at `swing` from -1 to 1 of its way: over a tenth of a radius it rises, over most of
+/// one it goes sideways.
+pub(super) fn build_swung(size: SceneSize, bands: &[usize], seed: u64, swing: f64) -> Object {
     let SceneSize { rows, columns } = size;
     let mut dice = Dice::new(seed);
     let radius = 0.23 * rows.min(columns) as f64;
-    let ball = Ball::new(
-        [columns as f64 * dice.between(0.5, 0.56), rows as f64 * dice.between(0.47, 0.53), 1.5 * radius],
-        radius,
-        &mut dice,
-    );
+    let rest = [columns as f64 * dice.between(0.5, 0.56), rows as f64 * dice.between(0.47, 0.53)];
+    let bob = [rest[0] + 0.8 * radius * swing, rest[1] - 0.1 * radius * swing * swing];
+    let ball = Ball::new([bob[0], bob[1], 1.5 * radius], radius, &mut dice);
     let frame = ProjectorFrame::covering(columns, ball.centre[2] + radius);
     let stage = Stage { ball, page: printed_page(rows, columns, seed), frame, size, cells: 2 * columns };
     let mut direct = Direct::new(size, bands.len(), |row, x| {

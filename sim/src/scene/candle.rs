@@ -69,11 +69,16 @@ impl Candle {
 }
 
 pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Object {
+    build_swung(size, bands, seed, 0.0)
+}
+
+/// The candle pushed sideways, at `swing` from -1 to 1 of its way: half a radius to either side.
+pub(super) fn build_swung(size: SceneSize, bands: &[usize], seed: u64, swing: f64) -> Object {
     let SceneSize { rows, columns } = size;
     let mut dice = Dice::new(seed);
     let radius = 0.29 * rows.min(columns) as f64;
     let candle = Candle {
-        axis_x: columns as f64 * dice.between(0.49, 0.53),
+        axis_x: columns as f64 * dice.between(0.49, 0.53) + 0.5 * radius * swing,
         axis_z: 1.15 * radius,
         radius,
         top: rows as f64 * dice.between(0.12, 0.18),

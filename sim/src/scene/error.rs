@@ -4,13 +4,13 @@ use std::path::PathBuf;
 
 use ndarray_npy::{ReadNpzError, WriteNpzError};
 
-use super::{BUILTIN_NAMES, MAX_ENTRIES, MIN_SIDE, Window};
+use super::{BUILTIN_NAMES, MAX_ENTRIES, MIN_SIDE, MOVING_NAMES, Window};
 
 /// Why a scene could not be had, or could not answer.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
     /// No built-in scene of this name.
-    #[error("scene \"{name}\": no such built-in scene; choose one of {}, or name a file that ends in .npz", BUILTIN_NAMES.join(", "))]
+    #[error("scene \"{name}\": no such built-in scene; choose one of {}, one that moves ({}), or name a file that ends in .npz", BUILTIN_NAMES.join(", "), MOVING_NAMES.join(", "))]
     UnknownName {
         /// The name asked for.
         name: String,
@@ -28,6 +28,19 @@ pub enum SceneError {
         columns: usize,
         /// 1 for mono, 3 for RGB.
         channels: usize,
+    },
+    /// A moving scene is computed in several positions, which would be too large together.
+    #[error(
+        "scene size {rows} rows x {columns} columns: a moving scene is kept in {keys} positions, and \
+         {keys} x rows x rows x columns may reach {MAX_ENTRIES}; choose a smaller size or a scene at rest"
+    )]
+    MovingSize {
+        /// Rows asked for.
+        rows: usize,
+        /// Columns asked for.
+        columns: usize,
+        /// Positions.
+        keys: usize,
     },
     /// The file cannot be opened.
     #[error("scene file {}: cannot be opened; check the path and its permissions", path.display())]

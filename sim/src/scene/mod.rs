@@ -16,6 +16,7 @@ mod error;
 mod form_factor;
 mod groove;
 mod mix;
+mod motion;
 mod npz;
 mod projector;
 mod quadrature;
@@ -31,6 +32,7 @@ use std::path::Path;
 use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayViewMut3, ArrayViewMut4, Axis, s};
 
 pub use error::SceneError;
+pub use motion::{MOVING_NAMES, Motion};
 use projector::{Pattern, PatternPart};
 pub use slab::slab_materials;
 
@@ -117,7 +119,7 @@ impl Scene {
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`].
     pub fn builtin(name: &str, size: SceneSize, seed: u64) -> Result<Self, SceneError> {
-        Self::compute(name, size, MONO, seed)
+        Self::compute(name, size, MONO, seed, 0.0)
     }
 
     /// Computes a built-in scene in linear RGB; otherwise as [`Scene::builtin`].
@@ -125,10 +127,17 @@ impl Scene {
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`].
     pub fn builtin_rgb(name: &str, size: SceneSize, seed: u64) -> Result<Self, SceneError> {
-        Self::compute(name, size, RGB, seed)
+        Self::compute(name, size, RGB, seed, 0.0)
     }
 
-    fn compute(name: &str, size: SceneSize, bands: &[usize], seed: u64) -> Result<Self, SceneError> {
+    /// `swing` is the place of what moves, from -1 at the left end of its swing to 1; scenes at rest have none.
+    fn compute(
+        name: &str,
+        size: SceneSize,
+        bands: &[usize],
+        seed: u64,
+        swing: f64,
+    ) -> Result<Self, SceneError> {
         let SceneSize { rows, columns } = size;
         let entries = rows.saturating_mul(rows).saturating_mul(columns).saturating_mul(bands.len());
         if rows < MIN_SIDE || columns < MIN_SIDE || entries > MAX_ENTRIES {
@@ -137,8 +146,10 @@ impl Scene {
         let panels = match name {
             "v-groove" => vec![Panel::whole(groove::build(size, bands, seed))],
             "mirror-ball" => vec![Panel::whole(ball::build(size, bands, seed))],
+            "pendulum" => vec![Panel::whole(ball::build_swung(size, bands, seed, swing))],
             "slab" => vec![Panel::whole(slab::build(size, bands, seed))],
             "candle" => vec![Panel::whole(candle::build(size, bands, seed))],
+            "moving-candle" => vec![Panel::whole(candle::build_swung(size, bands, seed, swing))],
             "mix" => mix::build(size, bands, seed),
             _ => return Err(SceneError::UnknownName { name: name.into() }),
         };

@@ -57,6 +57,16 @@ impl Feed {
     }
 
     fn begin(&mut self, frames: u32, trigger_delay_us: f64, light_edges_later: u32) {
+        self.begin_after(None, frames, trigger_delay_us, light_edges_later);
+    }
+
+    fn begin_after(
+        &mut self,
+        periods_from_last: Option<u32>,
+        frames: u32,
+        trigger_delay_us: f64,
+        light_edges_later: u32,
+    ) {
         let actual = CameraSettings { shutter: Shutter::Rolling, exposure_us: EXPOSURE_US, trigger_delay_us };
         self.push(Event::Begin(Job {
             id: SettingsId { point: 7, attempt: 0 },
@@ -64,6 +74,7 @@ impl Feed {
             applied: Applied { actual, first_frame: FirstFrame::Exactly(0) },
             delay_us: 0.0,
             light_edges_later,
+            periods_from_last,
         }));
     }
 
@@ -298,4 +309,37 @@ fn frame_ids_that_fall_back_do_no_harm() {
     feed.frame(4, 1);
     feed.push(Event::End);
     assert!(feed.unit().counts.balanced());
+}
+
+#[test]
+fn triggers_that_a_film_misses_between_two_settings_are_counted() {
+    let mut feed = Feed::new();
+    feed.edges(0, 12);
+    // One frame a job; the third takes a period more than the others, by its settings, and the fifth because the
+    // camera heard nothing at edge 7.
+    for (job, edge) in [2, 3, 5, 6, 8].into_iter().enumerate() {
+        let periods = [None, Some(1), Some(2), Some(1), Some(1)][job];
+        feed.begin_after(periods, 1, 700.0, 0);
+        feed.frame(edge, 100);
+        feed.push(Event::End);
+    }
+    let missed = feed.decisions.iter().map(|decision| match decision {
+        Decision::Unit(unit) => unit.counts.lost_total(),
+        _ => panic!("every frame is sound"),
+    });
+    assert_eq!(missed.collect::<Vec<_>>(), [0, 0, 0, 0, 1]);
+}
+
+#[test]
+fn a_frame_that_found_no_room_is_lost_once() {
+    let mut feed = Feed::new();
+    feed.edges(0, 12);
+    feed.begin(2, 700.0, 0);
+    feed.frame(2, 100);
+    let lost = feed.stamp(3 * PERIOD_NS);
+    feed.push(Event::Lost(lost.seq, Some(LossCause::PoolEmpty)));
+    feed.frame(4, 100);
+    feed.push(Event::End);
+    let counts = &feed.unit().counts;
+    assert_eq!((counts.expected, counts.lost_total()), (3, 1), "its trigger was answered");
 }

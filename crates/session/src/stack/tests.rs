@@ -2,7 +2,7 @@ use super::*;
 use std::fs;
 
 fn shape(rows: usize, columns: usize) -> StackShape {
-    StackShape { points: 4, exposures: 2, rows, columns }
+    StackShape { points: 4, exposures: 2, rows, columns, settings: 0 }
 }
 
 fn image(shape: &StackShape, seed: u32) -> Array2<u32> {
@@ -24,7 +24,7 @@ fn every_array_reads_back_at_sizes_around_a_chunk() {
                 assert_eq!(stack.write(array, index, data.view()).unwrap(), crc32(data.view()));
             }
         }
-        let stack = Stack::open(&path).unwrap();
+        let stack = Stack::open(&path, &shape).unwrap();
         assert_eq!(*stack.shape(), shape);
         for array in ArrayName::ALL {
             let all = stack.read(array).unwrap();
@@ -101,7 +101,7 @@ fn the_same_data_give_the_same_bytes_in_a_new_stack_and_in_a_resumed_one() {
     let first = bytes(Stack::create(dir.path(), &shape, "sweep").unwrap());
     for _ in 0..10 {
         assert!(bytes(Stack::create(dir.path(), &shape, "sweep").unwrap()) == first);
-        assert!(bytes(Stack::open(dir.path()).unwrap()) == first);
+        assert!(bytes(Stack::open(dir.path(), &shape).unwrap()) == first);
     }
 }
 
@@ -131,7 +131,7 @@ fn every_damaged_byte_of_a_shard_is_noticed() {
 #[test]
 fn a_hierarchy_that_is_not_a_stack_is_an_error() {
     let dir = tempfile::tempdir().unwrap();
-    assert!(matches!(Stack::open(&dir.path().join("missing")), Err(Error::Zarr { .. })));
+    assert!(matches!(Stack::open(&dir.path().join("missing"), &shape(8, 8)), Err(Error::Zarr { .. })));
     let stack = Stack::create(dir.path(), &shape(8, 8), "sweep").unwrap();
     stack.write(ArrayName::Sum, 0, image(&shape(8, 8), 0).view()).unwrap();
     let path = dir.path().join("sum/zarr.json");
@@ -150,7 +150,7 @@ fn a_hierarchy_that_is_not_a_stack_is_an_error() {
     ] {
         assert!(compact.contains(from), "{from}");
         fs::write(&path, compact.replace(from, to)).unwrap();
-        let opened = Stack::open(dir.path());
+        let opened = Stack::open(dir.path(), &shape(8, 8));
         let error = opened.and_then(|stack| stack.read_point(ArrayName::Sum, 0)).err();
         assert!(matches!(error, Some(Error::Zarr { .. } | Error::Shape { .. })), "{from} -> {to}: {error:?}");
     }

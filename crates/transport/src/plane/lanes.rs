@@ -4,6 +4,7 @@ use aligned_vec::{AVec, avec};
 use ndarray::{ArrayView1, ArrayView2};
 use pulp::{Simd, WithSimd};
 
+use super::narrow::NarrowWork;
 use super::pivot::{MAX_STEPS, PATIENCE, TOLERANCE};
 use super::quadratic::Quadratic;
 
@@ -91,6 +92,8 @@ struct Work<'a, S: Simd> {
     matrix: AVec<f64>,
     rhs: AVec<f64>,
     reciprocals: AVec<f64>,
+    /// Solves the systems instead, where there are few settings for many rows.
+    narrow: Option<NarrowWork<'a, S>>,
 }
 
 impl<'a, S: Simd> Work<'a, S> {
@@ -114,6 +117,7 @@ impl<'a, S: Simd> Work<'a, S> {
             matrix: zeros(slots),
             rhs: zeros(padded),
             reciprocals: zeros(padded),
+            narrow: quadratic.narrow().map(|narrow| NarrowWork::new(simd, narrow)),
         }
     }
 
@@ -146,9 +150,13 @@ impl<'a, S: Simd> Work<'a, S> {
         (lane..self.y.len()).step_by(lanes).map(|at| if self.free[at] { self.y[at].max(0.0) } else { 0.0 })
     }
 
-    /// Sets `y` in all lanes, by whichever of the free slots and the others are fewer.
+    /// Sets `y` in all lanes, by whichever of the settings, the free slots and the others are fewer.
     #[inline(always)]
     fn solve(&mut self) {
+        if let Some(narrow) = &mut self.narrow {
+            narrow.solve(&self.free, &self.c, &mut self.y);
+            return;
+        }
         let lanes = S::F64_LANES;
         let mut free = [0; MAX_LANES];
         for flags in self.free.chunks_exact(lanes) {
@@ -565,6 +573,28 @@ mod tests {
             let intensities = Array2::from_shape_simple_fn((pixels, settings), || 4.0 * random() - 1.0);
             let start = warm.then(|| Array2::from_shape_simple_fn((pixels, slots), || random() < 0.5));
             let prior = if split { Prior::Split { alpha: 0.01, beta } } else { Prior::Paper { alpha: 0.01, beta } };
+            equals_the_reference(&weights, &intensities, prior, start.as_ref());
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+
+        /// Few settings for many slots, which are solved along their chains: both priors, boxes and anything else, rows
+        /// that no setting sees.
+        #[test]
+        fn few_settings(slots in 30..90_usize, settings in 1..9_usize, pixels in 1..20_usize, beta in 0.0..1.0, split: bool, warm: bool, boxes: bool, seed: u64) {
+            let mut random = random(seed);
+            let weights = match boxes {
+                true => Array2::from_shape_fn((settings, slots), |(n, u)| f64::from((n * slots / settings).abs_diff(u) < 9)),
+                false => Array2::from_shape_simple_fn((settings, slots), || (2.0 * random() - 1.0).max(0.0)),
+            };
+            let intensities = Array2::from_shape_simple_fn((pixels, settings), || 4.0 * random() - 1.0);
+            let start = warm.then(|| Array2::from_shape_simple_fn((pixels, slots), || random() < 0.5));
+            let prior = if split { Prior::Split { alpha: 0.1, beta } } else { Prior::Paper { alpha: 0.01, beta } };
+            let all: Vec<Slot> = (-(slots as i32) / 2..).take(slots).map(|u| Slot { u, kind: SlotKind::Own }).collect();
+            let quadratic = Quadratic::new(weights.view(), &all, &prior).unwrap();
+            prop_assert_eq!(quadratic.narrow().is_some(), 3 * (settings + 1 + usize::from(split)) <= slots);
             equals_the_reference(&weights, &intensities, prior, start.as_ref());
         }
     }

@@ -26,6 +26,7 @@ mod demux;
 mod error;
 mod forward;
 mod lanes;
+mod narrow;
 mod noise;
 mod pivot;
 mod prior;

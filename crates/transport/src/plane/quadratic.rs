@@ -1,10 +1,11 @@
 use ndarray::{Array2, ArrayView2, Axis, s};
 
+use super::narrow::Narrow;
 use super::{PlaneError, Prior, Slot, cholesky};
 
 /// Relative increase of the diagonal of `H`. Rows that the settings leave undetermined then have one solution, the
 /// smallest, and every factorisation succeeds; the minimum moves by far less than a sample's rounding.
-const RIDGE: f64 = 1e-12;
+pub(super) const RIDGE: f64 = 1e-12;
 
 /// Condition up to which the inverse is used; the paper's sweep has at most 1e4, undetermined rows 1e12.
 const WELL_CONDITIONED: f64 = 1e7;
@@ -21,6 +22,8 @@ pub(super) struct Quadratic {
     /// large that nothing but rounding would remain.
     well_conditioned: bool,
     half_beta: f64,
+    /// The parts of `H`, where there are few settings for many rows.
+    narrow: Option<Narrow>,
 }
 
 impl Quadratic {
@@ -54,19 +57,20 @@ impl Quadratic {
                 touched.iter().for_each(|&(j, b)| h[[i, j]] += prior.alpha() * a * b);
             }
         }
+        let narrow = Narrow::new(weights, differences, prior.alpha(), &h.diag().to_vec());
         for diagonal in h.diag_mut().slice_mut(s![..n]) {
             // A slot that no setting sees and no difference holds must not make H singular; its T is 0 in any case.
             *diagonal = if *diagonal > 0.0 { *diagonal * (1.0 + RIDGE) } else { 1.0 };
         }
         let inverse = invert(h.slice(s![..n, ..n]))?;
-        Ok(Self::from_parts(h, inverse, prior.beta() / 2.0))
+        Ok(Self { narrow, ..Self::from_parts(h, inverse, prior.beta() / 2.0) })
     }
 
     fn from_parts(h: Array2<f64>, inverse: Array2<f64>, half_beta: f64) -> Self {
         // The diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
         let condition =
             h.diag().iter().zip(inverse.diag()).fold(1.0_f64, |most, (h, inverse)| most.max(h * inverse));
-        Self { h, inverse, well_conditioned: condition < WELL_CONDITIONED, half_beta }
+        Self { h, inverse, well_conditioned: condition < WELL_CONDITIONED, half_beta, narrow: None }
     }
 
     /// The same objective without some of its settings, whose weights are `dropped`, shape `[dropped settings, slots]`:
@@ -100,6 +104,11 @@ impl Quadratic {
             .slice_mut(s![..n, ..n])
             .zip_mut_with(&update.t().dot(&update), |inverse, more| *inverse += more);
         Some(Self::from_parts(h, inverse, self.half_beta)).filter(|downdated| downdated.well_conditioned)
+    }
+
+    /// The parts of `H` that systems are solved by where there are few settings for many rows.
+    pub fn narrow(&self) -> Option<&Narrow> {
+        self.narrow.as_ref()
     }
 
     /// How many unknowns there are.

@@ -1,0 +1,61 @@
+//! How a film went: what its end, its report and the daemon's status say.
+
+use serde::{Deserialize, Serialize};
+
+/// The account of a film. Cycles planned = stored + incomplete + those not taken.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct FilmSummary {
+    /// Cycles that the plan asks for.
+    pub cycles_planned: usize,
+    /// Cycles whose frames are all stored.
+    pub cycles_stored: usize,
+    /// Cycles that lack a frame; the ledger says which, and why.
+    pub cycles_incomplete: usize,
+    /// Stored cycles whose transport was estimated during the film.
+    pub transports: usize,
+    /// Stored cycles whose transport was not, because the machine did not keep up or a stage failed: `raysweep process`
+    /// makes them.
+    pub transports_missing: usize,
+    /// Estimates between the cycles, published and not stored.
+    pub sliding_estimates: usize,
+    /// Cycles a second between the first and the last that were stored.
+    pub cycles_per_s: Option<f64>,
+    /// From the end of the last exposure of a cycle to the publication of its transport; nothing on a virtual clock.
+    pub latency_ms: Option<Percentiles>,
+}
+
+/// Percentiles of something that was measured again and again.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Percentiles {
+    /// Median.
+    pub p50: f64,
+    /// 95th percentile.
+    pub p95: f64,
+    /// 99th percentile.
+    pub p99: f64,
+    /// The largest.
+    pub max: f64,
+}
+
+impl Percentiles {
+    /// Of values in ascending order; nothing of none. Each is the smallest value that so many percent do not exceed.
+    pub fn of_sorted(values: &[f64]) -> Option<Self> {
+        let at = |percent: usize| values.get((values.len() * percent).div_ceil(100).max(1) - 1).copied();
+        Some(Self { p50: at(50)?, p95: at(95)?, p99: at(99)?, max: at(100)? })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn percentiles_are_values_that_were_measured() {
+        let values: Vec<f64> = (1..=200).map(f64::from).collect();
+        let all = Percentiles { p50: 100.0, p95: 190.0, p99: 198.0, max: 200.0 };
+        assert_eq!(Percentiles::of_sorted(&values), Some(all));
+        let one = Percentiles { p50: 7.0, p95: 7.0, p99: 7.0, max: 7.0 };
+        assert_eq!(Percentiles::of_sorted(&[7.0]), Some(one));
+        assert_eq!(Percentiles::of_sorted(&[]), None);
+    }
+}

@@ -1,0 +1,286 @@
+//! Films: a short sweep, one frame a setting, again and again without pause; each cycle has its own light transport.
+
+use std::sync::Arc;
+
+use ndarray::{Array2, Array3, Axis};
+use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
+use raysweep_transport::plane::{Demux, Setting, Transport};
+
+use crate::demux::{DemuxFold, DemuxOptions};
+use crate::registry::RegistryError;
+use crate::schedule::{Schedule, SweepGeometry};
+use crate::stage::FoldError;
+use crate::unit::Unit;
+
+/// The order in which a cycle takes its settings, as indices, and the VSYNC periods from each one's frame to the
+/// next one's (of the last: to the first one's of the next cycle).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CycleOrder {
+    /// Indices of the settings.
+    pub settings: Vec<usize>,
+    /// Periods after the frame of the same place.
+    pub periods: Vec<u32>,
+}
+
+impl CycleOrder {
+    /// The order that takes the fewest periods on this camera; `margin_us` is kept free of every period, since edges
+    /// jitter.
+    ///
+    /// A camera that overlaps readout and exposure misses a trigger where the trigger delay falls back by more than
+    /// period - readout. Downwards, a cycle falls back by no more than the largest gap between neighbouring delays,
+    /// and less is impossible: each gap must be crossed on the way down from the largest delay to the smallest. Where
+    /// even that is too much, one fall a cycle is the least that can be, and upwards there is just one.
+    pub fn fastest(
+        shots: &[CameraSettings],
+        camera: &CameraCapabilities,
+        period_us: f64,
+        margin_us: f64,
+    ) -> Self {
+        let mut upwards: Vec<usize> = (0..shots.len()).collect();
+        upwards.sort_by(|&a, &b| shots[a].trigger_delay_us.total_cmp(&shots[b].trigger_delay_us));
+        let downwards: Vec<usize> = upwards.iter().rev().copied().collect();
+        let timed = |settings: Vec<usize>| {
+            let next = settings.iter().cycle().skip(1);
+            let periods = settings
+                .iter()
+                .zip(next)
+                .map(|(&a, &b)| camera.periods_between(&shots[a], &shots[b], period_us - margin_us))
+                .collect();
+            Self { settings, periods }
+        };
+        let (downwards, upwards) = (timed(downwards), timed(upwards));
+        if upwards.cycle_periods() < downwards.cycle_periods() { upwards } else { downwards }
+    }
+
+    /// VSYNC periods that a cycle takes.
+    pub fn cycle_periods(&self) -> u32 {
+        self.periods.iter().sum()
+    }
+}
+
+/// One sound frame of a film.
+#[derive(Debug, Clone)]
+pub struct FilmFrame {
+    /// The delay as measured, the exposure as taken.
+    pub setting: Setting,
+    /// Start of the exposure of row 0, on the host's clock.
+    pub exposure_start_ns: i64,
+    /// Raw counts, `[t, s]`.
+    pub raw: Arc<Array2<u32>>,
+    /// Counts after all stages, `[t, s]`; nothing where a stage failed.
+    pub image: Option<Arc<Array2<f32>>>,
+}
+
+impl FilmFrame {
+    /// The only frame of a film's unit, with its image after all stages.
+    pub fn of(unit: &Unit, image: Option<Arc<Array2<f32>>>) -> Option<Self> {
+        let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
+        let exposure_start_ns = unit.last_exposure_ns?;
+        Some(Self { setting, exposure_start_ns, raw: unit.sum.clone(), image })
+    }
+}
+
+/// A cycle that is being taken.
+#[derive(Debug, Clone)]
+pub struct Cycle {
+    /// Counted from 0.
+    pub number: u32,
+    /// By setting.
+    pub frames: Vec<Option<FilmFrame>>,
+    /// Where its triggers went.
+    pub counts: Counts,
+    /// Settings whose fate is decided.
+    pub decided: usize,
+}
+
+impl Cycle {
+    /// A cycle of `settings` settings, nothing of which is there yet.
+    pub fn new(number: u32, settings: usize) -> Self {
+        Self { number, frames: vec![None; settings], counts: Counts::default(), decided: 0 }
+    }
+
+    /// Whether nothing more comes.
+    pub fn is_over(&self) -> bool {
+        self.decided == self.frames.len()
+    }
+
+    /// The settings that have no sound frame.
+    pub fn missing(&self) -> Vec<usize> {
+        let missing = self.frames.iter().enumerate().filter(|(_, frame)| frame.is_none());
+        missing.map(|(setting, _)| setting).collect()
+    }
+}
+
+/// From the frames of a cycle to its light transport.
+pub struct FilmSolver {
+    demux: Demux,
+    geometry: SweepGeometry,
+}
+
+impl FilmSolver {
+    /// A solver for the cycles of `schedule`.
+    ///
+    /// # Errors
+    /// When the options or the geometry make no model.
+    pub fn new(
+        options: DemuxOptions,
+        schedule: &Schedule,
+        geometry: &SweepGeometry,
+    ) -> Result<Self, RegistryError> {
+        let demux = DemuxFold::new(options, schedule, geometry)?
+            .demux()
+            .map_err(|error| RegistryError::Invalid { name: "demux".into(), what: error.to_string() })?;
+        Ok(Self { demux, geometry: geometry.clone() })
+    }
+
+    /// The relative rows that are estimated: first and last.
+    pub fn reach_rows(&self) -> (i32, i32) {
+        let reach = self.demux.reach();
+        (*reach.start(), *reach.end())
+    }
+
+    /// The transport of one frame of each setting, in the settings' order; `dark` is the image `[t, s]` without light.
+    /// From `last`, the transport of a moment before, it is found sooner, and may differ in the last bits. Ends early,
+    /// with an error, soon after `go_on` says no.
+    ///
+    /// # Errors
+    /// When a frame's delay makes no model, or `go_on` said no.
+    pub fn solve(
+        &self,
+        frames: &[(Setting, Arc<Array2<f32>>)],
+        dark: &Array2<f32>,
+        last: Option<&Transport>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, FoldError> {
+        let (height, width) = (self.geometry.height, self.geometry.width);
+        let scale = (1.0 / self.geometry.white_dn) as f32;
+        let is_valid = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
+        let shape = (frames.len(), height, width);
+        let saturates = frames.iter().any(|(_, image)| image.iter().any(|&counts| !is_valid(counts)));
+        let mut valid = saturates.then(|| Array3::from_elem(shape, true));
+        let mut stack = Array3::zeros(shape);
+        for (index, (_, image)) in frames.iter().enumerate() {
+            if let Some(valid) = &mut valid {
+                valid.index_axis_mut(Axis(0), index).assign(&image.mapv(is_valid));
+            }
+            stack.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * scale));
+        }
+        let settings = frames.iter().map(|(setting, _)| setting.clone()).collect();
+        self.demux
+            .with_settings(settings)
+            .and_then(|demux| {
+                let valid = valid.as_ref().map(|valid| valid.view());
+                match last {
+                    Some(last) => demux.solve_from(last, stack.view(), valid, go_on),
+                    None => demux.solve_while(stack.view(), valid, go_on),
+                }
+            })
+            .map_err(|error| FoldError { fold: "film".into(), what: error.to_string() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_core::{PixelFormat, Readout, Shutter};
+
+    use super::*;
+
+    const PERIOD_US: f64 = 16_666.667;
+    /// The default film's delays.
+    const DELAYS_US: [f64; 15] = [
+        -1500.0, -1154.0, -847.0, -579.0, -355.0, -178.0, -55.0, 0.0, 55.0, 178.0, 355.0, 579.0, 847.0,
+        1154.0, 1500.0,
+    ];
+
+    fn camera(readout: Readout, readout_us: f64) -> CameraCapabilities {
+        CameraCapabilities {
+            model: "scripted".into(),
+            width: 2,
+            height: 1,
+            format: PixelFormat::Mono12,
+            row_time_us: 20.0,
+            trigger_latency_us: 8.0,
+            readout_us,
+            readout,
+            exposure_us: 1.0..=1e6,
+            trigger_delay_us: 0.0..=1e6,
+        }
+    }
+
+    fn shots(delays_us: &[f64]) -> Vec<CameraSettings> {
+        let shot = |delay_us: &f64| CameraSettings {
+            shutter: Shutter::Rolling,
+            exposure_us: 600.0,
+            trigger_delay_us: 2000.0 + delay_us,
+        };
+        delays_us.iter().map(shot).collect()
+    }
+
+    /// All orders of `rest` after those already in `order`.
+    fn orders(order: &mut Vec<usize>, rest: &mut Vec<usize>, visit: &mut impl FnMut(&[usize])) {
+        if rest.is_empty() {
+            visit(order);
+        }
+        for place in 0..rest.len() {
+            let setting = rest.remove(place);
+            order.push(setting);
+            orders(order, rest, visit);
+            order.pop();
+            rest.insert(place, setting);
+        }
+    }
+
+    #[test]
+    fn no_order_takes_fewer_periods_or_falls_back_by_less() {
+        let delays_us = [300.0, -1500.0, 0.0, -200.0, 1100.0, 700.0];
+        let shots = shots(&delays_us);
+        for readout_us in [1_000.0, 15_000.0, 15_700.0, 16_100.0, 16_400.0, 16_600.0, 20_000.0] {
+            for readout in [Readout::Overlapped, Readout::Sequential] {
+                let camera = camera(readout, readout_us);
+                let found = CycleOrder::fastest(&shots, &camera, PERIOD_US, 0.0);
+                let fall = |order: &[usize]| {
+                    let next = order.iter().cycle().skip(1);
+                    order.iter().zip(next).map(|(&a, &b)| delays_us[a] - delays_us[b]).fold(0.0, f64::max)
+                };
+                let periods = |order: &[usize]| -> u32 {
+                    let next = order.iter().cycle().skip(1);
+                    let between =
+                        |(&a, &b): (&usize, &usize)| camera.periods_between(&shots[a], &shots[b], PERIOD_US);
+                    order.iter().zip(next).map(between).sum()
+                };
+                let (mut fewest, mut smallest) = (u32::MAX, f64::INFINITY);
+                orders(&mut Vec::new(), &mut (0..6).collect(), &mut |order| {
+                    fewest = fewest.min(periods(order));
+                    smallest = smallest.min(fall(order));
+                });
+                assert_eq!(found.cycle_periods(), fewest, "{readout:?}, {readout_us} us");
+                assert_eq!(found.cycle_periods(), periods(&found.settings));
+                if found.settings.first() == Some(&4) {
+                    assert_eq!(fall(&found.settings), smallest);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_default_film_misses_no_trigger_of_a_camera_that_reads_out_in_16_1_ms() {
+        let shots = shots(&DELAYS_US);
+        let periods = |readout_us: f64| {
+            CycleOrder::fastest(&shots, &camera(Readout::Overlapped, readout_us), PERIOD_US, 50.0)
+                .cycle_periods()
+        };
+        // Upwards the fall from +1500 to -1500 leaves 13.67 ms, which is 3.75 cycles a second at 60 Hz.
+        assert_eq!((periods(16_100.0), periods(16_400.0)), (15, 16));
+        let sequential = camera(Readout::Sequential, 16_100.0);
+        assert_eq!(CycleOrder::fastest(&shots, &sequential, PERIOD_US, 50.0).cycle_periods(), 30);
+    }
+
+    #[test]
+    fn a_cycle_is_over_when_every_setting_is_decided() {
+        let mut cycle = Cycle::new(3, 2);
+        assert!(!cycle.is_over());
+        cycle.decided = 2;
+        assert!(cycle.is_over());
+        assert_eq!(cycle.missing(), [0, 1]);
+    }
+}

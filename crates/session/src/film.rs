@@ -1,0 +1,314 @@
+//! `film.zarr` and `transport_film.zarr`: what a film saw and what was made of it, Zarr v3 groups.
+//!
+//! | array | type | axes | what |
+//! | --- | --- | --- | --- |
+//! | `film.zarr/film` | uint16 | `[cycle, setting, t, s]` | raw frames in camera counts (DN), settings in the plan's order |
+//! | `transport_film.zarr/transport` | float32 | `[cycle, u, t, s]` | light transport of each cycle, as in [`crate::transport`] |
+//!
+//! One shard is one cycle, so that a cycle costs one fsync of a file and one of a folder. A cycle without a line in
+//! the ledger is not stored, whatever `film` holds there; in `transport` a cycle that was not estimated is NaN.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use ndarray::{Array3, Array4, ArrayView3, s};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use zarrs::array::{
+    Array, ArrayBuilder, CodecOptions, DataType, Element, ElementOwned, FillValue, data_type,
+};
+
+use crate::stack::StackShape;
+use crate::zarr::{self, CHUNK_PX, DurableStore};
+use crate::{Error, Result};
+
+/// A series of volumes in time: one array of four axes, one shard a cycle.
+pub struct CycleArray<T> {
+    path: PathBuf,
+    array: Array<DurableStore>,
+    /// `[depth, t, s]` of a cycle.
+    shape: [usize; 3],
+    element: std::marker::PhantomData<T>,
+}
+
+/// `film.zarr/film` `[cycle, setting, t, s]`.
+pub type Film = CycleArray<u16>;
+
+/// `transport_film.zarr/transport` `[cycle, u, t, s]`.
+pub type TransportFilm = CycleArray<f32>;
+
+/// What a cycle array is in its group.
+struct Layout {
+    name: &'static str,
+    axes: [&'static str; 4],
+    /// Settings or relative rows in an inner chunk.
+    chunk_depth: usize,
+    data_type: DataType,
+    fill: FillValue,
+}
+
+impl Film {
+    /// Makes an empty film at `dir`.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] where the file system refuses.
+    pub fn create(dir: &Path, shape: &StackShape) -> Result<Self> {
+        let cycle = [shape.settings, shape.rows, shape.columns];
+        let attributes = Map::from_iter([("units".to_owned(), Value::from("DN"))]);
+        Self::create_array(dir, shape.points, cycle, film_layout(), attributes)
+    }
+
+    /// Opens the film at `dir`.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] where it cannot be read, [`Error::Shape`] where it has another shape.
+    pub fn open(dir: &Path, shape: &StackShape) -> Result<Self> {
+        let opened = Self::open_array(dir, &film_layout())?;
+        let expected = [shape.points, shape.settings, shape.rows, shape.columns];
+        let found = zarr::shape_of(&opened.array);
+        if found != expected {
+            let what = opened.path.display().to_string();
+            return Err(Error::Shape { what, found, allowed: format!("{expected:?}") });
+        }
+        Ok(opened)
+    }
+}
+
+impl TransportFilm {
+    /// Makes an empty series of `cycles` transports `[u, t, s]` at `dir`, in place of what is there. `attributes` become
+    /// the array's: `u_min`, `row_time_us`, the prior and whatever made it.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] or [`Error::Io`] where the file system refuses.
+    pub fn create(
+        dir: &Path,
+        cycles: usize,
+        cycle: [usize; 3],
+        attributes: &Map<String, Value>,
+    ) -> Result<Self> {
+        if dir.exists() {
+            std::fs::remove_dir_all(dir).map_err(Error::io("remove", dir))?;
+        }
+        Self::create_array(dir, cycles, cycle, transport_layout(cycle[0]), attributes.clone())
+    }
+
+    /// Opens the series at `dir`.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] where there is none or it is damaged.
+    pub fn open(dir: &Path) -> Result<Self> {
+        Self::open_array(dir, &transport_layout(1))
+    }
+
+    /// The attributes that it was made with.
+    pub fn attributes(&self) -> &Map<String, Value> {
+        self.array.attributes()
+    }
+}
+
+fn film_layout() -> Layout {
+    let axes = ["cycle", "setting", "t", "s"];
+    Layout { name: "film", axes, chunk_depth: 1, data_type: data_type::uint16(), fill: 0u16.into() }
+}
+
+fn transport_layout(depth: usize) -> Layout {
+    let axes = ["cycle", "u", "t", "s"];
+    let fill = f32::NAN.into();
+    Layout { name: "transport", axes, chunk_depth: depth, data_type: data_type::float32(), fill }
+}
+
+impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
+    fn create_array(
+        dir: &Path,
+        cycles: usize,
+        cycle: [usize; 3],
+        layout: Layout,
+        attributes: Map<String, Value>,
+    ) -> Result<Self> {
+        let store = DurableStore::new(dir)?;
+        zarr::create_group(&store, Map::new())?;
+        let [depth, rows, columns] = cycle;
+        let chunk = [1, layout.chunk_depth, rows.min(CHUNK_PX), columns.min(CHUNK_PX)];
+        // A shard must be a whole number of inner chunks, so it may reach beyond the frame; what lies there is 0.
+        let shard = [1, depth, rows.next_multiple_of(chunk[2]), columns.next_multiple_of(chunk[3])];
+        let to_u64 = |axes: [usize; 4]| axes.map(|len| len as u64).to_vec();
+        let mut builder = ArrayBuilder::new(
+            to_u64([cycles, depth, rows, columns]),
+            to_u64(shard),
+            layout.data_type,
+            layout.fill,
+        );
+        zarr::with_codecs(&mut builder)
+            .subchunk_shape(to_u64(chunk))
+            .dimension_names(Some(layout.axes))
+            .attributes(attributes);
+        let array = zarr::create_array(&store, layout.name, &builder)?;
+        Ok(Self { path: dir.join(layout.name), array, shape: cycle, element: std::marker::PhantomData })
+    }
+
+    fn open_array(dir: &Path, layout: &Layout) -> Result<Self> {
+        let store: Arc<DurableStore> = DurableStore::new(dir)?;
+        let array = zarr::open_array(&store, layout.name, 4)?;
+        let path = dir.join(layout.name);
+        match zarr::shape_of(&array)[..] {
+            [_, depth, rows, columns] => {
+                Ok(Self { path, array, shape: [depth, rows, columns], element: std::marker::PhantomData })
+            }
+            _ => Err(Error::Shape {
+                what: path.display().to_string(),
+                found: zarr::shape_of(&array),
+                allowed: "four axes".into(),
+            }),
+        }
+    }
+
+    /// How many cycles it has room for.
+    pub fn cycles(&self) -> usize {
+        zarr::shape_of(&self.array)[0]
+    }
+
+    /// Writes a cycle, replacing what was there; when this returns, it is durable.
+    ///
+    /// # Errors
+    /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] where the file system refuses.
+    pub fn write(&self, cycle: usize, data: ArrayView3<T>) -> Result<()> {
+        self.check(cycle)?;
+        if data.shape() != self.shape {
+            return Err(Error::Shape {
+                what: format!("a cycle of {}", self.path.display()),
+                found: data.shape().to_vec(),
+                allowed: format!("{:?}", self.shape),
+            });
+        }
+        let place = [cycle as u64, 0, 0, 0];
+        let shard = self.array.chunk_shape_usize(&place).map_err(Error::zarr("write", &self.path))?;
+        let [depth, rows, columns] = self.shape;
+        let mut padded = Array4::from_elem((1, shard[1], shard[2], shard[3]), T::default());
+        padded.slice_mut(s![0, ..depth, ..rows, ..columns]).assign(&data);
+        self.array.store_chunk_opt(&place, padded, &options()).map_err(Error::zarr("write", &self.path))
+    }
+
+    /// Reads a cycle; nothing where none was written.
+    ///
+    /// # Errors
+    /// [`Error::Index`], or [`Error::Zarr`] for damaged data.
+    pub fn read(&self, cycle: usize) -> Result<Option<Array3<T>>> {
+        self.check(cycle)?;
+        let shard = self
+            .array
+            .retrieve_chunk_if_exists_opt::<Array4<T>>(&[cycle as u64, 0, 0, 0], &options())
+            .map_err(Error::zarr("read", &self.path))?;
+        let [depth, rows, columns] = self.shape;
+        Ok(shard.map(|shard| {
+            let cycle = shard.slice_move(s![0, ..depth, ..rows, ..columns]);
+            cycle.as_standard_layout().into_owned()
+        }))
+    }
+
+    fn check(&self, cycle: usize) -> Result<()> {
+        let len = self.cycles();
+        if cycle < len { Ok(()) } else { Err(Error::Index { array: "cycle", index: cycle, len }) }
+    }
+}
+
+/// One thread: a film is written while its next frames arrive, and they need the others.
+fn options() -> CodecOptions {
+    zarr::codec_options().with_concurrent_target(1)
+}
+
+/// CRC-32 (the one of zip and PNG) of a cycle's frames as little-endian uint16 in C order.
+pub fn crc32(data: ArrayView3<u16>) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    let mut row_bytes = Vec::with_capacity(data.len_of(ndarray::Axis(2)) * 2);
+    for row in data.rows() {
+        row_bytes.clear();
+        row_bytes.extend(row.iter().flat_map(|value| value.to_le_bytes()));
+        hasher.update(&row_bytes);
+    }
+    hasher.finalize()
+}
+
+/// A stored cycle of a film, as the ledger says it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CycleEntry {
+    /// Its index in `film.zarr`.
+    pub cycle: usize,
+    /// Start of the first exposure of its frames, in seconds after that of the film's first.
+    pub start_s: f64,
+    /// The exposure time that the camera applied.
+    pub exposure_us: f64,
+    /// The true delay of each setting's frame, from its exposure start and its VSYNC edge.
+    pub delays_us: Vec<f64>,
+    /// Where its triggers went.
+    pub counts: raysweep_core::Counts,
+    /// CRC-32 of the stored frames, see [`crc32`].
+    pub crc32: u32,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shape(rows: usize, columns: usize) -> StackShape {
+        StackShape { points: 4, exposures: 1, rows, columns, settings: 3 }
+    }
+
+    fn frames(rows: usize, columns: usize, seed: usize) -> Array3<u16> {
+        Array3::from_shape_fn((3, rows, columns), |(k, t, s)| (seed * 7919 + k * 997 + t * 31 + s) as u16)
+    }
+
+    #[test]
+    fn cycles_read_back_at_sizes_that_are_no_multiple_of_a_chunk() {
+        let dir = tempfile::tempdir().unwrap();
+        for (rows, columns) in [(1, 1), (3, 5), (64, 64), (65, 130)] {
+            let path = dir.path().join(format!("{rows}.zarr"));
+            let film = Film::create(&path, &shape(rows, columns)).unwrap();
+            film.write(2, frames(rows, columns, 1).view()).unwrap();
+            let film = Film::open(&path, &shape(rows, columns)).unwrap();
+            assert_eq!(film.read(2).unwrap(), Some(frames(rows, columns, 1)));
+            assert_eq!(film.read(1).unwrap(), None);
+        }
+    }
+
+    #[test]
+    fn the_same_cycle_gives_the_same_bytes_in_an_opened_film() {
+        let dir = tempfile::tempdir().unwrap();
+        let bytes = |film: Film| {
+            film.write(0, frames(70, 66, 5).view()).unwrap();
+            std::fs::read(dir.path().join("film/c.0.0.0.0")).unwrap()
+        };
+        let first = bytes(Film::create(dir.path(), &shape(70, 66)).unwrap());
+        assert!(bytes(Film::open(dir.path(), &shape(70, 66)).unwrap()) == first);
+    }
+
+    #[test]
+    fn transports_that_were_not_estimated_are_not_there_and_making_anew_forgets_the_old() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("transport_film.zarr");
+        let attributes = Map::from_iter([("u_min".to_owned(), Value::from(-3))]);
+        let transport = Array3::from_shape_fn((7, 9, 70), |(u, t, s)| (u * 900 + t * 70 + s) as f32 / 7.0);
+        let film = TransportFilm::create(&path, 2, [7, 9, 70], &attributes).unwrap();
+        film.write(1, transport.view()).unwrap();
+        let opened = TransportFilm::open(&path).unwrap();
+        assert_eq!((opened.cycles(), opened.attributes()), (2, &attributes));
+        assert_eq!(opened.read(1).unwrap(), Some(transport));
+        assert_eq!(opened.read(0).unwrap(), None);
+        TransportFilm::create(&path, 2, [7, 9, 70], &attributes).unwrap();
+        assert_eq!(opened.read(1).unwrap(), None);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_and_damage_is_noticed() {
+        let dir = tempfile::tempdir().unwrap();
+        let film = Film::create(dir.path(), &shape(8, 8)).unwrap();
+        assert!(matches!(film.write(4, frames(8, 8, 0).view()), Err(Error::Index { len: 4, .. })));
+        assert!(matches!(film.write(0, frames(8, 9, 0).view()), Err(Error::Shape { .. })));
+        assert!(matches!(Film::open(dir.path(), &shape(8, 9)), Err(Error::Shape { .. })));
+        film.write(0, frames(8, 8, 0).view()).unwrap();
+        let path = dir.path().join("film/c.0.0.0.0");
+        let mut bytes = std::fs::read(&path).unwrap();
+        bytes.truncate(bytes.len() / 2);
+        std::fs::write(&path, bytes).unwrap();
+        assert!(matches!(film.read(0), Err(Error::Zarr { .. })));
+    }
+}

@@ -1,0 +1,362 @@
+//! Films of moving scenes through the daemon's core, on the virtual clock: each frame is the frame of its setting and its
+//! moment, each cycle's transport that of the scene as it then was, and what is lost harms its own cycle alone.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use ndarray::{Array2, Array3, Axis, s};
+use raysweep::config::RigFile;
+use raysweep::control::Control;
+use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile, LiveReader};
+use raysweep::process;
+use raysweep::rig::Rig;
+use raysweep::run::Runner;
+use raysweep_core::{LossCause, PixelFormat};
+use raysweep_pipeline::Registry;
+use raysweep_proto::{ErrorCode, Event, ResumeParams, RunParams};
+use raysweep_session::film::{CycleEntry, TransportFilm};
+use raysweep_session::manifest;
+use raysweep_sim::{PlaneRig, PlaneSetup};
+use raysweep_tests::{Bench, Ended, data, end_of, rig_text};
+
+const ROWS: usize = 24;
+const COLUMNS: usize = 16;
+const PERIOD_NS: i64 = 16_666_667;
+
+fn plan(cycles: u32) -> String {
+    format!("kind = \"film\"\n[film]\ncycles = {cycles}\n")
+}
+
+/// A pendulum without sensor noise that needs `swing_s` there and back; jitter stays.
+fn rig(swing_s: f64, more: &str) -> String {
+    let sim = format!(
+        "scene = \"pendulum\"\nscene_rows = {ROWS}\nscene_columns = {COLUMNS}\nseed = 5\nmotion_period_s = {swing_s}"
+    );
+    rig_text(720, &sim, &format!("[sim.sensor]\nnoise = false\n{more}"))
+}
+
+fn truth(rig_toml: &str) -> PlaneRig {
+    let rig = RigFile::parse(rig_toml).unwrap();
+    let setup = PlaneSetup {
+        raster: rig.raster(),
+        camera_row_time_us: rig.camera_row_time_us(),
+        row_pitch: 1.0,
+        white_dn: rig.camera.white_dn(),
+        black_dn: rig.camera.black_dn(),
+        format: PixelFormat::Mono12,
+        first_row: None,
+    };
+    PlaneRig::new(rig.sim, setup, Path::new("")).unwrap()
+}
+
+/// Every frame of the stored cycles: its place in the film in VSYNC periods after the first frame's, its true delay and
+/// its counts above black. A cycle takes its settings downwards, one a period.
+fn frames(ended: &Ended) -> Vec<(i64, f64, Array2<f32>)> {
+    let (session, state) = ended.open();
+    let film = session.film().unwrap();
+    let mut frames = Vec::new();
+    for CycleEntry { cycle, start_s, delays_us, .. } in state.cycles() {
+        let raw: Array3<u16> = film.read(*cycle).unwrap().unwrap();
+        let first = (start_s * 1e9 / PERIOD_NS as f64).round() as i64;
+        for (setting, (frame, &delay_us)) in raw.outer_iter().zip(delays_us).enumerate() {
+            let period = first + (delays_us.len() - 1 - setting) as i64;
+            frames.push((period, delay_us, frame.mapv(|counts| f32::from(counts) - 64.0)));
+        }
+    }
+    frames
+}
+
+/// How far, in counts, a frame is from the light of a moment.
+fn deviation(truth: &PlaneRig, time_ns: i64, delay_us: f64, frame: &Array2<f32>) -> f32 {
+    // The light's own clock is asked in the middle of its frame: its edge jitters.
+    let light = truth.noise_free_at(time_ns, delay_us, 600.0).unwrap() * 2500.0;
+    (frame - &light.mapv(|dn| dn.min(4095.0 - 64.0))).iter().fold(0.0, |most, off| off.abs().max(most))
+}
+
+/// When the film's first frame was lit, on the devices' clock: the only moment that makes all frames true.
+fn film_start_ns(truth: &PlaneRig, frames: &[(i64, f64, Array2<f32>)]) -> i64 {
+    let is_true = |start: i64| {
+        frames.iter().all(|(period, delay_us, frame)| {
+            deviation(truth, (start + period) * PERIOD_NS, *delay_us, frame) < 2.0
+        })
+    };
+    let starts: Vec<i64> = (0..120).filter(|&start| is_true(start)).collect();
+    let (Some(first), Some(last)) = (starts.first(), starts.last()) else {
+        panic!("no moment makes every frame the frame of its setting")
+    };
+    assert!(last - first < 12, "several moments would do: {starts:?}");
+    (first + last) / 2 * PERIOD_NS
+}
+
+#[test]
+fn every_frame_is_that_of_its_setting_and_its_moment_and_every_trigger_is_answered() {
+    // A key position of the scene lasts 4 frames, and a cycle of 15 frames sees several.
+    let rig = rig(2.1, "");
+    let bench = Bench::new(&rig);
+    let ended = bench.run(&plan(6));
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    let (_, state) = ended.open();
+    assert_eq!(state.cycles().count(), 6);
+    assert_eq!(state.counts.lost_total(), 0, "{:?}", state.counts);
+    for cycle in state.cycles() {
+        assert_eq!(cycle.counts.averaged, 15);
+        let expected_s = cycle.cycle as f64 * 15.0 * PERIOD_NS as f64 * 1e-9;
+        assert!((cycle.start_s - expected_s).abs() < 1e-3, "a cycle a quarter of a second, without pause");
+    }
+    film_start_ns(&truth(&rig), &frames(&ended));
+    let film = state.film.unwrap();
+    assert_eq!((film.cycles_stored, film.transports, film.transports_missing), (6, 6, 0));
+    assert!((film.cycles_per_s.unwrap() - 4.0).abs() < 0.01 && film.latency_ms.is_none());
+}
+
+#[test]
+fn settings_that_take_effect_frames_later_are_written_ahead() {
+    for late in [1, 2, 3] {
+        let rig = rig(2.1, &format!("[sim.camera]\nlate_frames_min = {late}\nlate_frames_max = {late}\n"));
+        let bench = Bench::new(&rig);
+        let ended = bench.run(&plan(3));
+        let (_, state) = ended.open();
+        assert_eq!(state.cycles().count(), 3);
+        let starts: Vec<f64> = state.cycles().map(|cycle| cycle.start_s).collect();
+        assert!((starts[2] - 0.5).abs() < 1e-3, "{late} frames late: {starts:?}");
+        film_start_ns(&truth(&rig), &frames(&ended));
+    }
+}
+
+#[test]
+fn settings_that_take_effect_no_one_knows_when_cost_time_and_nothing_else() {
+    let rig = rig(60.0, "[sim.camera]\nlate_frames_max = 2\n");
+    let bench = Bench::new(&rig);
+    let ended = bench.run(&plan(2));
+    let (_, state) = ended.open();
+    assert_eq!((state.cycles().count(), state.counts.lost_total()), (2, 0));
+    let truth = truth(&rig);
+    for (_, delay_us, frame) in frames(&ended) {
+        // The scene is all but at rest; which key it is in does not matter here.
+        let off = (0..16).map(|key| deviation(&truth, key * 1_900_000_000, delay_us, &frame));
+        assert!(off.fold(f32::INFINITY, f32::min) < 2.0, "{delay_us} us");
+    }
+}
+
+#[test]
+fn the_transport_of_a_cycle_is_the_scenes_at_that_time() {
+    // Slow enough for a cycle to see one key position, or two neighbours.
+    let rig = rig(24.0, "");
+    let bench = Bench::new(&rig);
+    let ended = bench.run(&plan(40));
+    let (session, state) = ended.open();
+    let truth = truth(&rig);
+    let start_ns = film_start_ns(&truth, &frames(&ended));
+    let transports = TransportFilm::open(&session.transport_film_path()).unwrap();
+    let u_min = transports.attributes()["u_min"].as_i64().unwrap();
+    let direct_at = |time_ns: i64| {
+        let scene = &truth.scene_at(time_ns).transport;
+        Array2::from_shape_fn((ROWS, COLUMNS), |(t, s)| scene[[t, t, s, 0]])
+    };
+    let distance = |a: &Array2<f32>, b: &Array2<f32>| {
+        let norm = |x: &Array2<f32>| x.iter().map(|x| x * x).sum::<f32>().sqrt();
+        norm(&(a - b)) / norm(b)
+    };
+    for cycle in state.cycles() {
+        let transport = transports.read(cycle.cycle).unwrap().unwrap();
+        let epipolar = transport.slice(s![-u_min as usize, .., ..]).to_owned();
+        let middle_ns = start_ns + ((cycle.start_s + 0.12) * 1e9) as i64;
+        let own = distance(&epipolar, &direct_at(middle_ns));
+        // Half a swing away the ball is elsewhere.
+        let other = distance(&epipolar, &direct_at(middle_ns + 6_000_000_000));
+        assert!(own < 0.1 && own < other, "cycle {}: {own} of its own time, {other} of another", cycle.cycle);
+    }
+}
+
+#[test]
+fn a_lost_frame_costs_its_own_cycle_and_is_counted_with_its_cause() {
+    let late = "late_frames_min = 2\nlate_frames_max = 2\n";
+    let rig = rig(60.0, &format!("[sim.camera]\n{late}dropped = 0.02\n[sim.vsync]\nunseen = 0.01\n"));
+    let bench = Bench::new(&rig);
+    let mut events = bench.runner.events();
+    bench.runner.run(RunParams { plan: plan(20), ..RunParams::default() }).unwrap();
+    let mut lost_events = 0;
+    let (session, film) = loop {
+        match events.blocking_recv() {
+            Ok(Event::Lost { .. }) => lost_events += 1,
+            Ok(Event::Finished { session, film, state, .. }) => {
+                assert_eq!(state, "complete");
+                break (session, film.unwrap());
+            }
+            Ok(_) | Err(tokio::sync::broadcast::error::RecvError::Lagged(_)) => {}
+            Err(error) => panic!("{error}"),
+        }
+    };
+    let ended = Ended { session, state: "complete".into(), error: None };
+    let (_, state) = ended.open();
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    let lost = &state.counts.lost;
+    assert!(
+        lost.contains_key(&LossCause::CameraGap) && lost.contains_key(&LossCause::EdgeMissing),
+        "{lost:?}"
+    );
+    assert!(film.cycles_incomplete > 0 && film.cycles_stored > 5 && lost_events > 0, "{film:?}");
+    assert_eq!(film.cycles_stored + film.cycles_incomplete, 20);
+    let ledger = std::fs::read_to_string(ended.session.join("ledger.jsonl")).unwrap();
+    let incomplete: Vec<&str> = ledger.lines().filter(|line| line.contains("\"cycle_lost\"")).collect();
+    assert_eq!(incomplete.len(), film.cycles_incomplete);
+    assert!(incomplete.iter().all(|line| !line.contains("\"missing\":[]")), "{incomplete:?}");
+    // The others are as if nothing had happened.
+    let truth = truth(&rig);
+    for (_, delay_us, frame) in frames(&ended) {
+        let off = (0..16).map(|key| deviation(&truth, key * 1_900_000_000, delay_us, &frame));
+        assert!(off.fold(f32::INFINITY, f32::min) < 2.0, "{delay_us} us");
+    }
+    for cycle in state.cycles() {
+        assert!(
+            cycle
+                .delays_us
+                .iter()
+                .zip(0..)
+                .all(|(delay_us, place)| { (delay_us - state_delay_us(place)).abs() < 50.0 })
+        );
+    }
+}
+
+fn state_delay_us(setting: usize) -> f64 {
+    let k = setting as f64 - 7.0;
+    1500.0 * k.signum() * (k.abs() / 7.0).powf(1.7) * f64::from(u8::from(k != 0.0))
+}
+
+#[test]
+fn a_cancelled_film_is_a_short_one() {
+    let bench = Bench::new(&rig(4.0, ""));
+    let mut events = bench.runner.events();
+    bench.runner.run(RunParams { plan: plan(5000), ..RunParams::default() }).unwrap();
+    let began = Instant::now();
+    while bench.runner.status().film.is_none_or(|film| film.transports < 2) {
+        assert!(began.elapsed() < Duration::from_secs(60), "no transport");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    bench.runner.cancel().unwrap();
+    let ended = end_of(&mut events);
+    assert_eq!(ended.state, "cancelled");
+    let (session, state) = ended.open();
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+    let stored = state.cycles().count();
+    assert!((2..5000).contains(&stored));
+    assert_eq!(state.film.as_ref().unwrap().transports, stored, "what waited for the solver is solved");
+    let differences = manifest::verify(&session).unwrap();
+    assert!(differences.is_empty(), "{differences:?}");
+    let report = std::fs::read_to_string(session.report_path()).unwrap();
+    assert!(report.contains("epipolar") && report.contains("indirect"), "the report shows some cycles");
+
+    let refused = bench.runner.resume(ResumeParams { session: ended.session.clone() }).unwrap_err();
+    assert_eq!(refused.name(), Some(ErrorCode::NoSession));
+    assert!(refused.message.contains("cannot be resumed"), "{refused}");
+}
+
+#[test]
+fn processing_a_film_again_gives_the_same_bits_and_names_what_is_damaged() {
+    let bench = Bench::new(&rig(4.0, ""));
+    let ended = bench.run(&plan(4));
+    let folder = ended.session.join("transport_film.zarr");
+    let files = |folder: &Path| {
+        let files = std::fs::read_dir(folder.join("transport")).unwrap().map(|file| file.unwrap().path());
+        let mut files: Vec<_> = files.map(|path| (path.clone(), std::fs::read(path).unwrap())).collect();
+        files.sort();
+        files
+    };
+    let before = files(&folder);
+    assert_eq!(before.len(), 5, "four cycles and the metadata");
+    std::fs::remove_dir_all(&folder).unwrap();
+    let processed = process::process(&ended.session).unwrap();
+    assert_eq!((processed.stored, processed.points, processed.problems), (4, 4, Vec::new()));
+    assert!(files(&folder) == before, "the bits differ");
+
+    let shard = ended.session.join("film.zarr/film/c.2.0.0.0");
+    let mut bytes = std::fs::read(&shard).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 0x10;
+    std::fs::write(&shard, bytes).unwrap();
+    let processed = process::process(&ended.session).unwrap();
+    assert!(
+        processed.problems.iter().any(|what| what.contains("cycle 2 is damaged")),
+        "{:?}",
+        processed.problems
+    );
+    let transports = TransportFilm::open(&folder).unwrap();
+    assert!(transports.read(2).unwrap().is_none() && transports.read(3).unwrap().is_some());
+}
+
+#[test]
+fn the_views_of_a_film_are_in_the_live_file() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("rig.toml"), rig(4.0, "")).unwrap();
+    let loaded = Rig::load(&folder.path().join("rig.toml")).unwrap();
+    let path = folder.path().join("live");
+    let runner = Runner::new(loaded, folder.path().join("sessions"), Registry::default()).unwrap();
+    let runner = runner.with_live(LiveFile::create(&path).unwrap());
+    let mut events = runner.events();
+    runner.run(RunParams { plan: plan(3), ..RunParams::default() }).unwrap();
+    let ended = end_of(&mut events);
+    let (session, _) = ended.open();
+    let last = TransportFilm::open(&session.transport_film_path()).unwrap().read(2).unwrap().unwrap();
+    let reader = LiveReader::open(&path).unwrap();
+    let shown = |name: &str| reader.newest(name).unwrap().unwrap();
+    let indirect = shown(INDIRECT);
+    assert_eq!(indirect.metadata["cycle"], 2);
+    let sum = |image: &ndarray::ArrayD<f32>| image.iter().map(|&x| f64::from(x)).sum::<f64>();
+    let total = last.sum_axis(Axis(0)).iter().map(|&x| f64::from(x)).sum::<f64>();
+    assert!((sum(&indirect.image) + sum(&shown(EPIPOLAR).image) - total).abs() < 1e-4 * total);
+}
+
+#[test]
+fn check_says_how_many_transports_a_second_the_camera_allows() {
+    let check = |more: &str| Bench::new(&rig(4.0, more)).runner.check(&plan(240)).unwrap();
+    let free = check("");
+    let film = free.film.unwrap();
+    assert_eq!((film.settings, film.cycles, film.periods_per_cycle), (15, 240, 15));
+    assert!((film.transports_per_s - 4.0).abs() < 0.001);
+    assert_eq!((free.points, free.extra_points, free.frames), (240, 1, 240 * 15 + 32));
+    // 15 frames of 2 bytes and the transport's 4 bytes a row, for each pixel.
+    let reach = (free.reach_rows.1 - free.reach_rows.0 + 1) as f64;
+    let minute = 240.0 * (ROWS * COLUMNS) as f64 * (30.0 + 4.0 * reach);
+    assert!((film.disk_bytes_per_minute as f64 / minute - 1.0).abs() < 0.001);
+    let held = check("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 16_100\n").film.unwrap();
+    assert_eq!(held.periods_per_cycle, 15, "downwards no trigger is missed");
+    let slow = check("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 16_500\n").film.unwrap();
+    assert_eq!(slow.periods_per_cycle, 16);
+    assert!((slow.transports_per_s - 3.75).abs() < 0.001 && slow.reason.contains("readout"), "{slow:?}");
+    let sequential = check("[sim.camera]\nreadout_us = 16_100\n").film.unwrap();
+    assert!((sequential.transports_per_s - 2.0).abs() < 0.001 && sequential.reason.contains("15 triggers"));
+}
+
+#[test]
+fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
+    for (readout_us, periods) in [(16_100, 15), (16_500, 16)] {
+        let rig = rig(60.0, &format!("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = {readout_us}\n"));
+        let bench = Bench::new(&rig);
+        let ended = bench.run(&plan(3));
+        let (_, state) = ended.open();
+        let counts = &state.counts;
+        assert_eq!((state.cycles().count(), counts.lost_total()), (3, 0), "{counts:?}");
+        let starts: Vec<f64> = state.cycles().map(|cycle| cycle.start_s).collect();
+        let cycle_s = f64::from(periods) * PERIOD_NS as f64 * 1e-9;
+        assert!((starts[2] - 2.0 * cycle_s).abs() < 1e-3, "{readout_us} us: {starts:?}");
+    }
+}
+
+#[test]
+fn zarr_reads_a_film() {
+    let python = std::env::var_os("RAYSWEEP_PYTHON").expect(
+        "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
+    );
+    let late = "[sim.camera]\nlate_frames_min = 2\nlate_frames_max = 2\ndropped = 0.02\n";
+    let bench = Bench::new(&rig(4.0, late));
+    let ended = bench.run(&plan(8));
+    assert!(ended.open().1.cycles().count() < 8, "one of the cycles is missing");
+    let script = data("").join("../python/read_session.py");
+    let output = Command::new(python).arg(script).arg(&ended.session).output().unwrap();
+    let said =
+        format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{said}");
+}
