@@ -330,6 +330,21 @@ mod tests {
     }
 
     #[test]
+    fn what_takes_longer_is_not_proposed() {
+        // The grids that err less have more delays that are triggered late in the period.
+        let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -4000, stop = 4000, count = 37 }\nexposure_us = [600, 1200]\n";
+        let fast = CameraCapabilities { readout: Readout::Overlapped, readout_us: 0.0, ..camera() };
+        let rig = RigFile::parse(RIG).unwrap();
+        let own = task(&rig, plan);
+        let advice = advise(&own, &rig, &fast).unwrap();
+        let other = task(&rig, &proposed(&advice, plan));
+        assert!(total_periods(&other, &fast) <= total_periods(&own, &fast));
+        assert!(total_periods(&other, &camera()) > total_periods(&own, &camera()));
+        let slow = advise(&own, &rig, &camera()).unwrap().better;
+        assert_ne!(slow.map(|better| better.sweep), advice.better.map(|better| better.sweep));
+    }
+
+    #[test]
     fn a_sweep_that_takes_too_long_to_foresee_is_not_foreseen() {
         let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -8000, stop = 8000, count = 1000 }\n";
         let error = advised(RIG, plan, &camera()).unwrap_err();
