@@ -130,7 +130,11 @@ impl Task {
         Ok(processing)
     }
 
-    fn products(&self, plan_text: &str) -> Result<Vec<ProductSpec>, ConfigError> {
+    /// What is made of the transport: the products that the plan names.
+    ///
+    /// # Errors
+    /// With the place in the plan's text of the product that cannot be made.
+    pub(crate) fn products(&self, plan_text: &str) -> Result<Vec<ProductSpec>, ConfigError> {
         let Some(tables) = &self.plan.product else { return Ok(ProductSpec::defaults()) };
         if !tables.is_empty() && !self.plan.stage.iter().any(|stage| stage.name == "demux") {
             let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";

@@ -6,6 +6,7 @@
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Array3, ArrayView3, Axis};
+use raysweep::control::Control;
 use raysweep_sim::scene::{Scene, SceneSize};
 use raysweep_tests::{Bench, Ended, corner_rig, data, rig_text};
 use raysweep_transport::plane::{RowTiming, Setting, reach, relative_rows};
@@ -183,4 +184,24 @@ fn a_flying_spot_costs_the_settings_that_it_cuts_and_nothing_else() {
     let (modelled, ended) = recover(&bench, &plan, corner().view(), longest());
     assert!(modelled.profile < 0.02 && modelled.own_row < 0.1, "{modelled:?}");
     assert!(report(&ended).contains("modelled in the"));
+}
+
+#[test]
+fn the_sweep_that_check_proposes_errs_less_than_the_papers() {
+    let bench = Bench::new(&corner_rig(""));
+    let plan = format!("{PAPER}1\n");
+    let advice = bench.runner.check(&plan).unwrap().advice.unwrap();
+    let better = advice.better.unwrap();
+    let proposed = plan.replace("[sweep]\naverage = 1\n", &better.sweep);
+    // What is said of the proposed sweep is what it says of itself.
+    let again = bench.runner.check(&proposed).unwrap();
+    assert_eq!((again.points, again.frames, again.reach_rows), (better.points, better.frames, (-94, 94)));
+    assert_eq!(again.advice.unwrap().expected, better.expected);
+
+    let longest = Setting::new(1500.0, 1200.0);
+    let recover = |plan: &str| recover(&bench, plan, corner().view(), longest.clone()).0;
+    for alone in ["", "[[stage]]\nname = \"demux\"\nprior = \"split\"\ncoupling = false\n"] {
+        let (paper, better) = (recover(&format!("{plan}{alone}")), recover(&format!("{proposed}{alone}")));
+        assert!(better.profile < paper.profile && better.own_row < paper.own_row, "{better:?} {paper:?}");
+    }
 }

@@ -153,7 +153,11 @@ impl Plan {
         }
     }
 
-    fn check(&self, text: &str) -> Result<(), ConfigError> {
+    /// Whether it can be run; `text` is what it was read from.
+    ///
+    /// # Errors
+    /// Those of [`Self::parse`].
+    pub(crate) fn check(&self, text: &str) -> Result<(), ConfigError> {
         let sweep = &self.sweep;
         let (kind, own, other) = match self.kind {
             PlanKind::Sweep => ("sweep", "sweep", "film"),
