@@ -7,7 +7,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
-use crate::findings::{self, Prepared};
+use crate::findings;
 use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
@@ -235,14 +235,16 @@ impl Fold for DemuxFold {
         let regular = taken.get(&Role::Regular).cloned();
         let regular = regular.zip(self.dark_of(&taken, Role::Regular));
         let mut stack = self.stack(taken)?;
-        let prepared = self
+        let height = self.geometry.height;
+        let rows = findings::rows_to_choose_by(height);
+        let choices = self
             .demux()
-            .and_then(|planned| findings::prepare(&planned, &self.options, &self.geometry, &mut stack))
+            .and_then(|planned| {
+                findings::choose(&planned, &self.options, &self.geometry, &rows, stack.of_rows(&rows))
+            })
             .map_err(refused)?;
-        let Prepared { demux, coupled, findings } = prepared;
-        let images = coupled.as_ref().unwrap_or(&stack.images);
-        let valid = stack.valid.as_ref().map(|valid| valid.view());
-        let transport = demux.solve_while(images.view(), valid, go_on).map_err(refused)?;
+        let transport = choices.solve(0..height, 0, &mut stack, go_on).map_err(refused)?;
+        let findings = choices.findings;
 
         let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
         let mut products = vec![

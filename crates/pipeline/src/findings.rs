@@ -1,12 +1,15 @@
 //! What the stack of a sweep says of the rig and of the scene, before it is demultiplexed: settings that cannot be
 //! trusted, the beam's width, the place of direct light, the prior, the noise.
 
-use ndarray::{Array3, Axis};
+use std::collections::BTreeSet;
+use std::ops::Range;
+
+use ndarray::{Array3, Axis, s};
 use raysweep_transport::plane::calibrate::{
     BeamEstimate, CalibrateError, Choice, FlyingSpot, OpticsEstimate, Sample, candidates, choose_prior,
     estimate_optics, settings_on_direct_row,
 };
-use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior};
+use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, Transport};
 
 use crate::demux::DemuxOptions;
 use crate::products::SweepStack;
@@ -34,26 +37,42 @@ pub struct Findings {
     pub warnings: Vec<String>,
 }
 
-/// A stack made ready for the solver.
-pub struct Prepared {
-    /// Solves it.
-    pub demux: Demux,
-    /// The stack after spatial coupling, `[settings, t, s]`; none: as it was taken.
-    pub coupled: Option<Array3<f32>>,
+/// How a sweep is to be demultiplexed, and why so. It is chosen by a few camera rows, so that a sweep which is solved in
+/// parts is solved as it would be in one.
+pub struct Choices {
+    /// Solves the images that are used.
+    demux: Demux,
+    /// Indices of the images that are used.
+    kept: Vec<usize>,
+    /// Which of the kept images may be coupled.
+    steady: Vec<usize>,
+    noise: Option<NoiseModel>,
+    coupling: Option<Coupling>,
     /// Why so.
     pub findings: Findings,
 }
 
-/// Chooses how to demultiplex a stack, and leaves out of it what cannot be used. `planned` is the plan's demultiplexer.
+/// The camera rows that [`choose`] looks at, of an image with so many: those of a sample, with the neighbours that they are
+/// coupled to.
+pub fn rows_to_choose_by(camera_rows: usize) -> Vec<usize> {
+    let halo_rows = Coupling::default().radius_px;
+    let with_halo = |t: usize| t.saturating_sub(halo_rows)..(t + halo_rows + 1).min(camera_rows);
+    let rows: BTreeSet<usize> = Sample::rows_of(camera_rows).flat_map(with_halo).collect();
+    rows.into_iter().collect()
+}
+
+/// Chooses how to demultiplex a sweep by some of its rows, those of [`rows_to_choose_by`]. `planned` is the plan's
+/// demultiplexer, `stack` holds `rows` alone.
 ///
 /// # Errors
 /// When the stack makes no model.
-pub fn prepare(
+pub fn choose(
     planned: &Demux,
     options: &DemuxOptions,
     geometry: &SweepGeometry,
-    stack: &mut SweepStack,
-) -> Result<Prepared, PlaneError> {
+    rows: &[usize],
+    mut stack: SweepStack,
+) -> Result<Choices, PlaneError> {
     let mut findings = Findings {
         prior: planned.prior(),
         choice: None,
@@ -63,32 +82,125 @@ pub fn prepare(
         remarks: Vec::new(),
         warnings: Vec::new(),
     };
-    let spot = leave_out(geometry, stack, &mut findings)?;
+    let all: Vec<usize> = (0..stack.settings.len()).collect();
+    let settings = stack.settings.clone();
+    let (cut, spot) = cut_by_the_spot(geometry, &stack, &mut findings)?;
+    stack.keep(|n| !cut.contains(&n));
+    let uncut: Vec<usize> = all.iter().copied().filter(|n| !cut.contains(n)).collect();
     let planned = planned.with_settings(stack.settings.clone())?;
-    let mut coupled = couple(options, stack, &mut findings)?;
-    let mut demux = match calibrate(&planned, options, geometry, stack, coupled.as_ref(), &mut findings) {
+    let noise = fit_noise(&stack, &mut findings);
+    let coupling = noise.filter(|_| options.coupling).map(|_| Coupling::default());
+    let coupled = match noise.zip(coupling) {
+        Some((noise, coupling)) => {
+            let Coupled { stack, variance_ratio } = couple(&coupling, &noise, &stack)?;
+            findings.remarks.push((
+                "spatial coupling",
+                format!(
+                    "like neighbours averaged before demultiplexing: the variance of noise falls to {:.0} % on average",
+                    100.0 * variance_ratio.mean().unwrap_or(1.0)
+                ),
+            ));
+            Some(stack)
+        }
+        None => None,
+    };
+    let demux = match calibrate(&planned, options, geometry, rows, &stack, coupled.as_ref(), &mut findings) {
         Ok(demux) => demux,
         Err(error) => {
             findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
             planned
         }
     };
-    if let Some((spot, mut whole, cut)) = spot {
+    Ok(match spot {
         // Neighbours see other moments of the spot, so images that depend on it are solved as they were taken.
-        if let Some(steady) = coupled.take() {
-            let mut all = whole.images.clone();
-            let kept = (0..whole.settings.len()).filter(|n| !cut.contains(n));
-            kept.zip(steady.outer_iter())
-                .for_each(|(n, image)| all.index_axis_mut(Axis(0), n).assign(&image));
-            coupled = Some(all);
+        Some(spot) => {
+            let demux = demux.with_settings(settings)?.with_spot(spot)?;
+            Choices { demux, kept: all, steady: uncut, noise, coupling, findings }
         }
-        (whole.noise, whole.variance_ratio) = (stack.noise, stack.variance_ratio.take());
-        *stack = whole;
-        demux = demux.with_settings(stack.settings.clone())?.with_spot(spot)?;
+        None => {
+            let steady = (0..uncut.len()).collect();
+            Choices { demux, kept: uncut, steady, noise, coupling, findings }
+        }
+    })
+}
+
+impl Choices {
+    /// Rows on either side of those solved that the stack must hold beside them, where the image has them.
+    pub fn halo_rows(&self) -> usize {
+        self.coupling.map_or(0, |coupling| coupling.radius_px)
     }
-    stack.timing = demux.timing().clone();
-    stack.prior = demux.prior();
-    Ok(Prepared { demux, coupled, findings })
+
+    /// Solves camera rows `rows`. `stack` holds the rows from `held_from` on, at least [`Self::halo_rows`] more than those
+    /// solved; it comes back with `rows` and the images that were used.
+    ///
+    /// # Errors
+    /// When the stack makes no model, or `go_on` said no.
+    pub fn solve(
+        &self,
+        rows: Range<usize>,
+        held_from: usize,
+        stack: &mut SweepStack,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, PlaneError> {
+        if self.kept.len() < stack.settings.len() {
+            stack.keep(|n| self.kept.contains(&n));
+        }
+        let inner = rows.start - held_from..rows.end - held_from;
+        let mut coupled = None;
+        if let Some((noise, coupling)) = self.noise.zip(self.coupling) {
+            let Coupled { stack: images, variance_ratio } = if self.steady.len() == stack.settings.len() {
+                couple(&coupling, &noise, stack)?
+            } else {
+                let mut steady = stack.clone();
+                steady.keep(|n| self.steady.contains(&n));
+                let mut coupled = couple(&coupling, &noise, &steady)?;
+                let mut all = stack.images.clone();
+                for (&n, image) in self.steady.iter().zip(coupled.stack.outer_iter()) {
+                    all.index_axis_mut(Axis(0), n).assign(&image);
+                }
+                coupled.stack = all;
+                coupled
+            };
+            stack.variance_ratio = Some(variance_ratio.slice_move(s![inner.clone(), ..]));
+            coupled = Some(images.slice_move(s![.., inner.clone(), ..]));
+        }
+        if inner.len() < stack.images.len_of(Axis(1)) {
+            stack.images = stack.images.slice(s![.., inner.clone(), ..]).to_owned();
+            stack.valid = stack.valid.as_ref().map(|valid| valid.slice(s![.., inner, ..]).to_owned());
+        }
+        stack.timing = self.demux.timing().clone();
+        stack.prior = self.demux.prior();
+        stack.noise = self.noise;
+        let images = coupled.as_ref().unwrap_or(&stack.images);
+        let valid = stack.valid.as_ref().map(|valid| valid.view());
+        let rows: Vec<usize> = rows.collect();
+        self.demux.with_settings(stack.settings.clone())?.solve_rows(&rows, images.view(), valid, go_on)
+    }
+}
+
+fn frames_of(stack: &SweepStack) -> Vec<usize> {
+    stack.settings.iter().map(|setting| setting.delays_us.len()).collect()
+}
+
+fn fit_noise(stack: &SweepStack, findings: &mut Findings) -> Option<NoiseModel> {
+    let valid = stack.valid.as_ref().map(|valid| valid.view());
+    match NoiseModel::fit(stack.images.view(), valid, &frames_of(stack)) {
+        Ok(noise) => {
+            let sd = |light| noise.variance(light, 1).sqrt();
+            let said = format!("{:.4} in the dark, {:.4} at the light of one white row", sd(0.0), sd(1.0));
+            findings.remarks.push(("noise of a frame", said));
+            Some(noise)
+        }
+        Err(error) => {
+            findings.remarks.push(("noise", format!("not fitted, and pixels not coupled: {error}")));
+            None
+        }
+    }
+}
+
+fn couple(coupling: &Coupling, noise: &NoiseModel, stack: &SweepStack) -> Result<Coupled, PlaneError> {
+    let valid = stack.valid.as_ref().map(|valid| valid.view());
+    coupling.apply(stack.images.view(), valid, noise, &frames_of(stack))
 }
 
 /// Estimates the optics from the images as they were taken, and chooses the prior for those that are solved.
@@ -96,13 +208,14 @@ fn calibrate(
     planned: &Demux,
     options: &DemuxOptions,
     geometry: &SweepGeometry,
+    rows: &[usize],
     stack: &SweepStack,
     coupled: Option<&Array3<f32>>,
     findings: &mut Findings,
 ) -> Result<Demux, CalibrateError> {
     let valid = stack.valid.as_ref().map(|valid| valid.view());
     let sample_of = |images: &Array3<f32>| {
-        Sample::new(stack.timing.clone(), stack.settings.clone(), images.view(), valid)
+        Sample::of_rows(stack.timing.clone(), stack.settings.clone(), rows, images.view(), valid)
     };
     let sample = sample_of(&stack.images)?;
     let OpticsEstimate { mut optics, beam, spike } = estimate_optics(&sample, geometry.beam_sigma_rows)?;
@@ -177,78 +290,35 @@ fn say_beam(estimate: Option<&Result<BeamEstimate, CalibrateError>>, sigma_rows:
     }
 }
 
-/// Fits the noise and averages like pixels, if the plan wants that.
-fn couple(
-    options: &DemuxOptions,
-    stack: &mut SweepStack,
-    findings: &mut Findings,
-) -> Result<Option<Array3<f32>>, PlaneError> {
-    let frames: Vec<usize> = stack.settings.iter().map(|setting| setting.delays_us.len()).collect();
-    let valid = stack.valid.as_ref().map(|valid| valid.view());
-    let noise = match NoiseModel::fit(stack.images.view(), valid, &frames) {
-        Ok(noise) => noise,
-        Err(error) => {
-            findings.remarks.push(("noise", format!("not fitted, and pixels not coupled: {error}")));
-            return Ok(None);
-        }
-    };
-    findings.remarks.push((
-        "noise of a frame",
-        format!(
-            "{:.4} in the dark, {:.4} at the light of one white row",
-            noise.variance(0.0, 1).sqrt(),
-            noise.variance(1.0, 1).sqrt()
-        ),
-    ));
-    stack.noise = Some(noise);
-    if !options.coupling {
-        return Ok(None);
-    }
-    let Coupled { stack: images, variance_ratio } =
-        Coupling::default().apply(stack.images.view(), valid, &noise, &frames)?;
-    findings.remarks.push((
-        "spatial coupling",
-        format!(
-            "like neighbours averaged before demultiplexing: the variance of noise falls to {:.0} % on average",
-            100.0 * variance_ratio.mean().unwrap_or(1.0)
-        ),
-    ));
-    stack.variance_ratio = Some(variance_ratio);
-    Ok(Some(images))
-}
-
 /// A prior with its weights.
 pub fn name(prior: Prior) -> String {
     format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta())
 }
 
-/// Leaves out of `stack` the images whose edge cuts the direct row while a flying spot draws it. If the rig knows when the
-/// spot passes each pixel's column, and the beam lets that be modelled, they are left out of the calibration only: then
-/// the spot's way, the whole stack and the images' indices come back.
-fn leave_out(
+/// The images whose edge cuts the direct row while a flying spot draws it; and the spot's way if the rig knows when it
+/// passes each pixel's column, and the beam lets that be modelled. Without it they are left out.
+fn cut_by_the_spot(
     geometry: &SweepGeometry,
-    stack: &mut SweepStack,
+    stack: &SweepStack,
     findings: &mut Findings,
-) -> Result<Option<(FlyingSpot, SweepStack, Vec<usize>)>, PlaneError> {
-    let Spot::Flying(_) = geometry.spot else { return Ok(None) };
+) -> Result<(Vec<usize>, Option<FlyingSpot>), PlaneError> {
+    let Spot::Flying(_) = geometry.spot else { return Ok((Vec::new(), None)) };
     let cut = settings_on_direct_row(&stack.timing, &stack.settings, 0.0)?;
     let mut say = |what: String| findings.remarks.push(("flying spot", what));
     if cut.is_empty() {
         say("no exposure begins or ends while it draws the direct row".into());
-        return Ok(None);
+        return Ok((cut, None));
     }
     if cut.len() == stack.settings.len() {
         say("every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into());
-        return Ok(None);
+        return Ok((Vec::new(), None));
     }
     if let Some(spot) = geometry.flying_spot().filter(|_| geometry.beam_sigma_rows == Some(0.0)) {
         say(format!(
             "modelled in the {} images whose exposure begins or ends while it draws the direct row",
             cut.len()
         ));
-        let whole = stack.clone();
-        stack.keep(|n| !cut.contains(&n));
-        return Ok(Some((spot, whole, cut)));
+        return Ok((cut, Some(spot)));
     }
     say(format!(
         "{} images are left out, because their exposure begins or ends while it draws the direct row, and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0); {} are kept",
@@ -257,6 +327,5 @@ fn leave_out(
     ));
     let at = |&n: &usize| (stack.settings[n].delays_us[0], stack.settings[n].exposure_us);
     findings.left_out_us = cut.iter().map(at).collect();
-    stack.keep(|n| !cut.contains(&n));
-    Ok(None)
+    Ok((cut, None))
 }

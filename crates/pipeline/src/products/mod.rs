@@ -44,6 +44,21 @@ pub struct SweepStack {
 }
 
 impl SweepStack {
+    /// Only these camera rows of the images.
+    pub(crate) fn of_rows(&self, rows: &[usize]) -> Self {
+        Self {
+            timing: self.timing.clone(),
+            prior: self.prior,
+            exposures_us: self.exposures_us.clone(),
+            settings: self.settings.clone(),
+            images: self.images.select(Axis(1), rows),
+            valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
+            regular: None,
+            noise: None,
+            variance_ratio: None,
+        }
+    }
+
     /// Keeps the images whose index `kept` says yes to.
     pub(crate) fn keep(&mut self, kept: impl Fn(usize) -> bool) {
         let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();

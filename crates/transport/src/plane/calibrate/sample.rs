@@ -60,6 +60,11 @@ impl Optics {
 }
 
 impl Sample {
+    /// The camera rows that a sample of an image with so many is taken from.
+    pub fn rows_of(camera_rows: usize) -> impl Iterator<Item = usize> {
+        strata(camera_rows, ROWS).map(|rows| (rows.start + rows.end) / 2)
+    }
+
     /// Takes a sample of `stack`, shape `[settings, camera_rows, columns]`, in the units of [`super::super::Demux`];
     /// `valid`, of the same shape, is false where a sample may not be used.
     ///
@@ -72,9 +77,25 @@ impl Sample {
         stack: ArrayView3<f32>,
         valid: Option<ArrayView3<bool>>,
     ) -> Result<Self, CalibrateError> {
+        let rows: Vec<usize> = (0..timing.camera_rows()).collect();
+        Self::of_rows(timing, settings, &rows, stack, valid)
+    }
+
+    /// [`Self::new`] from a stack that holds only some camera rows, ascending: at least those of [`Self::rows_of`].
+    ///
+    /// # Errors
+    /// Those of [`Self::new`]; [`PlaneError::Rows`] for a row that is missing.
+    pub fn of_rows(
+        timing: RowTiming,
+        settings: Vec<Setting>,
+        held: &[usize],
+        stack: ArrayView3<f32>,
+        valid: Option<ArrayView3<bool>>,
+    ) -> Result<Self, CalibrateError> {
         let reach = reach(&timing, &settings)?;
-        let (_, height, columns) = stack.dim();
-        let expected = [settings.len(), timing.camera_rows(), columns];
+        let (_, _, columns) = stack.dim();
+        let height = timing.camera_rows();
+        let expected = [settings.len(), held.len(), columns];
         for (array, shape) in
             [Some(("stack", stack.shape())), valid.as_ref().map(|valid| ("valid", valid.shape()))]
                 .into_iter()
@@ -86,26 +107,27 @@ impl Sample {
                 return Err(PlaneError::Shape { array, axes, actual, expected }.into());
             }
         }
-        let usable = |t: usize, column: &usize| {
-            valid.is_none_or(|valid| valid.slice(s![.., t, *column]).iter().all(|v| *v))
+        let usable = |at: usize, column: &usize| {
+            valid.is_none_or(|valid| valid.slice(s![.., at, *column]).iter().all(|v| *v))
         };
         let unspread = timing.clone().with_beam(Beam::Ideal)?;
-        let rows: Vec<SampledRow> = strata(height, ROWS)
+        let rows: Vec<SampledRow> = Self::rows_of(height)
             .enumerate()
             .collect::<Vec<_>>()
             .into_par_iter()
-            .map(|(index, rows)| {
-                let t = (rows.start + rows.end) / 2;
+            .map(|(index, t)| {
+                let missing = |_| PlaneError::Rows { row: t, camera_rows: held.len() };
+                let at = held.binary_search(&t).map_err(missing)?;
                 // Golden-ratio places in the strata: no two rows sample the same columns, and no pattern is aliased.
                 let place = (index as f64 * 0.618_033_988_75).fract();
                 let columns: Vec<usize> = strata(columns, PIXELS_PER_ROW)
                     .filter_map(|columns| {
                         let first = columns.start + (place * columns.len() as f64) as usize;
-                        (first..columns.end).chain(columns.start..first).find(|column| usable(t, column))
+                        (first..columns.end).chain(columns.start..first).find(|column| usable(at, column))
                     })
                     .collect();
                 let intensities = Array2::from_shape_fn((columns.len(), settings.len()), |(pixel, n)| {
-                    f64::from(stack[[n, t, columns[pixel]]])
+                    f64::from(stack[[n, at, columns[pixel]]])
                 });
                 if let Some(((pixel, setting), _)) =
                     intensities.indexed_iter().find(|(_, value)| !value.is_finite())
