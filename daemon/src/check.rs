@@ -116,6 +116,8 @@ pub fn check(
         reach_rows: (*reach.start(), *reach.end()),
         // JSON has no infinity.
         condition: condition.min(f64::MAX),
+        // Worked out on request alone: a run must not wait for it.
+        advice: None,
         film,
         warnings,
     })
@@ -141,7 +143,7 @@ fn light_periods(periods: &[u64], task: &Task, film: Option<&FilmCheck>) -> u64 
 }
 
 /// VSYNC periods that each frame of a point takes.
-fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
+pub(crate) fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
     let shot = task.geometry.shot(point, camera.trigger_latency_us);
     u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))
 }

@@ -1,5 +1,6 @@
 //! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
 
+mod advice;
 pub mod check;
 pub mod cli;
 pub mod config;

@@ -39,6 +39,7 @@ impl Task {
             row_table_us: rig.projector.row_table.as_deref().map(Into::into),
             beam_sigma_rows: rig.projector.beam_sigma_rows,
             spot: rig.projector.spot(),
+            projector_columns: rig.camera.projector_columns,
             first_row,
             row_pitch: rig.camera.row_pitch,
             camera_row_time_us: rig.camera_row_time_us(),
@@ -129,7 +130,11 @@ impl Task {
         Ok(processing)
     }
 
-    fn products(&self, plan_text: &str) -> Result<Vec<ProductSpec>, ConfigError> {
+    /// What is made of the transport: the products that the plan names.
+    ///
+    /// # Errors
+    /// With the place in the plan's text of the product that cannot be made.
+    pub(crate) fn products(&self, plan_text: &str) -> Result<Vec<ProductSpec>, ConfigError> {
         let Some(tables) = &self.plan.product else { return Ok(ProductSpec::defaults()) };
         if !tables.is_empty() && !self.plan.stage.iter().any(|stage| stage.name == "demux") {
             let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";

@@ -403,7 +403,7 @@ fn row_times(geometry: &SweepGeometry) -> String {
 fn beam(geometry: &SweepGeometry) -> String {
     let spot = match geometry.spot {
         Spot::Uniform => "rows lit evenly",
-        Spot::Flying(_) => "a flying spot, modelled as rows lit evenly",
+        Spot::Flying(_) => "a flying spot",
     };
     match geometry.beam_sigma_rows {
         Some(0.0) => format!("ideal, {spot}"),

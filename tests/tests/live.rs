@@ -208,7 +208,11 @@ impl Snapshot for Trouble {
         1
     }
 
-    fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
+    fn estimate(
+        &self,
+        _: Option<&Transport>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, FoldError> {
         assert!(*self != Self::EstimatePanics, "on purpose");
         while *self == Self::EstimateHangs && go_on() {
             std::thread::sleep(Duration::from_millis(1));

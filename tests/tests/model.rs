@@ -13,7 +13,7 @@ use raysweep_core::{PixelFormat, Raster};
 use raysweep_sim::config::{Beam as SimBeam, RowTable, SimProjector};
 use raysweep_sim::{PlaneRig, PlaneSetup, SimConfig};
 use raysweep_tests::{Bench, corner_rig, data};
-use raysweep_transport::plane::advice::{Noise, SweepGrid, better_plan};
+use raysweep_transport::plane::advice::{Noise, SweepGrid, advise};
 use raysweep_transport::plane::{Beam, CameraRows, Demux, Prior, RowTiming, Setting};
 use raysweep_transport::quality::{median_profile_error, relative_l2};
 
@@ -251,8 +251,9 @@ fn a_plan_that_is_expected_to_be_better_is() {
     let timing = rig.timing();
     let white_e = 8000.0 * 2500.0 / 4095.0;
     for frames in [1, 8] {
-        let noise = Noise { read: 15.0 / white_e, gain: 1.0 / white_e, frames };
-        let (grid, expected) = better_plan(&timing, &paper_grid(), &Prior::SPLIT, &noise).unwrap();
+        let noise = Noise { read: 15.0 / white_e, gain: 1.0 / white_e, frames, dark_frames: None };
+        let advice = advise(&timing, &paper_grid(), &Prior::SPLIT, &noise, |grid| Some(grid.settings()));
+        let (grid, expected) = advice.unwrap().better.unwrap();
         println!("{} x {:?}, {expected:?}", grid.delays_us.len(), grid.exposures_us);
         let paper = rig.recover_from(&timing, paper_grid().settings(), frames);
         let better = rig.recover_from(&timing, grid.settings(), frames);

@@ -183,16 +183,6 @@ impl DemuxFold {
         })
     }
 
-    fn solve(&self, stack: &SweepStack, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
-        let SweepStack { settings, images, valid, .. } = stack;
-        self.demux()
-            .and_then(|demux| demux.with_settings(settings.clone()))
-            .and_then(|demux| {
-                demux.solve_while(images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
-            })
-            .map_err(|error| FoldError { fold: "demux".into(), what: error.to_string() })
-    }
-
     /// How well the transport predicts the light of the regular image (counts: `image`) where it is not saturated.
     fn check_regular(&self, image: &Array2<f32>, light: &Array2<f32>, transport: &Transport) -> Vec<Product> {
         let valid = self.valid(image);
@@ -245,7 +235,6 @@ impl Fold for DemuxFold {
         let regular = taken.get(&Role::Regular).cloned();
         let regular = regular.zip(self.dark_of(&taken, Role::Regular));
         let mut stack = self.stack(taken)?;
-        let refused = |error: PlaneError| FoldError { fold: "demux".into(), what: error.to_string() };
         let prepared = self
             .demux()
             .and_then(|planned| findings::prepare(&planned, &self.options, &self.geometry, &mut stack))
@@ -266,6 +255,7 @@ impl Fold for DemuxFold {
             products.extend(self.check_regular(&regular.image, &light, &transport));
             stack.regular = Some(light);
         }
+        products.extend(findings.warnings.iter().cloned().map(Product::Warning));
         products.push(Product::Findings(Box::new(findings)));
         products.push(Product::Transport(Box::new(transport)));
         products.push(Product::Stack(Box::new(stack)));
@@ -281,7 +271,23 @@ impl Snapshot for DemuxFold {
             .count()
     }
 
-    fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
-        self.solve(&self.stack(self.taken.clone())?, go_on)
+    fn estimate(
+        &self,
+        before: Option<&Transport>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, FoldError> {
+        let SweepStack { settings, images, valid, .. } = self.stack(self.taken.clone())?;
+        let valid = valid.as_ref().map(|valid| valid.view());
+        self.demux()
+            .and_then(|demux| demux.with_settings(settings))
+            .and_then(|demux| match before {
+                Some(before) => demux.solve_from(before, images.view(), valid, go_on),
+                None => demux.solve_while(images.view(), valid, go_on),
+            })
+            .map_err(refused)
     }
+}
+
+fn refused(error: PlaneError) -> FoldError {
+    FoldError { fold: "demux".into(), what: error.to_string() }
 }

@@ -1,10 +1,10 @@
 //! What the stack of a sweep says of the rig and of the scene, before it is demultiplexed: settings that cannot be
 //! trusted, the beam's width, the place of direct light, the prior, the noise.
 
-use ndarray::Array3;
+use ndarray::{Array3, Axis};
 use raysweep_transport::plane::calibrate::{
-    BeamEstimate, CalibrateError, Choice, OpticsEstimate, Sample, candidates, choose_prior, estimate_optics,
-    settings_on_direct_row,
+    BeamEstimate, CalibrateError, Choice, FlyingSpot, OpticsEstimate, Sample, candidates, choose_prior,
+    estimate_optics, settings_on_direct_row,
 };
 use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior};
 
@@ -30,6 +30,8 @@ pub struct Findings {
     pub left_out_us: Vec<(f64, f64)>,
     /// What was found, as a key and a sentence each.
     pub remarks: Vec<(&'static str, String)>,
+    /// What makes the result worse than it looks.
+    pub warnings: Vec<String>,
 }
 
 /// A stack made ready for the solver.
@@ -59,35 +61,59 @@ pub fn prepare(
         u0_rows: 0.0,
         left_out_us: Vec::new(),
         remarks: Vec::new(),
+        warnings: Vec::new(),
     };
-    leave_out(geometry, stack, &mut findings)?;
+    let spot = leave_out(geometry, stack, &mut findings)?;
     let planned = planned.with_settings(stack.settings.clone())?;
-    let demux = match calibrate(&planned, options, geometry, stack, &mut findings) {
+    let mut coupled = couple(options, stack, &mut findings)?;
+    let mut demux = match calibrate(&planned, options, geometry, stack, coupled.as_ref(), &mut findings) {
         Ok(demux) => demux,
         Err(error) => {
             findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
             planned
         }
     };
+    if let Some((spot, mut whole, cut)) = spot {
+        // Neighbours see other moments of the spot, so images that depend on it are solved as they were taken.
+        if let Some(steady) = coupled.take() {
+            let mut all = whole.images.clone();
+            let kept = (0..whole.settings.len()).filter(|n| !cut.contains(n));
+            kept.zip(steady.outer_iter())
+                .for_each(|(n, image)| all.index_axis_mut(Axis(0), n).assign(&image));
+            coupled = Some(all);
+        }
+        (whole.noise, whole.variance_ratio) = (stack.noise, stack.variance_ratio.take());
+        *stack = whole;
+        demux = demux.with_settings(stack.settings.clone())?.with_spot(spot)?;
+    }
     stack.timing = demux.timing().clone();
     stack.prior = demux.prior();
-    let coupled = couple(options, stack, &mut findings)?;
     Ok(Prepared { demux, coupled, findings })
 }
 
-/// Estimates the optics and chooses the prior.
+/// Estimates the optics from the images as they were taken, and chooses the prior for those that are solved.
 fn calibrate(
     planned: &Demux,
     options: &DemuxOptions,
     geometry: &SweepGeometry,
     stack: &SweepStack,
+    coupled: Option<&Array3<f32>>,
     findings: &mut Findings,
 ) -> Result<Demux, CalibrateError> {
     let valid = stack.valid.as_ref().map(|valid| valid.view());
-    let sample = Sample::new(stack.timing.clone(), stack.settings.clone(), stack.images.view(), valid)?;
+    let sample_of = |images: &Array3<f32>| {
+        Sample::new(stack.timing.clone(), stack.settings.clone(), images.view(), valid)
+    };
+    let sample = sample_of(&stack.images)?;
     let OpticsEstimate { mut optics, beam, spike } = estimate_optics(&sample, geometry.beam_sigma_rows)?;
+    if beam.is_some() && optics.beam_sigma_rows > 0.0 {
+        findings.warnings.push(format!(
+            "the beam's width, {:.2} rows, was estimated from this scene, and light that spreads by about a row under the surface looks the same: measure it once on a matt white surface and state it as projector.beam_sigma_rows in the rig file",
+            optics.beam_sigma_rows
+        ));
+    }
+    findings.remarks.push(("beam", say_beam(beam.as_ref(), optics.beam_sigma_rows)));
     let sigma_rows = optics.beam_sigma_rows;
-    findings.remarks.push(("beam", say_beam(beam.as_ref(), sigma_rows)));
     let beam = Beam::of_sigma(sigma_rows);
     let mut demux = planned.with_timing(stack.timing.clone().with_beam(beam)?)?;
     findings.beam_sigma_rows = sigma_rows;
@@ -120,7 +146,9 @@ fn calibrate(
             let default = findings.prior;
             let others = candidates().into_iter().filter(|prior| *prior != default);
             let compared: Vec<Prior> = std::iter::once(default).chain(others).collect();
-            match choose_prior(&sample, &optics, &compared) {
+            // Noise asks for smoothness, and coupling has taken most of it.
+            let solved = coupled.map_or(Ok(sample), sample_of);
+            match solved.and_then(|solved| choose_prior(&solved, &optics, &compared)) {
                 Ok(choice) => {
                     findings.prior = choice.prior();
                     let reason = choice.reason();
@@ -194,30 +222,41 @@ pub fn name(prior: Prior) -> String {
     format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta())
 }
 
-/// Leaves out settings whose edge cuts the direct row while a flying spot draws it: whether the spot has passed a pixel
-/// by then depends on a projector column that nobody knows.
+/// Leaves out of `stack` the images whose edge cuts the direct row while a flying spot draws it. If the rig knows when the
+/// spot passes each pixel's column, and the beam lets that be modelled, they are left out of the calibration only: then
+/// the spot's way, the whole stack and the images' indices come back.
 fn leave_out(
     geometry: &SweepGeometry,
     stack: &mut SweepStack,
     findings: &mut Findings,
-) -> Result<(), PlaneError> {
-    let Spot::Flying(_) = geometry.spot else { return Ok(()) };
+) -> Result<Option<(FlyingSpot, SweepStack, Vec<usize>)>, PlaneError> {
+    let Spot::Flying(_) = geometry.spot else { return Ok(None) };
     let cut = settings_on_direct_row(&stack.timing, &stack.settings, 0.0)?;
-    if cut.len() == stack.settings.len() {
-        let what = "every exposure begins or ends while the direct row is drawn, so none is left out and direct light is not to be trusted: move the delays by a row";
-        findings.remarks.push(("flying spot", what.into()));
-        return Ok(());
+    let mut say = |what: String| findings.remarks.push(("flying spot", what));
+    if cut.is_empty() {
+        say("no exposure begins or ends while it draws the direct row".into());
+        return Ok(None);
     }
+    if cut.len() == stack.settings.len() {
+        say("every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into());
+        return Ok(None);
+    }
+    if let Some(spot) = geometry.flying_spot().filter(|_| geometry.beam_sigma_rows == Some(0.0)) {
+        say(format!(
+            "modelled in the {} images whose exposure begins or ends while it draws the direct row",
+            cut.len()
+        ));
+        let whole = stack.clone();
+        stack.keep(|n| !cut.contains(&n));
+        return Ok(Some((spot, whole, cut)));
+    }
+    say(format!(
+        "{} images are left out, because their exposure begins or ends while it draws the direct row, and the rig file does not say when it passes a pixel (projector.scan, camera.projector_columns, projector.beam_sigma_rows = 0); {} are kept",
+        cut.len(),
+        stack.settings.len() - cut.len()
+    ));
     let at = |&n: &usize| (stack.settings[n].delays_us[0], stack.settings[n].exposure_us);
     findings.left_out_us = cut.iter().map(at).collect();
     stack.keep(|n| !cut.contains(&n));
-    findings.remarks.push((
-        "flying spot",
-        format!(
-            "{} images are left out, because their exposure begins or ends while the spot draws the direct row; {} are kept",
-            cut.len(),
-            stack.settings.len()
-        ),
-    ));
-    Ok(())
+    Ok(None)
 }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use raysweep_core::{CameraSettings, Raster, Shutter};
+use raysweep_transport::plane::calibrate::{self, FlyingSpot};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming};
 use serde::Deserialize;
 
@@ -67,6 +68,8 @@ pub struct SweepGeometry {
     pub beam_sigma_rows: Option<f64>,
     /// When within its row a pixel's direct light arrives.
     pub spot: Spot,
+    /// Projector columns, 0 to 1 over its width, that the image's left and right edges see; none: not known.
+    pub projector_columns: Option<[f64; 2]>,
     /// Projector row that camera row 0 sees.
     pub first_row: usize,
     /// Projector rows from one camera row to the next.
@@ -131,6 +134,18 @@ impl SweepGeometry {
             row_time_us: self.camera_row_time_us,
         };
         timing.with_camera(camera)?.with_beam(Beam::of_sigma(self.beam_sigma_rows.unwrap_or(0.0)))
+    }
+
+    /// The way of a flying spot over the camera's columns, where the rig knows it.
+    pub fn flying_spot(&self) -> Option<FlyingSpot> {
+        let scan = match self.spot {
+            Spot::Uniform | Spot::Flying(Scan::Unknown) => return None,
+            Spot::Flying(Scan::OneWay) => calibrate::Scan::OneWay,
+            Spot::Flying(Scan::Bidirectional) => calibrate::Scan::Bidirectional,
+        };
+        let [left, right] = self.projector_columns?;
+        let column = |s: usize| left + (right - left) * (s as f64 + 0.5) / self.width as f64;
+        Some(FlyingSpot { scan, columns: (0..self.width).map(column).collect() })
     }
 
     /// The settings for a point on a camera with this trigger latency.

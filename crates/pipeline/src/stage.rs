@@ -110,11 +110,16 @@ pub trait Snapshot: Send + Sync {
     /// How many points of the sweep it can estimate from.
     fn points(&self) -> usize;
 
-    /// The transport as these points tell it. Ends early, with an error, soon after `go_on` says no.
+    /// The transport as these points tell it, sooner for being started from the estimate of fewer points. Ends early,
+    /// with an error, soon after `go_on` says no.
     ///
     /// # Errors
     /// When it cannot be told, or `go_on` said no.
-    fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError>;
+    fn estimate(
+        &self,
+        before: Option<&Transport>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, FoldError>;
 }
 
 /// Stage `hot-pixels`: a pixel that outshines all its neighbours by more than `threshold_dn` takes their median.

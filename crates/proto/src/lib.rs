@@ -3,12 +3,14 @@
 //! [`Method`] is the one table of what can be asked; `describe` returns it with JSON Schemas. A request is one line of
 //! at most [`MAX_MESSAGE_BYTES`]; answers and events are one line each, of any length.
 
+mod advice;
 mod client;
 pub mod live;
 mod messages;
 mod methods;
 mod rpc;
 
+pub use advice::{BetterSweep, ExpectedError, NoiseEstimate, NoiseSource, SweepAdvice};
 pub use client::{Client, ClientError, Subscription};
 pub use messages::*;
 pub use methods::{Description, Empty, ErrorInfo, LimitsInfo, Method, MethodInfo, Role, describe};

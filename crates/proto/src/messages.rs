@@ -6,6 +6,8 @@ use raysweep_core::{Counts, FilmSummary, VsyncStats};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
+use crate::SweepAdvice;
+
 /// What the daemon is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -215,6 +217,9 @@ pub struct CheckReport {
     pub reach_rows: (i32, i32),
     /// Condition number of the demultiplexing of a camera row in the middle, with its prior.
     pub condition: f64,
+    /// What error to expect of a sweep, and what to do better; nothing where a warning says why, and for films.
+    #[serde(default)]
+    pub advice: Option<SweepAdvice>,
     /// Where the plan is a film.
     #[serde(default)]
     pub film: Option<FilmCheck>,

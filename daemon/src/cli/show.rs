@@ -5,7 +5,10 @@ use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
 use raysweep_core::{Counts, FilmSummary, Percentiles};
-use raysweep_proto::{CheckReport, Description, Progress, Role, RunState, SessionInfo, Status};
+use raysweep_proto::{
+    CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo, Status,
+    SweepAdvice,
+};
 
 use crate::process::Processed;
 
@@ -56,6 +59,7 @@ pub(super) fn check(report: &CheckReport) -> String {
         ("reach", format!("relative rows {first} to {last}")),
         ("condition", format!("{:.3e}", report.condition)),
     ];
+    rows.extend(report.advice.iter().flat_map(advice));
     if let Some(film) = &report.film {
         rows[0] = (
             "cycles",
@@ -70,7 +74,57 @@ pub(super) fn check(report: &CheckReport) -> String {
         rows.insert(2, ("a minute", format!("{minute} on disk, uncompressed; latency hangs on the machine")));
     }
     rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
-    block(&rows)
+    let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
+    better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.sweep.trim_end()))
+}
+
+/// What `check` expects and advises; the better sweep's table stands after the rows.
+fn advice(advice: &SweepAdvice) -> Vec<(&'static str, String)> {
+    let SweepAdvice { noise, prior, expected, better } = advice;
+    let source = match noise.source {
+        NoiseSource::Stated => "as the rig file states it",
+        NoiseSource::Simulated => "as simulated",
+        NoiseSource::Assumed => {
+            "assumed: state camera.electrons_per_dn and camera.read_noise_e in the rig file"
+        }
+    };
+    let (dark, shot) = (short(noise.dark), short(noise.shot));
+    vec![
+        ("noise", format!("{dark} in the dark, {shot} of a white pixel's row, which is 1; {source}")),
+        ("error", format!("{}, expected with the prior {prior}", errors(expected))),
+        (
+            "better",
+            better.as_ref().map_or_else(
+                || "no better sweep of this length found".into(),
+                |better| {
+                    let (first, last) = better.reach_rows;
+                    format!(
+                        "{}, with {} points, {} frames, relative rows {first} to {last}; see [sweep] below",
+                        errors(&better.expected),
+                        better.points,
+                        better.frames
+                    )
+                },
+            ),
+        ),
+    ]
+}
+
+fn errors(expected: &ExpectedError) -> String {
+    let ExpectedError { epipolar, short_range, long_range, profile } = expected;
+    format!(
+        "epipolar {}, short range {}, long range {}, profile {}",
+        short(*epipolar),
+        short(*short_range),
+        short(*long_range),
+        short(*profile)
+    )
+}
+
+/// A small number with two digits that say something.
+fn short(value: f64) -> String {
+    let decimals = if value > 0.0 { (1.0 - value.log10().floor()).clamp(0.0, 12.0) } else { 0.0 };
+    format!("{value:.*}", decimals as usize)
 }
 
 /// `sessions`

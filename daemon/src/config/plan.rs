@@ -122,6 +122,8 @@ fn default_stages() -> Vec<StageTable> {
     vec![StageTable { name: "demux".into(), options: Map::new() }]
 }
 
+/// Fewest frames of a dark image: its noise is in all images of its exposure, so it should hardly have any.
+const MIN_DARK_AVERAGE: u32 = 8;
 /// Most values along an axis.
 const MAX_AXIS: usize = 1024;
 /// Most points of a sweep.
@@ -151,7 +153,11 @@ impl Plan {
         }
     }
 
-    fn check(&self, text: &str) -> Result<(), ConfigError> {
+    /// Whether it can be run; `text` is what it was read from.
+    ///
+    /// # Errors
+    /// Those of [`Self::parse`].
+    pub(crate) fn check(&self, text: &str) -> Result<(), ConfigError> {
         let sweep = &self.sweep;
         let (kind, own, other) = match self.kind {
             PlanKind::Sweep => ("sweep", "sweep", "film"),
@@ -214,7 +220,10 @@ impl Plan {
             return self.film.schedule();
         }
         let frames = self.sweep.average;
-        let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames };
+        let point = |role, delay_us, exposure_us| {
+            let frames = if matches!(role, Role::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+            Point { role, delay_us, exposure_us, frames }
+        };
         let exposures = self.sweep.exposure_us.values();
         let delays = self.sweep.delay_us.values();
 

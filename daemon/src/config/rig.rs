@@ -2,6 +2,7 @@
 
 use raysweep_core::{PixelFormat, Raster};
 use raysweep_pipeline::{Scan, Spot};
+use raysweep_proto::NoiseSource;
 use raysweep_sim::SimConfig;
 use raysweep_sim::config::Spot as SimSpot;
 use raysweep_transport::plane::{PlaneError, RowTiming};
@@ -52,6 +53,10 @@ pub struct CameraSection {
     white_dn: Option<f64>,
     /// Counts without light; left out: 64 of 4096 of the format's.
     black_dn: Option<f64>,
+    /// Electrons per count; left out: see [`RigFile::noise`].
+    electrons_per_dn: Option<f64>,
+    /// Electrons of noise in a dark sample; left out: see [`RigFile::noise`].
+    read_noise_e: Option<f64>,
     /// How frames are packed.
     #[serde(default = "default_pixel_format")]
     pub pixel_format: PixelFormat,
@@ -62,6 +67,8 @@ pub struct CameraSection {
     pub row_pitch: f64,
     /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
     pub first_projector_row: Option<usize>,
+    /// Projector columns, 0 to 1 over its width, that the image's left and right edges see; left out: not known.
+    pub projector_columns: Option<[f64; 2]>,
 }
 
 impl CameraSection {
@@ -79,6 +86,22 @@ impl CameraSection {
         f64::from(self.pixel_format.max_value()) + 1.0
     }
 }
+
+/// What the noise of a camera hangs on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraNoise {
+    /// Electrons per count; infinitely many where light brings no noise.
+    pub electrons_per_dn: f64,
+    /// Electrons of noise in a dark sample.
+    pub read_noise_e: f64,
+    /// How they are known.
+    pub source: NoiseSource,
+}
+
+/// Electrons over the full scale of a typical camera [A].
+const TYPICAL_FULL_SCALE_E: f64 = 8000.0;
+/// Electrons of read noise of a typical camera [A].
+const TYPICAL_READ_NOISE_E: f64 = 15.0;
 
 /// `[vsync]`
 #[derive(Debug, Clone, Deserialize)]
@@ -201,10 +224,42 @@ impl RigFile {
         self.camera.row_pitch * self.projector.row_time_us
     }
 
+    /// The camera's noise: as stated; what is left out of it as the simulator makes it, of other cameras typical values.
+    pub fn noise(&self) -> CameraNoise {
+        let (camera, sensor) = (&self.camera, &self.sim.sensor);
+        let unstated = if camera.driver != Driver::Sim {
+            CameraNoise {
+                electrons_per_dn: TYPICAL_FULL_SCALE_E / camera.full_scale_dn(),
+                read_noise_e: TYPICAL_READ_NOISE_E,
+                source: NoiseSource::Assumed,
+            }
+        } else if sensor.noise {
+            // The simulator counts its electrons on a scale of 12 bit.
+            let electrons_per_dn = sensor.electrons_per_dn * 4096.0 / camera.full_scale_dn();
+            CameraNoise {
+                electrons_per_dn,
+                read_noise_e: sensor.read_noise_e,
+                source: NoiseSource::Simulated,
+            }
+        } else {
+            CameraNoise { electrons_per_dn: f64::INFINITY, read_noise_e: 0.0, source: NoiseSource::Simulated }
+        };
+        match (camera.electrons_per_dn, camera.read_noise_e) {
+            (Some(electrons_per_dn), Some(read_noise_e)) => {
+                CameraNoise { electrons_per_dn, read_noise_e, source: NoiseSource::Stated }
+            }
+            (electrons_per_dn, read_noise_e) => CameraNoise {
+                electrons_per_dn: electrons_per_dn.unwrap_or(unstated.electrons_per_dn),
+                read_noise_e: read_noise_e.unwrap_or(unstated.read_noise_e),
+                ..unstated
+            },
+        }
+    }
+
     fn check(&self, text: &str) -> Result<(), ConfigError> {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
         let max_dn = f64::from(camera.pixel_format.max_value());
-        let rules: [(&[&str], f64, f64, f64); 10] = [
+        let rules: [(&[&str], f64, f64, f64); 12] = [
             (&["vsync", "period_us"], vsync.period_us, 4000.0, 1e6),
             (&["vsync", "gate_us"], vsync.gate_us, 1.0, vsync.period_us / 4.0),
             (&["projector", "rows"], projector.rows as f64, 1.0, MAX_ROWS as f64),
@@ -214,6 +269,8 @@ impl RigFile {
             (&["camera", "row_pitch"], camera.row_pitch, 0.01, 100.0),
             (&["camera", "row_time_us"], self.camera_row_time_us(), 0.1, 10_000.0),
             (&["camera", "white_dn"], camera.white_dn(), 1.0, max_dn),
+            (&["camera", "electrons_per_dn"], camera.electrons_per_dn.unwrap_or(1.0), 1e-3, 1e6),
+            (&["camera", "read_noise_e"], camera.read_noise_e.unwrap_or(0.0), 0.0, 1e6),
             (&["camera", "black_dn"], camera.black_dn(), 0.0, max_dn / 2.0),
         ];
         for (path, value, low, high) in rules {
@@ -239,6 +296,12 @@ impl RigFile {
                 self.pace_us()
             );
             return Err(ConfigError::at(text, &["camera", "row_time_us"], message));
+        }
+        if let Some(column) = camera.projector_columns.iter().flatten().find(|c| !(0.0..=1.0).contains(*c)) {
+            let message = format!(
+                "camera.projector_columns contains {column}: give 0 to 1, in parts of the projector's width"
+            );
+            return Err(ConfigError::at(text, &["camera", "projector_columns"], message));
         }
         if projector.spot == SpotKind::Uniform && projector.scan.is_some() {
             let message = "projector.scan says which way a flying spot runs: set projector.spot = \"flying\" or leave scan out";
@@ -306,6 +369,21 @@ mod tests {
     }
 
     #[test]
+    fn noise_is_what_is_stated_else_what_is_simulated() {
+        let noise = |camera: &str, sensor: &str| {
+            let text = MINIMAL.replace("[camera]\n", &format!("[camera]\n{camera}\n"));
+            RigFile::parse(&format!("{text}[sim.sensor]\n{sensor}\n")).unwrap().noise()
+        };
+        let is =
+            |electrons_per_dn, read_noise_e, source| CameraNoise { electrons_per_dn, read_noise_e, source };
+        assert_eq!(noise("", "read_noise_e = 7"), is(1.66, 7.0, NoiseSource::Simulated));
+        assert_eq!(noise("pixel_format = \"Mono10\"", ""), is(6.64, 9.0, NoiseSource::Simulated));
+        assert_eq!(noise("read_noise_e = 3", ""), is(1.66, 3.0, NoiseSource::Simulated));
+        assert_eq!(noise("", "noise = false"), is(f64::INFINITY, 0.0, NoiseSource::Simulated));
+        assert_eq!(noise("electrons_per_dn = 2\nread_noise_e = 3", ""), is(2.0, 3.0, NoiseSource::Stated));
+    }
+
+    #[test]
     fn every_key_but_kind_and_drivers_has_a_default() {
         let rig = RigFile::parse(MINIMAL).unwrap();
         assert_eq!(rig.raster().rows, 720);
@@ -320,11 +398,17 @@ mod tests {
             (MINIMAL.replace("[vsync]\n", "[vsync]\nperiod_us = 5\n"), "vsync.period_us = 5"),
             (MINIMAL.replace("[camera]\n", "[camera]\ngain = 3\n"), "gain"),
             (MINIMAL.replace("[camera]\n", "[camera]\nwhite_dn = 5000\n"), "4095"),
+            (
+                MINIMAL.replace("[camera]\n", "[camera]\nelectrons_per_dn = 0\n"),
+                "electrons_per_dn = 0: allowed",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\nread_noise_e = -1\n"), "read_noise_e = -1: allowed"),
             (MINIMAL.replace("[camera]\n", "[camera]\nrow_time_us = 30\n"), "same speed"),
             (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 2\nrow_time_us = 22.22\n"), "44.44"),
             (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0\n"), "camera.row_pitch = 0"),
             (MINIMAL.replace("[projector]\n", "[projector]\nrows = 1000\n"), "longer than"),
             (MINIMAL.replace("[projector]\n", "[projector]\nbeam_sigma_rows = -1\n"), "beam_sigma_rows = -1"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nprojector_columns = [0, 1.5]\n"), "0 to 1"),
             (MINIMAL.replace("[projector]\n", "[projector]\nscan = \"one-way\"\n"), "flying"),
             (
                 format!(

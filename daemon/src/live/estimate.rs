@@ -139,16 +139,19 @@ impl Inbox {
 }
 
 fn work(inbox: &Inbox, pool: &ThreadPool, outlet: &Outlet) {
+    let mut before: Option<Transport> = None;
     while let Some(snapshot) = inbox.next() {
         let began = Instant::now();
         let go_on = || !inbox.lock().ended;
-        let estimated = catch_unwind(AssertUnwindSafe(|| pool.install(|| snapshot.estimate(&go_on))));
+        let estimated =
+            catch_unwind(AssertUnwindSafe(|| pool.install(|| snapshot.estimate(before.as_ref(), &go_on))));
         let why = match estimated {
             _ if !go_on() => return,
-            Ok(Ok(transport)) => outlet
-                .show(&transport, snapshot.points(), began.elapsed(), false)
-                .err()
-                .map(|error| error.to_string()),
+            Ok(Ok(transport)) => {
+                let shown = outlet.show(&transport, snapshot.points(), began.elapsed(), false);
+                before = Some(transport);
+                shown.err().map(|error| error.to_string())
+            }
             Ok(Err(error)) => Some(error.to_string()),
             Err(panic) => Some(format!("panicked: {}", message_of(&*panic))),
         };
@@ -195,7 +198,11 @@ mod tests {
             self.points
         }
 
-        fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
+        fn estimate(
+            &self,
+            _: Option<&Transport>,
+            go_on: &(dyn Fn() -> bool + Sync),
+        ) -> Result<Transport, FoldError> {
             self.begun.send(self.points).unwrap();
             loop {
                 match self.points {

@@ -9,8 +9,9 @@ pub(super) fn section(products: &[Product]) -> Option<Section> {
         Product::Findings(findings) => Some(&**findings),
         _ => None,
     })?;
-    let facts = findings.remarks.iter().map(|(key, said)| ((*key).to_owned(), said.clone())).collect();
-    let mut blocks = vec![Block::Facts(facts)];
+    let said = findings.remarks.iter().map(|(what, said)| vec![(*what).to_owned(), said.clone()]).collect();
+    let headers = vec!["about".into(), "what the images say".into()];
+    let mut blocks = vec![Block::Table(Table { headers, rows: said })];
     blocks.extend(curve(findings));
     if !findings.left_out_us.is_empty() {
         let row = |(delay_us, exposure_us): &(f64, f64)| {
@@ -23,7 +24,7 @@ pub(super) fn section(products: &[Product]) -> Option<Section> {
     }
     Some(Section {
         title: "How it was demultiplexed".into(),
-        intro: "What the images say of themselves: some are held out, predicted from the others, and the model that predicts them best is taken.".into(),
+        intro: "Some images are held out and predicted from the others; the model that predicts them best is taken, the default in doubt.".into(),
         blocks,
     })
 }

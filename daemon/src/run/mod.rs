@@ -29,6 +29,7 @@ pub(crate) use self::board::Board;
 use self::board::WrongState;
 use self::engine::{Acquired, Run, RunError};
 use self::orders::{Order, Orders};
+use crate::advice;
 use crate::check;
 use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
@@ -414,7 +415,14 @@ impl Control for Runner {
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
-        self.foresee(plan).map(|(_, report)| report)
+        let (task, mut report) = self.foresee(plan)?;
+        if !task.is_film() {
+            match advice::advise(&task, &self.rig.file, &self.camera) {
+                Ok(advice) => report.advice = Some(advice),
+                Err(none) => report.warnings.push(none.to_string()),
+            }
+        }
+        Ok(report)
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {

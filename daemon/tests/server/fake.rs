@@ -8,8 +8,8 @@ use raysweep::control::Control;
 use raysweep::server::{Access, Limits, Listening, serve_within};
 use raysweep_core::{Counts, LossCause, VsyncStats};
 use raysweep_proto::{
-    CheckReport, Client, ErrorCode, Event, Progress, ResumeParams, RpcError, RunParams, RunState,
-    SessionInfo, Started, Status,
+    BetterSweep, CheckReport, Client, ErrorCode, Event, ExpectedError, NoiseEstimate, NoiseSource, Progress,
+    ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status, SweepAdvice,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -112,6 +112,8 @@ pub fn progress() -> Progress {
 }
 
 pub fn report() -> CheckReport {
+    let expected =
+        ExpectedError { epipolar: 0.0106, short_range: 0.011, long_range: 0.0039, profile: 0.0157 };
     CheckReport {
         points: 75,
         extra_points: 6,
@@ -123,6 +125,18 @@ pub fn report() -> CheckReport {
         disk_free_bytes: 1 << 40,
         reach_rows: (-94, 94),
         condition: 1234.5,
+        advice: Some(SweepAdvice {
+            noise: NoiseEstimate { dark: 0.002, shot: 0.0155, source: NoiseSource::Assumed },
+            prior: "split".into(),
+            expected,
+            better: Some(BetterSweep {
+                points: 74,
+                frames: 616,
+                reach_rows: (-94, 94),
+                expected: ExpectedError { epipolar: 0.0062, ..expected },
+                sweep: "[sweep]\naverage = 8\n".into(),
+            }),
+        }),
         film: None,
         warnings: vec!["few points".into()],
     }

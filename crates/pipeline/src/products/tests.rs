@@ -14,6 +14,7 @@ fn geometry() -> SweepGeometry {
         row_table_us: None,
         beam_sigma_rows: None,
         spot: Spot::Uniform,
+        projector_columns: None,
         first_row: 2,
         row_pitch: 1.0,
         camera_row_time_us: 20.0,

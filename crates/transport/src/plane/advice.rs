@@ -2,7 +2,8 @@
 
 use std::ops::RangeInclusive;
 
-use ndarray::{Array1, Array2, ArrayView1, Axis};
+use ndarray::{Array1, Array2, Axis};
+use rayon::prelude::*;
 
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SlotKind, cholesky, reach};
 
@@ -15,6 +16,9 @@ pub struct Noise {
     pub gain: f64,
     /// Frames averaged per setting.
     pub frames: u32,
+    /// Frames of the dark image that is subtracted from all images of one exposure, which all err by its noise; none
+    /// where nothing is subtracted.
+    pub dark_frames: Option<u32>,
 }
 
 impl Noise {
@@ -22,15 +26,21 @@ impl Noise {
     fn variance(&self, light: f64) -> f64 {
         (self.read.powi(2) + self.gain * light.max(0.0)) / f64::from(self.frames.max(1))
     }
+
+    /// Variance of the dark image.
+    fn dark_variance(&self) -> f64 {
+        self.dark_frames.map_or(0.0, |frames| self.read.powi(2) / f64::from(frames.max(1)))
+    }
 }
 
 /// Expected errors of a white pixel in the middle of the frame, in white units.
 ///
 /// They are those of the linear estimator `H^-1 A' I` with `H = A'A + alpha D'D`: `T >= 0` and beta, which only help
-/// (the paper's prior, which smears the own row without them, by a factor of 3), are left out, and timing, beam and white level are taken as true. The pixel receives 1 from its own row and
-/// [`INDIRECT_PER_ROW`] from all others; around that, neighbouring rows differ such that the prior's weighted
-/// differences have the standard deviation [`ROUGHNESS`]. So the error has two parts: the samples' noise, and what
-/// smoothing takes away or settings do not see.
+/// (the paper's prior, which smears the own row without them, by a factor of 3), are left out, and timing, beam and
+/// white level are taken as true. The pixel receives 1 from its own row and [`INDIRECT_PER_ROW`] from all others; around
+/// that, neighbouring rows differ such that the prior's weighted differences have the standard deviation [`ROUGHNESS`].
+/// So the error has two parts: the noise of the samples and of the dark images, and what smoothing takes away or
+/// settings do not see.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExpectedError {
     /// Standard deviation of the pixel's own row, `u = 0`.
@@ -68,54 +78,74 @@ pub fn expected_error(
     timing.check(settings)?;
     let RowModel { slots, weights } = RowModel::new(timing, settings, reach, timing.camera_rows() / 2);
     let differences = prior.differences(&slots);
+    let smoothness = differences.t().dot(&differences) * prior.alpha();
     let n = slots.len();
-    let mut h = weights.t().dot(&weights) + prior.alpha() * differences.t().dot(&differences);
+    let mut h = weights.t().dot(&weights) + &smoothness;
     // Rows that nothing determines must not make it singular.
     h.diag_mut().mapv_inplace(|diagonal| if diagonal > 0.0 { diagonal * (1.0 + 1e-12) } else { 1.0 });
-    let mut factor: Vec<f64> = h.into_iter().collect();
-    cholesky::factor(&mut factor, n).map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
-    let solve_rows = |right_sides: &Array2<f64>| {
-        let mut solutions = right_sides.to_owned();
-        for mut row in solutions.rows_mut() {
-            let mut solution = row.to_vec();
-            cholesky::solve(&factor, n, &mut solution);
-            row.assign(&ArrayView1::from(&solution));
-        }
-        solutions
-    };
+    let mut inverse: Vec<f64> = h.into_iter().collect();
+    cholesky::invert(&mut inverse, n).map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
+    let inverse = Array2::from_shape_fn((n, n), |(i, j)| inverse[i.max(j) * n + i.min(j)]);
 
-    // Each row: what one independent cause of error with standard deviation 1 does to the profile.
     let truth = Array1::from_iter(slots.iter().map(|slot| match slot.u {
         0 => 1.0,
         _ => INDIRECT_PER_ROW,
     }));
-    let deviations = weights.dot(&truth).mapv(|light| noise.variance(light).sqrt()).insert_axis(Axis(1));
-    let by_noise = solve_rows(&weights) * deviations;
-    let by_roughness = solve_rows(&differences) * (prior.alpha() * ROUGHNESS);
-    let smoothed = differences.t().dot(&differences.dot(&truth)) * prior.alpha();
-    let by_smoothing = solve_rows(&smoothed.insert_axis(Axis(0)));
+    // What is wrong with the right side `A'I` of `H T = A'I`: its covariance,
+    let variances = weights.dot(&truth).mapv(|light| noise.variance(light)).insert_axis(Axis(1));
+    let mut wrong = weights.t().dot(&(&weights * &variances));
+    wrong.scaled_add(prior.alpha() * ROUGHNESS.powi(2), &smoothness);
+    for exposed in of_each_exposure(settings, &weights) {
+        add_square(&mut wrong, noise.dark_variance(), &exposed);
+    }
+    // and where smoothing draws away from the truth even without noise.
+    add_square(&mut wrong, 1.0, &smoothness.dot(&truth));
 
-    let causes = [by_noise, by_roughness, by_smoothing];
-    let profiles = || causes.iter().flat_map(|profiles| profiles.rows());
-    let own = |slot: usize, rows: &RangeInclusive<i32>| {
-        slots[slot].kind == SlotKind::Own && rows.contains(&slots[slot].u.abs())
+    let covariance_half = inverse.dot(&wrong);
+    let own = |rows: RangeInclusive<i32>| {
+        slots
+            .iter()
+            .map(move |slot| f64::from(slot.kind == SlotKind::Own && rows.contains(&slot.u.abs())))
+            .collect::<Array1<f64>>()
     };
     let band = |rows: RangeInclusive<i32>| {
-        let sum = |profile: ArrayView1<f64>| -> f64 {
-            (0..n).filter(|&slot| own(slot, &rows)).map(|slot| profile[slot]).sum()
-        };
-        profiles().map(|profile| sum(profile).powi(2)).sum::<f64>().sqrt()
+        let solved = inverse.dot(&own(rows));
+        solved.dot(&wrong.dot(&solved)).max(0.0).sqrt()
     };
-    let all = 0..=i32::MAX;
-    let squares = |profile: ArrayView1<f64>| -> f64 {
-        (0..n).filter(|&slot| own(slot, &all)).map(|slot| profile[slot].powi(2)).sum()
-    };
+    let squares = (&covariance_half * &inverse).sum_axis(Axis(1));
     Ok(ExpectedError {
         epipolar: band(0..=0),
         short_range: band(1..=SHORT_RANGE_ROWS),
         long_range: band(SHORT_RANGE_ROWS + 1..=i32::MAX),
-        profile: profiles().map(squares).sum::<f64>().sqrt(),
+        profile: squares.dot(&own(0..=i32::MAX)).sqrt(),
     })
+}
+
+/// Sums of the weights of the settings of each exposure: what an error of its dark image adds to `A'I`.
+fn of_each_exposure(settings: &[Setting], weights: &Array2<f64>) -> Vec<Array1<f64>> {
+    let mut sums: Vec<(f64, Array1<f64>)> = Vec::new();
+    for (setting, weights) in settings.iter().zip(weights.rows()) {
+        match sums.iter_mut().find(|(exposure_us, _)| *exposure_us == setting.exposure_us) {
+            Some((_, sum)) => *sum += &weights,
+            None => sums.push((setting.exposure_us, weights.to_owned())),
+        }
+    }
+    sums.into_iter().map(|(_, sum)| sum).collect()
+}
+
+/// Adds `factor x x'`.
+fn add_square(to: &mut Array2<f64>, factor: f64, x: &Array1<f64>) {
+    for (mut row, &x_i) in to.rows_mut().into_iter().zip(x) {
+        row.scaled_add(factor * x_i, x);
+    }
+}
+
+/// What the pixel that [`ExpectedError`] is about collects under a setting.
+pub fn white_light(timing: &RowTiming, setting: &Setting) -> f64 {
+    let row = timing.camera_rows() / 2;
+    let weights = timing.weights(row, setting);
+    let own = weights[timing.camera().own_row(row)];
+    own + INDIRECT_PER_ROW * (weights.iter().sum::<f64>() - own)
 }
 
 /// A sweep: every delay with every exposure.
@@ -137,56 +167,106 @@ impl SweepGrid {
     }
 }
 
-/// Power by which delays thin out away from 0 in the grids that are dense there.
-const DENSITY: f64 = 1.7;
+/// What to expect of a sweep, and which to take instead.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Advice {
+    /// Of the sweep.
+    pub expected: ExpectedError,
+    /// One of at most as many points that is worth the change, and what to expect of it.
+    pub better: Option<(SweepGrid, ExpectedError)>,
+}
 
-/// The grid of at most as many points as `plan`, over the same delays, with the smallest expected error of the profile,
-/// and that error: `plan` itself, or one or two of its exposures with more delays, even or dense near 0
-/// (`± d_max (k/h)^1.7`). Errors are those over the reach of `plan`, so that a grid that sees less of it pays for it.
+/// Share of a plan's expected error of the profile below which another is worth the change.
+const WORTHWHILE: f64 = 0.9;
+
+/// How much larger than the plan's another's error of a band may be.
+const HARMLESS: f64 = 1.1;
+
+/// Foresees `plan`, and of the grids of at most as many points over the same delays and exposures finds that with the
+/// smallest expected error of the profile, if that is smaller by 10 % and that of no band larger by 10 %. Tried are one
+/// to four exposures, with delays that are even or dense near 0 (`± d_max (k/h)^p`).
+///
+/// `usable` gives the settings of a grid whose images will serve, nothing where the rig cannot take the grid. Errors are
+/// those over the reach of `plan`, so that a grid that sees less of it pays for it.
 ///
 /// # Errors
-/// Those of [`reach`] and [`expected_error`].
-pub fn better_plan(
+/// Those of [`reach`] and [`expected_error`]; [`PlaneError::NoDelays`] if no setting of `plan` serves.
+pub fn advise(
     timing: &RowTiming,
     plan: &SweepGrid,
     prior: &Prior,
     noise: &Noise,
-) -> Result<(SweepGrid, ExpectedError), PlaneError> {
-    let settings = plan.settings();
-    let reach = reach(timing, &settings)?;
-    let mut best = (plan.clone(), expected_error(timing, &settings, &reach, prior, noise)?);
-    for grid in alternatives(plan) {
-        let expected = expected_error(timing, &grid.settings(), &reach, prior, noise)?;
-        if expected.profile < best.1.profile {
-            best = (grid, expected);
-        }
-    }
-    Ok(best)
+    usable: impl Fn(&SweepGrid) -> Option<Vec<Setting>> + Sync,
+) -> Result<Advice, PlaneError> {
+    let reach = reach(timing, &plan.settings())?;
+    let foresee = |settings: &[Setting]| expected_error(timing, settings, &reach, prior, noise);
+    let expected = foresee(&usable(plan).unwrap_or_default())?;
+    let worthwhile = |other: &ExpectedError| {
+        other.profile <= WORTHWHILE * expected.profile
+            && other.epipolar <= HARMLESS * expected.epipolar
+            && other.short_range <= HARMLESS * expected.short_range
+            && other.long_range <= HARMLESS * expected.long_range
+    };
+    let foreseen = alternatives(plan)
+        .into_par_iter()
+        .filter_map(|grid| {
+            let settings = usable(&grid).filter(|settings| !settings.is_empty())?;
+            Some(foresee(&settings).map(|expected| (grid, expected)))
+        })
+        .collect::<Result<Vec<_>, _>>()?;
+    let worthwhile = foreseen.into_iter().filter(|(_, expected)| worthwhile(expected));
+    let better = worthwhile.min_by(|(_, a), (_, b)| a.profile.total_cmp(&b.profile));
+    Ok(Advice { expected, better })
 }
+
+/// Powers by which delays thin out away from 0 in the grids that are dense there.
+const DENSITIES: [f64; 2] = [1.3, 1.7];
+
+/// Most exposures of the grids that are tried.
+const MAX_EXPOSURES: usize = 4;
 
 fn alternatives(plan: &SweepGrid) -> Vec<SweepGrid> {
     let points = plan.delays_us.len() * plan.exposures_us.len();
-    let farthest_us = plan.delays_us.iter().fold(0.0_f64, |farthest, delay_us| farthest.max(delay_us.abs()));
-    let shortest_us = plan.exposures_us.iter().copied().fold(f64::INFINITY, f64::min);
-    let longest_us = plan.exposures_us.iter().copied().fold(0.0, f64::max);
+    let (first_us, last_us) = range_of(&plan.delays_us);
+    let (shortest_us, longest_us) = range_of(&plan.exposures_us);
     let mut exposures = vec![vec![shortest_us]];
     if longest_us > shortest_us {
-        exposures.extend([vec![longest_us], vec![shortest_us, longest_us]]);
+        exposures.push(vec![longest_us]);
+        exposures.extend((2..=MAX_EXPOSURES).map(|count| even(shortest_us, longest_us, count)));
     }
     let mut grids = Vec::new();
     for exposures_us in exposures {
-        // On each side of a delay of 0.
-        let half = (points / exposures_us.len()).saturating_sub(1) / 2;
-        if half == 0 {
-            continue;
-        }
-        for power in [1.0, DENSITY] {
-            let place = |k: i32| f64::from(k.signum()) * (f64::from(k.abs()) / half as f64).powf(power);
-            let delays_us = (-(half as i32)..=half as i32).map(|k| farthest_us * place(k)).collect();
+        let delays = points / exposures_us.len();
+        if delays > 1 && first_us < last_us {
+            let delays_us = even(first_us, last_us, delays);
             grids.push(SweepGrid { delays_us, exposures_us: exposures_us.clone() });
+        }
+        // On each side of a delay of 0.
+        let half = delays.saturating_sub(1) / 2;
+        if half > 0 && first_us < 0.0 && last_us > 0.0 {
+            for density in DENSITIES {
+                // Nobody wants to read, and no camera keeps, more digits.
+                let place = |far_us: f64, k: usize| {
+                    (far_us * (k as f64 / half as f64).powf(density) * 10.0).round() / 10.0
+                };
+                let before = (1..=half).rev().map(|k| place(first_us, k));
+                let delays_us = before.chain((0..=half).map(|k| place(last_us, k))).collect();
+                grids.push(SweepGrid { delays_us, exposures_us: exposures_us.clone() });
+            }
         }
     }
     grids
+}
+
+fn range_of(values: &[f64]) -> (f64, f64) {
+    values
+        .iter()
+        .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &value| (low.min(value), high.max(value)))
+}
+
+/// `count` values from `first` to `last`, of which there are at least two.
+fn even(first: f64, last: f64, count: usize) -> Vec<f64> {
+    (0..count).map(|k| first + (last - first) * k as f64 / (count - 1) as f64).collect()
 }
 
 #[cfg(test)]
@@ -213,7 +293,7 @@ mod tests {
 
     /// 15 electrons of read noise and 4884 electrons of a white pixel's row.
     fn noise(frames: u32) -> Noise {
-        Noise { read: 15.0 / 4884.0, gain: 1.0 / 4884.0, frames }
+        Noise { read: 15.0 / 4884.0, gain: 1.0 / 4884.0, frames, dark_frames: None }
     }
 
     #[test]
@@ -221,13 +301,30 @@ mod tests {
         // One row, seen whole by four settings: the mean of four samples of variance 0.01 + 0.04.
         let timing = RowTiming::new(1, 20.0, 100.0).unwrap();
         let settings = vec![Setting::new(0.0, 20.0); 4];
-        let noise = Noise { read: 0.1, gain: 0.04, frames: 1 };
-        let expected = expected_error(&timing, &settings, &(0..=0), &Prior::SPLIT, &noise).unwrap();
-        assert!((expected.epipolar - (0.05_f64 / 4.0).sqrt()).abs() < 1e-9, "{expected:?}");
-        assert_eq!((expected.short_range, expected.profile), (0.0, expected.epipolar));
-        let twice =
-            expected_error(&timing, &settings, &(0..=0), &Prior::SPLIT, &Noise { frames: 4, ..noise });
-        assert!((twice.unwrap().epipolar - expected.epipolar / 2.0).abs() < 1e-9);
+        let noise = Noise { read: 0.1, gain: 0.04, frames: 1, dark_frames: None };
+        let epipolar = |settings: &[Setting], noise: &Noise| {
+            let expected = expected_error(&timing, settings, &(0..=0), &Prior::SPLIT, noise).unwrap();
+            assert_eq!((expected.short_range, expected.profile), (0.0, expected.epipolar));
+            expected.epipolar
+        };
+        let close = |found: f64, variance: f64| assert!((found - variance.sqrt()).abs() < 1e-9, "{found}");
+        close(epipolar(&settings, &noise), 0.05 / 4.0);
+        close(epipolar(&settings, &Noise { frames: 4, ..noise }), 0.05 / 16.0);
+        // The dark image of five frames is the same for all four, and another for a fifth of half the row.
+        let noise = Noise { dark_frames: Some(5), ..noise };
+        close(epipolar(&settings, &noise), 0.05 / 4.0 + 0.01 / 5.0);
+        let fifth = [settings, vec![Setting::new(0.0, 10.0)]].concat();
+        let dark = (4.0 * 4.0 + 0.5 * 0.5) * 0.01 / 5.0;
+        close(epipolar(&fifth, &noise), (4.0 * 0.05 + 0.25 * 0.03 + dark) / 4.25_f64.powi(2));
+    }
+
+    #[test]
+    fn white_light_by_hand() {
+        // Rows 63, 64, 65 whole and half of rows 62 and 66.
+        let light = white_light(&timing(), &Setting::new(0.0, 4.0 * TAU_US));
+        assert!((light - (1.0 + 3.0 * INDIRECT_PER_ROW)).abs() < 1e-9);
+        let beside = white_light(&timing(), &Setting::new(500.0, 4.0 * TAU_US));
+        assert!((beside - 4.0 * INDIRECT_PER_ROW).abs() < 1e-9);
     }
 
     #[test]
@@ -242,7 +339,7 @@ mod tests {
         const PIXELS: usize = 300;
         let (timing, settings) = (timing().window(64, 1).unwrap(), paper_grid().settings());
         let prior = Prior::Split { alpha, beta: 0.0 };
-        let noise = noise(8);
+        let noise = Noise { dark_frames: Some(1), ..noise(8) };
         let demux = Demux::new(timing.clone(), settings.clone(), prior).unwrap();
         let expected = expected_error(&timing, &settings, &demux.reach(), &prior, &noise).unwrap();
 
@@ -269,6 +366,10 @@ mod tests {
         let mut stack = weights.dot(&truth);
         for (mut samples, deviation) in stack.rows_mut().into_iter().zip(&deviations) {
             samples.mapv_inplace(|sample| sample + deviation * normal());
+        }
+        for mut samples in stack.exact_chunks_mut((15, PIXELS)) {
+            let dark = Array1::from_shape_fn(PIXELS, |_| noise.read * normal());
+            samples -= &dark;
         }
         let stack = stack.mapv(|sample| sample as f32).insert_axis(Axis(1));
         let found = demux.solve(stack.view(), None).unwrap();
@@ -307,25 +408,54 @@ mod tests {
     #[test]
     fn more_delays_beat_more_exposures() {
         for frames in [1, 8] {
-            let own = expected_error(
-                &timing(),
-                &paper_grid().settings(),
-                &(-94..=94),
-                &Prior::SPLIT,
-                &noise(frames),
-            );
-            let (grid, expected) =
-                better_plan(&timing(), &paper_grid(), &Prior::SPLIT, &noise(frames)).unwrap();
-            assert!(grid.exposures_us.len() <= 2 && grid.delays_us.len() * grid.exposures_us.len() <= 75);
-            assert!(expected.profile < own.unwrap().profile);
+            let noise = Noise { dark_frames: Some(frames), ..noise(frames) };
+            let own = |grid: &SweepGrid| {
+                expected_error(&timing(), &grid.settings(), &(-94..=94), &Prior::SPLIT, &noise).unwrap()
+            };
+            let advice =
+                advise(&timing(), &paper_grid(), &Prior::SPLIT, &noise, |grid| Some(grid.settings()))
+                    .unwrap();
+            let (grid, expected) = advice.better.unwrap();
+            assert_eq!((advice.expected, expected), (own(&paper_grid()), own(&grid)));
+            assert!(grid.delays_us.len() > 15 && grid.delays_us.len() * grid.exposures_us.len() <= 75);
+            assert!(expected.profile < WORTHWHILE * advice.expected.profile);
+            assert!(expected.long_range <= HARMLESS * advice.expected.long_range);
             assert_eq!(grid.delays_us.first().copied(), Some(-1500.0));
             assert!(grid.delays_us.is_sorted() && grid.delays_us.contains(&0.0));
         }
     }
 
     #[test]
+    fn what_the_rig_cannot_take_is_not_advised() {
+        let advise = |usable: &(dyn Fn(&SweepGrid) -> Option<Vec<Setting>> + Sync)| {
+            advise(&timing(), &paper_grid(), &Prior::SPLIT, &noise(8), usable)
+        };
+        let own = paper_grid();
+        assert_eq!(advise(&|grid| (*grid == own).then(|| grid.settings())).unwrap().better, None);
+        let long = |grid: &SweepGrid| *grid == own || grid.exposures_us == [1200.0];
+        assert_ne!(advise(&|grid| Some(grid.settings())).unwrap().better.unwrap().0.exposures_us, [1200.0]);
+        let (grid, _) = advise(&|grid| long(grid).then(|| grid.settings())).unwrap().better.unwrap();
+        assert_eq!(grid.exposures_us, [1200.0]);
+        // Settings that do not serve are not counted on, and a plan without any that does has no error.
+        let few = advise(&|grid| Some(grid.settings().into_iter().step_by(3).collect())).unwrap();
+        assert!(few.expected.profile > advise(&|grid| Some(grid.settings())).unwrap().expected.profile);
+        assert_eq!(advise(&|_| None), Err(PlaneError::NoDelays { index: 0 }));
+    }
+
+    #[test]
+    fn delays_to_one_side_stay_there() {
+        let plan =
+            SweepGrid { delays_us: vec![0.0, 500.0, 1000.0, 2000.0], exposures_us: vec![300.0, 600.0] };
+        let grids = alternatives(&plan);
+        assert_eq!(grids.len(), 5);
+        for grid in grids {
+            assert_eq!((grid.delays_us[0], grid.delays_us.last().copied()), (0.0, Some(2000.0)));
+        }
+    }
+
+    #[test]
     fn a_plan_too_short_for_alternatives_stays() {
         let plan = SweepGrid { delays_us: vec![0.0], exposures_us: vec![600.0, 900.0] };
-        assert_eq!(better_plan(&timing(), &plan, &Prior::SPLIT, &noise(1)).unwrap().0, plan);
+        assert_eq!(alternatives(&plan), []);
     }
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axis, s};
 use rayon::prelude::*;
 
+use super::calibrate::FlyingSpot;
 use super::quadratic::Quadratic;
 use super::row::{Row, RowSolver};
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach};
@@ -22,6 +23,7 @@ pub struct Demux {
     prior: Prior,
     reach: RangeInclusive<i32>,
     u0_rows: Option<Arc<Array2<f32>>>,
+    spot: Option<Arc<FlyingSpot>>,
     simd: SimdLevel,
 }
 
@@ -33,7 +35,7 @@ impl Demux {
     pub fn new(timing: RowTiming, settings: Vec<Setting>, prior: Prior) -> Result<Self, PlaneError> {
         prior.check()?;
         let reach = reach(&timing, &settings)?;
-        Ok(Self { timing, settings, prior, reach, u0_rows: None, simd: SimdLevel::best() })
+        Ok(Self { timing, settings, prior, reach, u0_rows: None, spot: None, simd: SimdLevel::best() })
     }
 
     /// The same unknowns and prior for other settings: those of the points captured so far, or the planned ones with
@@ -79,6 +81,19 @@ impl Demux {
             });
         }
         Ok(Self { u0_rows: Some(Arc::new(u0_rows)), ..self.clone() })
+    }
+
+    /// The moment of direct light within its row, which settings whose edge falls on the row depend on. It holds for a
+    /// beam no wider than a row.
+    ///
+    /// # Errors
+    /// [`PlaneError::OutOfRange`] for a column outside 0..=1.
+    pub fn with_spot(&self, spot: FlyingSpot) -> Result<Self, PlaneError> {
+        if let Some(&value) = spot.columns.iter().find(|column| !(0.0..=1.0).contains(*column)) {
+            let allowed = "from 0 to 1: divide the projector's column by its width";
+            return Err(PlaneError::OutOfRange { field: "columns", value, allowed });
+        }
+        Ok(Self { spot: Some(Arc::new(spot)), ..self.clone() })
     }
 
     /// The same, solved with other instructions than the fastest.
@@ -251,6 +266,9 @@ impl Demux {
             let expected = [self.timing.camera_rows(), columns];
             check_shape("u0_rows", "[camera rows, columns]", u0_rows.shape(), &expected)?;
         }
+        if let Some(spot) = &self.spot {
+            check_shape("columns of the spot", "[columns]", &[spot.columns.len()], &[columns])?;
+        }
         if let Some(((setting, row, column), _)) =
             stack.indexed_iter().find(|(_, sample)| !sample.is_finite())
         {
@@ -272,7 +290,14 @@ impl Demux {
                 if !go_on() {
                     return Err(PlaneError::Stopped);
                 }
+                let spot = match self.spot.as_deref().zip(solver.direct_weights()) {
+                    Some((spot, even)) => {
+                        Some((spot, spot.weights(&self.timing, &self.settings, *row, even)?))
+                    }
+                    None => None,
+                };
                 solver.solve(Row {
+                    spot: spot.as_ref().map(|(spot, weights)| (*spot, &weights[..])),
                     stack: stack.index_axis(Axis(1), *at),
                     valid: valid.map(|valid| valid.index_axis_move(Axis(1), *at)),
                     u0_rows: self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(*row)),

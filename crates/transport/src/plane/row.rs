@@ -5,6 +5,7 @@ use std::ops::RangeInclusive;
 
 use ndarray::{Array2, ArrayView1, ArrayView2, ArrayViewMut2, Axis};
 
+use super::calibrate::FlyingSpot;
 use super::lanes::Lanes;
 use super::pivot::{Outcome, Pivoting};
 use super::quadratic::Quadratic;
@@ -24,6 +25,8 @@ pub(super) struct Row<'a> {
     pub valid: Option<ArrayView2<'a, bool>>,
     /// `[columns]`
     pub u0_rows: Option<ArrayView1<'a, f32>>,
+    /// A flying spot, and the weights `[settings]` of direct light for each part of its width where they are not even.
+    pub spot: Option<(&'a FlyingSpot, &'a [Option<Vec<f64>>])>,
     /// What to start from, `[reach, columns]`.
     pub estimate: Option<ArrayView2<'a, f32>>,
     /// The result, `[reach, columns]`.
@@ -72,7 +75,7 @@ impl<'a> RowSolver<'a> {
         simd: SimdLevel,
     ) -> Result<Self, PlaneError> {
         let place = |slot: &Slot| (slot.kind == SlotKind::Own).then(|| (slot.u - reach.start()) as usize);
-        let centred = Problem::new(model, prior, None)?;
+        let centred = Problem::new(model, prior, None, None)?;
         Ok(Self { model, prior, simd, places: model.slots.iter().map(place).collect(), centred })
     }
 
@@ -81,28 +84,36 @@ impl<'a> RowSolver<'a> {
     /// # Errors
     /// [`PlaneError::NotConvex`].
     pub fn solve(&self, mut row: Row) -> Result<(), PlaneError> {
-        let mut groups: BTreeMap<i32, Vec<usize>> = BTreeMap::new();
+        // By where and when direct light arrives.
+        let mut groups: BTreeMap<(i32, Option<usize>), Vec<usize>> = BTreeMap::new();
         for column in 0..row.stack.ncols() {
             let step = row.u0_rows.map_or(0.0, |u0_rows| (u0_rows[column] * SPIKE_STEPS).round());
-            groups.entry(step as i32).or_default().push(column);
+            let uneven = row.spot.map(|(spot, weights)| (spot.part(column), weights));
+            let part = uneven.and_then(|(part, weights)| weights[part].as_ref().map(|_| part));
+            groups.entry((step as i32, part)).or_default().push(column);
         }
-        for (step, columns) in groups {
-            match self.spike(step as f32 / SPIKE_STEPS) {
-                None => self.solve_group(&self.centred, &columns, &mut row)?,
-                spike => {
-                    let problem = Problem::new(self.model, self.prior, spike)?;
-                    self.solve_group(&problem, &columns, &mut row)?;
-                }
+        for ((step, part), columns) in groups {
+            let spike = self.spike(step as f32 / SPIKE_STEPS);
+            let direct = part.zip(row.spot).and_then(|(part, (_, weights))| weights[part].as_deref());
+            if spike.is_none() && direct.is_none() {
+                self.solve_group(&self.centred, &columns, &mut row)?;
+            } else {
+                let problem = Problem::new(self.model, self.prior, direct, spike)?;
+                self.solve_group(&problem, &columns, &mut row)?;
             }
         }
         Ok(())
     }
 
+    /// Weight of the pixel's own row in each setting; nothing where the projector has no such row.
+    pub fn direct_weights(&self) -> Option<ArrayView1<'_, f64>> {
+        Some(self.model.weights.column(slot_of(self.model, 0)?))
+    }
+
     fn spike(&self, u0_rows: f32) -> Option<Spike> {
-        let slot_of =
-            |u: i32| self.model.slots.iter().position(|slot| *slot == Slot { u, kind: SlotKind::Own });
-        let own = slot_of(0).filter(|_| u0_rows != 0.0)?;
-        Some(Spike { own, neighbour: slot_of(u0_rows.signum() as i32), share: f64::from(u0_rows.abs()) })
+        let own = slot_of(self.model, 0).filter(|_| u0_rows != 0.0)?;
+        let neighbour = slot_of(self.model, u0_rows.signum() as i32);
+        Some(Spike { own, neighbour, share: f64::from(u0_rows.abs()) })
     }
 
     fn solve_group(&self, problem: &Problem, columns: &[usize], row: &mut Row) -> Result<(), PlaneError> {
@@ -206,9 +217,22 @@ impl<'a> RowSolver<'a> {
     }
 }
 
+fn slot_of(model: &RowModel, u: i32) -> Option<usize> {
+    model.slots.iter().position(|slot| *slot == Slot { u, kind: SlotKind::Own })
+}
+
 impl Problem {
-    fn new(model: &RowModel, prior: &Prior, spike: Option<Spike>) -> Result<Self, PlaneError> {
+    /// `direct`, if given, takes the place of the weights of row 0.
+    fn new(
+        model: &RowModel,
+        prior: &Prior,
+        direct: Option<&[f64]>,
+        spike: Option<Spike>,
+    ) -> Result<Self, PlaneError> {
         let mut weights = model.weights.clone();
+        if let Some((direct, own)) = direct.zip(slot_of(model, 0)) {
+            weights.column_mut(own).iter_mut().zip(direct).for_each(|(to, &direct)| *to = direct);
+        }
         if let Some(Spike { own, neighbour, share }) = spike {
             let other = neighbour.map(|neighbour| weights.column(neighbour).to_owned());
             let mut column = weights.column_mut(own);

@@ -22,4 +22,4 @@ pub use error::CalibrateError;
 pub use holdout::{Candidate, Choice, candidates, choose_prior};
 pub use sample::{Optics, Sample};
 pub use spike::{SpikeMap, spike_offset};
-pub use spot::{Scan, settings_on_direct_row, spike_weights};
+pub use spot::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};

@@ -1,3 +1,5 @@
+use ndarray::ArrayView1;
+
 use super::super::{PlaneError, RowTiming, Setting};
 
 /// How a flying spot draws its rows.
@@ -7,6 +9,43 @@ pub enum Scan {
     OneWay,
     /// Even rows of the projector from column 0 on, odd rows backwards.
     Bidirectional,
+}
+
+/// A flying spot whose way over the scene is known.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FlyingSpot {
+    /// How it draws.
+    pub scan: Scan,
+    /// The projector column that each column of the camera sees, 0..=1 over the projector's width.
+    pub columns: Vec<f64>,
+}
+
+/// Parts of the projector's width that are told apart: finer ones would cost more time than they save error.
+const SPOT_PARTS: usize = 64;
+
+impl FlyingSpot {
+    /// Which part of the projector's width a camera column sees.
+    pub(in super::super) fn part(&self, column: usize) -> usize {
+        ((self.columns[column] * SPOT_PARTS as f64) as usize).min(SPOT_PARTS - 1)
+    }
+
+    /// Weights of direct light in each setting for the pixels of camera row `t` that see each part, where they differ
+    /// from those of a row that is lit evenly, `even`.
+    pub(in super::super) fn weights(
+        &self,
+        timing: &RowTiming,
+        settings: &[Setting],
+        t: usize,
+        even: ArrayView1<f64>,
+    ) -> Result<Vec<Option<Vec<f64>>>, PlaneError> {
+        let of_part = |part: usize| {
+            let column = (part as f64 + 0.5) / SPOT_PARTS as f64;
+            let weights = spike_weights(timing, settings, t, column, self.scan)?;
+            let differ = weights.iter().zip(&even).any(|(a, b)| (a - b).abs() > 1e-9);
+            Ok(differ.then_some(weights))
+        };
+        (0..SPOT_PARTS).map(of_part).collect()
+    }
 }
 
 /// Settings that a flying spot makes unreliable when a pixel's projector column is unknown: those with an edge within
