@@ -199,7 +199,9 @@ impl Sequencer {
                 self.input.send(Event::End).map_err(closed)?;
             }
             // Exposed once more under settings that have their frame: the next ones came too late for it.
-            None => drop(self.hand_on(received, Label::Settling)?),
+            None => {
+                self.hand_on(received, Label::Settling)?;
+            }
         }
         Ok(())
     }
