@@ -301,18 +301,8 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
         let unknowns = S::as_simd_f64s(&self.unknowns).0;
         let known = S::as_mut_simd_f64s(&mut self.known).0;
         let zero = simd.splat_f64s(0.0);
-        // c - A'v: what is left for K to balance.
-        let left = |slot: usize| {
-            let mut left = c[slot];
-            for (&weight, &v) in narrow.weights_of(slot).iter().zip(unknowns) {
-                if weight != 0.0 {
-                    left = simd.negate_mul_add_e_f64s(simd.splat_f64s(weight), v, left);
-                }
-            }
-            left
-        };
-        for (place, joint) in narrow.chain.iter().enumerate() {
-            known[place] = left(joint.slot);
+        for (known, joint) in known.iter_mut().zip(&narrow.chain) {
+            *known = balance(simd, c[joint.slot], narrow.weights_of(joint.slot), unknowns);
         }
         for (border, &x) in narrow.border.iter().zip(&unknowns[settings..]) {
             if let Some((place, weight)) = border.neighbour {
@@ -346,7 +336,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
             before = x;
         }
         for (border, &x) in narrow.border.iter().zip(&unknowns[settings..]) {
-            let mut pull = left(border.slot);
+            let mut pull = balance(simd, c[border.slot], narrow.weights_of(border.slot), unknowns);
             if let Some((place, weight)) = border.neighbour {
                 let joint = narrow.chain[place].slot;
                 let x = simd.mul_f64s(masks[joint], y[joint]);
@@ -356,4 +346,16 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
             y[border.slot] = simd.negate_mul_add_e_f64s(fixed, pull, x);
         }
     }
+}
+
+/// `c - A'v` of one slot: what is left for `K` to balance.
+#[inline(always)]
+fn balance<S: Simd>(simd: S, c: S::f64s, weights: &[f64], v: &[S::f64s]) -> S::f64s {
+    let mut left = c;
+    for (&weight, &v) in weights.iter().zip(v) {
+        if weight != 0.0 {
+            left = simd.negate_mul_add_e_f64s(simd.splat_f64s(weight), v, left);
+        }
+    }
+    left
 }
