@@ -79,11 +79,15 @@ impl FilmPass {
 impl Ahead {
     /// Whether settings that are written now take effect after those written last, so that each have a frame.
     fn has_room(&self) -> bool {
-        let Some(oldest) = self.written.front() else { return true };
-        // Frames before theirs, under settings that have been seen.
-        let frames_before = oldest.first_seq.saturating_sub(self.newest_seq.unwrap_or(0) + 1);
-        let own_periods: u64 = self.written.iter().map(|written| u64::from(written.periods)).sum();
-        frames_before * self.frame_periods + own_periods <= self.lead_periods.unwrap_or(0)
+        let Some(last) = self.written.back() else { return true };
+        // By frame ids, so that frames count that were exposed once more because settings came late for them.
+        let frames = last.first_seq.saturating_sub(self.newest_seq.unwrap_or(0));
+        let longer_steps: u64 = self
+            .written
+            .iter()
+            .map(|written| u64::from(written.periods).saturating_sub(self.frame_periods))
+            .sum();
+        frames * self.frame_periods + longer_steps <= self.lead_periods.unwrap_or(0)
     }
 
     fn push(&mut self, job: Job, periods: u32) {
@@ -248,6 +252,25 @@ mod tests {
         for latency in 0..4 {
             let expected: Vec<u64> = (0..20).map(|frame| frame + 1 + latency).collect();
             assert_eq!(play(latency, 20, true), expected, "latency of {latency} frames");
+        }
+    }
+
+    #[test]
+    fn a_host_that_is_late_now_and_then_overwrites_no_settings() {
+        for latency in 0..4 {
+            let mut ahead = Ahead { newest_seq: Some(0), frame_periods: 1, ..Ahead::default() };
+            let mut first = Vec::new();
+            // Triggers that have passed unseen when a frame is looked at: the host was busy, then catches up.
+            for (newest, late) in (0..).zip([0, 0, 0, 2, 1, 0, 0, 1, 0, 3, 2, 1, 0, 0, 0, 0, 1, 0, 0]) {
+                ahead.newest_seq = Some(newest);
+                ahead.pop_seen(newest);
+                while ahead.has_room() {
+                    let seq = newest + 1 + late + latency;
+                    ahead.push(job(FirstFrame::Exactly(seq)), 1);
+                    first.push(seq);
+                }
+            }
+            assert!(first.is_sorted_by(|a, b| a < b), "latency of {latency} frames: {first:?}");
         }
     }
 
