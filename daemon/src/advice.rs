@@ -5,7 +5,7 @@ use raysweep_pipeline::{DemuxFold, Point, Role, Spot, prior_name};
 use raysweep_proto::{BetterSweep, ExpectedError, NoiseEstimate, SweepAdvice};
 use raysweep_transport::plane::advice::{self, Noise, SweepGrid, white_light};
 use raysweep_transport::plane::calibrate::settings_on_direct_row;
-use raysweep_transport::plane::{PlaneError, RowTiming, Setting, reach};
+use raysweep_transport::plane::{PlaneError, RowTiming, Setting};
 
 use crate::check::periods;
 use crate::config::{Axis, Plan, RigFile, Sweep};
@@ -75,22 +75,20 @@ pub fn advise(task: &Task, rig: &RigFile, camera: &CameraCapabilities) -> Result
         PlaneError::NoDelays { .. } => NoAdvice::NothingUsable,
         error => error.into(),
     })?;
-    let better = advised.better.map(|(grid, expected)| -> Result<BetterSweep, NoAdvice> {
+    let better = advised.better.map(|(grid, expected)| {
         let other = limits.with_grid(&grid);
-        let reach = reach(timing, &grid.settings())?;
-        Ok(BetterSweep {
+        BetterSweep {
             points: other.schedule.sweep_len(),
             frames: total_frames(&other),
-            reach_rows: (*reach.start(), *reach.end()),
             expected: told(expected),
             sweep: written(&other.plan.sweep),
-        })
+        }
     });
     Ok(SweepAdvice {
         noise: NoiseEstimate { dark: read, shot: gain.sqrt(), source: known.source },
         prior: prior_name(prior),
         expected: told(advised.expected),
-        better: better.transpose()?,
+        better,
     })
 }
 
