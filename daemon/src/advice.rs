@@ -1,11 +1,11 @@
 //! What errors a sweep must expect on this rig, and which sweep of the same length to take instead.
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point, Spot, prior_name};
+use raysweep_pipeline::{DemuxFold, Point, Role, Spot, prior_name};
 use raysweep_proto::{BetterSweep, ExpectedError, NoiseEstimate, SweepAdvice};
 use raysweep_transport::plane::advice::{self, Noise, SweepGrid, white_light};
 use raysweep_transport::plane::calibrate::settings_on_direct_row;
-use raysweep_transport::plane::{PlaneError, RowTiming, Setting, reach};
+use raysweep_transport::plane::{PlaneError, RowTiming, Setting};
 
 use crate::check::periods;
 use crate::config::{Axis, Plan, RigFile, Sweep};
@@ -64,8 +64,9 @@ pub fn advise(task: &Task, rig: &RigFile, camera: &CameraCapabilities) -> Result
     let gain = 1.0 / (white_dn * known.electrons_per_dn);
     // Rounding to counts errs by their twelfth, squared.
     let read = (known.read_noise_e * gain).hypot(12_f64.sqrt().recip() / white_dn);
-    let frames = task.plan.sweep.average;
-    let noise = Noise { read, gain, frames, dark_frames: Some(frames) };
+    let dark = task.schedule.points.iter().find(|point| matches!(point.role, Role::Dark(_)));
+    let dark_frames = dark.map(|point| point.frames);
+    let noise = Noise { read, gain, frames: task.plan.sweep.average, dark_frames };
 
     let plan = grid_of(&task.plan.sweep);
     let limits = Limits::new(task, rig, camera, timing);
@@ -74,22 +75,20 @@ pub fn advise(task: &Task, rig: &RigFile, camera: &CameraCapabilities) -> Result
         PlaneError::NoDelays { .. } => NoAdvice::NothingUsable,
         error => error.into(),
     })?;
-    let better = advised.better.map(|(grid, expected)| -> Result<BetterSweep, NoAdvice> {
+    let better = advised.better.map(|(grid, expected)| {
         let other = limits.with_grid(&grid);
-        let reach = reach(timing, &grid.settings())?;
-        Ok(BetterSweep {
+        BetterSweep {
             points: other.schedule.sweep_len(),
-            frames: other.schedule.points.iter().map(|point| u64::from(point.frames)).sum(),
-            reach_rows: (*reach.start(), *reach.end()),
+            frames: total_frames(&other),
             expected: told(expected),
             sweep: written(&other.plan.sweep),
-        })
+        }
     });
     Ok(SweepAdvice {
         noise: NoiseEstimate { dark: read, shot: gain.sqrt(), source: known.source },
         prior: prior_name(prior),
         expected: told(advised.expected),
-        better: better.transpose()?,
+        better,
     })
 }
 
@@ -102,7 +101,9 @@ struct Limits<'a> {
     ceiling: f64,
     /// Points of the plan's sweep that saturate a white pixel.
     saturated: usize,
-    /// VSYNC periods of the whole plan.
+    /// Frames of the whole plan.
+    frames: u64,
+    /// VSYNC periods that they take.
     periods: u64,
 }
 
@@ -110,7 +111,15 @@ impl<'a> Limits<'a> {
     fn new(task: &'a Task, rig: &RigFile, camera: &'a CameraCapabilities, timing: &'a RowTiming) -> Self {
         let ceiling = (task.geometry.saturation_dn - rig.camera.black_dn()) / task.geometry.white_dn;
         let saturated = saturated(timing, &grid_of(&task.plan.sweep).settings(), ceiling);
-        Self { task, camera, timing, ceiling, saturated, periods: total_periods(task, camera) }
+        Self {
+            task,
+            camera,
+            timing,
+            ceiling,
+            saturated,
+            frames: total_frames(task),
+            periods: total_periods(task, camera),
+        }
     }
 
     /// The settings of a grid whose images will serve; none where it cannot be taken, or not in the plan's time, or
@@ -124,6 +133,7 @@ impl<'a> Limits<'a> {
         let taken = other.plan.check("").is_ok()
             && other.products("").is_ok()
             && other.schedule.points.iter().all(takes)
+            && total_frames(&other) <= self.frames
             && total_periods(&other, self.camera) <= self.periods;
         let mut settings = grid.settings();
         if !taken || saturated(self.timing, &settings, self.ceiling) > self.saturated {
@@ -131,6 +141,7 @@ impl<'a> Limits<'a> {
         }
         let cut = match other.geometry.spot {
             Spot::Uniform => Vec::new(),
+            Spot::Flying(_) if other.geometry.modelled_spot().is_some() => Vec::new(),
             Spot::Flying(_) => settings_on_direct_row(self.timing, &settings, 0.0).ok()?,
         };
         let mut index = 0..;
@@ -162,6 +173,11 @@ fn grid_of(sweep: &Sweep) -> SweepGrid {
 /// How many of the settings saturate a white pixel.
 fn saturated(timing: &RowTiming, settings: &[Setting], ceiling: f64) -> usize {
     settings.iter().filter(|setting| white_light(timing, setting) >= ceiling).count()
+}
+
+/// Frames of all points of a task.
+fn total_frames(task: &Task) -> u64 {
+    task.schedule.points.iter().map(|point| u64::from(point.frames)).sum()
 }
 
 /// VSYNC periods that all frames of a task take.
@@ -244,9 +260,7 @@ mod tests {
         let better = advice.better.unwrap();
         assert_eq!((other.plan.sweep.average, other.plan.sweep.max_jitter_us), (8, 50.0));
         assert_eq!(other.schedule.sweep_len(), better.points);
-        let frames = |task: &Task| task.schedule.points.iter().map(|point| u64::from(point.frames)).sum();
-        let (own_frames, other_frames): (u64, u64) = (frames(&own), frames(&other));
-        assert!(other_frames == better.frames && other_frames <= own_frames);
+        assert!(total_frames(&other) == better.frames && better.frames <= total_frames(&own));
         assert!(total_periods(&other, &camera()) <= total_periods(&own, &camera()));
 
         // By hand: 2500 counts of 1.66 electrons, 9 electrons of read noise, rounded to counts.
@@ -274,6 +288,10 @@ mod tests {
         let expected = |rig: &str, plan: &str| advised(rig, plan, &camera()).unwrap().expected;
         assert_ne!(expected(RIG, plan), expected(RIG, &without));
         assert_eq!(expected(&flying, plan), expected(RIG, &without));
+        let known = flying
+            .replace("spot =", "scan = \"one-way\"\nbeam_sigma_rows = 0\nspot =")
+            .replace("[camera]\n", "[camera]\nprojector_columns = [0.0, 1.0]\n");
+        assert_eq!(expected(&known, plan), expected(RIG, plan));
 
         let none = plan.replace("-500, ", "").replace("0, 300, 500", "300");
         let error = advised(&flying, &none, &camera()).unwrap_err();

@@ -313,7 +313,7 @@ fn cut_by_the_spot(
         say("every exposure begins or ends while it draws the direct row, so none is left out and direct light is not to be trusted: move the delays by a row".into());
         return Ok((Vec::new(), None));
     }
-    if let Some(spot) = geometry.flying_spot().filter(|_| geometry.beam_sigma_rows == Some(0.0)) {
+    if let Some(spot) = geometry.modelled_spot() {
         say(format!(
             "modelled in the {} images whose exposure begins or ends while it draws the direct row",
             cut.len()

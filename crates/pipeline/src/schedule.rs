@@ -148,6 +148,11 @@ impl SweepGeometry {
         Some(FlyingSpot { scan, columns: (0..self.width).map(column).collect() })
     }
 
+    /// The same, where the model can take it into account: with an ideal beam.
+    pub fn modelled_spot(&self) -> Option<FlyingSpot> {
+        self.flying_spot().filter(|_| self.beam_sigma_rows == Some(0.0))
+    }
+
     /// The settings for a point on a camera with this trigger latency.
     pub fn shot(&self, point: &Point, trigger_latency_us: f64) -> Shot {
         let trigger =

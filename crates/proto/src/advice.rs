@@ -55,16 +55,14 @@ pub struct ExpectedError {
     pub profile: f64,
 }
 
-/// A sweep to take instead.
+/// A sweep to take instead; it reaches as many rows as the plan's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BetterSweep {
     /// Its points.
     pub points: usize,
     /// Frames to average over all points, dark and regular images included.
     pub frames: u64,
-    /// First and last relative row that it reaches.
-    pub reach_rows: (i32, i32),
-    /// What to expect of it, over the rows that the plan's sweep reaches.
+    /// What to expect of it.
     pub expected: ExpectedError,
     /// The table `[sweep]` of its plan, in TOML.
     pub sweep: String,

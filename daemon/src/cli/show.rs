@@ -6,8 +6,8 @@ use std::time::Duration;
 use indicatif::{BinaryBytes, FormattedDuration};
 use raysweep_core::{Counts, FilmSummary, Percentiles};
 use raysweep_proto::{
-    CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo, Status,
-    SweepAdvice,
+    BetterSweep, CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo,
+    Status, SweepAdvice,
 };
 
 use crate::process::Processed;
@@ -97,12 +97,10 @@ fn advice(advice: &SweepAdvice) -> Vec<(&'static str, String)> {
             better.as_ref().map_or_else(
                 || "no better sweep of this length found".into(),
                 |better| {
-                    let (first, last) = better.reach_rows;
+                    let BetterSweep { points, frames, expected, .. } = better;
                     format!(
-                        "{}, with {} points, {} frames, relative rows {first} to {last}; see [sweep] below",
-                        errors(&better.expected),
-                        better.points,
-                        better.frames
+                        "{}, with {points} points and {frames} frames; see [sweep] below",
+                        errors(expected)
                     )
                 },
             ),

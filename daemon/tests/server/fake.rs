@@ -132,7 +132,6 @@ pub fn report() -> CheckReport {
             better: Some(BetterSweep {
                 points: 74,
                 frames: 616,
-                reach_rows: (-94, 94),
                 expected: ExpectedError { epipolar: 0.0062, ..expected },
                 sweep: "[sweep]\naverage = 8\n".into(),
             }),
