@@ -1,6 +1,10 @@
 //! Fold `demux`: from the averaged images of a sweep to its light transport.
 
+mod strips;
+mod tally;
+
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::Arc;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis};
@@ -11,7 +15,10 @@ use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
 use crate::stage::{Fold, FoldError, Product, Snapshot};
+use crate::strips::{InStrips, Strip};
 use crate::unit::Unit;
+
+use self::tally::Tally;
 
 /// Options of `demux` in a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -61,21 +68,6 @@ impl DemuxOptions {
 /// Name of the figure that closes the circle: the light of the regular image, by the model over by the camera.
 pub const PREDICTED_SHARE: &str = "predicted / captured regular light";
 
-/// So well the transport must predict the regular image.
-const CLOSE_SHARE: f64 = 0.02;
-/// More saturated pixels than this deserve a warning: highlights are normal, fields are not.
-const SATURATED_SHARE: f64 = 0.01;
-
-fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<Product> {
-    let share = saturated as f64 / pixels as f64;
-    (share > SATURATED_SHARE).then(|| {
-        Product::Warning(format!(
-            "{:.1} % of the pixels of {what} are saturated: take less gain, a smaller aperture or less ambient light",
-            share * 100.0
-        ))
-    })
-}
-
 /// One image of the sweep, as it was taken.
 struct Taken {
     setting: Setting,
@@ -91,6 +83,8 @@ pub struct DemuxFold {
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
     taken: BTreeMap<Role, Arc<Taken>>,
+    /// Of images that are not kept: the point's ordinal and the setting. None: they are.
+    not_kept: Option<BTreeMap<Role, (u32, Setting)>>,
 }
 
 /// Fewer points than this make no estimate worth a look.
@@ -112,7 +106,7 @@ impl DemuxFold {
         prior.check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { prior, schedule, geometry, timing, taken: BTreeMap::new() };
+        let fold = Self { prior, schedule, geometry, timing, taken: BTreeMap::new(), not_kept: None };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -147,7 +141,8 @@ impl DemuxFold {
         }
         let scale = (1.0 / self.geometry.white_dn) as f32;
         let saturates = |taken: &Arc<Taken>| self.valid(&taken.image).iter().any(|valid| !valid);
-        let shape = (taken.len(), self.geometry.height, self.geometry.width);
+        let rows = taken.values().next().map_or(0, |taken| taken.image.nrows());
+        let shape = (taken.len(), rows, self.geometry.width);
         let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
@@ -165,40 +160,42 @@ impl DemuxFold {
         Ok(SweepStack { timing: self.timing.clone(), exposures_us, settings, images, valid, regular: None })
     }
 
-    fn solve(&self, stack: &SweepStack, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
+    /// The transport of some camera rows, of which the stack is.
+    fn solve(
+        &self,
+        rows: Range<usize>,
+        stack: &SweepStack,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, FoldError> {
         let SweepStack { settings, images, valid, .. } = stack;
+        let rows: Vec<usize> = rows.collect();
         self.demux()
             .and_then(|demux| demux.with_settings(settings.clone()))
             .and_then(|demux| {
-                demux.solve_while(images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
+                demux.solve_rows(&rows, images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
             })
             .map_err(|error| FoldError { fold: "demux".into(), what: error.to_string() })
     }
 
-    /// How well the transport predicts the light of the regular image (counts: `image`) where it is not saturated.
-    fn check_regular(&self, image: &Array2<f32>, light: &Array2<f32>, transport: &Transport) -> Vec<Product> {
-        let valid = self.valid(image);
-        let saturated = valid.iter().filter(|valid| !**valid).count();
-        let sum = |image: &Array2<f32>| -> f64 {
-            let pixels = image.iter().zip(&valid).filter(|&(_, &valid)| valid);
-            pixels.map(|(&light, _)| f64::from(light)).sum()
-        };
-        let (captured, predicted) = (sum(light), sum(&transport.total()));
-        let mut products: Vec<Product> =
-            too_many_saturated("the regular image (a whole VSYNC period long)", saturated, valid.len())
-                .into_iter()
-                .collect();
-        if products.is_empty() && captured > 0.0 {
-            let share = predicted / captured;
-            products.push(Product::Figure { name: PREDICTED_SHARE, value: share });
-            if (share - 1.0).abs() > CLOSE_SHARE {
-                products.push(Product::Warning(format!(
-                    "the transport predicts {:.1} % of the light of the regular image: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
-                    share * 100.0
-                )));
-            }
+    /// Stack and transport of some camera rows, of which the images are; what there is to say of them goes into `tally`.
+    fn strip(
+        &self,
+        rows: Range<usize>,
+        taken: BTreeMap<Role, Arc<Taken>>,
+        tally: &mut Tally,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Strip, FoldError> {
+        let regular = taken.get(&Role::Regular).cloned().zip(self.dark_of(&taken, Role::Regular));
+        let first_row = rows.start;
+        let mut stack = self.stack(taken)?;
+        let transport = self.solve(rows, &stack, go_on)?;
+        tally.add_sweep(stack.settings.len(), &transport);
+        if let Some((regular, dark)) = regular {
+            let light = (&regular.image - &dark.image) / self.geometry.white_dn as f32;
+            tally.add_regular(&self.valid(&regular.image), &light, &transport);
+            stack.regular = Some(light);
         }
-        products
+        Ok(Strip { first_row, stack, transport })
     }
 
     /// Where an image is not saturated.
@@ -215,7 +212,12 @@ impl Fold for DemuxFold {
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
         let Some(point) = self.schedule.points.get(unit.id.point as usize) else { return };
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
-        self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() }));
+        match &mut self.not_kept {
+            Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
+            None => {
+                drop(self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() })));
+            }
+        }
     }
 
     fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
@@ -224,25 +226,24 @@ impl Fold for DemuxFold {
 
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError> {
         let taken = std::mem::take(&mut self.taken);
-        let regular = taken.get(&Role::Regular).cloned();
-        let regular = regular.zip(self.dark_of(&taken, Role::Regular));
-        let mut stack = self.stack(taken)?;
-        let transport = self.solve(&stack, go_on)?;
-
-        let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
-        let mut products = vec![
-            Product::Figure { name: "images demultiplexed", value: stack.settings.len() as f64 },
-            Product::Figure { name: "saturated pixels", value: saturated as f64 },
-        ];
-        products.extend(too_many_saturated("the sweep", saturated, transport.saturated.len()));
-        if let Some((regular, dark)) = regular {
-            let light = (&regular.image - &dark.image) / self.geometry.white_dn as f32;
-            products.extend(self.check_regular(&regular.image, &light, &transport));
-            stack.regular = Some(light);
-        }
+        let mut tally = Tally::default();
+        let Strip { stack, transport, .. } = self.strip(0..self.geometry.height, taken, &mut tally, go_on)?;
+        let mut products = tally.products();
         products.push(Product::Transport(Box::new(transport)));
         products.push(Product::Stack(Box::new(stack)));
         Ok(products)
+    }
+
+    fn keep_no_images(&mut self) {
+        self.not_kept = Some(BTreeMap::new());
+    }
+
+    fn finish_in_strips(
+        &mut self,
+        strips: InStrips<'_>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Vec<Product>, FoldError> {
+        self.solve_in_strips(strips, go_on)
     }
 }
 
@@ -255,6 +256,6 @@ impl Snapshot for DemuxFold {
     }
 
     fn estimate(&self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Transport, FoldError> {
-        self.solve(&self.stack(self.taken.clone())?, go_on)
+        self.solve(0..self.geometry.height, &self.stack(self.taken.clone())?, go_on)
     }
 }

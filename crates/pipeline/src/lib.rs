@@ -12,15 +12,17 @@ mod queue;
 mod registry;
 mod schedule;
 mod stage;
+mod strips;
 mod unit;
 
 pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
 pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
 pub use edges::{EdgeTracker, Line};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
-pub use products::{NotMade, ProductError, ProductSpec, Profile, SweepStack};
+pub use products::{Assembly, NotMade, ProductError, ProductSpec, Profile, SweepStack};
 pub use queue::{Input, Policy, QueueError};
 pub use registry::{Entry, Registry, RegistryError};
 pub use schedule::{Point, Role, Scan, Schedule, Shot, Spot, SweepGeometry};
 pub use stage::{Fold, FoldError, HotPixels, Product, Snapshot, Stage, StageError};
+pub use strips::{ImageRows, InStrips, Strip};
 pub use unit::Unit;
