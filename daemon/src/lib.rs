@@ -5,6 +5,7 @@ pub mod cli;
 pub mod config;
 pub mod control;
 pub mod live;
+mod memory;
 pub mod process;
 pub mod processing;
 mod report;
@@ -12,6 +13,7 @@ mod results;
 pub mod rig;
 pub mod run;
 pub mod server;
+mod strips;
 
 /// Name and version, as sessions keep it.
 pub const SOFTWARE: &str = concat!("raysweepd ", env!("CARGO_PKG_VERSION"));

@@ -141,7 +141,7 @@ impl Run {
         }
         let planned = self.task.schedule.points.len();
         let (verdicts, results) = channel();
-        let stages = std::mem::take(&mut self.processing.stages);
+        let stages = self.processing.stages.clone();
         let storage = Storage {
             task: self.task.clone(),
             stack,
