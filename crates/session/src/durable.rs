@@ -77,38 +77,38 @@ pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Resul
 /// A folder that is written over some time beside the one that it will replace; as [`replace_dir`]. Dropped without
 /// [`DraftDir::commit`], it is removed.
 pub(crate) struct DraftDir {
+    target: PathBuf,
     path: PathBuf,
-    fresh: PathBuf,
 }
 
 impl DraftDir {
     /// Makes the temporary folder, in place of one that a crash left.
-    pub(crate) fn create(path: &Path) -> Result<DraftDir> {
-        let fresh = temporary_path(path);
-        if fresh.exists() {
-            fs::remove_dir_all(&fresh).map_err(Error::io("remove", &fresh))?;
+    pub(crate) fn create(target: &Path) -> Result<DraftDir> {
+        let path = temporary_path(target);
+        if path.exists() {
+            fs::remove_dir_all(&path).map_err(Error::io("remove", &path))?;
         }
-        create_dir(&fresh)?;
-        Ok(DraftDir { path: path.to_owned(), fresh })
+        create_dir(&path)?;
+        Ok(DraftDir { target: target.to_owned(), path })
     }
 
     /// The temporary folder, whose files must be written durably.
     pub(crate) fn path(&self) -> &Path {
-        &self.fresh
+        &self.path
     }
 
     /// Puts the folder in its place.
     pub(crate) fn commit(self) -> Result<()> {
-        let DraftDir { path, fresh } = &self;
-        sync_dir(fresh)?;
-        if path.exists() {
-            exchange(fresh, path)?;
+        let DraftDir { target, path } = &self;
+        sync_dir(path)?;
+        if target.exists() {
+            exchange(path, target)?;
         } else {
-            fs::rename(fresh, path).map_err(Error::io("replace", path))?;
+            fs::rename(path, target).map_err(Error::io("replace", target))?;
         }
-        sync_dir(parent(path))?;
-        match fs::remove_dir_all(fresh) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", fresh)(error)),
+        sync_dir(parent(target))?;
+        match fs::remove_dir_all(path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", path)(error)),
             _ => Ok(()),
         }
     }
@@ -117,24 +117,24 @@ impl DraftDir {
 impl Drop for DraftDir {
     fn drop(&mut self) {
         // After a commit nothing is there; what cannot be removed is removed by the next writer.
-        let _ = fs::remove_dir_all(&self.fresh);
+        let _ = fs::remove_dir_all(&self.path);
     }
 }
 
 /// A file that is written over some time beside the one that it will replace; as [`write`]. Dropped without
 /// [`DraftFile::commit`], it is removed.
 pub(crate) struct DraftFile {
+    target: PathBuf,
     path: PathBuf,
-    fresh: PathBuf,
     file: File,
 }
 
 impl DraftFile {
     /// Makes the temporary file; a stale one is overwritten.
-    pub(crate) fn create(path: &Path) -> Result<DraftFile> {
-        let fresh = temporary_path(path);
-        let file = File::create(&fresh).map_err(Error::io("write", &fresh))?;
-        Ok(DraftFile { path: path.to_owned(), fresh, file })
+    pub(crate) fn create(target: &Path) -> Result<DraftFile> {
+        let path = temporary_path(target);
+        let file = File::create(&path).map_err(Error::io("write", &path))?;
+        Ok(DraftFile { target: target.to_owned(), path, file })
     }
 
     /// The temporary file.
@@ -144,21 +144,21 @@ impl DraftFile {
 
     /// For `map_err` of writes to [`DraftFile::file`].
     pub(crate) fn failed(&self) -> impl FnOnce(io::Error) -> Error {
-        Error::io("write", &self.fresh)
+        Error::io("write", &self.path)
     }
 
     /// Puts the file in its place.
     pub(crate) fn commit(self) -> Result<()> {
         self.file.sync_all().map_err(self.failed())?;
-        fs::rename(&self.fresh, &self.path).map_err(Error::io("replace", &self.path))?;
-        sync_dir(parent(&self.path))
+        fs::rename(&self.path, &self.target).map_err(Error::io("replace", &self.target))?;
+        sync_dir(parent(&self.target))
     }
 }
 
 impl Drop for DraftFile {
     fn drop(&mut self) {
         // After a commit nothing is there; what cannot be removed is removed by the next writer.
-        let _ = fs::remove_file(&self.fresh);
+        let _ = fs::remove_file(&self.path);
     }
 }
 
