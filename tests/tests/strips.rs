@@ -4,10 +4,13 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock};
 
 use ndarray::Array2;
 use raysweep::control::Control;
 use raysweep::process::{self, Asked, ProcessError};
+use raysweep::run::Runner;
 use raysweep_pipeline::{Entry, Registry, Stage, StageError, Unit};
 use raysweep_proto::{ErrorCode, RunParams};
 use raysweep_session::stack::ArrayName;
@@ -154,4 +157,55 @@ fn what_does_not_fit_in_strips_either_is_refused_before_anything_is_written() {
     let refused = bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap_err();
     assert_eq!(refused.name(), Some(ErrorCode::Storage), "{refused}");
     assert!(refused.message.contains("--memory"), "{refused}");
+}
+
+/// Cancels the run when it has seen so many images.
+struct Canceller {
+    images_left: AtomicUsize,
+    runner: Arc<OnceLock<Arc<Runner>>>,
+}
+
+impl Stage for Canceller {
+    fn name(&self) -> &str {
+        "canceller"
+    }
+
+    fn apply(&self, _unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError> {
+        let left = self.images_left.fetch_update(Relaxed, Relaxed, |left| left.checked_sub(1));
+        if let (Err(_), Some(runner)) = (left, self.runner.get()) {
+            runner.cancel().unwrap();
+        }
+        Ok(image)
+    }
+}
+
+#[test]
+fn a_run_cancelled_between_strips_leaves_no_part_of_a_transport_and_can_be_processed() {
+    let plan = plan(&["canceller", "demux"]);
+    let mut bench = Bench::new(&rig());
+    let runner = Arc::new(OnceLock::new());
+    let mut registry = Registry::default();
+    registry.register("canceller", {
+        let runner = runner.clone();
+        // 14 points of the sweep, two dark images and the regular one: as they come, and for the first strip.
+        move |_, _, _| {
+            let images_left = AtomicUsize::new(2 * 17);
+            Ok(Entry::Stage(Box::new(Canceller { images_left, runner: runner.clone() })))
+        }
+    });
+    let limit_bytes = whole_bytes(&bench, &plan.replace("canceller", "hot-pixels")) - 1;
+    bench.limit_memory(limit_bytes, registry);
+    assert!(runner.set(bench.runner.clone()).is_ok());
+    let ended = bench.run(&plan);
+    assert_eq!(ended.state, "cancelled", "{:?}", ended.error);
+    let names = |folder: &Path| -> Vec<String> {
+        let entries = std::fs::read_dir(folder).into_iter().flatten();
+        entries.map(|entry| entry.unwrap().file_name().to_str().unwrap().to_owned()).collect()
+    };
+    assert!(names(&ended.session).iter().all(|name| !name.starts_with("transport")));
+    assert_eq!(names(&ended.session.join("products")), [""; 0]);
+    std::fs::write(ended.session.join("plan.toml"), plan.replace("canceller", "hot-pixels")).unwrap();
+    let made = process::process_asked(&ended.session, &limited(limit_bytes)).unwrap();
+    assert_eq!((made.stored, made.problems.as_slice()), (14, [].as_slice()));
+    checksums(&ended.session);
 }
