@@ -30,6 +30,7 @@ fn plan(stages: &[&str]) -> String {
     let more = [
         r#"kind = "delay-profile", region = [40, 140, 5, 60]"#,
         r#"kind = "delay-profile", pixel = [149, 69]"#,
+        r#"kind = "uncertainty", from_rows = 0, to_rows = 0"#,
     ];
     let stages: String = stages.iter().map(|name| format!("[[stage]]\nname = \"{name}\"\n")).collect();
     with_products(&[&PRODUCTS[..], &more].concat(), sweep) + &stages
