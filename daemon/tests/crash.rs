@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
+use raysweep_session::film::TransportFilm;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 use tempfile::TempDir;
@@ -293,4 +294,32 @@ fn a_socket_passed_by_the_service_manager_is_served() {
     assert_eq!(daemon.client().status().unwrap().rig, "plane");
     daemon.terminate();
     assert!(daemon.process.wait().unwrap().success());
+}
+
+#[test]
+fn a_film_that_is_killed_keeps_its_cycles_and_is_processed_not_resumed() {
+    let folder = folder(RIG);
+    let mut daemon = Daemon::start(folder.path());
+    let started = daemon.client().run(&plan("kind = \"film\"\n[film]\ncycles = 80000\n")).unwrap();
+    let began = Instant::now();
+    while ledger_lines(&started.session) < 30 {
+        assert!(began.elapsed() < Duration::from_secs(60), "the film does not go on");
+    }
+    daemon.kill();
+
+    let session = Session::open(&started.session).unwrap();
+    let state = session.state().unwrap();
+    assert!(state.end.is_none() && state.cycles().count() > 5, "{} cycles", state.cycles().count());
+    let mut daemon = Daemon::start(folder.path());
+    let refused = daemon.client().resume(&started.session).unwrap_err().to_string();
+    assert!(refused.contains("cannot be resumed") && refused.contains("raysweep process"), "{refused}");
+    drop(daemon);
+
+    let processed = raysweep::process::process(&started.session).unwrap();
+    assert_eq!((processed.stored, processed.problems), (state.cycles().count(), Vec::new()));
+    let transports = TransportFilm::open(&session.transport_film_path()).unwrap();
+    for cycle in state.cycles() {
+        assert!(transports.read(cycle.cycle).unwrap().is_some(), "cycle {} has no transport", cycle.cycle);
+    }
+    assert!(raysweep_session::manifest::verify(&session).unwrap().is_empty());
 }

@@ -332,7 +332,9 @@ fn check_says_how_many_transports_a_second_the_camera_allows() {
 
 #[test]
 fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
-    for (readout_us, periods) in [(16_100, 15), (16_500, 16)] {
+    // Where a trigger is missed, and frames arrive later than the next trigger, nothing tells in time which one it was: a
+    // frame more is exposed under the settings before.
+    for (readout_us, periods) in [(16_100, 15), (16_500, 17)] {
         let rig = rig(60.0, &format!("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = {readout_us}\n"));
         let bench = Bench::new(&rig);
         let ended = bench.run(&plan(3));

@@ -151,7 +151,7 @@ pub struct FilmCheck {
     pub cycles: usize,
     /// VSYNC periods that a cycle takes on this camera.
     pub periods_per_cycle: u32,
-    /// Light transports a second, if the machine keeps up.
+    /// Light transports a second, at the most.
     pub transports_per_s: f64,
     /// Disk space that a minute takes, uncompressed.
     pub disk_bytes_per_minute: u64,

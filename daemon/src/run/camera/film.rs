@@ -43,6 +43,8 @@ struct Slot {
 /// Settings that the camera has been given.
 struct Written {
     job: Job,
+    /// VSYNC periods from the frame before to theirs.
+    periods: u32,
     /// The first frame that is certain to have them; the next settings end their time.
     first_seq: u64,
 }
@@ -52,10 +54,12 @@ struct Written {
 struct Ahead {
     written: VecDeque<Written>,
     newest_seq: Option<u64>,
-    /// Frames after the newest one that have their settings already when new ones are written, because they are on
-    /// their way to the host or their settings on their way into the sensor: what the camera says of its first frames
-    /// tells. 0 where it cannot say exactly.
-    lead_frames: Option<u64>,
+    /// Fewest VSYNC periods from one frame to the next.
+    frame_periods: u64,
+    /// VSYNC periods after the newest frame's in which frames have their settings already when new ones are written,
+    /// because they are on their way to the host or their settings on their way into the sensor: what the camera says of
+    /// its first frames tells. 0 where it cannot say exactly.
+    lead_periods: Option<u64>,
     /// Whether settings were written before, without a pause since.
     running: bool,
 }
@@ -75,24 +79,26 @@ impl FilmPass {
 impl Ahead {
     /// Whether settings that are written now take effect after those written last, so that each have a frame.
     fn has_room(&self) -> bool {
-        let Some(last) = self.written.back() else { return true };
-        let newest_seq = self.newest_seq.unwrap_or(0);
-        newest_seq + self.lead_frames.unwrap_or(0) >= last.first_seq
+        let Some(oldest) = self.written.front() else { return true };
+        // Frames before theirs, under settings that have been seen.
+        let frames_before = oldest.first_seq.saturating_sub(self.newest_seq.unwrap_or(0) + 1);
+        let own_periods: u64 = self.written.iter().map(|written| u64::from(written.periods)).sum();
+        frames_before * self.frame_periods + own_periods <= self.lead_periods.unwrap_or(0)
     }
 
-    fn push(&mut self, job: Job) {
-        let (first_seq, lead_frames) = match job.applied.first_frame {
+    fn push(&mut self, job: Job, periods: u32) {
+        let (first_seq, lead_periods) = match job.applied.first_frame {
             FirstFrame::Exactly(seq) => {
                 // Where the write was late, the lead looks longer than it is, and settings that are written too soon
                 // would take the place of others.
-                let lead = seq.saturating_sub(self.newest_seq.unwrap_or(seq) + 1);
-                (seq, self.lead_frames.map_or(lead, |known| known.min(lead)))
+                let lead = seq.saturating_sub(self.newest_seq.unwrap_or(seq) + 1) * self.frame_periods;
+                (seq, self.lead_periods.map_or(lead, |known| known.min(lead)))
             }
             FirstFrame::Within(seq) => (seq, 0),
         };
-        self.lead_frames = Some(lead_frames);
+        self.lead_periods = Some(lead_periods);
         self.running = true;
-        self.written.push_back(Written { job, first_seq });
+        self.written.push_back(Written { job, periods, first_seq });
     }
 
     /// The oldest settings, if the time of their frames is over by the frame `seq`, and when it was over.
@@ -118,7 +124,12 @@ impl Sequencer {
     pub(super) fn film(&mut self, film: &FilmPass) -> Result<(), DeviceError> {
         self.warm_up(film.not_before_ns)?;
         let mut slots = film.slots().peekable();
-        let mut ahead = Ahead { newest_seq: self.newest_seq, ..Ahead::default() };
+        let frame_periods = film.settings.iter().map(|setting| u64::from(setting.periods_from_last)).min();
+        let mut ahead = Ahead {
+            newest_seq: self.newest_seq,
+            frame_periods: frame_periods.unwrap_or(1),
+            ..Ahead::default()
+        };
         let mut watchdog = self.watchdog();
         while self.orders.go_on() {
             let is_held =
@@ -155,14 +166,15 @@ impl Sequencer {
         let id = SettingsId { point: ordinal, attempt: slot.cycle };
         let applied = self.camera.configure(id, &shot.settings)?;
         self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
-        ahead.push(Job {
+        let job = Job {
             id,
             frames: point.frames,
             applied,
             delay_us: point.delay_us,
             light_edges_later: shot.light_edges_later,
             periods_from_last: ahead.running.then_some(periods_from_last),
-        });
+        };
+        ahead.push(job, periods_from_last);
         Ok(())
     }
 
@@ -170,7 +182,7 @@ impl Sequencer {
     /// up before it.
     fn deliver(&mut self, received: Received, ahead: &mut Ahead) -> Result<(), DeviceError> {
         let FrameStamp { seq, .. } = received.stamp;
-        while let Some((Written { job, first_seq }, end_seq)) = ahead.pop_missed(seq) {
+        while let Some((Written { job, first_seq, .. }, end_seq)) = ahead.pop_missed(seq) {
             self.input.send(Event::Begin(job)).map_err(closed)?;
             for lost_seq in first_seq.max(ahead.newest_seq.map_or(0, |newest| newest + 1))..end_seq {
                 self.input.send(Event::Lost(lost_seq, Some(LossCause::CameraGap))).map_err(closed)?;
@@ -187,7 +199,9 @@ impl Sequencer {
                 self.input.send(Event::End).map_err(closed)?;
             }
             // Exposed once more under settings that have their frame: the next ones came too late for it.
-            None => drop(self.hand_on(received, Label::Settling)?),
+            None => {
+                self.hand_on(received, Label::Settling)?;
+            }
         }
         Ok(())
     }
@@ -215,14 +229,14 @@ mod tests {
     /// Plays a camera that gives settings to the frame `latency` after the next one, until `frames` frames have come;
     /// returns the first frames of all settings written.
     fn play(latency: u64, frames: u64, exact: bool) -> Vec<u64> {
-        let mut ahead = Ahead { newest_seq: Some(0), ..Ahead::default() };
+        let mut ahead = Ahead { newest_seq: Some(0), frame_periods: 1, ..Ahead::default() };
         let mut first = Vec::new();
         for newest in 0..frames {
             ahead.newest_seq = Some(newest);
             ahead.pop_seen(newest);
             while ahead.has_room() {
                 let seq = newest + 1 + latency;
-                ahead.push(job(if exact { FirstFrame::Exactly(seq) } else { FirstFrame::Within(seq) }));
+                ahead.push(job(if exact { FirstFrame::Exactly(seq) } else { FirstFrame::Within(seq) }), 1);
                 first.push(seq);
             }
         }
@@ -245,8 +259,8 @@ mod tests {
     #[test]
     fn settings_that_never_had_a_frame_are_given_up_when_the_next_ones_have() {
         let mut ahead = Ahead { newest_seq: Some(4), ..Ahead::default() };
-        ahead.push(job(FirstFrame::Exactly(5)));
-        ahead.push(job(FirstFrame::Exactly(7)));
+        ahead.push(job(FirstFrame::Exactly(5)), 1);
+        ahead.push(job(FirstFrame::Exactly(7)), 1);
         assert!(ahead.pop_missed(6).is_none(), "frame 6 still has the settings of frame 5");
         let (missed, end_seq) = ahead.pop_missed(7).unwrap();
         assert_eq!((missed.first_seq, end_seq), (5, 7));

@@ -31,8 +31,8 @@ pub struct FilmSink {
     dark: Option<Arc<Array2<f32>>>,
     /// The cycle under way.
     cycle: Option<Cycle>,
-    /// The newest image of each setting.
-    newest: Vec<Option<(Setting, Arc<Array2<f32>>, i64)>>,
+    /// The newest frame of each setting that has an image.
+    newest: Vec<Option<FilmFrame>>,
     first_start_ns: Option<i64>,
     /// Starts of the first and the last stored cycle.
     stored_span_ns: Option<(i64, i64)>,
@@ -117,12 +117,15 @@ impl FilmSink {
         if self.pace == Pace::Pipeline {
             return;
         }
-        let Some(newest) = self.newest.iter().cloned().collect::<Option<Vec<_>>>() else { return };
-        let starts = || newest.iter().map(|(_, _, start_ns)| *start_ns);
-        let Some(span_ns) = starts().min().zip(starts().max()) else { return };
+        let newest: Vec<&FilmFrame> = self.newest.iter().flatten().collect();
+        let starts = || newest.iter().map(|frame| frame.exposure_start_ns);
+        let Some(span_ns) = starts().min().zip(starts().max()).filter(|_| newest.len() == self.settings)
+        else {
+            return;
+        };
         let left = (self.settings - decided) as f64 / self.settings as f64;
         let cycle_end = Instant::now() + Duration::from_secs_f64(left * self.timing.cycle_ns * 1e-9);
-        let frames = newest.into_iter().map(|(setting, image, _)| (setting, image)).collect();
+        let Some(frames) = images_of(&newest) else { return };
         if let Some(exposed) = self.exposed(number, frames, span_ns) {
             self.worker.sliding(exposed, cycle_end);
         }
@@ -163,11 +166,11 @@ impl Storage {
         let Some(film) = &mut self.film else { return true };
         let number = unit.id.attempt;
         let frame = FilmFrame::of(unit, image.as_ref().ok().map(|image| Arc::new(image.clone())));
-        if let Some(FilmFrame { setting: measured, exposure_start_ns, image: Some(image), .. }) = &frame {
-            film.newest[setting] = Some((measured.clone(), image.clone(), *exposure_start_ns));
-        }
         if let Some(frame) = &frame {
             film.first_start_ns.get_or_insert(frame.exposure_start_ns);
+        }
+        if frame.as_ref().is_some_and(|frame| frame.image.is_some()) {
+            film.newest[setting].clone_from(&frame);
         }
         self.film_decided(number, |cycle| {
             cycle.counts.add(&unit.counts);
@@ -255,9 +258,7 @@ impl Storage {
             crc32: crc32(raw.view()),
         }))?;
         film.note_stored(first_ns);
-        let images: Option<Vec<_>> =
-            frames.iter().map(|frame| Some((frame.setting.clone(), frame.image.clone()?))).collect();
-        match images.and_then(|images| film.exposed(cycle.number, images, (first_ns, last_ns))) {
+        match images_of(&frames).and_then(|images| film.exposed(cycle.number, images, (first_ns, last_ns))) {
             Some(exposed) => film.worker.cycle(exposed),
             None => film.account.note(|film| film.transports_missing += 1),
         }
@@ -277,6 +278,11 @@ impl Storage {
         tracing::error!(%error, cycle, setting, "stored, but its cycle has no transport");
         self.processing.problems.push(format!("cycle {cycle}, setting {setting}: {error}"));
     }
+}
+
+/// The images of frames with their settings, if all have one.
+fn images_of(frames: &[&FilmFrame]) -> Option<Vec<(Setting, Arc<Array2<f32>>)>> {
+    frames.iter().map(|frame| Some((frame.setting.clone(), frame.image.clone()?))).collect()
 }
 
 /// The sound frames of a cycle that is not stored end in another column than those that are.
