@@ -5,16 +5,18 @@ use std::path::Path;
 use raysweep_core::CameraCapabilities;
 use raysweep_pipeline::{DemuxFold, Point, ProductSpec, Role};
 use raysweep_proto::{CheckReport, FilmCheck};
-use raysweep_session::durable;
+use raysweep_session::{STRIP_ROWS, durable};
 
 use crate::config::ConfigError;
 use crate::film;
+use crate::memory::{MemoryNeed, available_bytes};
 use crate::processing::Task;
 
 /// Condition number from which on noise is amplified more than the prior can hold.
 const ILL_CONDITIONED: f64 = 1e9;
 
-/// Foresees a task that makes `products` and whose session will lie in `data`.
+/// Foresees a task that makes `products` and whose session will lie in `data`; its results may take so much memory, or
+/// what is free.
 ///
 /// # Errors
 /// When the plan makes no model on this rig.
@@ -23,6 +25,7 @@ pub fn check(
     products: &[ProductSpec],
     camera: &CameraCapabilities,
     data: &Path,
+    memory_limit_bytes: Option<u64>,
 ) -> Result<CheckReport, ConfigError> {
     let no_model = |message: String| ConfigError { message, field: Some("sweep".into()), span: None };
     let options = task.demux_options()?;
@@ -39,13 +42,10 @@ pub fn check(
     let frames: u64 = planned.clone().map(|(point, times)| times * u64::from(point.frames)).sum();
     let pixels = (geometry.height * geometry.width) as u64;
     let reach_rows = reach.clone().count() as u64;
-    // The stack twice while it changes hands, where pixels are valid, the transport and its copy on the way to the disk.
-    let images = products.iter().map(|product| product.images(geometry) as u64);
-    // Each image once, the largest sequence twice more: as EXR's channels and as the file's bytes.
-    let product_images = images.clone().sum::<u64>() + 2 * images.clone().max().unwrap_or(0);
-    let mut memory_bytes =
-        pixels * (9 * task.schedule.points.len() as u64 + 8 * reach_rows + 4 * product_images);
-    let files = 2 * images.sum::<u64>();
+    let memory = MemoryNeed::of(task, products).map_err(|error| no_model(error.to_string()))?;
+    let memory_free_bytes = available_bytes(memory_limit_bytes);
+    let memory_bytes = memory.bytes(memory_free_bytes);
+    let files = 2 * products.iter().map(|product| product.images(geometry) as u64).sum::<u64>();
     let mut disk_bytes =
         pixels * 4 * (task.schedule.points.len() as u64 + 2 * reach_rows + files) + 10_000_000;
     let existing = data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
@@ -59,8 +59,6 @@ pub fn check(
     let mut warnings = Vec::new();
     let film = task.is_film().then(|| film::check(task, camera, reach_rows));
     if let Some(film) = &film {
-        // Frames and images of the cycles under way, a stack and its mask, the transport and its copies to the disk.
-        memory_bytes = pixels * (80 * film.settings as u64 + 16 * reach_rows);
         let minutes = points as f64 / film.transports_per_s / 60.0;
         disk_bytes = (film.disk_bytes_per_minute as f64 * minutes) as u64 + 10_000_000;
     }
@@ -93,7 +91,13 @@ pub fn check(
             "a pixel saturates at {headroom:.2} of a white one over {brightest_rows:.0} rows: lower camera.white_dn (gain, aperture) to leave room for indirect light"
         ));
     }
-    let memory_free_bytes = memory_free_bytes().unwrap_or(u64::MAX);
+    if memory.in_strips(memory_free_bytes) {
+        warnings.push(format!(
+            "{} MB of memory would be needed to solve the sweep in one piece and {} MB may be used: it is solved {STRIP_ROWS} camera rows at a time, after its end, without live estimates; the results are the same",
+            memory.whole_bytes / 1_000_000,
+            memory_free_bytes / 1_000_000
+        ));
+    }
     for (what, needed, free) in
         [("memory", memory_bytes, memory_free_bytes), ("disk", disk_bytes, disk_free_bytes)]
     {
@@ -146,12 +150,4 @@ fn light_periods(periods: &[u64], task: &Task, film: Option<&FilmCheck>) -> u64 
 pub(crate) fn periods(task: &Task, camera: &CameraCapabilities, point: &Point) -> u64 {
     let shot = task.geometry.shot(point, camera.trigger_latency_us);
     u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))
-}
-
-/// What the system says it can still give to programs.
-fn memory_free_bytes() -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/meminfo").ok()?;
-    let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
-    let kilobytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    Some(kilobytes * 1024)
 }

@@ -7,6 +7,7 @@ pub mod config;
 pub mod control;
 mod film;
 pub mod live;
+mod memory;
 pub mod process;
 pub mod processing;
 mod report;
@@ -14,6 +15,7 @@ mod results;
 pub mod rig;
 pub mod run;
 pub mod server;
+mod strips;
 
 /// Name and version, as sessions keep it.
 pub const SOFTWARE: &str = concat!("raysweepd ", env!("CARGO_PKG_VERSION"));

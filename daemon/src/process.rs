@@ -8,8 +8,9 @@ use raysweep_session::stack::ArrayName;
 
 use crate::config::{Plan, RigFile, append_argument};
 use crate::film;
+use crate::memory::{MemoryNeed, available_bytes};
 use crate::processing::Task;
-use crate::results;
+use crate::results::{self, Results};
 
 /// Why a session cannot be processed.
 #[derive(Debug, thiserror::Error)]
@@ -23,6 +24,18 @@ pub enum ProcessError {
     /// A product that was asked for cannot be had.
     #[error("{0}")]
     Product(String),
+    /// The results do not fit into the memory, in strips either.
+    #[error(
+        "the results take {} MB of memory even some camera rows at a time, and {} MB may be used: raise --memory, make shorter sequences, or end other programs",
+        needed_bytes / 1_000_000,
+        available_bytes / 1_000_000
+    )]
+    Memory {
+        /// What they take.
+        needed_bytes: u64,
+        /// What they may take.
+        available_bytes: u64,
+    },
     /// A file cannot be copied.
     #[error("cannot copy to {}: {source}", path.display())]
     Copy {
@@ -53,6 +66,9 @@ pub struct Asked {
     pub products: Vec<String>,
     /// Whether the plan's own products are left as they lie there.
     pub only: bool,
+    /// Results that would take more memory than this are made some camera rows at a time, and are the same; none: more
+    /// than is free.
+    pub memory_limit_bytes: Option<u64>,
 }
 
 /// Makes the products of a session again, with the plan and the rig file that lie in it: the same bits as the run's.
@@ -106,17 +122,31 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
             problems,
         });
     }
+    let memory = MemoryNeed::of(&task, &processing.products)
+        .map_err(|error| ProcessError::Config(error.to_string()))?;
+    let available_bytes = available_bytes(asked.memory_limit_bytes);
+    if memory.bytes(available_bytes) > available_bytes {
+        return Err(ProcessError::Memory { needed_bytes: memory.bytes(available_bytes), available_bytes });
+    }
+    let in_strips = memory.in_strips(available_bytes);
+    if in_strips {
+        processing.keep_no_images();
+    }
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
-    let (products, problems) = processing.finish(&|| true);
-    results::write_transport(&session, &task, &products)?;
-    results::write_products(&session, &task, &products)?;
-    results::write_report(&session, state, &task, &products, &problems)?;
+    let mut results = match in_strips {
+        true => Results::in_strips(processing, &session, state, &task, &|| true)?,
+        false => Results::whole(processing, &|| true),
+    };
+    results.write_transport(&session, &task)?;
+    let overview = results.overview();
+    results::write_products(&session, &task, &results.products)?;
+    results::write_report(&session, state, &task, &results, overview.as_ref())?;
     results::write_manifest(&session, state, &task, &rig)?;
     Ok(Processed {
         report: session.report_path(),
         stored: state.stored(ArrayName::Sum).count(),
         points: shape.points,
-        problems,
+        problems: results.problems,
     })
 }
 

@@ -1,14 +1,18 @@
 //! The stages and folds of a plan, and what is known of the points that they work on.
 
 use std::any::Any;
+use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    DemuxOptions, Entry, FilmSolver, Fold, Point, Product, ProductSpec, Registry, RegistryError, Role,
-    Schedule, Snapshot, Stage, SweepGeometry, Unit, message_of, run_stages,
+    Assembly, DemuxOptions, Entry, FilmSolver, Findings, Fold, FoldError, ImageRows, InStrips, Point,
+    Product, ProductSpec, Registry, RegistryError, Role, Schedule, Snapshot, Stage, Strip, SweepGeometry,
+    Unit, message_of, run_stages,
 };
+use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::{ArrayName, Stack, crc32};
 use serde_json::Value;
@@ -99,8 +103,8 @@ impl Task {
     /// # Errors
     /// With the place in the plan's text of the stage or product that cannot be made.
     pub fn processing(&self, registry: &Registry, plan_text: &str) -> Result<Processing, ConfigError> {
-        let mut processing =
-            Processing { stages: Vec::new(), folds: Vec::new(), products: Vec::new(), problems: Vec::new() };
+        let mut stages = Vec::new();
+        let mut folds: Vec<Box<dyn Fold>> = Vec::new();
         for (index, stage) in self.plan.stage.iter().enumerate() {
             let place = index.to_string();
             let refused = |message: String| ConfigError::at(plan_text, &["stage", &place, "name"], message);
@@ -115,19 +119,19 @@ impl Task {
                 }
                 // Each cycle has a transport of its own, which no fold over the whole run makes.
                 Entry::Fold(_) if self.is_film() => {}
-                Entry::Fold(fold) if processing.folds.iter().any(|other| other.name() == fold.name()) => {
+                Entry::Fold(fold) if folds.iter().any(|other| other.name() == fold.name()) => {
                     let name = fold.name();
                     return Err(refused(format!(
                         "{name} stands twice: its products would overwrite each other; keep one"
                     )));
                 }
-                Entry::Stage(stage) => processing.stages.push(stage),
-                Entry::Fold(fold) => processing.folds.push(fold),
+                Entry::Stage(stage) => stages.push(stage),
+                Entry::Fold(fold) => folds.push(fold),
             }
         }
         // After the folds, which refuse a rig that no product could be made on.
-        processing.products = self.products(plan_text)?;
-        Ok(processing)
+        let products = self.products(plan_text)?;
+        Ok(Processing { stages: stages.into(), folds, products, problems: Vec::new() })
     }
 
     /// What is made of the transport: the products that the plan names.
@@ -151,7 +155,7 @@ impl Task {
 /// The stages, folds and products of a plan.
 pub struct Processing {
     /// Work on each unit alone.
-    pub stages: Vec<Box<dyn Stage>>,
+    pub stages: Arc<[Box<dyn Stage>]>,
     /// Work on all units in order.
     pub folds: Vec<Box<dyn Fold>>,
     /// What is made of the transport of the folds.
@@ -213,15 +217,65 @@ impl Processing {
         self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
     }
 
+    /// Keeps no images from now on: [`Self::finish_in_strips`] reads them again.
+    pub fn keep_no_images(&mut self) {
+        self.folds.iter_mut().for_each(|fold| fold.keep_no_images());
+    }
+
+    /// [`Self::finish`] after [`Self::keep_no_images`]: the transport goes into `write`, strip by strip, and is not among
+    /// the products.
+    pub fn finish_in_strips(
+        mut self,
+        images: &dyn ImageRows,
+        go_on: &(dyn Fn() -> bool + Sync),
+        write: &mut dyn FnMut(&Findings, &Strip) -> Result<(), String>,
+    ) -> (Vec<Product>, Vec<String>) {
+        let mut products = Vec::new();
+        let mut assemblies: Vec<Assembly> = self.products.drain(..).map(Assembly::new).collect();
+        let mut strips_taken = 0;
+        for fold in &mut self.folds {
+            let name = fold.name().to_owned();
+            let problems = &mut self.problems;
+            let mut take = |findings: &Findings, strip: Strip| {
+                write(findings, &strip).map_err(|what| FoldError { fold: name.clone(), what })?;
+                assemblies.retain_mut(|assembly| {
+                    let Strip { first_row, stack, transport } = &strip;
+                    let product = assembly.name().to_owned();
+                    let added = caught(&product, || assembly.add(*first_row, stack, transport));
+                    added.map_err(|problem| problems.push(problem)).is_ok()
+                });
+                strips_taken += 1;
+                Ok(())
+            };
+            let strips = InStrips { images, strip_rows: STRIP_ROWS, take: &mut take };
+            match caught(&name, || fold.finish_in_strips(strips, go_on)) {
+                Ok(made) => products.extend(made),
+                Err(problem) => {
+                    // Images of which rows are lacking are none.
+                    assemblies.clear();
+                    self.problems.push(problem);
+                }
+            }
+        }
+        for assembly in assemblies.into_iter().filter(|_| strips_taken > 0) {
+            let product = assembly.name().to_owned();
+            match caught(&product, || assembly.finish()) {
+                Ok(product) => products.push(product),
+                Err(problem) => self.problems.push(problem),
+            }
+        }
+        (products, self.problems)
+    }
+
     /// The products of all folds and those that the plan names, and everything that could not be done. Ends early soon
     /// after `go_on` says no.
     pub fn finish(mut self, go_on: &(dyn Fn() -> bool + Sync)) -> (Vec<Product>, Vec<String>) {
         let mut products = Vec::new();
         for fold in &mut self.folds {
-            match catch_unwind(AssertUnwindSafe(|| fold.finish(go_on))) {
-                Ok(Ok(made)) => products.extend(made),
-                Ok(Err(error)) => self.problems.push(error.to_string()),
-                Err(panic) => self.problems.push(panicked(fold.name(), &*panic)),
+            let name = fold.name().to_owned();
+            match caught(&name, || fold.finish(go_on)) {
+                Ok(made) => products.extend(made),
+                Err(problem) => self.problems.push(problem),
             }
         }
         products.extend(self.make_named(&products, go_on));
@@ -242,13 +296,20 @@ impl Processing {
         let Some((transport, stack)) = transport.zip(stack) else { return Vec::new() };
         let mut products = Vec::new();
         for spec in self.products.iter().take_while(|_| go_on()) {
-            match catch_unwind(AssertUnwindSafe(|| spec.make(stack, transport))) {
-                Ok(Ok(product)) => products.push(product),
-                Ok(Err(error)) => self.problems.push(error.to_string()),
-                Err(panic) => self.problems.push(panicked(spec.name(), &*panic)),
+            match caught(spec.name(), || spec.make(stack, transport)) {
+                Ok(product) => products.push(product),
+                Err(problem) => self.problems.push(problem),
             }
         }
         products
+    }
+}
+
+/// What `make` gives; as a problem, what kept `name` from being made: an error or a panic.
+fn caught<T, E: Display>(name: &str, make: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
+    match catch_unwind(AssertUnwindSafe(make)) {
+        Ok(made) => made.map_err(|error| error.to_string()),
+        Err(panic) => Err(panicked(name, &*panic)),
     }
 }
 
@@ -273,7 +334,7 @@ pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Uni
         exposure_us: entry.exposure_us,
         delays_us: entry.delays_us.clone(),
         last_exposure_ns: None,
-        sum: std::sync::Arc::new(sum),
+        sum: Arc::new(sum),
         counts: entry.counts.clone(),
     }
 }

@@ -5,19 +5,19 @@ mod products;
 
 use std::collections::BTreeMap;
 
-use ndarray::{Array2, ArrayView2, Axis};
+use ndarray::{Array1, Array2};
 use raysweep_pipeline::{PREDICTED_SHARE, Product, Role, Spot, SweepGeometry};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
     Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table,
-    ToneMap,
+    ToneSamples,
 };
 use raysweep_session::stack::{ArrayName, Stack};
-use raysweep_session::{Result, Session};
-use raysweep_transport::plane::Transport;
+use raysweep_session::{Result, Session, transport};
 
 use crate::processing::{Task, place};
 use crate::results;
+use crate::strips::Overview;
 
 /// Share of pixels, in percent, that a picture's scale does not overexpose.
 const PERCENTILE: f64 = 99.5;
@@ -33,15 +33,12 @@ pub fn make(
     session: &Session,
     state: &State,
     task: &Task,
+    overview: Option<&Overview>,
     products: &[Product],
     problems: &[String],
 ) -> Result<Report> {
     let stack = session.stack()?;
-    let transport = products.iter().find_map(|product| match product {
-        Product::Transport(transport) => Some(&**transport),
-        _ => None,
-    });
-    let markers = transport.map(mark).unwrap_or_default();
+    let markers = overview.map(mark).unwrap_or_default();
     let sweep = SweepImages { task, state, stack: &stack };
     let mut sections = Vec::new();
     let errors = problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone()));
@@ -50,9 +47,11 @@ pub fn make(
     if !blocks.is_empty() {
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
-    if let Some(transport) = transport {
+    if let Some(overview) = overview {
+        let pixels: Vec<[usize; 2]> = markers.iter().map(|marker| [marker.row, marker.column]).collect();
+        let over_rows = transport::read_profiles(&session.transport_path(), &pixels)?;
         sections.extend(products::images(products, &markers));
-        sections.push(profiles(&sweep, transport, &markers)?);
+        sections.push(profiles(&sweep, overview.u_min, &over_rows, &markers)?);
         sections.extend(products::sequences(products));
         sections.extend(products::profiles(products));
     }
@@ -101,18 +100,9 @@ fn facts(state: &State, task: &Task) -> Vec<(String, String)> {
 }
 
 /// Pixels worth a look: the brightest of each kind of light.
-fn mark(transport: &Transport) -> Vec<Marker> {
-    let beyond = |near: i32| {
-        let total = transport.total();
-        let inside = transport.band(-near..=near);
-        total - inside
-    };
-    let kinds = [
-        transport.epipolar(1),
-        transport.band(-4..=4) - transport.epipolar(1),
-        transport.band(-20..=20) - transport.band(-4..=4),
-        beyond(20),
-    ];
+fn mark(overview: &Overview) -> Vec<Marker> {
+    let Overview { epipolar, near, middle, total, .. } = overview;
+    let kinds = [epipolar.clone(), near - epipolar, middle - near, total - middle];
     let mut markers: Vec<Marker> = Vec::new();
     for image in &kinds {
         let brightest = image
@@ -130,12 +120,17 @@ fn mark(transport: &Transport) -> Vec<Marker> {
     markers
 }
 
-fn profiles(sweep: &SweepImages<'_>, transport: &Transport, markers: &[Marker]) -> Result<Section> {
+/// The marked pixels' light over the delay, and over relative rows from `u_min` on.
+fn profiles(
+    sweep: &SweepImages<'_>,
+    u_min: i32,
+    over_rows: &[Array1<f32>],
+    markers: &[Marker],
+) -> Result<Section> {
     let exposure_us = sweep.task.plan.sweep.exposure_us.values().into_iter().fold(f64::INFINITY, f64::min);
-    let images = sweep.at_exposure(exposure_us)?;
-    let delay = markers.iter().map(|marker| {
-        let points =
-            images.iter().map(|(delay_us, image)| (*delay_us, f64::from(image[[marker.row, marker.column]])));
+    let over_delays = sweep.at_exposure(exposure_us, markers)?;
+    let delay = markers.iter().enumerate().map(|(index, marker)| {
+        let points = over_delays.iter().map(|(delay_us, light)| (*delay_us, f64::from(light[index])));
         Series::line(
             format!("pixel {} (t {}, s {})", marker.label, marker.row, marker.column),
             points.collect(),
@@ -148,11 +143,11 @@ fn profiles(sweep: &SweepImages<'_>, transport: &Transport, markers: &[Marker]) 
         series: delay.collect(),
         guides: Vec::new(),
     };
-    let rows = markers.iter().map(|marker| {
-        let profile = transport.t.index_axis(Axis(2), marker.column).index_axis_move(Axis(1), marker.row);
-        let points = profile.iter().enumerate().map(|(index, &light)| {
-            (f64::from(transport.u_min) + index as f64, f64::from(light.max(1e-5)).log10())
-        });
+    let rows = markers.iter().zip(over_rows).map(|(marker, profile)| {
+        let points = profile
+            .iter()
+            .enumerate()
+            .map(|(index, &light)| (f64::from(u_min) + index as f64, f64::from(light.max(1e-5)).log10()));
         Series::line(format!("pixel {}", marker.label), points.collect())
     });
     let rows = Plot {
@@ -196,34 +191,46 @@ impl SweepImages<'_> {
         Ok(Some(sum.mapv(|sum| sum as f32 / entry.frames as f32)))
     }
 
-    fn at_exposure(&self, exposure_us: f64) -> Result<Vec<(f64, Array2<f32>)>> {
-        let mut images = Vec::new();
+    /// Delay, and light of the marked pixels, of each image at an exposure.
+    fn at_exposure(&self, exposure_us: f64, markers: &[Marker]) -> Result<Vec<(f64, Vec<f32>)>> {
+        let mut lights = Vec::new();
         for point in &self.task.schedule.points {
             if matches!(point.role, Role::Sweep(_))
                 && point.exposure_us == exposure_us
                 && let Some(image) = self.light(point.role)?
             {
-                images.push((point.delay_us, image));
+                let light = markers.iter().map(|marker| image[[marker.row, marker.column]]);
+                lights.push((point.delay_us, light.collect()));
             }
         }
-        Ok(images)
+        Ok(lights)
+    }
+
+    /// Pixels of the sweep's images that the ledger knows.
+    fn stored_px(&self) -> usize {
+        let shape = &self.state.session.shape;
+        self.state.stored(ArrayName::Sum).count() * shape.rows * shape.columns
     }
 
     fn contact_sheet(&self) -> Result<Section> {
         let (delays, exposures) =
             (self.task.plan.sweep.delay_us.values(), self.task.plan.sweep.exposure_us.values());
-        let mut lights = Vec::new();
-        for index in 0..(delays.len() * exposures.len()) as u32 {
-            lights.push(self.light(Role::Sweep(index))?);
+        let places = delays.len() * exposures.len();
+        // The sweep may be larger than the memory: one image at a time.
+        let mut samples = ToneSamples::new(self.stored_px());
+        let mut thumbnails = Vec::with_capacity(places);
+        for index in 0..places as u32 {
+            let light = self.light(Role::Sweep(index))?;
+            light.iter().for_each(|light| samples.add(light.view()));
+            thumbnails.push(light.map(|light| Picture::reduced(light.view())));
         }
-        let views: Vec<ArrayView2<'_, f32>> = lights.iter().flatten().map(|image| image.view()).collect();
         let label = |value: &f64| format!("{value:.0}");
         let sheet = |tone_map| ContactSheet {
             column_title: "delay / µs".into(),
             columns: delays.iter().map(label).collect(),
             row_title: "exposure / µs".into(),
             rows: exposures.iter().map(label).collect(),
-            pictures: lights
+            pictures: thumbnails
                 .iter()
                 .map(|image| image.as_ref().map(|image| Picture::thumbnail(image.view(), tone_map)))
                 .collect(),
@@ -232,8 +239,8 @@ impl SweepImages<'_> {
             title: "The stack".into(),
             intro: "Every image of the sweep, dark image subtracted. A camera row collects the light of projector rows that lie delay / row time below its own, over a band as wide as the exposure. The second sheet is exposed for the indirect light.".into(),
             blocks: vec![
-                Block::ContactSheet(sheet(ToneMap::percentile(&views, PERCENTILE))),
-                Block::ContactSheet(sheet(ToneMap::percentile(&views, INDIRECT_PERCENTILE))),
+                Block::ContactSheet(sheet(samples.percentile(PERCENTILE))),
+                Block::ContactSheet(sheet(samples.percentile(INDIRECT_PERCENTILE))),
             ],
         })
     }

@@ -2,15 +2,18 @@
 
 use std::collections::BTreeMap;
 
-use raysweep_pipeline::{Product, Role, Schedule};
+use raysweep_pipeline::{Findings, Product, Role, Schedule, Strip};
 use raysweep_session::ledger::{EndState, State};
+use raysweep_session::products::VolumeWriter;
 use raysweep_session::{Result, Session, manifest, transport};
+use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use crate::config::RigFile;
 use crate::film;
-use crate::processing::Task;
+use crate::processing::{Processing, Task};
 use crate::report;
+use crate::strips::{Overview, StoredImages};
 
 /// A run's end in a word.
 pub fn name_of(state: EndState) -> &'static str {
@@ -21,15 +24,118 @@ pub fn name_of(state: EndState) -> &'static str {
     }
 }
 
-/// Writes the transport, as NPY and Zarr at the same time: somebody may be waiting for it.
-///
-/// # Errors
-/// When the disk refuses.
-pub fn write_transport(session: &Session, task: &Task, products: &[Product]) -> Result<()> {
-    for product in products {
-        let Product::Transport(found) = product else { continue };
+/// What was made of a sweep.
+pub struct Results {
+    /// Everything; the transport only if it was made in one piece.
+    pub products: Vec<Product>,
+    /// What could not be made, and why.
+    pub problems: Vec<String>,
+    /// A transport that was made in strips: its files, not in place yet.
+    writer: Option<TransportWriter>,
+    /// And its sums.
+    overview: Option<Overview>,
+}
+
+impl Results {
+    /// Makes them in one piece; ends early, and short of results, soon after `go_on` says no.
+    pub fn whole(processing: Processing, go_on: &(dyn Fn() -> bool + Sync)) -> Self {
+        let (products, problems) = processing.finish(go_on);
+        Self { products, problems, writer: None, overview: None }
+    }
+
+    /// Makes them strip by strip from what is stored, of folds that have kept no images; otherwise as [`Self::whole`].
+    ///
+    /// # Errors
+    /// When the stack cannot be opened or the disk refuses the transport.
+    pub fn in_strips(
+        processing: Processing,
+        session: &Session,
+        state: &State,
+        task: &Task,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Self> {
+        let (stack, stages) = (session.stack()?, processing.stages.clone());
+        let images = StoredImages { task, state, stack: &stack, stages: &stages };
+        let mut written: Option<(TransportWriter, Overview)> = None;
+        let mut append = |findings: &Findings, Strip { first_row, transport, .. }: &Strip| {
+            let (writer, overview) = match &mut written {
+                Some(written) => written,
+                None => written.insert((
+                    TransportWriter::create(session, task, Some(findings), transport)?,
+                    Overview::empty(task.geometry.height, transport),
+                )),
+            };
+            overview.put(*first_row, transport);
+            writer.append(transport)
+        };
+        let mut refused = None;
+        let mut write = |findings: &Findings, strip: &Strip| {
+            append(findings, strip).map_err(|error| {
+                let what = error.to_string();
+                refused = Some(error);
+                what
+            })
+        };
+        let (products, problems) = processing.finish_in_strips(&images, go_on, &mut write);
+        if let Some(error) = refused {
+            return Err(error);
+        }
+        // Where the fold broke off, rows are missing.
+        let (writer, overview) = written.filter(|(writer, _)| writer.is_whole()).unzip();
+        Ok(Self { products, problems, writer, overview })
+    }
+
+    /// Puts the transport in its place, as NPY and Zarr at the same time: somebody may be waiting for it.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn write_transport(&mut self, session: &Session, task: &Task) -> Result<()> {
+        if let Some(writer) = self.writer.take() {
+            return writer.commit();
+        }
+        let Some(transport) = self.transport() else { return Ok(()) };
+        let mut writer = TransportWriter::create(session, task, self.findings(), transport)?;
+        writer.append(transport)?;
+        writer.commit()
+    }
+
+    /// The transport's sums, if there is one.
+    pub fn overview(&mut self) -> Option<Overview> {
+        self.overview.take().or_else(|| self.transport().map(Overview::of))
+    }
+
+    fn transport(&self) -> Option<&Transport> {
+        self.products.iter().find_map(|product| match product {
+            Product::Transport(transport) => Some(&**transport),
+            _ => None,
+        })
+    }
+
+    fn findings(&self) -> Option<&Findings> {
+        self.products.iter().find_map(|product| match product {
+            Product::Findings(findings) => Some(&**findings),
+            _ => None,
+        })
+    }
+}
+
+/// Writes a transport from its first camera row to its last, as NPY and Zarr; nothing is seen of it before the end.
+struct TransportWriter {
+    npy: VolumeWriter,
+    zarr: transport::Writer,
+    rows_left: usize,
+}
+
+impl TransportWriter {
+    /// For a transport of which this is all, or some rows.
+    fn create(
+        session: &Session,
+        task: &Task,
+        findings: Option<&Findings>,
+        found: &Transport,
+    ) -> Result<Self> {
         let mut metadata = common(task);
-        metadata.extend(model(products));
+        metadata.extend(findings.map(model).unwrap_or_default());
         metadata.insert("axes".into(), json!(["u", "t", "s"]));
         metadata.insert("u_min".into(), json!(found.u_min));
         metadata.insert("u_max".into(), json!(found.u_max()));
@@ -37,13 +143,31 @@ pub fn write_transport(session: &Session, task: &Task, products: &[Product]) -> 
             "about".into(),
             json!("light from projector row v = u + round(first_row + row_pitch t) to camera pixel (t, s); 0 where the projector has no such row"),
         );
-        let (npy, zarr) = rayon::join(
-            || session.products().volume("transport", found.t.view(), &metadata),
-            || transport::write(&session.transport_path(), found.t.view(), &metadata),
-        );
-        npy.and(zarr)?;
+        let (depth, _, columns) = found.t.dim();
+        let shape = (depth, task.geometry.height, columns);
+        Ok(Self {
+            npy: session.products().volume_writer("transport", shape, &metadata)?,
+            zarr: transport::Writer::create(&session.transport_path(), shape, &metadata)?,
+            rows_left: task.geometry.height,
+        })
     }
-    Ok(())
+
+    fn append(&mut self, rows: &Transport) -> Result<()> {
+        let (npy, zarr) = (&mut self.npy, &mut self.zarr);
+        let (npy, zarr) = rayon::join(|| npy.append(rows.t.view()), || zarr.append(rows.t.view()));
+        npy.and(zarr)?;
+        self.rows_left = self.rows_left.saturating_sub(rows.exists.ncols());
+        Ok(())
+    }
+
+    fn is_whole(&self) -> bool {
+        self.rows_left == 0
+    }
+
+    fn commit(self) -> Result<()> {
+        let (npy, zarr) = rayon::join(|| self.npy.commit(), || self.zarr.commit());
+        npy.and(zarr)
+    }
 }
 
 /// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY).
@@ -92,12 +216,7 @@ pub fn write_products(session: &Session, task: &Task, products: &[Product]) -> R
 }
 
 /// What the transport was found with.
-fn model(products: &[Product]) -> Map<String, Value> {
-    let findings = products.iter().find_map(|product| match product {
-        Product::Findings(findings) => Some(findings),
-        _ => None,
-    });
-    let Some(found) = findings else { return Map::new() };
+fn model(found: &Findings) -> Map<String, Value> {
     let remarks: Map<String, Value> =
         found.remarks.iter().map(|(key, said)| ((*key).to_owned(), json!(said))).collect();
     let entries = [
@@ -150,10 +269,11 @@ pub fn write_report(
     session: &Session,
     state: &State,
     task: &Task,
-    products: &[Product],
-    problems: &[String],
+    results: &Results,
+    overview: Option<&Overview>,
 ) -> Result<()> {
-    let page = report::make(session, state, task, products, problems)?.to_html()?;
+    let Results { products, problems, .. } = results;
+    let page = report::make(session, state, task, overview, products, problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())
 }
 

@@ -87,7 +87,7 @@ impl Bench {
     pub fn with_registry(rig: &str, registry: Registry) -> Self {
         let folder = TempDir::new().expect("a temporary folder");
         std::fs::write(folder.path().join("rig.toml"), rig).expect("rig.toml written");
-        let runner = start(folder.path(), registry);
+        let runner = Arc::new(start(folder.path(), registry));
         Self { folder, runner }
     }
 
@@ -97,7 +97,17 @@ impl Bench {
     /// When the rig cannot be built.
     pub fn restart_with(&mut self, registry: Registry) {
         self.runner.shut_down();
-        self.runner = start(self.folder.path(), registry);
+        self.runner = Arc::new(start(self.folder.path(), registry));
+    }
+
+    /// As [`Self::restart_with`], with results that may take so much memory.
+    ///
+    /// # Panics
+    /// When the rig cannot be built.
+    pub fn limit_memory(&mut self, bytes: u64, registry: Registry) {
+        self.runner.shut_down();
+        let runner = start(self.folder.path(), registry);
+        self.runner = Arc::new(runner.with_memory_limit(bytes));
     }
 
     /// Runs a plan to its end.
@@ -123,10 +133,10 @@ impl Bench {
     }
 }
 
-fn start(folder: &Path, registry: Registry) -> Arc<Runner> {
+fn start(folder: &Path, registry: Registry) -> Runner {
     let rig = Rig::load(&folder.join("rig.toml")).unwrap_or_else(|error| panic!("{error}"));
     let runner = Runner::new(rig, folder.join("sessions"), registry);
-    Arc::new(runner.unwrap_or_else(|error| panic!("{error}")))
+    runner.unwrap_or_else(|error| panic!("{error}"))
 }
 
 /// Waits for the end of the run.

@@ -22,7 +22,7 @@ fn bench() -> Bench {
 }
 
 fn asked(products: &[&str], only: bool) -> Asked {
-    Asked { products: products.iter().map(|&product| product.to_owned()).collect(), only }
+    Asked { products: products.iter().map(|&product| product.to_owned()).collect(), only, ..Asked::default() }
 }
 
 /// The files of a session's products, by name.

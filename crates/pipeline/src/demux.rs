@@ -1,18 +1,25 @@
 //! Fold `demux`: from the averaged images of a sweep to its light transport.
 
+mod strips;
+mod tally;
+
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{Array2, Array3, ArrayView2, Axis};
+use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
 use serde::Deserialize;
 
-use crate::findings;
+use crate::findings::{Choices, choose, rows_to_choose_by};
 use crate::products::SweepStack;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
 use crate::stage::{Fold, FoldError, Product, Snapshot};
+use crate::strips::{InStrips, Strip};
 use crate::unit::Unit;
+
+use self::tally::Tally;
 
 /// Options of `demux` in a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -70,21 +77,6 @@ impl DemuxOptions {
 /// Name of the figure that closes the circle: the light of the regular image, by the model over by the camera.
 pub const PREDICTED_SHARE: &str = "predicted / captured regular light";
 
-/// So well the transport must predict the regular image.
-const CLOSE_SHARE: f64 = 0.02;
-/// More saturated pixels than this deserve a warning: highlights are normal, fields are not.
-const SATURATED_SHARE: f64 = 0.01;
-
-fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<Product> {
-    let share = saturated as f64 / pixels as f64;
-    (share > SATURATED_SHARE).then(|| {
-        Product::Warning(format!(
-            "{:.1} % of the pixels of {what} are saturated: take less gain, a smaller aperture or less ambient light",
-            share * 100.0
-        ))
-    })
-}
-
 /// One image of the sweep, as it was taken.
 struct Taken {
     setting: Setting,
@@ -100,6 +92,17 @@ pub struct DemuxFold {
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
     taken: BTreeMap<Role, Arc<Taken>>,
+    /// Of images that are not kept: the point's ordinal and the setting. None: they are.
+    not_kept: Option<BTreeMap<Role, (u32, Setting)>>,
+}
+
+/// Camera rows of a sweep that are to be solved, and those beside them that they depend on.
+struct Held {
+    /// The camera row that is row 0 of the images.
+    first_row: usize,
+    stack: SweepStack,
+    /// The regular image and its dark image, if both were taken.
+    regular: Option<(Arc<Taken>, Arc<Taken>)>,
 }
 
 /// Fewer points than this make no estimate worth a look.
@@ -120,7 +123,7 @@ impl DemuxFold {
         options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new() };
+        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new(), not_kept: None };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -154,8 +157,9 @@ impl DemuxFold {
             });
         }
         let scale = (1.0 / self.geometry.white_dn) as f32;
-        let saturates = |taken: &Arc<Taken>| self.valid(&taken.image).iter().any(|valid| !valid);
-        let shape = (taken.len(), self.geometry.height, self.geometry.width);
+        let saturates = |taken: &Arc<Taken>| self.valid(taken.image.view()).iter().any(|valid| !valid);
+        let rows = taken.values().next().map_or(0, |taken| taken.image.nrows());
+        let shape = (taken.len(), rows, self.geometry.width);
         let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
@@ -163,7 +167,7 @@ impl DemuxFold {
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&self.valid(&sample.image));
+                valid.index_axis_mut(Axis(0), index).assign(&self.valid(sample.image.view()));
             }
             if let Some(dark) = self.dark_of(&darks, role) {
                 images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * scale));
@@ -183,34 +187,45 @@ impl DemuxFold {
         })
     }
 
-    /// How well the transport predicts the light of the regular image (counts: `image`) where it is not saturated.
-    fn check_regular(&self, image: &Array2<f32>, light: &Array2<f32>, transport: &Transport) -> Vec<Product> {
-        let valid = self.valid(image);
-        let saturated = valid.iter().filter(|valid| !**valid).count();
-        let sum = |image: &Array2<f32>| -> f64 {
-            let pixels = image.iter().zip(&valid).filter(|&(_, &valid)| valid);
-            pixels.map(|(&light, _)| f64::from(light)).sum()
-        };
-        let (captured, predicted) = (sum(light), sum(&transport.total()));
-        let mut products: Vec<Product> =
-            too_many_saturated("the regular image (a whole VSYNC period long)", saturated, valid.len())
-                .into_iter()
-                .collect();
-        if products.is_empty() && captured > 0.0 {
-            let share = predicted / captured;
-            products.push(Product::Figure { name: PREDICTED_SHARE, value: share });
-            if (share - 1.0).abs() > CLOSE_SHARE {
-                products.push(Product::Warning(format!(
-                    "the transport predicts {:.1} % of the light of the regular image: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
-                    share * 100.0
-                )));
-            }
+    /// The camera rows from `first_row` on, of which the images are.
+    fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<Taken>>) -> Result<Held, FoldError> {
+        let regular = taken.get(&Role::Regular).cloned().zip(self.dark_of(&taken, Role::Regular));
+        Ok(Held { first_row, stack: self.stack(taken)?, regular })
+    }
+
+    /// Chooses how to demultiplex by the rows of [`rows_to_choose_by`], which the stack holds alone.
+    fn choose(&self, stack: SweepStack) -> Result<Choices, FoldError> {
+        let rows = rows_to_choose_by(self.geometry.height);
+        self.demux()
+            .and_then(|planned| choose(&planned, &self.options, &self.geometry, &rows, stack))
+            .map_err(refused)
+    }
+
+    /// Stack and transport of some camera rows; what there is to say of them goes into `tally`.
+    fn strip(
+        &self,
+        choices: &Choices,
+        rows: Range<usize>,
+        held: Held,
+        tally: &mut Tally,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Strip, FoldError> {
+        let Held { first_row: held_from, mut stack, regular } = held;
+        let first_row = rows.start;
+        let inner = rows.start - held_from..rows.end - held_from;
+        let transport = choices.solve(rows, held_from, &mut stack, go_on).map_err(refused)?;
+        tally.add_sweep(stack.settings.len(), &transport);
+        if let Some((regular, dark)) = regular {
+            let [image, dark] = [&regular, &dark].map(|taken| taken.image.slice(s![inner.clone(), ..]));
+            let light = (&image - &dark) / self.geometry.white_dn as f32;
+            tally.add_regular(&self.valid(image), &light, &transport);
+            stack.regular = Some(light);
         }
-        products
+        Ok(Strip { first_row, stack, transport })
     }
 
     /// Where an image is not saturated.
-    fn valid(&self, image: &Array2<f32>) -> Array2<bool> {
+    fn valid(&self, image: ArrayView2<'_, f32>) -> Array2<bool> {
         image.mapv(|counts| f64::from(counts) < self.geometry.saturation_dn)
     }
 }
@@ -223,7 +238,12 @@ impl Fold for DemuxFold {
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
         let Some(point) = self.schedule.points.get(unit.id.point as usize) else { return };
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
-        self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() }));
+        match &mut self.not_kept {
+            Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
+            None => {
+                drop(self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() })));
+            }
+        }
     }
 
     fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
@@ -232,36 +252,27 @@ impl Fold for DemuxFold {
 
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError> {
         let taken = std::mem::take(&mut self.taken);
-        let regular = taken.get(&Role::Regular).cloned();
-        let regular = regular.zip(self.dark_of(&taken, Role::Regular));
-        let mut stack = self.stack(taken)?;
+        let mut tally = Tally::default();
         let height = self.geometry.height;
-        let rows = findings::rows_to_choose_by(height);
-        let choices = self
-            .demux()
-            .and_then(|planned| {
-                findings::choose(&planned, &self.options, &self.geometry, &rows, stack.of_rows(&rows))
-            })
-            .map_err(refused)?;
-        let transport = choices.solve(0..height, 0, &mut stack, go_on).map_err(refused)?;
-        let findings = choices.findings;
-
-        let saturated = transport.saturated.iter().filter(|&&saturated| saturated).count();
-        let mut products = vec![
-            Product::Figure { name: "images demultiplexed", value: stack.settings.len() as f64 },
-            Product::Figure { name: "saturated pixels", value: saturated as f64 },
-        ];
-        products.extend(too_many_saturated("the sweep", saturated, transport.saturated.len()));
-        if let Some((regular, dark)) = regular {
-            let light = (&regular.image - &dark.image) / self.geometry.white_dn as f32;
-            products.extend(self.check_regular(&regular.image, &light, &transport));
-            stack.regular = Some(light);
-        }
-        products.extend(findings.warnings.iter().cloned().map(Product::Warning));
-        products.push(Product::Findings(Box::new(findings)));
+        let held = self.hold(0, taken)?;
+        let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)))?;
+        let Strip { stack, transport, .. } = self.strip(&choices, 0..height, held, &mut tally, go_on)?;
+        let mut products = tally.products(choices.findings);
         products.push(Product::Transport(Box::new(transport)));
         products.push(Product::Stack(Box::new(stack)));
         Ok(products)
+    }
+
+    fn keep_no_images(&mut self) {
+        self.not_kept = Some(BTreeMap::new());
+    }
+
+    fn finish_in_strips(
+        &mut self,
+        strips: InStrips<'_>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Vec<Product>, FoldError> {
+        self.solve_in_strips(strips, go_on)
     }
 }
 

@@ -79,7 +79,7 @@ impl<S: Sink + 'static> Pipeline<S> {
     pub fn start(
         config: PipelineConfig,
         assembler: AssemblerConfig,
-        stages: Vec<Box<dyn Stage>>,
+        stages: Arc<[Box<dyn Stage>]>,
         sink: S,
     ) -> Result<(Self, Input<Event>), PipelineError> {
         let workers = rayon::ThreadPoolBuilder::new()
@@ -97,11 +97,7 @@ impl<S: Sink + 'static> Pipeline<S> {
         }
         let sink = spawn("sink", move || run_sink(sink, &items, &give_back))?;
         let assembler = spawn("assembler", move || {
-            run_assembler(
-                Assembler::new(assembler),
-                &events,
-                &Dispatch { workers, stages: stages.into(), done, permits },
-            );
+            run_assembler(Assembler::new(assembler), &events, &Dispatch { workers, stages, done, permits });
         })?;
         Ok((Self { assembler, sink }, input))
     }

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::findings::Findings;
 use crate::products::{Profile, SweepStack};
+use crate::strips::InStrips;
 use crate::unit::Unit;
 
 /// Why a stage gave up on a unit.
@@ -28,6 +29,13 @@ pub trait Stage: Send + Sync {
     /// # Errors
     /// When this unit cannot be processed; its raw image is stored all the same.
     fn apply(&self, unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError>;
+
+    /// How many rows above and below a pixel its result may depend on, wherever in the image it lies: then a stage can
+    /// be given some rows and these beside them. None: it must see the whole image, which costs time where the sweep is
+    /// larger than the memory.
+    fn halo_rows(&self) -> Option<usize> {
+        None
+    }
 }
 
 /// What a fold makes.
@@ -103,6 +111,23 @@ pub trait Fold: Send {
     /// # Errors
     /// When too little was taken, or `go_on` said no.
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError>;
+
+    /// Keeps no images from now on, and gives no snapshots: [`Self::finish_in_strips`] reads them again. Nothing to do
+    /// for a fold whose memory does not grow with the sweep.
+    fn keep_no_images(&mut self) {}
+
+    /// [`Self::finish`] after [`Self::keep_no_images`]. The transport and its stack are not among the products: they are
+    /// given away strip by strip.
+    ///
+    /// # Errors
+    /// Those of [`Self::finish`]; when an image cannot be read again, or a strip is not taken.
+    fn finish_in_strips(
+        &mut self,
+        _strips: InStrips<'_>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Vec<Product>, FoldError> {
+        self.finish(go_on)
+    }
 }
 
 /// A fold's units at some moment.
@@ -175,6 +200,10 @@ impl Stage for HotPixels {
             }
         }
         Ok(repaired)
+    }
+
+    fn halo_rows(&self) -> Option<usize> {
+        Some(self.step_px)
     }
 }
 

@@ -205,9 +205,10 @@ pub struct CheckReport {
     pub frames: u64,
     /// Shortest time that the light takes.
     pub light_s: f64,
-    /// Memory for the images and the results.
+    /// Memory for the images and the results; where it does not suffice to make them in one piece, for some camera rows
+    /// at a time.
     pub memory_bytes: u64,
-    /// Memory that the system can still give.
+    /// Memory that the daemon may use for it: what it is limited to, or else what the system can still give.
     pub memory_free_bytes: u64,
     /// Disk space for the session.
     pub disk_bytes: u64,

@@ -30,15 +30,10 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 /// # Errors
 /// What `fill` gives, or [`Error::Io`]; the file at `path` is then as before.
 pub fn write_with(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<()>) -> Result<()> {
-    let temporary = temporary_path(path);
-    let write_data = || {
-        let mut file = File::create(&temporary)?;
-        fill(&mut file)?;
-        file.sync_all()
-    };
-    write_data().map_err(Error::io("write", &temporary))?;
-    fs::rename(&temporary, path).map_err(Error::io("replace", path))?;
-    sync_dir(parent(path))
+    let mut draft = DraftFile::create(path)?;
+    let filled = fill(&mut draft.file);
+    filled.map_err(draft.failed())?;
+    draft.commit()
 }
 
 /// Makes a new folder, durably. Its existence is the lock: it fails where something has this name.
@@ -74,22 +69,96 @@ pub fn create_dir_all(path: &Path) -> Result<()> {
 /// # Errors
 /// What `fill` gives, or [`Error::Io`]; the folder at `path` is then as before.
 pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
-    let fresh = temporary_path(path);
-    if fresh.exists() {
-        fs::remove_dir_all(&fresh).map_err(Error::io("remove", &fresh))?;
+    let draft = DraftDir::create(path)?;
+    fill(draft.path())?;
+    draft.commit()
+}
+
+/// A folder that is written over some time beside the one that it will replace; as [`replace_dir`]. Dropped without
+/// [`DraftDir::commit`], it is removed.
+pub(crate) struct DraftDir {
+    target: PathBuf,
+    path: PathBuf,
+}
+
+impl DraftDir {
+    /// Makes the temporary folder, in place of one that a crash left.
+    pub(crate) fn create(target: &Path) -> Result<DraftDir> {
+        let path = temporary_path(target);
+        if path.exists() {
+            fs::remove_dir_all(&path).map_err(Error::io("remove", &path))?;
+        }
+        create_dir(&path)?;
+        Ok(DraftDir { target: target.to_owned(), path })
     }
-    create_dir(&fresh)?;
-    fill(&fresh)?;
-    sync_dir(&fresh)?;
-    if path.exists() {
-        exchange(&fresh, path)?;
-    } else {
-        fs::rename(&fresh, path).map_err(Error::io("replace", path))?;
+
+    /// The temporary folder, whose files must be written durably.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
     }
-    sync_dir(parent(path))?;
-    match fs::remove_dir_all(&fresh) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", &fresh)(error)),
-        _ => Ok(()),
+
+    /// Puts the folder in its place.
+    pub(crate) fn commit(self) -> Result<()> {
+        let DraftDir { target, path } = &self;
+        sync_dir(path)?;
+        if target.exists() {
+            exchange(path, target)?;
+        } else {
+            fs::rename(path, target).map_err(Error::io("replace", target))?;
+        }
+        sync_dir(parent(target))?;
+        match fs::remove_dir_all(path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(Error::io("remove", path)(error)),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Drop for DraftDir {
+    fn drop(&mut self) {
+        // After a commit nothing is there; what cannot be removed is removed by the next writer.
+        let _ = fs::remove_dir_all(&self.path);
+    }
+}
+
+/// A file that is written over some time beside the one that it will replace; as [`write`]. Dropped without
+/// [`DraftFile::commit`], it is removed.
+pub(crate) struct DraftFile {
+    target: PathBuf,
+    path: PathBuf,
+    file: File,
+}
+
+impl DraftFile {
+    /// Makes the temporary file; a stale one is overwritten.
+    pub(crate) fn create(target: &Path) -> Result<DraftFile> {
+        let path = temporary_path(target);
+        let file = File::create(&path).map_err(Error::io("write", &path))?;
+        Ok(DraftFile { target: target.to_owned(), path, file })
+    }
+
+    /// The temporary file.
+    pub(crate) fn file(&self) -> &File {
+        &self.file
+    }
+
+    /// For `map_err` of writes to [`DraftFile::file`].
+    pub(crate) fn failed(&self) -> impl FnOnce(io::Error) -> Error {
+        Error::io("write", &self.path)
+    }
+
+    /// Puts the file in its place.
+    pub(crate) fn commit(self) -> Result<()> {
+        self.file.sync_all().map_err(self.failed())?;
+        fs::rename(&self.path, &self.target).map_err(Error::io("replace", &self.target))?;
+        sync_dir(parent(&self.target))
+    }
+}
+
+impl Drop for DraftFile {
+    fn drop(&mut self) {
+        // After a commit nothing is there; what cannot be removed is removed by the next writer.
+        let _ = fs::remove_file(&self.path);
     }
 }
 

@@ -29,3 +29,7 @@ mod zarr;
 
 pub use error::{Error, Result};
 pub use folder::{Listing, Session, SessionSummary, list};
+
+/// Camera rows of a strip: the unit in which [`stack`] and [`transport`] are stored, and so the cheapest in which what is
+/// larger than the memory is read and written.
+pub const STRIP_ROWS: usize = zarr::CHUNK_PX;

@@ -13,7 +13,10 @@ use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
 use ndarray_npy::WriteNpyExt;
 use serde_json::{Map, Value};
 
+pub use self::volume::VolumeWriter;
 use crate::{Error, Result, durable, exr_file};
+
+mod volume;
 
 /// The folder of the products.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,7 +63,25 @@ impl Products {
     /// # Errors
     /// As [`Products::image`].
     pub fn volume(&self, name: &str, values: ArrayView3<f32>, metadata: &Map<String, Value>) -> Result<()> {
-        self.write_array(name, &values, metadata)
+        let mut writer = self.volume_writer(name, values.dim(), metadata)?;
+        writer.append(values)?;
+        writer.commit()
+    }
+
+    /// Begins a volume of this shape `[u, t, s]` that is written in strips of its middle axis, from top to bottom:
+    /// [`Products::volume`] for one that is larger than the memory.
+    ///
+    /// # Errors
+    /// As [`Products::image`].
+    pub fn volume_writer(
+        &self,
+        name: &str,
+        shape: (usize, usize, usize),
+        metadata: &Map<String, Value>,
+    ) -> Result<VolumeWriter> {
+        let path = self.path(name, "npy")?;
+        durable::create_dir_all(&self.dir)?;
+        VolumeWriter::create(&path, shape, (self.path(name, "json")?, sidecar(name, metadata)?))
     }
 
     /// Writes images `[k, t, s]` as `name.npy`, `name.json` and one `name.exr` whose layer `k` has the channel
@@ -137,10 +158,7 @@ impl Products {
             // An array in Fortran order would be written as such.
             values.as_standard_layout().write_npy(BufWriter::new(file)).map_err(io::Error::other)
         })?;
-        let mut sidecar =
-            serde_json::to_vec_pretty(metadata).map_err(Error::codec("encode", format!("{name}.json")))?;
-        sidecar.push(b'\n');
-        self.write(name, "json", &sidecar)
+        self.write(name, "json", &sidecar(name, metadata)?)
     }
 
     fn write(&self, name: &str, extension: &str, bytes: &[u8]) -> Result<()> {
@@ -158,6 +176,13 @@ impl Products {
         }
         Ok(self.dir.join(format!("{name}.{extension}")))
     }
+}
+
+fn sidecar(name: &str, metadata: &Map<String, Value>) -> Result<Vec<u8>> {
+    let mut text =
+        serde_json::to_vec_pretty(metadata).map_err(Error::codec("encode", format!("{name}.json")))?;
+    text.push(b'\n');
+    Ok(text)
 }
 
 #[cfg(test)]

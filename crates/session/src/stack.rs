@@ -13,6 +13,7 @@
 //! ledger is not stored, whatever the array holds there.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -20,6 +21,7 @@ use ndarray::{Array2, Array3, ArrayView2, Axis, Ix2, s};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 use zarrs::array::{Array, ArrayBuilder, data_type};
+use zarrs::storage::ReadableStorageTraits;
 
 use crate::zarr::{self, CHUNK_PX, DurableStore};
 use crate::{Error, Result};
@@ -211,6 +213,25 @@ impl Stack {
         let frame = shard.slice_move(s![0, ..self.shape.rows, ..self.shape.columns]);
         debug_assert_eq!(frame.raw_dim(), Ix2(self.shape.rows, self.shape.columns));
         Ok(frame.as_standard_layout().into_owned())
+    }
+
+    /// Reads some rows of a point, `[rows, s]`, and of its shard no more than the inner chunks that hold them:
+    /// 64 rows from a multiple of 64 on cost least. The checksums of the shard's index and of these chunks are verified.
+    /// That of the ledger is one of the whole point: to hold the point against it, read it once with
+    /// [`Stack::read_point`].
+    ///
+    /// # Errors
+    /// [`Error::NotStored`] where nothing was written, [`Error::Index`], [`Error::Shape`] for rows that the camera does
+    /// not have, or [`Error::Zarr`] for damaged data.
+    pub fn read_rows(&self, array: ArrayName, index: usize, rows: Range<usize>) -> Result<Array2<u32>> {
+        let zarr = self.array(array, index)?;
+        let stored = zarr.storage().size_key(&zarr.chunk_key(&[index as u64, 0, 0]));
+        // Zarr itself takes a missing chunk for zeros.
+        if stored.map_err(Error::zarr("read", &self.dir.join(array.as_str())))?.is_none() {
+            return Err(Error::NotStored { path: self.dir.clone(), array: array.as_str(), index });
+        }
+        let part = zarr::read_part(zarr, [index..index + 1, rows, 0..self.shape.columns])?;
+        Ok(part.index_axis_move(Axis(0), 0))
     }
 
     /// Reads a whole array `[point, t, s]`; points that were never written are 0.

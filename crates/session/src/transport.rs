@@ -6,13 +6,14 @@
 
 use std::path::Path;
 
-use ndarray::{Array3, ArrayView3, s};
+use ndarray::{Array1, Array3, ArrayView3, Axis, s};
 use rayon::prelude::*;
 use serde_json::{Map, Value};
-use zarrs::array::{ArrayBuilder, data_type};
+use zarrs::array::{Array, ArrayBuilder, data_type};
 
+use crate::durable::DraftDir;
 use crate::zarr::{self, CHUNK_PX, DurableStore};
-use crate::{Error, Result, durable};
+use crate::{Error, Result};
 
 const NAME: &str = "transport";
 
@@ -23,34 +24,120 @@ const NAME: &str = "transport";
 /// [`Error::Shape`] for an axis of length 0; [`Error::Zarr`] or [`Error::Io`] where the file system refuses, and then
 /// the group is as before.
 pub fn write(dir: &Path, transport: ArrayView3<f32>, attributes: &Map<String, Value>) -> Result<()> {
-    let (depth, rows, columns) = transport.dim();
-    if transport.is_empty() {
-        let found = transport.shape().to_vec();
-        return Err(Error::Shape {
-            what: "the transport [u, t, s]".into(),
-            found,
-            allowed: "no empty axis".into(),
-        });
-    }
-    let chunk = [depth, rows.min(CHUNK_PX), columns.min(CHUNK_PX)];
-    let to_u64 = |axes: [usize; 3]| axes.map(|len| len as u64).to_vec();
-    let mut builder =
-        ArrayBuilder::new(to_u64([depth, rows, columns]), to_u64(chunk), data_type::float32(), 0.0f32);
-    zarr::with_codecs(&mut builder).dimension_names(Some(["u", "t", "s"])).attributes(attributes.clone());
+    let mut writer = Writer::create(dir, transport.dim(), attributes)?;
+    writer.append(transport)?;
+    writer.commit()
+}
 
-    durable::replace_dir(dir, |fresh| {
-        let store = DurableStore::new(fresh)?;
+/// Writes a transport in strips of camera rows, from top to bottom: [`write()`] for one that is larger than the memory.
+/// Nothing is seen of it before [`Writer::commit`], and nothing stays of it without.
+pub struct Writer {
+    draft: DraftDir,
+    array: Array<DurableStore>,
+    /// `[u, t, s]`
+    shape: (usize, usize, usize),
+    next_row: usize,
+}
+
+impl Writer {
+    /// Begins a transport of this shape `[u, t, s]`, with the attributes of [`write()`].
+    ///
+    /// # Errors
+    /// As [`write()`].
+    pub fn create(
+        dir: &Path,
+        shape: (usize, usize, usize),
+        attributes: &Map<String, Value>,
+    ) -> Result<Writer> {
+        let (depth, rows, columns) = shape;
+        if depth * rows * columns == 0 {
+            return Err(Error::Shape {
+                what: "the transport [u, t, s]".into(),
+                found: vec![depth, rows, columns],
+                allowed: "no empty axis".into(),
+            });
+        }
+        let to_u64 = |axes: [usize; 3]| axes.map(|len| len as u64).to_vec();
+        let mut builder = ArrayBuilder::new(
+            to_u64([depth, rows, columns]),
+            to_u64(chunk_of(shape)),
+            data_type::float32(),
+            0.0f32,
+        );
+        zarr::with_codecs(&mut builder).dimension_names(Some(["u", "t", "s"])).attributes(attributes.clone());
+        let draft = DraftDir::create(dir)?;
+        let store = DurableStore::new(draft.path())?;
         zarr::create_group(&store, Map::new())?;
         let array = zarr::create_array(&store, NAME, &builder)?;
+        Ok(Writer { draft, array, shape, next_row: 0 })
+    }
+
+    /// Writes the next camera rows, durably: a multiple of [`STRIP_ROWS`](crate::STRIP_ROWS), or all that are left.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for other rows; [`Error::Zarr`] where the file system refuses.
+    pub fn append(&mut self, strip: ArrayView3<f32>) -> Result<()> {
+        let (depth, all_rows, columns) = self.shape;
+        let (first_row, rows) = (self.next_row, strip.len_of(Axis(1)));
+        let chunk = chunk_of(self.shape);
+        let end = first_row + rows;
+        let whole_chunks = end == all_rows || (end < all_rows && rows.is_multiple_of(chunk[1]));
+        if rows == 0 || !whole_chunks || strip.dim() != (depth, rows, columns) {
+            return Err(Error::Shape {
+                what: format!("a strip of the transport from row {first_row} on"),
+                found: strip.shape().to_vec(),
+                allowed: format!(
+                    "[{depth}, a multiple of {} or the last {}, {columns}]",
+                    chunk[1],
+                    all_rows - first_row
+                ),
+            });
+        }
         let chunks_across = columns.div_ceil(chunk[2]);
         // While one chunk waits for the disk, others are compressed.
         (0..rows.div_ceil(chunk[1]) * chunks_across).into_par_iter().try_for_each(|index| {
             let (chunk_row, chunk_column) = (index / chunks_across, index % chunks_across);
             let (t, s) = (chunk_row * chunk[1], chunk_column * chunk[2]);
-            let part = transport.slice(s![.., t..rows.min(t + chunk[1]), s..columns.min(s + chunk[2])]);
-            zarr::write_chunk(&array, [0, chunk_row as u64, chunk_column as u64], chunk, part)
-        })
-    })
+            let part = strip.slice(s![.., t..rows.min(t + chunk[1]), s..columns.min(s + chunk[2])]);
+            let chunk_row = first_row / chunk[1] + chunk_row;
+            zarr::write_chunk(&self.array, [0, chunk_row as u64, chunk_column as u64], chunk, part)
+        })?;
+        self.next_row = end;
+        Ok(())
+    }
+
+    /// Puts the transport in its place.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] while rows are lacking; [`Error::Io`] where the file system refuses.
+    pub fn commit(self) -> Result<()> {
+        let (depth, rows, columns) = self.shape;
+        if self.next_row < rows {
+            return Err(Error::Shape {
+                what: "the transport that is to be put in place".into(),
+                found: vec![depth, self.next_row, columns],
+                allowed: format!("{:?}", [depth, rows, columns]),
+            });
+        }
+        self.draft.commit()
+    }
+}
+
+fn chunk_of((depth, rows, columns): (usize, usize, usize)) -> [usize; 3] {
+    [depth, rows.min(CHUNK_PX), columns.min(CHUNK_PX)]
+}
+
+/// Reads the profiles over u of some pixels `[t, s]`, without the rest.
+///
+/// # Errors
+/// [`Error::Shape`] for pixels that it does not have; as [`read`].
+pub fn read_profiles(dir: &Path, pixels: &[[usize; 2]]) -> Result<Vec<Array1<f32>>> {
+    let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
+    let depth = array.shape()[0] as usize;
+    let profile = |&[t, s]: &[usize; 2]| {
+        zarr::read_part(&array, [0..depth, t..t + 1, s..s + 1]).map(|part| part.into_flat())
+    };
+    pixels.iter().map(profile).collect()
 }
 
 /// Reads `transport [u, t, s]` and its attributes.
@@ -105,6 +192,69 @@ mod tests {
         write(&path, volume((3, 4, 5)).view(), &attributes(-2)).unwrap();
         assert_eq!(read(&path).unwrap(), (volume((3, 4, 5)), attributes(-2)));
         assert!(!path.join("transport/c.0.2.2").exists());
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    /// All files below a folder, with their bytes.
+    fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
+        let mut files: Vec<_> = ["zarr.json", "transport/zarr.json"].map(str::to_owned).into();
+        let chunks = fs::read_dir(dir.join("transport")).unwrap();
+        files.extend(
+            chunks.map(|entry| format!("transport/{}", entry.unwrap().file_name().to_str().unwrap())),
+        );
+        files.sort();
+        files
+            .into_iter()
+            .map(|name| {
+                let bytes = fs::read(dir.join(&name)).unwrap();
+                (name, bytes)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn strips_give_the_files_of_the_whole_and_profiles_are_its_columns() {
+        let dir = tempfile::tempdir().unwrap();
+        for (shape, strips) in
+            [((3, 130, 70), vec![64, 64, 2]), ((3, 200, 64), vec![128, 72]), ((2, 5, 7), vec![5])]
+        {
+            let (whole, in_strips) = (dir.path().join("whole.zarr"), dir.path().join("strips.zarr"));
+            let volume = volume(shape);
+            write(&whole, volume.view(), &attributes(-3)).unwrap();
+            let mut writer = Writer::create(&in_strips, shape, &attributes(-3)).unwrap();
+            let mut first = 0;
+            for rows in strips {
+                writer.append(volume.slice(s![.., first..first + rows, ..])).unwrap();
+                first += rows;
+                assert!(!in_strips.exists(), "nothing is seen before the end");
+            }
+            writer.commit().unwrap();
+            assert!(files(&in_strips) == files(&whole), "{shape:?}");
+            let pixels = [[0, 0], [shape.1 - 1, shape.2 - 1], [shape.1 / 2, 3]];
+            for ([t, s], profile) in pixels.into_iter().zip(read_profiles(&in_strips, &pixels).unwrap()) {
+                assert_eq!(profile, volume.slice(s![.., t, s]));
+            }
+            let outside = read_profiles(&in_strips, &[[shape.1, 0]]);
+            assert!(matches!(outside, Err(Error::Shape { .. })));
+            fs::remove_dir_all(&in_strips).unwrap();
+        }
+    }
+
+    #[test]
+    fn what_is_not_whole_is_not_put_in_place_and_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("transport.zarr");
+        let volume = volume((2, 130, 5));
+        write(&path, volume.view(), &attributes(7)).unwrap();
+        let mut writer = Writer::create(&path, (2, 130, 5), &attributes(0)).unwrap();
+        for rows in [0..0, 0..63, 0..131, 0..65] {
+            let columns = if rows.end > 130 { 0..0 } else { 0..5 };
+            let strip = volume.slice(s![.., rows.start..rows.end.min(130), columns]);
+            assert!(matches!(writer.append(strip), Err(Error::Shape { .. })), "{rows:?}");
+        }
+        writer.append(volume.slice(s![.., ..64, ..])).unwrap();
+        assert!(matches!(writer.commit(), Err(Error::Shape { .. })));
+        assert_eq!(read(&path).unwrap(), (volume, attributes(7)));
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 

@@ -1,5 +1,6 @@
 //! What `stack.zarr` and `transport.zarr` share: a durable store, and chunks at the edge of an array.
 
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -7,8 +8,8 @@ use ndarray::{Array3, ArrayView3, s};
 use serde_json::{Map, Value};
 use zarrs::array::codec::{BytesCodec, ShardingCodecOptions, SubchunkWriteOrder, ZstdCodec};
 use zarrs::array::{
-    Array, ArrayBuilder, ArrayMetadataOptions, BytesToBytesCodecTraits, CodecOptions, CodecSpecificOptions,
-    Element, ElementOwned,
+    Array, ArrayBuilder, ArrayMetadataOptions, ArraySubset, BytesToBytesCodecTraits, CodecOptions,
+    CodecSpecificOptions, Element, ElementOwned,
 };
 use zarrs::filesystem::FilesystemStore;
 use zarrs::group::GroupBuilder;
@@ -157,6 +158,24 @@ pub(crate) fn write_chunk<T: Element + Clone + Default>(
     chunk.slice_mut(s![..depth, ..rows, ..columns]).assign(&data);
     let options = codec_options();
     array.store_chunk_opt(&indices, chunk, &options).map_err(Error::zarr("write", &path_of(array)))
+}
+
+/// Reads a part of an array, and of its shards no more than the inner chunks that hold it. Parts of chunks that were
+/// never written are 0.
+pub(crate) fn read_part<T: ElementOwned>(
+    array: &Array<DurableStore>,
+    part: [Range<usize>; 3],
+) -> Result<Array3<T>> {
+    let shape = shape_of(array);
+    if part.iter().zip(&shape).any(|(range, &len)| range.start >= range.end || range.end > len) {
+        return Err(Error::Shape {
+            what: format!("a part of {}", path_of(array).display()),
+            found: part.iter().map(|range| range.end).collect(),
+            allowed: format!("not empty, and within {shape:?}"),
+        });
+    }
+    let subset = ArraySubset::new_with_ranges(&part.map(|range| range.start as u64..range.end as u64));
+    array.retrieve_array_subset_opt(&subset, &codec_options()).map_err(Error::zarr("read", &path_of(array)))
 }
 
 /// Reads a whole array.

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytesize::ByteSize;
 use clap::Parser;
 use raysweep::control::Control;
 use raysweep::live::{LiveError, LiveFile};
@@ -39,6 +40,10 @@ struct Arguments {
     /// Group whose members may drive the rig; others who can connect may only look.
     #[arg(long, value_name = "GROUP", default_value = "raysweep")]
     operators: String,
+    /// Memory that the results of a run may take, such as 2GB: larger sweeps are solved some camera rows at a time, after
+    /// their end [default: what is free when the run begins]
+    #[arg(long, value_name = "SIZE")]
+    memory: Option<ByteSize>,
     /// Reads the rig file, opens every device once, says what it found, and ends.
     #[arg(long)]
     check: bool,
@@ -77,6 +82,10 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     prepare_data(&arguments.data).map_err(|error| {
         format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
     })?;
+    let runner = match arguments.memory {
+        Some(size) => runner.with_memory_limit(size.as_u64()),
+        None => runner,
+    };
     let runner = Arc::new(match live_file(arguments)? {
         Some(file) => runner.with_live(file),
         None => runner,

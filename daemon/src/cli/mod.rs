@@ -12,6 +12,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
 use raysweep_proto::{Client, ClientError, Empty, ErrorCode, RpcError, RunParams, RunState, Started};
 use serde::Serialize;
@@ -115,6 +116,10 @@ enum Command {
         /// Make the given products only, not the plan's
         #[arg(long, requires = "products")]
         only: bool,
+        /// Take no more memory than this for the results, such as 2GB: larger sweeps are solved some camera rows at a time
+        /// [default: what is free]
+        #[arg(long, value_name = "SIZE")]
+        memory: Option<ByteSize>,
     },
     /// Copy a session's products, report and manifest; needs no daemon
     Export {
@@ -202,8 +207,9 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
             printer.print(&Empty {}, |_| "the run is being ended; what was acquired is kept".into())?;
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
-        Command::Process { session, products, only } => {
-            let made = process_asked(&session, &Asked { products, only })?;
+        Command::Process { session, products, only, memory } => {
+            let memory_limit_bytes = memory.map(|size| size.as_u64());
+            let made = process_asked(&session, &Asked { products, only, memory_limit_bytes })?;
             let value = json!({
                 "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
             });

@@ -5,6 +5,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use ndarray::Array2;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 use raysweep_pipeline::{Snapshot, message_of};
 use raysweep_proto::Event;
@@ -41,13 +42,25 @@ impl Outlet {
         took: Duration,
         last: bool,
     ) -> Result<(), LiveError> {
+        let [epipolar, indirect, total] =
+            [transport.epipolar(1), transport.non_epipolar(1), transport.total()];
+        self.show_images([&epipolar, &indirect, &total], points, took, last)
+    }
+
+    /// [`Self::show`] of the transport's epipolar light, all other light, and both.
+    ///
+    /// # Errors
+    /// Those of [`LiveFile::publish`].
+    pub fn show_images(
+        &self,
+        images: [&Array2<f32>; 3],
+        points: usize,
+        took: Duration,
+        last: bool,
+    ) -> Result<(), LiveError> {
         let seconds = took.as_secs_f64();
         let mut sequence = 0;
-        for (name, image) in [
-            (EPIPOLAR, transport.epipolar(1)),
-            (INDIRECT, transport.non_epipolar(1)),
-            (TOTAL, transport.total()),
-        ] {
+        for (name, image) in [EPIPOLAR, INDIRECT, TOTAL].into_iter().zip(images) {
             let entries = [
                 ("axes", json!(["t", "s"])),
                 ("units", json!("1 = a white pixel lit by its own projector row")),
@@ -170,7 +183,7 @@ fn work(inbox: &Inbox, pool: &ThreadPool, outlet: &Outlet) {
 mod tests {
     use std::sync::mpsc::{Receiver, Sender, channel};
 
-    use ndarray::{Array2, Array3};
+    use ndarray::Array3;
     use raysweep_pipeline::FoldError;
     use tokio::sync::broadcast;
 

@@ -160,7 +160,7 @@ impl Run {
             None => None,
         };
         let (verdicts, results) = channel();
-        let stages = std::mem::take(&mut self.processing.stages);
+        let stages = self.processing.stages.clone();
         let storage = Storage {
             task: self.task.clone(),
             stack,

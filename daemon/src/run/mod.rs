@@ -16,7 +16,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{Product, Registry, message_of};
+use raysweep_pipeline::{Registry, message_of};
 use raysweep_proto::{
     CheckReport, ErrorCode, Event, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
@@ -34,9 +34,11 @@ use crate::check;
 use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
 use crate::live::{LiveFile, Outlet};
+use crate::memory::{MemoryNeed, available_bytes};
 use crate::processing::Task;
-use crate::results;
+use crate::results::{self, Results};
 use crate::rig::{Rig, RigError};
+use crate::strips::Overview;
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
@@ -47,6 +49,7 @@ pub struct Runner {
     registry: Arc<Registry>,
     board: Arc<Board>,
     live: Option<Arc<LiveFile>>,
+    memory_limit_bytes: Option<u64>,
     current: Mutex<Option<Current>>,
     /// Set once, when no further run may begin.
     closed: AtomicBool,
@@ -82,6 +85,7 @@ impl Runner {
             registry: Arc::new(registry),
             board: Arc::new(Board::new("plane")),
             live: None,
+            memory_limit_bytes: None,
             current: Mutex::default(),
             closed: AtomicBool::new(false),
         })
@@ -92,6 +96,14 @@ impl Runner {
     pub fn with_live(mut self, file: LiveFile) -> Self {
         self.board.set_live(file.path().to_owned());
         self.live = Some(Arc::new(file));
+        self
+    }
+
+    /// The same; results that would take more memory than this are made some camera rows at a time. Without, that is
+    /// what is free when a run begins.
+    #[must_use]
+    pub fn with_memory_limit(mut self, bytes: u64) -> Self {
+        self.memory_limit_bytes = Some(bytes);
         self
     }
 
@@ -106,7 +118,8 @@ impl Runner {
         let size = (self.camera.height, self.camera.width);
         let task = Task::new(parsed, &self.rig.file, self.rig.first_row(), size);
         let processing = task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
-        let report = check::check(&task, &processing.products, &self.camera, &self.data)
+        let limit_bytes = self.memory_limit_bytes;
+        let report = check::check(&task, &processing.products, &self.camera, &self.data, limit_bytes)
             .map_err(|error| invalid_plan(&error))?;
         Ok((task, report))
     }
@@ -164,7 +177,14 @@ impl Runner {
 
     fn spawn(&self, prepared: Prepared) -> Result<(Started, Current), RpcError> {
         let Prepared { task, session, ledger, plan_text, resumed } = prepared;
-        let processing = task.processing(&self.registry, &plan_text).map_err(|error| invalid_plan(&error))?;
+        let mut processing =
+            task.processing(&self.registry, &plan_text).map_err(|error| invalid_plan(&error))?;
+        let memory = MemoryNeed::of(&task, &processing.products)
+            .map_err(|error| RpcError::new(ErrorCode::InvalidPlan, error.to_string()))?;
+        let in_strips = memory.in_strips(available_bytes(self.memory_limit_bytes));
+        if in_strips {
+            processing.keep_no_images();
+        }
         let dir = session.dir().to_owned();
         self.board.set_session(dir.clone());
         let orders = Arc::new(Orders::default());
@@ -189,7 +209,7 @@ impl Runner {
             .spawn({
                 let orders = orders.clone();
                 let dir = dir.clone();
-                move || conduct(run, &orders, &board, &dir)
+                move || conduct(run, in_strips, &orders, &board, &dir)
             })
             .map_err(|error| RpcError::new(ErrorCode::Internal, format!("no thread for the run: {error}")))?;
         Ok((Started { session: dir }, Current { orders, thread }))
@@ -208,7 +228,7 @@ impl Runner {
         }
         if report.memory_bytes > report.memory_free_bytes {
             let what = format!(
-                "the run needs {} MB of memory, {} MB are free: take fewer points, a smaller region, or a larger machine",
+                "the run needs {} MB of memory even some camera rows at a time, {} MB may be used: make shorter sequences, give the daemon more --memory, or take a larger machine",
                 report.memory_bytes / 1_000_000,
                 report.memory_free_bytes / 1_000_000
             );
@@ -269,7 +289,7 @@ impl Runner {
 }
 
 /// The run's thread: acquires, makes the results, and says how it ended. Nothing it meets leaves the daemon stuck.
-fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
+fn conduct(run: Run, in_strips: bool, orders: &Orders, board: &Board, dir: &Path) {
     let task = run.task.clone();
     let rig = run.rig.clone();
     let live = run.live.clone();
@@ -278,7 +298,7 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
         let acquired = run.acquire()?;
         match task.is_film() {
             true => conclude_film(acquired, &task, &rig, orders),
-            false => conclude(acquired, &task, &rig, orders, live.as_ref()),
+            false => conclude(acquired, in_strips, &task, &rig, orders, live.as_ref()),
         }
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
@@ -325,6 +345,7 @@ fn conduct(run: Run, orders: &Orders, board: &Board, dir: &Path) {
 /// Makes the results of what was acquired, unless it is told to end: then there are none yet, so that it ends soon.
 fn conclude(
     acquired: Acquired,
+    in_strips: bool,
     task: &Task,
     rig: &Rig,
     orders: &Orders,
@@ -333,7 +354,11 @@ fn conclude(
     let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
     let whole = fault.is_none() && engine::missing(task, ledger.state()).is_empty();
     let began = Instant::now();
-    let results = whole.then(|| processing.finish(&|| orders.go_on()));
+    let make = || match in_strips {
+        true => Results::in_strips(processing, &session, ledger.state(), task, &|| orders.go_on()),
+        false => Ok(Results::whole(processing, &|| orders.go_on())),
+    };
+    let mut results = whole.then(make).transpose()?;
     let computed = began.elapsed();
     let state = match (&fault, &results) {
         (Some(_), _) => EndState::Faulted,
@@ -350,20 +375,23 @@ fn conclude(
         vsync,
         final_s: None,
     };
-    if let (EndState::Complete, Some((products, problems))) = (state, &results) {
-        results::write_transport(&session, task, products)?;
+    if let (EndState::Complete, Some(results)) = (state, &mut results) {
+        results.write_transport(&session, task)?;
         end.final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
-        show_last(live, products, stored, computed);
-        results::write_products(&session, task, products)?;
+        let overview = results.overview();
+        if let Some((live, overview)) = live.zip(overview.as_ref()) {
+            show_last(live, overview, stored, computed);
+        }
+        results::write_products(&session, task, &results.products)?;
         ledger.append(&Entry::End(end.clone()))?;
-        results::write_report(&session, ledger.state(), task, products, problems)?;
+        results::write_report(&session, ledger.state(), task, results, overview.as_ref())?;
         results::write_manifest(&session, ledger.state(), task, &rig.file)?;
         let (computed_s, written_s) = (computed.as_secs_f64(), (began.elapsed() - computed).as_secs_f64());
         tracing::info!(computed_s, written_s, final_s = end.final_s, "results made");
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    let warnings = results.map_or_else(Vec::new, |(products, mut problems)| {
+    let warnings = results.map_or_else(Vec::new, |Results { products, mut problems, .. }| {
         problems.extend(results::warnings(&products));
         problems
     });
@@ -399,13 +427,10 @@ fn conclude_film(
 }
 
 /// Shows the result where the estimates before it were shown.
-fn show_last(live: Option<&Outlet>, products: &[Product], points: usize, took: Duration) {
-    for product in products {
-        if let (Some(live), Product::Transport(transport)) = (live, product)
-            && let Err(error) = live.show(transport, points, took, true)
-        {
-            tracing::warn!(%error, "the result is not among the live images");
-        }
+fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) {
+    let Overview { epipolar, non_epipolar, total, .. } = overview;
+    if let Err(error) = live.show_images([epipolar, non_epipolar, total], points, took, true) {
+        tracing::warn!(%error, "the result is not among the live images");
     }
 }
 

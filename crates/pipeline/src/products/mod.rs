@@ -1,6 +1,7 @@
 //! Products by the names that plans use: what a `[[product]]` asks for, checked before anything moves, and made of the
 //! transport and the stack at the end of the run or long after it.
 
+mod assembly;
 mod band;
 mod profile;
 mod relight;
@@ -18,6 +19,7 @@ use self::relight::Pattern;
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage::Product;
 
+pub use self::assembly::Assembly;
 pub use self::profile::Profile;
 
 /// The images that a transport was made of.
@@ -31,7 +33,8 @@ pub struct SweepStack {
     pub exposures_us: Vec<f64>,
     /// How each image was taken.
     pub settings: Vec<Setting>,
-    /// `[settings, t, s]`, dark image subtracted, 1 = a white pixel lit by its own projector row.
+    /// `[settings, t, s]` of all camera rows, or those of a [`crate::Strip`]; dark image subtracted, 1 = a white pixel lit
+    /// by its own projector row.
     pub images: Array3<f32>,
     /// Which samples are not saturated, of the same shape; none: all.
     pub valid: Option<Array3<bool>>,
@@ -206,28 +209,9 @@ impl ProductSpec {
     /// # Errors
     /// When what it needs was not taken, or saturates.
     pub fn make(&self, stack: &SweepStack, transport: &Transport) -> Result<Product, NotMade> {
-        let name = self.name.clone();
-        let not_made = |what: String| NotMade { name: self.name.clone(), what };
-        match &self.kind {
-            Kind::Regular => match &stack.regular {
-                Some(image) => Ok(Product::Image {
-                    name,
-                    about: "a captured exposure of one whole VSYNC period: every row lit once".into(),
-                    image: image.clone(),
-                }),
-                None => {
-                    Err(not_made("the regular image or its dark image is not there: resume the run".into()))
-                }
-            },
-            Kind::Epipolar(width) => Ok(width.epipolar(name, transport)),
-            Kind::NonEpipolar(width) => Ok(width.non_epipolar(name, transport)),
-            Kind::Band(band) => Ok(band.make(name, transport)),
-            Kind::Relight(pattern) => {
-                pattern.make(name, &stack.timing, transport).map_err(|error| not_made(error.to_string()))
-            }
-            Kind::DelayProfile(options) => options.make(name, stack, transport).map_err(not_made),
-            Kind::Uncertainty(band) => uncertainty::make(name, *band, stack, transport).map_err(not_made),
-        }
+        let mut assembly = Assembly::new(self.clone());
+        assembly.add(0, stack, transport)?;
+        assembly.finish()
     }
 }
 

@@ -2,7 +2,7 @@
 //! predicts it.
 
 use ndarray::Axis;
-use raysweep_transport::plane::{DelayProfile, Transport};
+use raysweep_transport::plane::{DelayProfile, Setting, Transport};
 use serde::Deserialize;
 
 use super::SweepStack;
@@ -27,6 +27,17 @@ pub(super) struct ProfileOptions {
     /// `[t0, t1, s0, s1]`, half open; a pixel is a region of one.
     region: [usize; 4],
     exposure_us: f64,
+}
+
+/// Sums over the pixels of a profile, taken from the camera rows from top to bottom.
+#[derive(Debug, Default)]
+pub(super) struct ProfileSums {
+    /// How the images at the profile's exposure were taken.
+    settings: Vec<Setting>,
+    /// Sum of the pixels' light in each of them.
+    measured: Vec<f64>,
+    predicted: Vec<f64>,
+    pixels: usize,
 }
 
 /// Light over the delay at one exposure.
@@ -113,35 +124,61 @@ impl ProfileOptions {
         }
     }
 
-    pub(super) fn make(
+    /// Adds what of it lies in the camera rows from `first_row` on, of which stack and transport are.
+    pub(super) fn add(
         self,
-        name: String,
+        sums: &mut ProfileSums,
+        first_row: usize,
         stack: &SweepStack,
         transport: &Transport,
-    ) -> Result<Product, String> {
-        let exposure_us = self.exposure_us;
+    ) {
         let taken: Vec<usize> =
-            (0..stack.settings.len()).filter(|&n| stack.exposures_us[n] == exposure_us).collect();
-        if taken.len() < MIN_DELAYS {
-            return Err(format!(
-                "{} images of {exposure_us} µs are there, a profile takes {MIN_DELAYS}: resume the run",
-                taken.len()
-            ));
+            (0..stack.settings.len()).filter(|&n| stack.exposures_us[n] == self.exposure_us).collect();
+        if sums.settings.is_empty() {
+            sums.settings = taken.iter().map(|&n| stack.settings[n].clone()).collect();
+            sums.measured = vec![0.0; taken.len()];
+            sums.predicted = vec![0.0; taken.len()];
         }
-        let settings: Vec<_> = taken.iter().map(|&n| stack.settings[n].clone()).collect();
         let [t0, t1, s0, s1] = self.region;
+        let end = first_row + stack.images.len_of(Axis(1));
         // A pixel that saturates at some delays would distort the others' profile there and only there.
         let unsaturated = |[t, s]: &[usize; 2]| {
             stack.valid.as_ref().is_none_or(|valid| taken.iter().all(|&n| valid[[n, *t, *s]]))
         };
-        let all = (t0..t1).flat_map(|t| (s0..s1).map(move |s| [t, s]));
+        let rows = t0.max(first_row)..t1.min(end);
+        let all = rows.flat_map(|t| (s0..s1).map(move |s| [t - first_row, s]));
         let pixels: Vec<[usize; 2]> = all.filter(unsaturated).collect();
         if pixels.is_empty() {
+            return;
+        }
+        sums.pixels += pixels.len();
+        let images = stack.images.select(Axis(0), &taken);
+        DelayProfile::add_measured(&mut sums.measured, images.view(), &pixels);
+        DelayProfile::add_predicted(
+            &mut sums.predicted,
+            &stack.timing,
+            first_row,
+            transport,
+            &sums.settings,
+            &pixels,
+        );
+    }
+
+    pub(super) fn make(self, name: String, sums: &ProfileSums) -> Result<Product, String> {
+        let exposure_us = self.exposure_us;
+        let taken = sums.settings.len();
+        if taken < MIN_DELAYS {
+            return Err(format!(
+                "{taken} images of {exposure_us} µs are there, a profile takes {MIN_DELAYS}: resume the run"
+            ));
+        }
+        if sums.pixels == 0 {
             return Err(format!(
                 "every pixel of it saturates at some delay at {exposure_us} µs: choose a shorter exposure_us, or other pixels"
             ));
         }
-        let left_out = (t1 - t0) * (s1 - s0) - pixels.len();
+        let [t0, t1, s0, s1] = self.region;
+        let left_out = (t1 - t0) * (s1 - s0) - sums.pixels;
         let mut about = match (t1 - t0, s1 - s0) {
             (1, 1) => {
                 format!("light of pixel t {t0}, s {s0} over the delay at an exposure of {exposure_us} µs")
@@ -153,13 +190,13 @@ impl ProfileOptions {
         if left_out > 0 {
             about.push_str(&format!("; {left_out} pixels that saturate are left out"));
         }
-        let images = stack.images.select(Axis(0), &taken);
+        let mean = |light: &[f64]| DelayProfile::mean(&sums.settings, light, sums.pixels);
         Ok(Product::Profile(Profile {
             name,
             about,
             exposure_us,
-            measured: DelayProfile::measured(images.view(), &settings, &pixels),
-            predicted: DelayProfile::predicted(&stack.timing, transport, &settings, &pixels),
+            measured: mean(&sums.measured),
+            predicted: mean(&sums.predicted),
         }))
     }
 }

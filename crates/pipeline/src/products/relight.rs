@@ -1,7 +1,7 @@
 //! Product `relight`: the scene under another pattern of projector rows than all of them.
 
 use ndarray::{Array1, Array3, Axis};
-use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight};
+use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
 use super::reach_of;
@@ -113,15 +113,17 @@ impl Pattern {
         }
     }
 
+    /// Makes it of the camera rows from `first_row` on, of which the transport is.
     pub(super) fn make(
         &self,
         name: String,
         timing: &RowTiming,
+        first_row: usize,
         transport: &Transport,
     ) -> Result<Product, PlaneError> {
         let rows = timing.projector_rows();
         let reach = reach_of(transport);
-        let under = |weights: &Array1<f64>| relight(timing, transport, weights.view());
+        let under = |weights: &Array1<f64>| relight_rows(timing, first_row, transport, weights.view());
         let (about, weights) = match self {
             Self::Rows(pieces) => {
                 let mut weights = Array1::zeros(rows);

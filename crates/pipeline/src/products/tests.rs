@@ -193,6 +193,62 @@ fn saturated_pixels_are_left_out_of_a_profile_and_said_to_be() {
     assert!(make(json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 200 })).is_ok());
 }
 
+/// Rows `rows` of stack and transport.
+fn strip(stack: &SweepStack, rows: std::ops::Range<usize>) -> (SweepStack, Transport) {
+    let (stack, transport) = (stack.clone(), transport());
+    let cut = SweepStack {
+        images: stack.images.slice(s![.., rows.clone(), ..]).to_owned(),
+        valid: stack.valid.map(|valid| valid.slice(s![.., rows.clone(), ..]).to_owned()),
+        regular: stack.regular.map(|regular| regular.slice(s![rows.clone(), ..]).to_owned()),
+        variance_ratio: stack.variance_ratio.map(|ratio| ratio.slice(s![rows.clone(), ..]).to_owned()),
+        ..stack
+    };
+    let transport = Transport {
+        t: transport.t.slice(s![.., rows.clone(), ..]).to_owned(),
+        exists: transport.exists.slice(s![.., rows.clone()]).to_owned(),
+        saturated: transport.saturated.slice(s![rows, ..]).to_owned(),
+        ..transport
+    };
+    (cut, transport)
+}
+
+#[test]
+fn products_of_strips_have_the_bits_of_the_whole() {
+    let mut stack = stack();
+    // Sums of thirds depend on their order.
+    stack.images.mapv_inplace(|light| light / 3.0);
+    stack.regular = Some(stack.images.sum_axis(Axis(0)));
+    let mut valid = Array3::from_elem(stack.images.dim(), true);
+    valid[[1, 4, 2]] = false;
+    stack.valid = Some(valid);
+    stack.noise = Some(NoiseModel { read_variance: 1e-4, gain: 1e-4 });
+    stack.variance_ratio = Some(Array2::from_shape_fn((6, 3), |(t, s)| 1.0 / (1 + t + s) as f32));
+    for table in [
+        json!({ "kind": "regular" }),
+        json!({ "kind": "epipolar", "width_rows": 3 }),
+        json!({ "kind": "non-epipolar" }),
+        json!({ "kind": "band", "from_rows": 1, "side": "below" }),
+        json!({ "kind": "relight", "rows": [{ "first": 1, "last": 8, "weight": 0.3 }] }),
+        json!({ "kind": "relight", "stripes": { "period_rows": 3, "lit_rows": 2, "phase_rows": 1 } }),
+        json!({ "kind": "relight", "line": { "height_rows": 2, "step_rows": 2 } }),
+        json!({ "kind": "delay-profile", "pixel": [3, 1] }),
+        json!({ "kind": "delay-profile", "region": [1, 6, 0, 3] }),
+        json!({ "kind": "uncertainty", "from_rows": 1, "to_rows": 3 }),
+    ] {
+        let spec = spec(&table).unwrap();
+        let whole = spec.make(&stack, &transport()).unwrap();
+        for cuts in [vec![0, 4, 6], vec![0, 1, 2, 3, 4, 5, 6]] {
+            let mut assembly = Assembly::new(spec.clone());
+            for rows in cuts.windows(2) {
+                let (stack, transport) = strip(&stack, rows[0]..rows[1]);
+                assembly.add(rows[0], &stack, &transport).unwrap();
+            }
+            let assembled = assembly.finish().unwrap();
+            assert_eq!(format!("{assembled:?}"), format!("{whole:?}"), "{table}");
+        }
+    }
+}
+
 #[test]
 fn what_was_not_taken_is_not_made() {
     let mut stack = stack();

@@ -7,9 +7,11 @@ use super::SweepStack;
 use super::band::Band;
 use crate::stage::Product;
 
+/// Of the camera rows from `first_row` on, of which stack and transport are.
 pub(super) fn make(
     name: String,
     band: Band,
+    first_row: usize,
     stack: &SweepStack,
     transport: &Transport,
 ) -> Result<Product, String> {
@@ -27,7 +29,9 @@ pub(super) fn make(
         noise,
         frames: &frames,
     };
-    let sd = model.of_bands(transport, &samples, &[band.ranges()]).map_err(|error| error.to_string())?;
+    let sd = model
+        .of_bands_in_rows(first_row, transport, &samples, &[band.ranges()])
+        .map_err(|error| error.to_string())?;
     let about =
         format!("standard deviation, through noise alone, of {}; the prior's bias is not in it", band.says());
     Ok(Product::Image { name, about, image: sd.index_axis_move(Axis(0), 0) })

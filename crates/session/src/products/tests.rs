@@ -116,6 +116,28 @@ fn a_volume_is_written_in_c_order_whatever_its_order_in_memory() {
 }
 
 #[test]
+fn a_volume_in_strips_has_the_bytes_of_the_whole() {
+    let (_dir, products) = products();
+    let values = Array3::from_shape_fn((4, 7, 5), |(u, t, s)| (u * 100 + t * 10 + s) as f32 / 3.0);
+    products.volume("whole", values.view(), &metadata()).unwrap();
+    let mut writer = products.volume_writer("strips", (4, 7, 5), &metadata()).unwrap();
+    for rows in [0..3, 3..4, 4..7] {
+        writer.append(values.slice(ndarray::s![.., rows, ..])).unwrap();
+        assert!(!products.dir().join("strips.npy").exists(), "nothing is seen before the end");
+    }
+    assert!(matches!(writer.append(values.slice(ndarray::s![.., ..1, ..])), Err(Error::Shape { .. })));
+    writer.commit().unwrap();
+    for extension in ["npy", "json"] {
+        let bytes = |name: &str| fs::read(products.dir().join(format!("{name}.{extension}"))).unwrap();
+        assert!(bytes("strips") == bytes("whole"), "{extension}");
+    }
+    let mut cut_short = products.volume_writer("strips", (4, 7, 5), &metadata()).unwrap();
+    cut_short.append(values.slice(ndarray::s![.., ..6, ..])).unwrap();
+    assert!(matches!(cut_short.commit(), Err(Error::Shape { .. })));
+    assert_eq!(fs::read_dir(products.dir()).unwrap().count(), 4, "what was not whole left nothing");
+}
+
+#[test]
 fn the_same_image_gives_the_same_bytes() {
     let (_dir, products) = products();
     let bytes = |name: &str| {

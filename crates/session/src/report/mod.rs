@@ -10,7 +10,7 @@ mod plot;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
 pub use contact_sheet::ContactSheet;
-pub use picture::{Marker, Picture, ToneMap};
+pub use picture::{Marker, Picture, ToneMap, ToneSamples};
 pub use plot::{Guide, Plot, Series, SeriesStyle};
 
 use crate::Result;

@@ -3,7 +3,7 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use maud::{Markup, html};
-use ndarray::{Array3, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
 use super::PALETTE;
 use crate::{Error, Result};
@@ -33,16 +33,9 @@ impl ToneMap {
     /// The scale on which `percent` of all pixels of these images are not overexposed; white is 1 where that would be
     /// 0 or where there are no finite values.
     pub fn percentile(images: &[ArrayView2<f32>], percent: f64) -> ToneMap {
-        let total: usize = images.iter().map(|image| image.len()).sum();
-        let step = total.div_ceil(PERCENTILE_SAMPLES).max(1);
-        let values = images.iter().flat_map(|image| image.iter().copied());
-        let mut values: Vec<f32> = values.step_by(step).filter(|value| value.is_finite()).collect();
-        if values.is_empty() {
-            return ToneMap { white: 1.0 };
-        }
-        let rank = (percent.clamp(0.0, 100.0) / 100.0 * (values.len() - 1) as f64).round() as usize;
-        let (_, &mut white, _) = values.select_nth_unstable_by(rank, f32::total_cmp);
-        ToneMap { white: if white > 0.0 { white } else { 1.0 } }
+        let mut samples = ToneSamples::new(images.iter().map(|image| image.len()).sum());
+        images.iter().for_each(|image| samples.add(image.view()));
+        samples.percentile(percent)
     }
 
     fn level(self, value: f32) -> u8 {
@@ -51,6 +44,40 @@ impl ToneMap {
             if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
         // NaN becomes 0 in the conversion, and so black.
         (encoded * 255.0).round() as u8
+    }
+}
+
+/// Values for a [`ToneMap`] of images that are not there at once.
+#[derive(Debug, Clone)]
+pub struct ToneSamples {
+    /// Every so many pixels one is taken.
+    step: usize,
+    /// Pixels of the next image before the first that is taken.
+    skip: usize,
+    values: Vec<f32>,
+}
+
+impl ToneSamples {
+    /// For images of so many pixels in all.
+    pub fn new(pixels: usize) -> ToneSamples {
+        ToneSamples { step: pixels.div_ceil(PERCENTILE_SAMPLES).max(1), skip: 0, values: Vec::new() }
+    }
+
+    /// Takes values of the next image.
+    pub fn add(&mut self, image: ArrayView2<f32>) {
+        let values = image.iter().copied().skip(self.skip).step_by(self.step);
+        self.values.extend(values.filter(|value| value.is_finite()));
+        self.skip = (self.skip + self.step - image.len() % self.step) % self.step;
+    }
+
+    /// [`ToneMap::percentile`] of all images.
+    pub fn percentile(&mut self, percent: f64) -> ToneMap {
+        if self.values.is_empty() {
+            return ToneMap { white: 1.0 };
+        }
+        let rank = (percent.clamp(0.0, 100.0) / 100.0 * (self.values.len() - 1) as f64).round() as usize;
+        let (_, &mut white, _) = self.values.select_nth_unstable_by(rank, f32::total_cmp);
+        ToneMap { white: if white > 0.0 { white } else { 1.0 } }
     }
 }
 
@@ -94,6 +121,14 @@ impl Picture {
         Picture::new(image.insert_axis(Axis(2)), tone_map, THUMBNAIL_MAX_PX)
     }
 
+    /// An image reduced to the size of a thumbnail, to be kept until its [`ToneMap`] is known: [`Picture::thumbnail`] of
+    /// either is the same.
+    pub fn reduced(image: ArrayView2<f32>) -> Array2<f32> {
+        let reduction = reduction_of(image.dim(), THUMBNAIL_MAX_PX);
+        let size = (image.nrows().div_ceil(reduction), image.ncols().div_ceil(reduction));
+        Array2::from_shape_fn(size, |place| mean_of_block(image, reduction, place))
+    }
+
     /// Images `[t, s]` of one size on one scale, shown one after the other in a loop; `None` where there are none.
     pub fn animation(images: &[ArrayView2<f32>], tone_map: ToneMap) -> Option<Picture> {
         let frame = |image: &ArrayView2<f32>| {
@@ -115,12 +150,11 @@ impl Picture {
 
     fn new(image: ArrayView3<f32>, tone_map: ToneMap, max_px: usize) -> Picture {
         let (rows, columns, channels) = image.dim();
-        let reduction = rows.max(columns).div_ceil(max_px).max(1);
+        let reduction = reduction_of((rows, columns), max_px);
         let reduced = (rows.div_ceil(reduction), columns.div_ceil(reduction), channels);
         let levels = Array3::from_shape_fn(reduced, |(row, column, channel)| {
-            let span = |index: usize, len: usize| index * reduction..len.min((index + 1) * reduction);
-            let block = image.slice(s![span(row, rows), span(column, columns), channel]);
-            tone_map.level(block.sum() / block.len() as f32)
+            let image = image.index_axis(Axis(2), channel);
+            tone_map.level(mean_of_block(image, reduction, (row, column)))
         });
         Picture {
             levels,
@@ -189,6 +223,17 @@ impl Picture {
             }
         }
     }
+}
+
+/// Pixels, along each side, that become one of a picture with sides of at most `max_px`.
+fn reduction_of((rows, columns): (usize, usize), max_px: usize) -> usize {
+    rows.max(columns).div_ceil(max_px).max(1)
+}
+
+fn mean_of_block(image: ArrayView2<f32>, reduction: usize, (row, column): (usize, usize)) -> f32 {
+    let span = |index: usize, len: usize| index * reduction..len.min((index + 1) * reduction);
+    let block = image.slice(s![span(row, image.nrows()), span(column, image.ncols())]);
+    block.sum() / block.len() as f32
 }
 
 /// A PNG file; with more than one frame an animated one, which programs without animation show the first frame of.

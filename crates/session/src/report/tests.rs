@@ -1,7 +1,7 @@
 use super::*;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
-use ndarray::{Array2, Array3, array};
+use ndarray::{Array2, Array3, ArrayView2, array};
 
 fn page(blocks: Vec<Block>) -> String {
     let section = Section { title: "S".into(), intro: String::new(), blocks };
@@ -32,6 +32,27 @@ fn grey_levels_are_those_of_srgb() {
     assert!((127..=128).contains(&levels[1]));
     assert_eq!([levels[0], levels[2], levels[3], levels[4], levels[5], levels[6]], [0, 255, 255, 0, 0, 10]);
     assert!(html.contains("white = 0.5 · 7 × 1 px<"), "the scale is stated");
+}
+
+#[test]
+fn images_one_after_the_other_are_toned_and_reduced_as_if_they_were_there_at_once() {
+    // More pixels than samples, and sizes that are no multiple of the step.
+    let image = |seed: usize| {
+        Array2::from_shape_fn((701, 811), |(t, s)| ((t * 811 + s + seed) * 2_654_435_761 % 10_007) as f32)
+    };
+    let images = [image(1), image(2), image(3)];
+    let flat: Vec<f32> = images.iter().flatten().copied().collect();
+    let mut sampled: Vec<f32> = flat.into_iter().step_by(2).collect();
+    sampled.sort_by(f32::total_cmp);
+    let mut samples = ToneSamples::new(3 * 701 * 811);
+    images.iter().for_each(|image| samples.add(image.view()));
+    for percent in [99.5, 70.0] {
+        let white = sampled[(percent / 100.0 * (sampled.len() - 1) as f64).round() as usize];
+        assert_eq!(samples.percentile(percent).white, white);
+    }
+    let tone_map = samples.percentile(90.0);
+    let png = |image: ArrayView2<f32>| Picture::thumbnail(image, tone_map).to_png().unwrap();
+    assert!(png(images[1].view()) == png(Picture::reduced(images[1].view()).view()));
 }
 
 #[test]

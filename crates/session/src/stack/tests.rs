@@ -129,6 +129,63 @@ fn every_damaged_byte_of_a_shard_is_noticed() {
 }
 
 #[test]
+fn rows_of_a_point_are_those_of_the_whole() {
+    for (rows, columns) in [(1, 1), (64, 63), (65, 130), (200, 70)] {
+        let dir = tempfile::tempdir().unwrap();
+        let shape = shape(rows, columns);
+        let stack = Stack::create(dir.path(), &shape, "sweep").unwrap();
+        stack.write(ArrayName::Sum, 1, image(&shape, 1).view()).unwrap();
+        stack.write(ArrayName::Sum, 2, image(&shape, 2).view()).unwrap();
+        for part in [0..1, 0..rows, rows - 1..rows, rows / 3..rows.min(rows / 3 + 64), rows / 2..rows] {
+            if part.is_empty() {
+                continue;
+            }
+            let found = stack.read_rows(ArrayName::Sum, 2, part.clone()).unwrap();
+            assert_eq!(found, image(&shape, 2).slice(s![part.clone(), ..]), "{rows} x {columns}: {part:?}");
+        }
+        for part in [0..0, 0..rows + 1, rows..rows + 1] {
+            let refused = stack.read_rows(ArrayName::Sum, 2, part.clone());
+            assert!(matches!(refused, Err(Error::Shape { .. })), "{part:?}");
+        }
+        let missing = stack.read_rows(ArrayName::Sum, 0, 0..1);
+        assert!(matches!(missing, Err(Error::NotStored { array: "sum", index: 0, .. })));
+        assert!(matches!(stack.read_rows(ArrayName::Sum, 4, 0..1), Err(Error::Index { len: 4, .. })));
+    }
+}
+
+#[test]
+fn rows_are_read_without_the_rest_of_their_shard_and_their_damage_is_noticed() {
+    let dir = tempfile::tempdir().unwrap();
+    let shape = shape(192, 64);
+    let stack = Stack::create(dir.path(), &shape, "sweep").unwrap();
+    let data = image(&shape, 3);
+    stack.write(ArrayName::Sum, 0, data.view()).unwrap();
+    let path = dir.path().join("sum/c.0.0.0");
+    let whole = fs::read(&path).unwrap();
+    let strip = |t: usize| stack.read_rows(ArrayName::Sum, 0, t..t + 64);
+    // Three inner chunks of one size or so follow each other, then comes their index.
+    for (byte, broken) in [(whole.len() / 6, 0), (whole.len() / 2, 64), (whole.len() * 5 / 6, 128)] {
+        let mut damaged = whole.clone();
+        damaged[byte] ^= 0x10;
+        fs::write(&path, damaged).unwrap();
+        for t in [0, 64, 128] {
+            match strip(t) {
+                Ok(found) => {
+                    assert!(t != broken && found == data.slice(s![t..t + 64, ..]), "byte {byte}, row {t}")
+                }
+                Err(error) => {
+                    assert!(t == broken && error.to_string().contains("sum"), "byte {byte}, row {t}: {error}")
+                }
+            }
+        }
+    }
+    for cut in [0, 1, whole.len() / 2, whole.len() - 1] {
+        fs::write(&path, &whole[..cut]).unwrap();
+        assert!(matches!(strip(0), Err(Error::Zarr { .. })), "cut at {cut}");
+    }
+}
+
+#[test]
 fn a_hierarchy_that_is_not_a_stack_is_an_error() {
     let dir = tempfile::tempdir().unwrap();
     assert!(matches!(Stack::open(&dir.path().join("missing"), &shape(8, 8)), Err(Error::Zarr { .. })));

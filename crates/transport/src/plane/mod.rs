@@ -49,7 +49,7 @@ pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative
 pub use noise::NoiseModel;
 pub use prior::Prior;
 pub use profile::DelayProfile;
-pub use relight::relight;
+pub use relight::{relight, relight_rows};
 pub use setting::{Setting, delay_us, offset_us};
 pub use simd::SimdLevel;
 pub use timing::{CameraRows, RowTiming};

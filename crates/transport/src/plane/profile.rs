@@ -14,11 +14,9 @@ pub struct DelayProfile {
 impl DelayProfile {
     /// The mean of `pixels` (`[t, s]`, at least one) in the images of `stack`, `[settings, t, s]`.
     pub fn measured(stack: ArrayView3<f32>, settings: &[Setting], pixels: &[[usize; 2]]) -> Self {
-        let light = stack.axis_iter(Axis(0)).map(|image| {
-            let sum: f64 = pixels.iter().map(|&pixel| f64::from(image[pixel])).sum();
-            sum / pixels.len() as f64
-        });
-        Self::by_delay(settings, light.collect())
+        let mut sums = vec![0.0; settings.len()];
+        Self::add_measured(&mut sums, stack, pixels);
+        Self::mean(settings, &sums, pixels.len())
     }
 
     /// The same as the forward model predicts it from `transport`. What an exposure sees of the next or the previous
@@ -29,30 +27,53 @@ impl DelayProfile {
         settings: &[Setting],
         pixels: &[[usize; 2]],
     ) -> Self {
-        let reach = transport.u_min..=transport.u_max();
-        let mut light = vec![0.0; settings.len()];
-        for of_row in pixels.chunk_by(|a, b| a[0] == b[0]) {
-            let t = of_row[0][0];
-            let model = RowModel::new(timing, settings, &reach, t);
-            for (Slot { u, kind }, weights) in model.slots.iter().zip(model.weights.axis_iter(Axis(1))) {
-                if *kind == SlotKind::Own {
-                    let profiles = transport.t.slice(s![(u - transport.u_min) as usize, t, ..]);
-                    let of_slot: f64 = of_row.iter().map(|&[_, s]| f64::from(profiles[s])).sum();
-                    light.iter_mut().zip(weights).for_each(|(light, weight)| *light += weight * of_slot);
-                }
-            }
-        }
-        light.iter_mut().for_each(|light| *light /= pixels.len() as f64);
-        Self::by_delay(settings, light)
+        let mut sums = vec![0.0; settings.len()];
+        Self::add_predicted(&mut sums, timing, 0, transport, settings, pixels);
+        Self::mean(settings, &sums, pixels.len())
     }
 
-    fn by_delay(settings: &[Setting], light: Vec<f64>) -> Self {
+    /// The mean of `pixels` whose light was summed by [`Self::add_measured`] or [`Self::add_predicted`], a sum for each
+    /// setting.
+    pub fn mean(settings: &[Setting], sums: &[f64], pixels: usize) -> Self {
         let mean_us =
             |setting: &Setting| setting.delays_us.iter().sum::<f64>() / setting.delays_us.len() as f64;
+        let light = sums.iter().map(|sum| sum / pixels as f64);
         let mut points: Vec<(f64, f64)> = settings.iter().map(mean_us).zip(light).collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (delays_us, light) = points.into_iter().unzip();
         Self { delays_us, light }
+    }
+
+    /// Adds the light of `pixels` to that of those before, in their order: some camera rows after others give the bits of
+    /// all at once.
+    pub fn add_measured(sums: &mut [f64], stack: ArrayView3<f32>, pixels: &[[usize; 2]]) {
+        for (sum, image) in sums.iter_mut().zip(stack.axis_iter(Axis(0))) {
+            pixels.iter().for_each(|&pixel| *sum += f64::from(image[pixel]));
+        }
+    }
+
+    /// [`Self::add_measured`] of the prediction from the camera rows from `first_row` on, of which `transport` and
+    /// `pixels` are.
+    pub fn add_predicted(
+        sums: &mut [f64],
+        timing: &RowTiming,
+        first_row: usize,
+        transport: &Transport,
+        settings: &[Setting],
+        pixels: &[[usize; 2]],
+    ) {
+        let reach = transport.u_min..=transport.u_max();
+        for of_row in pixels.chunk_by(|a, b| a[0] == b[0]) {
+            let at = of_row[0][0];
+            let model = RowModel::new(timing, settings, &reach, first_row + at);
+            for (Slot { u, kind }, weights) in model.slots.iter().zip(model.weights.axis_iter(Axis(1))) {
+                if *kind == SlotKind::Own {
+                    let profiles = transport.t.slice(s![(u - transport.u_min) as usize, at, ..]);
+                    let of_slot: f64 = of_row.iter().map(|&[_, s]| f64::from(profiles[s])).sum();
+                    sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight * of_slot);
+                }
+            }
+        }
     }
 
     /// The profile over its area (trapezium rule), per microsecond: albedo and brightness cancel, as the recognition

@@ -17,20 +17,34 @@ pub fn relight(
     transport: &Transport,
     weights: ArrayView1<f64>,
 ) -> Result<Array2<f32>, PlaneError> {
-    let shape = |array, axes, actual, expected| match actual == expected {
-        true => Ok(()),
-        false => Err(PlaneError::Shape { array, axes, actual: vec![actual], expected: vec![expected] }),
-    };
-    shape("weights", "[projector rows]", weights.len(), timing.projector_rows())?;
+    check_shape("transport", "its camera rows", transport.t.len_of(Axis(1)), timing.camera_rows())?;
+    relight_rows(timing, 0, transport, weights)
+}
+
+/// [`relight`] of the camera rows from `first_row` on that `transport` holds alone.
+///
+/// # Errors
+/// [`PlaneError::Shape`] if the weights are not those of the projector's rows; [`PlaneError::Rows`] for rows that the
+/// camera does not have.
+pub fn relight_rows(
+    timing: &RowTiming,
+    first_row: usize,
+    transport: &Transport,
+    weights: ArrayView1<f64>,
+) -> Result<Array2<f32>, PlaneError> {
+    check_shape("weights", "[projector rows]", weights.len(), timing.projector_rows())?;
     let (_, rows, columns) = transport.t.dim();
-    shape("transport", "its camera rows", rows, timing.camera_rows())?;
+    let (end, camera_rows) = (first_row + rows, timing.camera_rows());
+    if end > camera_rows {
+        return Err(PlaneError::Rows { row: end - 1, camera_rows });
+    }
 
     let mut image = Array2::zeros((rows, columns));
-    image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut image_row)| {
-        let profiles = transport.t.index_axis(Axis(1), t);
+    image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(at, mut image_row)| {
+        let profiles = transport.t.index_axis(Axis(1), at);
         // In f64, because thousands of dim rows add up beside a bright one.
         let mut sum = Array1::<f64>::zeros(columns);
-        let u_of_row_0 = i64::from(timing.relative_row(0, t));
+        let u_of_row_0 = i64::from(timing.relative_row(0, first_row + at));
         for (u, light) in (i64::from(transport.u_min)..).zip(profiles.outer_iter()) {
             let v = u - u_of_row_0;
             let weight = usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
@@ -43,9 +57,21 @@ pub fn relight(
     Ok(image)
 }
 
+fn check_shape(
+    array: &'static str,
+    axes: &'static str,
+    actual: usize,
+    expected: usize,
+) -> Result<(), PlaneError> {
+    match actual == expected {
+        true => Ok(()),
+        false => Err(PlaneError::Shape { array, axes, actual: vec![actual], expected: vec![expected] }),
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use ndarray::Array3;
+    use ndarray::{Array3, s};
 
     use super::*;
 
@@ -77,6 +103,23 @@ mod tests {
                 assert_eq!(light, expected, "row {v} at ({t}, {s})");
             }
         }
+    }
+
+    #[test]
+    fn some_rows_are_relit_as_in_the_whole() {
+        let (timing, transport) = scene();
+        let weights = Array1::from_shape_fn(8, |row| (row * row) as f64);
+        let whole = relight(&timing, &transport, weights.view()).unwrap();
+        let rows = Transport {
+            t: transport.t.slice(s![.., 1..3, ..]).to_owned(),
+            exists: transport.exists.slice(s![.., 1..3]).to_owned(),
+            saturated: transport.saturated.slice(s![1..3, ..]).to_owned(),
+            ..transport
+        };
+        let part = relight_rows(&timing, 1, &rows, weights.view()).unwrap();
+        assert_eq!(part, whole.slice(s![1..3, ..]));
+        let beyond = relight_rows(&timing, 3, &rows, weights.view());
+        assert_eq!(beyond.unwrap_err(), PlaneError::Rows { row: 4, camera_rows: 4 });
     }
 
     #[test]

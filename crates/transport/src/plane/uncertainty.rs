@@ -62,11 +62,28 @@ impl Uncertainty<'_> {
         samples: &Samples,
         bands: &[Vec<RangeInclusive<i32>>],
     ) -> Result<Array3<f32>, PlaneError> {
-        self.check(transport, samples)?;
+        let (_, rows, columns) = transport.t.dim();
+        let expected = [self.timing.camera_rows(), columns];
+        fits("transport", "[camera rows, columns]", &[rows, columns], &expected)?;
+        self.of_bands_in_rows(0, transport, samples, bands)
+    }
+
+    /// [`Self::of_bands`] in the camera rows from `first_row` on that `transport` and `samples` hold alone.
+    ///
+    /// # Errors
+    /// Those of [`Self::of_bands`]; [`PlaneError::Rows`] for rows that the camera does not have.
+    pub fn of_bands_in_rows(
+        &self,
+        first_row: usize,
+        transport: &Transport,
+        samples: &Samples,
+        bands: &[Vec<RangeInclusive<i32>>],
+    ) -> Result<Array3<f32>, PlaneError> {
+        self.check(first_row, transport, samples)?;
         let (_, rows, columns) = transport.t.dim();
         let mut sd = Array3::zeros((bands.len(), rows, columns));
         sd.axis_iter_mut(Axis(1)).into_par_iter().enumerate().try_for_each(|(t, mut sd)| {
-            let row = Row::new(self, transport, bands, t);
+            let row = Row::new(self, transport, bands, first_row + t);
             let profiles = transport.t.index_axis(Axis(1), t);
             let valid = samples.valid.map(|valid| valid.index_axis_move(Axis(1), t));
             // The change of each band of each column with each sample, [columns * bands, settings].
@@ -81,22 +98,34 @@ impl Uncertainty<'_> {
         Ok(sd)
     }
 
-    fn check(&self, transport: &Transport, samples: &Samples) -> Result<(), PlaneError> {
+    fn check(&self, first_row: usize, transport: &Transport, samples: &Samples) -> Result<(), PlaneError> {
         self.timing.check(self.settings)?;
         self.prior.check()?;
         self.noise.check()?;
         check_shapes(samples.stack, samples.valid, self.frames)?;
         let (_, rows, columns) = transport.t.dim();
-        let fits = |array, axes, actual: &[usize], expected: &[usize]| match actual == expected {
-            true => Ok(()),
-            false => Err(PlaneError::Shape { array, axes, actual: actual.into(), expected: expected.into() }),
-        };
-        let pixels = [self.timing.camera_rows(), columns];
-        fits("transport", "[camera rows, columns]", &[rows, columns], &pixels)?;
+        let (end, camera_rows) = (first_row + rows, self.timing.camera_rows());
+        if end > camera_rows {
+            return Err(PlaneError::Rows { row: end - 1, camera_rows });
+        }
         let expected = [self.settings.len(), rows, columns];
         fits("stack", "[settings, camera rows, columns]", samples.stack.shape(), &expected)?;
         let ratio = samples.variance_ratio;
-        ratio.map_or(Ok(()), |ratio| fits("variance_ratio", "[camera rows, columns]", ratio.shape(), &pixels))
+        ratio.map_or(Ok(()), |ratio| {
+            fits("variance_ratio", "[camera rows, columns]", ratio.shape(), &[rows, columns])
+        })
+    }
+}
+
+fn fits(
+    array: &'static str,
+    axes: &'static str,
+    actual: &[usize],
+    expected: &[usize],
+) -> Result<(), PlaneError> {
+    match actual == expected {
+        true => Ok(()),
+        false => Err(PlaneError::Shape { array, axes, actual: actual.into(), expected: expected.into() }),
     }
 }
 

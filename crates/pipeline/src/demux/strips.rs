@@ -1,0 +1,212 @@
+//! The fold of a sweep that is larger than the memory: it keeps how images were taken, and reads their rows again.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::sync::Arc;
+
+use ndarray::Axis;
+use rayon::prelude::*;
+use raysweep_transport::plane::{PlaneError, Setting};
+
+use super::tally::Tally;
+use super::{DemuxFold, Taken, refused};
+use crate::findings::rows_to_choose_by;
+use crate::schedule::Role;
+use crate::stage::{FoldError, Product};
+use crate::strips::{ImageRows, InStrips};
+
+impl DemuxFold {
+    pub(super) fn solve_in_strips(
+        &mut self,
+        strips: InStrips<'_>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Vec<Product>, FoldError> {
+        let InStrips { images, strip_rows, take } = strips;
+        let not_kept = self.not_kept.take().unwrap_or_default();
+        let height = self.geometry.height;
+        let choices = self.choose(self.stack(self.read_to_choose_by(&not_kept, images, go_on)?)?)?;
+        let mut tally = Tally::default();
+        for first_row in (0..height).step_by(strip_rows) {
+            let rows = first_row..height.min(first_row + strip_rows);
+            let halo_rows = choices.halo_rows();
+            let around = first_row.saturating_sub(halo_rows)..height.min(rows.end + halo_rows);
+            let held = self.hold(around.start, read_rows(&not_kept, images, &around)?)?;
+            take(&choices.findings, self.strip(&choices, rows, held, &mut tally, go_on)?)?;
+        }
+        Ok(tally.products(choices.findings))
+    }
+
+    /// The rows of [`rows_to_choose_by`] of all images. They lie all over an image, so that it is read whole: one at a time,
+    /// because many together may be larger than the memory.
+    fn read_to_choose_by(
+        &self,
+        not_kept: &BTreeMap<Role, (u32, Setting)>,
+        images: &dyn ImageRows,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<BTreeMap<Role, Arc<Taken>>, FoldError> {
+        let height = self.geometry.height;
+        let rows = rows_to_choose_by(height);
+        let of_rows = |(role, (point, setting)): (&Role, &(u32, Setting))| {
+            if !go_on() {
+                return Err(refused(PlaneError::Stopped));
+            }
+            let image = images.read(*point, 0..height).map_err(not_read)?.select(Axis(0), &rows);
+            Ok((*role, Arc::new(Taken { setting: setting.clone(), image })))
+        };
+        not_kept.iter().map(of_rows).collect()
+    }
+}
+
+/// The images of some camera rows.
+fn read_rows(
+    not_kept: &BTreeMap<Role, (u32, Setting)>,
+    images: &dyn ImageRows,
+    rows: &Range<usize>,
+) -> Result<BTreeMap<Role, Arc<Taken>>, FoldError> {
+    not_kept
+        .par_iter()
+        .map(|(role, (point, setting))| {
+            let image = images.read(*point, rows.clone()).map_err(not_read)?;
+            Ok((*role, Arc::new(Taken { setting: setting.clone(), image })))
+        })
+        .collect()
+}
+
+fn not_read(what: String) -> FoldError {
+    FoldError { fold: "demux".into(), what }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array2, concatenate, s};
+    use raysweep_core::{Counts, Raster, SettingsId};
+
+    use super::*;
+    use crate::demux::DemuxOptions;
+    use crate::schedule::{Point, Schedule, Spot, SweepGeometry};
+    use crate::stage::Fold;
+    use crate::strips::Strip;
+    use crate::unit::Unit;
+
+    /// Higher than the rows that are chosen by, and saturated in the last of its strips only.
+    const HEIGHT: usize = 130;
+    const WIDTH: usize = 12;
+    const STRIP_ROWS: usize = 50;
+
+    fn geometry() -> SweepGeometry {
+        SweepGeometry {
+            raster: Raster { rows: 140, row_time_us: 20.0, period_us: 3000.0, first_row_us: 0.0 },
+            row_table_us: None,
+            beam_sigma_rows: None,
+            spot: Spot::Uniform,
+            projector_columns: None,
+            first_row: 5,
+            row_pitch: 1.0,
+            camera_row_time_us: 20.0,
+            height: HEIGHT,
+            width: WIDTH,
+            white_dn: 1000.0,
+            saturation_dn: 3900.0,
+        }
+    }
+
+    fn schedule() -> Schedule {
+        let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames: 1 };
+        let regular = [
+            point(Role::Dark(0), 0.0, 60.0),
+            point(Role::Dark(1), 0.0, 3000.0),
+            point(Role::Regular, 0.0, 3000.0),
+        ];
+        let delays_us = (-4..=4).map(|step| f64::from(step) * 25.0);
+        let sweep = (0..).zip(delays_us).map(|(index, delay_us)| point(Role::Sweep(index), delay_us, 60.0));
+        Schedule { points: regular.into_iter().chain(sweep).collect() }
+    }
+
+    /// Direct light and some that is as bright on either side of it, in noise.
+    fn image(ordinal: usize, point: &Point) -> Array2<f32> {
+        let timing = geometry().timing().unwrap();
+        let setting = Setting::new(point.delay_us, point.exposure_us);
+        Array2::from_shape_fn((HEIGHT, WIDTH), |(t, s)| {
+            let light = |v: usize| match timing.relative_row(v, t) {
+                0 => 0.4 + 0.01 * s as f64,
+                u => 0.1 * (-f64::from(u.abs()) / 2.0).exp(),
+            };
+            let weights = timing.weights(t, &setting);
+            let lit: f64 = weights.iter().enumerate().map(|(v, weight)| weight * light(v)).sum();
+            let lit = if matches!(point.role, Role::Dark(_)) { 0.0 } else { lit };
+            let seed = ((ordinal * HEIGHT + t) * WIDTH + s) as f64;
+            let noise = (seed * 12.9898).sin() * 43_758.545_3;
+            let highlight = if (t, s, ordinal) == (HEIGHT - 2, 3, 6) { 4000.0 } else { 0.0 };
+            (100.0 + 1000.0 * lit + 10.0 * (noise - noise.floor()) + highlight) as f32
+        })
+    }
+
+    struct Kept(Vec<Array2<f32>>);
+
+    impl ImageRows for Kept {
+        fn read(&self, point: u32, rows: Range<usize>) -> Result<Array2<f32>, String> {
+            Ok(self.0[point as usize].slice(s![rows, ..]).to_owned())
+        }
+    }
+
+    fn push_all(fold: &mut DemuxFold, images: &Kept) {
+        for ((ordinal, point), image) in (0..).zip(schedule().points).zip(&images.0) {
+            let unit = Unit {
+                id: SettingsId { point: ordinal, attempt: 0 },
+                frames: 1,
+                exposure_us: point.exposure_us,
+                delays_us: vec![point.delay_us],
+                last_exposure_ns: None,
+                sum: Arc::new(Array2::zeros((0, 0))),
+                counts: Counts::default(),
+            };
+            fold.push(&unit, image.view());
+        }
+    }
+
+    #[test]
+    fn strips_that_do_not_divide_the_image_have_the_bits_of_the_whole() {
+        let points = schedule().points;
+        let images = Kept(points.iter().enumerate().map(|(ordinal, point)| image(ordinal, point)).collect());
+        let fold = || DemuxFold::new(DemuxOptions::default(), &schedule(), &geometry()).unwrap();
+
+        let mut whole = fold();
+        push_all(&mut whole, &images);
+        let mut said = whole.finish(&|| true).unwrap();
+        let Some(Product::Stack(stack)) = said.pop() else { panic!("no stack") };
+        let Some(Product::Transport(transport)) = said.pop() else { panic!("no transport") };
+        let Some(Product::Findings(findings)) = said.last() else { panic!("no findings") };
+        assert!(findings.choice.is_some() && stack.variance_ratio.is_some(), "{findings:?}");
+        assert!(rows_to_choose_by(HEIGHT).len() < HEIGHT);
+
+        let mut in_strips = fold();
+        in_strips.keep_no_images();
+        push_all(&mut in_strips, &images);
+        let mut strips: Vec<Strip> = Vec::new();
+        let mut take = |chosen: &crate::Findings, strip| {
+            assert_eq!(chosen, &**findings);
+            strips.push(strip);
+            Ok(())
+        };
+        let order = InStrips { images: &images, strip_rows: STRIP_ROWS, take: &mut take };
+        let said_in_strips = in_strips.finish_in_strips(order, &|| true).unwrap();
+        assert_eq!(format!("{said_in_strips:?}"), format!("{said:?}"));
+
+        assert_eq!(strips.iter().map(|strip| strip.first_row).collect::<Vec<_>>(), [0, 50, 100]);
+        assert_eq!(
+            strips.iter().map(|strip| strip.stack.valid.is_some()).collect::<Vec<_>>(),
+            [false, false, true]
+        );
+        let rows = |of: &dyn Fn(&Strip) -> Array2<f32>| {
+            let parts: Vec<Array2<f32>> = strips.iter().map(of).collect();
+            let views: Vec<_> = parts.iter().map(|part| part.view()).collect();
+            concatenate(Axis(0), &views).unwrap()
+        };
+        assert_eq!(rows(&|strip| strip.stack.regular.clone().unwrap()), stack.regular.unwrap());
+        assert_eq!(rows(&|strip| strip.stack.variance_ratio.clone().unwrap()), stack.variance_ratio.unwrap());
+        let transports: Vec<_> = strips.iter().map(|strip| strip.transport.t.view()).collect();
+        assert!(concatenate(Axis(1), &transports).unwrap() == transport.t);
+        let images: Vec<_> = strips.iter().map(|strip| strip.stack.images.view()).collect();
+        assert!(concatenate(Axis(1), &images).unwrap() == stack.images);
+    }
+}

@@ -1,0 +1,99 @@
+//! What is said of a sweep beside its transport, counted over its camera rows from top to bottom.
+
+use ndarray::Array2;
+use raysweep_transport::plane::Transport;
+
+use crate::findings::Findings;
+use crate::stage::Product;
+
+use super::PREDICTED_SHARE;
+
+/// So well the transport must predict the regular image.
+const CLOSE_SHARE: f64 = 0.02;
+/// More saturated pixels than this deserve a warning: highlights are normal, fields are not.
+const SATURATED_SHARE: f64 = 0.01;
+
+/// Counts over the camera rows so far; the same, to the bit, however the rows come together.
+#[derive(Default)]
+pub(super) struct Tally {
+    images: usize,
+    pixels: usize,
+    saturated: usize,
+    /// None: the regular image was not taken.
+    regular: Option<Regular>,
+}
+
+#[derive(Default)]
+struct Regular {
+    saturated: usize,
+    /// Light where the regular image does not saturate.
+    captured: f64,
+    /// The same as the transport predicts it.
+    predicted: f64,
+}
+
+impl Tally {
+    /// Counts rows whose transport was made of so many images.
+    pub(super) fn add_sweep(&mut self, images: usize, transport: &Transport) {
+        self.images = images;
+        self.pixels += transport.saturated.len();
+        self.saturated += transport.saturated.iter().filter(|&&saturated| saturated).count();
+    }
+
+    /// Counts the light of the regular image in these rows.
+    pub(super) fn add_regular(&mut self, valid: &Array2<bool>, light: &Array2<f32>, transport: &Transport) {
+        let regular = self.regular.get_or_insert_default();
+        regular.saturated += valid.iter().filter(|valid| !**valid).count();
+        let add = |sum: &mut f64, image: &Array2<f32>| {
+            let pixels = image.iter().zip(valid).filter(|&(_, &valid)| valid);
+            pixels.for_each(|(&light, _)| *sum += f64::from(light));
+        };
+        add(&mut regular.captured, light);
+        add(&mut regular.predicted, &transport.total());
+    }
+
+    /// Figures and warnings, and how the transport was found.
+    pub(super) fn products(self, findings: Findings) -> Vec<Product> {
+        let mut products = vec![
+            Product::Figure { name: "images demultiplexed", value: self.images as f64 },
+            Product::Figure { name: "saturated pixels", value: self.saturated as f64 },
+        ];
+        products.extend(too_many_saturated("the sweep", self.saturated, self.pixels));
+        if let Some(regular) = self.regular {
+            products.extend(regular.products(self.pixels));
+        }
+        products.extend(findings.warnings.iter().cloned().map(Product::Warning));
+        products.push(Product::Findings(Box::new(findings)));
+        products
+    }
+}
+
+impl Regular {
+    /// How well the transport predicts the light of the regular image where it is not saturated.
+    fn products(self, pixels: usize) -> Vec<Product> {
+        let what = "the regular image (a whole VSYNC period long)";
+        let mut products: Vec<Product> =
+            too_many_saturated(what, self.saturated, pixels).into_iter().collect();
+        if products.is_empty() && self.captured > 0.0 {
+            let share = self.predicted / self.captured;
+            products.push(Product::Figure { name: PREDICTED_SHARE, value: share });
+            if (share - 1.0).abs() > CLOSE_SHARE {
+                products.push(Product::Warning(format!(
+                    "the transport predicts {:.1} % of the light of the regular image: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
+                    share * 100.0
+                )));
+            }
+        }
+        products
+    }
+}
+
+fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<Product> {
+    let share = saturated as f64 / pixels as f64;
+    (share > SATURATED_SHARE).then(|| {
+        Product::Warning(format!(
+            "{:.1} % of the pixels of {what} are saturated: take less gain, a smaller aperture or less ambient light",
+            share * 100.0
+        ))
+    })
+}

@@ -1,0 +1,122 @@
+//! Products put together from the strips of a sweep.
+
+use ndarray::{Array3, Axis, s};
+use raysweep_transport::plane::Transport;
+
+use super::profile::ProfileSums;
+use super::{Kind, NotMade, ProductSpec, SweepStack, uncertainty};
+use crate::stage::Product;
+
+/// A product in the making. Whatever the strips, it has the same bits.
+#[derive(Debug)]
+pub struct Assembly {
+    spec: ProductSpec,
+    /// The product of each strip so far; of a profile, none.
+    parts: Vec<Product>,
+    sums: ProfileSums,
+}
+
+impl Assembly {
+    /// Begins a product.
+    pub fn new(spec: ProductSpec) -> Self {
+        Self { spec, parts: Vec::new(), sums: ProfileSums::default() }
+    }
+
+    /// The product's name.
+    pub fn name(&self) -> &str {
+        self.spec.name()
+    }
+
+    /// Adds the camera rows from `first_row` on, of which stack and transport are: from top to bottom, each once.
+    ///
+    /// # Errors
+    /// When what it needs was not taken.
+    pub fn add(
+        &mut self,
+        first_row: usize,
+        stack: &SweepStack,
+        transport: &Transport,
+    ) -> Result<(), NotMade> {
+        let name = self.spec.name.clone();
+        let not_made = |what: String| NotMade { name: self.spec.name.clone(), what };
+        let part = match &self.spec.kind {
+            Kind::Regular => match &stack.regular {
+                Some(image) => Product::Image {
+                    name,
+                    about: "a captured exposure of one whole VSYNC period: every row lit once".into(),
+                    image: image.clone(),
+                },
+                None => {
+                    let what = "the regular image or its dark image is not there: resume the run";
+                    return Err(not_made(what.into()));
+                }
+            },
+            Kind::Epipolar(width) => width.epipolar(name, transport),
+            Kind::NonEpipolar(width) => width.non_epipolar(name, transport),
+            Kind::Band(band) => band.make(name, transport),
+            Kind::Relight(pattern) => pattern
+                .make(name, &stack.timing, first_row, transport)
+                .map_err(|error| not_made(error.to_string()))?,
+            Kind::Uncertainty(band) => {
+                uncertainty::make(name, *band, first_row, stack, transport).map_err(not_made)?
+            }
+            Kind::DelayProfile(options) => {
+                options.add(&mut self.sums, first_row, stack, transport);
+                return Ok(());
+            }
+        };
+        self.parts.push(part);
+        Ok(())
+    }
+
+    /// The product, once all strips are added.
+    ///
+    /// # Errors
+    /// When what it needs saturates.
+    pub fn finish(self) -> Result<Product, NotMade> {
+        let Self { spec: ProductSpec { name, kind }, parts, sums } = self;
+        if let Kind::DelayProfile(options) = kind {
+            return options.make(name.clone(), &sums).map_err(|what| NotMade { name, what });
+        }
+        let mut parts = parts.into_iter();
+        let first = parts.next();
+        let first = first.ok_or(NotMade { name, what: "no camera row was solved: resume the run".into() })?;
+        if parts.len() == 0 {
+            return Ok(first);
+        }
+        Ok(match first {
+            Product::Image { name, about, image } => {
+                let rest = parts.filter_map(|part| match part {
+                    Product::Image { image, .. } => Some(image.insert_axis(Axis(0))),
+                    _ => None,
+                });
+                let image = one_below_the_other(image.insert_axis(Axis(0)), rest).index_axis_move(Axis(0), 0);
+                Product::Image { name, about, image }
+            }
+            Product::Sequence { name, about, axis, at, images } => {
+                let rest = parts.filter_map(|part| match part {
+                    Product::Sequence { images, .. } => Some(images),
+                    _ => None,
+                });
+                Product::Sequence { name, about, axis, at, images: one_below_the_other(images, rest) }
+            }
+            other => other,
+        })
+    }
+}
+
+/// Images `[k, t, s]` of which each part has some rows. In C order, as if they had been made whole: sums of what is made
+/// of them depend, to the bit, on how they lie in memory.
+fn one_below_the_other(first: Array3<f32>, rest: impl Iterator<Item = Array3<f32>>) -> Array3<f32> {
+    let parts: Vec<Array3<f32>> = std::iter::once(first).chain(rest).collect();
+    let (count, _, columns) = parts[0].dim();
+    let rows = parts.iter().map(|part| part.len_of(Axis(1))).sum();
+    let mut whole = Array3::zeros((count, rows, columns));
+    let mut first_row = 0;
+    for part in parts {
+        let end = first_row + part.len_of(Axis(1));
+        whole.slice_mut(s![.., first_row..end, ..]).assign(&part);
+        first_row = end;
+    }
+    whole
+}
