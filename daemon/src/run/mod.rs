@@ -227,8 +227,12 @@ impl Runner {
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
         if report.memory_bytes > report.memory_free_bytes {
+            let (at_least, instead) = match task.is_film() {
+                true => ("", "take fewer settings"),
+                false => (" even some camera rows at a time", "make shorter sequences"),
+            };
             let what = format!(
-                "the run needs {} MB of memory even some camera rows at a time, {} MB may be used: make shorter sequences, give the daemon more --memory, or take a larger machine",
+                "the run needs {} MB of memory{at_least}, {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
                 report.memory_bytes / 1_000_000,
                 report.memory_free_bytes / 1_000_000
             );
