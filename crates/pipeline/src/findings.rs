@@ -15,8 +15,8 @@ use crate::demux::DemuxOptions;
 use crate::products::SweepStack;
 use crate::schedule::{Spot, SweepGeometry};
 
-/// Offsets of direct light below this are not worth a model of their own: they cost less than the noise.
-const NEGLIGIBLE_U0_ROWS: f32 = 0.01;
+/// Offsets of direct light below this are not worth models of their own, of which each row then needs several.
+const NEGLIGIBLE_U0_ROWS: f32 = 0.02;
 
 /// How a sweep was demultiplexed, and why so.
 #[derive(Debug, Clone, PartialEq)]
@@ -238,7 +238,7 @@ fn calibrate(
             places.sort_by(f32::total_cmp);
             let (low, median, high) = (places[0], places[places.len() / 2], places[places.len() - 1]);
             let error = map.standard_error.iter().fold(0.0_f32, |most, &error| most.max(error));
-            if low.abs().max(high.abs()) < error.max(NEGLIGIBLE_U0_ROWS) {
+            if low.abs().max(high.abs()) < (2.0 * error).max(NEGLIGIBLE_U0_ROWS) {
                 optics.spike = None;
                 format!("in its own row within {error:.3} rows, from {} pixels", map.pixels)
             } else {
