@@ -5,6 +5,7 @@ use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axi
 use rayon::prelude::*;
 
 use super::calibrate::FlyingSpot;
+use super::error::check_shape;
 use super::quadratic::Quadratic;
 use super::row::{Row, RowSolver};
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach};
@@ -339,18 +340,6 @@ struct Task<'a> {
     class: usize,
     /// Its part of the transport, `[reach, columns]`.
     profiles: ArrayViewMut2<'a, f32>,
-}
-
-fn check_shape(
-    array: &'static str,
-    axes: &'static str,
-    actual: &[usize],
-    expected: &[usize],
-) -> Result<(), PlaneError> {
-    match actual == expected {
-        true => Ok(()),
-        false => Err(PlaneError::Shape { array, axes, actual: actual.to_vec(), expected: expected.to_vec() }),
-    }
 }
 
 /// Of a symmetric positive definite matrix, by power iteration to about 1 %.

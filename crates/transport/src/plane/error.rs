@@ -94,3 +94,16 @@ pub enum PlaneError {
         name: String,
     },
 }
+
+/// Checks that an array has the shape that it must have.
+pub(super) fn check_shape(
+    array: &'static str,
+    axes: &'static str,
+    actual: &[usize],
+    expected: &[usize],
+) -> Result<(), PlaneError> {
+    match actual == expected {
+        true => Ok(()),
+        false => Err(PlaneError::Shape { array, axes, actual: actual.to_vec(), expected: expected.to_vec() }),
+    }
+}

@@ -1,6 +1,7 @@
 use ndarray::{Array1, Array2, ArrayView1, Axis};
 use rayon::prelude::*;
 
+use super::error::check_shape;
 use super::{PlaneError, RowTiming, Transport};
 
 /// The image `[t, s]` under a projector that shows each of its rows with one weight, shape `[projector_rows]`:
@@ -17,7 +18,7 @@ pub fn relight(
     transport: &Transport,
     weights: ArrayView1<f64>,
 ) -> Result<Array2<f32>, PlaneError> {
-    check_shape("transport", "its camera rows", transport.t.len_of(Axis(1)), timing.camera_rows())?;
+    check_shape("transport", "its camera rows", &[transport.t.len_of(Axis(1))], &[timing.camera_rows()])?;
     relight_rows(timing, 0, transport, weights)
 }
 
@@ -32,7 +33,7 @@ pub fn relight_rows(
     transport: &Transport,
     weights: ArrayView1<f64>,
 ) -> Result<Array2<f32>, PlaneError> {
-    check_shape("weights", "[projector rows]", weights.len(), timing.projector_rows())?;
+    check_shape("weights", "[projector rows]", &[weights.len()], &[timing.projector_rows()])?;
     let (_, rows, columns) = transport.t.dim();
     let (end, camera_rows) = (first_row + rows, timing.camera_rows());
     if end > camera_rows {
@@ -55,18 +56,6 @@ pub fn relight_rows(
         image_row.zip_mut_with(&sum, |pixel, &sum| *pixel = sum as f32);
     });
     Ok(image)
-}
-
-fn check_shape(
-    array: &'static str,
-    axes: &'static str,
-    actual: usize,
-    expected: usize,
-) -> Result<(), PlaneError> {
-    match actual == expected {
-        true => Ok(()),
-        false => Err(PlaneError::Shape { array, axes, actual: vec![actual], expected: vec![expected] }),
-    }
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@ use std::ops::RangeInclusive;
 use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
+use super::error::check_shape;
 use super::noise::check_shapes;
 use super::{
     NoiseModel, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind, Transport, cholesky,
@@ -64,7 +65,7 @@ impl Uncertainty<'_> {
     ) -> Result<Array3<f32>, PlaneError> {
         let (_, rows, columns) = transport.t.dim();
         let expected = [self.timing.camera_rows(), columns];
-        fits("transport", "[camera rows, columns]", &[rows, columns], &expected)?;
+        check_shape("transport", "[camera rows, columns]", &[rows, columns], &expected)?;
         self.of_bands_in_rows(0, transport, samples, bands)
     }
 
@@ -109,23 +110,11 @@ impl Uncertainty<'_> {
             return Err(PlaneError::Rows { row: end - 1, camera_rows });
         }
         let expected = [self.settings.len(), rows, columns];
-        fits("stack", "[settings, camera rows, columns]", samples.stack.shape(), &expected)?;
+        check_shape("stack", "[settings, camera rows, columns]", samples.stack.shape(), &expected)?;
         let ratio = samples.variance_ratio;
         ratio.map_or(Ok(()), |ratio| {
-            fits("variance_ratio", "[camera rows, columns]", ratio.shape(), &[rows, columns])
+            check_shape("variance_ratio", "[camera rows, columns]", ratio.shape(), &[rows, columns])
         })
-    }
-}
-
-fn fits(
-    array: &'static str,
-    axes: &'static str,
-    actual: &[usize],
-    expected: &[usize],
-) -> Result<(), PlaneError> {
-    match actual == expected {
-        true => Ok(()),
-        false => Err(PlaneError::Shape { array, axes, actual: actual.into(), expected: expected.into() }),
     }
 }
 
