@@ -1,7 +1,7 @@
 //! How the transport was found: what the stack said of rig and scene, and the held-out error of the priors.
 
 use raysweep_pipeline::{Findings, Product, prior_name};
-use raysweep_session::report::{Block, Section, Table};
+use raysweep_session::report::{Block, NoteLevel, Section, Table};
 
 /// The section, unless nothing was demultiplexed.
 pub(super) fn section(products: &[Product]) -> Option<Section> {
@@ -9,9 +9,8 @@ pub(super) fn section(products: &[Product]) -> Option<Section> {
         Product::Findings(findings) => Some(&**findings),
         _ => None,
     })?;
-    let said = findings.remarks.iter().map(|(what, said)| vec![(*what).to_owned(), said.clone()]).collect();
-    let headers = vec!["about".into(), "what the images say".into()];
-    let mut blocks = vec![Block::Table(Table { headers, rows: said })];
+    let note = |(what, said): &(&str, String)| Block::Note(NoteLevel::Info, format!("{what}: {said}"));
+    let mut blocks: Vec<Block> = findings.remarks.iter().map(note).collect();
     blocks.extend(curve(findings));
     if !findings.left_out_us.is_empty() {
         let row = |(delay_us, exposure_us): &(f64, f64)| {

@@ -122,6 +122,9 @@ impl Band {
 
     /// The rows in words.
     pub(super) fn says(self) -> String {
+        if self.to_rows == Some(0) {
+            return "light from the pixel's own projector row (u = 0)".into();
+        }
         let rows = match self.to_rows {
             Some(to_rows) => format!("{} to {to_rows} rows", self.from_rows),
             None => format!("{} rows and more", self.from_rows),
