@@ -12,12 +12,14 @@ fn allowed() -> BTreeMap<&'static str, &'static [&'static str]> {
         ("raysweep-pipeline", &["raysweep-core", "raysweep-transport"]),
         ("raysweep-session", &["raysweep-core"]),
         ("raysweep-proto", &["raysweep-core"]),
+        ("raysweep-drivers", &["raysweep-core"]),
         ("raysweep-sim", &["raysweep-core"]),
         ("xtask", &[]),
         (
             "raysweep",
             &[
                 "raysweep-core",
+                "raysweep-drivers",
                 "raysweep-pipeline",
                 "raysweep-proto",
                 "raysweep-session",
