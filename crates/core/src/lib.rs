@@ -23,6 +23,6 @@ pub use device::{
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
 pub use frame::{Edge, Frame, FrameBuf, FramePool, FrameStamp};
-pub use pixel::{PixelError, PixelFormat};
+pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use units::{ns_from_us, us_from_ns};
