@@ -17,8 +17,8 @@ mod units;
 pub use clock::{Clock, ClockHandle};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
-    Applied, Camera, CameraCapabilities, CameraSettings, FirstFrame, Pattern, Projector, Readout, SettingsId,
-    Shown, Shutter, Vsync,
+    Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Pattern, Projector,
+    Readout, SettingsId, Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
