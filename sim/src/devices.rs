@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, DeviceErrorKind,
-    Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync, us_from_ns,
+    DeviceState, Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync,
+    us_from_ns,
 };
 
 use crate::line::{Exposure, Light, Line, LineTruth};
@@ -134,6 +135,10 @@ impl SimCamera {
 impl Camera for SimCamera {
     fn capabilities(&self) -> &CameraCapabilities {
         &self.capabilities
+    }
+
+    fn state(&self) -> DeviceState {
+        if self.line.lock().is_armed() { DeviceState::Streaming } else { DeviceState::Ready }
     }
 
     fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
