@@ -5,11 +5,13 @@
 mod support;
 
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
 
 use raysweep_core::{
-    Camera, CameraSettings, DeviceErrorKind, DeviceState, FirstFrame, FramePool, LossCause, PixelFormat,
-    SettingsId, Shutter,
+    Camera, CameraSettings, DeviceErrorKind, DeviceState, FirstFrame, FramePool, FrameStamp, LossCause,
+    PixelFormat, SettingsId, Shutter,
 };
 use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, Region, RigFacts};
 
@@ -139,4 +141,96 @@ fn ten_thousand_frames_and_every_lost_one_has_its_cause() {
     assert_eq!(received + lost_total, newest - first.unwrap() + 1);
     assert!(lost[&LossCause::PacketsLost] > 0, "{lost:?}");
     eprintln!("{received} frames, lost: {lost:?}");
+}
+
+/// Takes frames until `enough`; none is an answer, too.
+fn watch(camera: &mut AravisCamera, mut enough: impl FnMut(&AravisCamera, Option<FrameStamp>) -> bool) {
+    let pool = FramePool::new(1, 128 * 128);
+    let mut buf = pool.take();
+    let patience = Instant::now() + Duration::from_secs(60);
+    loop {
+        let stamp = camera.next_frame(&mut buf, Duration::from_millis(100)).unwrap();
+        if enough(camera, stamp) {
+            return;
+        }
+        assert!(Instant::now() < patience, "nothing happens: {:?}", camera.state());
+    }
+}
+
+#[test]
+fn a_camera_that_died_is_noticed_and_goes_on_when_it_is_back() {
+    own_network();
+    let device = FakeCamera::start(&[]);
+    let mut camera = AravisCamera::open(&config(16_667, 128), FACTS).unwrap();
+    camera.configure(ID, &SETTINGS).unwrap();
+    camera.arm().unwrap();
+    let mut newest = None;
+    watch(&mut camera, |_, stamp| {
+        newest = stamp.or(newest);
+        stamp.is_some_and(|stamp| stamp.seq >= 30)
+    });
+    let before = newest.unwrap();
+    drop(device);
+    let died = Instant::now();
+    watch(&mut camera, |camera, stamp| {
+        newest = stamp.or(newest);
+        camera.state() == DeviceState::Lost
+    });
+    eprintln!("noticed after {:?}", died.elapsed());
+    let error = camera.configure(ID, &SETTINGS).unwrap_err();
+    assert_eq!(error.kind, DeviceErrorKind::NotReady, "{error}");
+
+    let _device = FakeCamera::start(&[]);
+    let back = Instant::now();
+    watch(&mut camera, |camera, _| camera.state() == DeviceState::Streaming);
+    eprintln!("open again after {:?}", back.elapsed());
+    let applied = camera.configure(ID, &SETTINGS).unwrap();
+    let mut after = None;
+    watch(&mut camera, |_, stamp| {
+        after = stamp;
+        stamp.is_some()
+    });
+    let (newest, after) = (newest.unwrap(), after.unwrap());
+    assert!(newest.seq >= before.seq);
+    // As many ids have passed as there were triggers, but for those about its death and its return.
+    let away_ns = after.exposure_start_ns - newest.exposure_start_ns;
+    let passed = away_ns as f64 / (FACTS.trigger_period_us * 1e3);
+    assert!((passed - (after.seq - newest.seq) as f64).abs() <= 2.0, "{passed} {newest:?} {after:?}");
+    assert!((newest.seq + 1..after.seq - 1).all(|seq| camera.loss_of(seq) == LossCause::CameraLost));
+    assert!(applied.first_frame.certain() > newest.seq);
+}
+
+#[test]
+fn a_camera_that_waits_for_its_trigger_is_not_lost() {
+    own_network();
+    let _device = FakeCamera::start(&[]);
+    let triggered = AravisConfig { trigger_source: "Line0".into(), ..config(1_000, 128) };
+    let mut camera = AravisCamera::open(&triggered, FACTS).unwrap();
+    camera.configure(ID, &SETTINGS).unwrap();
+    camera.arm().unwrap();
+    let begun = Instant::now();
+    watch(&mut camera, |camera, stamp| {
+        assert_eq!((stamp, camera.state()), (None, DeviceState::Streaming));
+        begun.elapsed() > Duration::from_secs(3)
+    });
+}
+
+#[test]
+fn a_camera_that_stays_away_is_given_up() {
+    own_network();
+    let device = FakeCamera::start(&[]);
+    let facts = RigFacts { reopen: Duration::from_secs(2), ..FACTS };
+    let mut camera = AravisCamera::open(&config(4_000, 128), facts).unwrap();
+    camera.arm().unwrap();
+    device.signal(Signal::SIGSTOP);
+    let pool = FramePool::new(1, 128 * 128);
+    let mut buf = pool.take();
+    let error = loop {
+        match camera.next_frame(&mut buf, Duration::from_millis(100)) {
+            Ok(_) => {}
+            Err(error) => break error,
+        }
+    };
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected);
+    assert!(error.to_string().contains("camera.reopen_s = 2"), "{error}");
 }

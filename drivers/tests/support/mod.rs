@@ -36,6 +36,14 @@ impl FakeCamera {
     }
 }
 
+impl FakeCamera {
+    /// Stops it as if its cable were pulled, or lets it go on.
+    pub fn signal(&self, signal: nix::sys::signal::Signal) {
+        let id = nix::unistd::Pid::from_raw(self.0.id().try_into().unwrap());
+        nix::sys::signal::kill(id, signal).unwrap();
+    }
+}
+
 impl Drop for FakeCamera {
     fn drop(&mut self) {
         let _ = self.0.kill();

@@ -10,7 +10,7 @@ use aravis::prelude::*;
 use aravis::{Buffer, BufferStatus, ChunkParser, Stream};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
-    DeviceState, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us,
+    DeviceState, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us, us_from_ns,
 };
 
 use super::buffer;
@@ -62,8 +62,6 @@ pub struct AravisCamera {
     losses: Losses,
     promises: Promises<CameraSettings>,
     newest: Option<Newest>,
-    /// The camera was away, and no frame has come since.
-    returned: bool,
 }
 
 enum Link {
@@ -123,7 +121,7 @@ impl AravisCamera {
                 return Err(error(DeviceErrorKind::NotReady, "its thread ended; the log has its message"));
             }
         };
-        let Opened { stream, chunks, capabilities, tells_time } = opened;
+        let Opened { stream, chunks, capabilities, tells_time, .. } = opened;
         let mut ids = FrameIds::default();
         ids.restart(1);
         Ok(Self {
@@ -141,7 +139,6 @@ impl AravisCamera {
             losses: Losses::new(),
             promises: Promises::new(),
             newest: None,
-            returned: false,
         })
     }
 
@@ -227,10 +224,11 @@ impl AravisCamera {
                         );
                         return Err(error(DeviceErrorKind::Protocol, what));
                     }
-                    let Opened { stream, chunks, tells_time, .. } = opened;
+                    let Opened { stream, chunks, tells_time, armed_ns, .. } = opened;
                     tracing::warn!(camera = self.capabilities.model, away = ?since.elapsed(), "camera back");
                     self.link = Link::Up { stream, chunks, tells_time };
-                    self.returned = true;
+                    self.armed_ns = self.armed_ns.and(armed_ns);
+                    self.resume_ids();
                     return Ok(());
                 }
                 Ok(Reply::Done(..)) => {}
@@ -259,10 +257,7 @@ impl AravisCamera {
             // Left over from before a stop.
             BufferStatus::Aborted | BufferStatus::Cleared => return Ok(None),
             _ => {
-                // Of a frame before the first whole one since its return a camera tells neither time nor place.
-                if !self.returned
-                    && let Some(seq) = self.ids.extend(from.frame_id())
-                {
+                if let Some(seq) = self.ids.extend(from.frame_id()) {
                     self.losses.incomplete(seq);
                 }
                 return Ok(None);
@@ -296,30 +291,29 @@ impl AravisCamera {
             }
             model.host_ns(device_ns).unwrap_or(arrived_ns)
         });
-        if std::mem::take(&mut self.returned) {
-            self.resume_ids(exposure_start_ns);
-        }
         let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
         self.losses.whole(seq);
         self.newest = Some(Newest { seq, exposure_start_ns, host_ns });
         Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
     }
 
-    /// The first frame since the camera's return: as many ids have passed as it would have answered triggers, and
-    /// all settings that were written before are those of this frame.
-    fn resume_ids(&mut self, exposure_start_ns: i64) {
-        let Some(newest) = self.newest else {
-            self.ids.restart(self.promises.latest_seq());
-            return;
-        };
-        let periods = self.promises.newest().map_or(1, |settings| {
-            self.capabilities.periods_per_frame(&settings, self.facts.trigger_period_us)
-        });
-        let frame_us = f64::from(periods) * self.facts.trigger_period_us;
-        let passed = (exposure_start_ns - newest.exposure_start_ns) as f64 / (frame_us * 1e3);
-        let passed = passed.round().max(1.0) as u64;
-        self.ids.restart((newest.seq + passed).max(self.promises.latest_seq()));
-        self.losses.away(newest.seq + 1..self.ids.next());
+    /// The camera is back and counts its frames anew. As many ids have passed as it would have answered triggers, and the
+    /// next frame is of the settings that were written last, whatever was promised of those before.
+    fn resume_ids(&mut self) {
+        let mut next_seq = self.promises.latest_seq();
+        if let Some(newest) = self.newest {
+            let settings = self.promises.newest();
+            let periods = settings.map_or(1, |settings| {
+                self.capabilities.periods_per_frame(&settings, self.facts.trigger_period_us)
+            });
+            let frame_us = f64::from(periods) * self.facts.trigger_period_us;
+            let away_us = us_from_ns(self.shared.clock.now_ns() - newest.exposure_start_ns);
+            next_seq = next_seq.max(newest.seq + (away_us / frame_us).ceil() as u64);
+        }
+        self.ids.restart(next_seq);
+        if let Some(newest) = self.newest {
+            self.losses.away(newest.seq + 1..self.ids.next());
+        }
     }
 
     /// What is known of the triggers now.

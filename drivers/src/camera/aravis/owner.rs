@@ -73,6 +73,8 @@ pub struct Opened {
     pub capabilities: CameraCapabilities,
     /// Whether its clock can be asked.
     pub tells_time: bool,
+    /// From when on it answers triggers, if it does.
+    pub armed_ns: Option<i64>,
 }
 
 /// How the time with a camera ended.
@@ -222,10 +224,11 @@ impl Owner {
         if let Some(settings) = &self.settings {
             writer.write(&device, settings)?;
         }
+        let armed_ns = self.armed.then(|| self.shared.clock.now_ns());
         if self.armed {
             device.execute("AcquisitionStart")?;
         }
-        let opened = Opened { stream, chunks, capabilities, tells_time: clock.is_some() };
+        let opened = Opened { stream, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
         Ok((Connection { device, writer, clock }, opened))
     }
 
