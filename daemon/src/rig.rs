@@ -90,6 +90,11 @@ impl Rig {
         self.sim.first_row()
     }
 
+    /// The simulated rig.
+    pub fn simulated(&self) -> &PlaneRig {
+        &self.sim
+    }
+
     /// Opens all devices.
     ///
     /// # Errors

@@ -6,6 +6,7 @@
 
 pub mod config;
 mod devices;
+pub mod gige;
 mod keyed;
 mod line;
 pub mod optics;
@@ -16,4 +17,4 @@ mod sensor;
 pub use config::SimConfig;
 pub use devices::{Devices, TruthProbe};
 pub use line::LineTruth;
-pub use rig::{PlaneRig, PlaneSetup, SimError};
+pub use rig::{PlaneRig, PlaneSetup, SimError, WireDevices};
