@@ -8,7 +8,8 @@ use raysweep_core::{
     Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync, us_from_ns,
 };
 
-use crate::line::{Exposure, Light, Line, LineTruth, TriggeredBy};
+use crate::gige::Look;
+use crate::line::{Exposure, Light, Line, LineTruth};
 use crate::rig::Bench;
 use crate::sensor::Exposed;
 
@@ -23,6 +24,18 @@ pub struct Devices {
     /// The clock that they live by.
     pub clock: Clock,
     /// What really happens on the line. A real rig has no such thing: it is for tests alone.
+    pub truth: TruthProbe,
+}
+
+/// The devices of one rig, by the host's clock, with the camera behind a wire.
+pub struct WireDevices {
+    /// What the camera looks at.
+    pub camera: Look,
+    /// The watcher of the VSYNC line.
+    pub vsync: Box<dyn Vsync>,
+    /// The projector; dark at first.
+    pub projector: Box<dyn Projector>,
+    /// What really happens on the line, for tests alone.
     pub truth: TruthProbe,
 }
 
@@ -74,44 +87,100 @@ impl SharedLine {
 }
 
 pub fn open(bench: &Arc<Bench>, line: Line, clock: Clock) -> Devices {
-    let (camera, vsync, projector, truth) = open_parts(bench, line, &clock);
-    Devices { camera: Box::new(camera), vsync: Box::new(vsync), projector: Box::new(projector), truth, clock }
-}
-
-/// The devices of [`open`] by their own types.
-pub fn open_parts(
-    bench: &Arc<Bench>,
-    line: Line,
-    clock: &Clock,
-) -> (SimCamera, SimVsync, SimProjector, TruthProbe) {
     let line = SharedLine(Arc::new(Mutex::new(line)));
-    let control = CameraControl { bench: bench.clone(), line: line.clone(), clock: clock.clone() };
-    (
-        SimCamera::new(control, clock.register()),
-        SimVsync { line: line.clone(), clock: clock.register() },
-        SimProjector { bench: bench.clone(), line: line.clone(), clock: clock.clone() },
-        TruthProbe(line),
-    )
+    Devices {
+        camera: Box::new(SimCamera::new(bench.clone(), line.clone(), clock.register())),
+        vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
+        projector: Box::new(SimProjector { bench: bench.clone(), line: line.clone(), clock: clock.clone() }),
+        truth: TruthProbe(line),
+        clock,
+    }
 }
 
-/// What is written to the camera, from whichever thread.
-#[derive(Clone)]
-pub struct CameraControl {
+/// The devices of [`open`], with two handles of the camera: one writes its settings while the other waits for frames.
+pub fn open_for_wire(bench: &Arc<Bench>, line: Line) -> WireDevices {
+    let (line, clock) = (SharedLine(Arc::new(Mutex::new(line))), Clock::real());
+    let camera = || SimCamera::new(bench.clone(), line.clone(), clock.register());
+    WireDevices {
+        camera: Look::at_scene(camera(), camera()),
+        vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
+        projector: Box::new(SimProjector { bench: bench.clone(), line: line.clone(), clock }),
+        truth: TruthProbe(line),
+    }
+}
+
+pub struct SimCamera {
     bench: Arc<Bench>,
     line: SharedLine,
-    clock: Clock,
+    clock: ClockHandle,
+    capabilities: CameraCapabilities,
+    light: Vec<f32>,
+    counts: Vec<u16>,
 }
 
-impl CameraControl {
+impl SimCamera {
+    fn new(bench: Arc<Bench>, line: SharedLine, clock: ClockHandle) -> Self {
+        let (height, width) = bench.size;
+        let capabilities = bench.capabilities();
+        Self {
+            bench,
+            line,
+            clock,
+            capabilities,
+            light: vec![0.0; height * width],
+            counts: vec![0; height * width],
+        }
+    }
+
     fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
         DeviceError::new("camera", kind, what.into())
     }
 
-    pub fn capabilities(&self) -> CameraCapabilities {
-        self.bench.capabilities()
+    /// The counts of the last exposure, `[t, s]` row-major.
+    pub fn counts(&self) -> &[u16] {
+        &self.counts
     }
 
-    pub fn configure(&self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
+    /// The line that triggers it.
+    pub fn with_line<T>(&self, work: impl FnOnce(&mut Line, i64) -> T) -> T {
+        let now_ns = self.clock.now_ns();
+        work(&mut self.line.lock(), now_ns)
+    }
+
+    /// Waits for the next exposure and reads the sensor; the shutter starts at row `first_row` and leaves out those above.
+    pub fn next_exposure(&mut self, first_row: usize, timeout: Duration) -> Option<Exposure> {
+        let taken = self.line.wait(&self.clock, timeout, |line, now_ns| line.take_frame(now_ns));
+        let (exposure, lights) = taken?;
+        self.render(&exposure, &lights, first_row);
+        Some(exposure)
+    }
+
+    /// Integrates the light of an exposure and reads the sensor.
+    fn render(&mut self, exposure: &Exposure, lights: &[Light], first_row: usize) {
+        let (_, width) = self.bench.size;
+        let exposure_us = exposure.settings.exposure_us;
+        let ambient = self.bench.ambient(exposure);
+        for (t, row) in self.light.chunks_mut(width).enumerate().skip(first_row) {
+            row.fill(ambient);
+            let row_start_us = self.bench.row_start_us(exposure.settings.shutter, t - first_row);
+            for light in lights {
+                if let Some(optics) = &light.optics {
+                    let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
+                    optics.expose_row(t, from_us, from_us + exposure_us, row);
+                }
+            }
+        }
+        let exposed = Exposed { light: &mut self.light, exposure_us, key: exposure.key };
+        self.bench.sensor.read(exposed, &mut self.counts);
+    }
+}
+
+impl Camera for SimCamera {
+    fn capabilities(&self) -> &CameraCapabilities {
+        &self.capabilities
+    }
+
+    fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
         let camera = &self.bench.config.camera;
         let stepped = |value: f64, step: f64| if step > 0.0 { (value / step).round() * step } else { value };
         let actual = CameraSettings {
@@ -119,7 +188,7 @@ impl CameraControl {
             exposure_us: stepped(settings.exposure_us, camera.exposure_step_us),
             trigger_delay_us: stepped(settings.trigger_delay_us, camera.delay_step_us),
         };
-        if let Err(what) = self.capabilities().allows(&actual) {
+        if let Err(what) = self.capabilities.allows(&actual) {
             return Err(Self::error(DeviceErrorKind::OutOfRange, what));
         }
         let next_seq = self.line.lock().configure(self.clock.now_ns(), id, actual);
@@ -132,94 +201,8 @@ impl CameraControl {
         Ok(Applied { actual, first_frame })
     }
 
-    pub fn set_armed(&self, armed: bool) {
-        self.line.lock().set_armed(self.clock.now_ns(), armed);
-    }
-
-    pub fn set_triggered_by(&self, triggered_by: TriggeredBy) {
-        self.line.lock().set_triggered_by(self.clock.now_ns(), triggered_by);
-    }
-
-    /// Triggers by command; whether the camera answered.
-    pub fn fire(&self) -> bool {
-        self.line.lock().fire(self.clock.now_ns())
-    }
-
-    /// The number of the next exposure.
-    pub fn next_seq(&self) -> u64 {
-        self.line.lock().next_seq()
-    }
-
-    pub fn set_late_frames(&self, frames: Option<u32>) {
-        self.line.lock().set_late_frames(frames);
-    }
-}
-
-pub struct SimCamera {
-    control: CameraControl,
-    clock: ClockHandle,
-    capabilities: CameraCapabilities,
-    light: Vec<f32>,
-    counts: Vec<u16>,
-}
-
-impl SimCamera {
-    fn new(control: CameraControl, clock: ClockHandle) -> Self {
-        let capabilities = control.capabilities();
-        let pixels = capabilities.height * capabilities.width;
-        Self { control, clock, capabilities, light: vec![0.0; pixels], counts: vec![0; pixels] }
-    }
-
-    pub fn control(&self) -> CameraControl {
-        self.control.clone()
-    }
-
-    /// The counts of the last exposure that was waited for, `[t, s]` row-major.
-    pub fn counts(&self) -> &[u16] {
-        &self.counts
-    }
-
-    /// Waits for the next exposure and reads the sensor; its shutter starts at row `first_row` and leaves out those
-    /// above.
-    pub fn next_exposure(&mut self, first_row: usize, timeout: Duration) -> Option<Exposure> {
-        let taken = self.control.line.wait(&self.clock, timeout, |line, now_ns| line.take_frame(now_ns));
-        let (exposure, lights) = taken?;
-        self.render(&exposure, &lights, first_row);
-        Some(exposure)
-    }
-
-    /// Integrates the light of an exposure and reads the sensor.
-    fn render(&mut self, exposure: &Exposure, lights: &[Light], first_row: usize) {
-        let bench = &self.control.bench;
-        let (_, width) = bench.size;
-        let exposure_us = exposure.settings.exposure_us;
-        let ambient = bench.ambient(exposure);
-        for (t, row) in self.light.chunks_mut(width).enumerate().skip(first_row) {
-            row.fill(ambient);
-            let row_start_us = bench.row_start_us(exposure.settings.shutter, t - first_row);
-            for light in lights {
-                if let Some(optics) = &light.optics {
-                    let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
-                    optics.expose_row(t, from_us, from_us + exposure_us, row);
-                }
-            }
-        }
-        let exposed = Exposed { light: &mut self.light, exposure_us, key: exposure.key };
-        bench.sensor.read(exposed, &mut self.counts);
-    }
-}
-
-impl Camera for SimCamera {
-    fn capabilities(&self) -> &CameraCapabilities {
-        &self.capabilities
-    }
-
-    fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
-        self.control.configure(id, settings)
-    }
-
     fn arm(&mut self) -> Result<(), DeviceError> {
-        self.control.set_armed(true);
+        self.line.lock().set_armed(self.clock.now_ns(), true);
         Ok(())
     }
 
@@ -228,15 +211,14 @@ impl Camera for SimCamera {
         buf: &mut FrameBuf,
         timeout: Duration,
     ) -> Result<Option<FrameStamp>, DeviceError> {
-        if !self.control.line.lock().is_armed() {
-            return Err(CameraControl::error(
+        if !self.line.lock().is_armed() {
+            return Err(Self::error(
                 DeviceErrorKind::NotReady,
                 "next_frame before arm: arm the camera first",
             ));
         }
         let Some(exposure) = self.next_exposure(0, timeout) else { return Ok(None) };
-        let bench = &self.control.bench;
-        bench
+        self.bench
             .format
             .pack_into(&self.counts, buf)
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::Protocol, error))?;
@@ -245,17 +227,17 @@ impl Camera for SimCamera {
             device_ns: exposure.start_ns,
             exposure_start_ns: exposure.start_ns,
             host_ns: exposure.done_ns,
-            exposure_us: bench.config.camera.chunk_exposure.then_some(exposure.settings.exposure_us),
+            exposure_us: self.bench.config.camera.chunk_exposure.then_some(exposure.settings.exposure_us),
         }))
     }
 
     fn disarm(&mut self) -> Result<(), DeviceError> {
-        self.control.set_armed(false);
+        self.line.lock().set_armed(self.clock.now_ns(), false);
         Ok(())
     }
 }
 
-pub struct SimVsync {
+struct SimVsync {
     line: SharedLine,
     clock: ClockHandle,
 }
@@ -266,7 +248,7 @@ impl Vsync for SimVsync {
     }
 }
 
-pub struct SimProjector {
+struct SimProjector {
     bench: Arc<Bench>,
     line: SharedLine,
     clock: Clock,

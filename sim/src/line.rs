@@ -134,28 +134,16 @@ impl CameraLine {
         due.map_or(self.in_force, |(_, settings)| *settings)
     }
 
-    /// From a trigger to the start of row 0's exposure under `settings`.
-    fn start_ns(&self, settings: &CameraSettings, latency_us: f64) -> i64 {
-        match self.triggered_by {
-            TriggeredBy::Edges | TriggeredBy::Software => ns_from_us(latency_us + settings.trigger_delay_us),
-            TriggeredBy::FreeRun { .. } => 0,
-        }
-    }
-
-    /// Whether an edge at `edge_ns` would be answered.
-    fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
-        edge_ns >= self.ready_ns(latency_us)
-    }
-
-    /// From when on an edge would be answered.
-    fn ready_ns(&self, latency_us: f64) -> i64 {
-        self.deaf_until_ns.max(self.occupied_until_ns - self.start_ns(&self.due(), latency_us))
-    }
-
     /// When the camera triggers itself, where it does.
     fn free_run_ns(&self) -> i64 {
         let runs = self.armed && matches!(self.triggered_by, TriggeredBy::FreeRun { .. });
         if runs { self.next_free_ns } else { i64::MAX }
+    }
+
+    /// Whether an edge at `edge_ns` would be answered.
+    fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
+        let start_ns = edge_ns + ns_from_us(latency_us + self.due().trigger_delay_us);
+        edge_ns >= self.deaf_until_ns && start_ns >= self.occupied_until_ns
     }
 }
 
@@ -176,6 +164,8 @@ pub struct LineTruth {
 
 /// Frames that the camera keeps for a host that does not take them; older ones are lost.
 const CAMERA_BUFFERS: usize = 32;
+/// How soon a free-running camera that was not ready looks again.
+const FREE_RETRY_NS: i64 = 50_000;
 /// A period is drawn this long before its nominal edge, so that no jitter puts the edge before the draw.
 const GUARD_NS: i64 = 400_000;
 
@@ -318,10 +308,8 @@ impl Line {
         } else {
             self.seen.push_back(Edge { seq: self.edges, host_ns: edge.at_ns });
         }
-        if self.camera.triggered_by == TriggeredBy::Edges
-            && self.trigger(edge.at_ns)
-            && edge.kind == EdgeKind::False
-        {
+        let answered = self.camera.triggered_by == TriggeredBy::Edges && self.trigger(edge.at_ns);
+        if answered && edge.kind == EdgeKind::False {
             self.truth.false_triggers += 1;
         }
     }
@@ -331,9 +319,8 @@ impl Line {
         let TriggeredBy::FreeRun { period_ns } = self.camera.triggered_by else { return };
         let at_ns = self.camera.next_free_ns;
         let answered = self.trigger(at_ns);
-        let ready_ns = self.camera.ready_ns(self.config.camera.trigger_latency_us);
         self.camera.next_free_ns =
-            if answered { ready_ns.max(at_ns + period_ns) } else { ready_ns.max(at_ns + 1) };
+            at_ns + if answered { period_ns.max(FREE_RETRY_NS) } else { FREE_RETRY_NS };
     }
 
     /// Whether the camera answered.
@@ -347,7 +334,7 @@ impl Line {
         let seq = camera.seq;
         camera.written.retain(|(first_seq, _)| *first_seq > seq);
         let settings = camera.in_force;
-        let start_ns = edge_ns + camera.start_ns(&settings, config.camera.trigger_latency_us);
+        let start_ns = edge_ns + ns_from_us(config.camera.trigger_latency_us + settings.trigger_delay_us);
         let exposure_ns = ns_from_us(settings.exposure_us);
         let key = [u64::from(camera.id.point), u64::from(camera.id.attempt), camera.frames];
         let delivered = uniform(&mut keyed(config.seed, Purpose::Drop, &key)) >= config.camera.dropped;
@@ -373,9 +360,7 @@ impl Line {
     pub fn configure(&mut self, now_ns: i64, id: SettingsId, settings: CameraSettings) -> u64 {
         self.advance(now_ns);
         let config = &self.config;
-        let late = if let Some(late) = self.late_frames {
-            late
-        } else if config.camera.late_frames_min < config.camera.late_frames_max {
+        let late = if config.camera.late_frames_min < config.camera.late_frames_max {
             let span = config.camera.late_frames_max - config.camera.late_frames_min + 1;
             let key = [u64::from(id.point), u64::from(id.attempt)];
             let draw = uniform(&mut keyed(config.seed, Purpose::Late, &key));
@@ -383,7 +368,7 @@ impl Line {
         } else {
             config.camera.late_frames_max
         };
-        let first_seq = self.camera.seq + u64::from(late);
+        let first_seq = self.camera.seq + u64::from(self.late_frames.unwrap_or(late));
         self.camera.id = id;
         self.camera.frames = 0;
         // Registers are read in the order in which they were written: the latest word stands.
@@ -423,6 +408,11 @@ impl Line {
         self.late_frames = frames;
     }
 
+    /// The number of the next exposure.
+    pub fn next_seq(&self) -> u64 {
+        self.camera.seq
+    }
+
     /// Arms or disarms the camera.
     pub fn set_armed(&mut self, now_ns: i64, armed: bool) {
         self.advance(now_ns);
@@ -431,11 +421,6 @@ impl Line {
         if !armed {
             self.camera.exposures.clear();
         }
-    }
-
-    /// The number of the next exposure.
-    pub fn next_seq(&self) -> u64 {
-        self.camera.seq
     }
 
     pub fn is_armed(&self) -> bool {

@@ -4,13 +4,10 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use ndarray::Array2;
-use raysweep_core::{
-    CameraCapabilities, Clock, Pattern, PixelFormat, Projector, Raster, Shutter, Vsync, ns_from_us,
-};
+use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
 
 use crate::config::SimConfig;
-use crate::devices::{self, Devices, TruthProbe};
-use crate::gige::Look;
+use crate::devices::{self, Devices, WireDevices};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::line::{Exposure, Line, LineConfig, Shown};
 use crate::optics::{self, Optics};
@@ -115,18 +112,6 @@ pub struct PlaneRig {
     bench: Arc<Bench>,
 }
 
-/// The devices of one rig, with the camera behind a wire.
-pub struct WireDevices {
-    /// What the camera looks at.
-    pub camera: Look,
-    /// The watcher of the VSYNC line.
-    pub vsync: Box<dyn Vsync>,
-    /// The projector; dark at first.
-    pub projector: Box<dyn Projector>,
-    /// What really happens on the line, for tests alone.
-    pub truth: TruthProbe,
-}
-
 /// Everything about the rig that does not change while it runs.
 pub(crate) struct Bench {
     pub config: SimConfig,
@@ -207,15 +192,7 @@ impl PlaneRig {
 
     /// Opens the devices by the host's clock, with the camera as what a wire leads to.
     pub fn open_for_wire(&self) -> WireDevices {
-        let clock = Clock::real();
-        let line = Line::new(self.bench.line_config(), clock.now_ns());
-        let (camera, vsync, projector, truth) = devices::open_parts(&self.bench, line, &clock);
-        WireDevices {
-            camera: Look::at_scene(camera),
-            vsync: Box::new(vsync),
-            projector: Box::new(projector),
-            truth,
-        }
+        devices::open_for_wire(&self.bench, Line::new(self.bench.line_config(), Clock::real().now_ns()))
     }
 
     /// The light of an image without noise or jitter, in the scene's units, `[t, s]`: each camera row exposed for

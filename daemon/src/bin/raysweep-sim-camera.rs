@@ -3,9 +3,12 @@
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::Parser;
 use raysweep::rig::Rig;
+use raysweep_sim::WireDevices;
+use raysweep_sim::bench::BenchServer;
 use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look};
 use serde::de::DeserializeOwned;
 
@@ -60,8 +63,11 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     }
     let path = arguments.rig.as_ref().ok_or("neither --rig nor --test-pictures is given")?;
     let rig = Rig::load(path)?;
-    let devices = rig.simulated().open_for_wire();
-    let _camera = GigeCamera::start(&setup, devices.camera)?;
+    let WireDevices { camera, vsync, projector, truth } = rig.simulated().open_for_wire();
+    let camera = Arc::new(GigeCamera::start(&setup, camera)?);
+    let bench = rig.file.sim.bench.as_deref();
+    let _bench =
+        bench.map(|path| BenchServer::start(path, vsync, projector, truth, camera.clone())).transpose()?;
     wait_for_ever()
 }
 

@@ -277,9 +277,14 @@ impl Control {
 
     /// The settings in the registers go to the sensor, and what it made of them back.
     fn apply_settings(&mut self) -> Result<(), Status> {
-        let applied = self.controls.configure(&settings_of(&self.registers));
+        let wanted = settings_of(&self.registers);
+        let triggered = self.registers.number(Id::TriggerMode) == 1;
+        // A camera that triggers itself delays nothing.
+        let delay_us = if triggered { wanted.trigger_delay_us } else { 0.0 };
+        let applied = self.controls.configure(&CameraSettings { trigger_delay_us: delay_us, ..wanted });
         if let Ok(actual) = applied {
-            self.settings = actual;
+            let delay_us = if triggered { actual.trigger_delay_us } else { wanted.trigger_delay_us };
+            self.settings = CameraSettings { trigger_delay_us: delay_us, ..actual };
         }
         let CameraSettings { shutter, exposure_us, trigger_delay_us } = self.settings;
         let shutter = if shutter == Shutter::Global { GLOBAL_SHUTTER } else { 0 };

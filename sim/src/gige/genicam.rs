@@ -1,6 +1,10 @@
 //! The camera's own description in the GenICam schema 1.1, made of the feature table.
 
-use std::fmt::Write;
+use std::fmt::Write as _;
+use std::io::{self, Cursor, Write as _};
+
+use zip::ZipWriter;
+use zip::write::SimpleFileOptions;
 
 use super::features::{Access, Feature, Id, Kind, Shows, VIEWS};
 use super::gvsp::Chunk;
@@ -28,6 +32,17 @@ pub fn describe(features: &[Feature], model: &str) -> String {
     chunks(&mut xml);
     xml.push_str("<Port Name=\"Device\"/>\n</RegisterDescription>\n");
     xml
+}
+
+/// The description as clients unpack it: one file in a zip archive.
+///
+/// # Errors
+/// Never for a description of less than 4 GiB.
+pub fn zip(description: &str) -> io::Result<Vec<u8>> {
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    archive.start_file("raysweep.xml", SimpleFileOptions::default())?;
+    archive.write_all(description.as_bytes())?;
+    Ok(archive.finish()?.into_inner())
 }
 
 fn categories(xml: &mut String, features: &[Feature]) {

@@ -74,8 +74,8 @@ pub struct Look(Arc<dyn Controls>, Box<dyn Pictures>);
 
 impl Look {
     /// At the simulated scene.
-    pub(crate) fn at_scene(camera: SimCamera) -> Self {
-        let (controls, pictures) = source::scene(camera);
+    pub(crate) fn at_scene(written: SimCamera, read: SimCamera) -> Self {
+        let (controls, pictures) = source::scene(written, read);
         Self(controls, pictures)
     }
 
@@ -109,13 +109,18 @@ impl GigeCamera {
         let pixels = capabilities.width * capabilities.height;
         let stream = Arc::new(Stream::new(out, pixels, setup.clock, setup.faults));
         let features = features::features(&capabilities);
-        let description = genicam::describe(&features, &capabilities.model).into_bytes();
+        let description = genicam::describe(&features, &capabilities.model);
+        let description = if setup.zipped {
+            (genicam::zip(&description)?, "raysweep.zip")
+        } else {
+            (description.into_bytes(), "raysweep.xml")
+        };
         let identity = Identity {
             address: setup.address,
             model: &capabilities.model,
             serial: &setup.serial,
             tick_frequency_hz: setup.clock.tick_frequency_hz,
-            description: (description, "raysweep.xml"),
+            description,
         };
         let registers = Registers::new(features, identity);
         let control = Control::new(registers, controls.clone(), stream.clone(), stream.wire()?);

@@ -1,15 +1,18 @@
 //! Where the camera's pictures come from: the simulated scene, or test pictures made in advance.
 
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::Duration;
 
 use raysweep_core::{
-    CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, PixelFormat, Readout, SettingsId,
+    Camera, CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, PixelFormat, Readout,
+    SettingsId,
 };
 
 use super::gvsp::{Block, View};
 use super::lock;
-use crate::devices::{CameraControl, SimCamera};
+use crate::devices::SimCamera;
+use crate::line::Line;
 pub use crate::line::TriggeredBy;
 
 /// Pictures that are kept for clients that miss packets; test pictures repeat after as many.
@@ -57,59 +60,63 @@ pub trait Pictures: Send {
 
 /// The simulated scene behind the wire.
 struct SceneControls {
-    control: CameraControl,
+    camera: Mutex<SimCamera>,
     /// Settings written so far: what noise is keyed by, in the place of a sweep's points.
-    written: Mutex<u32>,
+    written: AtomicU32,
 }
 
 struct ScenePictures {
     camera: SimCamera,
-    capabilities: CameraCapabilities,
     region: Vec<u16>,
 }
 
-/// Both sides of the simulated scene.
-pub fn scene(camera: SimCamera) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
-    let control = camera.control();
-    let capabilities = control.capabilities();
-    let region = Vec::with_capacity(capabilities.width * capabilities.height);
+/// Both sides of the simulated scene, from two handles of its camera.
+pub fn scene(written: SimCamera, read: SimCamera) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
+    let region = Vec::with_capacity(read.counts().len());
     (
-        Arc::new(SceneControls { control, written: Mutex::new(0) }),
-        Box::new(ScenePictures { camera, capabilities, region }),
+        Arc::new(SceneControls { camera: Mutex::new(written), written: AtomicU32::new(0) }),
+        Box::new(ScenePictures { camera: read, region }),
     )
+}
+
+impl SceneControls {
+    fn with_line<T>(&self, work: impl FnOnce(&mut Line, i64) -> T) -> T {
+        lock(&self.camera).with_line(work)
+    }
 }
 
 impl Controls for SceneControls {
     fn capabilities(&self) -> CameraCapabilities {
-        self.control.capabilities()
+        lock(&self.camera).capabilities().clone()
     }
 
     fn configure(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError> {
-        let mut written = lock(&self.written);
-        *written = written.wrapping_add(1);
-        let applied = self.control.configure(SettingsId { point: 0, attempt: *written }, settings)?;
+        let attempt = self.written.fetch_add(1, Ordering::Relaxed);
+        let applied = lock(&self.camera).configure(SettingsId { point: 0, attempt }, settings)?;
         Ok(applied.actual)
     }
 
     fn set_triggered_by(&self, triggered_by: TriggeredBy) {
-        self.control.set_triggered_by(triggered_by);
+        self.with_line(|line, now_ns| line.set_triggered_by(now_ns, triggered_by));
     }
 
     fn arm(&self) -> u64 {
-        self.control.set_armed(true);
-        self.control.next_seq()
+        self.with_line(|line, now_ns| {
+            line.set_armed(now_ns, true);
+            line.next_seq()
+        })
     }
 
     fn disarm(&self) {
-        self.control.set_armed(false);
+        self.with_line(|line, now_ns| line.set_armed(now_ns, false));
     }
 
     fn fire(&self) {
-        self.control.fire();
+        self.with_line(|line, now_ns| line.fire(now_ns));
     }
 
     fn set_late_frames(&self, frames: Option<u32>) {
-        self.control.set_late_frames(frames);
+        self.with_line(|line, _| line.set_late_frames(frames));
     }
 }
 
@@ -123,9 +130,11 @@ impl Pictures for ScenePictures {
     fn write(&mut self, _: &Exposed, block: &mut Block) {
         let view = block.view;
         // The converter's bits are the rig's format's; another format keeps the upper ones, or leaves the lower ones 0.
-        let (from, to) = (self.capabilities.format.bits(), view.format.bits());
+        let (from, to) = (self.camera.capabilities().format.bits(), view.format.bits());
         self.region.clear();
-        for row in self.camera.counts().chunks(self.capabilities.width).skip(view.y).take(view.height) {
+        for row in
+            self.camera.counts().chunks(self.camera.capabilities().width).skip(view.y).take(view.height)
+        {
             let pixels = row[view.x..view.x + view.width].iter();
             self.region.extend(
                 pixels.map(|&count| if to < from { count >> (from - to) } else { count << (to - from) }),
