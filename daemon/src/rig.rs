@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use raysweep_core::{Camera, DeviceError, Projector, Vsync};
+use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
 use crate::config::{ConfigError, Driver, RigFile};
@@ -66,7 +67,7 @@ impl Rig {
         let text = std::fs::read_to_string(path)
             .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
         let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
-        let file = RigFile::parse(&text).map_err(shown)?;
+        let mut file = RigFile::parse(&text).map_err(shown)?;
         let setup = PlaneSetup {
             raster: file.raster(),
             camera_row_time_us: file.camera_row_time_us(),
@@ -77,6 +78,7 @@ impl Rig {
             first_row: file.camera.first_projector_row,
         };
         let folder = path.parent().unwrap_or(Path::new("."));
+        file.sim.bench = file.sim.bench.map(|bench| folder.join(bench));
         let sim = PlaneRig::new(file.sim.clone(), setup, folder).map_err(|error| {
             let path: Vec<&str> = ["sim"].into_iter().chain(error.key().split('.')).collect();
             shown(ConfigError::at(&text, &path, error.to_string()))
@@ -90,6 +92,11 @@ impl Rig {
         self.sim.first_row()
     }
 
+    /// The simulated rig.
+    pub fn simulated(&self) -> &PlaneRig {
+        &self.sim
+    }
+
     /// Opens all devices.
     ///
     /// # Errors
@@ -97,8 +104,17 @@ impl Rig {
     pub fn open(&self) -> Result<Devices, RigError> {
         let (Driver::Sim, Driver::Sim, Driver::Sim) =
             (self.file.camera.driver, self.file.vsync.driver, self.file.projector.driver);
+        if self.file.sim.bench.is_some() && self.file.camera.driver == Driver::Sim {
+            let message = "sim.bench: the camera of a bench is reached over its wire: set camera.driver to the driver that does, or leave sim.bench out";
+            return Err(RigError::Config(message.into()));
+        }
         let sim = self.sim.open();
-        let pace = if self.file.sim.realtime { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera: sim.camera, vsync: sim.vsync, projector: sim.projector, pace })
+        let (vsync, projector): (Box<dyn Vsync>, Box<dyn Projector>) = match &self.file.sim.bench {
+            Some(bench) => (Box::new(RemoteVsync::open(bench)?), Box::new(RemoteProjector::open(bench)?)),
+            None => (sim.vsync, sim.projector),
+        };
+        let by_the_clock = self.file.sim.realtime || self.file.sim.bench.is_some();
+        let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
+        Ok(Devices { camera: sim.camera, vsync, projector, pace })
     }
 }
