@@ -1,6 +1,7 @@
 //! libaravis: finding cameras, opening one, its features and its clock.
 
 use std::ffi::CStr;
+use std::net::IpAddr;
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,7 +14,6 @@ use aravis::prelude::*;
 use aravis::{Aravis, Camera, GcFeatureNode, GvDevice};
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind, RoundTrip};
 
-use super::config::{AravisConfig, ConfigFault};
 use super::features::{FeatureError, Features, Result, first_present};
 
 /// A camera that answered.
@@ -85,15 +85,12 @@ pub struct Device {
 }
 
 impl Device {
-    /// Opens the camera that the rig file names.
+    /// Opens a camera by its address or its name.
     ///
     /// # Errors
     /// `Disconnected` when it does not answer, `Busy` when another program controls it.
-    pub fn open(config: &AravisConfig, health: Arc<Health>) -> std::result::Result<Self, DeviceError> {
-        let named = config
-            .device()
-            .map_err(|fault: ConfigFault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
-        if config.name.is_some() {
+    pub fn open(named: &str, health: Arc<Health>) -> std::result::Result<Self, DeviceError> {
+        if named.parse::<IpAddr>().is_err() {
             // Without the list a name is looked for ten times as long.
             discover();
         }

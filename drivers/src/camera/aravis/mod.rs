@@ -39,4 +39,6 @@ mod setup;
 #[cfg(feature = "aravis")]
 pub use driver::{AravisCamera, RigFacts};
 #[cfg(feature = "aravis")]
+pub use file::{Refused, load_features, save_features};
+#[cfg(feature = "aravis")]
 pub use library::{Found, discover};

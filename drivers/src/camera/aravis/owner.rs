@@ -168,7 +168,10 @@ impl Owner {
 
     fn connect(&mut self) -> Result<(Connection, Opened), DeviceError> {
         let Self { config, facts, shared, .. } = self;
-        let device = Device::open(config, shared.health.clone())?;
+        let named = config
+            .device()
+            .map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
+        let device = Device::open(named, shared.health.clone())?;
         if device.has("AcquisitionStop") {
             // A client that died may have left it streaming; a camera that is not may refuse.
             let _ = device.execute("AcquisitionStop");
