@@ -11,6 +11,8 @@ mod gvsp;
 mod registers;
 mod source;
 mod stream;
+#[cfg(test)]
+mod tests;
 mod wire;
 
 use std::io;
