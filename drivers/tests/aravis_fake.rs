@@ -13,7 +13,9 @@ use raysweep_core::{
     Camera, CameraSettings, DeviceErrorKind, DeviceState, FirstFrame, FramePool, FrameStamp, LossCause,
     PixelFormat, SettingsId, Shutter,
 };
-use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, Region, RigFacts};
+use raysweep_drivers::camera::aravis::{
+    AravisCamera, AravisConfig, Region, RigFacts, discover, load_features, save_features,
+};
 
 use support::{ADDRESS, FakeCamera, own_network};
 
@@ -233,4 +235,33 @@ fn a_camera_that_stays_away_is_given_up() {
     };
     assert_eq!(error.kind, DeviceErrorKind::Disconnected);
     assert!(error.to_string().contains("camera.reopen_s = 2"), "{error}");
+}
+
+#[test]
+fn a_camera_is_found_and_its_settings_are_saved_and_restored() {
+    own_network();
+    let _device = FakeCamera::start(&[]);
+    let found = discover();
+    assert_eq!(found.len(), 1, "{found:?}");
+    assert_eq!((found[0].address.as_str(), found[0].model.as_str()), (ADDRESS, "Fake"));
+
+    let by_name = AravisConfig { address: None, name: Some(found[0].name.clone()), ..config(16_667, 256) };
+    let mut camera = AravisCamera::open(&by_name, FACTS).unwrap();
+    camera.configure(ID, &CameraSettings { exposure_us: 1234.0, ..SETTINGS }).unwrap();
+    let error = save_features(ADDRESS).unwrap_err();
+    assert_eq!(error.kind, DeviceErrorKind::Busy, "{error}");
+    drop(camera);
+    let saved = save_features(ADDRESS).unwrap();
+    for line in ["Width=256", "Height=256", "ExposureTimeAbs=1234", "PixelFormat=Mono8", "TriggerMode=Off"] {
+        assert!(saved.lines().any(|saved| saved == line), "{line} in\n{saved}");
+    }
+
+    drop(AravisCamera::open(&AravisConfig { binning: [2, 2], ..config(16_667, 512) }, FACTS).unwrap());
+    assert_ne!(save_features(ADDRESS).unwrap(), saved);
+    let text = format!("{saved}NoSuchFeature=1\nWidth=1000000\n");
+    let (taken, refused) = load_features(ADDRESS, &text).unwrap();
+    let lines: Vec<_> = refused.iter().map(|refused| refused.line.as_str()).collect();
+    assert_eq!(lines, ["NoSuchFeature=1", "Width=1000000"], "{refused:?}");
+    assert_eq!(taken, saved.lines().count() - 1);
+    assert_eq!(save_features(ADDRESS).unwrap(), saved);
 }
