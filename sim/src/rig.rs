@@ -7,7 +7,7 @@ use ndarray::Array2;
 use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
 
 use crate::config::SimConfig;
-use crate::devices::{self, Devices};
+use crate::devices::{self, Devices, WireDevices};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::line::{Exposure, Line, LineConfig, Shown};
 use crate::optics::{self, Optics};
@@ -188,6 +188,11 @@ impl PlaneRig {
     pub fn open(&self) -> Devices {
         let clock = if self.bench.config.realtime { Clock::real() } else { Clock::simulated() };
         devices::open(&self.bench, Line::new(self.bench.line_config(), clock.now_ns()), clock)
+    }
+
+    /// Opens the devices by the host's clock, with the camera as what a wire leads to.
+    pub fn open_for_wire(&self) -> WireDevices {
+        devices::open_for_wire(&self.bench, Line::new(self.bench.line_config(), Clock::real().now_ns()))
     }
 
     /// The light of an image without noise or jitter, in the scene's units, `[t, s]`: each camera row exposed for

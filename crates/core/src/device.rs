@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use crate::{DeviceError, Edge, FrameBuf, FrameStamp, PixelFormat};
+use crate::{DeviceError, Edge, FrameBuf, FrameStamp, LossCause, PixelFormat};
 
 /// How a sensor exposes its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -186,6 +186,11 @@ pub trait Camera: Send {
         buf: &mut FrameBuf,
         timeout: Duration,
     ) -> Result<Option<FrameStamp>, DeviceError>;
+
+    /// Why a frame is lost whose id [`Camera::next_frame`] left out before the newest one.
+    fn loss_of(&self, _seq: u64) -> LossCause {
+        LossCause::CameraGap
+    }
 
     /// Answers no further trigger. Idempotent.
     ///

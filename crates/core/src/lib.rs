@@ -5,6 +5,7 @@
 //! `i64` (`_ns`) or microseconds as `f64` (`_us`); the unit stands in every name.
 
 mod clock;
+mod clock_model;
 mod counts;
 mod device;
 mod error;
@@ -15,6 +16,7 @@ mod raster;
 mod units;
 
 pub use clock::{Clock, ClockHandle};
+pub use clock_model::{ClockModel, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Pattern, Projector,

@@ -1,6 +1,7 @@
 //! `[camera.v4l2]` of a rig file.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use raysweep_core::{PixelFormat, Readout};
 use serde::Deserialize;
@@ -57,6 +58,10 @@ pub struct V4l2Setup {
     pub format: PixelFormat,
     /// From the start of one row's exposure to the next row's, as the rig needs it.
     pub row_time_us: f64,
+    /// From one trigger to the next.
+    pub trigger_period_us: f64,
+    /// How long a camera that is lost may stay away.
+    pub reopen: Duration,
 }
 
 impl V4l2Config {

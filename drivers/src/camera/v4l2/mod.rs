@@ -15,12 +15,13 @@ mod timing;
 
 use std::collections::VecDeque;
 use std::io;
+use std::ops::Range;
 use std::time::Duration;
 
 use nix::libc::{EACCES, EBUSY, EINVAL, EIO, ENODEV, ENOENT, ENOTTY, ENXIO, EPERM, ERANGE};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState,
-    FirstFrame, FrameBuf, FrameStamp, SettingsId, Shutter,
+    FirstFrame, FrameBuf, FrameStamp, LossCause, SettingsId, Shutter, us_from_ns,
 };
 
 pub use self::config::{TimeControl, V4l2Config, V4l2Setup};
@@ -71,6 +72,10 @@ pub struct V4l2Camera {
     /// The first frame that is certain to have them.
     certain: u64,
     ids: Ids,
+    /// When the newest frame was exposed.
+    newest_ns: Option<i64>,
+    /// Frames that went by while the camera was lost.
+    away: Range<u64>,
     exposures: Exposures,
     /// Frames that were there when settings were written, oldest first.
     waiting: VecDeque<(u64, Filled, i64)>,
@@ -80,7 +85,7 @@ pub struct V4l2Camera {
 /// The way to the device.
 enum Link {
     Open(Session),
-    Lost { next_attempt_ns: i64 },
+    Lost { since_ns: i64, next_attempt_ns: i64 },
 }
 
 impl V4l2Camera {
@@ -106,6 +111,8 @@ impl V4l2Camera {
             settings: (settings, settings),
             certain: 0,
             ids: Ids::default(),
+            newest_ns: None,
+            away: 0..0,
             warned_of_clock: false,
             setup,
         })
@@ -115,11 +122,11 @@ impl V4l2Camera {
     fn lose(&mut self, cause: &io::Error) {
         tracing::warn!(%cause, device = %self.setup.config.device.display(), "camera lost; opening it again");
         self.waiting.clear();
-        self.schedule_attempt();
+        self.schedule_attempt(self.clock.now_ns());
     }
 
-    fn schedule_attempt(&mut self) {
-        self.link = Link::Lost { next_attempt_ns: self.clock.now_ns() + self.pause_ns };
+    fn schedule_attempt(&mut self, since_ns: i64) {
+        self.link = Link::Lost { since_ns, next_attempt_ns: self.clock.now_ns() + self.pause_ns };
         self.pause_ns = (2 * self.pause_ns).clamp(FIRST_PAUSE_NS, LONGEST_PAUSE_NS);
     }
 
@@ -145,21 +152,34 @@ impl V4l2Camera {
 
     /// Tries to open a lost device, at most once, and not before it is time.
     fn reopen(&mut self, now_ns: i64) {
-        let Link::Lost { next_attempt_ns } = self.link else { return };
+        let Link::Lost { since_ns, next_attempt_ns } = self.link else { return };
         if now_ns < next_attempt_ns {
             return;
         }
         match self.reopened() {
             Ok(session) => {
                 tracing::info!(device = %self.setup.config.device.display(), "camera is back");
-                self.ids.stream_begins();
+                self.resume_ids();
                 self.link = Link::Open(session);
             }
             Err(cause) => {
                 tracing::debug!(%cause, "camera still lost");
-                self.schedule_attempt();
+                self.schedule_attempt(since_ns);
             }
         }
+    }
+
+    /// Ids go on as if the camera had counted the triggers that it missed.
+    fn resume_ids(&mut self) {
+        let next = self.ids.next();
+        let missed = self.newest_ns.map_or(0, |newest_ns| {
+            let period_us = self.setup.trigger_period_us;
+            let periods = self.capabilities.periods_per_frame(&self.settings.1, period_us);
+            let away_us = us_from_ns(self.clock.now_ns() - newest_ns);
+            (away_us / (f64::from(periods) * period_us)) as u64
+        });
+        self.away = next..next + missed;
+        self.ids.stream_begins(self.away.end);
     }
 
     /// Takes a filled buffer off the kernel, with its id and when that was.
@@ -206,6 +226,7 @@ impl V4l2Camera {
         }
         let exposure_us = self.exposures.of(id);
         let start_ns = exposure_start_ns(&filled, exposure_us, self.capabilities.readout_us, dequeued_ns);
+        self.newest_ns = Some(start_ns);
         Ok(Some(FrameStamp {
             seq: id,
             // The kernel's clock is the host's.
@@ -222,7 +243,7 @@ impl V4l2Camera {
             Link::Open(session) => {
                 session.node.wait(Duration::from_nanos((deadline_ns - now_ns).unsigned_abs()))
             }
-            Link::Lost { next_attempt_ns } => {
+            Link::Lost { next_attempt_ns, .. } => {
                 self.clock.register().sleep_until(deadline_ns.min(*next_attempt_ns));
                 Ok(())
             }
@@ -308,7 +329,8 @@ impl Camera for V4l2Camera {
             }),
         };
         started?;
-        self.ids.stream_begins();
+        self.ids.stream_begins(self.ids.next());
+        self.newest_ns = None;
         self.armed = true;
         Ok(())
     }
@@ -334,6 +356,15 @@ impl Camera for V4l2Camera {
         loop {
             self.reopen(self.clock.now_ns());
             let now_ns = self.clock.now_ns();
+            if let Link::Lost { since_ns, .. } = self.link
+                && now_ns - since_ns > i64::try_from(self.setup.reopen.as_nanos()).unwrap_or(i64::MAX)
+            {
+                let what = format!(
+                    "was lost and did not come back within camera.reopen_s = {} s",
+                    self.setup.reopen.as_secs_f64()
+                );
+                return Err(error(DeviceErrorKind::Disconnected, what));
+            }
             match self.take(buf) {
                 Ok(Some(stamp)) => return Ok(Some(stamp)),
                 Ok(None) if now_ns >= deadline_ns => return Ok(None),
@@ -345,6 +376,10 @@ impl Camera for V4l2Camera {
                 Err(cause) => self.lose(&cause),
             }
         }
+    }
+
+    fn loss_of(&self, seq: u64) -> LossCause {
+        if self.away.contains(&seq) { LossCause::CameraLost } else { LossCause::CameraGap }
     }
 
     fn disarm(&mut self) -> Result<(), DeviceError> {

@@ -3,7 +3,7 @@ use std::time::Duration;
 use nix::libc::{EBUSY, EINVAL, EIO, ENOENT, ENOTTY};
 use raysweep_core::{
     Camera, CameraSettings, DeviceError, DeviceErrorKind, DeviceState, FirstFrame, FrameBuf, FramePool,
-    FrameStamp, PixelFormat, SettingsId, Shutter,
+    FrameStamp, LossCause, PixelFormat, SettingsId, Shutter,
 };
 
 use super::node::{FLAG_CLOCK_MONOTONIC, FLAG_ERROR, FLAG_MOMENT_START_OF_EXPOSURE};
@@ -13,7 +13,13 @@ use super::*;
 /// Eight columns, four rows of 10 us: 40 us of readout.
 fn setup(keys: &str) -> V4l2Setup {
     let text = format!("device = \"/dev/video0\"\nwidth = 8\nheight = 4\nlate_frames = 2\n{keys}");
-    V4l2Setup { config: toml::from_str(&text).unwrap(), format: PixelFormat::Mono8, row_time_us: 10.0 }
+    V4l2Setup {
+        config: toml::from_str(&text).unwrap(),
+        format: PixelFormat::Mono8,
+        row_time_us: 10.0,
+        trigger_period_us: 10_000.0,
+        reopen: Duration::from_secs(60),
+    }
 }
 
 fn open(script: &Script, setup: V4l2Setup) -> Result<V4l2Camera, DeviceError> {
@@ -303,6 +309,7 @@ fn rows_with_gaps_between_them_are_put_together() {
 #[test]
 fn a_camera_that_is_pulled_out_and_plugged_in_goes_on_as_it_was() {
     let script = Script::new([]);
+    // The frame before is exposed at 5 ms.
     let keys = "controls = [[\"trigger_mode\", 1]]";
     let mut feed = Feed::new(&script, setup(keys));
     feed.camera.configure(ID, &exposed(700.0)).unwrap();
@@ -323,8 +330,31 @@ fn a_camera_that_is_pulled_out_and_plugged_in_goes_on_as_it_was() {
     assert_eq!(feed.camera.state(), DeviceState::Streaming);
     // Attempts at once, after 100, 200 and 400 ms.
     assert!(feed.camera.clock.now_ns() - began_ns <= 700_000_000);
-    assert_eq!(feed.seqs(1), [2], "ids go on");
-    assert_eq!((script.device().controls[0].1, script.device().controls[2].1), (7, 1), "settings are back");
+    // The time away in periods of 10 ms, from the exposure of frame 0 on; the frame after the gap came above.
+    let seq = feed.seqs(1)[0];
+    let first = seq - 1;
+    assert_eq!(first, 1 + (feed.camera.clock.now_ns() as u64 - 5_000_000) / 10_000_000);
+    assert_eq!(feed.camera.loss_of(1), LossCause::CameraLost);
+    assert_eq!(feed.camera.loss_of(first - 1), LossCause::CameraLost);
+    assert_eq!(feed.camera.loss_of(first), LossCause::CameraGap);
+    let held = script.device().controls.iter().map(|(_, value)| *value).collect::<Vec<_>>();
+    assert_eq!(held, [7, 0, 1], "settings and controls are back");
+}
+
+#[test]
+fn a_camera_that_stays_away_ends_the_run() {
+    let script = Script::new([Step::Gone]);
+    let mut feed = Feed::new(&script, V4l2Setup { reopen: Duration::from_secs(3), ..setup("") });
+    script.device().refusals.extend([ENOENT; 1000]);
+    let gone = loop {
+        match feed.camera.next_frame(&mut feed.buf, WAIT) {
+            Ok(stamp) => assert!(stamp.is_none()),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!(gone.kind, DeviceErrorKind::Disconnected);
+    assert!(gone.to_string().contains("camera.reopen_s = 3 s"), "{gone}");
+    assert!((3_000_000_000..=3_200_000_000).contains(&feed.camera.clock.now_ns()));
 }
 
 #[test]

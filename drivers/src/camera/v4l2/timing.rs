@@ -17,8 +17,9 @@ pub(super) struct Ids {
 }
 
 impl Ids {
-    /// A stream begins: its count says nothing about frames before.
-    pub(super) fn stream_begins(&mut self) {
+    /// A stream begins: its count says nothing about frames before. Its first frame is taken for this one.
+    pub(super) fn stream_begins(&mut self, first: u64) {
+        self.newest = first.checked_sub(1);
         self.count = None;
     }
 
@@ -90,10 +91,12 @@ mod tests {
         let taken: Vec<u64> =
             [0xFFFF_FF80, 0xFFFF_FF81, 0xFFFF_FFFF, 0, 3].into_iter().map(|count| ids.take(count)).collect();
         assert_eq!(taken, [0, 1, 127, 128, 131]);
-        ids.stream_begins();
+        ids.stream_begins(ids.next());
         assert_eq!((ids.next(), ids.take(7), ids.take(8)), (132, 132, 133));
         // A driver that never counts.
         assert_eq!((ids.take(8), ids.take(8), ids.take(2)), (134, 135, 136));
+        ids.stream_begins(0);
+        assert_eq!(ids.take(9), 0);
     }
 
     #[test]
