@@ -470,6 +470,14 @@ mod tests {
             (MINIMAL.replace("[camera]\n", "[camera]\nfirst_projector_row = 720\n"), "0 to 719"),
             (format!("{MINIMAL}[sim]\nseed = -1\n"), "-1"),
             (MINIMAL.replacen("\"sim\"", "\"aravis\"", 1), "`raysweep devices`"),
+            (MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\""), "[camera.v4l2]"),
+            (
+                format!(
+                    "{}[camera.v4l2]\ndevice = \"/dev/video0\"\nwidth = 640\nheight = 360\nbuffers = 1\n",
+                    MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\"")
+                ),
+                "camera.v4l2.buffers = 1: allowed is 2 to 32",
+            ),
             (MINIMAL.replace("[camera]\n", "[camera]\nreopen_s = -1\n"), "camera.reopen_s = -1"),
             (
                 MINIMAL.replacen("\"sim\"", "\"aravis\"\naravis.name = \"a\"\naravis.packet_size = 10", 1),

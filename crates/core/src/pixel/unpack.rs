@@ -244,8 +244,7 @@ mod x86 {
             let (high_mask, low_mask) = (cast([layout.high_mask; 16]), cast([layout.low_mask; 16]));
 
             let bytes = groups.as_flattened();
-            let half =
-                |at: usize| bytes.get(at..at + 16)?.as_array::<16>().map(|half| cast::<_, __m128i>(*half));
+            let half = |at: usize| Some(cast::<[u8; 16], __m128i>(*bytes.get(at..)?.first_chunk()?));
             let mut done = 0;
             for pixels in pixels.as_chunks_mut::<VECTOR>().0 {
                 // The last loads would reach beyond the end.

@@ -84,7 +84,7 @@ pub struct V4l2Camera {
 
 /// The way to the device.
 enum Link {
-    Open(Session),
+    Open(Box<Session>),
     Lost { since_ns: i64, next_attempt_ns: i64 },
 }
 
@@ -131,7 +131,7 @@ impl V4l2Camera {
     }
 
     /// Opens the device as it was: same formats, same settings, streaming if it was.
-    fn reopened(&mut self) -> Result<Session, DeviceError> {
+    fn reopened(&mut self) -> Result<Box<Session>, DeviceError> {
         let mut session = Session::open(self.opener.as_mut(), &self.setup)?;
         let found = session.capabilities(&self.setup);
         if found != self.capabilities || session.layout() != self.layout {

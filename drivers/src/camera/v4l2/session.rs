@@ -48,7 +48,7 @@ pub(super) struct Session {
 }
 
 impl Session {
-    pub(super) fn open(opener: &mut dyn Opener, setup: &V4l2Setup) -> Result<Self, DeviceError> {
+    pub(super) fn open(opener: &mut dyn Opener, setup: &V4l2Setup) -> Result<Box<Self>, DeviceError> {
         let config = &setup.config;
         let at = |cause| kernel_error_at(&config.device.display().to_string(), cause);
         let mut node = opener.open(&config.device).map_err(at)?;
@@ -92,7 +92,7 @@ impl Session {
             );
             return Err(error(DeviceErrorKind::Busy, what));
         }
-        Ok(Self { node, identity, layout, buffers, row_time_us, exposure, trigger_delay })
+        Ok(Box::new(Self { node, identity, layout, buffers, row_time_us, exposure, trigger_delay }))
     }
 
     pub(super) fn layout(&self) -> Layout {
