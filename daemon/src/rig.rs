@@ -2,11 +2,14 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
-use raysweep_core::{Camera, DeviceError, Projector, Vsync};
+use raysweep_core::{Camera, CameraCapabilities, DeviceError, Projector, Vsync};
+use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
+use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
-use crate::config::{ConfigError, Driver, RigFile};
+use crate::config::{CameraDriver, ConfigError, Driver, RigFile};
 
 /// Why a rig cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -66,7 +69,7 @@ impl Rig {
         let text = std::fs::read_to_string(path)
             .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
         let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
-        let file = RigFile::parse(&text).map_err(shown)?;
+        let mut file = RigFile::parse(&text).map_err(shown)?;
         let setup = PlaneSetup {
             raster: file.raster(),
             camera_row_time_us: file.camera_row_time_us(),
@@ -77,6 +80,7 @@ impl Rig {
             first_row: file.camera.first_projector_row,
         };
         let folder = path.parent().unwrap_or(Path::new("."));
+        file.sim.bench = file.sim.bench.map(|bench| folder.join(bench));
         let sim = PlaneRig::new(file.sim.clone(), setup, folder).map_err(|error| {
             let path: Vec<&str> = ["sim"].into_iter().chain(error.key().split('.')).collect();
             shown(ConfigError::at(&text, &path, error.to_string()))
@@ -85,9 +89,37 @@ impl Rig {
         Ok(Self { file, text, sim })
     }
 
-    /// Projector row that camera row 0 sees.
-    pub fn first_row(&self) -> usize {
-        self.sim.first_row()
+    /// Projector row that row 0 of its camera sees.
+    pub fn first_row(&self, camera: &CameraCapabilities) -> usize {
+        let RigFile { camera: section, projector, sim, .. } = &self.file;
+        if section.driver == CameraDriver::Sim || sim.bench.is_some() {
+            return self.sim.first_row();
+        }
+        let middle = projector.rows.saturating_sub(self.projector_rows_of(camera)) / 2;
+        section.first_projector_row.unwrap_or(middle)
+    }
+
+    /// How many projector rows the rows of a camera look along.
+    fn projector_rows_of(&self, camera: &CameraCapabilities) -> usize {
+        (camera.height.saturating_sub(1) as f64 * self.file.camera.row_pitch).round() as usize + 1
+    }
+
+    /// Whether the camera's rows lie within the projector's.
+    fn check_rows(&self, camera: &CameraCapabilities) -> Result<(), RigError> {
+        let (first, rows) = (self.first_row(camera), self.projector_rows_of(camera));
+        let projector_rows = self.file.projector.rows;
+        if first + rows <= projector_rows {
+            return Ok(());
+        }
+        Err(RigError::Config(format!(
+            "the camera's {} rows look along {rows} projector rows from {first} on, of {projector_rows}: read out a smaller region of its sensor, lower camera.row_pitch or set camera.first_projector_row",
+            camera.height
+        )))
+    }
+
+    /// The simulated rig.
+    pub fn simulated(&self) -> &PlaneRig {
+        &self.sim
     }
 
     /// Opens all devices.
@@ -95,10 +127,61 @@ impl Rig {
     /// # Errors
     /// The first device that does not open.
     pub fn open(&self) -> Result<Devices, RigError> {
-        let (Driver::Sim, Driver::Sim, Driver::Sim) =
-            (self.file.camera.driver, self.file.vsync.driver, self.file.projector.driver);
+        let (Driver::Sim, Driver::Sim) = (self.file.vsync.driver, self.file.projector.driver);
+        if self.file.sim.bench.is_some() && self.file.camera.driver == CameraDriver::Sim {
+            let message = "sim.bench: the camera of a bench is reached over its wire: set camera.driver to the driver that does, or leave sim.bench out";
+            return Err(RigError::Config(message.into()));
+        }
         let sim = self.sim.open();
-        let pace = if self.file.sim.realtime { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera: sim.camera, vsync: sim.vsync, projector: sim.projector, pace })
+        let (vsync, projector): (Box<dyn Vsync>, Box<dyn Projector>) = match &self.file.sim.bench {
+            Some(bench) => (Box::new(RemoteVsync::open(bench)?), Box::new(RemoteProjector::open(bench)?)),
+            None => (sim.vsync, sim.projector),
+        };
+        let camera = match self.file.camera.driver {
+            CameraDriver::Sim => sim.camera,
+            CameraDriver::Aravis => self.open_aravis()?,
+            CameraDriver::V4l2 => self.open_v4l2()?,
+        };
+        self.check_rows(camera.capabilities())?;
+        let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
+        let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
+        Ok(Devices { camera, vsync, projector, pace })
+    }
+
+    fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {
+        let RigFile { camera, vsync, .. } = &self.file;
+        let Some(config) = camera.v4l2.clone() else {
+            return Err(RigError::Config("[camera.v4l2] is missing".into()));
+        };
+        let setup = V4l2Setup {
+            config,
+            format: camera.pixel_format,
+            row_time_us: self.file.camera_row_time_us(),
+            trigger_period_us: vsync.period_us,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(v4l2::open(setup)?))
+    }
+
+    #[cfg(feature = "aravis")]
+    fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
+        use raysweep_drivers::camera::aravis::{AravisCamera, RigFacts};
+
+        let RigFile { camera, vsync, .. } = &self.file;
+        let facts = RigFacts {
+            format: camera.pixel_format,
+            row_time_us: self.file.camera_row_time_us(),
+            trigger_period_us: vsync.period_us,
+            trigger_margin_us: vsync.gate_us,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
+    }
+
+    #[cfg(not(feature = "aravis"))]
+    fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
+        Err(RigError::Config(
+            "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
+        ))
     }
 }

@@ -22,6 +22,9 @@ pub struct SimConfig {
     pub motion_period_s: f64,
     /// Pace by the host's clock instead of as fast as it can.
     pub realtime: bool,
+    /// Socket (relative to the rig file) of the process that simulates VSYNC line and projector beside a camera that is
+    /// reached by its own driver; left out: everything is simulated in this process.
+    pub bench: Option<PathBuf>,
     /// `[sim.projector]`
     pub projector: SimProjector,
     /// `[sim.vsync]`
@@ -43,6 +46,7 @@ impl Default for SimConfig {
             seed: 1,
             motion_period_s: 4.0,
             realtime: false,
+            bench: None,
             projector: SimProjector::default(),
             vsync: SimVsync::default(),
             camera: SimCamera::default(),

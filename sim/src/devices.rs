@@ -5,9 +5,11 @@ use std::time::Duration;
 
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, DeviceErrorKind,
-    Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync, us_from_ns,
+    DeviceState, Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync,
+    us_from_ns,
 };
 
+use crate::gige::Look;
 use crate::line::{Exposure, Light, Line, LineTruth};
 use crate::rig::Bench;
 use crate::sensor::Exposed;
@@ -23,6 +25,18 @@ pub struct Devices {
     /// The clock that they live by.
     pub clock: Clock,
     /// What really happens on the line. A real rig has no such thing: it is for tests alone.
+    pub truth: TruthProbe,
+}
+
+/// The devices of one rig, by the host's clock, with the camera behind a wire.
+pub struct WireDevices {
+    /// What the camera looks at.
+    pub camera: Look,
+    /// The watcher of the VSYNC line.
+    pub vsync: Box<dyn Vsync>,
+    /// The projector; dark at first.
+    pub projector: Box<dyn Projector>,
+    /// What really happens on the line, for tests alone.
     pub truth: TruthProbe,
 }
 
@@ -84,7 +98,19 @@ pub fn open(bench: &Arc<Bench>, line: Line, clock: Clock) -> Devices {
     }
 }
 
-struct SimCamera {
+/// The devices of [`open`], with two handles of the camera: one writes its settings while the other waits for frames.
+pub fn open_for_wire(bench: &Arc<Bench>, line: Line) -> WireDevices {
+    let (line, clock) = (SharedLine(Arc::new(Mutex::new(line))), Clock::real());
+    let camera = || SimCamera::new(bench.clone(), line.clone(), clock.register());
+    WireDevices {
+        camera: Look::at_scene(camera(), camera()),
+        vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
+        projector: Box::new(SimProjector { bench: bench.clone(), line: line.clone(), clock }),
+        truth: TruthProbe(line),
+    }
+}
+
+pub struct SimCamera {
     bench: Arc<Bench>,
     line: SharedLine,
     clock: ClockHandle,
@@ -111,14 +137,33 @@ impl SimCamera {
         DeviceError::new("camera", kind, what.into())
     }
 
+    /// The counts of the last exposure, `[t, s]` row-major.
+    pub fn counts(&self) -> &[u16] {
+        &self.counts
+    }
+
+    /// The line that triggers it.
+    pub fn with_line<T>(&self, work: impl FnOnce(&mut Line, i64) -> T) -> T {
+        let now_ns = self.clock.now_ns();
+        work(&mut self.line.lock(), now_ns)
+    }
+
+    /// Waits for the next exposure and reads the sensor; the shutter starts at row `first_row` and leaves out those above.
+    pub fn next_exposure(&mut self, first_row: usize, timeout: Duration) -> Option<Exposure> {
+        let taken = self.line.wait(&self.clock, timeout, |line, now_ns| line.take_frame(now_ns));
+        let (exposure, lights) = taken?;
+        self.render(&exposure, &lights, first_row);
+        Some(exposure)
+    }
+
     /// Integrates the light of an exposure and reads the sensor.
-    fn render(&mut self, exposure: &Exposure, lights: &[Light]) {
+    fn render(&mut self, exposure: &Exposure, lights: &[Light], first_row: usize) {
         let (_, width) = self.bench.size;
         let exposure_us = exposure.settings.exposure_us;
         let ambient = self.bench.ambient(exposure);
-        for (t, row) in self.light.chunks_mut(width).enumerate() {
+        for (t, row) in self.light.chunks_mut(width).enumerate().skip(first_row) {
             row.fill(ambient);
-            let row_start_us = self.bench.row_start_us(exposure.settings.shutter, t);
+            let row_start_us = self.bench.row_start_us(exposure.settings.shutter, t - first_row);
             for light in lights {
                 if let Some(optics) = &light.optics {
                     let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
@@ -134,6 +179,10 @@ impl SimCamera {
 impl Camera for SimCamera {
     fn capabilities(&self) -> &CameraCapabilities {
         &self.capabilities
+    }
+
+    fn state(&self) -> DeviceState {
+        if self.line.lock().is_armed() { DeviceState::Streaming } else { DeviceState::Ready }
     }
 
     fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
@@ -173,9 +222,7 @@ impl Camera for SimCamera {
                 "next_frame before arm: arm the camera first",
             ));
         }
-        let taken = self.line.wait(&self.clock, timeout, |line, now_ns| line.take_frame(now_ns));
-        let Some((exposure, lights)) = taken else { return Ok(None) };
-        self.render(&exposure, &lights);
+        let Some(exposure) = self.next_exposure(0, timeout) else { return Ok(None) };
         self.bench
             .format
             .pack_into(&self.counts, buf)

@@ -20,6 +20,8 @@ pub enum Purpose {
     Flicker,
     /// Kinks of the row table.
     RowTable,
+    /// What becomes of one packet, or one frame, on the wire.
+    Wire,
 }
 
 /// A generator for `purpose` under the rig's `seed`, told apart by `key`.

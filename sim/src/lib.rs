@@ -4,8 +4,10 @@
 //! lack. All randomness is keyed by what it is for (point, attempt, frame), so the same seed gives the same bits
 //! whatever the number of threads and wherever a run was interrupted.
 
+pub mod bench;
 pub mod config;
 mod devices;
+pub mod gige;
 mod keyed;
 mod line;
 pub mod optics;
@@ -14,6 +16,6 @@ pub mod scene;
 mod sensor;
 
 pub use config::SimConfig;
-pub use devices::{Devices, TruthProbe};
+pub use devices::{Devices, TruthProbe, WireDevices};
 pub use line::LineTruth;
 pub use rig::{PlaneRig, PlaneSetup, SimError};

@@ -76,6 +76,8 @@ pub struct Line {
     seen: VecDeque<Edge>,
     edges: u64,
     camera: CameraLine,
+    /// In the place of what is configured.
+    late_frames: Option<u32>,
     truth: LineTruth,
 }
 
@@ -92,8 +94,25 @@ enum EdgeKind {
     False,
 }
 
+/// What starts the camera's exposures.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum TriggeredBy {
+    /// The edges of the VSYNC line.
+    Edges,
+    /// [`Line::fire`] alone.
+    Software,
+    /// The camera's own clock, as often as it is ready and no faster than this.
+    FreeRun {
+        /// From one exposure's trigger to the next one's.
+        period_ns: i64,
+    },
+}
+
 struct CameraLine {
     armed: bool,
+    triggered_by: TriggeredBy,
+    /// When a free-running camera triggers itself next.
+    next_free_ns: i64,
     /// Triggers before this are not heard.
     deaf_until_ns: i64,
     /// No exposure may start before this.
@@ -115,6 +134,12 @@ impl CameraLine {
         due.map_or(self.in_force, |(_, settings)| *settings)
     }
 
+    /// When the camera triggers itself, where it does.
+    fn free_run_ns(&self) -> i64 {
+        let runs = self.armed && matches!(self.triggered_by, TriggeredBy::FreeRun { .. });
+        if runs { self.next_free_ns } else { i64::MAX }
+    }
+
     /// Whether an edge at `edge_ns` would be answered.
     fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
         let start_ns = edge_ns + ns_from_us(latency_us + self.due().trigger_delay_us);
@@ -123,7 +148,7 @@ impl CameraLine {
 }
 
 /// What really happened, for tests alone.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LineTruth {
     /// Exposures that the camera made while armed.
     pub exposures: u64,
@@ -139,6 +164,8 @@ pub struct LineTruth {
 
 /// Frames that the camera keeps for a host that does not take them; older ones are lost.
 const CAMERA_BUFFERS: usize = 32;
+/// How soon a free-running camera that was not ready looks again.
+const FREE_RETRY_NS: i64 = 50_000;
 /// A period is drawn this long before its nominal edge, so that no jitter puts the edge before the draw.
 const GUARD_NS: i64 = 400_000;
 
@@ -160,6 +187,8 @@ impl Line {
             edges: 0,
             camera: CameraLine {
                 armed: false,
+                triggered_by: TriggeredBy::Edges,
+                next_free_ns: 0,
                 deaf_until_ns: 0,
                 occupied_until_ns: 0,
                 id: SettingsId { point: u32::MAX, attempt: 0 },
@@ -169,6 +198,7 @@ impl Line {
                 seq: 0,
                 exposures: VecDeque::new(),
             },
+            late_frames: None,
             truth: LineTruth::default(),
         }
     }
@@ -179,6 +209,10 @@ impl Line {
 
     /// When something happens next.
     pub fn next_event_ns(&self) -> i64 {
+        self.next_line_event_ns().min(self.camera.free_run_ns())
+    }
+
+    fn next_line_event_ns(&self) -> i64 {
         let draw_ns = self.nominal_ns(self.next_period) - GUARD_NS;
         self.pending.front().map_or(draw_ns, |edge| edge.at_ns.min(draw_ns))
     }
@@ -186,6 +220,10 @@ impl Line {
     /// Lets everything happen that happens until `now_ns`.
     pub fn advance(&mut self, now_ns: i64) {
         while self.next_event_ns() <= now_ns {
+            if self.camera.free_run_ns() < self.next_line_event_ns() {
+                self.free_run();
+                continue;
+            }
             let draw_ns = self.nominal_ns(self.next_period) - GUARD_NS;
             match self.pending.front() {
                 Some(edge) if edge.at_ns <= draw_ns => {
@@ -270,9 +308,19 @@ impl Line {
         } else {
             self.seen.push_back(Edge { seq: self.edges, host_ns: edge.at_ns });
         }
-        if self.trigger(edge.at_ns) && edge.kind == EdgeKind::False {
+        let answered = self.camera.triggered_by == TriggeredBy::Edges && self.trigger(edge.at_ns);
+        if answered && edge.kind == EdgeKind::False {
             self.truth.false_triggers += 1;
         }
+    }
+
+    /// The trigger of a free-running camera.
+    fn free_run(&mut self) {
+        let TriggeredBy::FreeRun { period_ns } = self.camera.triggered_by else { return };
+        let at_ns = self.camera.next_free_ns;
+        let answered = self.trigger(at_ns);
+        self.camera.next_free_ns =
+            at_ns + if answered { period_ns.max(FREE_RETRY_NS) } else { FREE_RETRY_NS };
     }
 
     /// Whether the camera answered.
@@ -320,7 +368,7 @@ impl Line {
         } else {
             config.camera.late_frames_max
         };
-        let first_seq = self.camera.seq + u64::from(late);
+        let first_seq = self.camera.seq + u64::from(self.late_frames.unwrap_or(late));
         self.camera.id = id;
         self.camera.frames = 0;
         // Registers are read in the order in which they were written: the latest word stands.
@@ -342,10 +390,34 @@ impl Line {
         }
     }
 
+    /// Triggers the camera by command; whether it answered.
+    pub fn fire(&mut self, now_ns: i64) -> bool {
+        self.advance(now_ns);
+        self.camera.triggered_by == TriggeredBy::Software && self.trigger(now_ns)
+    }
+
+    /// Chooses what starts exposures.
+    pub fn set_triggered_by(&mut self, now_ns: i64, triggered_by: TriggeredBy) {
+        self.advance(now_ns);
+        self.camera.triggered_by = triggered_by;
+        self.camera.next_free_ns = now_ns;
+    }
+
+    /// How many frames still have the old settings after a change, from now on; `None`: as configured.
+    pub fn set_late_frames(&mut self, frames: Option<u32>) {
+        self.late_frames = frames;
+    }
+
+    /// The number of the next exposure.
+    pub fn next_seq(&self) -> u64 {
+        self.camera.seq
+    }
+
     /// Arms or disarms the camera.
     pub fn set_armed(&mut self, now_ns: i64, armed: bool) {
         self.advance(now_ns);
         self.camera.armed = armed;
+        self.camera.next_free_ns = now_ns;
         if !armed {
             self.camera.exposures.clear();
         }

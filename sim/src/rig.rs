@@ -7,7 +7,7 @@ use ndarray::Array2;
 use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
 
 use crate::config::SimConfig;
-use crate::devices::{self, Devices};
+use crate::devices::{self, Devices, WireDevices};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::line::{Exposure, Line, LineConfig, Shown};
 use crate::optics::{self, Optics};
@@ -190,6 +190,11 @@ impl PlaneRig {
         devices::open(&self.bench, Line::new(self.bench.line_config(), clock.now_ns()), clock)
     }
 
+    /// Opens the devices by the host's clock, with the camera as what a wire leads to.
+    pub fn open_for_wire(&self) -> WireDevices {
+        devices::open_for_wire(&self.bench, Line::new(self.bench.line_config(), Clock::real().now_ns()))
+    }
+
     /// The light of an image without noise or jitter, in the scene's units, `[t, s]`: each camera row exposed for
     /// `exposure_us`, centred `delay_us` after its own projector row, to one white frame.
     ///
@@ -227,7 +232,7 @@ impl Bench {
     pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
         let rows = self.setup.raster.rows;
         let build = |weights: &[f32]| {
-            let mosaic = self.format.is_mosaic();
+            let mosaic = self.format.mosaic;
             let (raster, projector) = (&self.setup.raster, &self.config.projector);
             let optics = |scene| {
                 Optics::new(scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)

@@ -10,6 +10,12 @@ use serde::{Deserialize, Serialize};
 pub enum LossCause {
     /// The camera exposed a frame (its id says so) that never reached the host.
     CameraGap,
+    /// Packets of the frame were lost on the wire, and the camera did not or could not send them again.
+    PacketsLost,
+    /// The camera's driver had no free buffer: the host took its frames too late.
+    DriverFull,
+    /// The camera had stopped answering and was being opened again.
+    CameraLost,
     /// A VSYNC edge came while the camera should have been ready, and no frame followed.
     MissedTrigger,
     /// No VSYNC edge was seen where the frame's, or its light's, should have been.

@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use crate::{DeviceError, Edge, FrameBuf, FrameStamp, PixelFormat};
+use crate::{DeviceError, Edge, FrameBuf, FrameStamp, LossCause, PixelFormat};
 
 /// How a sensor exposes its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -102,6 +102,12 @@ impl CameraCapabilities {
     /// # Errors
     /// Field, value and what is allowed.
     pub fn allows(&self, settings: &CameraSettings) -> Result<(), String> {
+        if self.trigger_delay_us == (0.0..=0.0) && settings.trigger_delay_us != 0.0 {
+            return Err(format!(
+                "trigger_delay_us = {}: {} cannot delay its trigger, so that delays cannot be swept; if its maker offers a delay, name it in the rig file",
+                settings.trigger_delay_us, self.model
+            ));
+        }
         let rules = [
             ("exposure_us", settings.exposure_us, &self.exposure_us),
             ("trigger_delay_us", settings.trigger_delay_us, &self.trigger_delay_us),
@@ -135,15 +141,33 @@ impl CameraCapabilities {
     }
 }
 
+/// Whether a device can be used just now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DeviceState {
+    /// It is being opened for the first time.
+    Connecting,
+    /// Open, not armed.
+    Ready,
+    /// Armed.
+    Streaming,
+    /// It has stopped answering; its driver is trying to open it again.
+    Lost,
+}
+
 /// A triggered camera.
 pub trait Camera: Send {
     /// What the camera is; constant while it is open.
     fn capabilities(&self) -> &CameraCapabilities;
 
+    /// Whether it can be used just now.
+    fn state(&self) -> DeviceState;
+
     /// Writes settings, also while armed, so that a sweep need not stop the stream.
     ///
     /// # Errors
-    /// `OutOfRange` if the camera cannot take a value; the old settings then stay.
+    /// `OutOfRange` if the camera cannot take a value; the old settings then stay. Any kind while it is
+    /// [`DeviceState::Lost`]: write them again when it is back.
     fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError>;
 
     /// From now on triggers are answered.
@@ -152,15 +176,21 @@ pub trait Camera: Send {
     /// Any kind; the camera then stays disarmed.
     fn arm(&mut self) -> Result<(), DeviceError>;
 
-    /// Waits for the next frame and copies it into `buf`; `None` when none came within `timeout`.
+    /// Waits for the next frame and copies it into `buf`; `None` when none came within `timeout`, also while the camera is
+    /// [`DeviceState::Lost`].
     ///
     /// # Errors
-    /// `NotReady` before [`Camera::arm`], `Disconnected` when the device is gone.
+    /// `NotReady` before [`Camera::arm`], `Disconnected` when the device is gone for good.
     fn next_frame(
         &mut self,
         buf: &mut FrameBuf,
         timeout: Duration,
     ) -> Result<Option<FrameStamp>, DeviceError>;
+
+    /// Why a frame is lost whose id [`Camera::next_frame`] left out before the newest one.
+    fn loss_of(&self, _seq: u64) -> LossCause {
+        LossCause::CameraGap
+    }
 
     /// Answers no further trigger. Idempotent.
     ///

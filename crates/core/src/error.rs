@@ -3,7 +3,7 @@
 use std::error::Error;
 
 /// What kind of failure it was: what a caller can act on.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DeviceErrorKind {
     /// Somebody else holds the device.

@@ -5,6 +5,7 @@
 //! `i64` (`_ns`) or microseconds as `f64` (`_us`); the unit stands in every name.
 
 mod clock;
+mod clock_model;
 mod counts;
 mod device;
 mod error;
@@ -15,14 +16,15 @@ mod raster;
 mod units;
 
 pub use clock::{Clock, ClockHandle};
+pub use clock_model::{ClockModel, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
-    Applied, Camera, CameraCapabilities, CameraSettings, FirstFrame, Pattern, Projector, Readout, SettingsId,
-    Shown, Shutter, Vsync,
+    Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Pattern, Projector,
+    Readout, SettingsId, Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
 pub use frame::{Edge, Frame, FrameBuf, FramePool, FrameStamp};
-pub use pixel::{PixelError, PixelFormat};
+pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use units::{ns_from_us, us_from_ns};

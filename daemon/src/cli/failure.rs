@@ -4,6 +4,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use miette::{Diagnostic, NamedSource, SourceSpan};
+#[cfg(feature = "aravis")]
+use raysweep_core::{DeviceError, DeviceErrorKind};
 use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
@@ -30,6 +32,17 @@ pub(super) enum Failure {
     Live(#[from] LiveError),
     #[error(transparent)]
     Process(#[from] ProcessError),
+    #[cfg(feature = "aravis")]
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    #[cfg(feature = "aravis")]
+    #[error("which camera? Name one with --camera:\n{0}")]
+    WhichCamera(String),
+    #[cfg(not(feature = "aravis"))]
+    #[error(
+        "this raysweep was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev"
+    )]
+    WithoutAravis,
     #[error("cannot watch for Ctrl-C: {0}")]
     Signals(io::Error),
     #[error("cannot print: {0}")]
@@ -104,6 +117,14 @@ impl Failure {
             Self::Client(_) => Exit::Unreachable,
             Self::Plan(_) => Exit::Refused,
             Self::File { .. } | Self::Process(ProcessError::Product(_)) => Exit::Usage,
+            #[cfg(feature = "aravis")]
+            Self::WhichCamera(_) => Exit::Usage,
+            #[cfg(feature = "aravis")]
+            Self::Device(error) if error.kind == DeviceErrorKind::Busy => Exit::Refused,
+            #[cfg(feature = "aravis")]
+            Self::Device(_) => Exit::Failed,
+            #[cfg(not(feature = "aravis"))]
+            Self::WithoutAravis => Exit::Usage,
             Self::NoLiveImage => Exit::Refused,
             Self::Write { .. } | Self::Live(_) | Self::Process(_) | Self::Signals(_) | Self::Output(_) => {
                 Exit::Failed

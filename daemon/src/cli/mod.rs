@@ -1,5 +1,6 @@
 //! The command line `raysweep`: what it takes, whom it asks, how it ends.
 
+mod devices;
 mod failure;
 mod follow;
 mod preview;
@@ -18,6 +19,7 @@ use raysweep_proto::{Client, ClientError, Empty, ErrorCode, RpcError, RunParams,
 use serde::Serialize;
 use serde_json::json;
 
+use self::devices::CameraCommand;
 use self::failure::Failure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::view::View;
@@ -72,6 +74,11 @@ enum Command {
     Status,
     /// List what can be asked of the daemon; with --json, with schemas
     Describe,
+    /// List the cameras that answer; needs no daemon
+    Devices,
+    /// Save and restore what a camera is set to; needs no daemon
+    #[command(subcommand)]
+    Camera(CameraCommand),
     /// Say what a plan would do; nothing moves
     Check {
         /// The plan, a TOML file
@@ -170,6 +177,8 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
     match command {
         Command::Status => printer.print(&connect()?.status()?, show::status)?,
         Command::Describe => printer.print(&connect()?.describe()?, show::description)?,
+        Command::Devices => return devices::devices(printer),
+        Command::Camera(command) => return devices::camera(command, printer),
         Command::Check { plan } => {
             let text = read_plan(&plan)?;
             let report = connect()?.check(&text).map_err(|error| Failure::of_plan(error, &plan, &text))?;

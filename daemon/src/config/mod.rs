@@ -12,7 +12,9 @@ use toml::de::DeValue;
 pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};
-pub use rig::{CameraNoise, CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection};
+pub use rig::{
+    CameraDriver, CameraNoise, CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection,
+};
 
 /// What is wrong with a rig or plan file, and where.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -1,6 +1,8 @@
 //! `rig.toml`: what the rig is made of and what is known of its timing.
 
 use raysweep_core::{PixelFormat, Raster};
+use raysweep_drivers::camera::aravis::{AravisConfig, ConfigFault};
+use raysweep_drivers::camera::v4l2::V4l2Config;
 use raysweep_pipeline::{Scan, Spot};
 use raysweep_proto::NoiseSource;
 use raysweep_sim::SimConfig;
@@ -35,6 +37,18 @@ pub enum RigKind {
     Plane,
 }
 
+/// Drivers of cameras by the names that rig files use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CameraDriver {
+    /// The simulated rig.
+    Sim,
+    /// GigE Vision and USB3 Vision through libaravis.
+    Aravis,
+    /// Cameras of the Linux kernel.
+    V4l2,
+}
+
 /// Drivers by the names that rig files use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -48,7 +62,15 @@ pub enum Driver {
 #[serde(deny_unknown_fields)]
 pub struct CameraSection {
     /// Which driver opens it.
-    pub driver: Driver,
+    pub driver: CameraDriver,
+    /// How long a camera that stops answering within a run may stay away.
+    #[serde(default = "default_reopen_s")]
+    pub reopen_s: f64,
+    /// `[camera.aravis]`, for the driver `aravis`.
+    #[serde(default)]
+    pub aravis: AravisConfig,
+    /// `[camera.v4l2]`, for the driver `v4l2`.
+    pub v4l2: Option<V4l2Config>,
     /// Counts, above black, of a white pixel in the time of one projector row; left out: 2500 of 4096 of the format's.
     white_dn: Option<f64>,
     /// Counts without light; left out: 64 of 4096 of the format's.
@@ -161,6 +183,10 @@ impl ProjectorSection {
     }
 }
 
+/// Longer than a camera takes to start.
+fn default_reopen_s() -> f64 {
+    60.0
+}
 /// Rectified rows of the same height.
 fn default_row_pitch() -> f64 {
     1.0
@@ -227,7 +253,7 @@ impl RigFile {
     /// The camera's noise: as stated; what is left out of it as the simulator makes it, of other cameras typical values.
     pub fn noise(&self) -> CameraNoise {
         let (camera, sensor) = (&self.camera, &self.sim.sensor);
-        let unstated = if camera.driver != Driver::Sim {
+        let unstated = if camera.driver != CameraDriver::Sim {
             CameraNoise {
                 electrons_per_dn: TYPICAL_FULL_SCALE_E / camera.full_scale_dn(),
                 read_noise_e: TYPICAL_READ_NOISE_E,
@@ -259,7 +285,7 @@ impl RigFile {
     fn check(&self, text: &str) -> Result<(), ConfigError> {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
         let max_dn = f64::from(camera.pixel_format.max_value());
-        let rules: [(&[&str], f64, f64, f64); 12] = [
+        let rules: [(&[&str], f64, f64, f64); 13] = [
             (&["vsync", "period_us"], vsync.period_us, 4000.0, 1e6),
             (&["vsync", "gate_us"], vsync.gate_us, 1.0, vsync.period_us / 4.0),
             (&["projector", "rows"], projector.rows as f64, 1.0, MAX_ROWS as f64),
@@ -268,6 +294,7 @@ impl RigFile {
             (&["projector", "beam_sigma_rows"], projector.beam_sigma_rows.unwrap_or(0.0), 0.0, 100.0),
             (&["camera", "row_pitch"], camera.row_pitch, 0.01, 100.0),
             (&["camera", "row_time_us"], self.camera_row_time_us(), 0.1, 10_000.0),
+            (&["camera", "reopen_s"], camera.reopen_s, 0.0, 3600.0),
             (&["camera", "white_dn"], camera.white_dn(), 1.0, max_dn),
             (&["camera", "electrons_per_dn"], camera.electrons_per_dn.unwrap_or(1.0), 1e-3, 1e6),
             (&["camera", "read_noise_e"], camera.read_noise_e.unwrap_or(0.0), 0.0, 1e6),
@@ -312,6 +339,20 @@ impl RigFile {
             return Err(ConfigError::at(text, &["sim", "projector", "spot"], message));
         }
         self.check_row_table(text)?;
+        if camera.driver == CameraDriver::Aravis {
+            let placed = |fault: ConfigFault| {
+                ConfigError::at(text, &["camera", "aravis", fault.key], fault.to_string())
+            };
+            camera.aravis.check().map_err(placed)?;
+        }
+        if camera.driver == CameraDriver::V4l2 {
+            let Some(v4l2) = &camera.v4l2 else {
+                let message = "camera.driver = \"v4l2\": a table [camera.v4l2] with device, width and height is missing";
+                return Err(ConfigError::at(text, &["camera", "driver"], message));
+            };
+            v4l2.check()
+                .map_err(|(key, message)| ConfigError::at(text, &["camera", "v4l2", key], message))?;
+        }
         if camera.first_projector_row.is_some_and(|row| row >= projector.rows) {
             let message = format!(
                 "camera.first_projector_row = {}: allowed is 0 to {}",
@@ -428,6 +469,21 @@ mod tests {
             (MINIMAL.replace("[camera]\n", "[camera]\npixel_format = \"Mono13\"\n"), "Mono12p"),
             (MINIMAL.replace("[camera]\n", "[camera]\nfirst_projector_row = 720\n"), "0 to 719"),
             (format!("{MINIMAL}[sim]\nseed = -1\n"), "-1"),
+            (MINIMAL.replacen("\"sim\"", "\"aravis\"", 1), "`raysweep devices`"),
+            (MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\""), "[camera.v4l2]"),
+            (
+                format!(
+                    "{}[camera.v4l2]\ndevice = \"/dev/video0\"\nwidth = 640\nheight = 360\nbuffers = 1\n",
+                    MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\"")
+                ),
+                "camera.v4l2.buffers = 1: allowed is 2 to 32",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\nreopen_s = -1\n"), "camera.reopen_s = -1"),
+            (
+                MINIMAL.replacen("\"sim\"", "\"aravis\"\naravis.name = \"a\"\naravis.packet_size = 10", 1),
+                "camera.aravis.packet_size = 10",
+            ),
+            (MINIMAL.replacen("\"sim\"", "\"sim\"\naravis.nam = \"a\"", 1), "nam"),
         ];
         for (text, expected) in cases {
             let error = RigFile::parse(&text).unwrap_err();

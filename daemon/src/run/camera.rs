@@ -8,8 +8,8 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use raysweep_core::{
-    Camera, CameraSettings, DeviceError, DeviceErrorKind, Frame, FrameBuf, FramePool, FrameStamp, LossCause,
-    SettingsId, ns_from_us,
+    Applied, Camera, CameraSettings, DeviceError, DeviceErrorKind, DeviceState, Frame, FrameBuf, FramePool,
+    FrameStamp, LossCause, SettingsId, ns_from_us,
 };
 use raysweep_pipeline::{Event, Input, Job, Label, Point, QueueError, Shot, message_of};
 
@@ -147,6 +147,8 @@ struct Sequencer {
     period_us: f64,
     /// Id of the newest frame.
     newest_seq: Option<u64>,
+    /// Up to this frame the assembler knows what became of each; nothing after a pause, whose frames are nobody's.
+    told_seq: Option<u64>,
     /// When the exposure of the last counted frame ended.
     exposed_until: Option<Instant>,
 }
@@ -191,6 +193,7 @@ impl Sequencer {
             longest_frame_us: 0.0,
             period_us,
             newest_seq: None,
+            told_seq: None,
             exposed_until: None,
         }
     }
@@ -211,8 +214,7 @@ impl Sequencer {
         self.warm_up(pass.not_before_ns)?;
         for attempt in &pass.attempts {
             if self.orders.now() == Order::Pause {
-                self.input.send(Event::Idle).map_err(closed)?;
-                self.orders.wait_while_paused();
+                self.idle()?;
             }
             if !self.orders.go_on() {
                 return Ok(());
@@ -232,7 +234,7 @@ impl Sequencer {
 
     fn attempt(&mut self, attempt: &Attempt) -> Result<(), DeviceError> {
         let Attempt { id, point, shot } = *attempt;
-        let applied = self.camera.configure(id, &shot.settings)?;
+        let Some(applied) = self.configure(id, &shot.settings)? else { return Ok(()) };
         let job = Job {
             id,
             frames: point.frames,
@@ -258,13 +260,40 @@ impl Sequencer {
                 Taken::Passed(..) => {}
                 Taken::Lost => spare_frames -= 1,
                 Taken::None => {
-                    watchdog.missed()?;
+                    watchdog.missed(self.camera.state())?;
                     continue;
                 }
             }
             watchdog.feed();
         }
         self.input.send(Event::End).map_err(closed)
+    }
+
+    /// Writes settings. A camera that is being opened again is waited for; nothing when the run ends meanwhile.
+    fn configure(
+        &mut self,
+        id: SettingsId,
+        settings: &CameraSettings,
+    ) -> Result<Option<Applied>, DeviceError> {
+        loop {
+            match self.camera.configure(id, settings) {
+                Err(_) if self.camera.state() == DeviceState::Lost => {
+                    if !self.orders.go_on() {
+                        return Ok(None);
+                    }
+                    self.take(|_| Label::Cancelled)?;
+                }
+                applied => return applied.map(Some),
+            }
+        }
+    }
+
+    /// Holds the run until it is told to go on.
+    fn idle(&mut self) -> Result<(), DeviceError> {
+        self.input.send(Event::Idle).map_err(closed)?;
+        self.orders.wait_while_paused();
+        self.told_seq = None;
+        Ok(())
     }
 
     /// Lets frames go by: at least `frames` of them, and until exposures start at `not_before_ns` or later.
@@ -280,7 +309,7 @@ impl Sequencer {
                 }
                 Taken::Lost => {}
                 Taken::None => {
-                    watchdog.missed()?;
+                    watchdog.missed(self.camera.state())?;
                     continue;
                 }
             }
@@ -329,6 +358,8 @@ impl Sequencer {
 
     /// Gives a frame to the assembler, or notes that there was no room for it.
     fn hand_on(&mut self, Received { stamp, data }: Received, label: Label) -> Result<Taken, DeviceError> {
+        self.tell_losses(stamp.seq)?;
+        self.told_seq = Some(stamp.seq);
         let Some(data) = data else { return self.lose(stamp, label, LossCause::PoolEmpty) };
         let frame = Frame { data, format: self.camera.capabilities().format, stamp };
         match self.input.offer(Event::Frame(frame, label)) {
@@ -336,6 +367,18 @@ impl Sequencer {
             Err(QueueError::Full(_)) => self.lose(stamp, label, LossCause::QueueFull),
             Err(error @ QueueError::Closed) => Err(closed(error)),
         }
+    }
+
+    /// Tells the assembler why frames before `seq` never came, where the camera knows more than that they did not.
+    fn tell_losses(&mut self, seq: u64) -> Result<(), DeviceError> {
+        let first = self.told_seq.map_or(seq, |told| told + 1);
+        for lost in first..seq {
+            let cause = self.camera.loss_of(lost);
+            if cause != LossCause::CameraGap {
+                self.input.send(Event::Lost(lost, Some(cause))).map_err(closed)?;
+            }
+        }
+        Ok(())
     }
 
     /// Only a frame that a point waits for is lost; the others are merely not looked at.
@@ -360,7 +403,12 @@ impl Watchdog {
         self.waited = Duration::ZERO;
     }
 
-    fn missed(&mut self) -> Result<(), DeviceError> {
+    fn missed(&mut self, state: DeviceState) -> Result<(), DeviceError> {
+        // A camera that its driver opens again comes back or ends the run itself.
+        if state == DeviceState::Lost {
+            self.waited = Duration::ZERO;
+            return Ok(());
+        }
         self.waited += POLL;
         if self.waited < self.patience {
             return Ok(());

@@ -116,7 +116,7 @@ impl Runner {
     fn foresee(&self, plan: &str) -> Result<(Task, CheckReport), RpcError> {
         let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
         let size = (self.camera.height, self.camera.width);
-        let task = Task::new(parsed, &self.rig.file, self.rig.first_row(), size);
+        let task = Task::new(parsed, &self.rig.file, self.rig.first_row(&self.camera), size);
         let processing = task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
         let limit_bytes = self.memory_limit_bytes;
         let report = check::check(&task, &processing.products, &self.camera, &self.data, limit_bytes)
@@ -255,7 +255,7 @@ impl Runner {
                 rows: self.camera.height,
                 columns: self.camera.width,
             },
-            first_row: self.rig.first_row(),
+            first_row: self.rig.first_row(&self.camera),
         };
         let (session, ledger) = Session::create(&self.data, entry, &params.plan, &self.rig.text)
             .map_err(|error| storage(&error))?;

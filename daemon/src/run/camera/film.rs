@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use raysweep_core::{DeviceError, FirstFrame, FrameStamp, LossCause, SettingsId};
+use raysweep_core::{DeviceError, FirstFrame, FrameStamp, SettingsId};
 use raysweep_pipeline::{Event, Job, Label, Point, Shot};
 
 use super::{MARGIN_FRAMES, Received, Sequencer, Taken, closed};
@@ -149,8 +149,7 @@ impl Sequencer {
                 if !is_held {
                     break;
                 }
-                self.input.send(Event::Idle).map_err(closed)?;
-                self.orders.wait_while_paused();
+                self.idle()?;
                 ahead.running = false;
                 continue;
             }
@@ -159,7 +158,7 @@ impl Sequencer {
                     self.deliver(received, &mut ahead)?;
                     watchdog.feed();
                 }
-                None => watchdog.missed()?,
+                None => watchdog.missed(self.camera.state())?,
             }
         }
         self.pass_frames(MARGIN_FRAMES, i64::MIN)
@@ -168,7 +167,7 @@ impl Sequencer {
     fn write(&mut self, slot: &Slot, ahead: &mut Ahead) -> Result<(), DeviceError> {
         let FilmSetting { ordinal, point, shot, periods_from_last } = slot.setting;
         let id = SettingsId { point: ordinal, attempt: slot.cycle };
-        let applied = self.camera.configure(id, &shot.settings)?;
+        let Some(applied) = self.configure(id, &shot.settings)? else { return Ok(()) };
         self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
         let job = Job {
             id,
@@ -189,7 +188,9 @@ impl Sequencer {
         while let Some((Written { job, first_seq, .. }, end_seq)) = ahead.pop_missed(seq) {
             self.input.send(Event::Begin(job)).map_err(closed)?;
             for lost_seq in first_seq.max(ahead.newest_seq.map_or(0, |newest| newest + 1))..end_seq {
-                self.input.send(Event::Lost(lost_seq, Some(LossCause::CameraGap))).map_err(closed)?;
+                let cause = self.camera.loss_of(lost_seq);
+                self.input.send(Event::Lost(lost_seq, Some(cause))).map_err(closed)?;
+                self.told_seq = Some(lost_seq);
             }
             self.input.send(Event::End).map_err(closed)?;
         }

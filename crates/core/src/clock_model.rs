@@ -1,0 +1,252 @@
+//! From a device's clock to the host's: a line through round trips of the question "what time is it?".
+//!
+//! Each round trip bounds the host's time at the moment when the device read its clock; the middle of it is the estimate, half of
+//! its length the largest possible error (Cristian, *Probabilistic clock synchronization*, 1989). The line is a weighted
+//! least-squares fit whose slope is held near 1 until the round trips span long enough to tell better.
+
+use std::collections::VecDeque;
+
+/// One question for a device's time, and its answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RoundTrip {
+    /// When the host asked.
+    pub request_ns: i64,
+    /// What the device answered, in nanoseconds of its own clock.
+    pub device_ns: i64,
+    /// When the host had the answer.
+    pub receive_ns: i64,
+}
+
+impl RoundTrip {
+    /// How long the answer took.
+    pub fn duration_ns(&self) -> i64 {
+        self.receive_ns - self.request_ns
+    }
+
+    fn middle_ns(&self) -> i64 {
+        self.request_ns + self.duration_ns() / 2
+    }
+}
+
+/// Standard deviation of the rate error of two crystals, before anything is measured [A].
+const RATE_SIGMA: f64 = 50e-6;
+/// Round trips longer than this many times the median one say little: the host or the wire was busy.
+const LONG_TRIP: f64 = 2.0;
+/// Host time cannot be known better than a clock can be read.
+const MIN_SIGMA_NS: f64 = 100.0;
+
+/// The relation of a device's clock to the host's, from its newest round trips.
+#[derive(Debug, Clone)]
+pub struct ClockModel {
+    trips: VecDeque<RoundTrip>,
+    capacity: usize,
+    /// Space to sort durations in, so that adding allocates nothing.
+    durations_ns: Vec<i64>,
+    fit: Option<Fit>,
+}
+
+/// host = host_ns + (device - device_ns) (1 + rate), with both origins within the data, so that no digit is lost.
+#[derive(Debug, Clone, Copy)]
+struct Fit {
+    device_ns: i64,
+    host_ns: i64,
+    rate: f64,
+    residual_ns: f64,
+}
+
+impl ClockModel {
+    /// A model of the newest `capacity` round trips, at least 1.
+    pub fn new(capacity: usize) -> Self {
+        let capacity = capacity.max(1);
+        Self {
+            trips: VecDeque::with_capacity(capacity),
+            capacity,
+            durations_ns: Vec::with_capacity(capacity),
+            fit: None,
+        }
+    }
+
+    /// How many round trips it keeps.
+    pub fn capacity(&self) -> usize {
+        self.capacity
+    }
+
+    /// Takes a round trip into account; one that ends before it begins is none.
+    pub fn add(&mut self, trip: RoundTrip) {
+        if trip.duration_ns() < 0 {
+            return;
+        }
+        if self.trips.len() == self.capacity {
+            self.trips.pop_front();
+        }
+        self.trips.push_back(trip);
+        self.fit = self.fitted();
+    }
+
+    /// The host's time at a moment of the device's clock; nothing before the first round trip.
+    pub fn host_ns(&self, device_ns: i64) -> Option<i64> {
+        self.fit.map(|fit| {
+            let since_ns = device_ns.saturating_sub(fit.device_ns);
+            fit.host_ns.saturating_add(since_ns).saturating_add((since_ns as f64 * fit.rate).round() as i64)
+        })
+    }
+
+    /// By how much the host's clock runs faster than the device's: host nanoseconds a device nanosecond, less 1.
+    pub fn rate(&self) -> f64 {
+        self.fit.map_or(0.0, |fit| fit.rate)
+    }
+
+    /// Weighted root mean square of the round trips' middles about the line.
+    pub fn residual_ns(&self) -> Option<f64> {
+        self.fit.map(|fit| fit.residual_ns)
+    }
+
+    fn fitted(&mut self) -> Option<Fit> {
+        self.durations_ns.clear();
+        self.durations_ns.extend(self.trips.iter().map(RoundTrip::duration_ns));
+        self.durations_ns.sort_unstable();
+        let median_ns = *self.durations_ns.get((self.durations_ns.len().max(1) - 1) / 2)?;
+        let limit_ns = LONG_TRIP * median_ns as f64;
+        let origin = *self.trips.front()?;
+        // The middle of a round trip is off by anything up to half of it: the variance of a uniform distribution.
+        let points = || {
+            self.trips.iter().filter(|trip| trip.duration_ns() as f64 <= limit_ns).map(|trip| {
+                let sigma_ns = (trip.duration_ns() as f64 / 12_f64.sqrt()).max(MIN_SIGMA_NS);
+                let device_ns = trip.device_ns.saturating_sub(origin.device_ns) as f64;
+                let host_ns = trip.middle_ns().saturating_sub(origin.middle_ns()) as f64;
+                (device_ns, host_ns - device_ns, sigma_ns.powi(-2))
+            })
+        };
+        let (mut weight, mut device_ns, mut ahead_ns) = (0.0, 0.0, 0.0);
+        for (x, y, w) in points() {
+            weight += w;
+            device_ns += w * x;
+            ahead_ns += w * y;
+        }
+        let (device_ns, ahead_ns) = (device_ns / weight, ahead_ns / weight);
+        let (mut xx, mut xy) = (RATE_SIGMA.powi(-2), 0.0);
+        for (x, y, w) in points() {
+            xx += w * (x - device_ns).powi(2);
+            xy += w * (x - device_ns) * (y - ahead_ns);
+        }
+        let rate = xy / xx;
+        let squares: f64 =
+            points().map(|(x, y, w)| w * (y - ahead_ns - rate * (x - device_ns)).powi(2)).sum();
+        Some(Fit {
+            device_ns: origin.device_ns.saturating_add(device_ns.round() as i64),
+            host_ns: origin.middle_ns().saturating_add((device_ns + ahead_ns).round() as i64),
+            rate,
+            residual_ns: (squares / weight).sqrt(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A device whose clock shows 0 at `start_ns` and runs slow by `rate`, and a host whose round trips are drawn from a
+    /// small generator: uniform answer times, now and then a long and lopsided one.
+    struct Bench {
+        state: u64,
+        start_ns: i64,
+        rate: f64,
+    }
+
+    impl Bench {
+        fn uniform(&mut self) -> f64 {
+            self.state =
+                self.state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (self.state >> 11) as f64 / (1_u64 << 53) as f64
+        }
+
+        fn device_ns(&self, host_ns: i64) -> i64 {
+            ((host_ns - self.start_ns) as f64 / (1.0 + self.rate)).round() as i64
+        }
+
+        fn ask(&mut self, request_ns: i64) -> RoundTrip {
+            let there_ns = (20_000.0 + 30_000.0 * self.uniform()) as i64;
+            let mut back_ns = (20_000.0 + 30_000.0 * self.uniform()) as i64;
+            if self.uniform() < 0.1 {
+                back_ns += 3_000_000;
+            }
+            RoundTrip {
+                request_ns,
+                device_ns: self.device_ns(request_ns + there_ns),
+                receive_ns: request_ns + there_ns + back_ns,
+            }
+        }
+    }
+
+    fn bench(seed: u64) -> Bench {
+        Bench { state: seed, start_ns: 5_000_000_000_000, rate: 37e-6 }
+    }
+
+    #[test]
+    fn offset_and_rate_are_found_in_spite_of_long_answers() {
+        for seed in 0..20 {
+            let mut bench = bench(seed);
+            let mut model = ClockModel::new(100);
+            for k in 0..150 {
+                let trip = bench.ask(6_000_000_000_000 + k * 200_000_000);
+                model.add(trip);
+            }
+            let host_ns = 6_000_000_000_000 + 150 * 200_000_000;
+            let error_ns = model.host_ns(bench.device_ns(host_ns)).unwrap() - host_ns;
+            assert!(error_ns.abs() < 10_000, "seed {seed}: {error_ns} ns");
+            assert!((model.rate() - bench.rate).abs() < 1e-6, "seed {seed}: {}", model.rate());
+            let residual_ns = model.residual_ns().unwrap();
+            assert!((1_000.0..15_000.0).contains(&residual_ns), "seed {seed}: {residual_ns} ns");
+        }
+    }
+
+    #[test]
+    fn a_short_beginning_does_not_run_away() {
+        for seed in 0..20 {
+            let mut bench = bench(seed);
+            let mut model = ClockModel::new(100);
+            for k in 0..8 {
+                let trip = bench.ask(6_000_000_000_000 + k * 200_000);
+                model.add(trip);
+            }
+            // A second later: the middle is off by tens of us at most, the rate by what crystals are.
+            let host_ns = 6_001_000_000_000;
+            let error_ns = model.host_ns(bench.device_ns(host_ns)).unwrap() - host_ns;
+            assert!(error_ns.abs() < 100_000, "seed {seed}: {error_ns} ns");
+        }
+    }
+
+    #[test]
+    fn one_round_trip_gives_its_middle_and_none_gives_nothing() {
+        let mut model = ClockModel::new(5);
+        assert_eq!(model.host_ns(7), None);
+        model.add(RoundTrip { request_ns: 100, device_ns: 7, receive_ns: 50 });
+        assert_eq!(model.host_ns(7), None, "an answer before its question");
+        model.add(RoundTrip { request_ns: 1_000, device_ns: 7, receive_ns: 3_000 });
+        assert_eq!(model.host_ns(7), Some(2_000));
+        assert_eq!(model.host_ns(1_007), Some(3_000));
+    }
+
+    #[test]
+    fn old_round_trips_are_forgotten() {
+        let mut model = ClockModel::new(10);
+        let trip = |host_ns: i64, offset_ns: i64| RoundTrip {
+            request_ns: host_ns - 500,
+            device_ns: host_ns - offset_ns,
+            receive_ns: host_ns + 500,
+        };
+        (0..20).for_each(|k| model.add(trip(k * 1_000_000, 0)));
+        (20..30).for_each(|k| model.add(trip(k * 1_000_000, 300_000)));
+        assert_eq!(model.host_ns(40_000_000), Some(40_300_000));
+    }
+
+    #[test]
+    fn no_time_makes_it_panic() {
+        let mut model = ClockModel::new(3);
+        for device_ns in [i64::MAX, i64::MIN, 0] {
+            model.add(RoundTrip { request_ns: 0, device_ns, receive_ns: 1 });
+            let _ = model.host_ns(i64::MIN);
+        }
+        assert!(model.host_ns(i64::MAX).is_some());
+    }
+}

@@ -1,0 +1,199 @@
+//! `[camera.aravis]`: which camera, and how it is set once, before a sweep sets what it sweeps.
+
+use raysweep_core::Readout;
+use serde::Deserialize;
+
+/// `[camera.aravis]`
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AravisConfig {
+    /// IP address of a GigE Vision camera.
+    pub address: Option<String>,
+    /// Name of a camera as `raysweep devices` lists it, for USB3 Vision and where addresses change.
+    pub name: Option<String>,
+    /// Features set first, in this order, each as `Name=Value`.
+    pub features: Vec<String>,
+    /// Pixels read out; left out: all that there are.
+    pub region: Option<Region>,
+    /// Sensor columns and rows that make a pixel.
+    pub binning: [u32; 2],
+    /// Offset of the analogue-digital converter, in the camera's units; left out: as it is.
+    pub black_level: Option<f64>,
+    /// The trigger's input, or `off` for a camera that runs freely.
+    pub trigger_source: String,
+    /// The edge that triggers.
+    pub trigger_activation: String,
+    /// From the trigger's edge to the start of row 0's exposure, at a trigger delay of zero.
+    pub trigger_latency_us: f64,
+    /// Whether the next exposure may start during readout.
+    pub readout: Readout,
+    /// From the end of row 0's exposure to the camera being ready; left out: as the camera says, or its rows' times.
+    pub readout_us: Option<f64>,
+    /// The moment that a frame's timestamp tells.
+    pub timestamp_at: TimestampAt,
+    /// Fewest frames that still have the old settings after a change.
+    pub late_frames_min: u32,
+    /// Most frames that still have the old settings after a change.
+    pub late_frames_max: u32,
+    /// Bytes of a GigE Vision packet; left out: negotiated.
+    pub packet_size: Option<u32>,
+    /// Bytes of the socket's receive buffer; left out: two frames, at least 1 MiB.
+    pub socket_buffer_bytes: Option<u32>,
+}
+
+/// A part of the sensor, in binned pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Region {
+    /// First column.
+    #[serde(default)]
+    pub x: u32,
+    /// First row.
+    #[serde(default)]
+    pub y: u32,
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// The moment that a camera's timestamps tell; its data sheet says which.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TimestampAt {
+    /// Start of the exposure of row 0 [A].
+    #[default]
+    ExposureStart,
+    /// End of the exposure of row 0, which is where its readout starts.
+    ExposureEnd,
+}
+
+impl Default for AravisConfig {
+    fn default() -> Self {
+        Self {
+            address: None,
+            name: None,
+            features: Vec::new(),
+            region: None,
+            binning: [1, 1],
+            black_level: None,
+            trigger_source: "Line0".into(),
+            trigger_activation: "RisingEdge".into(),
+            trigger_latency_us: 0.0,
+            readout: Readout::Sequential,
+            readout_us: None,
+            timestamp_at: TimestampAt::default(),
+            late_frames_min: 0,
+            late_frames_max: 3,
+            packet_size: None,
+            socket_buffer_bytes: None,
+        }
+    }
+}
+
+/// A value that no camera can be opened with.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("camera.aravis.{key}{message}")]
+pub struct ConfigFault {
+    /// The key.
+    pub key: &'static str,
+    message: String,
+}
+
+/// The largest payload of a UDP packet, which is what a GigE Vision packet is.
+const MAX_PACKET_BYTES: u32 = 65_507;
+/// What every GigE Vision device must be able to send.
+const MIN_PACKET_BYTES: u32 = 576;
+
+impl AravisConfig {
+    /// The camera's address or name.
+    ///
+    /// # Errors
+    /// Unless there is exactly one.
+    pub fn device(&self) -> Result<&str, ConfigFault> {
+        match (&self.address, &self.name) {
+            (Some(device), None) | (None, Some(device)) => Ok(device),
+            _ => Err(ConfigFault {
+                key: "address",
+                message: " or camera.aravis.name: give one of them; `raysweep devices` lists both".into(),
+            }),
+        }
+    }
+
+    /// Whether frames wait for a trigger.
+    pub fn is_triggered(&self) -> bool {
+        self.trigger_source != "off"
+    }
+
+    /// Checks what can be checked without the camera.
+    ///
+    /// # Errors
+    /// The first key that cannot be.
+    pub fn check(&self) -> Result<(), ConfigFault> {
+        self.device()?;
+        let fault = |key, message: String| Err(ConfigFault { key, message });
+        if let Some(text) = self.features.iter().find(|text| !text.contains('=')) {
+            return fault("features", format!(" contains {text:?}: write each as \"Name=Value\""));
+        }
+        if self.binning.contains(&0) {
+            return fault("binning", format!(" = {:?}: allowed is 1 and more", self.binning));
+        }
+        if self.region.is_some_and(|region| region.width == 0 || region.height == 0) {
+            return fault("region", " has no pixels: width and height are 1 and more".into());
+        }
+        for (key, value) in
+            [("trigger_latency_us", Some(self.trigger_latency_us)), ("readout_us", self.readout_us)]
+        {
+            if let Some(value) = value.filter(|value| !(0.0..=1e6).contains(value)) {
+                return fault(key, format!(" = {value}: allowed is 0 to 1000000"));
+            }
+        }
+        if self.late_frames_min > self.late_frames_max {
+            return fault(
+                "late_frames_min",
+                format!(
+                    " = {}: allowed is 0 to late_frames_max = {}",
+                    self.late_frames_min, self.late_frames_max
+                ),
+            );
+        }
+        if let Some(size) =
+            self.packet_size.filter(|size| !(MIN_PACKET_BYTES..=MAX_PACKET_BYTES).contains(size))
+        {
+            return fault(
+                "packet_size",
+                format!(" = {size}: allowed is {MIN_PACKET_BYTES} to {MAX_PACKET_BYTES}"),
+            );
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fault(keys: &str) -> String {
+        toml::from_str::<AravisConfig>(keys).unwrap().check().unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_camera_is_named_once_and_its_values_are_possible() {
+        assert!(toml::from_str::<AravisConfig>("address = \"10.0.0.2\"").unwrap().check().is_ok());
+        assert!(fault("").contains("give one of them"));
+        assert!(fault("address = \"a\"\nname = \"b\"").contains("give one of them"));
+        for (keys, expected) in [
+            ("features = [\"Gain\"]", "features contains \"Gain\""),
+            ("binning = [2, 0]", "binning = [2, 0]"),
+            ("region = { width = 0, height = 4 }", "region has no pixels"),
+            ("trigger_latency_us = nan", "trigger_latency_us = NaN"),
+            ("readout_us = -1", "readout_us = -1"),
+            ("late_frames_min = 4", "late_frames_max = 3"),
+            ("packet_size = 100", "packet_size = 100: allowed is 576"),
+        ] {
+            let message = fault(&format!("name = \"b\"\n{keys}"));
+            assert!(message.contains(expected), "{keys}: {message}");
+        }
+        assert!(toml::from_str::<AravisConfig>("adress = \"a\"").is_err());
+    }
+}

@@ -1,0 +1,477 @@
+//! The camera as the traits of `raysweep-core` have it: the side that takes frames.
+
+use std::ffi::CStr;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use aravis::prelude::*;
+use aravis::{Buffer, BufferStatus, ChunkParser, Stream};
+use raysweep_core::{
+    Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
+    DeviceState, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us, us_from_ns,
+};
+
+use super::buffer;
+use super::config::{AravisConfig, TimestampAt};
+use super::ids::FrameIds;
+use super::library::Health;
+use super::losses::Losses;
+use super::owner::{BUFFERS, Command, Done, Opened, Order, Owner, Reply, Shared};
+use super::promise::{Latency, Promises, Triggers, first_frame};
+
+/// What the driver must know of the rig that its camera is part of.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RigFacts {
+    /// How frames are packed.
+    pub format: PixelFormat,
+    /// From the start of one row's exposure to the next row's.
+    pub row_time_us: f64,
+    /// From one trigger to the next.
+    pub trigger_period_us: f64,
+    /// By how much a trigger may come too early.
+    pub trigger_margin_us: f64,
+    /// How long a camera that was lost may stay away.
+    pub reopen: Duration,
+}
+
+/// A camera that has neither answered nor given a frame for so long is lost.
+const SILENCE_NS: i64 = 900_000_000;
+/// Round trips that the clock model keeps: 20 s of them.
+const ROUND_TRIPS: usize = 100;
+/// The longest wait on a channel or a stream before the camera's health is looked at.
+const LOOK: Duration = Duration::from_millis(50);
+/// An owner whose camera is dead may be blocked for longer; it then ends by itself.
+const FAREWELL: Duration = Duration::from_secs(3);
+const CHUNK_EXPOSURE: &CStr = c"ChunkExposureTime";
+
+/// A GenICam camera.
+pub struct AravisCamera {
+    capabilities: CameraCapabilities,
+    config: AravisConfig,
+    facts: RigFacts,
+    shared: Shared,
+    orders: Option<SyncSender<Order>>,
+    replies: Receiver<Reply>,
+    owner: Option<JoinHandle<()>>,
+    ticket: u64,
+    link: Link,
+    armed_ns: Option<i64>,
+    ids: FrameIds,
+    losses: Losses,
+    promises: Promises<CameraSettings>,
+    newest: Option<Newest>,
+}
+
+enum Link {
+    Up { stream: Stream, chunks: Option<ChunkParser>, tells_time: bool },
+    Lost { since: Instant },
+}
+
+/// The newest frame that came whole.
+#[derive(Clone, Copy)]
+struct Newest {
+    seq: u64,
+    exposure_start_ns: i64,
+    host_ns: i64,
+}
+
+fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
+    DeviceError::new("camera", kind, what.into())
+}
+
+fn lost() -> DeviceError {
+    error(DeviceErrorKind::NotReady, "stopped answering and is being opened again")
+}
+
+impl AravisCamera {
+    /// Opens the camera and sets everything that no sweep changes.
+    ///
+    /// # Errors
+    /// `Disconnected` when it does not answer, `Busy` when another program holds it, `Unsupported` and `OutOfRange`
+    /// with the feature that it lacks or does not take.
+    pub fn open(config: &AravisConfig, facts: RigFacts) -> Result<Self, DeviceError> {
+        config.check().map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
+        let clock = Clock::real();
+        let shared = Shared {
+            health: Arc::new(Health::new(clock.clone())),
+            model: Arc::new(Mutex::new(ClockModel::new(ROUND_TRIPS))),
+            clock,
+        };
+        // At most one order is under way, beside the last two of a camera's life.
+        let (orders, todo) = sync_channel(4);
+        let (answers, replies) = sync_channel(4);
+        let owner = Owner {
+            config: config.clone(),
+            facts,
+            shared: shared.clone(),
+            orders: todo,
+            replies: answers,
+            armed: false,
+            settings: None,
+        };
+        let thread = thread::Builder::new()
+            .name("camera-owner".into())
+            .spawn(move || owner.run())
+            .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
+        let opened = match replies.recv() {
+            Ok(Reply::Opened(opened)) => opened?,
+            Ok(Reply::Done(..)) | Err(_) => {
+                return Err(error(DeviceErrorKind::NotReady, "its thread ended; the log has its message"));
+            }
+        };
+        let Opened { stream, chunks, capabilities, tells_time, .. } = opened;
+        let mut ids = FrameIds::default();
+        ids.restart(1);
+        Ok(Self {
+            capabilities,
+            config: config.clone(),
+            facts,
+            shared,
+            orders: Some(orders),
+            replies,
+            owner: Some(thread),
+            ticket: 0,
+            link: Link::Up { stream, chunks, tells_time },
+            armed_ns: None,
+            ids,
+            losses: Losses::new(),
+            promises: Promises::new(),
+            newest: None,
+        })
+    }
+
+    /// Frames lost so far, by cause.
+    pub fn losses(&self) -> impl Iterator<Item = (LossCause, u64)> {
+        self.losses.totals().iter().map(|(&cause, &frames)| (cause, frames))
+    }
+
+    /// How far the round trips of the clock model scatter about it; nothing where the camera has no clock to ask.
+    pub fn clock_residual_ns(&self) -> Option<f64> {
+        self.shared.with_model(|model| model.residual_ns())
+    }
+
+    /// Has the owner do something, for as long as the camera shows any life.
+    fn ask(&mut self, command: Command) -> Result<Done, DeviceError> {
+        if matches!(self.link, Link::Lost { .. }) {
+            return Err(lost());
+        }
+        self.ticket += 1;
+        let order = Order { ticket: self.ticket, command };
+        let asked_ns = self.shared.clock.now_ns();
+        if self.orders.as_ref().is_none_or(|orders| orders.try_send(order).is_err()) {
+            return Err(error(
+                DeviceErrorKind::Disconnected,
+                "its thread has ended; the log has its message",
+            ));
+        }
+        loop {
+            match self.replies.recv_timeout(LOOK) {
+                Ok(Reply::Done(ticket, Err(error))) if ticket == self.ticket => {
+                    if matches!(error.kind, DeviceErrorKind::Timeout | DeviceErrorKind::Disconnected) {
+                        self.lose();
+                    }
+                    return Err(error);
+                }
+                Ok(Reply::Done(ticket, done)) if ticket == self.ticket => return done,
+                // Of an order that was given up.
+                Ok(Reply::Done(..) | Reply::Opened(_)) => {}
+                Err(RecvTimeoutError::Timeout) if self.silent_since(asked_ns) => {
+                    self.lose();
+                    return Err(lost());
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+                Err(RecvTimeoutError::Disconnected) => {
+                    return Err(error(
+                        DeviceErrorKind::Disconnected,
+                        "its thread has ended; the log has its message",
+                    ));
+                }
+            }
+        }
+    }
+
+    /// Whether the camera has shown no life since `since_ns`, and that for long.
+    fn silent_since(&self, since_ns: i64) -> bool {
+        let answered_ns = self.shared.health.answered_ns();
+        answered_ns == i64::MIN
+            || self.shared.clock.now_ns().saturating_sub(answered_ns.max(since_ns)) > SILENCE_NS
+    }
+
+    /// Gives the camera up and has it opened again.
+    fn lose(&mut self) {
+        let link = std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() });
+        if let (Link::Up { stream, .. }, Some(orders)) = (link, &self.orders) {
+            tracing::warn!(camera = self.capabilities.model, "camera lost; opening it again");
+            self.ticket += 1;
+            // The channel has room for this and for what was asked before.
+            let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(stream) });
+        }
+    }
+
+    /// Waits for a lost camera to be back; tells nothing where it still is not.
+    fn wait_for_return(&mut self, since: Instant, timeout: Duration) -> Result<(), DeviceError> {
+        let until = Instant::now() + timeout;
+        loop {
+            match self.replies.recv_timeout(until.saturating_duration_since(Instant::now())) {
+                Ok(Reply::Opened(opened)) => {
+                    let opened = opened?;
+                    if opened.capabilities != self.capabilities {
+                        let what = format!(
+                            "came back as another: {} of {} x {}; end the run and look at it",
+                            opened.capabilities.model, opened.capabilities.height, opened.capabilities.width
+                        );
+                        return Err(error(DeviceErrorKind::Protocol, what));
+                    }
+                    let Opened { stream, chunks, tells_time, armed_ns, .. } = opened;
+                    tracing::warn!(camera = self.capabilities.model, away = ?since.elapsed(), "camera back");
+                    self.link = Link::Up { stream, chunks, tells_time };
+                    self.armed_ns = self.armed_ns.and(armed_ns);
+                    self.resume_ids();
+                    return Ok(());
+                }
+                Ok(Reply::Done(..)) => {}
+                Err(RecvTimeoutError::Timeout) if since.elapsed() > self.facts.reopen => {
+                    let what = format!(
+                        "stopped answering and did not come back within camera.reopen_s = {} s",
+                        self.facts.reopen.as_secs_f64()
+                    );
+                    return Err(error(DeviceErrorKind::Disconnected, what));
+                }
+                Err(RecvTimeoutError::Timeout) => return Ok(()),
+                Err(RecvTimeoutError::Disconnected) => {
+                    return Err(error(
+                        DeviceErrorKind::Disconnected,
+                        "its thread has ended; the log has its message",
+                    ));
+                }
+            }
+        }
+    }
+
+    /// Looks at a buffer that the stream gave: a whole frame is copied into `buf`.
+    fn take(&mut self, from: &Buffer, buf: &mut FrameBuf) -> Result<Option<FrameStamp>, DeviceError> {
+        match from.status() {
+            BufferStatus::Success => {}
+            // Left over from before a stop.
+            BufferStatus::Aborted | BufferStatus::Cleared => return Ok(None),
+            _ => {
+                if let Some(seq) = self.ids.extend(from.frame_id()) {
+                    self.losses.incomplete(seq);
+                }
+                return Ok(None);
+            }
+        }
+        let host_ns = self.shared.clock.now_ns();
+        let image = buffer::image_data(from);
+        let Some(image) = image.get(..buf.len()) else {
+            let what = format!(
+                "a frame has {} bytes instead of {}: its region or format was changed",
+                image.len(),
+                buf.len()
+            );
+            return Err(error(DeviceErrorKind::Protocol, what));
+        };
+        buf.copy_from_slice(image);
+        let Link::Up { chunks, tells_time, .. } = &self.link else { return Ok(None) };
+        let exposure_us =
+            chunks.as_ref().and_then(|parser| buffer::chunk_float(parser, from, CHUNK_EXPOSURE));
+        let set_us =
+            exposure_us.or(self.promises.newest().map(|settings| settings.exposure_us)).unwrap_or(0.0);
+        let stamped_ns = i64::try_from(from.timestamp()).unwrap_or(i64::MAX);
+        let device_ns = match self.config.timestamp_at {
+            TimestampAt::ExposureStart => stamped_ns,
+            TimestampAt::ExposureEnd => stamped_ns - ns_from_us(set_us),
+        };
+        let arrived_ns = host_ns - ns_from_us(set_us + self.capabilities.readout_us);
+        let exposure_start_ns = self.shared.with_model(|model| {
+            if !tells_time {
+                model.add(RoundTrip { request_ns: arrived_ns, device_ns, receive_ns: arrived_ns });
+            }
+            model.host_ns(device_ns).unwrap_or(arrived_ns)
+        });
+        let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
+        self.losses.whole(seq);
+        self.newest = Some(Newest { seq, exposure_start_ns, host_ns });
+        Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
+    }
+
+    /// The camera is back and counts its frames anew. As many ids have passed as it would have answered triggers, and the
+    /// next frame is of the settings that were written last, whatever was promised of those before.
+    fn resume_ids(&mut self) {
+        let mut next_seq = self.promises.latest_seq();
+        if let Some(newest) = self.newest {
+            let settings = self.promises.newest();
+            let periods = settings.map_or(1, |settings| {
+                self.capabilities.periods_per_frame(&settings, self.facts.trigger_period_us)
+            });
+            let frame_us = f64::from(periods) * self.facts.trigger_period_us;
+            let away_us = us_from_ns(self.shared.clock.now_ns() - newest.exposure_start_ns);
+            next_seq = next_seq.max(newest.seq + (away_us / frame_us).ceil() as u64);
+        }
+        self.ids.restart(next_seq);
+        if let Some(newest) = self.newest {
+            self.losses.away(newest.seq + 1..self.ids.next());
+        }
+    }
+
+    /// What is known of the triggers now.
+    fn triggers(&self) -> Triggers {
+        let period_us = if self.config.is_triggered() {
+            self.facts.trigger_period_us
+        } else {
+            // Frames of a camera that runs freely may follow as soon as it can.
+            self.promises
+                .newest()
+                .map_or(0.0, |settings| settings.exposure_us)
+                .max(self.capabilities.readout_us)
+        };
+        let period_ns = ns_from_us(period_us);
+        let last_ns = self.armed_ns.map(|armed_ns| {
+            let Some(newest) = self.newest.filter(|newest| newest.exposure_start_ns > armed_ns) else {
+                return armed_ns - period_ns;
+            };
+            let longest_us = self
+                .promises
+                .possible(newest.seq)
+                .map(|settings| settings.trigger_delay_us)
+                .fold(0.0, f64::max);
+            newest.exposure_start_ns - ns_from_us(longest_us + self.capabilities.trigger_latency_us)
+        });
+        Triggers {
+            next_seq: self.ids.next(),
+            last_ns,
+            period_ns,
+            margin_ns: ns_from_us(self.facts.trigger_margin_us),
+        }
+    }
+
+    /// Throws away what has come of frames that nobody asked for.
+    fn drain(&self) {
+        if let Link::Up { stream, .. } = &self.link {
+            while let Some(buffer) = stream.try_pop_buffer() {
+                stream.push_buffer(buffer);
+            }
+        }
+    }
+}
+
+impl Camera for AravisCamera {
+    fn capabilities(&self) -> &CameraCapabilities {
+        &self.capabilities
+    }
+
+    fn state(&self) -> DeviceState {
+        match (&self.link, self.armed_ns) {
+            (Link::Lost { .. }, _) => DeviceState::Lost,
+            (Link::Up { .. }, Some(_)) => DeviceState::Streaming,
+            (Link::Up { .. }, None) => DeviceState::Ready,
+        }
+    }
+
+    fn configure(&mut self, _: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
+        self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
+        let triggers = self.triggers();
+        let Done { written_ns, actual, restarted } = self.ask(Command::Configure(*settings))?;
+        let actual = actual.unwrap_or(*settings);
+        if restarted {
+            self.ids.restart(0);
+        }
+        let latency =
+            Latency { min_frames: self.config.late_frames_min, max_frames: self.config.late_frames_max };
+        let first_frame = first_frame(triggers, written_ns, latency);
+        self.promises.push(first_frame, actual);
+        Ok(Applied { actual, first_frame })
+    }
+
+    fn arm(&mut self) -> Result<(), DeviceError> {
+        if self.armed_ns.is_some() {
+            return Ok(());
+        }
+        self.drain();
+        self.ids.restart(0);
+        let armed_ns = self.shared.clock.now_ns();
+        self.ask(Command::Arm)?;
+        self.armed_ns = Some(armed_ns);
+        Ok(())
+    }
+
+    fn next_frame(
+        &mut self,
+        buf: &mut FrameBuf,
+        timeout: Duration,
+    ) -> Result<Option<FrameStamp>, DeviceError> {
+        let Some(armed_ns) = self.armed_ns else {
+            return Err(error(DeviceErrorKind::NotReady, "next_frame before arm: arm the camera first"));
+        };
+        let until = Instant::now() + timeout;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            let stream = match &self.link {
+                Link::Lost { since } => {
+                    let since = *since;
+                    self.wait_for_return(since, left)?;
+                    return Ok(None);
+                }
+                Link::Up { stream, .. } => stream,
+            };
+            let wait_us = left.min(LOOK).as_micros().try_into().unwrap_or(u64::MAX);
+            let popped = stream.timeout_pop_buffer(wait_us);
+            let Some(buffer) = popped else {
+                let alive_ns = self.newest.map_or(armed_ns, |newest| newest.host_ns.max(armed_ns));
+                if self.silent_since(alive_ns) {
+                    self.lose();
+                } else if left.is_zero() {
+                    return Ok(None);
+                }
+                continue;
+            };
+            if stream.n_buffers().0 == 0 {
+                self.losses.full(self.ids.next() + BUFFERS);
+            }
+            let taken = self.take(&buffer, buf);
+            if let Link::Up { stream, .. } = &self.link {
+                stream.push_buffer(buffer);
+            }
+            if let Some(stamp) = taken? {
+                return Ok(Some(stamp));
+            }
+        }
+    }
+
+    fn loss_of(&self, seq: u64) -> LossCause {
+        self.losses.cause(seq)
+    }
+
+    fn disarm(&mut self) -> Result<(), DeviceError> {
+        if self.armed_ns.take().is_none() {
+            return Ok(());
+        }
+        self.ask(Command::Disarm)?;
+        Ok(())
+    }
+}
+
+impl Drop for AravisCamera {
+    fn drop(&mut self) {
+        let Some(orders) = self.orders.take() else { return };
+        if let Link::Up { stream, .. } =
+            std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() })
+        {
+            let _ = orders.try_send(Order { ticket: 0, command: Command::Close(stream) });
+        }
+        drop(orders);
+        // The owner of a dead camera may be blocked in the library: it is waited for, but not for ever.
+        let until = Instant::now() + FAREWELL;
+        while self.owner.as_ref().is_some_and(|owner| !owner.is_finished()) && Instant::now() < until {
+            match self.replies.recv_timeout(LOOK) {
+                Err(RecvTimeoutError::Disconnected) => break,
+                Ok(_) | Err(RecvTimeoutError::Timeout) => {}
+            }
+        }
+        if let Some(owner) = self.owner.take().filter(JoinHandle::is_finished) {
+            let _ = owner.join();
+        }
+    }
+}

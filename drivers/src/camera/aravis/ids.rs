@@ -1,0 +1,92 @@
+//! From the ids that a camera gives its frames to ids that only rise.
+
+/// Ids of GigE Vision 1.x: 16 bits, and after 65535 comes 1, because 0 is no frame.
+const SHORT_IDS: u64 = 65_535;
+
+/// Extends frame ids of 16 bits to 64 and carries ids that are long already (USB3 Vision, GigE Vision 2.0) on.
+#[derive(Debug, Default)]
+pub struct FrameIds {
+    /// The newest frame: as the camera counts, and as we do.
+    last: Option<(u64, u64)>,
+    /// What the next frame gets after a restart.
+    next: u64,
+}
+
+impl FrameIds {
+    /// The id of the next frame if none is lost before it.
+    pub fn next(&self) -> u64 {
+        self.last.map_or(self.next, |(_, seq)| seq + 1)
+    }
+
+    /// The camera counts anew; its first frame shall be `seq` or, if that is taken, the one after the last.
+    pub fn restart(&mut self, seq: u64) {
+        self.next = self.next().max(seq);
+        self.last = None;
+    }
+
+    /// The id of the frame that the camera calls `raw`; nothing for one that was there already.
+    pub fn extend(&mut self, raw: u64) -> Option<u64> {
+        let seq = match self.last {
+            None => self.next,
+            Some((last_raw, seq)) => {
+                let step = if raw > SHORT_IDS || last_raw > SHORT_IDS {
+                    raw.wrapping_sub(last_raw)
+                } else {
+                    (raw + SHORT_IDS - last_raw) % SHORT_IDS
+                };
+                match step {
+                    0 => return None,
+                    // No host sleeps through half of all ids: the camera began to count anew, how much later is unknown.
+                    step if step > SHORT_IDS / 2 => seq + 1,
+                    step => seq + step,
+                }
+            }
+        };
+        self.last = Some((raw, seq));
+        Some(seq)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn short_ids_wrap_past_zero_and_gaps_stay_gaps() {
+        let mut ids = FrameIds::default();
+        ids.restart(1);
+        // Three times round, every seventh frame lost.
+        let mut seen = 0;
+        for seq in (1..=3 * SHORT_IDS).filter(|seq| seq % 7 != 0) {
+            assert_eq!(ids.extend((seq - 1) % SHORT_IDS + 1), Some(seq));
+            seen = seq;
+        }
+        assert_eq!(ids.next(), seen + 1);
+        assert_eq!(ids.extend((seen - 1) % SHORT_IDS + 1), None, "the same frame again");
+    }
+
+    #[test]
+    fn long_ids_go_on_past_65535() {
+        let mut ids = FrameIds::default();
+        for raw in 65_530..70_000 {
+            assert_eq!(ids.extend(raw), Some(raw - 65_530));
+        }
+        let mut from_zero = FrameIds::default();
+        assert_eq!(
+            [from_zero.extend(0), from_zero.extend(1), from_zero.extend(4)],
+            [Some(0), Some(1), Some(4)]
+        );
+    }
+
+    #[test]
+    fn a_camera_that_counts_anew_goes_on_where_it_was() {
+        let mut ids = FrameIds::default();
+        ids.restart(1);
+        assert_eq!((1..=500).map(|raw| ids.extend(raw)).last(), Some(Some(500)));
+        assert_eq!(ids.extend(1), Some(501), "without a word");
+        ids.restart(100);
+        assert_eq!(ids.extend(1), Some(502), "no id twice");
+        ids.restart(900);
+        assert_eq!([ids.extend(3), ids.extend(4)], [Some(900), Some(901)]);
+    }
+}

@@ -1,0 +1,285 @@
+//! libaravis: finding cameras, opening one, its features and its clock.
+
+use std::ffi::CStr;
+use std::net::IpAddr;
+use std::ops::RangeInclusive;
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use aravis::glib;
+use aravis::glib::object::Cast;
+use aravis::prelude::*;
+use aravis::{Aravis, Camera, GcFeatureNode, GvDevice};
+use raysweep_core::{Clock, DeviceError, DeviceErrorKind, RoundTrip};
+
+use super::features::{FeatureError, Features, Result, first_present};
+
+/// A camera that answered.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Found {
+    /// What to call it in a rig file: `camera.aravis.name`.
+    pub name: String,
+    /// Its maker.
+    pub vendor: String,
+    /// Its model.
+    pub model: String,
+    /// Where it is: an IP address (`camera.aravis.address`) or a place on the USB.
+    pub address: String,
+    /// GigEVision or USB3Vision.
+    pub protocol: String,
+}
+
+/// The library's list of devices is one for the process.
+static LIBRARY: Mutex<Option<Aravis>> = Mutex::new(None);
+
+/// Asks on every network and on the USB which cameras there are; takes about a second.
+pub fn discover() -> Vec<Found> {
+    let mut library = LIBRARY.lock().unwrap_or_else(PoisonError::into_inner);
+    if library.is_none() {
+        *library = Aravis::initialize().ok();
+    }
+    let devices = library.as_ref().map(Aravis::get_device_list).unwrap_or_default();
+    let text = |text: &CStr| text.to_string_lossy().into_owned();
+    let found = devices.iter().map(|device| Found {
+        name: text(&device.id),
+        vendor: text(&device.vendor),
+        model: text(&device.model),
+        address: text(&device.address),
+        protocol: text(&device.protocol),
+    });
+    found.collect()
+}
+
+/// When a camera last answered on its control channel, for whoever waits for it on another thread.
+pub struct Health {
+    clock: Clock,
+    answered_ns: AtomicI64,
+}
+
+impl Health {
+    pub fn new(clock: Clock) -> Self {
+        Self { answered_ns: AtomicI64::new(clock.now_ns()), clock }
+    }
+
+    pub fn answered(&self) {
+        self.answered_ns.store(self.clock.now_ns(), Ordering::Relaxed);
+    }
+
+    /// The camera is known to be gone.
+    pub fn gone(&self) {
+        self.answered_ns.store(i64::MIN, Ordering::Relaxed);
+    }
+
+    pub fn answered_ns(&self) -> i64 {
+        self.answered_ns.load(Ordering::Relaxed)
+    }
+}
+
+/// An open camera that this process controls.
+pub struct Device {
+    pub camera: Camera,
+    device: aravis::Device,
+    health: Arc<Health>,
+}
+
+impl Device {
+    /// Opens a camera by its address or its name.
+    ///
+    /// # Errors
+    /// `Disconnected` when it does not answer, `Busy` when another program controls it.
+    pub fn open(named: &str, health: Arc<Health>) -> std::result::Result<Self, DeviceError> {
+        if named.parse::<IpAddr>().is_err() {
+            // Without the list a name is looked for ten times as long.
+            discover();
+        }
+        let no_camera = |what: String| DeviceError::new("camera", DeviceErrorKind::Disconnected, what);
+        let camera = Camera::new(Some(named)).map_err(|error| {
+            no_camera(format!(
+                "no camera answers at {named}: {error}; is it powered and on this network? `raysweep devices` lists those that answer"
+            ))
+        })?;
+        let device = camera
+            .device()
+            .ok_or_else(|| no_camera(format!("{named} is no device that libaravis can open")))?;
+        if device.downcast_ref::<GvDevice>().is_some_and(|device| !device.is_controller()) {
+            let what = format!(
+                "{named} is controlled by another program: raysweepd holds it while a run is under way; a program that was killed frees it within 3 s"
+            );
+            return Err(DeviceError::new("camera", DeviceErrorKind::Busy, what));
+        }
+        // Off by default: values out of range would go to the camera and come back as puzzling protocol errors.
+        device.set_range_check_policy(aravis::RangeCheckPolicy::Enable);
+        health.answered();
+        Ok(Self { camera, device, health })
+    }
+
+    /// Maker, model and serial number.
+    pub fn model(&self) -> String {
+        let parts = [self.camera.vendor_name(), self.camera.model_name(), self.camera.device_serial_number()];
+        parts.into_iter().filter_map(|part| part.ok().map(String::from)).collect::<Vec<_>>().join(" ")
+    }
+
+    pub fn genicam(&self) -> Option<aravis::Gc> {
+        self.device.genicam()
+    }
+
+    /// Asks for anything at all, to know whether the camera is there.
+    pub fn ping(&self) -> Result<()> {
+        self.integer("Width").map(drop)
+    }
+
+    fn node(&self, name: &str) -> Option<GcFeatureNode> {
+        self.device.feature(name)?.downcast::<GcFeatureNode>().ok()
+    }
+
+    /// Notes that the camera has answered, be it with an error of its own.
+    fn answer<T>(&self, name: &str, result: std::result::Result<T, glib::Error>) -> Result<T> {
+        let error = match result {
+            Ok(value) => {
+                self.health.answered();
+                return Ok(value);
+            }
+            Err(error) => FeatureError::new(name, kind_of(&error), error.message()),
+        };
+        if !matches!(error.kind, DeviceErrorKind::Timeout | DeviceErrorKind::Disconnected) {
+            self.health.answered();
+        }
+        Err(error)
+    }
+}
+
+/// An error of libaravis as one of ours.
+pub fn device_error(what: &str, error: &glib::Error) -> DeviceError {
+    DeviceError::new("camera", kind_of(error), format!("{what}: {error}"))
+}
+
+fn kind_of(error: &glib::Error) -> DeviceErrorKind {
+    use aravis::{DeviceError as Fault, GcError};
+    match error.kind::<Fault>() {
+        Some(Fault::Timeout) => return DeviceErrorKind::Timeout,
+        Some(Fault::NotConnected | Fault::NotFound | Fault::TransferError) => {
+            return DeviceErrorKind::Disconnected;
+        }
+        Some(Fault::NotController | Fault::ProtocolErrorAccessDenied | Fault::ProtocolErrorBusy) => {
+            return DeviceErrorKind::Busy;
+        }
+        Some(Fault::FeatureNotFound) => return DeviceErrorKind::Unsupported,
+        _ => {}
+    }
+    match error.kind::<GcError>() {
+        Some(GcError::OutOfRange | GcError::EnumEntryNotFound) => DeviceErrorKind::OutOfRange,
+        Some(GcError::NodeNotFound) => DeviceErrorKind::Unsupported,
+        _ => DeviceErrorKind::Protocol,
+    }
+}
+
+impl Features for Device {
+    fn has(&self, name: &str) -> bool {
+        // Asked of the node itself: the bindings' short cuts of the device lose the answer.
+        self.node(name).is_some_and(|node| {
+            node.is_implemented().unwrap_or(false) && node.is_available().unwrap_or(false)
+        })
+    }
+
+    fn float(&self, name: &str) -> Result<f64> {
+        self.answer(name, self.device.float_feature_value(name))
+    }
+
+    fn set_float(&self, name: &str, value: f64) -> Result<()> {
+        self.answer(name, self.device.set_float_feature_value(name, value))
+    }
+
+    fn float_range(&self, name: &str) -> Result<RangeInclusive<f64>> {
+        self.answer(name, self.device.float_feature_bounds(name)).map(|(low, high)| low..=high)
+    }
+
+    fn integer(&self, name: &str) -> Result<i64> {
+        self.answer(name, self.device.integer_feature_value(name))
+    }
+
+    fn set_integer(&self, name: &str, value: i64) -> Result<()> {
+        self.answer(name, self.device.set_integer_feature_value(name, value))
+    }
+
+    fn integer_range(&self, name: &str) -> Result<RangeInclusive<i64>> {
+        self.answer(name, self.device.integer_feature_bounds(name)).map(|(low, high)| low..=high)
+    }
+
+    fn text(&self, name: &str) -> Result<String> {
+        self.answer(name, self.device.string_feature_value(name)).map(String::from)
+    }
+
+    fn set_text(&self, name: &str, value: &str) -> Result<()> {
+        self.answer(name, self.device.set_string_feature_value(name, value))
+    }
+
+    fn choices(&self, name: &str) -> Result<Vec<String>> {
+        let choices = self.device.dup_available_enumeration_feature_values_as_strings(name);
+        Ok(self.answer(name, choices)?.into_iter().map(String::from).collect())
+    }
+
+    fn boolean(&self, name: &str) -> Result<bool> {
+        self.answer(name, self.device.boolean_feature_value(name))
+    }
+
+    fn set_boolean(&self, name: &str, value: bool) -> Result<()> {
+        self.answer(name, self.device.set_boolean_feature_value(name, value))
+    }
+
+    fn execute(&self, name: &str) -> Result<()> {
+        self.answer(name, self.device.execute_command(name))
+    }
+
+    fn set_line(&self, line: &str) -> Result<()> {
+        let name = line.split('=').next().unwrap_or(line);
+        self.answer(name, self.device.set_features_from_string(line))
+    }
+}
+
+/// How a camera tells its time.
+#[derive(Debug, Clone, Copy)]
+pub struct DeviceClock {
+    latch: &'static str,
+    value: &'static str,
+    ticks_per_s: i64,
+}
+
+/// Between two looks at a clock whose unit is not known.
+const CLOCK_LOOK: Duration = Duration::from_millis(20);
+
+impl DeviceClock {
+    /// Finds out how the camera tells its time, and in which unit; nothing if it does not, or stands still.
+    pub fn probe(device: &Device, clock: &Clock) -> Option<Self> {
+        let latch = first_present(device, &["TimestampLatch", "GevTimestampControlLatch"])?;
+        let value = first_present(device, &["TimestampLatchValue", "GevTimestampValue"])?;
+        let read = || -> Option<(i64, i64)> {
+            device.execute(latch).ok()?;
+            Some((clock.now_ns(), device.integer(value).ok()?))
+        };
+        let (begin_ns, begin) = read()?;
+        thread::sleep(CLOCK_LOOK);
+        let (end_ns, end) = read()?;
+        let ticks_per_s = (end - begin) as f64 * 1e9 / (end_ns - begin_ns) as f64;
+        // The standards disagree on whether the value counts ticks or nanoseconds, so what it does decides.
+        let gige = device.device.downcast_ref::<GvDevice>();
+        let stated = gige.and_then(|device| device.timestamp_tick_frequency().ok());
+        let units = [Some(1_000_000_000), stated.and_then(|hz| i64::try_from(hz).ok())];
+        let ticks_per_s = units.into_iter().flatten().find(|&unit| {
+            let ratio = ticks_per_s / unit as f64;
+            (0.9..1.1).contains(&ratio)
+        })?;
+        Some(Self { latch, value, ticks_per_s })
+    }
+
+    /// Asks for the camera's time.
+    pub fn ask(&self, device: &Device, clock: &Clock) -> Result<RoundTrip> {
+        let request_ns = clock.now_ns();
+        device.execute(self.latch)?;
+        let receive_ns = clock.now_ns();
+        let ticks = i128::from(device.integer(self.value)?);
+        let device_ns = ticks * 1_000_000_000 / i128::from(self.ticks_per_s);
+        Ok(RoundTrip { request_ns, device_ns: device_ns.try_into().unwrap_or(i64::MAX), receive_ns })
+    }
+}

@@ -1,0 +1,137 @@
+//! Frames that never came, by cause. That they are lost, gaps between frame ids tell; why, what was seen meanwhile.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use raysweep_core::LossCause;
+
+/// Frames with missing packets that are remembered within one gap; more than the driver has buffers never are.
+const REMEMBERED: usize = 64;
+
+/// Why the frames of the newest gap are lost, and how many were lost so far.
+#[derive(Debug)]
+pub struct Losses {
+    /// Frames that came with packets missing, since the newest whole one or in the gap before it.
+    incomplete: Vec<u64>,
+    /// Frames that went by while the camera was away.
+    away: Range<u64>,
+    /// Up to this frame there may have been no free buffer.
+    full_until: Option<u64>,
+    /// The gap before the newest whole frame.
+    gap: Range<u64>,
+    newest: Option<u64>,
+    totals: BTreeMap<LossCause, u64>,
+}
+
+impl Losses {
+    pub fn new() -> Self {
+        Self {
+            incomplete: Vec::with_capacity(REMEMBERED),
+            away: 0..0,
+            full_until: None,
+            gap: 0..0,
+            newest: None,
+            totals: BTreeMap::new(),
+        }
+    }
+
+    /// A frame came with packets missing.
+    pub fn incomplete(&mut self, seq: u64) {
+        if self.incomplete.len() == REMEMBERED {
+            let end = self.gap.end;
+            self.incomplete.retain(|&seq| seq >= end);
+        }
+        if self.incomplete.len() < REMEMBERED {
+            self.incomplete.push(seq);
+        }
+    }
+
+    /// All buffers are full, the newest of them with this frame or one before: the next one may have had no place.
+    pub fn full(&mut self, seq: u64) {
+        self.full_until = Some(seq);
+    }
+
+    /// The camera was away for these frames.
+    pub fn away(&mut self, seqs: Range<u64>) {
+        self.away = seqs;
+    }
+
+    /// A frame came whole: it ends the gap before it.
+    pub fn whole(&mut self, seq: u64) {
+        self.gap = self.newest.map_or(seq, |newest| newest + 1)..seq;
+        self.newest = Some(seq);
+        if self.gap.is_empty() {
+            return;
+        }
+        for lost in self.gap.clone() {
+            *self.totals.entry(self.cause(lost)).or_default() += 1;
+        }
+    }
+
+    /// Why a frame of the gap before the newest whole one is lost.
+    pub fn cause(&self, seq: u64) -> LossCause {
+        if self.away.contains(&seq) {
+            LossCause::CameraLost
+        } else if self.incomplete.contains(&seq) {
+            LossCause::PacketsLost
+        } else if self.full_until.is_some_and(|until| self.gap.start <= until + 1) {
+            LossCause::DriverFull
+        } else {
+            LossCause::CameraGap
+        }
+    }
+
+    /// Frames lost so far, by cause.
+    pub fn totals(&self) -> &BTreeMap<LossCause, u64> {
+        &self.totals
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_lost_frame_has_one_cause() {
+        let mut losses = Losses::new();
+        (0..3).for_each(|seq| losses.whole(seq));
+        losses.incomplete(4);
+        losses.whole(6);
+        assert_eq!([3, 4, 5].map(|seq| losses.cause(seq)), {
+            use LossCause::{CameraGap, PacketsLost};
+            [CameraGap, PacketsLost, CameraGap]
+        });
+        // Two buffers, full with 7 and 8, then two frames without place, later one that the camera lost.
+        losses.full(8);
+        [7, 8, 11].into_iter().for_each(|seq| losses.whole(seq));
+        assert_eq!(losses.cause(9), LossCause::DriverFull);
+        losses.whole(13);
+        assert_eq!(losses.cause(12), LossCause::CameraGap, "not of the time when buffers were full");
+        losses.away(14..20);
+        losses.whole(21);
+        assert_eq!([19, 20].map(|seq| losses.cause(seq)), [LossCause::CameraLost, LossCause::CameraGap]);
+        let totals: Vec<_> = losses.totals().iter().map(|(cause, frames)| (*cause, *frames)).collect();
+        assert_eq!(
+            totals,
+            [
+                (LossCause::CameraGap, 4),
+                (LossCause::PacketsLost, 1),
+                (LossCause::DriverFull, 2),
+                (LossCause::CameraLost, 6)
+            ]
+        );
+    }
+
+    #[test]
+    fn many_torn_frames_need_no_more_memory() {
+        let mut losses = Losses::new();
+        losses.whole(0);
+        for seq in (1..10_000).step_by(2) {
+            losses.incomplete(seq);
+            losses.whole(seq + 1);
+            assert_eq!(losses.cause(seq), LossCause::PacketsLost);
+        }
+        assert_eq!(losses.incomplete.capacity(), REMEMBERED);
+        assert_eq!(losses.totals()[&LossCause::PacketsLost], 5_000);
+    }
+}

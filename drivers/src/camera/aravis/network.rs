@@ -1,0 +1,102 @@
+//! GigE Vision on this host: packets, resends, and a socket buffer that outlasts a busy moment.
+
+use std::fs;
+
+use aravis::glib::object::Cast;
+use aravis::prelude::*;
+use aravis::{Camera, GvStream, GvStreamOption, GvStreamSocketBuffer, Stream};
+
+use super::config::AravisConfig;
+
+/// Where the system says how large socket buffers may be.
+const RMEM_MAX: &str = "/proc/sys/net/core/rmem_max";
+/// The least that a socket buffer is asked to hold.
+const MIN_SOCKET_BUFFER_BYTES: u64 = 1 << 20;
+
+/// What frames need on their way through this host's sockets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SocketBuffer {
+    /// Bytes asked for.
+    pub wanted_bytes: u64,
+    /// Bytes that the system allows.
+    pub allowed_bytes: u64,
+}
+
+impl SocketBuffer {
+    /// Two frames: one that is read while the next arrives.
+    pub fn of(config: &AravisConfig, payload_bytes: usize) -> Self {
+        let wanted = (2 * payload_bytes as u64).max(MIN_SOCKET_BUFFER_BYTES);
+        let allowed = fs::read_to_string(RMEM_MAX).ok().and_then(|text| text.trim().parse().ok());
+        Self {
+            wanted_bytes: config.socket_buffer_bytes.map_or(wanted, u64::from),
+            allowed_bytes: allowed.unwrap_or(u64::MAX),
+        }
+    }
+
+    pub fn suffices(&self) -> bool {
+        self.wanted_bytes <= self.allowed_bytes
+    }
+
+    /// What is wrong and how it is mended, where it does not suffice.
+    pub fn warning(&self) -> Option<String> {
+        let Self { wanted_bytes, allowed_bytes } = self;
+        (!self.suffices()).then(|| {
+            format!(
+                "net.core.rmem_max = {allowed_bytes} allows no socket buffer of {wanted_bytes} bytes for this camera's frames: packets will be lost whenever the host is busy. Mend it with `sysctl -w net.core.rmem_max={wanted_bytes}`; a file in /etc/sysctl.d keeps it"
+            )
+        })
+    }
+}
+
+/// Before the stream is made: which socket it uses, and how large packets may be.
+pub fn prepare(camera: &Camera, config: &AravisConfig, socket: SocketBuffer) {
+    if !camera.is_gv_device() {
+        return;
+    }
+    // libaravis takes a packet socket wherever it may, which is slower than a UDP socket with room for a frame or two,
+    // and better than one without.
+    camera.gv_set_stream_options(if socket.suffices() {
+        GvStreamOption::PACKET_SOCKET_DISABLED
+    } else {
+        GvStreamOption::NONE
+    });
+    let sized = match config.packet_size {
+        Some(size) => camera.gv_set_packet_size(size.try_into().unwrap_or(i32::MAX)),
+        None => camera.gv_auto_packet_size(),
+    };
+    if let Err(error) = sized {
+        tracing::warn!(%error, "packet size not negotiated; it stays as the camera has it");
+    }
+}
+
+/// Once the stream is made. Packets are asked for again where the camera can send them again: libaravis finds out.
+pub fn tune(stream: &Stream, socket: SocketBuffer) {
+    if let Some(stream) = stream.downcast_ref::<GvStream>() {
+        stream.set_socket_buffer(GvStreamSocketBuffer::Fixed);
+        let bytes = socket.wanted_bytes.min(socket.allowed_bytes);
+        stream.set_socket_buffer_size(bytes.try_into().unwrap_or(i32::MAX));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_buffer_that_the_system_does_not_allow_is_told_with_the_remedy() {
+        let small = SocketBuffer { wanted_bytes: 4_000_000, allowed_bytes: 212_992 };
+        let warning = small.warning().unwrap();
+        assert!(warning.contains("sysctl -w net.core.rmem_max=4000000"), "{warning}");
+        assert_eq!(SocketBuffer { allowed_bytes: 4_000_000, ..small }.warning(), None);
+    }
+
+    #[test]
+    fn two_frames_fit_unless_the_rig_says_otherwise() {
+        let wanted = |config: &AravisConfig, payload| SocketBuffer::of(config, payload).wanted_bytes;
+        let config = AravisConfig::default();
+        assert_eq!(wanted(&config, 3_000_000), 6_000_000);
+        assert_eq!(wanted(&config, 1_000), MIN_SOCKET_BUFFER_BYTES);
+        let stated = AravisConfig { socket_buffer_bytes: Some(5_000), ..config };
+        assert_eq!(wanted(&stated, 3_000_000), 5_000);
+    }
+}

@@ -1,0 +1,312 @@
+//! The thread that holds a camera's control channel.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use aravis::prelude::*;
+use aravis::{Buffer, ChunkParser, Stream};
+use raysweep_core::{CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind};
+
+use super::config::AravisConfig;
+use super::driver::RigFacts;
+use super::features::Features;
+use super::library::{Device, DeviceClock, Health, device_error};
+use super::network::{self, SocketBuffer};
+use super::settings::Writer;
+use super::setup::set_up;
+
+/// Buffers that frames arrive in: a quarter of a second and more at 60 frames/s.
+pub const BUFFERS: u64 = 32;
+/// How often a camera is asked for its time, and so whether it is there.
+const ASK_PERIOD: Duration = Duration::from_millis(200);
+/// Times that it is asked at first, so that its first frame has a time.
+const FIRST_ASKS: usize = 8;
+/// A program that was killed holds a camera until its heartbeat is missed, 3 s.
+const BUSY_PATIENCE: Duration = Duration::from_secs(5);
+/// The longest pause between two attempts to open a camera again.
+const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+const SHORTEST_PAUSE: Duration = Duration::from_millis(100);
+
+/// What the owner is told to do.
+pub enum Command {
+    /// Begin to answer triggers.
+    Arm,
+    /// Answer no further trigger.
+    Disarm,
+    /// Write settings.
+    Configure(CameraSettings),
+    /// The camera is given up: dispose of its stream and open it again.
+    Reopen(Stream),
+    /// The same for good; the channel's end says so, too.
+    Close(Stream),
+}
+
+/// A command with the number that its reply carries.
+pub struct Order {
+    pub ticket: u64,
+    pub command: Command,
+}
+
+/// What the owner has to say.
+pub enum Reply {
+    /// The camera is open, for the first time or again.
+    Opened(Result<Opened, DeviceError>),
+    /// An order was carried out.
+    Done(u64, Result<Done, DeviceError>),
+}
+
+/// What came of an order.
+pub struct Done {
+    /// When the last register was written, on the host's clock.
+    pub written_ns: i64,
+    /// The settings that the camera has, where some were written.
+    pub actual: Option<CameraSettings>,
+    /// Whether it had to stop for them, so that it counts its frames anew.
+    pub restarted: bool,
+}
+
+/// An open camera, as far as whoever takes its frames needs it.
+pub struct Opened {
+    pub stream: Stream,
+    pub chunks: Option<ChunkParser>,
+    pub capabilities: CameraCapabilities,
+    /// Whether its clock can be asked.
+    pub tells_time: bool,
+    /// From when on it answers triggers, if it does.
+    pub armed_ns: Option<i64>,
+}
+
+/// How the time with a camera ended.
+enum Ended {
+    Lost,
+    Closed,
+}
+
+/// What the owner thread shares with whoever takes the frames.
+#[derive(Clone)]
+pub struct Shared {
+    pub clock: Clock,
+    pub health: Arc<Health>,
+    /// From the camera's clock to the host's; locked for as long as a line is fitted.
+    pub model: Arc<Mutex<ClockModel>>,
+}
+
+impl Shared {
+    pub fn with_model<T>(&self, f: impl FnOnce(&mut ClockModel) -> T) -> T {
+        f(&mut self.model.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+pub struct Owner {
+    pub config: AravisConfig,
+    pub facts: RigFacts,
+    pub shared: Shared,
+    pub orders: Receiver<Order>,
+    pub replies: SyncSender<Reply>,
+    pub armed: bool,
+    pub settings: Option<CameraSettings>,
+}
+
+struct Connection {
+    device: Device,
+    writer: Writer,
+    clock: Option<DeviceClock>,
+}
+
+impl Owner {
+    /// Opens the camera, serves it, opens it again when it was lost, until nobody wants it any more.
+    pub fn run(mut self) {
+        let begun = Instant::now();
+        let mut was_open = false;
+        let mut pause = SHORTEST_PAUSE;
+        loop {
+            match self.connect() {
+                Ok((connection, opened)) => {
+                    was_open = true;
+                    pause = SHORTEST_PAUSE;
+                    if self.replies.send(Reply::Opened(Ok(opened))).is_err() {
+                        return;
+                    }
+                    if matches!(self.serve(connection), Ended::Closed) {
+                        return;
+                    }
+                }
+                Err(error) => {
+                    let is_held = error.kind == DeviceErrorKind::Busy && begun.elapsed() < BUSY_PATIENCE;
+                    if !was_open && !is_held {
+                        // Nobody is left who could be told.
+                        let _ = self.replies.send(Reply::Opened(Err(error)));
+                        return;
+                    }
+                    tracing::debug!(%error, "camera not open yet");
+                    if self.rest(pause) {
+                        return;
+                    }
+                    pause = (2 * pause).min(LONGEST_PAUSE);
+                }
+            }
+        }
+    }
+
+    /// Whether the end came meanwhile.
+    fn rest(&self, pause: Duration) -> bool {
+        let until = Instant::now() + pause;
+        loop {
+            match self.orders.recv_timeout(until.saturating_duration_since(Instant::now())) {
+                Ok(Order { command: Command::Close(_), .. }) | Err(RecvTimeoutError::Disconnected) => {
+                    return true;
+                }
+                Ok(Order { ticket, .. }) => {
+                    let error = DeviceError::new("camera", DeviceErrorKind::NotReady, "is not open");
+                    let _ = self.replies.send(Reply::Done(ticket, Err(error)));
+                }
+                Err(RecvTimeoutError::Timeout) => return false,
+            }
+        }
+    }
+
+    fn connect(&mut self) -> Result<(Connection, Opened), DeviceError> {
+        let Self { config, facts, shared, .. } = self;
+        let named = config
+            .device()
+            .map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
+        let device = Device::open(named, shared.health.clone())?;
+        if device.has("AcquisitionStop") {
+            // A client that died may have left it streaming; a camera that is not may refuse.
+            let _ = device.execute("AcquisitionStop");
+        }
+        let set_up = set_up(&device, config, facts.format)?;
+        let payload_bytes =
+            device.camera.payload().map_err(|error| device_error("payload size", &error))? as usize;
+        let socket = SocketBuffer::of(config, payload_bytes);
+        network::prepare(&device.camera, config, socket);
+        if let Some(warning) = socket.warning().filter(|_| device.camera.is_gv_device()) {
+            tracing::warn!("{warning}");
+        }
+        if !set_up.lacks.is_empty() {
+            tracing::warn!(camera = device.model(), "the camera lacks {}", set_up.lacks.join("; "));
+        }
+        let stream = device.camera.create_stream().map_err(|error| device_error("no stream", &error))?;
+        network::tune(&stream, socket);
+        for _ in 0..BUFFERS {
+            stream.push_buffer(Buffer::new_allocate(payload_bytes));
+        }
+        let clock = DeviceClock::probe(&device, &shared.clock);
+        shared.with_model(|model| *model = ClockModel::new(model.capacity()));
+        if let Some(clock) = clock {
+            for _ in 0..FIRST_ASKS {
+                let trip = clock.ask(&device, &shared.clock)?;
+                shared.with_model(|model| model.add(trip));
+            }
+        } else {
+            tracing::warn!(
+                camera = device.model(),
+                "the camera cannot be asked for its time: exposures are dated by the arrival of their frames, late by the time that they travel"
+            );
+        }
+        let readout_us = set_up.height as f64 * facts.row_time_us;
+        let delay_us = match set_up.names.delay {
+            Some(name) => device.float_range(name)?,
+            None => 0.0..=0.0,
+        };
+        let capabilities = CameraCapabilities {
+            model: device.model(),
+            width: set_up.width,
+            height: set_up.height,
+            format: facts.format,
+            row_time_us: facts.row_time_us,
+            trigger_latency_us: config.trigger_latency_us,
+            readout_us: config.readout_us.or(set_up.readout_us).unwrap_or(readout_us),
+            readout: config.readout,
+            exposure_us: device.float_range(set_up.names.exposure)?,
+            trigger_delay_us: delay_us,
+        };
+        let chunks = if set_up.chunk_exposure { device.camera.create_chunk_parser() } else { None };
+        let mut writer = Writer::new(set_up.names);
+        if let Some(settings) = &self.settings {
+            writer.write(&device, settings)?;
+        }
+        let armed_ns = self.armed.then(|| self.shared.clock.now_ns());
+        if self.armed {
+            device.execute("AcquisitionStart")?;
+        }
+        let opened = Opened { stream, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
+        Ok((Connection { device, writer, clock }, opened))
+    }
+
+    fn serve(&mut self, mut connection: Connection) -> Ended {
+        let mut next_ask = Instant::now() + ASK_PERIOD;
+        loop {
+            match self.orders.recv_timeout(next_ask.saturating_duration_since(Instant::now())) {
+                Ok(Order { command: Command::Reopen(stream), .. }) => {
+                    drop(stream);
+                    return Ended::Lost;
+                }
+                Ok(Order { command: Command::Close(stream), .. }) => {
+                    let _ = connection.device.execute("AcquisitionStop");
+                    drop(stream);
+                    return Ended::Closed;
+                }
+                Err(RecvTimeoutError::Disconnected) => return Ended::Closed,
+                Ok(Order { ticket, command }) => {
+                    let done = self.obey(&mut connection, command);
+                    if self.replies.send(Reply::Done(ticket, done)).is_err() {
+                        return Ended::Closed;
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {
+                    self.ask(&connection);
+                    next_ask = Instant::now() + ASK_PERIOD;
+                }
+            }
+        }
+    }
+
+    /// Asks the camera for its time, and so whether it is there.
+    fn ask(&self, Connection { device, clock, .. }: &Connection) {
+        let answer = match clock {
+            Some(clock) => clock
+                .ask(device, &self.shared.clock)
+                .map(|trip| self.shared.with_model(|model| model.add(trip))),
+            None => device.ping(),
+        };
+        if let Err(error) = answer {
+            tracing::debug!(%error, "camera does not answer");
+            if error.kind == DeviceErrorKind::Disconnected {
+                self.shared.health.gone();
+            }
+        }
+    }
+
+    fn obey(&mut self, connection: &mut Connection, command: Command) -> Result<Done, DeviceError> {
+        let Connection { device, writer, .. } = connection;
+        let mut done = Done { written_ns: 0, actual: None, restarted: false };
+        match command {
+            Command::Arm => {
+                device.execute("AcquisitionStart")?;
+                self.armed = true;
+            }
+            Command::Disarm => {
+                self.armed = false;
+                device.execute("AcquisitionStop")?;
+            }
+            Command::Configure(settings) => {
+                self.settings = Some(settings);
+                // Shutter modes are locked while a camera streams.
+                done.restarted = self.armed && writer.changes_shutter(&settings);
+                if done.restarted {
+                    device.execute("AcquisitionStop")?;
+                }
+                let written = writer.write(device, &settings);
+                if done.restarted {
+                    device.execute("AcquisitionStart")?;
+                }
+                done.actual = Some(written?);
+            }
+            Command::Reopen(_) | Command::Close(_) => {}
+        }
+        done.written_ns = self.shared.clock.now_ns();
+        Ok(done)
+    }
+}

@@ -1,0 +1,205 @@
+//! The bench's side of the socket.
+
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::os::fd::AsFd;
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use raysweep_core::{DeviceErrorKind, Edge, Projector, Vsync};
+
+use super::{MAX_LINE, Reply, Request, Truth};
+use crate::devices::TruthProbe;
+use crate::gige::GigeCamera;
+
+/// Longest wait for a client or an edge, and so the longest that a stop waits.
+const PATIENCE: Duration = Duration::from_millis(50);
+/// Clients at once; more are turned away.
+const MAX_CLIENTS: usize = 16;
+
+/// Why the bench cannot be there.
+#[derive(Debug, thiserror::Error)]
+pub enum BenchError {
+    /// Its socket cannot be made.
+    #[error("sim.bench = {}: {source}; give a path in a folder that exists and that no other bench has", path.display())]
+    Listen {
+        /// The socket.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A thread cannot be had.
+    #[error("cannot start the bench: {0}")]
+    System(#[from] io::Error),
+}
+
+/// Serves the socket until it is dropped.
+pub struct BenchServer {
+    path: PathBuf,
+    stop: Arc<AtomicBool>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+/// What clients share.
+struct Bench {
+    projector: Mutex<Box<dyn Projector>>,
+    truth: TruthProbe,
+    camera: Arc<GigeCamera>,
+    /// Clients that are told of edges.
+    watchers: Mutex<Vec<UnixStream>>,
+    stop: Arc<AtomicBool>,
+}
+
+impl BenchServer {
+    /// Offers VSYNC line and projector beside a camera at `path`.
+    ///
+    /// # Errors
+    /// When there can be no socket at `path`.
+    pub fn start(
+        path: &Path,
+        vsync: Box<dyn Vsync>,
+        projector: Box<dyn Projector>,
+        truth: TruthProbe,
+        camera: Arc<GigeCamera>,
+    ) -> Result<Self, BenchError> {
+        let listener = listen(path).map_err(|source| BenchError::Listen { path: path.to_owned(), source })?;
+        let mut server = Self { path: path.to_owned(), stop: Arc::default(), threads: Vec::new() };
+        let bench = Arc::new(Bench {
+            projector: Mutex::new(projector),
+            truth,
+            camera,
+            watchers: Mutex::default(),
+            stop: server.stop.clone(),
+        });
+        let told = bench.clone();
+        server.threads.push(spawn("bench-vsync", move || told.tell_edges(vsync))?);
+        server.threads.push(spawn("bench", move || accept(&listener, &bench))?);
+        Ok(server)
+    }
+}
+
+impl Drop for BenchServer {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        for thread in self.threads.drain(..) {
+            // A thread that panicked has said so on stderr.
+            let _ = thread.join();
+        }
+        // Somebody may have removed it already.
+        let _ = std::fs::remove_file(&self.path);
+    }
+}
+
+fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> io::Result<JoinHandle<()>> {
+    std::thread::Builder::new().name(name.into()).spawn(work)
+}
+
+fn listen(path: &Path) -> io::Result<UnixListener> {
+    let listener = match UnixListener::bind(path) {
+        // A bench that was killed leaves its socket behind, where nobody answers.
+        Err(error) if error.kind() == ErrorKind::AddrInUse && UnixStream::connect(path).is_err() => {
+            std::fs::remove_file(path)?;
+            UnixListener::bind(path)?
+        }
+        bound => bound?,
+    };
+    listener.set_nonblocking(true)?;
+    Ok(listener)
+}
+
+fn accept(listener: &UnixListener, bench: &Arc<Bench>) {
+    let mut clients: Vec<JoinHandle<()>> = Vec::new();
+    while !bench.stop.load(Ordering::Relaxed) {
+        let mut ready = [PollFd::new(listener.as_fd(), PollFlags::POLLIN)];
+        // An interrupted wait is as good as one that is over.
+        let _ = poll(&mut ready, PollTimeout::try_from(PATIENCE).unwrap_or(PollTimeout::ZERO));
+        clients.retain(|client| !client.is_finished());
+        let Ok((stream, _)) = listener.accept() else { continue };
+        if clients.len() < MAX_CLIENTS {
+            let bench = bench.clone();
+            clients.extend(spawn("bench-client", move || bench.serve(stream)));
+        }
+    }
+    for client in clients {
+        let _ = client.join();
+    }
+}
+
+impl Bench {
+    fn tell_edges(&self, mut vsync: Box<dyn Vsync>) {
+        while !self.stop.load(Ordering::Relaxed) {
+            let Ok(Some(Edge { seq, host_ns })) = vsync.next_edge(PATIENCE) else { continue };
+            let line = line(&Reply::Edge { seq, host_ns });
+            // A watcher that does not read is cut off rather than waited for; it learns of it by the end of its stream.
+            lock(&self.watchers).retain_mut(|watcher| watcher.write_all(&line).is_ok());
+        }
+    }
+
+    fn serve(&self, stream: UnixStream) {
+        if stream.set_nonblocking(false).is_err() || stream.set_read_timeout(Some(PATIENCE)).is_err() {
+            return;
+        }
+        let mut reader = BufReader::new(stream);
+        let mut text = Vec::new();
+        while !self.stop.load(Ordering::Relaxed) {
+            match (&mut reader).take(MAX_LINE - text.len() as u64).read_until(b'\n', &mut text) {
+                Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => continue,
+                Ok(_) if text.ends_with(b"\n") => {}
+                // The end, or a line without end.
+                _ => return,
+            }
+            let reply = match serde_json::from_slice(&text) {
+                Ok(Request::Edges) => {
+                    let stream = reader.into_inner();
+                    if stream.set_nonblocking(true).is_ok() {
+                        lock(&self.watchers).push(stream);
+                    }
+                    return;
+                }
+                Ok(request) => self.answer(request),
+                Err(error) => {
+                    Reply::Error { kind: DeviceErrorKind::Protocol, message: format!("no request: {error}") }
+                }
+            };
+            if reader.get_mut().write_all(&line(&reply)).is_err() {
+                return;
+            }
+            text.clear();
+        }
+    }
+
+    fn answer(&self, request: Request) -> Reply {
+        let shown = match request {
+            Request::Show(shown) => lock(&self.projector).show(&shown.into()),
+            Request::Blank => lock(&self.projector).blank(),
+            Request::SetFaults(faults) => {
+                self.camera.set_faults(faults);
+                return Reply::Faults(faults);
+            }
+            Request::Faults | Request::Edges => return Reply::Faults(self.camera.faults()),
+            Request::Truth => {
+                return Reply::Truth(Truth { line: self.truth.read(), wire: self.camera.truth() });
+            }
+        };
+        match shown {
+            Ok(shown) => Reply::Shown { not_before_ns: shown.not_before_ns },
+            Err(error) => Reply::Error { kind: error.kind, message: error.source.to_string() },
+        }
+    }
+}
+
+fn line(reply: &Reply) -> Vec<u8> {
+    // Numbers and texts always have a JSON form.
+    let mut line = serde_json::to_vec(reply).unwrap_or_default();
+    line.push(b'\n');
+    line
+}
+
+// What these guard is never left half changed, so a panic elsewhere does not spoil it.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

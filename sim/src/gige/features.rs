@@ -1,0 +1,304 @@
+//! The one table of what the camera offers: the description that clients download and the registers that they read and
+//! write are both made of it, so that they cannot disagree. Names are those of the GenICam SFNC 2.7; registers below
+//! 0x1000 lie where GigE Vision 2.0 puts them.
+
+use raysweep_core::{CameraCapabilities, Mosaic, PixelFormat};
+
+/// A register; its name is the feature's.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[allow(missing_docs, reason = "the names are defined by the SFNC and by GigE Vision")]
+pub enum Id {
+    DeviceVendorName,
+    DeviceModelName,
+    DeviceVersion,
+    DeviceManufacturerInfo,
+    DeviceSerialNumber,
+    DeviceUserID,
+    GevHeartbeatTimeout,
+    GevTimestampTickFrequency,
+    GevTimestampControl,
+    GevTimestampValue,
+    GevCCP,
+    GevSCPHostPort,
+    GevSCPS,
+    GevSCPD,
+    GevSCDA,
+    SensorWidth,
+    SensorHeight,
+    SensorShutterMode,
+    SensorReadoutTime,
+    WidthMax,
+    HeightMax,
+    OffsetXMax,
+    OffsetYMax,
+    Width,
+    Height,
+    OffsetX,
+    OffsetY,
+    PixelFormat,
+    AcquisitionMode,
+    AcquisitionStart,
+    AcquisitionStop,
+    AcquisitionFrameRateEnable,
+    AcquisitionFrameRate,
+    TriggerSelector,
+    TriggerMode,
+    TriggerSoftware,
+    TriggerSource,
+    TriggerActivation,
+    TriggerDelay,
+    ExposureMode,
+    ExposureTime,
+    ChunkModeActive,
+    ChunkSelector,
+    ChunkEnable,
+    TimestampLatch,
+    PayloadSize,
+    TLParamsLocked,
+    UserSetSelector,
+    UserSetLoad,
+    UserSetSave,
+}
+
+/// Who may change a register.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// The camera alone.
+    ReadOnly,
+    /// The client in control.
+    ReadWrite,
+    /// The client in control, but not while frames are acquired.
+    ReadWriteIdle,
+    /// A command: writing does something, reading gives 0.
+    Command,
+}
+
+/// What a register holds; all of it big-endian.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Kind {
+    /// Four bytes, unsigned.
+    Integer {
+        /// Smallest value.
+        min: u32,
+        /// Largest value.
+        max: u32,
+        /// Distance of allowed values.
+        step: u32,
+        /// The register with the largest value as things stand.
+        max_in: Option<Id>,
+    },
+    /// Eight bytes, unsigned.
+    Long,
+    /// A double.
+    Float {
+        /// Smallest value.
+        min: f64,
+        /// Largest value.
+        max: f64,
+        /// Its unit.
+        unit: &'static str,
+    },
+    /// Four bytes, one of these.
+    Enumeration(Vec<(String, u32)>),
+    /// Four bytes, 0 or 1.
+    Boolean,
+    /// Four bytes, 0 or 1, for each entry of an enumeration.
+    BooleanFor(Id),
+    /// Zero-terminated, in so many bytes.
+    Text(u32),
+}
+
+impl Kind {
+    /// A whole number of any size.
+    fn any() -> Self {
+        Self::Integer { min: 0, max: u32::MAX, step: 1, max_in: None }
+    }
+}
+
+/// One line of the table.
+#[derive(Debug, Clone)]
+pub struct Feature {
+    /// Which it is.
+    pub id: Id,
+    /// Where clients look for it; `None`: it serves other features and is not shown.
+    pub category: Option<&'static str>,
+    /// Its register.
+    pub address: u32,
+    /// Who may change it.
+    pub access: Access,
+    /// What it holds.
+    pub kind: Kind,
+    /// What it holds at first, as bits of a `u64`: a whole number, or those of a double.
+    pub initial: u64,
+}
+
+impl Feature {
+    /// Bytes of its register.
+    pub fn bytes(&self, features: &[Self]) -> u32 {
+        match &self.kind {
+            Kind::Integer { .. } | Kind::Enumeration(_) | Kind::Boolean => 4,
+            Kind::Long | Kind::Float { .. } => 8,
+            Kind::Text(bytes) => *bytes,
+            Kind::BooleanFor(selector) => {
+                let entries = features.iter().find(|feature| feature.id == *selector);
+                entries.map_or(4, |feature| match &feature.kind {
+                    Kind::Enumeration(entries) => 4 * entries.len() as u32,
+                    _ => 4,
+                })
+            }
+        }
+    }
+}
+
+/// Where the registers begin that GigE Vision leaves to the maker.
+pub const MAKERS_REGISTERS: u32 = 0x1_0000;
+/// Bytes kept for each of them.
+pub const MAKERS_STRIDE: u32 = 16;
+
+/// Values of `AcquisitionMode`.
+pub const SINGLE_FRAME: u32 = 1;
+/// Values of `TriggerSource`.
+pub const SOFTWARE: u32 = 1;
+/// Values of `SensorShutterMode`.
+pub const GLOBAL_SHUTTER: u32 = 1;
+/// Entries of `ChunkSelector`, which are also what `ChunkEnable` is told apart by.
+pub const CHUNKS: [&str; 3] = ["ExposureTime", "Timestamp", "FrameID"];
+
+/// The table for a camera with these capabilities.
+pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
+    use Access::{Command, ReadOnly, ReadWrite, ReadWriteIdle};
+    let (width, height) = (camera.width as u32, camera.height as u32);
+    let whole = |min, max, step, max_in| Kind::Integer { min, max, step, max_in };
+    let one_of = |entries: &[&str]| {
+        Kind::Enumeration(entries.iter().map(|entry| (*entry).to_owned()).zip(0..).collect())
+    };
+    let exposure =
+        Kind::Float { min: *camera.exposure_us.start(), max: *camera.exposure_us.end(), unit: "us" };
+    let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
+    let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
+    let mosaic = camera.format.mosaic;
+    // A region that starts in the middle of a 2 x 2 cell would have another mosaic.
+    let offset_step = if mosaic == Mosaic::Mono { 1 } else { 2 };
+    let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
+    let formats = formats.filter_map(|format| Some((format.to_string(), format.pfnc()?)));
+    let formats = Kind::Enumeration(formats.collect());
+
+    let device = Some("DeviceControl");
+    let transport = Some("TransportLayerControl");
+    let image = Some("ImageFormatControl");
+    let acquisition = Some("AcquisitionControl");
+    let chunks = Some("ChunkDataControl");
+    let user_sets = Some("UserSetControl");
+    let standard =
+        |id, address, category, access, kind| Feature { id, category, address, access, kind, initial: 0 };
+    let maker = |id, category, access, kind, initial| {
+        let address = MAKERS_REGISTERS + MAKERS_STRIDE * id as u32;
+        Feature { id, category, address, access, kind, initial }
+    };
+    vec![
+        standard(Id::DeviceVendorName, 0x48, device, ReadOnly, Kind::Text(32)),
+        standard(Id::DeviceModelName, 0x68, device, ReadOnly, Kind::Text(32)),
+        standard(Id::DeviceVersion, 0x88, device, ReadOnly, Kind::Text(32)),
+        standard(Id::DeviceManufacturerInfo, 0xA8, device, ReadOnly, Kind::Text(48)),
+        standard(Id::DeviceSerialNumber, 0xD8, device, ReadOnly, Kind::Text(16)),
+        standard(Id::DeviceUserID, 0xE8, device, ReadWrite, Kind::Text(16)),
+        Feature {
+            initial: 3000,
+            ..standard(Id::GevHeartbeatTimeout, 0x938, transport, ReadWrite, whole(500, 60_000, 1, None))
+        },
+        standard(Id::GevTimestampTickFrequency, 0x93C, transport, ReadOnly, Kind::Long),
+        standard(Id::GevTimestampControl, 0x944, None, Command, Kind::any()),
+        standard(Id::GevTimestampValue, 0x948, transport, ReadOnly, Kind::Long),
+        standard(Id::GevCCP, 0xA00, None, ReadWrite, Kind::any()),
+        standard(Id::GevSCPHostPort, 0xD00, transport, ReadWrite, whole(0, 0xFFFF, 1, None)),
+        Feature { initial: 1500, ..standard(Id::GevSCPS, 0xD04, None, ReadWrite, Kind::any()) },
+        standard(Id::GevSCPD, 0xD08, transport, ReadWrite, Kind::any()),
+        standard(Id::GevSCDA, 0xD18, transport, ReadWrite, Kind::any()),
+        maker(Id::SensorWidth, image, ReadOnly, Kind::any(), width.into()),
+        maker(Id::SensorHeight, image, ReadOnly, Kind::any(), height.into()),
+        maker(Id::SensorShutterMode, image, ReadWrite, one_of(&["Rolling", "Global"]), 0),
+        maker(
+            Id::SensorReadoutTime,
+            image,
+            ReadOnly,
+            Kind::Float { min: 0.0, max: 1e9, unit: "us" },
+            camera.readout_us.to_bits(),
+        ),
+        maker(Id::WidthMax, image, ReadOnly, Kind::any(), width.into()),
+        maker(Id::HeightMax, image, ReadOnly, Kind::any(), height.into()),
+        maker(Id::OffsetXMax, None, ReadOnly, Kind::any(), 0),
+        maker(Id::OffsetYMax, None, ReadOnly, Kind::any(), 0),
+        maker(Id::Width, image, ReadWriteIdle, whole(1, width, 1, Some(Id::WidthMax)), width.into()),
+        maker(Id::Height, image, ReadWriteIdle, whole(1, height, 1, Some(Id::HeightMax)), height.into()),
+        maker(Id::OffsetX, image, ReadWriteIdle, whole(0, width, offset_step, Some(Id::OffsetXMax)), 0),
+        maker(Id::OffsetY, image, ReadWriteIdle, whole(0, height, offset_step, Some(Id::OffsetYMax)), 0),
+        maker(
+            Id::PixelFormat,
+            image,
+            ReadWriteIdle,
+            formats,
+            camera.format.pfnc().unwrap_or_default().into(),
+        ),
+        maker(Id::AcquisitionMode, acquisition, ReadWriteIdle, one_of(&["Continuous", "SingleFrame"]), 0),
+        maker(Id::AcquisitionStart, acquisition, Command, Kind::any(), 0),
+        maker(Id::AcquisitionStop, acquisition, Command, Kind::any(), 0),
+        maker(Id::AcquisitionFrameRateEnable, acquisition, ReadWrite, Kind::Boolean, 1),
+        maker(
+            Id::AcquisitionFrameRate,
+            acquisition,
+            ReadWrite,
+            Kind::Float { min: 0.1, max: 10_000.0, unit: "Hz" },
+            30_f64.to_bits(),
+        ),
+        maker(Id::TriggerSelector, acquisition, ReadWrite, one_of(&["FrameStart"]), 0),
+        maker(Id::TriggerMode, acquisition, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(Id::TriggerSoftware, acquisition, Command, Kind::any(), 0),
+        maker(Id::TriggerSource, acquisition, ReadWrite, one_of(&["Line0", "Software"]), 0),
+        maker(Id::TriggerActivation, acquisition, ReadWrite, one_of(&["RisingEdge"]), 0),
+        maker(Id::TriggerDelay, acquisition, ReadWrite, delay, delay_min.to_bits()),
+        maker(Id::ExposureMode, acquisition, ReadWrite, one_of(&["Timed"]), 0),
+        maker(Id::ExposureTime, acquisition, ReadWrite, exposure, 1000_f64.to_bits()),
+        maker(Id::ChunkModeActive, chunks, ReadWriteIdle, Kind::Boolean, 0),
+        maker(Id::ChunkSelector, chunks, ReadWrite, one_of(&CHUNKS), 0),
+        maker(Id::ChunkEnable, chunks, ReadWriteIdle, Kind::BooleanFor(Id::ChunkSelector), 0),
+        maker(Id::TimestampLatch, device, Command, Kind::any(), 0),
+        maker(Id::PayloadSize, transport, ReadOnly, Kind::any(), 0),
+        maker(Id::TLParamsLocked, transport, ReadWrite, whole(0, 1, 1, None), 0),
+        maker(Id::UserSetSelector, user_sets, ReadWrite, one_of(&["Default", "UserSet1"]), 0),
+        maker(Id::UserSetLoad, user_sets, Command, Kind::any(), 0),
+        maker(Id::UserSetSave, user_sets, Command, Kind::any(), 0),
+    ]
+}
+
+/// A feature that is a part of a register, or another name of one.
+pub struct View {
+    /// Its SFNC name.
+    pub name: &'static str,
+    /// The register.
+    pub of: Id,
+    /// What it shows of it.
+    pub shows: Shows,
+}
+
+/// What a [`View`] shows.
+pub enum Shows {
+    /// These bits, counted from the least significant, as a whole number.
+    Bits(u32, u32),
+    /// One bit.
+    Flag(u32),
+    /// A command that writes this value.
+    Command(u32),
+    /// All of it.
+    All,
+}
+
+/// Views for the description alone; what they read and write is checked where the register is.
+pub const VIEWS: [View; 7] = [
+    View { name: "GevSCPSPacketSize", of: Id::GevSCPS, shows: Shows::Bits(0, 15) },
+    View { name: "GevSCPSDoNotFragment", of: Id::GevSCPS, shows: Shows::Flag(30) },
+    View { name: "GevSCPSFireTestPacket", of: Id::GevSCPS, shows: Shows::Flag(31) },
+    View { name: "GevTimestampControlLatch", of: Id::GevTimestampControl, shows: Shows::Command(2) },
+    View { name: "GevTimestampControlReset", of: Id::GevTimestampControl, shows: Shows::Command(1) },
+    View { name: "TimestampLatchValue", of: Id::GevTimestampValue, shows: Shows::All },
+    View { name: "DeviceID", of: Id::DeviceSerialNumber, shows: Shows::All },
+];

@@ -1,0 +1,223 @@
+//! GVSP, the streaming protocol of GigE Vision 2.0: a frame as a leader, packets of payload and a trailer. Every field
+//! of a header is big-endian; ids have 16 bits for frames and 24 for packets.
+
+use raysweep_core::PixelFormat;
+
+use super::gvcp::Status;
+
+/// Bytes of IP, UDP and GVSP headers, which a packet's size counts too.
+const HEADERS: usize = 20 + 8 + GVSP_HEADER;
+const GVSP_HEADER: usize = 8;
+/// Smallest packet that a client may choose.
+pub const MIN_PACKET_BYTES: usize = 576;
+/// Largest datagram that IP carries.
+pub const MAX_PACKET_BYTES: usize = 65_535;
+
+const LEADER: u8 = 1;
+const TRAILER: u8 = 2;
+const PAYLOAD: u8 = 3;
+
+/// A payload of an image, and of an image with chunks behind it.
+const IMAGE: u16 = 0x0001;
+const IMAGE_WITH_CHUNKS: u16 = 0x4001;
+/// Identifies the image among the chunks.
+const IMAGE_CHUNK: u32 = 0x0000_0001;
+/// Each chunk ends with its id and its length.
+const CHUNK_TRAILER: usize = 8;
+/// All chunks of this camera but the image are one 64-bit value.
+const CHUNK_DATA: usize = 8;
+
+/// What a frame can carry about itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Chunk {
+    /// Microseconds, a double.
+    ExposureTime,
+    /// Start of the exposure in ticks of the camera's clock.
+    Timestamp,
+    /// The frame's number, which does not wrap.
+    FrameId,
+}
+
+impl Chunk {
+    /// All, in the order of `ChunkSelector`.
+    pub const ALL: [Self; 3] = [Self::ExposureTime, Self::Timestamp, Self::FrameId];
+
+    /// Its id in the payload.
+    pub fn id(self) -> u32 {
+        0x1000 + self as u32
+    }
+
+    /// Its name in the SFNC.
+    pub fn feature(self) -> &'static str {
+        match self {
+            Self::ExposureTime => "ChunkExposureTime",
+            Self::Timestamp => "ChunkTimestamp",
+            Self::FrameId => "ChunkFrameID",
+        }
+    }
+}
+
+/// What of a picture is sent, and how.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct View {
+    /// How pixels are packed.
+    pub format: PixelFormat,
+    /// First column.
+    pub x: usize,
+    /// First row.
+    pub y: usize,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// The chunks sent, in the order of [`Chunk::ALL`]; `None`: the plain image.
+    pub chunks: Option<[bool; 3]>,
+}
+
+impl View {
+    /// Bytes of the pixels alone.
+    pub fn image_bytes(&self) -> usize {
+        self.format.frame_bytes(self.width * self.height)
+    }
+
+    /// Bytes of a frame.
+    pub fn payload_bytes(&self) -> usize {
+        match self.chunks {
+            None => self.image_bytes(),
+            Some(enabled) => {
+                let sent = enabled.iter().filter(|enabled| **enabled).count();
+                self.image_chunk_bytes() + CHUNK_TRAILER + sent * (CHUNK_DATA + CHUNK_TRAILER)
+            }
+        }
+    }
+
+    /// A chunk's length is a multiple of four.
+    fn image_chunk_bytes(&self) -> usize {
+        self.image_bytes().next_multiple_of(4)
+    }
+}
+
+/// What a frame says of itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Stamp {
+    /// The camera's own count of exposures.
+    pub seq: u64,
+    /// Start of row 0's exposure in ticks of the camera's clock.
+    pub ticks: u64,
+    /// The exposure, as the chunk tells it.
+    pub exposure_us: f64,
+}
+
+/// A frame as it is sent, kept for clients that miss packets of it.
+pub struct Block {
+    /// The id that packets carry; 0 is none.
+    pub id: u16,
+    /// What it shows.
+    pub view: View,
+    /// When it was exposed.
+    pub stamp: Stamp,
+    /// Bytes of a packet, headers included.
+    pub packet_bytes: usize,
+    /// Room for pixels and chunks; [`View::payload_bytes`] of it are in use.
+    pub payload: Vec<u8>,
+}
+
+impl Block {
+    /// An empty block with room for any view of `pixels` pixels.
+    pub fn with_room(view: View, pixels: usize) -> Self {
+        let bytes =
+            PixelFormat::Mono16.frame_bytes(pixels) + (CHUNK_DATA + CHUNK_TRAILER) * (Chunk::ALL.len() + 1);
+        Self { id: 0, view, stamp: Stamp::default(), packet_bytes: MIN_PACKET_BYTES, payload: vec![0; bytes] }
+    }
+
+    /// Where the packed pixels go.
+    pub fn image_mut(&mut self) -> &mut [u8] {
+        let bytes = self.view.image_bytes();
+        &mut self.payload[..bytes]
+    }
+
+    /// Writes the chunks behind the pixels.
+    pub fn write_chunks(&mut self) {
+        let Some(enabled) = self.view.chunks else { return };
+        let mut at = self.view.image_chunk_bytes();
+        put(&mut self.payload, &mut at, &IMAGE_CHUNK.to_be_bytes());
+        put(&mut self.payload, &mut at, &(self.view.image_chunk_bytes() as u32).to_be_bytes());
+        for (chunk, _) in Chunk::ALL.into_iter().zip(enabled).filter(|(_, enabled)| *enabled) {
+            let value = match chunk {
+                Chunk::ExposureTime => self.stamp.exposure_us.to_bits(),
+                Chunk::Timestamp => self.stamp.ticks,
+                Chunk::FrameId => self.stamp.seq,
+            };
+            put(&mut self.payload, &mut at, &value.to_be_bytes());
+            put(&mut self.payload, &mut at, &chunk.id().to_be_bytes());
+            put(&mut self.payload, &mut at, &(CHUNK_DATA as u32).to_be_bytes());
+        }
+    }
+
+    /// Packets of the block, leader and trailer included.
+    pub fn packets(&self) -> u32 {
+        (self.view.payload_bytes().div_ceil(self.packet_bytes - HEADERS) + 2) as u32
+    }
+
+    /// Writes packet `number` into `datagram`; returns its bytes.
+    pub fn packet(&self, number: u32, datagram: &mut [u8]) -> usize {
+        let mut at = 0;
+        let mut word = |bytes: &[u8]| put(datagram, &mut at, bytes);
+        let payload_type = if self.view.chunks.is_some() { IMAGE_WITH_CHUNKS } else { IMAGE };
+        let last = self.packets() - 1;
+        let kind = match number {
+            0 => LEADER,
+            number if number == last => TRAILER,
+            _ => PAYLOAD,
+        };
+        word(&(Status::Success as u16).to_be_bytes());
+        word(&self.id.to_be_bytes());
+        word(&(u32::from(kind) << 24 | number).to_be_bytes());
+        match kind {
+            LEADER => {
+                word(&[0; 2]);
+                word(&payload_type.to_be_bytes());
+                word(&self.stamp.ticks.to_be_bytes());
+                word(&self.view.format.pfnc().unwrap_or_default().to_be_bytes());
+                for value in [self.view.width, self.view.height, self.view.x, self.view.y] {
+                    word(&(value as u32).to_be_bytes());
+                }
+                word(&[0; 4]);
+            }
+            TRAILER => {
+                word(&[0; 2]);
+                word(&payload_type.to_be_bytes());
+                word(&(self.view.height as u32).to_be_bytes());
+                if self.view.chunks.is_some() {
+                    // The layout of the chunks never changes while a client acquires.
+                    word(&[0; 4]);
+                }
+            }
+            _ => {
+                let data = self.packet_bytes - HEADERS;
+                let from = (number as usize - 1) * data;
+                word(&self.payload[from..self.view.payload_bytes().min(from + data)]);
+            }
+        }
+        at
+    }
+}
+
+/// Writes the answer to a request for packets that are no longer kept.
+pub fn unavailable(block: u16, number: u32, datagram: &mut [u8]) -> usize {
+    let mut at = 0;
+    put(datagram, &mut at, &(Status::PacketUnavailable as u16).to_be_bytes());
+    put(datagram, &mut at, &block.to_be_bytes());
+    put(datagram, &mut at, &(u32::from(PAYLOAD) << 24 | number).to_be_bytes());
+    at
+}
+
+fn put(to: &mut [u8], at: &mut usize, bytes: &[u8]) {
+    to[*at..*at + bytes.len()].copy_from_slice(bytes);
+    *at += bytes.len();
+}
+
+/// The id of the `n`th frame since acquisition began, counted from 0: 1 to 65535 and round again, without 0.
+pub fn block_id(n: u64) -> u16 {
+    (n % 0xFFFF) as u16 + 1
+}

@@ -1,0 +1,268 @@
+//! The camera's memory: the registers of the feature table, the standard's constants, and the description.
+
+use std::net::Ipv4Addr;
+
+use super::features::{Access, Feature, Id, Kind, MAKERS_REGISTERS, MAKERS_STRIDE};
+use super::gvcp::Status;
+
+/// Bytes that a discovery answers with: the beginning of the memory.
+pub const DISCOVERY_BYTES: usize = 0xF8;
+/// Bytes of the registers that the standard defines.
+const STANDARD_BYTES: u32 = 0x1000;
+const DESCRIPTION: u32 = 0x10_0000;
+/// GigE Vision 2.0.
+const VERSION: u32 = 0x0002_0000;
+/// Big-endian, names in UTF-8.
+const DEVICE_MODE: u32 = 0x8000_0001;
+/// Link-local address, the only configuration that every device has.
+const LINK_LOCAL: u32 = 4;
+const URL_BYTES: usize = 512;
+/// Optional parts of GVCP that this camera has: concatenated reads, memory writes, resending, heartbeat, names.
+const CAPABILITIES: u32 = 1 | 1 << 1 | 1 << 30 | 1 << 31;
+const RESENDS: u32 = 1 << 2;
+
+/// What is fixed when the camera is built.
+pub struct Identity<'a> {
+    /// Where it listens.
+    pub address: Ipv4Addr,
+    /// Model, as clients show it.
+    pub model: &'a str,
+    /// Serial number.
+    pub serial: &'a str,
+    /// Ticks a second of its clock.
+    pub tick_frequency_hz: u64,
+    /// The description and the name of its file.
+    pub description: (Vec<u8>, &'static str),
+}
+
+/// The memory.
+pub struct Registers {
+    features: Vec<Feature>,
+    standard: Vec<u8>,
+    makers: Vec<u8>,
+    description: Vec<u8>,
+}
+
+/// A write that was checked and not yet done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Write<'a> {
+    /// The register.
+    pub id: Id,
+    /// Who may do it.
+    pub access: Access,
+    address: u32,
+    data: &'a [u8],
+}
+
+impl Write<'_> {
+    /// What is written, where it is a whole number of four bytes.
+    pub fn value(&self) -> u32 {
+        super::gvcp::u32_at(self.data, 0).unwrap_or(0)
+    }
+}
+
+impl Registers {
+    /// The memory after power is switched on.
+    pub fn new(features: Vec<Feature>, identity: Identity<'_>) -> Self {
+        let (description, file) = identity.description;
+        let bytes = description.len();
+        let mut registers = Self {
+            standard: vec![0; STANDARD_BYTES as usize],
+            makers: vec![0; features.len() * MAKERS_STRIDE as usize],
+            features,
+            description,
+        };
+        // Clients read whole words, the last one too.
+        registers.description.resize(bytes.next_multiple_of(4), 0);
+        let octets = identity.address.octets();
+        // A locally administered address, made of the camera's other one.
+        let mac = [0x02, 0x52, octets[0], octets[1], octets[2], octets[3]];
+        let url = format!("Local:{file};{DESCRIPTION:x};{bytes:x}");
+        let mut put = |address: usize, bytes: &[u8]| {
+            registers.standard[address..address + bytes.len()].copy_from_slice(bytes);
+        };
+        put(0x00, &VERSION.to_be_bytes());
+        put(0x04, &DEVICE_MODE.to_be_bytes());
+        put(0x0A, &mac);
+        put(0x10, &LINK_LOCAL.to_be_bytes());
+        put(0x14, &LINK_LOCAL.to_be_bytes());
+        put(0x24, &octets);
+        put(0x34, &[255, 0, 0, 0]);
+        put(0x200, &url.as_bytes()[..url.len().min(URL_BYTES - 1)]);
+        put(0x600, &1_u32.to_be_bytes());
+        put(0x904, &1_u32.to_be_bytes());
+        put(0x934, &CAPABILITIES.to_be_bytes());
+        registers.set_text(Id::DeviceVendorName, "raysweep");
+        registers.set_text(Id::DeviceModelName, identity.model);
+        registers.set_text(Id::DeviceVersion, env!("CARGO_PKG_VERSION"));
+        registers.set_text(Id::DeviceManufacturerInfo, "simulated camera");
+        registers.set_text(Id::DeviceSerialNumber, identity.serial);
+        for feature in registers.features.clone() {
+            if feature.initial != 0 {
+                registers.set_bits(feature.id, feature.initial);
+            }
+        }
+        registers.set_long(Id::GevTimestampTickFrequency, identity.tick_frequency_hz);
+        registers
+    }
+
+    /// Says whether lost packets can be asked for.
+    pub fn set_resends(&mut self, resends: bool) {
+        let capabilities = if resends { CAPABILITIES | RESENDS } else { CAPABILITIES };
+        self.standard[0x934..0x938].copy_from_slice(&capabilities.to_be_bytes());
+    }
+
+    /// What a discovery answers with.
+    pub fn discovery(&self) -> &[u8] {
+        &self.standard[..DISCOVERY_BYTES]
+    }
+
+    /// Bytes from an address on.
+    ///
+    /// # Errors
+    /// `BadAlignment` unless address and length are multiples of four, `InvalidAddress` where there is no memory.
+    pub fn read(&self, address: u32, bytes: usize) -> Result<&[u8], Status> {
+        if !address.is_multiple_of(4) || !bytes.is_multiple_of(4) {
+            return Err(Status::BadAlignment);
+        }
+        let (base, memory) = match address {
+            DESCRIPTION.. => (DESCRIPTION, &self.description),
+            MAKERS_REGISTERS.. => (MAKERS_REGISTERS, &self.makers),
+            _ => (0, &self.standard),
+        };
+        let from = (address - base) as usize;
+        memory.get(from..from + bytes).ok_or(Status::InvalidAddress)
+    }
+
+    /// Checks a write; nothing has happened yet.
+    ///
+    /// # Errors
+    /// `InvalidAddress` unless it is exactly one register, `WriteProtect` where the camera alone may write,
+    /// `InvalidParameter` for a value that the feature does not take.
+    pub fn check<'a>(&self, address: u32, data: &'a [u8]) -> Result<Write<'a>, Status> {
+        if !address.is_multiple_of(4) {
+            return Err(Status::BadAlignment);
+        }
+        let feature = self.features.iter().find(|feature| {
+            let end = feature.address + feature.bytes(&self.features);
+            (feature.address..end).contains(&address)
+        });
+        let Some(feature) = feature else {
+            return Err(self.read(address, 4).map_or(Status::InvalidAddress, |_| Status::WriteProtect));
+        };
+        if feature.access == Access::ReadOnly {
+            return Err(Status::WriteProtect);
+        }
+        let offset = address - feature.address;
+        let whole = match feature.kind {
+            Kind::BooleanFor(_) => data.len() == 4,
+            Kind::Text(bytes) => offset as usize + data.len() <= bytes as usize,
+            _ => offset == 0 && data.len() == feature.bytes(&self.features) as usize,
+        };
+        if !whole {
+            return Err(Status::InvalidAddress);
+        }
+        let number = || super::gvcp::u32_at(data, 0).unwrap_or(0);
+        let allowed = match &feature.kind {
+            _ if feature.access == Access::Command => true,
+            Kind::Integer { min, max, step, max_in } => {
+                let max = max_in.map_or(*max, |id| self.number(id).min(*max));
+                (*min..=max).contains(&number()) && (number() - min).is_multiple_of(*step)
+            }
+            Kind::Enumeration(entries) => entries.iter().any(|(_, value)| *value == number()),
+            Kind::Boolean | Kind::BooleanFor(_) => number() <= 1,
+            Kind::Float { min, max, .. } => {
+                let value = data.first_chunk().map(|bytes| f64::from_be_bytes(*bytes));
+                value.is_some_and(|value| (*min..=*max).contains(&value))
+            }
+            Kind::Long | Kind::Text(_) => true,
+        };
+        if !allowed {
+            return Err(Status::InvalidParameter);
+        }
+        Ok(Write { id: feature.id, access: feature.access, address, data })
+    }
+
+    /// Does a checked write; a command leaves nothing behind.
+    pub fn commit(&mut self, write: Write<'_>) {
+        if write.access != Access::Command
+            && let Some(memory) = self.memory(write.address, write.data.len())
+        {
+            memory.copy_from_slice(write.data);
+        }
+    }
+
+    fn memory(&mut self, address: u32, bytes: usize) -> Option<&mut [u8]> {
+        let (base, memory) = if address >= MAKERS_REGISTERS {
+            (MAKERS_REGISTERS, &mut self.makers)
+        } else {
+            (0, &mut self.standard)
+        };
+        let from = (address - base) as usize;
+        memory.get_mut(from..from + bytes)
+    }
+
+    fn address(&self, id: Id) -> u32 {
+        self.features.iter().find(|feature| feature.id == id).map_or(0, |feature| feature.address)
+    }
+
+    /// The bits of a register of four or eight bytes.
+    fn set_bits(&mut self, id: Id, bits: u64) {
+        let wide = self.features.iter().any(|feature| feature.id == id && feature.bytes(&self.features) == 8);
+        if wide { self.set_long(id, bits) } else { self.set_number(id, bits as u32) }
+    }
+
+    /// A register of four bytes.
+    pub fn number(&self, id: Id) -> u32 {
+        self.number_for(id, 0)
+    }
+
+    /// The entry `index` of a register that has one for each entry of an enumeration.
+    pub fn number_for(&self, id: Id, index: u32) -> u32 {
+        let word = self.read(self.address(id) + 4 * index, 4);
+        word.ok().and_then(|bytes| super::gvcp::u32_at(bytes, 0)).unwrap_or(0)
+    }
+
+    /// A register that holds a double.
+    pub fn float(&self, id: Id) -> f64 {
+        let bytes = self.read(self.address(id), 8).ok().and_then(|bytes| bytes.first_chunk());
+        bytes.map_or(0.0, |bytes| f64::from_be_bytes(*bytes))
+    }
+
+    /// Sets a register of four bytes.
+    pub fn set_number(&mut self, id: Id, value: u32) {
+        self.set(id, &value.to_be_bytes());
+    }
+
+    /// Sets a register of eight bytes.
+    pub fn set_long(&mut self, id: Id, value: u64) {
+        self.set(id, &value.to_be_bytes());
+    }
+
+    /// Sets a register that holds a double.
+    pub fn set_float(&mut self, id: Id, value: f64) {
+        self.set(id, &value.to_be_bytes());
+    }
+
+    fn set_text(&mut self, id: Id, text: &str) {
+        let room = self.features.iter().find(|feature| feature.id == id);
+        let room = room.map_or(0, |feature| feature.bytes(&self.features) as usize - 1);
+        self.set(id, &text.as_bytes()[..text.len().min(room)]);
+    }
+
+    fn set(&mut self, id: Id, bytes: &[u8]) {
+        if let Some(memory) = self.memory(self.address(id), bytes.len()) {
+            memory.copy_from_slice(bytes);
+        }
+    }
+
+    /// What a client may change, as it stands: a user set.
+    pub fn snapshot(&self) -> Vec<u8> {
+        self.makers.clone()
+    }
+
+    /// Puts a user set back.
+    pub fn restore(&mut self, set: &[u8]) {
+        self.makers.copy_from_slice(set);
+    }
+}

@@ -1,0 +1,149 @@
+//! The stream channel: frames from their pictures to the wire, and again for a client that missed packets.
+
+use std::net::UdpSocket;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, RwLock};
+use std::time::Duration;
+
+use raysweep_core::PixelFormat;
+
+use super::clock::DeviceClock;
+use super::faults::{Faults, WireTruth};
+use super::gvcp::Resend;
+use super::gvsp::{Block, MIN_PACKET_BYTES, Stamp, View, block_id};
+use super::source::{BLOCKS, Controls, Pictures};
+use super::wire::{Route, Wire};
+use super::{lock, read, write};
+use crate::keyed::{Purpose, keyed, uniform};
+
+/// Longest wait for an exposure, and so the longest that a stop waits.
+const PATIENCE: Duration = Duration::from_millis(2);
+
+/// What the client asked to be sent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Order {
+    /// Which acquisition: frames exposed for an earlier one are not sent.
+    pub acquisition: u64,
+    /// What of the pictures.
+    pub view: View,
+    /// Bytes of a packet, with IP and UDP headers.
+    pub packet_bytes: usize,
+    /// Where to.
+    pub route: Route,
+    /// Number of the first exposure.
+    pub first_seq: u64,
+    /// Whether one frame is all.
+    pub single: bool,
+}
+
+/// What the threads of control and of the stream share.
+pub struct Stream {
+    order: Mutex<Option<Order>>,
+    blocks: Vec<RwLock<Block>>,
+    /// What goes wrong.
+    pub faults: Mutex<Faults>,
+    /// What really left.
+    pub truth: Arc<Mutex<WireTruth>>,
+    /// The camera's clock.
+    pub clock: Mutex<DeviceClock>,
+    socket: UdpSocket,
+}
+
+impl Stream {
+    /// A stream at rest that leaves from `socket`; pictures have at most `pixels` pixels.
+    pub fn new(socket: UdpSocket, pixels: usize, clock: DeviceClock, faults: Faults) -> Self {
+        let nothing = View { format: PixelFormat::Mono8, x: 0, y: 0, width: 0, height: 0, chunks: None };
+        Self {
+            order: Mutex::new(None),
+            blocks: (0..BLOCKS).map(|_| RwLock::new(Block::with_room(nothing, pixels))).collect(),
+            faults: Mutex::new(faults),
+            truth: Arc::default(),
+            clock: Mutex::new(clock),
+            socket,
+        }
+    }
+
+    /// A way to the network.
+    ///
+    /// # Errors
+    /// When the socket cannot be shared.
+    pub fn wire(&self) -> std::io::Result<Wire> {
+        Ok(Wire::new(self.socket.try_clone()?, self.truth.clone()))
+    }
+
+    /// Begins or ends an acquisition.
+    pub fn set_order(&self, order: Option<Order>) {
+        if order.is_some() {
+            // Ids begin anew: what is kept of the acquisition before has other frames under them.
+            self.blocks.iter().for_each(|block| write(block).id = 0);
+        }
+        *lock(&self.order) = order;
+    }
+
+    /// What is being sent.
+    pub fn order(&self) -> Option<Order> {
+        *lock(&self.order)
+    }
+
+    /// Sends packets again that a client missed.
+    pub fn resend(&self, wanted: Resend, wire: &mut Wire) {
+        let Some(order) = self.order() else { return };
+        let faults = *lock(&self.faults);
+        if !faults.resend || wanted.block == 0 {
+            return;
+        }
+        let kept = self.blocks.iter().map(read).find(|block| u64::from(block.id) == wanted.block);
+        match kept {
+            Some(block) => wire.resend(&block, wanted.first..=wanted.last, order.route, &faults),
+            None => wire.send_unavailable(wanted.block as u16, wanted.first, order.route),
+        }
+    }
+
+    /// Sends frames until `stop`.
+    pub fn run(
+        &self,
+        controls: &dyn Controls,
+        mut pictures: Box<dyn Pictures>,
+        mut wire: Wire,
+        stop: &AtomicBool,
+    ) {
+        let mut exposure_before_us = 0.0;
+        while !stop.load(Ordering::Relaxed) {
+            let Some(order) = self.order() else {
+                std::thread::sleep(PATIENCE);
+                continue;
+            };
+            let Some(exposed) = pictures.wait(&order.view, PATIENCE) else { continue };
+            let faults = *lock(&self.faults);
+            let count = exposed.seq.checked_sub(order.first_seq);
+            let Some(count) = count.filter(|_| self.order() == Some(order) && !faults.dead) else { continue };
+            let told_us = if faults.late_chunk { exposure_before_us } else { exposed.exposure_us };
+            exposure_before_us = exposed.exposure_us;
+            let slot = &self.blocks[(exposed.seq % BLOCKS as u64) as usize];
+            {
+                let mut block = write(slot);
+                block.id = block_id(count);
+                block.view = order.view;
+                block.packet_bytes = order.packet_bytes.max(MIN_PACKET_BYTES);
+                let ticks = lock(&self.clock).ticks(exposed.start_ns);
+                block.stamp = Stamp { seq: exposed.seq, ticks, exposure_us: told_us };
+                pictures.write(&exposed, &mut block);
+                block.write_chunks();
+            }
+            if faults.delay_us > 0 {
+                std::thread::sleep(Duration::from_micros(faults.delay_us.into()));
+            }
+            if uniform(&mut keyed(faults.seed, Purpose::Wire, &[exposed.seq])) < faults.frame_loss {
+                // Frames of which nothing is sent are not kept either, or a client could ask for them.
+                write(slot).id = 0;
+                lock(&self.truth).frames_lost += 1;
+            } else {
+                wire.send(&read(slot), order.route, &faults);
+            }
+            if order.single {
+                controls.disarm();
+                self.set_order(None);
+            }
+        }
+    }
+}
