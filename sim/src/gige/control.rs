@@ -291,7 +291,7 @@ impl Control {
         self.registers.set_number(Id::SensorShutterMode, shutter);
         self.registers.set_float(Id::ExposureTime, exposure_us);
         self.registers.set_float(Id::TriggerDelay, trigger_delay_us);
-        applied.map(drop).map_err(|_| Status::InvalidParameter)
+        if applied.is_ok() { Ok(()) } else { Err(Status::InvalidParameter) }
     }
 
     fn apply_all(&mut self) {
