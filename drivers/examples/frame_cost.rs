@@ -41,8 +41,7 @@ fn ours(size: u32, period_us: u32) -> Result<(f64, u64), Box<dyn Error>> {
         reopen: Duration::from_secs(5),
     };
     let mut camera = AravisCamera::open(&config, facts)?;
-    let settings =
-        CameraSettings { shutter: Shutter::Rolling, exposure_us: 10_000.0, trigger_delay_us: 0.0 };
+    let settings = CameraSettings { shutter: Shutter::Rolling, exposure_us: 10_000.0, trigger_delay_us: 0.0 };
     camera.configure(SettingsId { point: 0, attempt: 0 }, &settings)?;
     let pool = FramePool::new(1, PixelFormat::Mono8.frame_bytes((size * size) as usize));
     let mut buf = pool.take();

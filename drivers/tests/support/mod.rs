@@ -1,6 +1,11 @@
 //! Cameras that others wrote, each on a network of its own.
 
-#![allow(dead_code, clippy::unwrap_used, clippy::expect_used, reason = "not every test needs all of it, and one that cannot go on may panic")]
+#![allow(
+    dead_code,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    reason = "not every test needs all of it, and one that cannot go on may panic"
+)]
 
 use std::process::{Child, Command, Stdio};
 use std::thread;
