@@ -77,7 +77,9 @@ impl SharedLine {
                 if let Some(found) = ready(&mut line, now_ns) {
                     return Some(found);
                 }
-                line.next_event_ns().min(line.next_frame_ns().unwrap_or(i64::MAX)).max(now_ns + 1)
+                // A frame that is there already wakes nobody: whoever waits is not the one who takes it.
+                let frame_ns = line.next_frame_ns().filter(|at_ns| *at_ns > now_ns);
+                line.next_event_ns().min(frame_ns.unwrap_or(i64::MAX)).max(now_ns + 1)
             };
             if now_ns >= deadline_ns {
                 return None;

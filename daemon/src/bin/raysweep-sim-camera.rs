@@ -59,6 +59,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     };
     if let Some((width, height)) = arguments.test_pictures {
         let _camera = GigeCamera::start(&setup, Look::at_test_pictures((height, width)))?;
+        announce(arguments);
         wait_for_ever();
     }
     let path = arguments.rig.as_ref().ok_or("neither --rig nor --test-pictures is given")?;
@@ -68,7 +69,13 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let bench = rig.file.sim.bench.as_deref();
     let _bench =
         bench.map(|path| BenchServer::start(path, vsync, projector, truth, camera.clone())).transpose()?;
+    announce(arguments);
     wait_for_ever()
+}
+
+/// Says that clients may come, for whoever started the camera from a script.
+fn announce(arguments: &Arguments) {
+    println!("listening on {}", arguments.address);
 }
 
 fn wait_for_ever() -> ! {

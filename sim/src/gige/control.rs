@@ -291,7 +291,7 @@ impl Control {
         self.registers.set_number(Id::SensorShutterMode, shutter);
         self.registers.set_float(Id::ExposureTime, exposure_us);
         self.registers.set_float(Id::TriggerDelay, trigger_delay_us);
-        applied.map(drop).map_err(|_| Status::InvalidParameter)
+        if applied.is_ok() { Ok(()) } else { Err(Status::InvalidParameter) }
     }
 
     fn apply_all(&mut self) {
@@ -343,8 +343,8 @@ impl Control {
         let port = self.registers.number(Id::GevSCPHostPort) as u16;
         let address = Ipv4Addr::from(self.registers.number(Id::GevSCDA));
         // GevSCPD counts ticks of the camera's clock.
-        let hz = u64::from(lock(&self.stream.clock).tick_frequency_hz.max(1) as u32).max(1);
-        let gap_ns = u64::from(self.registers.number(Id::GevSCPD)) * 1_000_000_000 / hz;
+        let tick_frequency_hz = lock(&self.stream.clock).tick_frequency_hz.max(1);
+        let gap_ns = u64::from(self.registers.number(Id::GevSCPD)) * 1_000_000_000 / tick_frequency_hz;
         (port != 0).then(|| Route { to: SocketAddrV4::new(address, port), gap_ns: gap_ns as i64 })
     }
 

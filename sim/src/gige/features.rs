@@ -169,6 +169,9 @@ pub const FORMATS: [PixelFormat; 10] = [
     PixelFormat::BayerRG12Packed,
 ];
 
+/// Longest gap between packets: what is sent in gaps is waited for.
+const MAX_PACKET_GAP_TICKS: u32 = 100_000;
+
 /// Values of `AcquisitionMode`.
 pub const SINGLE_FRAME: u32 = 1;
 /// Values of `TriggerSource`.
@@ -225,7 +228,7 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
         standard(Id::GevCCP, 0xA00, None, ReadWrite, Kind::any()),
         standard(Id::GevSCPHostPort, 0xD00, transport, ReadWrite, whole(0, 0xFFFF, 1, None)),
         Feature { initial: 1500, ..standard(Id::GevSCPS, 0xD04, None, ReadWrite, Kind::any()) },
-        standard(Id::GevSCPD, 0xD08, transport, ReadWrite, Kind::any()),
+        standard(Id::GevSCPD, 0xD08, transport, ReadWrite, whole(0, MAX_PACKET_GAP_TICKS, 1, None)),
         standard(Id::GevSCDA, 0xD18, transport, ReadWrite, Kind::any()),
         maker(Id::SensorWidth, image, ReadOnly, Kind::any(), width.into()),
         maker(Id::SensorHeight, image, ReadOnly, Kind::any(), height.into()),

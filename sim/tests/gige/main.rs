@@ -1,0 +1,333 @@
+//! The simulated camera on real sockets: its pictures to the bit, its faults, and the bench beside it.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+mod client;
+mod tools;
+
+use std::net::Ipv4Addr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use raysweep_core::{
+    CameraSettings, Clock, FramePool, Pattern, PixelFormat, Projector, Raster, SettingsId, Shutter, Vsync,
+};
+use raysweep_sim::bench::{BenchProbe, BenchServer, RemoteProjector, RemoteVsync};
+use raysweep_sim::config::{SimProjector, SimSensor, SimVsync};
+use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look, test_pixel};
+use raysweep_sim::{PlaneRig, PlaneSetup, SimConfig, WireDevices};
+
+use self::client::Client;
+
+const ROWS: usize = 24;
+const COLUMNS: usize = 20;
+const ROW_TIME_US: f64 = 20.0;
+const LATENCY_US: f64 = 8.0;
+const SECOND: Duration = Duration::from_secs(1);
+
+/// Camera addresses, so that tests can run at once.
+fn address(test: u8) -> Ipv4Addr {
+    Ipv4Addr::new(127, 40, std::process::id() as u8, test)
+}
+
+fn setup(test: u8, faults: Faults) -> GigeSetup {
+    GigeSetup {
+        address: address(test),
+        serial: format!("T{test}"),
+        clock: DeviceClock::default(),
+        faults,
+        zipped: false,
+    }
+}
+
+/// A rig whose pictures depend on settings alone: no noise, no jitter.
+fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
+    let mut config = SimConfig {
+        scene: PathBuf::from("mix"),
+        scene_rows: ROWS,
+        scene_columns: COLUMNS,
+        sensor: SimSensor { noise: false, ..SimSensor::default() },
+        vsync: SimVsync { jitter_us: 0.0, ..SimVsync::default() },
+        projector: SimProjector { phase_jitter_us: 0.0, ..SimProjector::default() },
+        ..SimConfig::default()
+    };
+    config.camera.trigger_latency_us = LATENCY_US;
+    change(&mut config);
+    let raster = Raster { rows: ROWS, row_time_us: ROW_TIME_US, first_row_us: 500.0, period_us: 16_000.0 };
+    let setup = PlaneSetup {
+        raster,
+        camera_row_time_us: ROW_TIME_US,
+        row_pitch: 1.0,
+        white_dn: 2500.0,
+        black_dn: 64.0,
+        format: PixelFormat::Mono12,
+        first_row: None,
+    };
+    PlaneRig::new(config, setup, Path::new("")).unwrap()
+}
+
+/// The counts of a picture that the rig takes in virtual time, through the devices that a simulated run has.
+fn expected(settings: CameraSettings) -> Vec<u16> {
+    let devices = rig(|_| {}).open();
+    let (mut camera, mut projector, mut vsync) = (devices.camera, devices.projector, devices.vsync);
+    // Virtual time waits for every device that is open.
+    let watcher = std::thread::spawn(move || {
+        while vsync.next_edge(SECOND).is_ok_and(|edge| edge.is_some_and(|edge| edge.seq < 20)) {}
+    });
+    projector.show(&Pattern::White).unwrap();
+    camera.configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
+    camera.arm().unwrap();
+    let mut buf = FramePool::new(1, PixelFormat::Mono12.frame_bytes(ROWS * COLUMNS)).take();
+    for _ in 0..4 {
+        assert!(camera.next_frame(&mut buf, SECOND).unwrap().is_some());
+    }
+    drop(camera);
+    watcher.join().unwrap();
+    let mut counts = vec![0; ROWS * COLUMNS];
+    PixelFormat::Mono12.unpack_into(&buf, &mut counts).unwrap();
+    counts
+}
+
+/// Starts the rig's camera with its projector lit, triggered by VSYNC.
+fn lit(test: u8, rig: &PlaneRig, faults: Faults) -> (GigeCamera, Client, Box<dyn Vsync>) {
+    let WireDevices { camera, vsync, mut projector, .. } = rig.open_for_wire();
+    let camera = GigeCamera::start(&setup(test, faults), camera).unwrap();
+    let shown = projector.show(&Pattern::White).unwrap();
+    while Clock::real().now_ns() < shown.not_before_ns {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let mut client = Client::open(address(test));
+    client.set("TriggerMode", 1);
+    (camera, client, vsync)
+}
+
+#[test]
+fn pictures_are_those_of_the_simulation_to_the_bit() {
+    let settings = CameraSettings { shutter: Shutter::Rolling, exposure_us: 310.0, trigger_delay_us: 620.5 };
+    let counts = expected(settings);
+    assert!(counts.iter().max() > counts.iter().min(), "a picture without content would prove nothing");
+    let (_camera, mut client, _vsync) = lit(1, &rig(|_| {}), Faults::default());
+    client.set_float("ExposureTime", settings.exposure_us);
+    client.set_float("TriggerDelay", settings.trigger_delay_us);
+    for format in [
+        PixelFormat::Mono12,
+        PixelFormat::Mono12p,
+        PixelFormat::Mono12Packed,
+        PixelFormat::Mono8,
+        PixelFormat::Mono10p,
+        PixelFormat::Mono16,
+    ] {
+        client.set("PixelFormat", format.pfnc());
+        client.set("AcquisitionStart", 1);
+        let frame = client.frame().unwrap();
+        client.set("AcquisitionStop", 1);
+        while client.packet().is_some() {}
+        let scaled: Vec<u16> =
+            counts.iter().map(|count| (u32::from(*count) << format.bits() >> 12) as u16).collect();
+        let mut packed = vec![0; format.frame_bytes(scaled.len())];
+        format.pack_into(&scaled, &mut packed).unwrap();
+        assert_eq!((frame.size, frame.block), ((ROWS, COLUMNS), 1), "{format:?}");
+        assert!(frame.payload == packed, "{format:?}");
+    }
+}
+
+#[test]
+fn a_region_exposes_its_first_row_at_the_trigger() {
+    let (y, height) = (6, 9);
+    // The rows above a region cost it no time: as if the trigger came that much earlier.
+    let delay_us = 400.0 - y as f64 * ROW_TIME_US;
+    let counts = expected(CameraSettings {
+        shutter: Shutter::Rolling,
+        exposure_us: 200.0,
+        trigger_delay_us: delay_us,
+    });
+    let (_camera, mut client, _vsync) = lit(2, &rig(|_| {}), Faults::default());
+    client.set_float("ExposureTime", 200.0);
+    client.set_float("TriggerDelay", 400.0);
+    for (feature, value) in [("Width", 5), ("Height", height), ("OffsetX", 3), ("OffsetY", y)] {
+        client.set(feature, value as u32);
+    }
+    client.set("AcquisitionStart", 1);
+    let frame = client.frame().unwrap();
+    let region: Vec<u16> =
+        (y..y + height).flat_map(|row| counts[row * COLUMNS + 3..row * COLUMNS + 8].to_vec()).collect();
+    let mut pixels = vec![0; region.len()];
+    PixelFormat::Mono12.unpack_into(&frame.payload, &mut pixels).unwrap();
+    assert_eq!(frame.size, (height, 5));
+    assert_eq!(pixels, region);
+}
+
+#[test]
+fn stamps_tell_the_start_of_the_exposure_on_the_cameras_own_clock() {
+    let rig = rig(|config| config.vsync.jitter_us = 30.0);
+    let (_camera, mut client, mut vsync) = lit(3, &rig, Faults::default());
+    client.set_float("TriggerDelay", 321.0);
+    client.set("ChunkModeActive", 1);
+    (0..3).for_each(|chunk| client.set_entry("ChunkEnable", chunk, 1));
+    client.set("AcquisitionStart", 1);
+    let frames: Vec<_> = (0..5).map(|_| client.frame().unwrap()).collect();
+    let mut edges = Vec::new();
+    while let Some(edge) = vsync.next_edge(Duration::ZERO).unwrap() {
+        edges.push(edge);
+    }
+    let clock = DeviceClock::default();
+    for frame in frames {
+        let starts = edges.iter().map(|edge| clock.ticks(edge.host_ns + (LATENCY_US * 1e3) as i64 + 321_000));
+        let nearest = starts.map(|start| start.abs_diff(frame.ticks)).min();
+        assert_eq!(nearest, Some(0), "block {}", frame.block);
+        assert_eq!(frame.chunk(0x1001), frame.ticks);
+        assert_eq!(f64::from_bits(frame.chunk(0x1000)), 1000.0);
+        assert_eq!(frame.chunk(0x1002), u64::from(frame.block) - 1);
+    }
+    // A latch reads the same clock.
+    let before = clock.ticks(Clock::real().now_ns());
+    client.set("TimestampLatch", 1);
+    let after = clock.ticks(Clock::real().now_ns());
+    assert!((before..=after).contains(&client.long("GevTimestampValue")));
+}
+
+#[test]
+fn settings_can_be_late_and_chunks_later_still() {
+    let faults = Faults { late_frames: Some(2), ..Faults::default() };
+    let (camera, mut client, _vsync) = lit(4, &rig(|_| {}), faults);
+    client.set_float("ExposureTime", 500.0);
+    client.set("ChunkModeActive", 1);
+    client.set_entry("ChunkEnable", 0, 1);
+    client.set("AcquisitionStart", 1);
+    let mut exposures = Vec::new();
+    let mut take = |client: &mut Client, frames: usize| {
+        exposures.extend((0..frames).map(|_| f64::from_bits(client.frame().unwrap().chunk(0x1000))));
+    };
+    take(&mut client, 4);
+    client.set_float("ExposureTime", 900.0);
+    take(&mut client, 6);
+    let first = exposures.iter().position(|exposure| *exposure == 900.0).unwrap();
+    // The frame under way when the register was written may be counted or not; then two are late.
+    assert!((4 + 2..=4 + 3).contains(&first), "{exposures:?}");
+    camera.set_faults(Faults { late_chunk: true, ..faults });
+    client.set("TriggerSource", 1);
+    let exposure = |client: &mut Client| {
+        client.set("TriggerSoftware", 1);
+        f64::from_bits(client.frame().unwrap().chunk(0x1000))
+    };
+    // Frames that VSYNC triggered before the source changed.
+    while client.packet().is_some() {}
+    client.set_float("ExposureTime", 700.0);
+    let told: Vec<f64> = (0..4).map(|_| exposure(&mut client)).collect();
+    assert_eq!(told, [900.0, 900.0, 900.0, 700.0], "two late, and told one frame later");
+}
+
+#[test]
+fn what_is_lost_doubled_and_overtaken_on_the_way_arrives_in_the_end() {
+    let faults =
+        Faults { packet_loss: 0.05, duplication: 0.05, reordering: 0.05, seed: 3, ..Faults::default() };
+    let size = (120, 160);
+    let camera = GigeCamera::start(&setup(5, faults), Look::at_test_pictures(size)).unwrap();
+    let mut client = Client::open(address(5));
+    client.resend = true;
+    client.set("AcquisitionStart", 1);
+    for _ in 0..30 {
+        let frame = client.frame().unwrap();
+        let picture = (usize::from(frame.block) - 1) % 8;
+        let pixel =
+            |index: usize| test_pixel(index % size.1, index / size.1, picture, PixelFormat::Mono8) as u8;
+        assert!(
+            (0..size.0 * size.1).all(|index| frame.payload[index] == pixel(index)),
+            "block {}",
+            frame.block
+        );
+    }
+    let truth = camera.truth();
+    assert!(truth.packets_lost > 0 && truth.packets_resent > 0, "{truth:?}");
+    assert!(truth.packets_duplicated > 0 && truth.packets_reordered > 0, "{truth:?}");
+    assert!(client.received.values().any(|times| *times > 1));
+}
+
+#[test]
+fn lost_frames_leave_gaps_and_packets_cannot_be_had_for_ever() {
+    let faults = Faults { frame_loss: 0.3, ..Faults::default() };
+    let camera = GigeCamera::start(&setup(6, faults), Look::at_test_pictures((16, 16))).unwrap();
+    let mut client = Client::open(address(6));
+    client.set_float("AcquisitionFrameRate", 200.0);
+    client.set("AcquisitionStart", 1);
+    let blocks: Vec<u16> = (0..40).map(|_| client.frame().unwrap().block).collect();
+    client.set("AcquisitionStop", 1);
+    assert!(blocks.is_sorted());
+    let gaps: u64 = u64::from(blocks[39] - blocks[0] - 39);
+    assert!(gaps > 0 && camera.truth().frames_lost >= gaps, "{gaps} {:?}", camera.truth());
+    while client.packet().is_some() {}
+    // The first frame is long gone.
+    client.set("AcquisitionStart", 1);
+    let block = (0..20).map(|_| client.frame().unwrap().block).last().unwrap();
+    assert!(block > 10);
+    client.ask_again(1, 0, 0);
+    let refusal = std::iter::repeat_with(|| client.packet()).flatten().find(|packet| packet.0 != 0).unwrap();
+    assert_eq!((refusal.0, refusal.1), (0x800C, 1));
+}
+
+#[test]
+fn a_camera_that_died_comes_back_as_nobodys() {
+    let camera = GigeCamera::start(&setup(7, Faults::default()), Look::at_test_pictures((16, 16))).unwrap();
+    let mut client = Client::open(address(7));
+    client.set("Width", 9);
+    client.set("AcquisitionStart", 1);
+    assert!(client.frame().is_some());
+    camera.set_faults(Faults { dead: true, ..Faults::default() });
+    // Frames on their way still arrive, then nothing does.
+    while client.frame().is_some() {}
+    assert!(!client.is_answered(Duration::from_millis(500)));
+    camera.set_faults(Faults::default());
+    let mut again = Client::open(address(7));
+    assert_eq!(again.number("Width"), 16, "the factory's settings");
+}
+
+#[test]
+fn vsync_and_projector_reach_another_process() {
+    let rig = rig(|_| {});
+    let WireDevices { camera, vsync, projector, truth } = rig.open_for_wire();
+    let camera = Arc::new(GigeCamera::start(&setup(8, Faults::default()), camera).unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bench.sock");
+    assert!(RemoteVsync::open(&path).is_err());
+    let server = BenchServer::start(&path, vsync, projector, truth, camera.clone()).unwrap();
+    let mut edges = RemoteVsync::open(&path).unwrap();
+    let mut light = RemoteProjector::open(&path).unwrap();
+    let mut probe = BenchProbe::open(&path).unwrap();
+
+    let (first, second) =
+        (edges.next_edge(SECOND).unwrap().unwrap(), edges.next_edge(SECOND).unwrap().unwrap());
+    assert_eq!((second.seq - first.seq, second.host_ns - first.host_ns), (1, 16_000_000));
+    let mut client = Client::open(address(8));
+    client.set("TriggerMode", 1);
+    client.set_float("TriggerDelay", 300.0);
+    client.set("AcquisitionStart", 1);
+    let mut brightest_after = |shown: raysweep_core::Shown| {
+        let clock = DeviceClock::default();
+        loop {
+            let frame = client.frame().unwrap();
+            if frame.ticks >= clock.ticks(shown.not_before_ns) {
+                let mut pixels = vec![0; ROWS * COLUMNS];
+                PixelFormat::Mono12.unpack_into(&frame.payload, &mut pixels).unwrap();
+                return pixels.into_iter().max().unwrap();
+            }
+        }
+    };
+    let white = brightest_after(light.show(&Pattern::White).unwrap());
+    let half = brightest_after(light.show(&Pattern::Rows(vec![0.5; ROWS])).unwrap());
+    let dark = brightest_after(light.blank().unwrap());
+    assert_eq!(dark, 64, "black level");
+    assert!(half > dark && white > half, "{white} {half} {dark}");
+    let error = light.show(&Pattern::Rows(vec![1.0; 3])).unwrap_err();
+    assert!(error.to_string().contains("3 rows"), "{error}");
+
+    probe.set_faults(Faults { frame_loss: 1.0, ..Faults::default() }).unwrap();
+    assert_eq!(camera.faults().frame_loss, 1.0);
+    assert_eq!(probe.faults().unwrap(), camera.faults());
+    let truth = probe.truth().unwrap();
+    assert!(truth.line.exposures > 0 && truth.wire.frames > 0, "{truth:?}");
+    drop(server);
+    let gone = std::iter::repeat_with(|| edges.next_edge(SECOND)).find_map(Result::err).unwrap();
+    assert!(gone.to_string().contains("bench"), "{gone}");
+    assert!(!path.exists());
+}

@@ -1,0 +1,165 @@
+//! Clients that others wrote, from the package aravis-tools: what they find, set and receive.
+
+use std::process::Command;
+
+use raysweep_sim::gige::{Faults, GigeCamera, GigeSetup, Look};
+
+use super::{address, rig, setup};
+
+/// What a tool prints, both ways.
+fn run(tool: &str, arguments: &[&str]) -> String {
+    let output = Command::new(tool).args(arguments).output();
+    let output =
+        output.unwrap_or_else(|error| panic!("{tool}: {error}; tests/packages.txt names its package"));
+    String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
+}
+
+fn arv_tool(test: u8, arguments: &[&str]) -> String {
+    run("arv-tool-0.8", &[&["-a", &address(test).to_string()], arguments].concat())
+}
+
+/// A figure of arv-camera-test's summary.
+fn figure(report: &str, name: &str) -> u64 {
+    let line =
+        report.lines().find(|line| line.starts_with(name)).unwrap_or_else(|| panic!("{name}: {report}"));
+    line.split('=').nth(1).unwrap().trim().parse().unwrap()
+}
+
+#[test]
+fn arv_tool_reads_and_writes_features() {
+    for (test, zipped) in [(21, false), (22, true)] {
+        let wire = rig(|_| {}).open_for_wire();
+        let _camera =
+            GigeCamera::start(&GigeSetup { zipped, ..setup(test, Faults::default()) }, wire.camera).unwrap();
+        let set = arv_tool(
+            test,
+            &[
+                "control",
+                "ExposureTime=765.25",
+                "TriggerDelay=1234.5",
+                "TriggerSelector=FrameStart",
+                "TriggerSource=Software",
+                "TriggerMode=On",
+                "SensorShutterMode=Global",
+                "PixelFormat=Mono12p",
+                "Width=12",
+                "ChunkSelector=Timestamp",
+                "ChunkEnable=true",
+                "DeviceUserID=left",
+            ],
+        );
+        assert!(!set.to_lowercase().contains("error"), "{set}");
+        let got = arv_tool(
+            test,
+            &[
+                "control",
+                "ExposureTime",
+                "TriggerDelay",
+                "TriggerSource",
+                "TriggerMode",
+                "SensorShutterMode",
+                "PixelFormat",
+                "Width",
+                "PayloadSize",
+                "DeviceUserID",
+                "DeviceModelName",
+                "ChunkEnable",
+            ],
+        );
+        for line in [
+            "ExposureTime = 765.25 us",
+            "TriggerDelay = 1234.5 us",
+            "TriggerSource = Software",
+            "TriggerMode = On",
+            "SensorShutterMode = Global",
+            "PixelFormat = Mono12p",
+            "Width = 12 min:1 max:20",
+            "PayloadSize = 432",
+            "DeviceUserID = left",
+            "DeviceModelName = raysweep simulated camera",
+            "ChunkEnable = true",
+        ] {
+            assert!(got.contains(line), "{line}: {got}");
+        }
+        let refused = arv_tool(test, &["control", "PixelFormat=Mono9", "PixelFormat"]);
+        assert!(refused.contains("PixelFormat = Mono12p"), "{refused}");
+        // Every feature can be read: register and description agree.
+        let values = arv_tool(test, &["values"]);
+        assert!(!values.to_lowercase().contains("error"), "{values}");
+        let features = arv_tool(test, &["features"]);
+        assert!(!features.contains("not found"), "{features}");
+    }
+}
+
+#[test]
+fn arv_camera_test_streams_without_loss() {
+    let wire = rig(|_| {}).open_for_wire();
+    let camera = GigeCamera::start(&setup(23, Faults::default()), wire.camera).unwrap();
+    let name = address(23).to_string();
+    let features = "TriggerMode=On TriggerSource=Line0 TriggerDelay=500 PixelFormat=Mono12p";
+    let report = run(
+        "arv-camera-test-0.8",
+        &["-n", &name, "--duration", "2", "--features", features, "-u", "ExposureTime,Timestamp"],
+    );
+    let completed = figure(&report, "n_completed_buffers");
+    assert!(completed > 0, "{report}");
+    for name in [
+        "n_failures",
+        "n_underruns",
+        "n_missing_frames",
+        "n_missing_packets",
+        "n_error_packets",
+        "n_size_mismatch_errors",
+    ] {
+        assert_eq!(figure(&report, name), 0, "{name}: {report}");
+    }
+    let truth = camera.truth();
+    // What was on its way when the tool stopped, it does not count.
+    assert!(truth.frames - completed <= 2, "{truth:?} {report}");
+    assert!(report.contains("ChunkExposureTime = 1000"), "{report}");
+}
+
+#[test]
+fn arv_camera_test_gets_lost_packets_back() {
+    let faults = Faults { packet_loss: 0.01, ..Faults::default() };
+    let camera = GigeCamera::start(&setup(24, faults), Look::at_test_pictures((512, 512))).unwrap();
+    let name = address(24).to_string();
+    let report = run(
+        "arv-camera-test-0.8",
+        &["-n", &name, "--duration", "2", "--features", "AcquisitionFrameRate=50"],
+    );
+    let truth = camera.truth();
+    assert!(truth.packets_lost > 0, "{truth:?}");
+    assert!(figure(&report, "n_resent_packets") > 0, "{report}");
+    assert_eq!(figure(&report, "n_failures"), 0, "{report}");
+    assert_eq!(figure(&report, "n_missing_packets"), 0, "{report}");
+    assert!(truth.frames - figure(&report, "n_completed_buffers") <= 3, "{truth:?} {report}");
+}
+
+/// Discovery is a broadcast, and cameras of other tests would answer it.
+#[test]
+fn arv_tool_discovers_cameras_by_broadcast() {
+    let itself = std::env::current_exe().unwrap();
+    let arguments = ["--map-root-user", "--net", "--", itself.to_str().unwrap()];
+    let report = run(
+        "unshare",
+        &[&arguments[..], &["--exact", "tools::in_a_network_of_its_own", "--ignored", "--nocapture"]]
+            .concat(),
+    );
+    assert!(report.contains("1 passed"), "{report}");
+}
+
+#[test]
+#[ignore = "arv_tool_discovers_cameras_by_broadcast runs it in a network namespace"]
+fn in_a_network_of_its_own() {
+    run("ip", &["link", "set", "lo", "up"]);
+    let start =
+        |test| GigeCamera::start(&setup(test, Faults::default()), Look::at_test_pictures((8, 8))).unwrap();
+    let _cameras = (start(31), start(32));
+    let found = run("arv-tool-0.8", &[]);
+    for test in [31, 32] {
+        assert!(found.contains(&format!("T{test} ({})", address(test))), "{found}");
+    }
+    let opened = run("arv-tool-0.8", &["-n", "raysweep-T32", "control", "DeviceSerialNumber"]);
+    assert!(opened.contains("DeviceSerialNumber = T32"), "{opened}");
+}
