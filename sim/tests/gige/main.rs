@@ -118,7 +118,7 @@ fn pictures_are_those_of_the_simulation_to_the_bit() {
         PixelFormat::Mono10p,
         PixelFormat::Mono16,
     ] {
-        client.set("PixelFormat", format.pfnc());
+        client.set("PixelFormat", format.pfnc().unwrap());
         client.set("AcquisitionStart", 1);
         let frame = client.frame().unwrap();
         client.set("AcquisitionStop", 1);

@@ -257,9 +257,7 @@ impl AravisCamera {
             // Left over from before a stop.
             BufferStatus::Aborted | BufferStatus::Cleared => return Ok(None),
             _ => {
-                if let Some(seq) = self.ids.extend(from.frame_id()) {
-                    self.losses.incomplete(seq);
-                }
+                self.losses.incomplete(self.ids.of_part(from.frame_id()));
                 return Ok(None);
             }
         }

@@ -26,25 +26,47 @@ impl FrameIds {
 
     /// The id of the frame that the camera calls `raw`; nothing for one that was there already.
     pub fn extend(&mut self, raw: u64) -> Option<u64> {
-        let seq = match self.last {
-            None => self.next,
-            Some((last_raw, seq)) => {
-                let step = if raw > SHORT_IDS || last_raw > SHORT_IDS {
-                    raw.wrapping_sub(last_raw)
-                } else {
-                    (raw + SHORT_IDS - last_raw) % SHORT_IDS
-                };
-                match step {
-                    0 => return None,
-                    // No host sleeps through half of all ids: the camera began to count anew, how much later is unknown.
-                    step if step > SHORT_IDS / 2 => seq + 1,
-                    step => seq + step,
-                }
-            }
+        let seq = match self.step_to(raw) {
+            Step::First => self.next,
+            Step::Same => return None,
+            Step::Forward(step) => self.next() - 1 + step,
+            // It began to count anew, how many frames later is unknown.
+            Step::Back => self.next(),
         };
         self.last = Some((raw, seq));
         Some(seq)
     }
+
+    /// The id of a frame of which only a part came, if that part told it: else the library gives an id of long ago.
+    pub fn of_part(&self, raw: u64) -> Option<u64> {
+        match self.step_to(raw) {
+            Step::Forward(step) => Some(self.next() - 1 + step),
+            Step::First | Step::Same | Step::Back => None,
+        }
+    }
+
+    fn step_to(&self, raw: u64) -> Step {
+        let Some((last_raw, _)) = self.last else { return Step::First };
+        let step = if raw > SHORT_IDS || last_raw > SHORT_IDS {
+            raw.wrapping_sub(last_raw)
+        } else {
+            (raw + SHORT_IDS - last_raw) % SHORT_IDS
+        };
+        match step {
+            0 => Step::Same,
+            // No host sleeps through half of all ids.
+            step if step > SHORT_IDS / 2 => Step::Back,
+            step => Step::Forward(step),
+        }
+    }
+}
+
+/// From the newest frame to another.
+enum Step {
+    First,
+    Same,
+    Forward(u64),
+    Back,
 }
 
 #[cfg(test)]
@@ -76,6 +98,16 @@ mod tests {
             [from_zero.extend(0), from_zero.extend(1), from_zero.extend(4)],
             [Some(0), Some(1), Some(4)]
         );
+    }
+
+    #[test]
+    fn a_part_of_a_frame_moves_nothing() {
+        let mut ids = FrameIds::default();
+        ids.restart(1);
+        assert_eq!(ids.of_part(1), None, "nothing to count from yet");
+        assert_eq!(ids.extend(100), Some(1));
+        assert_eq!([103, 100, 68, 0].map(|raw| ids.of_part(raw)), [Some(4), None, None, None]);
+        assert_eq!(ids.extend(102), Some(3));
     }
 
     #[test]

@@ -13,6 +13,8 @@ const REMEMBERED: usize = 64;
 pub struct Losses {
     /// Frames that came with packets missing, since the newest whole one or in the gap before it.
     incomplete: Vec<u64>,
+    /// Frames that came in part since the newest whole one, and of which that part did not say which they are.
+    nameless: usize,
     /// Frames that went by while the camera was away.
     away: Range<u64>,
     /// Up to this frame there may have been no free buffer.
@@ -27,6 +29,7 @@ impl Losses {
     pub fn new() -> Self {
         Self {
             incomplete: Vec::with_capacity(REMEMBERED),
+            nameless: 0,
             away: 0..0,
             full_until: None,
             gap: 0..0,
@@ -35,8 +38,12 @@ impl Losses {
         }
     }
 
-    /// A frame came with packets missing.
-    pub fn incomplete(&mut self, seq: u64) {
+    /// A frame came with packets missing; without its id, where the packet that has it is one of them.
+    pub fn incomplete(&mut self, seq: Option<u64>) {
+        let Some(seq) = seq else {
+            self.nameless += 1;
+            return;
+        };
         if self.incomplete.len() == REMEMBERED {
             let end = self.gap.end;
             self.incomplete.retain(|&seq| seq >= end);
@@ -60,9 +67,17 @@ impl Losses {
     pub fn whole(&mut self, seq: u64) {
         self.gap = self.newest.map_or(seq, |newest| newest + 1)..seq;
         self.newest = Some(seq);
-        if self.gap.is_empty() {
-            return;
+        // The nameless are some of the gap, whichever.
+        for lost in self.gap.clone() {
+            if self.nameless == 0 {
+                break;
+            }
+            if !self.incomplete.contains(&lost) {
+                self.nameless -= 1;
+                self.incomplete(Some(lost));
+            }
         }
+        self.nameless = 0;
         for lost in self.gap.clone() {
             *self.totals.entry(self.cause(lost)).or_default() += 1;
         }
@@ -95,12 +110,19 @@ mod tests {
     fn every_lost_frame_has_one_cause() {
         let mut losses = Losses::new();
         (0..3).for_each(|seq| losses.whole(seq));
-        losses.incomplete(4);
+        losses.incomplete(Some(4));
         losses.whole(6);
         assert_eq!([3, 4, 5].map(|seq| losses.cause(seq)), {
             use LossCause::{CameraGap, PacketsLost};
             [CameraGap, PacketsLost, CameraGap]
         });
+        losses.incomplete(None);
+        losses.whole(7);
+        losses.incomplete(None);
+        losses.whole(9);
+        assert_eq!(losses.cause(8), LossCause::PacketsLost, "between 6 and 7 there was no place for another");
+        let mut losses = Losses::new();
+        losses.whole(6);
         // Two buffers, full with 7 and 8, then two frames without place, later one that the camera lost.
         losses.full(8);
         [7, 8, 11].into_iter().for_each(|seq| losses.whole(seq));
@@ -113,12 +135,7 @@ mod tests {
         let totals: Vec<_> = losses.totals().iter().map(|(cause, frames)| (*cause, *frames)).collect();
         assert_eq!(
             totals,
-            [
-                (LossCause::CameraGap, 4),
-                (LossCause::PacketsLost, 1),
-                (LossCause::DriverFull, 2),
-                (LossCause::CameraLost, 6)
-            ]
+            [(LossCause::CameraGap, 2), (LossCause::DriverFull, 2), (LossCause::CameraLost, 6)]
         );
     }
 
@@ -127,7 +144,7 @@ mod tests {
         let mut losses = Losses::new();
         losses.whole(0);
         for seq in (1..10_000).step_by(2) {
-            losses.incomplete(seq);
+            losses.incomplete(Some(seq));
             losses.whole(seq + 1);
             assert_eq!(losses.cause(seq), LossCause::PacketsLost);
         }

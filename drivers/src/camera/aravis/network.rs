@@ -72,6 +72,8 @@ pub fn prepare(camera: &Camera, config: &AravisConfig, socket: SocketBuffer) {
 /// Once the stream is made. Packets are asked for again where the camera can send them again: libaravis finds out.
 pub fn tune(stream: &Stream, socket: SocketBuffer) {
     if let Some(stream) = stream.downcast_ref::<GvStream>() {
+        // A quarter of the packets, libaravis' own limit, is none of a frame that is three jumbo packets.
+        stream.set_packet_request_ratio(1.0);
         stream.set_socket_buffer(GvStreamSocketBuffer::Fixed);
         let bytes = socket.wanted_bytes.min(socket.allowed_bytes);
         stream.set_socket_buffer_size(bytes.try_into().unwrap_or(i32::MAX));
