@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use raysweep_core::{Camera, DeviceError, Projector, Vsync};
+use raysweep_core::{Camera, Clock, DeviceError, Projector, Vsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
 use crate::config::{ConfigError, Driver, RigFile};
@@ -44,6 +44,8 @@ pub struct Devices {
     pub vsync: Box<dyn Vsync>,
     /// The projector.
     pub projector: Box<dyn Projector>,
+    /// The clock that their stamps are on.
+    pub clock: Clock,
     /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
     pub pace: Pace,
 }
@@ -97,8 +99,8 @@ impl Rig {
     pub fn open(&self) -> Result<Devices, RigError> {
         let (Driver::Sim, Driver::Sim, Driver::Sim) =
             (self.file.camera.driver, self.file.vsync.driver, self.file.projector.driver);
-        let sim = self.sim.open();
+        let raysweep_sim::Devices { camera, vsync, projector, clock, .. } = self.sim.open();
         let pace = if self.file.sim.realtime { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera: sim.camera, vsync: sim.vsync, projector: sim.projector, pace })
+        Ok(Devices { camera, vsync, projector, clock, pace })
     }
 }

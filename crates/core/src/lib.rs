@@ -18,7 +18,7 @@ pub use clock::{Clock, ClockHandle};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, FirstFrame, Pattern, Projector, Readout, SettingsId,
-    Shown, Shutter, Vsync,
+    SettingsLatency, Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
