@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use raysweep_core::{Camera, CameraCapabilities, DeviceError, Projector, Vsync};
+use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
@@ -47,6 +47,8 @@ pub struct Devices {
     pub vsync: Box<dyn Vsync>,
     /// The projector.
     pub projector: Box<dyn Projector>,
+    /// The clock that their stamps are on.
+    pub clock: Clock,
     /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
     pub pace: Pace,
 }
@@ -145,7 +147,7 @@ impl Rig {
         self.check_rows(camera.capabilities())?;
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera, vsync, projector, pace })
+        Ok(Devices { camera, vsync, projector, clock: sim.clock, pace })
     }
 
     fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {

@@ -20,7 +20,7 @@ pub use clock_model::{ClockModel, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Pattern, Projector,
-    Readout, SettingsId, Shown, Shutter, Vsync,
+    Readout, SettingsId, SettingsLatency, Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};

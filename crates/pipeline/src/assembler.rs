@@ -36,17 +36,10 @@ pub struct Job {
 pub enum Label {
     /// It belongs to the point.
     Counted,
-    /// It may have been exposed under the settings before.
+    /// It was, or may have been, exposed under the settings before.
     Settling,
     /// Nobody waits for it.
     Cancelled,
-}
-
-impl Label {
-    /// The label of a frame that comes after a change of settings.
-    pub fn of(stamp: &FrameStamp, applied: &Applied) -> Self {
-        if stamp.seq < applied.first_frame.certain() { Self::Settling } else { Self::Counted }
-    }
 }
 
 /// What the device threads tell the assembler, in order.
@@ -97,7 +90,7 @@ const TRIGGER_TOLERANCE_NS: i64 = 200_000;
 /// A frame waits this long, on the host's clock, for the edges around it.
 const EDGE_PATIENCE_NS: i64 = 100_000_000;
 /// A camera's own word for its exposure may differ by rounding from what it was set to.
-const EXPOSURE_TOLERANCE_US: f64 = 0.5;
+pub const EXPOSURE_TOLERANCE_US: f64 = 0.5;
 
 /// The assembler's state.
 pub struct Assembler {

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
-use raysweep_core::{Counts, FilmSummary, Percentiles};
+use raysweep_core::{Counts, FilmSummary, Percentiles, SettingsLatency};
 use raysweep_proto::{
     BetterSweep, CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo,
     Status, SweepAdvice,
@@ -37,6 +37,9 @@ pub(super) fn status(status: &Status) -> String {
                 vsync.period_us, vsync.jitter_us, vsync.edges, vsync.missed, vsync.false_edges
             ),
         ));
+    }
+    if let Some(SettingsLatency { min_frames, max_frames }) = status.settings_latency {
+        rows.push(("settings", format!("act {min_frames} to {max_frames} frames late")));
     }
     if let Some(error) = &status.error {
         rows.push(("error", error.clone()));
@@ -174,9 +177,12 @@ pub(super) fn ending(
     stored: usize,
     missing: usize,
     final_s: Option<f64>,
+    light_s: Option<f64>,
 ) -> String {
     let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
     lines.push(format!("session: {}", session.display()));
+    lines
+        .extend(light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")));
     lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
     lines.extend(report.map(|report| format!("report: {}", report.display())));
     if missing > 0 {
@@ -294,10 +300,13 @@ mod tests {
     #[test]
     fn an_unfinished_session_is_told_how_to_go_on() {
         let folder = Path::new("/data/20260101-000000_corner");
-        let unfinished = ending(folder, "cancelled", None, 40, 35, None);
+        let unfinished = ending(folder, "cancelled", None, 40, 35, None, None);
         assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
-        let complete = ending(folder, "complete", Some(&folder.join("report.html")), 75, 0, Some(0.25));
-        assert!(complete.contains("0.25 s after the last frame"));
+        let complete =
+            ending(folder, "complete", Some(&folder.join("report.html")), 75, 0, Some(0.25), Some(10.5));
+        assert!(
+            complete.contains("0.25 s after the last frame") && complete.contains("10.50 s from the first")
+        );
         assert!(complete.ends_with("report.html") && !complete.contains("resume"), "{complete}");
     }
 }

@@ -318,6 +318,8 @@ fn conduct(run: Run, in_strips: bool, orders: &Orders, board: &Board, dir: &Path
             missing: points - stored,
             vsync: None,
             final_s: None,
+            light_s: None,
+            settings_latency: None,
         };
         (end, Vec::new())
     });
@@ -338,6 +340,7 @@ fn conduct(run: Run, in_strips: bool, orders: &Orders, board: &Board, dir: &Path
         film: board.status().film,
         warnings,
         final_s: end.final_s,
+        light_s: end.light_s,
     };
     if board.status().state != RunState::Draining && state == RunState::Idle {
         let _ = board.go(RunState::Draining);
@@ -355,7 +358,7 @@ fn conclude(
     orders: &Orders,
     live: Option<&Outlet>,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
-    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
     let whole = fault.is_none() && engine::missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let make = || match in_strips {
@@ -378,10 +381,12 @@ fn conclude(
         missing: task.points() - stored,
         vsync,
         final_s: None,
+        light_s: exposures.light_s(),
+        settings_latency: latency,
     };
     if let (EndState::Complete, Some(results)) = (state, &mut results) {
         results.write_transport(&session, task)?;
-        end.final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+        end.final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
         let overview = results.overview();
         if let Some((live, overview)) = live.zip(overview.as_ref()) {
             show_last(live, overview, stored, computed);
@@ -409,7 +414,7 @@ fn conclude_film(
     rig: &Rig,
     orders: &Orders,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
-    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
     let state = match &fault {
         Some(_) => EndState::Faulted,
         None if orders.now() == Order::Cancel => EndState::Cancelled,
@@ -417,9 +422,10 @@ fn conclude_film(
     };
     let stored = ledger.state().stored_points();
     let error = fault.map(|fault| fault.to_string());
-    let final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+    let final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
     let missing = task.points() - stored;
-    let end = EndEntry { state, error, stored, missing, vsync, final_s };
+    let (light_s, settings_latency) = (exposures.light_s(), latency);
+    let end = EndEntry { state, error, stored, missing, vsync, final_s, light_s, settings_latency };
     ledger.append(&Entry::End(end.clone()))?;
     let mut problems = processing.problems;
     if state != EndState::Faulted {

@@ -65,6 +65,7 @@ impl Fake {
             film: None,
             warnings: Vec::new(),
             final_s: None,
+            light_s: None,
         });
     }
 
@@ -170,6 +171,7 @@ impl Control for Fake {
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
             film: None,
+            settings_latency: None,
             error: None,
             live: self.live.exists().then(|| self.live.clone()),
         }

@@ -312,7 +312,8 @@ impl Camera for V4l2Camera {
             self.certain = self.ids.next() + u64::from(self.setup.config.late_frames);
             self.exposures.set(self.certain, actual.exposure_us);
         }
-        let first_frame = FirstFrame::Within(self.certain.max(self.ids.next()));
+        let earliest = self.ids.next();
+        let first_frame = FirstFrame::Within { earliest, certain: self.certain.max(earliest) };
         Ok(Applied { actual: self.settings.1, first_frame })
     }
 
