@@ -187,3 +187,21 @@ impl Rig {
         ))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bench_stands_beside_the_rig_file_and_goes_with_a_camera_on_a_wire() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        let text = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
+                    [sim]\nbench = \"bench.sock\"\nscene_rows = 8\nscene_columns = 8\n";
+        std::fs::write(&path, text).unwrap();
+        let rig = Rig::load(&path).unwrap();
+        assert_eq!(rig.file.sim.bench, Some(folder.path().join("bench.sock")));
+        let Err(error) = rig.open() else { panic!("the camera cannot be in both processes") };
+        assert!(error.to_string().contains("camera.driver"), "{error}");
+    }
+}
