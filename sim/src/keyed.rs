@@ -20,6 +20,10 @@ pub enum Purpose {
     Flicker,
     /// Kinks of the row table.
     RowTable,
+    /// How a mirror misses the same point another time.
+    MirrorRepeat,
+    /// Faults of a mirror's controller and its wire.
+    MirrorWire,
 }
 
 /// A generator for `purpose` under the rig's `seed`, told apart by `key`.

@@ -8,6 +8,7 @@ pub mod config;
 mod devices;
 mod keyed;
 mod line;
+pub mod mirror;
 pub mod optics;
 mod rig;
 pub mod scene;
