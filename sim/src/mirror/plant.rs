@@ -24,7 +24,7 @@ pub struct MirrorTruth {
     pub held: Vec<Held>,
     /// Where the mirror is.
     pub tilt: Tilt,
-    /// Times that the controller ran dry with the mirror away from rest or lit.
+    /// Times that the controller ran dry with the light on or the mirror in motion.
     pub underruns: u64,
     /// Samples that found no room.
     pub overfills: u64,
@@ -47,6 +47,7 @@ pub struct Plant {
     to_tilt: fn(Held) -> [f64; 2],
     full_scale_deg: f64,
     origin: Held,
+    before: Held,
     now: Held,
     since_ns: i64,
     truth: Arc<Mutex<MirrorTruth>>,
@@ -76,6 +77,7 @@ impl Plant {
             to_tilt,
             full_scale_deg,
             origin,
+            before: origin,
             now: origin,
             since_ns: 0,
             truth: Arc::new(Mutex::new(truth)),
@@ -92,9 +94,9 @@ impl Plant {
         self.mechanics.set_rate(rate_hz);
     }
 
-    /// Whether the outputs are at the origin and dark.
-    pub fn is_parked(&self) -> bool {
-        self.now == self.origin
+    /// Whether the outputs are dark and the last one was where the one before it was.
+    pub fn is_still(&self) -> bool {
+        self.now.light == 0 && (self.now.x, self.now.y) == (self.before.x, self.before.y)
     }
 
     /// Puts the outputs at rest, as a controller does that starts anew.
@@ -114,7 +116,7 @@ impl Plant {
                 truth.tilt = self.mechanics.hold(Tilt::new(x, y));
             }
         }
-        (self.now, self.since_ns) = (next, at_ns);
+        (self.before, self.now, self.since_ns) = (self.now, next, at_ns);
         truth.held.push(next);
         if next.light > 0 {
             truth.dark_since_ns = None;

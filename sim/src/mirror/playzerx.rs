@@ -95,7 +95,7 @@ impl PlayzerXController {
                 }
                 None => {
                     self.idle = true;
-                    let underruns = u64::from(!self.plant.is_parked());
+                    let underruns = u64::from(!self.plant.is_still());
                     self.plant.note(|truth| truth.underruns += underruns);
                 }
             }

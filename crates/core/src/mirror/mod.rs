@@ -175,8 +175,9 @@ pub trait Mirror: Send {
     /// Begins to play the loaded path `batches` times; after the last the mirror goes to the origin by itself, dark.
     ///
     /// # Errors
-    /// `NotReady` before [`Mirror::load`], or if the path has light and nobody has permitted light.
-    fn start(&mut self, batches: u64) -> Result<(), DeviceError>;
+    /// `NotReady` before [`Mirror::load`], or if the path has light and nobody has permitted light; `OutOfRange` for no
+    /// batch.
+    fn start(&mut self, batches: u32) -> Result<(), DeviceError>;
 
     /// Sends what the controller has room for and reads what it confirms; to be called every few milliseconds while a
     /// path is played.

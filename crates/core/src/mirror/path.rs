@@ -2,13 +2,15 @@
 
 use std::f64::consts::{PI, TAU};
 
+use serde::{Deserialize, Serialize};
+
 use super::{MirrorLimits, SecondOrder, Tilt};
 
 /// Samples that a path may have, at most: more than any controller holds.
 pub const MAX_POINTS: usize = 131_072;
 
 /// Where the mirror is to be in one sample, and how bright the light.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MirrorPoint {
     /// Where.
     pub tilt: Tilt,
@@ -500,11 +502,11 @@ mod tests {
         let responses = [SecondOrder { f0_hz: 500.0, q: 30.0 }, SecondOrder { f0_hz: 480.0, q: 30.0 }];
         let path = MirrorPath::lissajous(Tilt::new(3.0, 2.0), [30, 17], 6500, RATE_HZ, &LIMITS).unwrap();
         let commanded = path.predistorted(responses, &LIMITS).unwrap();
-        for axis in 0..2 {
+        for (axis, response) in responses.into_iter().enumerate() {
             let wanted: Vec<f64> = tilts(&path).iter().map(|tilt| tilt.deg()[axis]).collect();
             let error_deg = |sent: &MirrorPath| {
                 let sent: Vec<f64> = tilts(sent).iter().map(|tilt| tilt.deg()[axis]).collect();
-                let moved = follow(&sent, RATE_HZ, responses[axis]);
+                let moved = follow(&sent, RATE_HZ, response);
                 moved.iter().zip(&wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
             };
             let (plain, corrected) = (error_deg(&path), error_deg(&commanded));
