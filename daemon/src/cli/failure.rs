@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use miette::{Diagnostic, NamedSource, SourceSpan};
+use raysweep_drivers::mirror::ParkError;
 use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
@@ -30,6 +31,8 @@ pub(super) enum Failure {
     Live(#[from] LiveError),
     #[error(transparent)]
     Process(#[from] ProcessError),
+    #[error(transparent)]
+    Park(#[from] ParkError),
     #[error("cannot watch for Ctrl-C: {0}")]
     Signals(io::Error),
     #[error("cannot print: {0}")]
@@ -105,9 +108,12 @@ impl Failure {
             Self::Plan(_) => Exit::Refused,
             Self::File { .. } | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             Self::NoLiveImage => Exit::Refused,
-            Self::Write { .. } | Self::Live(_) | Self::Process(_) | Self::Signals(_) | Self::Output(_) => {
-                Exit::Failed
-            }
+            Self::Write { .. }
+            | Self::Live(_)
+            | Self::Process(_)
+            | Self::Park(_)
+            | Self::Signals(_)
+            | Self::Output(_) => Exit::Failed,
         }
     }
 }

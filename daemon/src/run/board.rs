@@ -33,6 +33,7 @@ impl Board {
             film: None,
             error: None,
             live: None,
+            mirror: None,
         };
         Self { status: Mutex::new(status), events: broadcast::Sender::new(EVENTS) }
     }

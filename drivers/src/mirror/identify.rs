@@ -305,8 +305,8 @@ mod tests {
         let config = MechanicsConfig { filter_hz: 5000.0, q: [30.0, 12.0], ..Default::default() };
         for (noise_deg, tolerance) in [(0.0, 0.01), (0.05, 0.03)] {
             let (commanded, measured) = measure(config, noise_deg);
-            for axis in 0..2 {
-                let found = identify(&commanded, &measured[axis], RATE_HZ, &BAND).unwrap();
+            for (axis, measured) in measured.iter().enumerate() {
+                let found = identify(&commanded, measured, RATE_HZ, &BAND).unwrap();
                 let (f0, q) = (found.response.f0_hz / config.f0_hz[axis], found.response.q / config.q[axis]);
                 assert!((f0 - 1.0).abs() < tolerance / 10.0, "axis {axis}: {found:?}");
                 assert!(

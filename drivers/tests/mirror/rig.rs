@@ -88,7 +88,11 @@ impl Rig {
         let allowed = LIMITS.max_step.0 / 6.5 * 2047.0 + 2.0;
         assert!(step <= allowed, "a step of {step} codes, {allowed} are allowed");
         assert_eq!(truth.overfills, 0);
-        Timing { dark_ns: truth.dark_since_ns.unwrap(), parked_ns: truth.parked_since_ns.unwrap() }
+        Timing {
+            dark_ns: truth.dark_since_ns.unwrap(),
+            parked_ns: truth.parked_since_ns.unwrap(),
+            largest_step: step,
+        }
     }
 }
 
@@ -96,16 +100,19 @@ impl Rig {
 pub struct Timing {
     pub dark_ns: i64,
     pub parked_ns: i64,
+    /// From one output to the next, in the wire's units.
+    pub largest_step: f64,
 }
 
 impl Timing {
-    pub fn print(&self, way: &str, since_ns: i64) {
+    pub fn print(&self, way: &str, since_ns: i64) -> &Self {
         let ms = |ns: i64| (ns - since_ns) as f64 / 1e6;
+        let (dark_ms, parked_ms) = (ms(self.dark_ns), ms(self.parked_ns));
         println!(
-            "{way}: light off after {:.1} ms, parked after {:.1} ms",
-            ms(self.dark_ns),
-            ms(self.parked_ns)
+            "{way}: light off after {dark_ms:.1} ms, parked after {parked_ms:.1} ms, largest step {}",
+            self.largest_step
         );
+        self
     }
 }
 

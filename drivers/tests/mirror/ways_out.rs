@@ -17,7 +17,7 @@ use raysweep_drivers::mirror::{
 use raysweep_sim::mirror::{Held, PlayzerXConfig, WireFaults};
 
 use crate::points::{circle, mti_config, mti_rig};
-use crate::rig::{LIMITS, Rig, batch, codes};
+use crate::rig::{LIMITS, Rig, batch, codes, largest_step};
 
 /// A mirror in the middle of a path.
 fn playing(rig: &Rig) -> PlayzerX {
@@ -70,7 +70,8 @@ fn stop_with_garbage_on_the_wire() {
         let mut mirror = playing(&rig);
         let since_ns = now_ns();
         mirror.park().unwrap();
-        rig.assert_parked().print("stop with garbage", since_ns);
+        let step = rig.assert_parked().print("stop with garbage", since_ns).largest_step;
+        assert!(step <= 2.0 * largest_step(&codes(&batch())), "the ramp begins elsewhere: {step} codes");
     }
 }
 
@@ -210,6 +211,7 @@ fn sigkill_with_a_guardian() {
     let since_ns = now_ns();
     end(&mut child, Signal::SIGKILL);
     rig.assert_parked().print("SIGKILL, guardian", since_ns);
+    assert_eq!(park(&rig.state()).unwrap(), Parked::Already, "the guardian has noted it");
 }
 
 #[test]
@@ -220,6 +222,7 @@ fn sigterm_without_a_handler_with_a_guardian() {
     let since_ns = now_ns();
     end(&mut child, Signal::SIGTERM);
     rig.assert_parked().print("SIGTERM, guardian", since_ns);
+    assert_eq!(park(&rig.state()).unwrap(), Parked::Already, "the guardian has noted it");
 }
 
 #[test]

@@ -2,17 +2,16 @@
 
 use std::fs::File;
 use std::io::{self, Read, Write};
-use std::os::fd::AsFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::fcntl::OFlag;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::pty::openpty;
-use nix::unistd::ttyname;
+use nix::pty::{grantpt, posix_openpt, ptsname_r, unlockpt};
 use raysweep_core::Clock;
 
 use super::plant::{MirrorTruth, lock};
@@ -72,15 +71,16 @@ impl MirrorPty {
     /// # Errors
     /// When there is no pseudo-terminal or no thread.
     pub fn plug(controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
-        let pair = openpty(None, None)?;
-        let path = ttyname(&pair.slave)?;
-        // Only the driver holds the other end, so that it can be closed and opened like a real port.
-        drop(pair.slave);
-        fcntl(&pair.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
+        // Closed on exec: a process that a test starts must not keep an unplugged controller's port alive. The other end
+        // is left to the driver, so that it can be opened and closed like a real port.
+        let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC)?;
+        grantpt(&master)?;
+        unlockpt(&master)?;
+        let path = ptsname_r(&master)?.into();
         let truth = controller.truth();
         let unplugged = Arc::new(AtomicBool::new(false));
         let mut wire = Wire {
-            master: File::from(pair.master),
+            master: File::from(OwnedFd::from(master)),
             controller,
             link,
             faults,
