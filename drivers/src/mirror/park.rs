@@ -39,6 +39,10 @@ pub enum Parked {
 /// # Errors
 /// `Locked` when a process still drives the mirror; `Device` when the controller cannot be reached.
 pub fn park(state: &Path) -> Result<Parked, ParkError> {
+    // Where no mirror was ever moved, nothing is written either.
+    if matches!(state.try_exists(), Ok(false)) {
+        return Ok(Parked::Already);
+    }
     park_left(&StateFile::open(state, LOCK_WAIT)?)
 }
 

@@ -58,7 +58,7 @@ fn garbage_stalls_and_a_wrong_clock_change_no_sample() {
 }
 
 #[test]
-fn a_small_fifo_is_not_overfilled_when_the_mirror_is_stopped_and_started_again() {
+fn a_full_fifo_is_not_overfilled_when_the_mirror_is_stopped_and_started_again() {
     let rig = Rig::good();
     let path = batch();
     let mut mirror = rig.open();

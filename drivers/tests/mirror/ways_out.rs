@@ -76,6 +76,29 @@ fn stop_with_garbage_on_the_wire() {
 }
 
 #[test]
+fn stop_of_a_controller_that_stalls() {
+    for seed in 0..6 {
+        let faults = WireFaults { seed, garbage: 0.1, stalls: 0.005, stall_ms: 50 };
+        let rig = Rig::playzerx(PlayzerXConfig::default(), faults);
+        let mut mirror = playing(&rig);
+        let since_ns = now_ns();
+        mirror.park().unwrap();
+        let step = rig.assert_parked().print("stop with stalls", since_ns).largest_step;
+        assert!(step <= 2.0 * largest_step(&codes(&batch())), "the ramp begins elsewhere: {step} codes");
+    }
+}
+
+#[test]
+fn stop_with_a_disk_that_takes_nothing() {
+    let rig = Rig::good();
+    let mut mirror = playing(&rig);
+    std::fs::remove_dir_all(rig.folder.path()).unwrap();
+    let since_ns = now_ns();
+    assert!(mirror.park().is_err(), "what could not be noted is said");
+    rig.assert_parked().print("stop without a disk", since_ns);
+}
+
+#[test]
 fn unplug_and_plug_in_again() {
     let mut rig = Rig::good();
     let mut mirror = playing(&rig);

@@ -143,7 +143,8 @@ impl<C: Controller> Wire<C> {
             self.wait();
             let now_ns = self.clock.now_ns();
             let ms = (now_ns - start_ns) / 1_000_000;
-            if (last_ms + 1..=ms).any(|ms| self.draw(&[0, ms.unsigned_abs()]) < self.faults.stalls) {
+            let begins = |ms: i64| self.draw(&[0, ms.unsigned_abs()]) < self.faults.stalls;
+            if now_ns >= stalled_until_ns && (last_ms + 1..=ms).any(begins) {
                 stalled_until_ns = now_ns + i64::from(self.faults.stall_ms) * 1_000_000;
             }
             last_ms = ms;

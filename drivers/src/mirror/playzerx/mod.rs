@@ -30,8 +30,6 @@ const BAUD: u32 = 921_600;
 const RATE_HZ: RangeInclusive<f64> = 50.0..=50_000.0;
 /// How long an answer may take.
 const REPLY_WAIT: Duration = Duration::from_millis(300);
-/// How long the place of the mirror may stay unknown when it is to be parked, before it is guessed.
-const PLACE_WAIT: Duration = Duration::from_millis(100);
 /// How often the light's permission is looked at.
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
 /// Longest time to wait for whoever drives the mirror to let go of it.

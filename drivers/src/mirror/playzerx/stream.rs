@@ -4,8 +4,8 @@ use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorProgress, Tilt};
 
+use super::REPLY_WAIT;
 use super::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, Sample, parse_response};
-use super::{PLACE_WAIT, REPLY_WAIT};
 use crate::mirror::port::{Port, fault};
 use crate::mirror::sequence::Sequence;
 use crate::mirror::state::{Sent, StateFile, of_state};
@@ -21,7 +21,9 @@ const SPARE_SAMPLES: u64 = 1000;
 const ASK_EVERY: Duration = Duration::from_millis(10);
 /// Answers that took longer say too little about when they were true.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
-/// How long after the first answer to wait for the others that were asked for with it.
+/// How long a controller may stand still before it takes an order.
+const HALT_WAIT: Duration = Duration::from_secs(1);
+/// How long after an answer to wait for the others that were asked for with it.
 const QUIET: Duration = Duration::from_millis(3);
 /// How many times the place is asked for: an answer may be lost in garbage, and the FIFO can be emptied only once.
 const QUESTIONS: usize = 3;
@@ -191,16 +193,16 @@ impl Stream {
         Ok(())
     }
 
-    /// Empties the FIFO. Where the mirror stands then: as the controller says, or, if it does not say in time, as the
-    /// clock does.
+    /// Empties the FIFO. Where the mirror stands then: as the controller says, or, if its answers are lost, as
+    /// the clock does.
     pub fn halt(&mut self, port: &mut Port) -> Result<Tilt, DeviceError> {
         let certain = self.certain_now();
         let unanswered = usize::from(self.question.is_some());
+        let seconds = self.moved.elapsed().as_secs_f64();
         let left = halt(port, unanswered)?;
         let played = match left {
             Some(left) => certain.saturating_sub(u64::from(left)),
             None => {
-                let seconds = self.moved.elapsed().as_secs_f64();
                 let rate_hz = self.rate.rate_hz().unwrap_or(self.asked_rate_hz);
                 (self.played + (seconds * rate_hz) as u64).min(certain)
             }
@@ -236,30 +238,28 @@ impl Stream {
     }
 }
 
-/// Empties the FIFO; how many samples it held just before, if the controller says so in time. `unanswered` questions
-/// are still on their way.
+/// Empties the FIFO; how many samples it held just before, if the controller says so. `unanswered` questions are still
+/// on their way.
+///
+/// A controller that says nothing at all has not taken the order yet, so there is time to wait for it; one that answers
+/// the ping behind the questions has taken them, and its answers are lost.
 pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
     let mut bytes = PADDING.to_vec();
     (0..QUESTIONS).for_each(|_| Command::SamplesLeft.to_bytes(&mut bytes));
     Command::Clear.to_bytes(&mut bytes);
+    Command::Ping.to_bytes(&mut bytes);
     port.send(&bytes)?;
-    let mut answers = 0;
-    let mut count = |reply| match reply {
-        Reply::Left(left) => {
-            answers += 1;
-            (answers > unanswered).then_some((left, answers))
+    let (mut answers, mut last) = (0, None);
+    loop {
+        // The last answer is the one nearest to the clearing.
+        let known = last.filter(|_| answers > unanswered);
+        let wait = if known.is_some() { QUIET } else { HALT_WAIT };
+        match port.await_reply(wait, parse_response, Some)? {
+            Some(Reply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
+            Some(Reply::Info { .. }) => {}
+            Some(Reply::Alive) | None => return Ok(known),
         }
-        _ => None,
-    };
-    let Some((mut left, mut answers)) = port.await_reply(PLACE_WAIT, parse_response, &mut count)? else {
-        return Ok(None);
-    };
-    // The last answer is the one nearest to the clearing.
-    while answers < unanswered + QUESTIONS {
-        let Some(later) = port.await_reply(QUIET, parse_response, &mut count)? else { break };
-        (left, answers) = later;
     }
-    Ok(Some(left))
 }
 
 /// A straight line through (seconds, samples).
