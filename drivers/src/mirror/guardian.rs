@@ -14,7 +14,8 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Starts a guardian: `command` must call [`park_when_closed`] on its standard input.
+    /// Starts a guardian: `command` must call [`park_when_closed`] on its standard input, as
+    /// `raysweep park --when-closed --state FILE` does. To be started before the mirror is opened and dropped after it.
     ///
     /// # Errors
     /// When the process cannot be started.
