@@ -11,6 +11,7 @@ mod device;
 mod error;
 mod film;
 mod frame;
+mod mirror;
 mod pixel;
 mod raster;
 mod units;
@@ -25,6 +26,10 @@ pub use device::{
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
 pub use frame::{Edge, Frame, FrameBuf, FramePool, FrameStamp};
+pub use mirror::{
+    MAX_POINTS, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
+    MirrorProgress, OpticalDeg, PathError, RasterScan, SecondOrder, Tilt,
+};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use units::{ns_from_us, us_from_ns};

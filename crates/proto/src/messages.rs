@@ -197,6 +197,20 @@ pub struct Status {
     /// The file with the newest live images, if there is one; `describe` has its layout.
     #[serde(default)]
     pub live: Option<PathBuf>,
+    /// The mirror, where the rig has ever moved one.
+    #[serde(default)]
+    pub mirror: Option<MirrorStatus>,
+}
+
+/// A mirror and its light.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct MirrorStatus {
+    /// Whether it is at the origin with the light off.
+    pub parked: bool,
+    /// Whether samples with light may be playing.
+    pub laser: bool,
+    /// `interlock_closed`, `interlock_open`, `armed` or `not_armed`.
+    pub light: String,
 }
 
 /// Parameters of `check`.

@@ -5,9 +5,10 @@ use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
 use raysweep_core::{Counts, FilmSummary, Percentiles, SettingsLatency};
+use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
-    BetterSweep, CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo,
-    Status, SweepAdvice,
+    BetterSweep, CheckReport, Description, ExpectedError, MirrorStatus, NoiseSource, Progress, Role,
+    RunState, SessionInfo, Status, SweepAdvice,
 };
 
 use crate::process::Processed;
@@ -41,10 +42,46 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(SettingsLatency { min_frames, max_frames }) = status.settings_latency {
         rows.push(("settings", format!("act {min_frames} to {max_frames} frames late")));
     }
+    if let Some(mirror) = &status.mirror {
+        rows.push(("mirror", self::mirror(mirror)));
+    }
     if let Some(error) = &status.error {
         rows.push(("error", error.clone()));
     }
     block(&rows)
+}
+
+/// `park`, for programs.
+pub(super) fn parked_name(parked: Parked) -> serde_json::Value {
+    match parked {
+        Parked::Already => serde_json::json!({ "parked": "already" }),
+        Parked::From(tilt) => serde_json::json!({ "parked": "from", "tilt_deg": tilt.deg() }),
+        Parked::ByReset => serde_json::json!({ "parked": "by_reset" }),
+    }
+}
+
+/// `park`
+pub(super) fn parked(parked: Parked) -> String {
+    match parked {
+        Parked::Already => "the mirror is parked, as it was".into(),
+        Parked::From(tilt) => {
+            let [x, y] = tilt.deg();
+            format!("the mirror is parked; it was found at {x:.2}, {y:.2} degrees")
+        }
+        Parked::ByReset => "nobody knew where the mirror was: its controller was started anew".into(),
+    }
+}
+
+fn mirror(mirror: &MirrorStatus) -> String {
+    let place = if mirror.parked { "parked" } else { "away from the origin" };
+    let laser = if mirror.laser { "on" } else { "off" };
+    let word = match mirror.light.as_str() {
+        "interlock_closed" => "the interlock is closed",
+        "interlock_open" => "the interlock is open",
+        "armed" => "light is armed",
+        _ => "nobody has armed the light since this boot: `raysweep arm-light`",
+    };
+    format!("{place}, light {laser}; {word}")
 }
 
 /// `check`

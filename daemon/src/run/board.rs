@@ -34,6 +34,7 @@ impl Board {
             settings_latency: None,
             error: None,
             live: None,
+            mirror: None,
         };
         Self { status: Mutex::new(status), events: broadcast::Sender::new(EVENTS) }
     }

@@ -35,6 +35,7 @@ use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
 use crate::live::{LiveFile, Outlet};
 use crate::memory::{MemoryNeed, available_bytes};
+use crate::mirror;
 use crate::processing::Task;
 use crate::results::{self, Results};
 use crate::rig::{Rig, RigError};
@@ -446,7 +447,7 @@ fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) 
 
 impl Control for Runner {
     fn status(&self) -> Status {
-        self.board.status()
+        Status { mirror: mirror::status(&self.data), ..self.board.status() }
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
@@ -480,6 +481,10 @@ impl Control for Runner {
         let during =
             [RunState::Preparing, RunState::Armed, RunState::Running, RunState::Paused, RunState::Draining];
         self.order(Order::Cancel, &during, None)
+    }
+
+    fn arm_light(&self) -> Result<(), RpcError> {
+        mirror::arm_light(&self.data)
     }
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
