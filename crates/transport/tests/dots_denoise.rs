@@ -64,7 +64,10 @@ fn assert_equals_reference(
             assert_eq!(column.values, expected.values, "{level:?}");
             assert_eq!(column.residual.len(), expected.residual.len());
             for (residual, expected) in column.residual.iter().zip(&expected.residual) {
-                assert!((residual - expected).abs() <= 1e-5 * (1.0 + expected.abs()), "{residual} {expected}");
+                assert!(
+                    (residual - expected).abs() <= 1e-5 * (1.0 + expected.abs()),
+                    "{residual} {expected}"
+                );
             }
         }
     }

@@ -5,12 +5,15 @@
 //! and the [`Denoiser`], which keeps what stands out of the noise pixel by pixel and the rest as means of blocks.
 mod background;
 mod batch;
+pub mod calibrate;
 mod column;
 mod correction;
 mod denoise;
 mod error;
+pub mod product;
 mod sensor;
 mod shape;
+mod synchronise;
 
 pub use background::{Background, BackgroundMean, NoiseFloor};
 pub use batch::{Batch, BatchArrays, BatchCounts, Column};
@@ -20,3 +23,6 @@ pub use denoise::{DenoiseSettings, Denoiser, Scratch, StopRule, false_alarm_sigm
 pub use error::DotsError;
 pub use sensor::RunStatistics;
 pub use shape::{BLOCK_PX, FrameShape, Region};
+pub use synchronise::{
+    Cause, Decided, Fate, Observation, SyncCounts, SyncSettings, Synchroniser, pulse_threshold,
+};
