@@ -89,7 +89,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`DotsError::Shape`] for arrays that do not fit each other, [`DotsError::Damaged`] for words out of order or
-    /// beyond the frame and masks without pixels.
+    /// beyond the frame, masks without pixels, and values that are not finite.
     pub fn new(shape: FrameShape, mut arrays: BatchArrays) -> Result<Self, DotsError> {
         if arrays.word_offsets.is_empty() {
             arrays.word_offsets.push(0);
@@ -124,6 +124,13 @@ impl Batch {
             })?);
         }
         check_shape("values", "[pixels x channels]", &[arrays.values.len()], &[pixels * shape.channels()])?;
+        for (values, problem) in
+            [(&arrays.values, "a value is not finite"), (&arrays.residual, "a residual is not finite")]
+        {
+            if let Some(index) = values.iter().position(|value| !value.is_finite()) {
+                return damaged(problem, index);
+            }
+        }
 
         let mut bands = Vec::with_capacity(dots * (shape.block_rows() + 1));
         for dot in 0..dots {
@@ -263,17 +270,24 @@ impl<'a> Column<'a> {
     ///
     /// `of_block` must have a place for each block; it is overwritten.
     pub(crate) fn energy(&self, of_block: &mut [u32]) -> [f64; 3] {
+        /// A multiple of all numbers of channels.
+        const LANES: usize = 12;
         let (shape, mut energy) = (self.batch.shape, [0.0; 3]);
+        let channels = shape.channels();
         of_block.fill(0);
-        for word in self.words() {
-            of_block[shape.block_of_word(word.word)] += word.mask.count_ones();
-            for pixel in word.values.chunks_exact(shape.channels()) {
-                energy.iter_mut().zip(pixel).for_each(|(energy, &value)| *energy += f64::from(value));
-            }
-        }
-        for (block, (means, &masked)) in
-            self.residual.chunks_exact(shape.channels()).zip(&*of_block).enumerate()
-        {
+        let range = self.words.clone();
+        let words = self.batch.arrays.words[range.clone()].iter().zip(&self.batch.arrays.masks[range]);
+        words.for_each(|(&word, mask)| of_block[shape.block_of_word(word as usize)] += mask.count_ones());
+        let starts = &self.batch.starts;
+        let values = starts[self.words.start] as usize * channels..starts[self.words.end] as usize * channels;
+        let values = &self.batch.arrays.values[values];
+        // Side by side: one sum after another would wait for each.
+        let mut partial = [0.0; LANES];
+        let (whole, rest) = values.as_chunks::<LANES>();
+        whole.iter().for_each(|lanes| (0..LANES).for_each(|lane| partial[lane] += f64::from(lanes[lane])));
+        rest.iter().zip(&mut partial).for_each(|(&value, partial)| *partial += f64::from(value));
+        partial.iter().enumerate().for_each(|(lane, partial)| energy[lane % channels] += partial);
+        for (block, (means, &masked)) in self.residual.chunks_exact(channels).zip(&*of_block).enumerate() {
             let outside = shape.pixels_of_block(block) as f64 - f64::from(masked);
             energy.iter_mut().zip(means).for_each(|(energy, &mean)| *energy += outside * f64::from(mean));
         }

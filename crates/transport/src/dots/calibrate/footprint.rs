@@ -1,3 +1,5 @@
+use rayon::prelude::*;
+
 use crate::dots::batch::Word;
 use crate::dots::column::bits;
 use crate::dots::error::check_range;
@@ -22,21 +24,29 @@ impl Footprints {
     pub fn new(batch: &Batch, level: f64) -> Result<Self, DotsError> {
         check_range("level", level, level > 0.0 && level <= 1.0, "above 0 and at most 1, as 0.5")?;
         let channels = batch.shape().channels();
+        let of_dots: Vec<Vec<(u32, u32)>> = (0..batch.dots())
+            .into_par_iter()
+            .map(|dot| {
+                let column = batch.column(dot);
+                let lights =
+                    column.words().flat_map(|word| word.values.chunks_exact(channels)).map(luminance);
+                let least =
+                    level as f32 * lights.fold(0.0, |most, light| if light > most { light } else { most });
+                // A column without light has no footprint.
+                let words = column.words().filter(|_| least > 0.0).map(|Word { word, mask, values }| {
+                    let above = bits(mask).zip(values.chunks_exact(channels));
+                    let above = above
+                        .fold(0, |mask, (bit, value)| mask | u32::from(luminance(value) >= least) << bit);
+                    (word as u32, above)
+                });
+                words.filter(|(_, mask)| *mask != 0).collect()
+            })
+            .collect();
         let mut footprints =
             Self { shape: batch.shape(), offsets: vec![0], words: Vec::new(), masks: Vec::new() };
-        for dot in 0..batch.dots() {
-            let column = batch.column(dot);
-            let least = level as f32 * column.pixels().map(|(_, value)| luminance(value)).fold(0.0, f32::max);
-            for Word { word, mask, values } in column.words() {
-                let above = bits(mask).zip(values.chunks_exact(channels));
-                // A column without light has no footprint.
-                let above = above.filter(|(_, value)| least > 0.0 && luminance(value) >= least);
-                let mask = above.fold(0_u32, |mask, (bit, _)| mask | 1 << bit);
-                if mask != 0 {
-                    footprints.words.push(word as u32);
-                    footprints.masks.push(mask);
-                }
-            }
+        for words in of_dots {
+            footprints.words.extend(words.iter().map(|(word, _)| word));
+            footprints.masks.extend(words.iter().map(|(_, mask)| mask));
             footprints.offsets.push(footprints.words.len() as u32);
         }
         Ok(footprints)

@@ -1,4 +1,5 @@
 use ndarray::{Array2, Array3};
+use rayon::prelude::*;
 
 use crate::dots::calibrate::Centroids;
 use crate::dots::error::{check_range, check_shape};
@@ -16,11 +17,14 @@ pub struct DualImage {
 /// All light of each column, those outside the mask by their blocks' means; the mean of the channels. On the
 /// calibration plane, what [`dual`] divides by.
 pub fn column_energies(batch: &Batch) -> Vec<f64> {
-    let mut of_block = vec![0; batch.shape().blocks()];
     let channels = batch.shape().channels() as f64;
-    (0..batch.dots())
-        .map(|dot| batch.column(dot).energy(&mut of_block).iter().sum::<f64>() / channels)
-        .collect()
+    energies_of_channels(batch).iter().map(|energy| energy.iter().sum::<f64>() / channels).collect()
+}
+
+fn energies_of_channels(batch: &Batch) -> Vec<[f64; 3]> {
+    let of_block = || vec![0; batch.shape().blocks()];
+    let dots = (0..batch.dots()).into_par_iter();
+    dots.map_init(of_block, |of_block, dot| batch.column(dot).energy(of_block)).collect()
 }
 
 /// Dual image by Helmholtz reciprocity: each dot's place on the calibration plane has the light of its whole column,
@@ -45,13 +49,12 @@ pub fn dual(
     let channels = shape.channels();
     let mut sums = Array3::<f64>::zeros((height, width, channels));
     let mut counts = Array2::<u32>::zeros((height, width));
-    let mut of_block = vec![0; shape.blocks()];
-    for (dot, (xy, &plane)) in centroids.xy.iter().zip(plane_energies).enumerate() {
+    let energies = energies_of_channels(batch);
+    for ((xy, &plane), energy) in centroids.xy.iter().zip(plane_energies).zip(energies) {
         let Some([x, y]) = xy.filter(|_| plane > 0.0) else { continue };
         let scaled =
             |at: f64, from: usize, to: usize| (((at + 0.5) * to as f64 / from as f64) as usize).min(to - 1);
         let at = [scaled(y, shape.height(), height), scaled(x, shape.width(), width)];
-        let energy = batch.column(dot).energy(&mut of_block);
         for channel in 0..channels {
             sums[[at[0], at[1], channel]] += energy[channel] / plane;
         }
@@ -74,47 +77,55 @@ pub fn dual(
 pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     let (height, width, channels) = image.dim();
     assert_eq!(known.dim(), (height, width), "known must be as large as the image");
-    let pixels = height * width;
-    let mut values: Vec<f32> = image.iter().copied().collect();
-    let mut is_filled: Vec<bool> = known.iter().copied().collect();
-    let neighbours = |pixel: usize| {
-        let (row, column) = (pixel / width, pixel % width);
-        let sideways = [(column > 0).then(|| pixel - 1), (column + 1 < width).then_some(pixel + 1)];
-        let upright = [(row > 0).then(|| pixel - width), (row + 1 < height).then_some(pixel + width)];
-        sideways.into_iter().chain(upright).flatten()
-    };
+    // With a border that is never filled and counts for nothing, so that every pixel has four neighbours.
+    let stride = width + 2;
+    let inside = |row: usize, column: usize| (row + 1) * stride + column + 1;
+    let mut filled = vec![0.0_f32; (height + 2) * stride];
+    let mut is_open = vec![false; filled.len()];
+    let mut values = vec![0.0_f32; filled.len() * channels];
+    for ((row, column), &known) in known.indexed_iter() {
+        let pixel = inside(row, column);
+        (filled[pixel], is_open[pixel]) = (f32::from(u8::from(known)), !known);
+        if known {
+            (0..channels)
+                .for_each(|channel| values[pixel * channels + channel] = image[[row, column, channel]]);
+        }
+    }
+    let neighbours = |pixel: usize| [pixel - 1, pixel + 1, pixel - stride, pixel + stride];
     // In each step only the rim of what is filled: every pixel is reached once.
-    let mut queued = is_filled.clone();
-    let mut rim: Vec<usize> = (0..pixels)
-        .filter(|&pixel| !is_filled[pixel] && neighbours(pixel).any(|near| is_filled[near]))
-        .collect();
+    let at_rim = |pixel: &usize| is_open[*pixel] && neighbours(*pixel).iter().any(|&near| filled[near] > 0.0);
+    let all = (0..height).flat_map(|row| inside(row, 0)..inside(row, width));
+    let mut rim: Vec<usize> = all.filter(at_rim).collect();
     let (mut next, mut means) = (Vec::new(), Vec::new());
+    rim.iter().for_each(|&pixel| is_open[pixel] = false);
     while !rim.is_empty() {
-        rim.iter().for_each(|&pixel| queued[pixel] = true);
         means.clear();
         for &pixel in &rim {
-            for channel in 0..channels {
-                let filled = neighbours(pixel).filter(|&near| is_filled[near]);
-                let (sum, count) = filled.fold((0.0, 0.0), |(sum, count), near| {
-                    (sum + values[near * channels + channel], count + 1.0)
-                });
-                means.push(sum / count);
-            }
-        }
-        for (&pixel, means) in rim.iter().zip(means.chunks_exact(channels)) {
-            values[pixel * channels..][..channels].copy_from_slice(means);
-            is_filled[pixel] = true;
+            let near = neighbours(pixel);
+            let count: f32 = near.iter().map(|&near| filled[near]).sum();
+            means.extend((0..channels).map(|channel| {
+                // What is not filled is 0.
+                near.iter().map(|&near| values[near * channels + channel]).sum::<f32>() / count
+            }));
         }
         next.clear();
-        for &pixel in &rim {
+        for (&pixel, means) in rim.iter().zip(means.chunks_exact(channels)) {
+            values[pixel * channels..][..channels].copy_from_slice(means);
+            filled[pixel] = 1.0;
             for near in neighbours(pixel) {
-                if !queued[near] {
-                    queued[near] = true;
+                if std::mem::take(&mut is_open[near]) {
                     next.push(near);
                 }
             }
         }
         std::mem::swap(&mut rim, &mut next);
     }
-    image.iter_mut().zip(values).for_each(|(place, value)| *place = value);
+    for (row, mut pixels) in image.outer_iter_mut().enumerate() {
+        for (column, mut pixel) in pixels.outer_iter_mut().enumerate() {
+            let at = inside(row, column);
+            if filled[at] > 0.0 {
+                pixel.iter_mut().zip(&values[at * channels..]).for_each(|(place, &value)| *place = value);
+            }
+        }
+    }
 }

@@ -3,7 +3,7 @@ use super::relight::floodlit;
 use super::sum::{add_blocks, by_bands, first_word};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Fundamental;
-use crate::dots::column::bits;
+use crate::dots::column::runs;
 use crate::dots::error::{check_range, check_shape};
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError};
@@ -14,7 +14,7 @@ const REFERENCE_WIDTH_PX: f64 = 1024.0;
 /// A block's share of the mask is the mean over this many points a side.
 const POINTS: usize = 4;
 
-/// Farther away than this many sigmas the mask is taken for 0.
+/// Farther out than this many sigmas the mask is 0; there a Gaussian is 4e-6.
 const REACH_SIGMAS: f64 = 5.0;
 
 /// How the mask falls off around an epipolar line.
@@ -47,9 +47,17 @@ struct Falloff {
 }
 
 impl Falloff {
+    /// Nothing farther away is direct.
+    fn reach_px(&self) -> f64 {
+        self.distance_px + REACH_SIGMAS * self.sigma_px
+    }
+
     /// Share that is direct at this distance from the line.
     fn at(&self, px: f64) -> f64 {
         let gaussian = |px: f64| (-0.5 * (px / self.sigma_px).powi(2)).exp();
+        if px > self.reach_px() {
+            return 0.0;
+        }
         match self.rule {
             MaskRule::Plateau if px <= self.distance_px => 1.0,
             MaskRule::Plateau if self.sigma_px > 0.0 => gaussian(px - self.distance_px),
@@ -57,6 +65,28 @@ impl Falloff {
             MaskRule::Printed if self.sigma_px > 0.0 => gaussian(px),
             MaskRule::Printed => 1.0,
             MaskRule::Plateau => 0.0,
+        }
+    }
+}
+
+impl Falloff {
+    /// Shares of pixels side by side from (x, y) on. The distance from a line is largest at an end of them, and smallest
+    /// too where the line does not cross, so that mostly one share serves all.
+    #[inline(always)]
+    fn along(&self, line: &Line, x: f64, y: f64, shares: &mut [f64]) {
+        let (first, last) = (line.signed(x, y), line.signed(x + (shares.len() - 1) as f64, y));
+        let flat = match self.rule {
+            MaskRule::Plateau => self.distance_px,
+            MaskRule::Printed => -1.0,
+        };
+        if first.abs().max(last.abs()) <= flat {
+            shares.fill(1.0);
+        } else if first * last > 0.0 && first.abs().min(last.abs()) > self.reach_px() {
+            shares.fill(0.0);
+        } else {
+            for (step, share) in shares.iter_mut().enumerate() {
+                *share = self.at(line.distance(x + step as f64, y));
+            }
         }
     }
 }
@@ -80,8 +110,13 @@ impl Line {
         })
     }
 
+    /// Positive on one side of it, negative on the other.
+    fn signed(&self, x: f64, y: f64) -> f64 {
+        self.x * x + self.y * y + self.constant
+    }
+
     fn distance(&self, x: f64, y: f64) -> f64 {
-        (self.x * x + self.y * y + self.constant).abs()
+        self.signed(x, y).abs()
     }
 }
 
@@ -116,6 +151,7 @@ pub fn epipolar(
     let direct = by_bands(shape, channels, |band, sums| {
         let pixels = sums.len() / channels;
         let (mut blocks, mut shares) = (vec![0.0; columns * channels], vec![0.0; columns]);
+        let mut weights = [0.0; BLOCK_PX];
         for (dot, line) in lines.iter().enumerate() {
             let Some(line) = line else { continue };
             let column = batch.band(dot, band);
@@ -131,13 +167,21 @@ pub fn epipolar(
             for Word { word, mask, values } in column.words() {
                 let block = word % columns;
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
-                let y = (word / columns) as f64;
-                for (bit, value) in bits(mask).zip(values.chunks_exact(channels)) {
-                    let share = falloff.at(line.distance((block * BLOCK_PX + bit) as f64, y));
-                    for (channel, &value) in value.iter().enumerate() {
-                        let mean = f64::from(column.residual()[block * channels + channel]);
-                        sums[channel * pixels + first + bit] +=
-                            share * f64::from(value) - shares[block] * mean;
+                let (left, y) = ((block * BLOCK_PX) as f64, (word / columns) as f64);
+                let mut values = values;
+                for run in runs(mask) {
+                    let (of_run, rest) = values.split_at(run.len() * channels);
+                    values = rest;
+                    let weights = &mut weights[..run.len()];
+                    falloff.along(line, left + run.start as f64, y, weights);
+                    for channel in 0..channels {
+                        let place = channel * pixels + first;
+                        let sums = sums[place + run.start..place + run.end].iter_mut();
+                        // The block's mean goes to all pixels in the end; here it is not the light.
+                        let mean = shares[block] * f64::from(column.residual()[block * channels + channel]);
+                        let light = of_run[channel..].iter().step_by(channels).zip(&*weights);
+                        sums.zip(light)
+                            .for_each(|(sum, (&value, share))| *sum += share * f64::from(value) - mean);
                     }
                 }
             }

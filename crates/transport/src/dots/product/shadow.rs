@@ -7,7 +7,7 @@ use super::sum::{by_bands, first_word};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Confusion;
 use crate::dots::calibrate::luminance;
-use crate::dots::column::bits;
+use crate::dots::column::runs;
 use crate::dots::error::{check_range, check_shape};
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError};
@@ -31,19 +31,26 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
     // Largest and least light that one dot takes away, one image each: as two more channels.
     let extremes = by_bands(batch.shape(), 2 * channels, |band, sums| {
         let pixels = sums.len() / (2 * channels);
-        let mut covering = vec![0_usize; pixels];
+        let mut covering = vec![0_u32; pixels];
         let (most, least) = sums.split_at_mut(channels * pixels);
         most.fill(f64::NEG_INFINITY);
         least.fill(f64::INFINITY);
         for dot in 0..dots {
-            for Word { word, mask, values } in batch.band(dot, band).words() {
+            for Word { word, mask, mut values } in batch.band(dot, band).words() {
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
-                for (bit, value) in bits(mask).zip(values.chunks_exact(channels)) {
-                    covering[first + bit] += 1;
-                    for (channel, &value) in value.iter().enumerate() {
-                        let at = channel * pixels + first + bit;
-                        most[at] = most[at].max(value.into());
-                        least[at] = least[at].min(value.into());
+                for run in runs(mask) {
+                    let (of_run, rest) = values.split_at(run.len() * channels);
+                    values = rest;
+                    let run = first + run.start..first + run.end;
+                    covering[run.clone()].iter_mut().for_each(|covering| *covering += 1);
+                    for channel in 0..channels {
+                        let at = channel * pixels + run.start..channel * pixels + run.end;
+                        let extremes = most[at.clone()].iter_mut().zip(&mut least[at]);
+                        let light = of_run[channel..].iter().step_by(channels).map(|&value| f64::from(value));
+                        for ((most, least), light) in extremes.zip(light) {
+                            *most = if light > *most { light } else { *most };
+                            *least = if light < *least { light } else { *least };
+                        }
                     }
                 }
             }
@@ -51,7 +58,7 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
         for (pixel, &covering) in covering.iter().enumerate() {
             for at in (0..channels).map(|channel| channel * pixels + pixel) {
                 // A dot that does not cover the pixel takes nothing away.
-                if covering < dots {
+                if (covering as usize) < dots {
                     (most[at], least[at]) = (most[at].max(0.0), least[at].min(0.0));
                 }
             }
@@ -96,25 +103,39 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
         let pixels = sums.len() / (channels + 1);
         let (mut brightest, mut dot_of) = (vec![f32::NEG_INFINITY; pixels], vec![NONE; pixels]);
         for dot in 0..dots {
-            for Word { word, mask, values } in batch.band(dot, band).words() {
+            for Word { word, mask, mut values } in batch.band(dot, band).words() {
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
-                for (bit, value) in bits(mask).zip(values.chunks_exact(channels)) {
-                    let value = luminance(value);
-                    if value > brightest[first + bit] {
-                        (brightest[first + bit], dot_of[first + bit]) = (value, dot as u32);
+                for run in runs(mask) {
+                    let (of_run, rest) = values.split_at(run.len() * channels);
+                    values = rest;
+                    let run = first + run.start..first + run.end;
+                    let pixels = brightest[run.clone()].iter_mut().zip(&mut dot_of[run]);
+                    for ((most, dot_of), value) in pixels.zip(of_run.chunks_exact(channels)) {
+                        let light = luminance(value);
+                        let brighter = light > *most;
+                        *most = if brighter { light } else { *most };
+                        *dot_of = if brighter { dot as u32 } else { *dot_of };
                     }
                 }
             }
         }
         for dot in 0..dots {
-            let column = batch.band(dot, band);
-            for Word { word, mask, values } in column.words() {
+            let (column, neighbours) = (batch.band(dot, band), is_neighbour.of(dot));
+            for Word { word, mask, mut values } in column.words() {
                 let (first, block) = ((word - first_word(batch, band)) * BLOCK_PX, word % columns);
-                for (bit, value) in bits(mask).zip(values.chunks_exact(channels)) {
-                    if is_neighbour.of(dot_of[first + bit] as usize, dot) {
-                        for (channel, &value) in value.iter().enumerate() {
-                            let mean = column.residual()[block * channels + channel];
-                            sums[channel * pixels + first + bit] += f64::from(value) - f64::from(mean);
+                for run in runs(mask) {
+                    let (of_run, rest) = values.split_at(run.len() * channels);
+                    values = rest;
+                    let run = first + run.start..first + run.end;
+                    for channel in 0..channels {
+                        let mean = f64::from(column.residual()[block * channels + channel]);
+                        let sums = &mut sums[channel * pixels + run.start..channel * pixels + run.end];
+                        let light = of_run[channel..].iter().step_by(channels);
+                        for ((sum, &value), &brightest) in
+                            sums.iter_mut().zip(light).zip(&dot_of[run.clone()])
+                        {
+                            let shares = neighbours[brightest as usize / 64] >> (brightest % 64) & 1 == 1;
+                            *sum += if shares { f64::from(value) - mean } else { 0.0 };
                         }
                     }
                 }
@@ -124,7 +145,8 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
         let mut residuals: Vec<Option<[f64; 3]>> = vec![None; dots];
         for block in 0..columns {
             let mut met = Vec::new();
-            for pixel in (0..pixels).filter(|pixel| pixel / BLOCK_PX % columns == block) {
+            let rows = (block * BLOCK_PX..pixels).step_by(shape.width());
+            for pixel in rows.flat_map(|first| first..first + BLOCK_PX) {
                 let dot = dot_of[pixel] as usize;
                 if dot_of[pixel] == NONE {
                     sums[channels * pixels + pixel] = 1.0;
@@ -176,7 +198,8 @@ impl Neighbours {
         Self { dots, bits }
     }
 
-    fn of(&self, dot: usize, other: usize) -> bool {
-        self.bits[dot * self.dots.div_ceil(64) + other / 64] >> (other % 64) & 1 == 1
+    /// A bit for each dot that shares pixels with this one.
+    fn of(&self, dot: usize) -> &[u64] {
+        &self.bits[dot * self.dots.div_ceil(64)..][..self.dots.div_ceil(64)]
     }
 }

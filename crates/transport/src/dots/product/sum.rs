@@ -1,4 +1,5 @@
 use ndarray::Array3;
+use pulp::Arch;
 use rayon::prelude::*;
 
 use crate::dots::shape::BLOCK_PX;
@@ -19,7 +20,8 @@ pub(super) fn by_bands(
             let pixels = image.len() / channels;
             let sums = &mut sums[..image.len()];
             sums.fill(0.0);
-            draw(band, sums);
+            // With the widest instructions; they round as all others do.
+            Arch::new().dispatch(|| draw(band, &mut *sums));
             for (channel, plane) in sums.chunks_exact(pixels).enumerate() {
                 image[channel..]
                     .iter_mut()
