@@ -93,7 +93,7 @@ fn write(folder: &Path, columns: &Columns) -> Result<(), Box<dyn Error>> {
     let settings = serde_json::json!({
         "background": BACKGROUND,
         "noise": NOISE,
-        "radius_px": 1.25 * scene.radius_px(),
+        "radius_px": scene.disc_radius_px(),
         "distance_px": mask.distance_px,
         "sigma_px": mask.sigma_px,
     });

@@ -38,8 +38,13 @@ impl Scene {
     }
 
     /// Radius of the dots, the paper's 16 pixels of 1024.
-    pub fn radius_px(&self) -> f64 {
+    fn radius_px(&self) -> f64 {
         16.0 * self.shape.width() as f64 / 1024.0
+    }
+
+    /// Radius of discs that hold a dot wherever noise puts its brightest pixel.
+    pub fn disc_radius_px(&self) -> f64 {
+        1.25 * self.radius_px()
     }
 
     /// Column and row of a dot's centre on the calibration plane.
@@ -59,13 +64,13 @@ impl Scene {
         Ok(())
     }
 
-    /// A dot in a scene: itself, none to two dimmer images of it elsewhere, and a glow below the noise.
+    /// A dot in a scene: itself, for a third of the dots a dimmer image of it elsewhere, and a glow below the noise.
     pub fn draw(&self, dot: usize, frame: &mut [u16]) -> Drawn {
         self.draw_plane(dot, frame)?;
         self.stamp(self.centre(dot), 4.0, 4.0, frame);
         let mut random = Xoshiro256PlusPlus::seed_from_u64((DOTS + dot) as u64);
         let anywhere = Uniform::new(0.0, self.shape.width() as f64)?;
-        for _ in 0..dot % 3 {
+        if dot.is_multiple_of(3) {
             let place = [anywhere.sample(&mut random), anywhere.sample(&mut random)];
             self.stamp(place, 80.0, 0.7, frame);
         }

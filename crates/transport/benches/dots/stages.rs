@@ -56,7 +56,7 @@ impl Sensor {
             .collect();
         let correction = Correction::new(shape, gain.view(), &hot, Sampling::Full)?;
         let background = Background::new(&correction, &vec![BACKGROUND as f32; shape.pixels()])?;
-        let settings = DenoiseSettings { radius_px: 1.25 * scene.radius_px(), ..DenoiseSettings::default() };
+        let settings = DenoiseSettings { radius_px: scene.disc_radius_px(), ..DenoiseSettings::default() };
         let floor = NoiseFloor { mean: 0.3, sigma: NOISE };
         Ok(Self { denoiser: Denoiser::new(correction, settings)?, background, floor })
     }

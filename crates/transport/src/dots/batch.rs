@@ -69,7 +69,7 @@ pub struct Batch {
     arrays: BatchArrays,
     /// Pixels before each word, `[words + 1]`.
     starts: Vec<u32>,
-    /// Where the words of each dot in each row of blocks begin, `[dots, block rows + 1]`.
+    /// Where the words of each dot in each row of blocks begin, `[block rows + 1, dots]`.
     bands: Vec<u32>,
 }
 
@@ -132,7 +132,7 @@ impl Batch {
             }
         }
 
-        let mut bands = Vec::with_capacity(dots * (shape.block_rows() + 1));
+        let mut bands = vec![0; (shape.block_rows() + 1) * dots];
         for dot in 0..dots {
             let (first, end) = (arrays.word_offsets[dot] as usize, arrays.word_offsets[dot + 1] as usize);
             let of_dot = &arrays.words[first..end];
@@ -145,10 +145,8 @@ impl Batch {
             let mut at = 0;
             for band in 0..=shape.block_rows() {
                 at += of_dot[at..].iter().take_while(|&&word| (word as usize) < band * shape.width()).count();
-                bands.push((first + at) as u32);
+                bands[band * dots + dot] = (first + at) as u32;
             }
-            // The frame may end within the last row of blocks, never before its words.
-            debug_assert_eq!(first + at, end);
         }
         Ok(Self { shape, arrays, starts, bands })
     }
@@ -195,16 +193,14 @@ impl Batch {
         Column { batch: self, words, residual: &self.arrays.residual[dot * residual..][..residual] }
     }
 
-    /// The part of a dot's column in one row of blocks.
-    pub(crate) fn band(&self, dot: usize, band: usize) -> Column<'_> {
-        let at = dot * (self.shape.block_rows() + 1) + band;
-        let row = self.shape.block_columns() * self.shape.channels();
-        let residual = (dot * self.shape.block_rows() + band) * row;
-        Column {
-            batch: self,
-            words: self.bands[at] as usize..self.bands[at + 1] as usize,
-            residual: &self.arrays.residual[residual..][..row],
-        }
+    /// The dots that have pixels in a row of blocks, in their order, with these.
+    pub(crate) fn in_band(&self, band: usize) -> impl Iterator<Item = (usize, Column<'_>)> {
+        let offsets = &self.bands[band * self.dots()..(band + 2) * self.dots()];
+        let (first, end) = offsets.split_at(self.dots());
+        let words = first.iter().zip(end).enumerate().filter(|(_, (first, end))| first < end);
+        words.map(|(dot, (&first, &end))| {
+            (dot, Column { words: first as usize..end as usize, ..self.column(dot) })
+        })
     }
 
     /// How a dot's frame was denoised.
@@ -216,13 +212,12 @@ impl Batch {
     }
 }
 
-/// A dot's column in a batch, or its part in one row of blocks.
+/// A dot's column in a batch, or its words in one row of blocks.
 #[derive(Debug, Clone)]
 pub struct Column<'a> {
     batch: &'a Batch,
     words: std::ops::Range<usize>,
-    /// Means of the blocks, `[blocks, channels]`: all of the frame's, or those of the row of blocks.
-    pub(crate) residual: &'a [f32],
+    residual: &'a [f32],
 }
 
 /// 32 pixels of a column.
@@ -256,6 +251,13 @@ impl<'a> Column<'a> {
         })
     }
 
+    /// The values of all pixels of the mask, `[pixels, channels]`.
+    pub(crate) fn values(&self) -> &'a [f32] {
+        let Batch { starts, arrays, shape, .. } = self.batch;
+        let (first, end) = (starts[self.words.start] as usize, starts[self.words.end] as usize);
+        &arrays.values[first * shape.channels()..end * shape.channels()]
+    }
+
     /// Number of pixels in the mask.
     pub fn pixel_count(&self) -> usize {
         (self.batch.starts[self.words.end] - self.batch.starts[self.words.start]) as usize
@@ -278,9 +280,7 @@ impl<'a> Column<'a> {
         let range = self.words.clone();
         let words = self.batch.arrays.words[range.clone()].iter().zip(&self.batch.arrays.masks[range]);
         words.for_each(|(&word, mask)| of_block[shape.block_of_word(word as usize)] += mask.count_ones());
-        let starts = &self.batch.starts;
-        let values = starts[self.words.start] as usize * channels..starts[self.words.end] as usize * channels;
-        let values = &self.batch.arrays.values[values];
+        let values = self.values();
         // Side by side: one sum after another would wait for each.
         let mut partial = [0.0; LANES];
         let (whole, rest) = values.as_chunks::<LANES>();

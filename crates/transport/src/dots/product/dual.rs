@@ -47,23 +47,24 @@ pub fn dual(
     check_shape("plane_energies", "[dots]", &[plane_energies.len()], &[batch.dots()])?;
     check_range("dual image's pixels", (height * width) as f64, height * width > 0, "at least 1")?;
     let channels = shape.channels();
-    let mut sums = Array3::<f64>::zeros((height, width, channels));
+    let mut image = Array3::<f32>::zeros((height, width, channels));
     let mut counts = Array2::<u32>::zeros((height, width));
+    let mut places = Vec::with_capacity(batch.dots());
     let energies = energies_of_channels(batch);
     for ((xy, &plane), energy) in centroids.xy.iter().zip(plane_energies).zip(energies) {
         let Some([x, y]) = xy.filter(|_| plane > 0.0) else { continue };
         let scaled =
             |at: f64, from: usize, to: usize| (((at + 0.5) * to as f64 / from as f64) as usize).min(to - 1);
         let at = [scaled(y, shape.height(), height), scaled(x, shape.width(), width)];
-        for channel in 0..channels {
-            sums[[at[0], at[1], channel]] += energy[channel] / plane;
-        }
         counts[at] += 1;
+        places.push((at, energy.map(|energy| energy / plane)));
+    }
+    for (at, light) in places {
+        for (channel, light) in light.iter().enumerate().take(channels) {
+            image[[at[0], at[1], channel]] += (light / f64::from(counts[at])) as f32;
+        }
     }
     let known = counts.mapv(|count| count > 0);
-    let mut image = Array3::from_shape_fn(sums.dim(), |(row, column, channel)| {
-        (sums[[row, column, channel]] / f64::from(counts[[row, column]].max(1))) as f32
-    });
     fill_holes(&mut image, &known);
     Ok(DualImage { image, known })
 }
@@ -83,12 +84,17 @@ pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     let mut filled = vec![0.0_f32; (height + 2) * stride];
     let mut is_open = vec![false; filled.len()];
     let mut values = vec![0.0_f32; filled.len() * channels];
-    for ((row, column), &known) in known.indexed_iter() {
-        let pixel = inside(row, column);
-        (filled[pixel], is_open[pixel]) = (f32::from(u8::from(known)), !known);
-        if known {
-            (0..channels)
-                .for_each(|channel| values[pixel * channels + channel] = image[[row, column, channel]]);
+    for (row, (known, pixels)) in known.outer_iter().zip(image.outer_iter()).enumerate() {
+        let places = inside(row, 0)..inside(row, width);
+        let state = filled[places.clone()].iter_mut().zip(&mut is_open[places.clone()]);
+        for (((filled, is_open), &known), (pixel, values)) in state
+            .zip(known)
+            .zip(pixels.outer_iter().zip(values[places.start * channels..].chunks_exact_mut(channels)))
+        {
+            (*filled, *is_open) = (f32::from(u8::from(known)), !known);
+            if known {
+                values.iter_mut().zip(pixel).for_each(|(value, &light)| *value = light);
+            }
         }
     }
     let neighbours = |pixel: usize| [pixel - 1, pixel + 1, pixel - stride, pixel + stride];
@@ -120,12 +126,11 @@ pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
         }
         std::mem::swap(&mut rim, &mut next);
     }
-    for (row, mut pixels) in image.outer_iter_mut().enumerate() {
-        for (column, mut pixel) in pixels.outer_iter_mut().enumerate() {
-            let at = inside(row, column);
-            if filled[at] > 0.0 {
-                pixel.iter_mut().zip(&values[at * channels..]).for_each(|(place, &value)| *place = value);
-            }
+    // Where nothing is known, nothing was filled.
+    if known.iter().any(|&known| known) {
+        for (row, mut pixels) in image.outer_iter_mut().enumerate() {
+            let places = inside(row, 0) * channels..inside(row, width) * channels;
+            pixels.iter_mut().zip(&values[places]).for_each(|(pixel, &value)| *pixel = value);
         }
     }
 }

@@ -1,12 +1,14 @@
+use std::ops::Range;
+
 use super::Separation;
 use super::relight::floodlit;
-use super::sum::{add_blocks, by_bands, first_word};
+use super::sum::{add_blocks, blocks_of, by_bands, first_word, sum_blocks};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Fundamental;
 use crate::dots::column::runs;
 use crate::dots::error::{check_range, check_shape};
 use crate::dots::shape::BLOCK_PX;
-use crate::dots::{Batch, DotsError};
+use crate::dots::{Batch, DotsError, FrameShape};
 
 /// Width of the frames that distances of masks are given for, in pixels.
 const REFERENCE_WIDTH_PX: f64 = 1024.0;
@@ -115,6 +117,24 @@ impl Line {
         self.x * x + self.y * y + self.constant
     }
 
+    /// Those blocks of a row that the mask may reach into; all others have none of it.
+    fn blocks_near(&self, falloff: &Falloff, band: usize, shape: FrameShape) -> Range<usize> {
+        let reach = falloff.reach_px() + (HALF_PX + 0.5) * std::f64::consts::SQRT_2;
+        let columns = shape.block_columns();
+        // Distance of the block's middle: a linear function of its column.
+        let at_0 = self.signed(HALF_PX, (band * BLOCK_PX) as f64 + HALF_PX);
+        let step = self.x * BLOCK_PX as f64;
+        let (one, other) = ((-reach - at_0) / step, (reach - at_0) / step);
+        let (first, last) = match step == 0.0 {
+            true if at_0.abs() <= reach => (0.0, columns as f64 - 1.0),
+            true => return 0..0,
+            false => (one.min(other).ceil(), one.max(other).floor()),
+        };
+        let within = |column: f64| column.clamp(0.0, columns as f64) as usize;
+        let (first, end) = (within(first), within(last + 1.0));
+        band * columns + first..band * columns + end.max(first)
+    }
+
     fn distance(&self, x: f64, y: f64) -> f64 {
         self.signed(x, y).abs()
     }
@@ -147,28 +167,36 @@ pub fn epipolar(
         .map(|mirror| mirror.and_then(|mirror| Line::new(fundamental.epipolar_line(mirror))))
         .collect();
 
-    let (channels, columns) = (shape.channels(), shape.block_columns());
-    let direct = by_bands(shape, channels, |band, sums| {
-        let pixels = sums.len() / channels;
-        let (mut blocks, mut shares) = (vec![0.0; columns * channels], vec![0.0; columns]);
-        let mut weights = [0.0; BLOCK_PX];
-        for (dot, line) in lines.iter().enumerate() {
-            let Some(line) = line else { continue };
-            let column = batch.band(dot, band);
-            for (at, share) in shares.iter_mut().enumerate() {
-                *share = share_of_block(line, &falloff, (at * BLOCK_PX) as f64, (band * BLOCK_PX) as f64);
-                if *share > 0.0 {
-                    for channel in 0..channels {
-                        blocks[channel * columns + at] +=
-                            *share * f64::from(column.residual()[at * channels + channel]);
-                    }
+    let (channels, blocks) = (shape.channels(), shape.blocks());
+    let residual = sum_blocks(batch, channels, |dot, sums| {
+        let Some(line) = &lines[dot] else { return };
+        let means = batch.column(dot).residual();
+        for band in 0..shape.block_rows() {
+            for block in line.blocks_near(&falloff, band, shape) {
+                let share = share_of_block(line, &falloff, block, shape);
+                for channel in 0..channels {
+                    sums[channel * blocks + block] += share * f64::from(means[block * channels + channel]);
                 }
             }
-            for Word { word, mask, values } in column.words() {
-                let block = word % columns;
+        }
+    });
+    let [direct] = by_bands(shape, channels, |band, sums| {
+        let pixels = sums.len() / channels;
+        let mut weights = [0.0; BLOCK_PX];
+        for (dot, column) in batch.in_band(band) {
+            let Some(line) = &lines[dot] else { continue };
+            // Each row of a disc goes through the same few blocks.
+            let mut shares = [(usize::MAX, 0.0); 2];
+            for Word { word, mask, mut values } in column.words() {
+                let block = shape.block_of_word(word);
+                let slot = &mut shares[block % 2];
+                if slot.0 != block {
+                    *slot = (block, share_of_block(line, &falloff, block, shape));
+                }
+                let share = slot.1;
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
-                let (left, y) = ((block * BLOCK_PX) as f64, (word / columns) as f64);
-                let mut values = values;
+                let left = (word % shape.block_columns() * BLOCK_PX) as f64;
+                let y = (word / shape.block_columns()) as f64;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
@@ -178,33 +206,31 @@ pub fn epipolar(
                         let place = channel * pixels + first;
                         let sums = sums[place + run.start..place + run.end].iter_mut();
                         // The block's mean goes to all pixels in the end; here it is not the light.
-                        let mean = shares[block] * f64::from(column.residual()[block * channels + channel]);
+                        let mean = share * f64::from(column.residual()[block * channels + channel]);
                         let light = of_run[channel..].iter().step_by(channels).zip(&*weights);
                         sums.zip(light)
-                            .for_each(|(sum, (&value, share))| *sum += share * f64::from(value) - mean);
+                            .for_each(|(sum, (&value, weight))| *sum += weight * f64::from(value) - mean);
                     }
                 }
             }
         }
-        for (sums, blocks) in sums.chunks_exact_mut(pixels).zip(blocks.chunks_exact(columns)) {
-            add_blocks(sums, blocks.iter().copied());
+        for (sums, residual) in sums.chunks_exact_mut(pixels).zip(residual.chunks_exact(blocks)) {
+            add_blocks(sums, &residual[blocks_of(batch, band)]);
         }
     });
     let global = floodlit(batch) - &direct;
     Ok(Separation { direct, global })
 }
 
+/// From the middle of a block to its first pixel.
+const HALF_PX: f64 = (BLOCK_PX as f64 - 1.0) / 2.0;
+
 /// Mean of the mask over a block.
-fn share_of_block(line: &Line, falloff: &Falloff, left: f64, top: f64) -> f64 {
-    let half = (BLOCK_PX as f64 - 1.0) / 2.0;
-    let reach = falloff.distance_px
-        + REACH_SIGMAS * falloff.sigma_px
-        + BLOCK_PX as f64 * std::f64::consts::FRAC_1_SQRT_2;
-    if line.distance(left + half, top + half) > reach {
-        return 0.0;
-    }
-    let pitch = (BLOCK_PX / POINTS) as f64;
-    let at = |point: usize| (point as f64 + 0.5) * pitch - 0.5;
+fn share_of_block(line: &Line, falloff: &Falloff, block: usize, shape: FrameShape) -> f64 {
+    const PITCH_PX: usize = BLOCK_PX / POINTS;
+    let left = (block % shape.block_columns() * BLOCK_PX) as f64;
+    let top = (block / shape.block_columns() * BLOCK_PX) as f64;
+    let at = |point: usize| (point * PITCH_PX) as f64 + (PITCH_PX as f64 - 1.0) / 2.0;
     let points = (0..POINTS * POINTS).map(|point| (left + at(point % POINTS), top + at(point / POINTS)));
     points.map(|(x, y)| falloff.at(line.distance(x, y))).sum::<f64>() / (POINTS * POINTS) as f64
 }

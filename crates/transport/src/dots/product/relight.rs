@@ -1,6 +1,6 @@
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3};
 
-use super::sum::{add_blocks, by_bands, first_word};
+use super::sum::{add_blocks, blocks_of, by_bands, first_word, sum_blocks};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Centroids;
 use crate::dots::column::runs;
@@ -80,49 +80,51 @@ fn cubic(at: f64, size: usize) -> [(usize, f64); 4] {
 
 fn weighted(batch: &Batch, weights: ArrayView2<f32>) -> Array3<f32> {
     let (shape, colours) = (batch.shape(), weights.ncols());
-    let (channels, columns) = (shape.channels(), shape.block_columns());
-    by_bands(shape, colours, |band, sums| {
+    let (channels, blocks) = (shape.channels(), shape.blocks());
+    // One channel serves all colours.
+    let channel_of = |colour: usize| colour.min(channels - 1);
+    let residual = sum_blocks(batch, colours, |dot, sums| {
+        let means = batch.column(dot).residual();
+        for (colour, sums) in sums.chunks_exact_mut(blocks).enumerate() {
+            let weight = f64::from(weights[[dot, colour]]);
+            let add = |(sum, &mean): (&mut f64, &f32)| *sum += weight * f64::from(mean);
+            match channels {
+                1 => sums.iter_mut().zip(means).for_each(add),
+                _ => sums.iter_mut().zip(means[channel_of(colour)..].iter().step_by(channels)).for_each(add),
+            }
+        }
+    });
+    let [image] = by_bands(shape, colours, |band, sums| {
         let pixels = sums.len() / colours;
-        let mut blocks = vec![0.0; columns * colours];
-        for (dot, weights) in weights.rows().into_iter().enumerate() {
-            if weights.iter().all(|&weight| weight == 0.0) {
-                continue;
-            }
-            let column = batch.band(dot, band);
-            for (colour, &weight) in weights.iter().enumerate() {
-                // One channel serves all colours.
-                let means = column.residual()[colour.min(channels - 1)..].iter().step_by(channels);
-                let blocks = blocks[colour * columns..].iter_mut();
-                blocks.zip(means).for_each(|(sum, &mean)| *sum += f64::from(weight) * f64::from(mean));
-            }
+        for (dot, column) in batch.in_band(band) {
             for Word { word, mask, mut values } in column.words() {
-                let block = word % columns;
+                let block = shape.block_of_word(word);
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
-                    for (colour, &weight) in weights.iter().enumerate() {
-                        let (channel, weight) = (colour.min(channels - 1), f64::from(weight));
+                    for colour in 0..colours {
+                        let weight = f64::from(weights[[dot, colour]]);
                         // The block's mean goes to all pixels in the end; here it is not the light.
-                        let mean = f64::from(column.residual()[block * channels + channel]);
+                        let mean = f64::from(column.residual()[block * channels + channel_of(colour)]);
                         let place = colour * pixels + first;
                         let sums = &mut sums[place + run.start..place + run.end];
+                        let add =
+                            |(sum, &value): (&mut f64, &f32)| *sum += weight * (f64::from(value) - mean);
                         match channels {
-                            1 => sums
-                                .iter_mut()
-                                .zip(of_run)
-                                .for_each(|(sum, &value)| *sum += weight * (f64::from(value) - mean)),
+                            1 => sums.iter_mut().zip(of_run).for_each(add),
                             _ => sums
                                 .iter_mut()
-                                .zip(of_run[channel..].iter().step_by(channels))
-                                .for_each(|(sum, &value)| *sum += weight * (f64::from(value) - mean)),
+                                .zip(of_run[channel_of(colour)..].iter().step_by(channels))
+                                .for_each(add),
                         }
                     }
                 }
             }
         }
-        for (sums, blocks) in sums.chunks_exact_mut(pixels).zip(blocks.chunks_exact(columns)) {
-            add_blocks(sums, blocks.iter().copied());
+        for (sums, residual) in sums.chunks_exact_mut(pixels).zip(residual.chunks_exact(blocks)) {
+            add_blocks(sums, &residual[blocks_of(batch, band)]);
         }
-    })
+    });
+    image
 }

@@ -3,7 +3,7 @@ use rayon::prelude::*;
 
 use super::Separation;
 use super::relight::floodlit;
-use super::sum::{by_bands, first_word};
+use super::sum::{blocks_of, by_bands, first_word};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Confusion;
 use crate::dots::calibrate::luminance;
@@ -28,15 +28,16 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
     check_range("dots", dots as f64, dots >= 2, "at least 2")?;
     let channels = batch.shape().channels();
     let light = floodlit(batch);
-    // Largest and least light that one dot takes away, one image each: as two more channels.
-    let extremes = by_bands(batch.shape(), 2 * channels, |band, sums| {
+    let share = dots as f64 / (dots - 1) as f64;
+    let [direct, global] = by_bands(batch.shape(), channels, |band, sums| {
         let pixels = sums.len() / (2 * channels);
         let mut covering = vec![0_u32; pixels];
+        // Largest and least light that one dot takes away.
         let (most, least) = sums.split_at_mut(channels * pixels);
         most.fill(f64::NEG_INFINITY);
         least.fill(f64::INFINITY);
-        for dot in 0..dots {
-            for Word { word, mask, mut values } in batch.band(dot, band).words() {
+        for (_, column) in batch.in_band(band) {
+            for Word { word, mask, mut values } in column.words() {
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
@@ -55,25 +56,27 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
                 }
             }
         }
-        for (pixel, &covering) in covering.iter().enumerate() {
-            for at in (0..channels).map(|channel| channel * pixels + pixel) {
+        let light = of_band(&light, band, pixels * channels);
+        for channel in 0..channels {
+            let at = channel * pixels..(channel + 1) * pixels;
+            let extremes = most[at.clone()].iter_mut().zip(&mut least[at]);
+            let light = light[channel..].iter().step_by(channels);
+            for (((most, least), &light), &covering) in extremes.zip(light).zip(&covering) {
                 // A dot that does not cover the pixel takes nothing away.
-                if (covering as usize) < dots {
-                    (most[at], least[at]) = (most[at].max(0.0), least[at].min(0.0));
-                }
+                let none = if (covering as usize) < dots { 0.0 } else { *most };
+                let (largest, smallest) = (most.max(none), least.min(none));
+                (*most, *least) = (largest - smallest, (f64::from(light) - largest) * share);
             }
         }
     });
-    let share = dots as f32 / (dots - 1) as f32;
-    let separate = |at: (usize, usize, usize)| {
-        let (row, column, channel) = at;
-        let (most, least) = (extremes[at], extremes[[row, column, channels + channel]]);
-        (most - least, (light[at] - most) * share)
-    };
-    Ok(Separation {
-        direct: Array3::from_shape_fn(light.dim(), |at| separate(at).0),
-        global: Array3::from_shape_fn(light.dim(), |at| separate(at).1),
-    })
+    Ok(Separation { direct, global })
+}
+
+/// The part of an image that a row of blocks has, `[pixels, channels]`.
+fn of_band(image: &Array3<f32>, band: usize, values: usize) -> &[f32] {
+    let (_, width, channels) = image.dim();
+    let first = band * BLOCK_PX * width * channels;
+    image.as_slice().map_or(&[], |image| &image[first..first + values])
 }
 
 /// Separates direct from global light where dots overlap: at each pixel, all dots are switched off that share pixels of the
@@ -87,7 +90,7 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
 /// others for neighbours.
 pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separation, DotsError> {
     let (shape, dots) = (batch.shape(), batch.dots());
-    let (channels, columns) = (shape.channels(), shape.block_columns());
+    let channels = shape.channels();
     check_shape("confusion", "[dots]", &[confusion.dots()], &[dots])?;
     let most = (0..dots).map(|dot| confusion.neighbours(dot).len().max(1)).max().unwrap_or(0);
     check_range(
@@ -98,12 +101,13 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
     )?;
     let is_neighbour = Neighbours::new(confusion);
     let light = floodlit(batch);
-    // What the dots that are switched off would give, in the pixels' channels, and N / (N - |S|) in one more.
-    let off = by_bands(shape, channels + 1, |band, sums| {
-        let pixels = sums.len() / (channels + 1);
+    let [direct, global] = by_bands(shape, channels, |band, sums| {
+        let pixels = sums.len() / (2 * channels);
+        // First what the dots that are switched off would give, then direct and global light.
+        let (off, global) = sums.split_at_mut(channels * pixels);
         let (mut brightest, mut dot_of) = (vec![f32::NEG_INFINITY; pixels], vec![NONE; pixels]);
-        for dot in 0..dots {
-            for Word { word, mask, mut values } in batch.band(dot, band).words() {
+        for (dot, column) in batch.in_band(band) {
+            for Word { word, mask, mut values } in column.words() {
                 let first = (word - first_word(batch, band)) * BLOCK_PX;
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
@@ -119,20 +123,20 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
                 }
             }
         }
-        for dot in 0..dots {
-            let (column, neighbours) = (batch.band(dot, band), is_neighbour.of(dot));
+        for (dot, column) in batch.in_band(band) {
+            let neighbours = is_neighbour.of(dot);
             for Word { word, mask, mut values } in column.words() {
-                let (first, block) = ((word - first_word(batch, band)) * BLOCK_PX, word % columns);
+                let first = (word - first_word(batch, band)) * BLOCK_PX;
+                let block = shape.block_of_word(word);
                 for run in runs(mask) {
                     let (of_run, rest) = values.split_at(run.len() * channels);
                     values = rest;
                     let run = first + run.start..first + run.end;
                     for channel in 0..channels {
                         let mean = f64::from(column.residual()[block * channels + channel]);
-                        let sums = &mut sums[channel * pixels + run.start..channel * pixels + run.end];
+                        let off = &mut off[channel * pixels + run.start..channel * pixels + run.end];
                         let light = of_run[channel..].iter().step_by(channels);
-                        for ((sum, &value), &brightest) in
-                            sums.iter_mut().zip(light).zip(&dot_of[run.clone()])
+                        for ((sum, &value), &brightest) in off.iter_mut().zip(light).zip(&dot_of[run.clone()])
                         {
                             let shares = neighbours[brightest as usize / 64] >> (brightest % 64) & 1 == 1;
                             *sum += if shares { f64::from(value) - mean } else { 0.0 };
@@ -142,42 +146,52 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
             }
         }
         // The neighbours' residual too is switched off; one sum serves all pixels of a block with the same dot.
+        let light = of_band(&light, band, pixels * channels);
         let mut residuals: Vec<Option<[f64; 3]>> = vec![None; dots];
-        for block in 0..columns {
-            let mut met = Vec::new();
-            let rows = (block * BLOCK_PX..pixels).step_by(shape.width());
+        let mut met = Vec::new();
+        for (column, block) in blocks_of(batch, band).enumerate() {
+            let rows = (column * BLOCK_PX..pixels).step_by(shape.width());
             for pixel in rows.flat_map(|first| first..first + BLOCK_PX) {
                 let dot = dot_of[pixel] as usize;
-                if dot_of[pixel] == NONE {
-                    sums[channels * pixels + pixel] = 1.0;
-                    continue;
-                }
-                // The calibration may not have seen the dot.
-                let itself = [dot as u32];
-                let neighbours = match confusion.neighbours(dot) {
-                    [] => &itself,
-                    neighbours => neighbours,
-                };
-                let residual = *residuals[dot].get_or_insert_with(|| {
-                    met.push(dot);
-                    let mut sum = [0.0; 3];
-                    for &other in neighbours {
-                        let means =
-                            &batch.band(other as usize, band).residual()[block * channels..][..channels];
-                        sum.iter_mut().zip(means).for_each(|(sum, &mean)| *sum += f64::from(mean));
+                let (residual, count) = match dot_of[pixel] {
+                    NONE => ([0.0; 3], 0),
+                    _ => {
+                        // The calibration may not have seen the dot.
+                        let itself = [dot as u32];
+                        let neighbours = match confusion.neighbours(dot) {
+                            [] => &itself,
+                            neighbours => neighbours,
+                        };
+                        let residual = *residuals[dot].get_or_insert_with(|| {
+                            met.push(dot);
+                            residual_of(batch, neighbours, block)
+                        });
+                        (residual, neighbours.len())
                     }
-                    sum
-                });
+                };
+                let share = dots as f64 / (dots - count) as f64;
                 for channel in 0..channels {
-                    sums[channel * pixels + pixel] += residual[channel];
+                    let at = channel * pixels + pixel;
+                    let light = f64::from(light[pixel * channels + channel]);
+                    global[at] = (light - off[at] - residual[channel]) * share;
+                    off[at] = light - global[at];
                 }
-                sums[channels * pixels + pixel] = dots as f64 / (dots - neighbours.len()) as f64;
             }
-            met.into_iter().for_each(|dot| residuals[dot] = None);
+            met.drain(..).for_each(|dot| residuals[dot] = None);
         }
     });
-    let global = Array3::from_shape_fn(light.dim(), |at| (light[at] - off[at]) * off[[at.0, at.1, channels]]);
-    Ok(Separation { direct: light - &global, global })
+    Ok(Separation { direct, global })
+}
+
+/// Sum of some dots' residual at one block.
+fn residual_of(batch: &Batch, dots: &[u32], block: usize) -> [f64; 3] {
+    let channels = batch.shape().channels();
+    let mut sum = [0.0; 3];
+    for &dot in dots {
+        let means = &batch.column(dot as usize).residual()[block * channels..][..channels];
+        sum.iter_mut().zip(means).for_each(|(sum, &mean)| *sum += f64::from(mean));
+    }
+    sum
 }
 
 /// The confusion matrix as bits, each dot its own neighbour even where the calibration has not seen it.
