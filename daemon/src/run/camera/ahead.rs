@@ -263,14 +263,7 @@ impl Ahead {
 
     /// When the frame `seq` has been triggered and its exposure begun.
     fn after_trigger_ns(&self, seq: u64) -> i64 {
-<<<<<<< HEAD
-        let Some((known_seq, known_ns)) = self.triggers.newest() else {
-            // By frames alone, then.
-            return if self.newest_seq.is_some_and(|newest| newest >= seq) { i64::MIN } else { i64::MAX };
-        };
-=======
-        let Some((known_seq, mut trigger_ns)) = self.triggers.newest() else { return i64::MAX };
->>>>>>> ahead
+        let Some((known_seq, known_ns)) = self.triggers.newest() else { return i64::MAX };
         if seq > self.newest_seq.unwrap_or(0) + FRAMES_UNDER_WAY {
             return i64::MAX;
         }
