@@ -36,13 +36,22 @@ pub struct GuestTest {
 }
 
 /// Adding a test is adding its line here, and its modules' folder in `kernel.rs` if it has a new one.
-const TESTS: [GuestTest; 1] = [GuestTest {
-    name: "guest_serial",
-    modules: &["xhci_pci", "ftdi_sio"],
-    devices: &[],
-    pipes: &["serial"],
-    environment: &[],
-}];
+const TESTS: &[GuestTest] = &[
+    GuestTest {
+        name: "guest_modemline",
+        modules: &["vhci-hcd", "ftdi_sio", "pps-ldisc"],
+        devices: &[],
+        pipes: &[],
+        environment: &[],
+    },
+    GuestTest {
+        name: "guest_serial",
+        modules: &["xhci_pci", "ftdi_sio"],
+        devices: &[],
+        pipes: &["serial"],
+        environment: &[],
+    },
+];
 
 /// Runs the tests that are named, or all.
 pub fn guest(names: &[&str]) -> Done {
