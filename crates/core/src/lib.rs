@@ -10,6 +10,7 @@ mod device;
 mod error;
 mod film;
 mod frame;
+mod pattern;
 mod pixel;
 mod raster;
 mod units;
@@ -17,12 +18,13 @@ mod units;
 pub use clock::{Clock, ClockHandle};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
-    Applied, Camera, CameraCapabilities, CameraSettings, FirstFrame, Pattern, Projector, Readout, SettingsId,
-    Shown, Shutter, Vsync,
+    Applied, Camera, CameraCapabilities, CameraSettings, FirstFrame, Projector, Readout, SettingsId, Shown,
+    Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
 pub use frame::{Edge, Frame, FrameBuf, FramePool, FrameStamp};
+pub use pattern::{Pattern, PatternError};
 pub use pixel::{PixelError, PixelFormat};
 pub use raster::{Raster, Trigger};
 pub use units::{ns_from_us, us_from_ns};

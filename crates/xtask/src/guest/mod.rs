@@ -38,6 +38,13 @@ pub struct GuestTest {
 /// Adding a test is adding its line here, and its modules' folder in `kernel.rs` if it has a new one.
 const TESTS: &[GuestTest] = &[
     GuestTest {
+        name: "guest_drm",
+        modules: &["virtio-gpu"],
+        devices: &["virtio-gpu-pci"],
+        pipes: &[],
+        environment: &[("RAYSWEEP_DRM_CARD", "/dev/dri/card0")],
+    },
+    GuestTest {
         name: "guest_modemline",
         modules: &["vhci-hcd", "ftdi_sio", "pps-ldisc"],
         devices: &[],
