@@ -52,8 +52,9 @@ pub fn render(pattern: &Pattern, (columns, rows): (usize, usize)) -> Result<Vec<
         (None, Pattern::Checkerboard { cell_px, shift_px }) => {
             let cell = *cell_px as usize;
             // The board repeats after two cells, so a shift is the same as one by less than that.
-            let lit_half =
-                |at: usize, shift: u32| (at + 2 * cell - shift as usize % (2 * cell)) / cell % 2 == 0;
+            let lit_half = |at: usize, shift: u32| {
+                ((at + 2 * cell - shift as usize % (2 * cell)) / cell).is_multiple_of(2)
+            };
             let pixel = |x, y| lit_half(x, shift_px.0) == lit_half(y, shift_px.1);
             let pixels = (0..rows).flat_map(|y| (0..columns).map(move |x| (x, y)));
             Ok(pixels.map(|(x, y)| code(if pixel(x, y) { 1.0 } else { 0.0 })).collect())

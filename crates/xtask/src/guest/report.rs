@@ -44,8 +44,11 @@ pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<u
             None => {
                 let what = if machine.has_ended() { "the guest ended" } else { "the guest hangs" };
                 failures.push(failure(&folder, &format!("{what} in {}", test.name)));
-                failures.push(format!("what the guest's kernel said: {}", run.join("console").display()));
-                failures.push(format!("what QEMU said: {}", run.join("qemu.log").display()));
+                for log in ["console", "qemu.log"] {
+                    let log = run.join(log);
+                    let said = std::fs::read_to_string(&log).unwrap_or_default();
+                    failures.push(format!("{}:\n{said}", log.display()));
+                }
                 break;
             }
         }
