@@ -5,6 +5,7 @@
 
 mod guest;
 
+use std::fs;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -23,7 +24,11 @@ const PERIOD: Duration = Duration::from_nanos(16_666_667);
 const PULSE: Duration = Duration::from_millis(8);
 
 fn plug() -> (Plugged, FtdiLine) {
-    let (converter, line) = Ftdi::new(PERIOD, PULSE);
+    plug_with(PERIOD, PULSE)
+}
+
+fn plug_with(period: Duration, pulse: Duration) -> (Plugged, FtdiLine) {
+    let (converter, line) = Ftdi::new(period, pulse);
     let plugged = Plugged::new(converter).unwrap();
     wait_for(PORT, || Path::new(PORT).exists().then_some(()));
     (plugged, line)
@@ -130,5 +135,31 @@ fn pulse_per_second_source_has_the_kernel_s_stamps_and_numbers() {
         }
     };
     assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
+    drop(attached);
+}
+
+/// On a line that rises and stays, only one of two watchers sees an edge.
+fn only_the_first_sees_an_edge(mut watchers: [impl Vsync; 2], line: &FtdiLine) {
+    line.start();
+    assert_eq!(watchers[0].next_edge(PATIENCE).unwrap().map(|edge| edge.seq), Some(1));
+    assert_eq!(watchers[1].next_edge(Duration::from_millis(200)).unwrap(), None);
+}
+
+#[test]
+#[ignore = "needs the kernel guest: cargo xtask guest"]
+fn the_polarity_says_which_change_is_the_edge() {
+    let long = Duration::from_secs(3600);
+    let both = [Polarity::Assert, Polarity::Clear];
+    let (plugged, line) = plug_with(2 * long, long);
+    let open = |edge| ModemLine::open(Path::new(PORT), Line::Dcd, edge).unwrap();
+    only_the_first_sees_an_edge(both.map(open), &line);
+    unplug(plugged);
+
+    let (plugged, line) = plug_with(2 * long, long);
+    let attached = LineDiscipline::pps();
+    let source = wait_for("a source", || fs::read_dir("/sys/class/pps").unwrap().next());
+    let source = Path::new("/dev").join(source.unwrap().file_name());
+    only_the_first_sees_an_edge(both.map(|edge| Pps::open(&source, edge).unwrap()), &line);
+    unplug(plugged);
     drop(attached);
 }

@@ -8,17 +8,19 @@ use super::qemu::Machine;
 use super::script::TEST_LIMIT_S;
 use crate::run::Done;
 
-/// Of a guest that boots in 5 s.
-const BOOT_LIMIT: Duration = Duration::from_secs(60);
+/// Beyond what the guest itself grants a test, so that it comes first: for booting, which takes 5 s, and loading modules.
+const MARGIN: Duration = Duration::from_secs(60);
+
+/// What `timeout` returns of a program that it had to kill.
+const KILLED: &str = "137";
 
 /// Prints what the tests say until the last has ended; counts the checks that passed.
 pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<usize> {
     let mut checks = 0;
     let mut failures = Vec::new();
-    for (index, test) in tests.iter().enumerate() {
+    for test in tests {
         let folder = run.join(test.name);
-        let limit =
-            Duration::from_secs(TEST_LIMIT_S.into()) + if index == 0 { BOOT_LIMIT } else { Duration::ZERO };
+        let limit = Duration::from_secs(TEST_LIMIT_S.into()) + MARGIN;
         let mut printed = 0;
         let began = Instant::now();
         let code = loop {
@@ -40,6 +42,10 @@ pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<u
         match code.as_deref().map(str::trim) {
             Some("0") if printed > 0 => {}
             Some("0") => failures.push(format!("{}: no check in it", test.name)),
+            Some(KILLED) => {
+                failures
+                    .push(failure(&folder, &format!("{} did not end within {TEST_LIMIT_S} s", test.name)));
+            }
             Some(code) => failures.push(failure(&folder, &format!("{} ended with code {code}", test.name))),
             None => {
                 let what = if machine.has_ended() { "the guest ended" } else { "the guest hangs" };
