@@ -2,3 +2,5 @@
 
 pub mod camera;
 pub mod mirror;
+pub mod projector;
+pub mod vsync;

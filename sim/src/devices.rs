@@ -11,7 +11,7 @@ use raysweep_core::{
 
 use crate::gige::Look;
 use crate::line::{Exposure, Light, Line, LineTruth};
-use crate::rig::Bench;
+use crate::rig::{Bench, SimError};
 use crate::sensor::Exposed;
 
 /// The devices of one rig, all on one clock.
@@ -262,10 +262,11 @@ struct SimProjector {
 
 impl Projector for SimProjector {
     fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
-        let optics = self
-            .bench
-            .optics_of(pattern)
-            .map_err(|error| DeviceError::new("projector", DeviceErrorKind::OutOfRange, error))?;
+        let optics = self.bench.optics_of(pattern).map_err(|error| {
+            let along_rows = matches!(error, SimError::AlongRows);
+            let kind = if along_rows { DeviceErrorKind::Unsupported } else { DeviceErrorKind::OutOfRange };
+            DeviceError::new("projector", kind, error)
+        })?;
         Ok(Shown { not_before_ns: self.line.lock().show(self.clock.now_ns(), Some(optics)) })
     }
 

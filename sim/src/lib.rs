@@ -15,6 +15,7 @@ pub mod optics;
 mod rig;
 pub mod scene;
 mod sensor;
+pub mod usb;
 
 pub use config::SimConfig;
 pub use devices::{Devices, TruthProbe, WireDevices};

@@ -4,7 +4,9 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use ndarray::Array2;
-use raysweep_core::{CameraCapabilities, Clock, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
+use raysweep_core::{
+    CameraCapabilities, Clock, Pattern, PatternError, PixelFormat, Raster, Shutter, ns_from_us,
+};
 
 use crate::config::SimConfig;
 use crate::devices::{self, Devices, WireDevices};
@@ -55,13 +57,13 @@ pub enum SimError {
     )]
     Beam,
     /// A pattern for another projector.
-    #[error("the pattern has {given} rows, projector.rows = {rows}: give one weight in 0..=1 for each row")]
-    Pattern {
-        /// Rows of the pattern.
-        given: usize,
-        /// Rows of the projector.
-        rows: usize,
-    },
+    #[error(transparent)]
+    Pattern(#[from] PatternError),
+    /// A pattern that the scenes, which know light by its row, cannot be lit with.
+    #[error(
+        "the simulated projector shows white, black, a line and row weights: a pattern that changes along rows needs a real one"
+    )]
+    AlongRows,
     /// A key of `[sim]` outside its range.
     #[error("sim.{key} = {value}: allowed is {allowed}")]
     Range {
@@ -78,9 +80,11 @@ impl SimError {
     /// The key below `[sim]` that it is about.
     pub fn key(&self) -> &'static str {
         match self {
-            Self::Scene(_) | Self::SceneRows { .. } | Self::CameraRows { .. } | Self::Pattern { .. } => {
-                "scene"
-            }
+            Self::Scene(_)
+            | Self::SceneRows { .. }
+            | Self::CameraRows { .. }
+            | Self::Pattern(_)
+            | Self::AlongRows => "scene",
             Self::RowTable => "projector.row_table",
             Self::Beam => "projector.beam",
             Self::Range { key, .. } => key,
@@ -240,21 +244,14 @@ impl Bench {
             };
             self.scenes.iter().map(optics).collect::<Result<Shown, SimError>>()
         };
-        match pattern {
-            Pattern::White => {
-                if let Some(white) = self.white.get() {
-                    return Ok(white.clone());
-                }
-                let white = build(&vec![1.0; rows])?;
-                Ok(self.white.get_or_init(|| white).clone())
+        if *pattern == Pattern::White {
+            if let Some(white) = self.white.get() {
+                return Ok(white.clone());
             }
-            Pattern::Rows(weights) => {
-                if weights.len() != rows || weights.iter().any(|weight| !(0.0..=1.0).contains(weight)) {
-                    return Err(SimError::Pattern { given: weights.len(), rows });
-                }
-                build(weights)
-            }
+            let white = build(&vec![1.0; rows])?;
+            return Ok(self.white.get_or_init(|| white).clone());
         }
+        build(&pattern.row_weights(rows)?.ok_or(SimError::AlongRows)?)
     }
 
     /// When row `t` starts its exposure, after row 0.

@@ -272,6 +272,8 @@ fn what_a_camera_cannot_do_is_refused_by_field_and_value() {
     let error = devices.camera.next_frame(&mut data, Duration::ZERO).unwrap_err();
     assert_eq!(error.kind, DeviceErrorKind::NotReady);
     assert!(devices.projector.show(&Pattern::Rows(vec![1.0; 3])).unwrap_err().to_string().contains("3 rows"));
+    let board = Pattern::Checkerboard { cell_px: 8, shift_px: (0, 0) };
+    assert_eq!(devices.projector.show(&board).unwrap_err().kind, DeviceErrorKind::Unsupported);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use crate::{DeviceError, Edge, FrameBuf, FrameStamp, LossCause, PixelFormat};
+use crate::{DeviceError, Edge, FrameBuf, FrameStamp, LossCause, Pattern, PixelFormat};
 
 /// How a sensor exposes its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -236,15 +236,6 @@ pub trait Vsync: Send {
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError>;
 }
 
-/// What a projector shows.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Pattern {
-    /// Every row fully lit.
-    White,
-    /// A weight in 0..=1 for each row, top row first.
-    Rows(Vec<f32>),
-}
-
 /// From when on a pattern is certain to be in the light.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shown {
@@ -257,7 +248,7 @@ pub trait Projector: Send {
     /// Shows a pattern.
     ///
     /// # Errors
-    /// `OutOfRange` if the pattern does not fit the projector.
+    /// `OutOfRange` if the pattern does not fit the projector, `Unsupported` if it cannot show such a pattern at all.
     fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError>;
 
     /// Light off. Part of every way out.

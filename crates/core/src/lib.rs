@@ -12,6 +12,7 @@ mod error;
 mod film;
 mod frame;
 mod mirror;
+mod pattern;
 mod pixel;
 mod raster;
 mod units;
@@ -20,8 +21,8 @@ pub use clock::{Clock, ClockHandle};
 pub use clock_model::{ClockModel, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
-    Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Pattern, Projector,
-    Readout, SettingsId, SettingsLatency, Shown, Shutter, Vsync,
+    Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Projector, Readout,
+    SettingsId, SettingsLatency, Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
@@ -30,6 +31,7 @@ pub use mirror::{
     MAX_POINTS, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
     MirrorProgress, OpticalDeg, PathError, RasterScan, SecondOrder, Tilt,
 };
+pub use pattern::{Pattern, PatternError};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use units::{ns_from_us, us_from_ns};

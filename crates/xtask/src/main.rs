@@ -1,7 +1,8 @@
-//! `cargo xtask demo | test | bench`: the project's own commands. Plain std, so that they build at once everywhere.
+//! `cargo xtask demo | test | guest | bench`: the project's own commands. Plain std, so that they build at once everywhere.
 
 mod bench;
 mod demo;
+mod guest;
 mod packages;
 mod python;
 mod run;
@@ -9,11 +10,14 @@ mod test;
 
 use std::process::ExitCode;
 
+use test::Guest;
+
 const USAGE: &str = "\
 usage: cargo xtask <command>
 
   demo    build, run the paper's sweep on the simulated rig, write a report
-  test    install what the tests need, then format, lints, tests
+  test    install what the tests need, then format, lints, tests, the guest's too; --no-guest leaves these out
+  guest   the drivers' tests against real kernel drivers, in a QEMU guest; [TEST...] runs only those
   bench   measure: without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {
@@ -21,7 +25,9 @@ fn main() -> ExitCode {
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let done = match arguments.as_slice() {
         ["demo"] => demo::demo(),
-        ["test"] => test::test(),
+        ["test"] => test::test(Guest::Run),
+        ["test", "--no-guest"] => test::test(Guest::Skip),
+        ["guest", names @ ..] => guest::guest(names),
         ["bench", arguments @ ..] => bench::bench(arguments),
         _ => Err(USAGE.to_owned()),
     };

@@ -76,7 +76,8 @@ fn is_there(shows: &str) -> bool {
     std::env::split_paths(&path).any(|folder| folder.join(shows).exists())
 }
 
-fn is_root() -> bool {
+/// Whether we may install packages.
+pub fn is_root() -> bool {
     let uid = Command::new("id").arg("-u").output();
     uid.is_ok_and(|output| output.stdout.trim_ascii() == b"0")
 }

@@ -1,15 +1,29 @@
 //! `cargo xtask test`: everything that must hold.
 
 use crate::run::{Done, cargo, run};
-use crate::{packages, python};
+use crate::{guest, packages, python};
 
-/// Installs what is missing, then format, lints, tests, doc tests.
-pub fn test() -> Done {
+/// Whether the tests in the kernel guest belong to it.
+#[derive(Clone, Copy, PartialEq)]
+pub enum Guest {
+    Run,
+    Skip,
+}
+
+/// Installs what is missing, then format, lints, tests, doc tests, tests in the kernel guest.
+pub fn test(wanted: Guest) -> Done {
     packages::install()?;
     // Packages that read our files in real life.
     let python = python::environment("python", "requirements.txt")?;
     run(cargo().args(["fmt", "--all", "--check"]))?;
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--", "-D", "warnings"]))?;
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
-    run(cargo().args(["test", "--workspace", "--all-features"]).env("RAYSWEEP_PYTHON", python))
+    run(cargo().args(["test", "--workspace", "--all-features"]).env("RAYSWEEP_PYTHON", python))?;
+    match wanted {
+        Guest::Run => guest::guest(&[]),
+        Guest::Skip => {
+            println!("{}", guest::skipped());
+            Ok(())
+        }
+    }
 }

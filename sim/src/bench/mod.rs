@@ -24,7 +24,7 @@ enum Request {
     /// Tell every edge from now on; the connection is good for nothing else then.
     Edges,
     /// Show a pattern.
-    Show(Shown),
+    Show(Pattern),
     /// Light off.
     Blank,
     /// What really happened so far.
@@ -33,32 +33,6 @@ enum Request {
     Faults,
     /// What goes wrong from now on; what is left out goes right.
     SetFaults(Faults),
-}
-
-/// [`Pattern`] as it is written.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Shown {
-    White,
-    Rows(Vec<f32>),
-}
-
-impl From<&Pattern> for Shown {
-    fn from(pattern: &Pattern) -> Self {
-        match pattern {
-            Pattern::White => Self::White,
-            Pattern::Rows(weights) => Self::Rows(weights.clone()),
-        }
-    }
-}
-
-impl From<Shown> for Pattern {
-    fn from(shown: Shown) -> Self {
-        match shown {
-            Shown::White => Self::White,
-            Shown::Rows(weights) => Self::Rows(weights),
-        }
-    }
 }
 
 /// What the bench says.

@@ -125,7 +125,7 @@ impl RemoteProjector {
 
 impl Projector for RemoteProjector {
     fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
-        self.shown(&Request::Show(pattern.into()))
+        self.shown(&Request::Show(pattern.clone()))
     }
 
     fn blank(&mut self) -> Result<Shown, DeviceError> {

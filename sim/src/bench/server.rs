@@ -174,7 +174,7 @@ impl Bench {
 
     fn answer(&self, request: Request) -> Reply {
         let shown = match request {
-            Request::Show(shown) => lock(&self.projector).show(&shown.into()),
+            Request::Show(pattern) => lock(&self.projector).show(&pattern),
             Request::Blank => lock(&self.projector).blank(),
             Request::SetFaults(faults) => {
                 self.camera.set_faults(faults);

@@ -1,0 +1,175 @@
+//! A stock Debian kernel and the modules that the drivers' tests need, from its package, kept under the target folder.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::packages;
+use crate::run::{Done, run};
+
+/// The package that names the newest kernel. Not the cloud variant, which has neither cameras nor USB.
+const META_PACKAGE: &str = "linux-image-amd64";
+
+/// Where the modules lie that a test may ask for. Unpacking all 4000 would take longer than the tests.
+const MODULE_FOLDERS: [&str; 15] = [
+    "drivers/char",
+    "drivers/gpu/drm/*.ko",
+    "drivers/gpu/drm/display",
+    "drivers/gpu/drm/virtio",
+    "drivers/i2c",
+    "drivers/media",
+    "drivers/pps",
+    "drivers/usb",
+    "drivers/video",
+    "drivers/virtio",
+    "fs/9p",
+    "fs/fscache",
+    "fs/netfs",
+    "lib",
+    "net/9p",
+];
+
+/// An unpacked kernel.
+pub struct Kernel {
+    /// The ELF image, which QEMU boots faster than the compressed one.
+    pub image: PathBuf,
+    /// What the guest mounts at `/lib/modules`: one folder, named as `uname -r` says.
+    pub modules: PathBuf,
+    release: String,
+}
+
+impl Kernel {
+    /// The kernel below `folder`, downloaded and unpacked if it is not there yet.
+    pub fn fetch(folder: &Path) -> Done<Self> {
+        let kept = folder.join("kernel");
+        if !kept.join("vmlinux").exists() {
+            // Renamed only when whole, so that an interrupted download is begun anew.
+            let fresh = folder.join("kernel.part");
+            let _ = std::fs::remove_dir_all(&fresh);
+            let _ = std::fs::remove_dir_all(&kept);
+            std::fs::create_dir_all(&fresh).map_err(|error| format!("{}: {error}", fresh.display()))?;
+            unpack(&download(&fresh)?, &fresh)?;
+            std::fs::rename(&fresh, &kept).map_err(|error| format!("{}: {error}", kept.display()))?;
+        }
+        let modules = kept.join("lib/modules");
+        let release = only_entry(&modules, "")?;
+        Ok(Self { image: kept.join("vmlinux"), modules, release })
+    }
+
+    /// Where the modules lie below [`Kernel::modules`].
+    pub fn release(&self) -> &str {
+        &self.release
+    }
+
+    /// The files of modules and of all that they need, relative to the folder of the release.
+    pub fn files_of(&self, names: &[&str]) -> Done<BTreeSet<String>> {
+        let path = self.modules.join(&self.release).join("modules.dep");
+        let text = std::fs::read_to_string(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+        let mut files = BTreeSet::new();
+        for name in names {
+            let line = text.lines().find(|line| {
+                line.split_once(':').is_some_and(|(file, _)| file.ends_with(&format!("/{name}.ko")))
+            });
+            let line = line.ok_or_else(|| format!("{}: no module `{name}`", path.display()))?;
+            files.extend(line.replace(':', "").split_whitespace().map(str::to_owned));
+        }
+        Ok(files)
+    }
+}
+
+/// The kernel's package, through apt.
+fn download(folder: &Path) -> Done<PathBuf> {
+    let fetched = package_name().and_then(|name| download_package(&name, folder)).or_else(|error| {
+        if !packages::is_root() {
+            return Err(format!(
+                "cannot download the guest's kernel: {error}\nthe guest needs Debian's {META_PACKAGE}; is the list of \
+                 packages fresh?\n  sudo apt-get update"
+            ));
+        }
+        run(Command::new("apt-get").arg("update").stdout(Stdio::null()))?;
+        download_package(&package_name()?, folder)
+    });
+    fetched.and_then(|()| only_entry(folder, ".deb")).map(|file| folder.join(file))
+}
+
+fn package_name() -> Done<String> {
+    let output = Command::new("apt-cache")
+        .args(["depends", META_PACKAGE])
+        .output()
+        .map_err(|error| format!("cannot start apt-cache: {error}"))?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    let name = text.lines().find_map(|line| line.trim().strip_prefix("Depends: "));
+    name.map(str::to_owned).ok_or_else(|| format!("apt knows no package {META_PACKAGE}"))
+}
+
+fn download_package(name: &str, folder: &Path) -> Done {
+    // As root, apt would fetch as a user who may not write here, and warn of it.
+    run(Command::new("apt-get")
+        .args(["-o", "APT::Sandbox::User=root", "-qq", "download", name])
+        .current_dir(folder))
+}
+
+/// The parts of the package that a guest needs, and the index of its modules.
+fn unpack(package: &Path, folder: &Path) -> Done {
+    let mut archive = Command::new("dpkg-deb")
+        .arg("--fsys-tarfile")
+        .arg(package)
+        .stdout(Stdio::piped())
+        .spawn()
+        .map_err(|error| format!("cannot start dpkg-deb: {error}"))?;
+    let stream = archive.stdout.take().ok_or("dpkg-deb without output")?;
+    run(Command::new("tar")
+        .arg("-x")
+        .arg("-C")
+        .arg(folder)
+        .args(["--wildcards", "./boot/vmlinuz-*", "./lib/modules/*/modules.*"])
+        .args(MODULE_FOLDERS.map(|path| format!("./lib/modules/*/kernel/{path}")))
+        .stdin(stream))?;
+    let status = archive.wait().map_err(|error| format!("dpkg-deb: {error}"))?;
+    if !status.success() {
+        return Err(format!("dpkg-deb ended with {status}: is {} whole?", package.display()));
+    }
+    let _ = std::fs::remove_file(package);
+    let release = only_entry(&folder.join("lib/modules"), "")?;
+    run(Command::new("busybox").args(["depmod", "-b"]).arg(folder).arg(&release))?;
+    let compressed = folder.join("boot").join(format!("vmlinuz-{release}"));
+    decompress(&compressed, &folder.join("vmlinux"))
+}
+
+/// The ELF image inside `vmlinuz`, which is a loader followed by an xz stream.
+fn decompress(compressed: &Path, image: &Path) -> Done {
+    const XZ: &[u8] = b"\xfd7zXZ\0";
+    let bytes = std::fs::read(compressed).map_err(|error| format!("{}: {error}", compressed.display()))?;
+    let start = bytes
+        .windows(XZ.len())
+        .position(|window| window == XZ)
+        .ok_or_else(|| format!("{}: no xz stream", compressed.display()))?;
+    let stream = image.with_extension("xz");
+    std::fs::write(&stream, &bytes[start..]).map_err(|error| format!("{}: {error}", stream.display()))?;
+    let part = image.with_extension("part");
+    let output = std::fs::File::create(&part).map_err(|error| format!("{}: {error}", part.display()))?;
+    // The loader's own tail follows the stream: xz writes all of the image and then complains.
+    let _ = Command::new("xz")
+        .args(["-dc", "--single-stream"])
+        .arg(&stream)
+        .stdout(output)
+        .stderr(Stdio::null())
+        .status();
+    let _ = std::fs::remove_file(&stream);
+    let elf = std::fs::read(&part).is_ok_and(|bytes| bytes.starts_with(b"\x7fELF"));
+    if !elf {
+        return Err(format!("{}: its xz stream holds no ELF image", compressed.display()));
+    }
+    std::fs::rename(&part, image).map_err(|error| format!("{}: {error}", image.display()))
+}
+
+/// The name of the one entry of a folder that ends so.
+fn only_entry(folder: &Path, ending: &str) -> Done<String> {
+    let entries = std::fs::read_dir(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let names = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let names: Vec<String> = names.filter(|name| name.ends_with(ending)).collect();
+    match names.as_slice() {
+        [name] => Ok(name.clone()),
+        _ => Err(format!("{}: {} entries `*{ending}`, not one", folder.display(), names.len())),
+    }
+}

@@ -1,0 +1,81 @@
+//! Follows the tests in the guest: a line for each check as it ends, the log of each test that fails.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use super::GuestTest;
+use super::qemu::Machine;
+use super::script::TEST_LIMIT_S;
+use crate::run::Done;
+
+/// Beyond what the guest itself grants a test, so that it comes first: for booting, which takes 5 s, and loading modules.
+const MARGIN: Duration = Duration::from_secs(60);
+
+/// What `timeout` returns of a program that it had to kill.
+const KILLED: &str = "137";
+
+/// Prints what the tests say until the last has ended; counts the checks that passed.
+pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<usize> {
+    let mut checks = 0;
+    let mut failures = Vec::new();
+    for test in tests {
+        let folder = run.join(test.name);
+        let limit = Duration::from_secs(TEST_LIMIT_S.into()) + MARGIN;
+        let mut printed = 0;
+        let began = Instant::now();
+        let code = loop {
+            // The order matters: an exit code that is there stands for a log that is whole.
+            let code = std::fs::read_to_string(folder.join("exit")).ok().filter(|code| code.ends_with('\n'));
+            let ended = machine.has_ended();
+            let log = std::fs::read_to_string(folder.join("log")).unwrap_or_default();
+            let verdicts: Vec<&str> = log.lines().filter_map(verdict).collect();
+            for line in &verdicts[printed..] {
+                println!("  {}: {line}", test.name);
+            }
+            printed = verdicts.len();
+            if code.is_some() || ended || began.elapsed() > limit {
+                checks += verdicts.iter().filter(|line| line.ends_with("... ok")).count();
+                break code;
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        };
+        match code.as_deref().map(str::trim) {
+            Some("0") if printed > 0 => {}
+            Some("0") => failures.push(format!("{}: no check in it", test.name)),
+            Some(KILLED) => {
+                failures
+                    .push(failure(&folder, &format!("{} did not end within {TEST_LIMIT_S} s", test.name)));
+            }
+            Some(code) => failures.push(failure(&folder, &format!("{} ended with code {code}", test.name))),
+            None => {
+                let what = if machine.has_ended() { "the guest ended" } else { "the guest hangs" };
+                failures.push(failure(&folder, &format!("{what} in {}", test.name)));
+                for log in ["console", "qemu.log"] {
+                    let log = run.join(log);
+                    let said = std::fs::read_to_string(&log).unwrap_or_default();
+                    failures.push(format!("{}:\n{said}", log.display()));
+                }
+                break;
+            }
+        }
+    }
+    if failures.is_empty() {
+        Ok(checks)
+    } else {
+        Err(format!("kernel guest: failed\n{}", failures.join("\n")))
+    }
+}
+
+/// The line that ends a check: `test name ... ok`.
+fn verdict(line: &str) -> Option<&str> {
+    let line = line.strip_prefix("test ")?;
+    let (_, verdict) = line.split_once(" ... ")?;
+    ["ok", "FAILED", "ignored"].iter().any(|known| verdict.starts_with(known)).then_some(line)
+}
+
+/// What a failed test said, and where more stands.
+fn failure(folder: &Path, what: &str) -> String {
+    let log = folder.join("log");
+    let said = std::fs::read_to_string(&log).unwrap_or_default();
+    format!("{said}\n{what}; its log is {}, the kernel's beside it", log.display())
+}

@@ -1,0 +1,33 @@
+//! What the guest runs once it sees the host's folders.
+
+use super::GuestTest;
+
+/// A test that takes longer hangs.
+pub const TEST_LIMIT_S: u32 = 90;
+
+const PREFACE: &str = "\
+modprobe virtio_console
+mkdir -p /dev/virtio-ports
+for port in /sys/class/virtio-ports/*; do
+    ln -s /dev/${port##*/} /dev/virtio-ports/$(cat $port/name)
+done
+export RUST_BACKTRACE=1
+";
+
+/// The script: modules, then the test, its output and its exit code into its folder of the share.
+pub fn script(tests: &[&GuestTest]) -> String {
+    let mut script = PREFACE.to_owned();
+    for GuestTest { name, modules, environment, .. } in tests {
+        let environment: String =
+            environment.iter().map(|(name, value)| format!("{name}='{value}' ")).collect();
+        script += &format!("\ncd /share/{name}\n");
+        for module in *modules {
+            script += &format!("modprobe {module} >>log 2>&1\n");
+        }
+        script += &format!(
+            "env {environment}timeout -s KILL {TEST_LIMIT_S} ./test --include-ignored --test-threads=1 >>log 2>&1\n\
+             code=$?\ndmesg -c >dmesg\necho $code >exit\n"
+        );
+    }
+    script
+}

@@ -1,0 +1,172 @@
+//! A projector that the operator works: on another computer, or with a lens cap.
+//!
+//! The driver asks, whoever talks to the operator (a terminal, the daemon's socket) answers. What is shown already is not
+//! asked for again, so a sweep of many passes needs one answer.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::time::Duration;
+
+use raysweep_core::{Clock, DeviceError, DeviceErrorKind, Pattern, Projector, Shown};
+
+use super::DEVICE;
+
+/// What the operator is to show.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Wanted {
+    /// This pattern.
+    Pattern(Pattern),
+    /// No light at all.
+    Dark,
+}
+
+/// A question to the operator. Dropped without an answer, it counts as refused.
+pub struct Request {
+    /// What is to be shown.
+    pub wanted: Wanted,
+    answer: SyncSender<Result<(), String>>,
+}
+
+impl Request {
+    /// The operator says that it is shown.
+    pub fn done(self) {
+        // Nobody listens once the driver has lost patience.
+        let _ = self.answer.send(Ok(()));
+    }
+
+    /// The operator says that it cannot be shown, and why.
+    pub fn refuse(self, why: impl Into<String>) {
+        let _ = self.answer.send(Err(why.into()));
+    }
+}
+
+/// Why the operator's answer is none to go on with.
+#[derive(Debug, thiserror::Error)]
+enum ExternalError {
+    #[error("no operator is there to show {0:?}")]
+    Nobody(Wanted),
+    #[error("the operator has not shown {wanted:?} within {patience:?}: ask again when somebody is there")]
+    Late { wanted: Wanted, patience: Duration },
+    #[error("the operator did not show {wanted:?}: {why}")]
+    Refused { wanted: Wanted, why: String },
+}
+
+/// The projector.
+pub struct External {
+    requests: SyncSender<Request>,
+    patience: Duration,
+    shown: Option<Wanted>,
+    clock: Clock,
+}
+
+impl External {
+    /// The projector, and where its questions come out.
+    pub fn new(patience: Duration) -> (Self, Receiver<Request>) {
+        let (requests, receiver) = sync_channel(1);
+        (Self { requests, patience, shown: None, clock: Clock::real() }, receiver)
+    }
+
+    fn ask(&mut self, wanted: Wanted) -> Result<Shown, DeviceError> {
+        if self.shown.as_ref() != Some(&wanted) {
+            // Until the answer comes, anything may be in the light.
+            self.shown = None;
+            self.answer(&wanted).map_err(|error| {
+                let kind = match error {
+                    ExternalError::Nobody(_) => DeviceErrorKind::Disconnected,
+                    ExternalError::Late { .. } => DeviceErrorKind::Timeout,
+                    ExternalError::Refused { .. } => DeviceErrorKind::NotReady,
+                };
+                DeviceError::new(DEVICE, kind, error)
+            })?;
+            self.shown = Some(wanted);
+        }
+        Ok(Shown { not_before_ns: self.clock.now_ns() })
+    }
+
+    fn answer(&self, wanted: &Wanted) -> Result<(), ExternalError> {
+        let (answer, answers) = sync_channel(1);
+        let request = Request { wanted: wanted.clone(), answer };
+        // A full channel holds a question that nobody has read: the operator is no nearer for another one.
+        self.requests.try_send(request).map_err(|_error| ExternalError::Nobody(wanted.clone()))?;
+        let refused = |why| ExternalError::Refused { wanted: wanted.clone(), why };
+        match answers.recv_timeout(self.patience) {
+            Ok(answer) => answer.map_err(refused),
+            Err(RecvTimeoutError::Timeout) => {
+                Err(ExternalError::Late { wanted: wanted.clone(), patience: self.patience })
+            }
+            Err(RecvTimeoutError::Disconnected) => Err(refused("the question was dropped".to_owned())),
+        }
+    }
+}
+
+impl Projector for External {
+    fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
+        self.ask(Wanted::Pattern(pattern.clone()))
+    }
+
+    fn blank(&mut self) -> Result<Shown, DeviceError> {
+        self.ask(Wanted::Dark)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::mpsc::TryRecvError;
+
+    const LONG: Duration = Duration::from_secs(60);
+
+    /// Answers as many questions as there are answers and returns them.
+    fn operator(
+        requests: Receiver<Request>,
+        answers: Vec<Result<(), &'static str>>,
+    ) -> std::thread::JoinHandle<(Vec<Wanted>, Receiver<Request>)> {
+        std::thread::spawn(move || {
+            let asked = answers.into_iter().map(|answer| {
+                let request = requests.recv().unwrap();
+                let wanted = request.wanted.clone();
+                match answer {
+                    Ok(()) => request.done(),
+                    Err(why) => request.refuse(why),
+                }
+                wanted
+            });
+            (asked.collect(), requests)
+        })
+    }
+
+    #[test]
+    fn what_is_shown_is_not_asked_for_again() {
+        let (mut projector, requests) = External::new(LONG);
+        let operator = operator(requests, vec![Ok(()); 3]);
+        let before_ns = Clock::real().now_ns();
+        for _ in 0..2 {
+            assert!(projector.show(&Pattern::White).unwrap().not_before_ns >= before_ns);
+        }
+        projector.blank().unwrap();
+        projector.blank().unwrap();
+        projector.show(&Pattern::White).unwrap();
+        let (asked, requests) = operator.join().unwrap();
+        let white = Wanted::Pattern(Pattern::White);
+        assert_eq!(asked, [white.clone(), Wanted::Dark, white]);
+        assert!(matches!(requests.try_recv(), Err(TryRecvError::Empty)));
+    }
+
+    #[test]
+    fn a_refusal_is_told_and_asked_again() {
+        let (mut projector, requests) = External::new(LONG);
+        let operator = operator(requests, vec![Err("the lamp is broken"), Ok(())]);
+        let error = projector.show(&Pattern::White).unwrap_err();
+        assert_eq!(error.kind, DeviceErrorKind::NotReady);
+        assert!(error.to_string().contains("the lamp is broken"), "{error}");
+        projector.show(&Pattern::White).unwrap();
+        operator.join().unwrap();
+    }
+
+    #[test]
+    fn nobody_and_no_answer_are_told_apart() {
+        let (mut projector, requests) = External::new(Duration::from_millis(1));
+        assert_eq!(projector.blank().unwrap_err().kind, DeviceErrorKind::Timeout);
+        drop(requests);
+        assert_eq!(projector.blank().unwrap_err().kind, DeviceErrorKind::Disconnected);
+    }
+}
