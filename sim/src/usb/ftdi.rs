@@ -35,12 +35,18 @@ pub struct Ftdi {
 pub struct FtdiLine {
     pulses: Arc<AtomicU64>,
     toggles: Arc<AtomicBool>,
+    asserted: Arc<AtomicBool>,
 }
 
 impl FtdiLine {
     /// Pulses whose beginning the host has been told of.
     pub fn pulses(&self) -> u64 {
         self.pulses.load(Ordering::Relaxed)
+    }
+
+    /// What the host was last told of the line.
+    pub fn is_asserted(&self) -> bool {
+        self.asserted.load(Ordering::Relaxed)
     }
 
     /// Pulses come from now on; before, the line is clear.
@@ -97,6 +103,7 @@ impl UsbDevice for Ftdi {
             return None;
         }
         self.line.pulses.fetch_add(u64::from(asserted && !self.dcd), Ordering::Relaxed);
+        self.line.asserted.store(asserted, Ordering::Relaxed);
         self.dcd = asserted;
         self.told = Instant::now();
         Some(Ok(self.status()))

@@ -1,5 +1,6 @@
 //! The guest's machine.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
@@ -39,12 +40,13 @@ impl Machine {
         ]);
         pipe(&mut qemu, "qmp");
         qemu.args(["-mon", "chardev=qmp,mode=control"]);
-        for test in tests {
-            test.pipes.iter().for_each(|name| pipe(&mut qemu, name));
-            test.devices.iter().for_each(|device| {
-                qemu.args(["-device", device]);
-            });
-        }
+        // Tests may share what they need.
+        let pipes: BTreeSet<&str> = tests.iter().flat_map(|test| test.pipes).copied().collect();
+        let devices: BTreeSet<&str> = tests.iter().flat_map(|test| test.devices).copied().collect();
+        pipes.iter().for_each(|name| pipe(&mut qemu, name));
+        devices.iter().for_each(|device| {
+            qemu.args(["-device", device]);
+        });
         qemu.spawn().map(Self).map_err(|error| format!("cannot start qemu-system-x86_64: {error}"))
     }
 
