@@ -44,6 +44,12 @@ pub trait Control: Send + Sync + 'static {
     /// `NotRunning`.
     fn cancel(&self) -> Result<(), RpcError>;
 
+    /// Permits a mirror's light until the next boot.
+    ///
+    /// # Errors
+    /// `Storage`.
+    fn arm_light(&self) -> Result<(), RpcError>;
+
     /// The sessions of the data folder, oldest first.
     ///
     /// # Errors

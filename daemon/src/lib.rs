@@ -8,6 +8,7 @@ pub mod control;
 mod film;
 pub mod live;
 mod memory;
+pub mod mirror;
 pub mod process;
 pub mod processing;
 mod report;

@@ -6,6 +6,7 @@ mod products;
 use std::collections::BTreeMap;
 
 use ndarray::{Array1, Array2};
+use raysweep_core::SettingsLatency;
 use raysweep_pipeline::{PREDICTED_SHARE, Product, Role, Spot, SweepGeometry};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
@@ -299,6 +300,17 @@ pub(crate) fn accounts(state: &State) -> Vec<Block> {
             NoteLevel::Error,
             "The frames do not add up to the expected triggers: this is a defect.".into(),
         ));
+    }
+    if let Some(end) = &state.end {
+        let light = end.light_s.map(|s| ("first to last frame with light", format!("{s:.2} s")));
+        let latency = end.settings_latency.map(|SettingsLatency { min_frames, max_frames }| {
+            ("camera settings act", format!("{min_frames} to {max_frames} frames late"))
+        });
+        let facts: Vec<_> =
+            light.into_iter().chain(latency).map(|(key, value)| (key.to_owned(), value)).collect();
+        if !facts.is_empty() {
+            blocks.push(Block::Facts(facts));
+        }
     }
     if let Some(vsync) = state.end.as_ref().and_then(|end| end.vsync) {
         blocks.push(Block::Facts(

@@ -311,6 +311,7 @@ pub fn write_manifest(session: &Session, state: &State, task: &Task, rig: &RigFi
         }),
     );
     settings.insert("exposures_us".into(), json!(taken_exposures(state, &task.schedule)));
+    settings.insert("latency".into(), json!(state.end.as_ref().and_then(|end| end.settings_latency)));
     manifest::write(session, state, software, settings)?;
     Ok(())
 }

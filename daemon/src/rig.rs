@@ -2,10 +2,10 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-#[cfg(feature = "aravis")]
 use std::time::Duration;
 
-use raysweep_core::{Camera, CameraCapabilities, DeviceError, Projector, Vsync};
+use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
+use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
@@ -47,6 +47,8 @@ pub struct Devices {
     pub vsync: Box<dyn Vsync>,
     /// The projector.
     pub projector: Box<dyn Projector>,
+    /// The clock that their stamps are on.
+    pub clock: Clock,
     /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
     pub pace: Pace,
 }
@@ -140,11 +142,27 @@ impl Rig {
         let camera = match self.file.camera.driver {
             CameraDriver::Sim => sim.camera,
             CameraDriver::Aravis => self.open_aravis()?,
+            CameraDriver::V4l2 => self.open_v4l2()?,
         };
         self.check_rows(camera.capabilities())?;
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera, vsync, projector, pace })
+        Ok(Devices { camera, vsync, projector, clock: sim.clock, pace })
+    }
+
+    fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {
+        let RigFile { camera, vsync, .. } = &self.file;
+        let Some(config) = camera.v4l2.clone() else {
+            return Err(RigError::Config("[camera.v4l2] is missing".into()));
+        };
+        let setup = V4l2Setup {
+            config,
+            format: camera.pixel_format,
+            row_time_us: self.file.camera_row_time_us(),
+            trigger_period_us: vsync.period_us,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(v4l2::open(setup)?))
     }
 
     #[cfg(feature = "aravis")]
@@ -167,5 +185,23 @@ impl Rig {
         Err(RigError::Config(
             "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
         ))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bench_stands_beside_the_rig_file_and_goes_with_a_camera_on_a_wire() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        let text = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
+                    [sim]\nbench = \"bench.sock\"\nscene_rows = 8\nscene_columns = 8\n";
+        std::fs::write(&path, text).unwrap();
+        let rig = Rig::load(&path).unwrap();
+        assert_eq!(rig.file.sim.bench, Some(folder.path().join("bench.sock")));
+        let Err(error) = rig.open() else { panic!("the camera cannot be in both processes") };
+        assert!(error.to_string().contains("camera.driver"), "{error}");
     }
 }

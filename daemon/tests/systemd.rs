@@ -15,6 +15,7 @@ fn systemd_accepts_the_units_and_finds_what_they_start() {
         std::fs::copy(from, to).unwrap();
     };
     put(Path::new(env!("CARGO_BIN_EXE_raysweepd")), "usr/bin/raysweepd");
+    put(Path::new(env!("CARGO_BIN_EXE_raysweep")), "usr/bin/raysweep");
     for unit in ["raysweepd.service", "raysweepd.socket"] {
         put(&deploy.join("systemd").join(unit), &format!("usr/lib/systemd/system/{unit}"));
     }

@@ -199,11 +199,10 @@ impl Camera for SimCamera {
             return Err(Self::error(DeviceErrorKind::OutOfRange, what));
         }
         let next_seq = self.line.lock().configure(self.clock.now_ns(), id, actual);
-        let certain = next_seq + u64::from(camera.late_frames_max);
-        let first_frame = if camera.late_frames_min == camera.late_frames_max {
-            FirstFrame::Exactly(certain)
-        } else {
-            FirstFrame::Within(certain)
+        // As of a real camera, no more is known than how late it may be.
+        let first_frame = match u64::from(camera.late_frames_max) {
+            0 => FirstFrame::Exactly(next_seq),
+            late => FirstFrame::Within { earliest: next_seq, certain: next_seq + late },
         };
         Ok(Applied { actual, first_frame })
     }

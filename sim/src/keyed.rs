@@ -22,6 +22,10 @@ pub enum Purpose {
     RowTable,
     /// What becomes of one packet, or one frame, on the wire.
     Wire,
+    /// How a mirror misses the same point another time.
+    MirrorRepeat,
+    /// Faults of a mirror's controller and its wire.
+    MirrorWire,
 }
 
 /// A generator for `purpose` under the rig's `seed`, told apart by `key`.

@@ -10,6 +10,7 @@ mod devices;
 pub mod gige;
 mod keyed;
 mod line;
+pub mod mirror;
 pub mod optics;
 mod rig;
 pub mod scene;

@@ -61,9 +61,9 @@ pub struct Line {
     config: LineConfig,
     /// Number of the next period to be drawn.
     next_period: i64,
-    /// Periods drawn since the camera's last trigger, or since it became ready.
+    /// What the last period was drawn for, and how many periods were.
+    drawn_for: DrawnFor,
     draws: u64,
-    was_ready: bool,
     /// When settings were last written: the camera is asked then, not earlier, whether it is ready for what lies ahead.
     configured_ns: i64,
     /// Edges on the line that lie ahead, in order.
@@ -81,7 +81,12 @@ pub struct Line {
     truth: LineTruth,
 }
 
+/// The frame that a period may trigger (point, attempt, frames before it under the same settings), and whether the camera
+/// is ready for it.
+type DrawnFor = ([u64; 3], bool);
+
 struct PendingEdge {
+    period: i64,
     at_ns: i64,
     kind: EdgeKind,
 }
@@ -117,21 +122,34 @@ struct CameraLine {
     deaf_until_ns: i64,
     /// No exposure may start before this.
     occupied_until_ns: i64,
-    id: SettingsId,
-    in_force: CameraSettings,
-    /// Settings on their way into the sensor, each with the first frame that will have them, in that order.
-    written: VecDeque<(u64, CameraSettings)>,
-    /// Triggers answered since the settings were written.
+    in_force: Written,
+    /// Triggers answered under the settings in force.
     frames: u64,
+    /// Settings on their way into the sensor, in the order of their first frames.
+    written: VecDeque<Written>,
     seq: u64,
     exposures: VecDeque<Exposure>,
 }
 
+/// Settings, and the first frame that has them.
+#[derive(Clone, Copy)]
+struct Written {
+    first_seq: u64,
+    id: SettingsId,
+    settings: CameraSettings,
+}
+
 impl CameraLine {
-    /// The settings of the next frame to be triggered.
-    fn due(&self) -> CameraSettings {
-        let due = self.written.iter().rev().find(|(first_seq, _)| *first_seq <= self.seq);
-        due.map_or(self.in_force, |(_, settings)| *settings)
+    /// The settings of the next frame to be triggered, and how many frames have had them.
+    fn due(&self) -> (Written, u64) {
+        let due = self.written.iter().rev().find(|written| written.first_seq <= self.seq);
+        due.map_or((self.in_force, self.frames), |written| (*written, 0))
+    }
+
+    /// What noise and faults of the next frame are keyed by.
+    fn key(&self) -> [u64; 3] {
+        let (Written { id, .. }, frames) = self.due();
+        [u64::from(id.point), u64::from(id.attempt), frames]
     }
 
     /// When the camera triggers itself, where it does.
@@ -142,7 +160,8 @@ impl CameraLine {
 
     /// Whether an edge at `edge_ns` would be answered.
     fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
-        let start_ns = edge_ns + ns_from_us(latency_us + self.due().trigger_delay_us);
+        let (Written { settings, .. }, _) = self.due();
+        let start_ns = edge_ns + ns_from_us(latency_us + settings.trigger_delay_us);
         edge_ns >= self.deaf_until_ns && start_ns >= self.occupied_until_ns
     }
 }
@@ -172,12 +191,16 @@ const GUARD_NS: i64 = 400_000;
 impl Line {
     /// A line at rest at `now_ns`.
     pub fn new(config: LineConfig, now_ns: i64) -> Self {
-        let idle = CameraSettings { shutter: Shutter::Rolling, exposure_us: 100.0, trigger_delay_us: 0.0 };
+        let idle = Written {
+            first_seq: 0,
+            id: SettingsId { point: u32::MAX, attempt: u32::MAX },
+            settings: CameraSettings { shutter: Shutter::Rolling, exposure_us: 100.0, trigger_delay_us: 0.0 },
+        };
         Self {
             next_period: now_ns / config.period_ns + 1,
             config,
+            drawn_for: ([0; 3], false),
             draws: 0,
-            was_ready: true,
             configured_ns: now_ns,
             pending: VecDeque::new(),
             lights: VecDeque::new(),
@@ -191,10 +214,9 @@ impl Line {
                 next_free_ns: 0,
                 deaf_until_ns: 0,
                 occupied_until_ns: 0,
-                id: SettingsId { point: u32::MAX, attempt: 0 },
                 in_force: idle,
-                written: VecDeque::new(),
                 frames: 0,
+                written: VecDeque::new(),
                 seq: 0,
                 exposures: VecDeque::new(),
             },
@@ -240,22 +262,19 @@ impl Line {
         period * self.config.period_ns
     }
 
-    /// Decides what the next period brings. All that is random is keyed by the point, the frame that the camera is at
-    /// and whether it is ready for the next, so that a point has the same edges in an uninterrupted run and in a
-    /// resumed one.
+    /// Decides what the next period brings. All that is random is keyed by the frame that it may trigger and whether the
+    /// camera is ready for it, so that a point has the same edges in an uninterrupted run and in a resumed one.
     fn draw_period(&mut self) {
         let nominal_ns = self.nominal_ns(self.next_period);
-        let asked_ns = (nominal_ns - GUARD_NS).max(self.configured_ns);
+        let asked_ns = nominal_ns.max(self.configured_ns);
         let ready = self.camera.is_ready(asked_ns, self.config.camera.trigger_latency_us);
-        if ready != self.was_ready {
-            (self.was_ready, self.draws) = (ready, 0);
+        let drawn_for = (self.camera.key(), ready);
+        if drawn_for != self.drawn_for {
+            (self.drawn_for, self.draws) = (drawn_for, 0);
         }
-        let SettingsId { point, attempt } = self.camera.id;
-        let mut random = keyed(
-            self.config.seed,
-            Purpose::Line,
-            &[u64::from(point), u64::from(attempt), self.camera.frames, u64::from(ready), self.draws],
-        );
+        let [point, attempt, frame] = drawn_for.0;
+        let mut random =
+            keyed(self.config.seed, Purpose::Line, &[point, attempt, frame, u64::from(ready), self.draws]);
         let vsync = &self.config.vsync;
         let z: f64 = StandardNormal.sample(&mut random);
         let limit_us = GUARD_NS as f64 / 1e3 / 2.0;
@@ -277,11 +296,12 @@ impl Line {
             (false, true) => EdgeKind::Unseen,
             (false, false) => EdgeKind::True,
         };
-        self.pending.push_back(PendingEdge { at_ns: edge_ns, kind });
+        self.pending.push_back(PendingEdge { period: self.next_period, at_ns: edge_ns, kind });
         if false_edge {
             // Anywhere but close to the true edges, where it would be one of them for all purposes.
             let offset_ns = (self.config.period_ns as f64 * (0.1 + 0.8 * false_at)) as i64;
-            self.pending.push_back(PendingEdge { at_ns: nominal_ns + offset_ns, kind: EdgeKind::False });
+            let at_ns = nominal_ns + offset_ns;
+            self.pending.push_back(PendingEdge { period: self.next_period, at_ns, kind: EdgeKind::False });
         }
         self.next_period += 1;
         self.draws += 1;
@@ -330,13 +350,13 @@ impl Line {
         if !camera.armed || !camera.is_ready(edge_ns, config.camera.trigger_latency_us) {
             return false;
         }
-        camera.in_force = camera.due();
+        let key = camera.key();
+        (camera.in_force, camera.frames) = camera.due();
         let seq = camera.seq;
-        camera.written.retain(|(first_seq, _)| *first_seq > seq);
-        let settings = camera.in_force;
+        camera.written.retain(|written| written.first_seq > seq);
+        let settings = camera.in_force.settings;
         let start_ns = edge_ns + ns_from_us(config.camera.trigger_latency_us + settings.trigger_delay_us);
         let exposure_ns = ns_from_us(settings.exposure_us);
-        let key = [u64::from(camera.id.point), u64::from(camera.id.attempt), camera.frames];
         let delivered = uniform(&mut keyed(config.seed, Purpose::Drop, &key)) >= config.camera.dropped;
         (camera.deaf_until_ns, camera.occupied_until_ns) = match config.camera.readout {
             Readout::Sequential => (start_ns + exposure_ns + config.readout_ns, 0),
@@ -349,8 +369,6 @@ impl Line {
         camera.exposures.push_back(Exposure { seq: camera.seq, key, settings, start_ns, done_ns, delivered });
         camera.seq += 1;
         camera.frames += 1;
-        self.draws = 0;
-        self.was_ready = false;
         self.truth.exposures += 1;
         self.truth.dropped_frames += u64::from(!delivered);
         true
@@ -369,25 +387,25 @@ impl Line {
             config.camera.late_frames_max
         };
         let first_seq = self.camera.seq + u64::from(self.late_frames.unwrap_or(late));
-        self.camera.id = id;
-        self.camera.frames = 0;
         // Registers are read in the order in which they were written: the latest word stands.
-        self.camera.written.retain(|(earlier_seq, _)| *earlier_seq < first_seq);
-        self.camera.written.push_back((first_seq, settings));
+        self.camera.written.retain(|earlier| earlier.first_seq < first_seq);
+        self.camera.written.push_back(Written { first_seq, id, settings });
         self.redraw(now_ns);
         self.camera.seq
     }
 
     /// What lies ahead was drawn for the settings before: draws it again for the new ones.
     fn redraw(&mut self, now_ns: i64) {
-        self.pending.clear();
         self.configured_ns = now_ns;
-        self.draws = 0;
-        self.was_ready = true;
         while self.lights.back().is_some_and(|light| light.edge_ns > now_ns) {
             self.lights.pop_back();
             self.next_period -= 1;
+            self.draws = self.draws.saturating_sub(1);
         }
+        // A false edge of the period under way would belong to frames of other settings.
+        let is_next = self.camera.due().1 == 0;
+        let next_period = self.next_period;
+        self.pending.retain(|edge| !is_next && edge.period < next_period);
     }
 
     /// Triggers the camera by command; whether it answered.

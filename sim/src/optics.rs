@@ -5,7 +5,7 @@
 
 use ndarray::{Array2, Array3, Axis, s};
 use rayon::prelude::*;
-use raysweep_core::Raster;
+use raysweep_core::{Mosaic, Raster};
 
 use crate::SimError;
 use crate::config::{Beam, RowTable, SimProjector, Spot};
@@ -52,7 +52,7 @@ impl Optics {
         projector: &SimProjector,
         pattern: &[f32],
         seed: u64,
-        mosaic: bool,
+        mosaic: Mosaic,
     ) -> Result<Self, SimError> {
         let transport = filtered(scene, mosaic);
         let (rows, height, width) = transport.dim();
@@ -172,20 +172,22 @@ impl Flashes {
     }
 }
 
-/// The transport as the sensor's pixels see it, `[V, H, W]`: through a Bayer mosaic (red top left) or, on a
-/// monochrome sensor, the mean of the colours.
-fn filtered(scene: &Scene, mosaic: bool) -> Array3<f32> {
+/// The transport as the sensor's pixels see it, `[V, H, W]`: through a Bayer mosaic or, on a monochrome
+/// sensor, the mean of the colours.
+fn filtered(scene: &Scene, mosaic: Mosaic) -> Array3<f32> {
     let transport = &scene.transport;
     let channels = transport.dim().3;
     if channels == 1 {
         return transport.index_axis(Axis(3), 0).to_owned();
     }
-    if !mosaic {
+    let Some((red_s, red_t)) = mosaic.red() else {
         return transport.sum_axis(Axis(3)) / channels as f32;
-    }
+    };
     let (rows, height, width, _) = transport.dim();
     let mut seen = Array3::zeros((rows, height, width));
-    for (first_t, first_s, channel) in [(0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)] {
+    for (first_t, first_s) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+        // Blue lies diagonally from red, green beside both.
+        let channel = (first_t ^ red_t) + (first_s ^ red_s);
         seen.slice_mut(s![.., first_t..;2, first_s..;2])
             .assign(&transport.index_axis(Axis(3), channel).slice(s![.., first_t..;2, first_s..;2]));
     }

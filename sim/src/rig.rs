@@ -232,7 +232,7 @@ impl Bench {
     pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
         let rows = self.setup.raster.rows;
         let build = |weights: &[f32]| {
-            let mosaic = self.format.is_mosaic();
+            let mosaic = self.format.mosaic;
             let (raster, projector) = (&self.setup.raster, &self.config.projector);
             let optics = |scene| {
                 Optics::new(scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)

@@ -14,9 +14,9 @@ use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile, LiveReader};
 use raysweep::process;
 use raysweep::rig::Rig;
 use raysweep::run::Runner;
-use raysweep_core::{LossCause, PixelFormat};
+use raysweep_core::{FilmSummary, LossCause, PixelFormat};
 use raysweep_pipeline::Registry;
-use raysweep_proto::{ErrorCode, Event, ResumeParams, RunParams};
+use raysweep_proto::{ErrorCode, Event, ResumeParams, RunParams, RunState};
 use raysweep_session::film::{CycleEntry, TransportFilm};
 use raysweep_session::manifest;
 use raysweep_sim::{PlaneRig, PlaneSetup};
@@ -332,9 +332,8 @@ fn check_says_how_many_transports_a_second_the_camera_allows() {
 
 #[test]
 fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
-    // Where a trigger is missed, and frames arrive later than the next trigger, nothing tells in time which one it was: a
-    // frame more is exposed under the settings before.
-    for (readout_us, periods) in [(16_100, 15), (16_500, 17)] {
+    // Where a trigger is missed, and frames arrive later than the next trigger, the clock tells which one it was.
+    for (readout_us, periods) in [(16_100, 15), (16_500, 16)] {
         let rig = rig(60.0, &format!("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = {readout_us}\n"));
         let bench = Bench::new(&rig);
         let ended = bench.run(&plan(3));
@@ -345,6 +344,85 @@ fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
         let cycle_s = f64::from(periods) * PERIOD_NS as f64 * 1e-9;
         assert!((starts[2] - 2.0 * cycle_s).abs() < 1e-3, "{readout_us} us: {starts:?}");
     }
+}
+
+/// Waits until the film under way is so far.
+fn wait_for(bench: &Bench, is_reached: impl Fn(&FilmSummary) -> bool) {
+    let began = Instant::now();
+    while !bench.runner.status().film.is_some_and(|film| is_reached(&film)) {
+        assert!(began.elapsed() < Duration::from_secs(60), "{:?}", bench.runner.status());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_film_is_held_between_two_cycles_and_goes_on() {
+    for more in ["", "[sim.camera]\nlate_frames_min = 2\nlate_frames_max = 2\n"] {
+        let rig = rig(60.0, more);
+        let bench = Bench::new(&rig);
+        let mut events = bench.runner.events();
+        bench.runner.run(RunParams { plan: plan(400), ..RunParams::default() }).unwrap();
+        for cycles in [3, 9] {
+            wait_for(&bench, |film| film.transports >= cycles);
+            bench.runner.pause().unwrap();
+            // What is under way comes to its end; then nothing more comes.
+            let mut held = bench.runner.status().film;
+            let mut since = Instant::now();
+            while since.elapsed() < Duration::from_millis(300) {
+                std::thread::sleep(Duration::from_millis(20));
+                let now = bench.runner.status().film;
+                if now != held {
+                    (held, since) = (now, Instant::now());
+                }
+            }
+            assert_eq!(bench.runner.status().state, RunState::Paused);
+            let held = held.unwrap();
+            assert_eq!((held.transports, held.cycles_incomplete), (held.cycles_stored, 0));
+            assert!(held.cycles_stored < 400, "{held:?}");
+            bench.runner.go_on().unwrap();
+            wait_for(&bench, |film| film.transports > held.transports);
+        }
+        bench.runner.cancel().unwrap();
+        let ended = end_of(&mut events);
+        assert_eq!(ended.state, "cancelled");
+        let (_, state) = ended.open();
+        assert!(state.counts.balanced() && state.counts.lost_total() == 0, "{:?}", state.counts);
+        let ledger = std::fs::read_to_string(ended.session.join("ledger.jsonl")).unwrap();
+        assert!(!ledger.contains("\"cycle_lost\""), "{ledger}");
+        let truth = truth(&rig);
+        for (_, delay_us, frame) in frames(&ended) {
+            let off = (0..16).map(|key| deviation(&truth, key * 1_900_000_000, delay_us, &frame));
+            assert!(off.fold(f32::INFINITY, f32::min) < 2.0, "{delay_us} us");
+        }
+    }
+}
+
+#[test]
+fn between_its_cycles_a_film_shows_sliding_estimates_where_there_is_time() {
+    // A solver that takes some ms, and cycles of a quarter of a second on the host's clock.
+    let rig = rig(60.0, "").replace("seed = 5", "seed = 5\nrealtime = true");
+    let bench = Bench::new(&rig);
+    let mut events = bench.runner.events();
+    bench.runner.run(RunParams { plan: plan(4000), ..RunParams::default() }).unwrap();
+    wait_for(&bench, |film| film.sliding_estimates >= 3 && film.transports >= 2);
+    bench.runner.cancel().unwrap();
+    let (mut sliding, mut whole) = (0, 0);
+    let session = loop {
+        match events.blocking_recv().unwrap() {
+            Event::Film(estimate) if estimate.sliding => sliding += 1,
+            Event::Film(_) => whole += 1,
+            Event::Finished { session, .. } => break session,
+            _ => {}
+        }
+    };
+    let ended = Ended { session, state: "cancelled".into(), error: None };
+    let (_, state) = ended.open();
+    let film = state.film.unwrap();
+    assert_eq!((film.sliding_estimates, film.transports), (sliding, whole));
+    let (session, _) = ended.open();
+    let transports = TransportFilm::open(&session.transport_film_path()).unwrap();
+    let stored = (0..whole + 1).filter(|&cycle| transports.read(cycle).unwrap().is_some()).count();
+    assert_eq!(stored, whole, "those of whole cycles are stored, and no others");
 }
 
 #[test]

@@ -47,18 +47,46 @@ pub struct CameraSettings {
 /// When new settings take effect, as an id that frames carry ([`crate::FrameStamp::seq`]): no clock can confuse it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FirstFrame {
-    /// This frame is the first with the new settings.
+    /// This frame is the first with the new settings: the camera says so, not the driver's hope.
     Exactly(u64),
-    /// This frame and all later ones have the new settings; some before it may have them already.
-    Within(u64),
+    /// The first with the new settings is one from `earliest` to `certain`; which one, the frames' own stamps must tell.
+    Within {
+        /// The first that may have them: the next to be triggered when they were written.
+        earliest: u64,
+        /// This one and all later ones have them, however late the camera is by its data sheet or the rig file.
+        certain: u64,
+    },
 }
 
 impl FirstFrame {
+    /// The first frame that may have the new settings; those before have the old ones.
+    pub fn earliest(self) -> u64 {
+        match self {
+            Self::Exactly(seq) | Self::Within { earliest: seq, .. } => seq,
+        }
+    }
+
     /// The first frame that is certain to have the new settings.
     pub fn certain(self) -> u64 {
         match self {
-            Self::Exactly(seq) | Self::Within(seq) => seq,
+            Self::Exactly(seq) | Self::Within { certain: seq, .. } => seq,
         }
+    }
+}
+
+/// How many frames later than the next one to be triggered settings take effect, as a run's probe found it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct SettingsLatency {
+    /// The fewest of all changes.
+    pub min_frames: u32,
+    /// The most.
+    pub max_frames: u32,
+}
+
+impl SettingsLatency {
+    /// The latency, where it was the same each time.
+    pub fn constant(self) -> Option<u32> {
+        (self.min_frames == self.max_frames).then_some(self.min_frames)
     }
 }
 
@@ -102,6 +130,12 @@ impl CameraCapabilities {
     /// # Errors
     /// Field, value and what is allowed.
     pub fn allows(&self, settings: &CameraSettings) -> Result<(), String> {
+        if self.trigger_delay_us == (0.0..=0.0) && settings.trigger_delay_us != 0.0 {
+            return Err(format!(
+                "trigger_delay_us = {}: {} cannot delay its trigger, so that delays cannot be swept; if its maker offers a delay, name it in the rig file",
+                settings.trigger_delay_us, self.model
+            ));
+        }
         let rules = [
             ("exposure_us", settings.exposure_us, &self.exposure_us),
             ("trigger_delay_us", settings.trigger_delay_us, &self.trigger_delay_us),

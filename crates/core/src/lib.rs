@@ -11,6 +11,7 @@ mod device;
 mod error;
 mod film;
 mod frame;
+mod mirror;
 mod pixel;
 mod raster;
 mod units;
@@ -20,11 +21,15 @@ pub use clock_model::{ClockModel, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Pattern, Projector,
-    Readout, SettingsId, Shown, Shutter, Vsync,
+    Readout, SettingsId, SettingsLatency, Shown, Shutter, Vsync,
 };
 pub use error::{DeviceError, DeviceErrorKind};
 pub use film::{FilmSummary, Percentiles};
 pub use frame::{Edge, Frame, FrameBuf, FramePool, FrameStamp};
-pub use pixel::{PixelError, PixelFormat};
+pub use mirror::{
+    MAX_POINTS, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
+    MirrorProgress, OpticalDeg, PathError, RasterScan, SecondOrder, Tilt,
+};
+pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use units::{ns_from_us, us_from_ns};

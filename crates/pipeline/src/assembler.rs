@@ -36,17 +36,10 @@ pub struct Job {
 pub enum Label {
     /// It belongs to the point.
     Counted,
-    /// It may have been exposed under the settings before.
+    /// It was, or may have been, exposed under the settings before.
     Settling,
     /// Nobody waits for it.
     Cancelled,
-}
-
-impl Label {
-    /// The label of a frame that comes after a change of settings.
-    pub fn of(stamp: &FrameStamp, applied: &Applied) -> Self {
-        if stamp.seq < applied.first_frame.certain() { Self::Settling } else { Self::Counted }
-    }
 }
 
 /// What the device threads tell the assembler, in order.
@@ -97,7 +90,7 @@ const TRIGGER_TOLERANCE_NS: i64 = 200_000;
 /// A frame waits this long, on the host's clock, for the edges around it.
 const EDGE_PATIENCE_NS: i64 = 100_000_000;
 /// A camera's own word for its exposure may differ by rounding from what it was set to.
-const EXPOSURE_TOLERANCE_US: f64 = 0.5;
+pub const EXPOSURE_TOLERANCE_US: f64 = 0.5;
 
 /// The assembler's state.
 pub struct Assembler {
@@ -112,7 +105,6 @@ pub struct Assembler {
     /// Whether frames may have passed that nobody asked for.
     idle: bool,
     newest_ns: i64,
-    pixels: Vec<u16>,
 }
 
 /// Events that wait for edges, in their order.
@@ -158,7 +150,6 @@ impl Assembler {
     pub fn new(config: AssemblerConfig) -> Self {
         let line =
             Line { period_ns: ns_from_us(config.raster.period_us), gate_ns: ns_from_us(config.edge_gate_us) };
-        let pixels = vec![0; config.camera.height * config.camera.width];
         Self {
             config,
             tracker: EdgeTracker::new(line),
@@ -169,7 +160,6 @@ impl Assembler {
             last_seq: None,
             idle: true,
             newest_ns: i64::MIN,
-            pixels,
         }
     }
 
@@ -352,19 +342,18 @@ impl Assembler {
             }
             None => attempt.chain.untied += 1,
         }
-        let summed = sound.and_then(|delay_us| {
-            frame.format.unpack_into(&frame.data, &mut self.pixels).map(|()| delay_us).map_err(|error| {
-                tracing::warn!(%error, seq = frame.stamp.seq, "frame does not match its format");
-                LossCause::SettingsMismatch
-            })
-        });
-        match summed {
+        match sound {
             Ok(_) if attempt.averaged == attempt.job.frames => attempt.counts.cancelled += 1,
             Ok(delay_us) => {
+                // An array that was made of zeros is one slice, row by row, as frames are.
+                let sums = attempt.sum.as_slice_mut().unwrap_or_default();
+                if let Err(error) = frame.format.add_to(&frame.data, sums) {
+                    tracing::warn!(%error, seq = frame.stamp.seq, "frame does not match its format");
+                    return attempt.counts.lose(LossCause::SettingsMismatch, 1);
+                }
                 attempt.averaged += 1;
                 attempt.delays_us.push(delay_us);
                 attempt.last_exposure_ns = Some(frame.stamp.exposure_start_ns);
-                attempt.sum.iter_mut().zip(&self.pixels).for_each(|(sum, &pixel)| *sum += u32::from(pixel));
             }
             Err(cause) => attempt.counts.lose(cause, 1),
         }

@@ -17,7 +17,7 @@ mod stage;
 mod strips;
 mod unit;
 
-pub use assembler::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
+pub use assembler::{Assembler, AssemblerConfig, Decision, EXPOSURE_TOLERANCE_US, Event, Job, Label};
 pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
 pub use edges::{EdgeTracker, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};

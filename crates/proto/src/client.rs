@@ -174,6 +174,14 @@ impl Client {
         self.call(Method::Cancel, &Empty {}).map(|Empty {}| ())
     }
 
+    /// Permits a mirror's light until the next boot.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn arm_light(&mut self) -> Result<(), ClientError> {
+        self.call(Method::ArmLight, &Empty {}).map(|Empty {}| ())
+    }
+
     /// The sessions of the daemon's data folder, oldest first.
     ///
     /// # Errors

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use raysweep_core::{Counts, FilmSummary, VsyncStats};
+use raysweep_core::{Counts, FilmSummary, SettingsLatency, VsyncStats};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -94,6 +94,15 @@ fn vsync_schema(_: &mut SchemaGenerator) -> Schema {
     })
 }
 
+fn latency_schema(_: &mut SchemaGenerator) -> Schema {
+    let frames = json_schema!({ "type": "integer", "minimum": 0 });
+    json_schema!({
+        "type": ["object", "null"],
+        "properties": { "min_frames": frames, "max_frames": frames },
+        "required": ["min_frames", "max_frames"],
+    })
+}
+
 fn film_schema(_: &mut SchemaGenerator) -> Schema {
     let cycles = json_schema!({ "type": "integer", "minimum": 0 });
     json_schema!({
@@ -179,11 +188,29 @@ pub struct Status {
     #[serde(default)]
     #[schemars(schema_with = "film_schema")]
     pub film: Option<FilmSummary>,
+    /// How many frames later than the next the camera's settings take effect, as the run's probe found it.
+    #[serde(default)]
+    #[schemars(schema_with = "latency_schema")]
+    pub settings_latency: Option<SettingsLatency>,
     /// Why the last run faulted.
     pub error: Option<String>,
     /// The file with the newest live images, if there is one; `describe` has its layout.
     #[serde(default)]
     pub live: Option<PathBuf>,
+    /// The mirror, where the rig has ever moved one.
+    #[serde(default)]
+    pub mirror: Option<MirrorStatus>,
+}
+
+/// A mirror and its light.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct MirrorStatus {
+    /// Whether it is at the origin with the light off.
+    pub parked: bool,
+    /// Whether samples with light may be playing.
+    pub laser: bool,
+    /// `interlock_closed`, `interlock_open`, `armed` or `not_armed`.
+    pub light: String,
 }
 
 /// Parameters of `check`.
@@ -340,6 +367,9 @@ pub enum Event {
         /// Seconds from the end of the last frame's exposure to the transport on disk; nothing where none was made.
         #[serde(default)]
         final_s: Option<f64>,
+        /// Seconds from the first frame with light to the end of the last: without the probe and the dark points.
+        #[serde(default)]
+        light_s: Option<f64>,
     },
     /// This many events were left out because the subscriber read too slowly.
     Skipped {

@@ -43,6 +43,8 @@ pub enum Method {
     Continue,
     /// Ends a run.
     Cancel,
+    /// Permits light until the next boot.
+    ArmLight,
     /// The sessions on disk.
     Sessions,
     /// Events from now on.
@@ -67,7 +69,7 @@ fn schema<T: JsonSchema>() -> Schema {
 
 impl Method {
     /// Every method.
-    pub const ALL: [Method; 10] = [
+    pub const ALL: [Method; 11] = [
         Self::Describe,
         Self::Status,
         Self::Check,
@@ -76,6 +78,7 @@ impl Method {
         Self::Pause,
         Self::Continue,
         Self::Cancel,
+        Self::ArmLight,
         Self::Sessions,
         Self::Subscribe,
     ];
@@ -107,6 +110,11 @@ impl Method {
             Self::Cancel => {
                 row::<Empty, Empty>("cancel", Operator, "Ends the run in order; what was acquired is kept.")
             }
+            Self::ArmLight => row::<Empty, Empty>(
+                "arm_light",
+                Operator,
+                "Permits a mirror's light until the next boot, on a rig without an interlock.",
+            ),
             Self::Sessions => row::<Empty, Vec<SessionInfo>>(
                 "sessions",
                 Observer,
@@ -237,7 +245,7 @@ mod tests {
     fn who_only_observes_cannot_move_the_rig() {
         let drives =
             Method::ALL.into_iter().filter(|method| method.role() == Role::Operator).map(Method::name);
-        assert_eq!(drives.collect::<Vec<_>>(), ["run", "resume", "pause", "continue", "cancel"]);
+        assert_eq!(drives.collect::<Vec<_>>(), ["run", "resume", "pause", "continue", "cancel", "arm_light"]);
     }
 
     #[test]

@@ -107,6 +107,8 @@ fn acquire(
         missing: 0,
         vsync: None,
         final_s: None,
+        light_s: None,
+        settings_latency: None,
     }))?;
     Ok(session)
 }

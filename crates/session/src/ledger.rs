@@ -10,7 +10,7 @@ use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
-use raysweep_core::{Counts, FilmSummary, VsyncStats};
+use raysweep_core::{Counts, FilmSummary, SettingsLatency, VsyncStats};
 use serde::{Deserialize, Serialize};
 
 use crate::film::CycleEntry;
@@ -160,6 +160,12 @@ pub struct EndEntry {
     /// Seconds from the end of the last frame's exposure to the transport on disk, where both were.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub final_s: Option<f64>,
+    /// Seconds from the first frame with light to the end of the last, without the probe and the dark points.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub light_s: Option<f64>,
+    /// How late the camera's settings took effect, where a probe has found out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub settings_latency: Option<SettingsLatency>,
 }
 
 /// In which state a run ended.

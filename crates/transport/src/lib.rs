@@ -3,5 +3,6 @@
 //! - [`plane`]: plane-to-ray transport of a raster projector and a rolling-shutter camera.
 //! - [`quality`]: the figures by which an estimate is judged against a known transport.
 
+pub mod dots;
 pub mod plane;
 pub mod quality;

@@ -224,6 +224,28 @@ fn the_number_of_threads_does_not_change_a_bit() {
 }
 
 #[test]
+fn other_rows_do_not_change_a_bit_of_a_row() {
+    // Rows that share a model, in tiles of many rows; pixels of several models, and some that lack samples.
+    let timing = RowTiming::new(720, 22.22, 50_000.0 / 3.0).unwrap().centred(60).unwrap();
+    let settings = paper_sweep();
+    let stack = noisy_corner().slice_move(s![.., 30..90, 20..61]);
+    let u0 = Array2::from_shape_fn((60, 41), |(t, s)| 0.02 * ((t / 7 + s / 5) % 3) as f32);
+    let mut valid = Array3::from_elem(stack.dim(), true);
+    valid.slice_mut(s![10..20, 22..25, 7..30]).fill(false);
+    valid.slice_mut(s![15..17, 23, 9]).fill(true);
+    let demux = Demux::new(timing, settings, Prior::SPLIT).unwrap().with_spike(u0).unwrap();
+    let whole = demux.solve(stack.view(), Some(valid.view())).unwrap();
+    for height in [1, 7, 32] {
+        for first in (0..60).step_by(height) {
+            let rows: Vec<usize> = (first..60.min(first + height)).collect();
+            let some = s![.., first..first + rows.len(), ..];
+            let part = demux.solve_rows(&rows, stack.slice(some), Some(valid.slice(some)), &|| true);
+            assert!(part.unwrap().t == whole.t.select(Axis(1), &rows), "rows {rows:?}");
+        }
+    }
+}
+
+#[test]
 fn no_light_gives_no_transport() {
     for prior in [Prior::PAPER, Prior::SPLIT] {
         let demux = Demux::new(timing(), paper_sweep(), prior).unwrap();

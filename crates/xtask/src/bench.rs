@@ -8,7 +8,12 @@ benchmarks: cargo xtask bench <name> [options]
 
   demux   the demultiplexer: seconds, share of the machine's GEMM peak, distance from the f64 reference
           --peers  beside CVXPY, SciPy and NumPy on the same stack, in a Python environment made for it
-          --json   JSON lines instead of tables: bench, case, method, seconds, ratio, gap";
+          --json   JSON lines instead of tables: bench, case, method, seconds, ratio, gap
+  dots    the flying dot's stages: time, ratio to a plain read of the same bytes, frames a second
+          --peers  beside NumPy, SciPy and OpenCV on the same frames and columns
+          --json   JSON lines instead of tables: bench, case, stage, method, seconds, times_read, ratio
+
+  unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
 
 /// Runs the benchmark that the first argument names with the options that follow; without a name, lists all.
 pub fn bench(arguments: &[&str]) -> Done {
@@ -17,22 +22,28 @@ pub fn bench(arguments: &[&str]) -> Done {
             println!("{BENCHES}");
             Ok(())
         }
-        ["demux", options @ ..] => demux(options),
+        ["demux", options @ ..] => transport("demux", "python-peers", "peers-requirements.txt", options),
+        ["dots", options @ ..] => {
+            transport("dots", "python-peers-dots", "peers-dots-requirements.txt", options)
+        }
+        ["unpack"] => run(cargo().args(["bench", "--package", "raysweep-core", "--bench", "unpack"])),
+        ["unpack", option, ..] => Err(format!("`unpack` has no option `{option}`\n{BENCHES}")),
         [unknown, ..] => Err(format!("no benchmark `{unknown}`\n{BENCHES}")),
     }
 }
 
-fn demux(options: &[&str]) -> Done {
+/// A benchmark of the mathematics; its peers run in a Python environment with what `requirements` names.
+fn transport(name: &str, environment: &str, requirements: &str, options: &[&str]) -> Done {
     if let Some(unknown) = options.iter().find(|option| !["--json", "--peers"].contains(option)) {
-        return Err(format!("`demux` has no option `{unknown}`\n{BENCHES}"));
+        return Err(format!("`{name}` has no option `{unknown}`\n{BENCHES}"));
     }
     let mut bench = cargo();
-    bench.args(["bench", "--package", "raysweep-transport", "--bench", "demux", "--"]);
+    bench.args(["bench", "--package", "raysweep-transport", "--bench", name, "--"]);
     if options.contains(&"--json") {
         bench.arg("--json");
     }
     if options.contains(&"--peers") {
-        let python = python::environment("python-peers", "peers-requirements.txt")?;
+        let python = python::environment(environment, requirements)?;
         bench.arg("--peers").arg(python);
     }
     run(&mut bench)
@@ -44,7 +55,9 @@ mod tests {
 
     #[test]
     fn unknown_names_and_options_are_told_what_there_is() {
-        for arguments in [&["demuxx"] as &[&str], &["demux", "--fast"]] {
+        for arguments in
+            [&["demuxx"] as &[&str], &["demux", "--fast"], &["dots", "--fast"], &["unpack", "--json"]]
+        {
             let message = bench(arguments).unwrap_err();
             assert!(
                 message.contains(arguments[arguments.len() - 1]) && message.contains(BENCHES),

@@ -58,11 +58,15 @@ fn list() -> Done<Vec<Package>> {
 }
 
 /// Whether a program is on the path or, written `python3:MODULE`, Python has a module or, written `pkg-config:NAME`, a C
-/// library can be built with.
+/// library can be built with or, written `ldconfig:NAME`, the loader has a library.
 fn is_there(shows: &str) -> bool {
     if let Some(library) = shows.strip_prefix("pkg-config:") {
         let exists = Command::new("pkg-config").args(["--exists", library]).status();
         return exists.is_ok_and(|status| status.success());
+    }
+    if let Some(library) = shows.strip_prefix("ldconfig:") {
+        let libraries = Command::new("/sbin/ldconfig").arg("-p").output();
+        return libraries.is_ok_and(|output| String::from_utf8_lossy(&output.stdout).contains(library));
     }
     if let Some(module) = shows.strip_prefix("python3:") {
         let import = Command::new("python3").args(["-c", &format!("import {module}")]).output();

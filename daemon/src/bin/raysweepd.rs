@@ -10,9 +10,11 @@ use bytesize::ByteSize;
 use clap::Parser;
 use raysweep::control::Control;
 use raysweep::live::{LiveError, LiveFile};
+use raysweep::mirror;
 use raysweep::rig::Rig;
 use raysweep::run::Runner;
 use raysweep::server::{self, Access, Listening};
+use raysweep_drivers::mirror::{Parked, park};
 use raysweep_pipeline::Registry;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
@@ -82,6 +84,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     prepare_data(&arguments.data).map_err(|error| {
         format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
     })?;
+    park_left_behind(&arguments.data);
     let runner = match arguments.memory {
         Some(size) => runner.with_memory_limit(size.as_u64()),
         None => runner,
@@ -105,6 +108,16 @@ fn live_file(arguments: &Arguments) -> Result<Option<LiveFile>, LiveError> {
     }
     let made = LiveFile::create(&arguments.socket.with_file_name("live"));
     Ok(made.map_err(|error| tracing::warn!(%error, "there will be no live images")).ok())
+}
+
+/// A mirror that a daemon before this one has left somewhere goes to the origin before anything else happens.
+fn park_left_behind(data: &Path) {
+    match park(&mirror::state_file(data)) {
+        Ok(Parked::Already) => {}
+        Ok(parked) => tracing::warn!(?parked, "parked a mirror that was left behind"),
+        // Runs that need no mirror can go on; the mirror's driver refuses to open until it is parked.
+        Err(error) => tracing::error!(%error, "a mirror that was left behind is not parked"),
+    }
 }
 
 /// Makes the data folder where it is missing, and makes sure that sessions can be kept in it.

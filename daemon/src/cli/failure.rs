@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use miette::{Diagnostic, NamedSource, SourceSpan};
 #[cfg(feature = "aravis")]
 use raysweep_core::{DeviceError, DeviceErrorKind};
+use raysweep_drivers::mirror::ParkError;
 use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
@@ -43,6 +44,8 @@ pub(super) enum Failure {
         "this raysweep was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev"
     )]
     WithoutAravis,
+    #[error(transparent)]
+    Park(#[from] ParkError),
     #[error("cannot watch for Ctrl-C: {0}")]
     Signals(io::Error),
     #[error("cannot print: {0}")]
@@ -126,9 +129,12 @@ impl Failure {
             #[cfg(not(feature = "aravis"))]
             Self::WithoutAravis => Exit::Usage,
             Self::NoLiveImage => Exit::Refused,
-            Self::Write { .. } | Self::Live(_) | Self::Process(_) | Self::Signals(_) | Self::Output(_) => {
-                Exit::Failed
-            }
+            Self::Write { .. }
+            | Self::Live(_)
+            | Self::Process(_)
+            | Self::Park(_)
+            | Self::Signals(_)
+            | Self::Output(_) => Exit::Failed,
         }
     }
 }

@@ -15,6 +15,7 @@ use std::process::ExitCode;
 
 use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
+use raysweep_drivers::mirror;
 use raysweep_proto::{Client, ClientError, Empty, ErrorCode, RpcError, RunParams, RunState, Started};
 use serde::Serialize;
 use serde_json::json;
@@ -111,6 +112,17 @@ enum Command {
     Continue,
     /// End the run in order; what was acquired is kept
     Cancel,
+    /// Permit a mirror's light until the next boot, on a rig without an interlock
+    ArmLight,
+    /// Take a mirror that a daemon has left behind to the origin, light off first; needs no daemon
+    Park {
+        /// The mirror's state, in the daemon's data folder
+        #[arg(long, value_name = "FILE", default_value = crate::mirror::DEFAULT_STATE)]
+        state: PathBuf,
+        /// Wait until standard input is closed: how a daemon's guardian outlives it
+        #[arg(long)]
+        when_closed: bool,
+    },
     /// List the daemon's sessions, oldest first
     Sessions,
     /// Make a session's products and report again from what is stored; needs no daemon
@@ -214,6 +226,18 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
         Command::Cancel => {
             connect()?.cancel()?;
             printer.print(&Empty {}, |_| "the run is being ended; what was acquired is kept".into())?;
+        }
+        Command::ArmLight => {
+            connect()?.arm_light()?;
+            printer.print(&Empty {}, |_| "light is permitted until the next boot".into())?;
+        }
+        Command::Park { state, when_closed } => {
+            let parked = if when_closed {
+                mirror::park_when_closed(io::stdin(), &state)?
+            } else {
+                mirror::park(&state)?
+            };
+            printer.print(&show::parked_name(parked), |_| show::parked(parked))?;
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
         Command::Process { session, products, only, memory } => {

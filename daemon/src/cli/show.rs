@@ -4,10 +4,11 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
-use raysweep_core::{Counts, FilmSummary, Percentiles};
+use raysweep_core::{Counts, FilmSummary, Percentiles, SettingsLatency};
+use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
-    BetterSweep, CheckReport, Description, ExpectedError, NoiseSource, Progress, Role, RunState, SessionInfo,
-    Status, SweepAdvice,
+    BetterSweep, CheckReport, Description, ExpectedError, MirrorStatus, NoiseSource, Progress, Role,
+    RunState, SessionInfo, Status, SweepAdvice,
 };
 
 use crate::process::Processed;
@@ -38,10 +39,49 @@ pub(super) fn status(status: &Status) -> String {
             ),
         ));
     }
+    if let Some(SettingsLatency { min_frames, max_frames }) = status.settings_latency {
+        rows.push(("settings", format!("act {min_frames} to {max_frames} frames late")));
+    }
+    if let Some(mirror) = &status.mirror {
+        rows.push(("mirror", self::mirror(mirror)));
+    }
     if let Some(error) = &status.error {
         rows.push(("error", error.clone()));
     }
     block(&rows)
+}
+
+/// `park`, for programs.
+pub(super) fn parked_name(parked: Parked) -> serde_json::Value {
+    match parked {
+        Parked::Already => serde_json::json!({ "parked": "already" }),
+        Parked::From(tilt) => serde_json::json!({ "parked": "from", "tilt_deg": tilt.deg() }),
+        Parked::ByReset => serde_json::json!({ "parked": "by_reset" }),
+    }
+}
+
+/// `park`
+pub(super) fn parked(parked: Parked) -> String {
+    match parked {
+        Parked::Already => "the mirror is parked, as it was".into(),
+        Parked::From(tilt) => {
+            let [x, y] = tilt.deg();
+            format!("the mirror is parked; it was found at {x:.2}, {y:.2} degrees")
+        }
+        Parked::ByReset => "nobody knew where the mirror was: its controller was started anew".into(),
+    }
+}
+
+fn mirror(mirror: &MirrorStatus) -> String {
+    let place = if mirror.parked { "parked" } else { "away from the origin" };
+    let laser = if mirror.laser { "on" } else { "off" };
+    let word = match mirror.light.as_str() {
+        "interlock_closed" => "the interlock is closed",
+        "interlock_open" => "the interlock is open",
+        "armed" => "light is armed",
+        _ => "nobody has armed the light since this boot: `raysweep arm-light`",
+    };
+    format!("{place}, light {laser}; {word}")
 }
 
 /// `check`
@@ -174,9 +214,12 @@ pub(super) fn ending(
     stored: usize,
     missing: usize,
     final_s: Option<f64>,
+    light_s: Option<f64>,
 ) -> String {
     let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
     lines.push(format!("session: {}", session.display()));
+    lines
+        .extend(light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")));
     lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
     lines.extend(report.map(|report| format!("report: {}", report.display())));
     if missing > 0 {
@@ -294,10 +337,13 @@ mod tests {
     #[test]
     fn an_unfinished_session_is_told_how_to_go_on() {
         let folder = Path::new("/data/20260101-000000_corner");
-        let unfinished = ending(folder, "cancelled", None, 40, 35, None);
+        let unfinished = ending(folder, "cancelled", None, 40, 35, None, None);
         assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
-        let complete = ending(folder, "complete", Some(&folder.join("report.html")), 75, 0, Some(0.25));
-        assert!(complete.contains("0.25 s after the last frame"));
+        let complete =
+            ending(folder, "complete", Some(&folder.join("report.html")), 75, 0, Some(0.25), Some(10.5));
+        assert!(
+            complete.contains("0.25 s after the last frame") && complete.contains("10.50 s from the first")
+        );
         assert!(complete.ends_with("report.html") && !complete.contains("resume"), "{complete}");
     }
 }

@@ -56,7 +56,18 @@ impl View {
             Event::Film(estimate) => self.film(estimate),
             Event::Vsync(_) => {}
             Event::Live { points, .. } => self.live = Some(*points),
-            Event::Finished { session, state, error, report, stored, missing, film, warnings, final_s } => {
+            Event::Finished {
+                session,
+                state,
+                error,
+                report,
+                stored,
+                missing,
+                film,
+                warnings,
+                final_s,
+                light_s,
+            } => {
                 if let Place::Bar(bar) = &self.place {
                     bar.finish_and_clear();
                 }
@@ -68,7 +79,9 @@ impl View {
                 }
                 let summary = match film {
                     Some(film) => show::film_ending(session, state, report.as_deref(), film),
-                    None => show::ending(session, state, report.as_deref(), *stored, *missing, *final_s),
+                    None => {
+                        show::ending(session, state, report.as_deref(), *stored, *missing, *final_s, *light_s)
+                    }
                 };
                 writeln!(io::stdout(), "{summary}")?;
             }

@@ -2,6 +2,7 @@
 
 use raysweep_core::{PixelFormat, Raster};
 use raysweep_drivers::camera::aravis::{AravisConfig, ConfigFault};
+use raysweep_drivers::camera::v4l2::V4l2Config;
 use raysweep_pipeline::{Scan, Spot};
 use raysweep_proto::NoiseSource;
 use raysweep_sim::SimConfig;
@@ -44,6 +45,8 @@ pub enum CameraDriver {
     Sim,
     /// GigE Vision and USB3 Vision through libaravis.
     Aravis,
+    /// Cameras of the Linux kernel.
+    V4l2,
 }
 
 /// Drivers by the names that rig files use.
@@ -66,6 +69,8 @@ pub struct CameraSection {
     /// `[camera.aravis]`, for the driver `aravis`.
     #[serde(default)]
     pub aravis: AravisConfig,
+    /// `[camera.v4l2]`, for the driver `v4l2`.
+    pub v4l2: Option<V4l2Config>,
     /// Counts, above black, of a white pixel in the time of one projector row; left out: 2500 of 4096 of the format's.
     white_dn: Option<f64>,
     /// Counts without light; left out: 64 of 4096 of the format's.
@@ -340,6 +345,14 @@ impl RigFile {
             };
             camera.aravis.check().map_err(placed)?;
         }
+        if camera.driver == CameraDriver::V4l2 {
+            let Some(v4l2) = &camera.v4l2 else {
+                let message = "camera.driver = \"v4l2\": a table [camera.v4l2] with device, width and height is missing";
+                return Err(ConfigError::at(text, &["camera", "driver"], message));
+            };
+            v4l2.check()
+                .map_err(|(key, message)| ConfigError::at(text, &["camera", "v4l2", key], message))?;
+        }
         if camera.first_projector_row.is_some_and(|row| row >= projector.rows) {
             let message = format!(
                 "camera.first_projector_row = {}: allowed is 0 to {}",
@@ -457,6 +470,14 @@ mod tests {
             (MINIMAL.replace("[camera]\n", "[camera]\nfirst_projector_row = 720\n"), "0 to 719"),
             (format!("{MINIMAL}[sim]\nseed = -1\n"), "-1"),
             (MINIMAL.replacen("\"sim\"", "\"aravis\"", 1), "`raysweep devices`"),
+            (MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\""), "[camera.v4l2]"),
+            (
+                format!(
+                    "{}[camera.v4l2]\ndevice = \"/dev/video0\"\nwidth = 640\nheight = 360\nbuffers = 1\n",
+                    MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\"")
+                ),
+                "camera.v4l2.buffers = 1: allowed is 2 to 32",
+            ),
             (MINIMAL.replace("[camera]\n", "[camera]\nreopen_s = -1\n"), "camera.reopen_s = -1"),
             (
                 MINIMAL.replacen("\"sim\"", "\"aravis\"\naravis.name = \"a\"\naravis.packet_size = 10", 1),

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use raysweep_core::FilmSummary;
+use raysweep_core::{FilmSummary, SettingsLatency};
 use raysweep_proto::{Event, RunState, Status};
 use tokio::sync::broadcast;
 
@@ -31,8 +31,10 @@ impl Board {
             progress: None,
             vsync: None,
             film: None,
+            settings_latency: None,
             error: None,
             live: None,
+            mirror: None,
         };
         Self { status: Mutex::new(status), events: broadcast::Sender::new(EVENTS) }
     }
@@ -63,7 +65,7 @@ impl Board {
         status.state = next;
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
-            status.film = None;
+            (status.film, status.settings_latency) = (None, None);
         }
         let event = Event::State { state: next, session: status.session.clone() };
         // Sent under the lock, so that subscribers see states in their true order.
@@ -79,6 +81,11 @@ impl Board {
     /// Notes how a film went.
     pub fn set_film(&self, film: FilmSummary) {
         self.lock().film = Some(film);
+    }
+
+    /// Notes how late the camera's settings take effect.
+    pub fn set_settings_latency(&self, latency: Option<SettingsLatency>) {
+        self.lock().settings_latency = latency;
     }
 
     /// Names the file with the live images.

@@ -1,20 +1,25 @@
 //! The camera's thread: sets the camera for one point after the other and hands its frames on.
 
-mod film;
+mod ahead;
+mod probe;
+mod sequence;
+mod triggers;
 
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, OnceLock};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use raysweep_core::{
-    Applied, Camera, CameraSettings, DeviceError, DeviceErrorKind, DeviceState, Frame, FrameBuf, FramePool,
-    FrameStamp, LossCause, SettingsId, ns_from_us,
+    Camera, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState, Frame, FrameBuf, FramePool,
+    FrameStamp, LossCause, SettingsId, SettingsLatency, ns_from_us,
 };
-use raysweep_pipeline::{Event, Input, Job, Label, Point, QueueError, Shot, message_of};
+use raysweep_pipeline::{Event, Input, Label, Point, QueueError, Shot, message_of};
 
-pub use self::film::{FilmPass, FilmSetting};
-use super::orders::{Order, Orders};
+pub use self::ahead::Line;
+use self::ahead::{Ahead, Seen};
+pub use self::sequence::{FilmPass, FilmSetting};
+use super::orders::Orders;
 use crate::rig::Pace;
 
 /// One attempt at a point.
@@ -40,6 +45,8 @@ pub struct Pass {
 /// What the camera is for until its next flush.
 #[derive(Debug, Clone)]
 pub enum Work {
+    /// To find out how late settings take effect, by changes from and to these.
+    Probe(CameraSettings),
     /// Points, each until all its frames are there.
     Pass(Pass),
     /// A film.
@@ -71,7 +78,34 @@ pub struct Gone;
 pub struct CameraThread {
     work: SyncSender<Work>,
     ended: Receiver<Ended>,
-    thread: JoinHandle<Option<Instant>>,
+    latency: Arc<OnceLock<SettingsLatency>>,
+    thread: JoinHandle<Exposures>,
+}
+
+/// When frames were exposed that a point waited for.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Exposures {
+    /// When the last of them ended.
+    pub until: Option<Instant>,
+    /// From the first to the end of the last of those with light, on the camera's clock.
+    lit_ns: Option<(i64, i64)>,
+}
+
+impl Exposures {
+    /// Seconds from the first frame with light to the end of the last.
+    pub fn light_s(&self) -> Option<f64> {
+        self.lit_ns.map(|(from_ns, to_ns)| (to_ns - from_ns) as f64 * 1e-9)
+    }
+}
+
+/// How a run's camera is driven.
+pub struct Drive {
+    /// The clock that stamps are on.
+    pub clock: Clock,
+    /// Who sets the pace.
+    pub pace: Pace,
+    /// The line that triggers it.
+    pub line: Line,
 }
 
 impl CameraThread {
@@ -81,30 +115,33 @@ impl CameraThread {
     /// When the camera cannot be armed or the system gives no thread.
     pub fn start(
         mut camera: Box<dyn Camera>,
+        drive: Drive,
         input: Input<Event>,
-        pace: Pace,
-        period_us: f64,
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         camera.arm()?;
+        let latency = Arc::new(OnceLock::new());
         let (work, todo) = sync_channel::<Work>(1);
         let (done, ended) = sync_channel(1);
         let thread = thread::Builder::new()
             .name("camera".into())
-            .spawn(move || {
-                let mut sequencer = Sequencer::new(camera, input, pace, period_us, orders);
-                for work in todo {
-                    if done.send(sequencer.work(&work)).is_err() {
-                        break;
+            .spawn({
+                let latency = latency.clone();
+                move || {
+                    let mut sequencer = Sequencer::new(camera, drive, input, orders);
+                    for work in todo {
+                        if done.send(sequencer.work(work, &latency)).is_err() {
+                            break;
+                        }
                     }
+                    if let Err(error) = sequencer.camera.disarm() {
+                        tracing::warn!(%error, "camera not disarmed");
+                    }
+                    sequencer.exposures
                 }
-                if let Err(error) = sequencer.camera.disarm() {
-                    tracing::warn!(%error, "camera not disarmed");
-                }
-                sequencer.exposed_until
             })
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
-        Ok(Self { work, ended, thread })
+        Ok(Self { work, ended, latency, thread })
     }
 
     /// Does some work and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
@@ -120,11 +157,16 @@ impl CameraThread {
         }
     }
 
-    /// Disarms the camera and ends its thread; says when the exposure of the last frame ended that a point waited for.
+    /// How late settings take effect, once a probe has found out.
+    pub fn latency(&self) -> Option<SettingsLatency> {
+        self.latency.get().copied()
+    }
+
+    /// Disarms the camera and ends its thread; says when frames were exposed that a point waited for.
     ///
     /// # Errors
     /// When the thread panicked.
-    pub fn join(self) -> Result<Option<Instant>, DeviceError> {
+    pub fn join(self) -> Result<Exposures, DeviceError> {
         drop(self.work);
         self.thread.join().map_err(|panic| {
             let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
@@ -135,6 +177,7 @@ impl CameraThread {
 
 struct Sequencer {
     camera: Box<dyn Camera>,
+    clock: Clock,
     input: Input<Event>,
     pace: Pace,
     pool: FramePool,
@@ -145,45 +188,41 @@ struct Sequencer {
     /// The longest that a frame has taken so far, from its edge to its last row.
     longest_frame_us: f64,
     period_us: f64,
-    /// Id of the newest frame.
-    newest_seq: Option<u64>,
+    ahead: Ahead,
     /// Up to this frame the assembler knows what became of each; nothing after a pause, whose frames are nobody's.
     told_seq: Option<u64>,
-    /// When the exposure of the last counted frame ended.
-    exposed_until: Option<Instant>,
+    /// Settings written that no point asked for.
+    lead_ins: u32,
+    exposures: Exposures,
 }
 
 /// A frame off the camera.
 struct Received {
     stamp: FrameStamp,
+    seen: Seen,
     /// Nothing where no buffer was free.
     data: Option<FrameBuf>,
 }
 
-/// What became of one wait for a frame.
+/// What became of a frame.
 enum Taken {
     /// It is with the assembler.
-    Passed(FrameStamp, Label),
+    Passed,
     /// There was no room for it.
     Lost,
-    /// None came in time.
-    None,
 }
 
 impl Sequencer {
-    fn new(
-        camera: Box<dyn Camera>,
-        input: Input<Event>,
-        pace: Pace,
-        period_us: f64,
-        orders: Arc<Orders>,
-    ) -> Self {
+    fn new(camera: Box<dyn Camera>, drive: Drive, input: Input<Event>, orders: Arc<Orders>) -> Self {
+        let Drive { clock, pace, line } = drive;
         let capabilities = camera.capabilities();
         let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
         let pool = FramePool::new(POOL_BUFFERS, bytes);
         let spare = pool.spare();
         Self {
+            ahead: Ahead::new(capabilities.clone(), line),
             camera,
+            clock,
             input,
             pace,
             pool,
@@ -191,37 +230,28 @@ impl Sequencer {
             orders,
             warmed_up: false,
             longest_frame_us: 0.0,
-            period_us,
-            newest_seq: None,
+            period_us: line.period_us,
             told_seq: None,
-            exposed_until: None,
+            lead_ins: 0,
+            exposures: Exposures::default(),
         }
     }
 
     /// Always ends with a flush, so that nothing stays undecided.
-    fn work(&mut self, work: &Work) -> Ended {
+    fn work(&mut self, work: Work, latency: &OnceLock<SettingsLatency>) -> Ended {
         let acquired = match work {
-            Work::Pass(pass) => self.attempts(pass),
-            Work::Film(film) => self.film(film),
+            Work::Probe(settings) => self.probe(&settings).map(|found| {
+                if let Some(found) = found {
+                    latency.get_or_init(|| found);
+                }
+            }),
+            Work::Pass(pass) => self.sweep(pass),
+            Work::Film(film) => self.film(&film),
         };
         match self.input.send(Event::Flush) {
             Ok(()) => Ended::Flushed(acquired),
             Err(_) => Ended::NotFlushed,
         }
-    }
-
-    fn attempts(&mut self, pass: &Pass) -> Result<(), DeviceError> {
-        self.warm_up(pass.not_before_ns)?;
-        for attempt in &pass.attempts {
-            if self.orders.now() == Order::Pause {
-                self.idle()?;
-            }
-            if !self.orders.go_on() {
-                return Ok(());
-            }
-            self.attempt(attempt)?;
-        }
-        self.pass_frames(MARGIN_FRAMES, i64::MIN)
     }
 
     /// Lets frames go by until the line is known and the picture is in the light.
@@ -232,90 +262,32 @@ impl Sequencer {
         Ok(())
     }
 
-    fn attempt(&mut self, attempt: &Attempt) -> Result<(), DeviceError> {
-        let Attempt { id, point, shot } = *attempt;
-        let Some(applied) = self.configure(id, &shot.settings)? else { return Ok(()) };
-        let job = Job {
-            id,
-            frames: point.frames,
-            applied,
-            delay_us: point.delay_us,
-            light_edges_later: shot.light_edges_later,
-            periods_from_last: None,
-        };
-        self.input.send(Event::Begin(job)).map_err(closed)?;
-        self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
-        let mut passed = 0;
-        let mut watchdog = self.watchdog();
-        // A point that has failed is taken with some frames to spare, the more the oftener it failed.
-        let wanted = point.frames + id.attempt * point.frames.div_ceil(4);
-        // Frames that found no room are taken again within the attempt, but not for ever.
-        let mut spare_frames = 64 + 3 * point.frames;
-        while passed < wanted && spare_frames > 0 && self.orders.go_on() {
-            match self.take(|stamp| Label::of(stamp, &applied))? {
-                Taken::Passed(stamp, Label::Counted) => {
-                    passed += 1;
-                    self.exposed_until = self.end_of_exposure(&stamp, &applied.actual);
-                }
-                Taken::Passed(..) => {}
-                Taken::Lost => spare_frames -= 1,
-                Taken::None => {
-                    watchdog.missed(self.camera.state())?;
-                    continue;
-                }
-            }
-            watchdog.feed();
-        }
-        self.input.send(Event::End).map_err(closed)
-    }
-
-    /// Writes settings. A camera that is being opened again is waited for; nothing when the run ends meanwhile.
-    fn configure(
-        &mut self,
-        id: SettingsId,
-        settings: &CameraSettings,
-    ) -> Result<Option<Applied>, DeviceError> {
-        loop {
-            match self.camera.configure(id, settings) {
-                Err(_) if self.camera.state() == DeviceState::Lost => {
-                    if !self.orders.go_on() {
-                        return Ok(None);
-                    }
-                    self.take(|_| Label::Cancelled)?;
-                }
-                applied => return applied.map(Some),
-            }
-        }
-    }
-
-    /// Holds the run until it is told to go on.
-    fn idle(&mut self) -> Result<(), DeviceError> {
-        self.input.send(Event::Idle).map_err(closed)?;
-        self.orders.wait_while_paused();
-        self.told_seq = None;
-        Ok(())
-    }
-
     /// Lets frames go by: at least `frames` of them, and until exposures start at `not_before_ns` or later.
     fn pass_frames(&mut self, frames: u32, not_before_ns: i64) -> Result<(), DeviceError> {
         let mut left = frames;
-        let mut watchdog = self.watchdog();
+        let mut watchdog = Watchdog::default();
         let mut reached_ns = i64::MIN;
         while (left > 0 || reached_ns < not_before_ns) && self.orders.go_on() {
-            match self.take(|_| Label::Cancelled)? {
-                Taken::Passed(stamp, _) => {
-                    left = left.saturating_sub(1);
-                    reached_ns = stamp.exposure_start_ns;
-                }
-                Taken::Lost => {}
-                Taken::None => {
-                    watchdog.missed(self.camera.state())?;
-                    continue;
-                }
-            }
+            let Some(received) = self.receive(POLL)? else {
+                watchdog.missed(POLL, self.longest_frame_us, self.camera.state())?;
+                continue;
+            };
             watchdog.feed();
+            let start_ns = received.stamp.exposure_start_ns;
+            if let Taken::Passed = self.pass(received)? {
+                left = left.saturating_sub(1);
+                reached_ns = start_ns;
+            }
         }
         Ok(())
+    }
+
+    /// Lets a frame go by.
+    fn pass(&mut self, received: Received) -> Result<Taken, DeviceError> {
+        for _ in 0..received.seen.owner.unwrap_or(0) {
+            self.ahead.pop();
+        }
+        self.hand_on(received, Label::Cancelled)
     }
 
     fn frame_us(&self, settings: &CameraSettings) -> f64 {
@@ -323,47 +295,42 @@ impl Sequencer {
         f64::from(periods) * self.period_us
     }
 
-    /// When the last row of a frame that has just come ended its exposure. The camera's clock may be a virtual one, so
-    /// that only its differences count.
-    fn end_of_exposure(&self, stamp: &FrameStamp, settings: &CameraSettings) -> Option<Instant> {
+    /// Notes a frame that a point waited for, which has just come.
+    fn note_exposure(&mut self, stamp: &FrameStamp, settings: &CameraSettings, is_lit: bool) {
         let capabilities = self.camera.capabilities();
         let rows_us = capabilities.height.saturating_sub(1) as f64 * capabilities.row_time_us;
-        let since_ns = stamp.host_ns - stamp.exposure_start_ns - ns_from_us(settings.exposure_us + rows_us);
-        Instant::now().checked_sub(Duration::from_nanos(since_ns.try_into().unwrap_or(0)))
-    }
-
-    fn watchdog(&self) -> Watchdog {
-        Watchdog {
-            patience: PATIENCE + Duration::from_secs_f64(3e-6 * self.longest_frame_us),
-            waited: Duration::ZERO,
+        let end_ns = stamp.exposure_start_ns + ns_from_us(settings.exposure_us + rows_us);
+        // The camera's clock may be a virtual one, so that only its differences count.
+        let since = Duration::from_nanos((stamp.host_ns - end_ns).try_into().unwrap_or(0));
+        self.exposures.until = Instant::now().checked_sub(since);
+        if is_lit {
+            let (first_ns, _) = self.exposures.lit_ns.unwrap_or((stamp.exposure_start_ns, end_ns));
+            self.exposures.lit_ns = Some((first_ns, end_ns));
         }
     }
 
-    fn take(&mut self, label: impl FnOnce(&FrameStamp) -> Label) -> Result<Taken, DeviceError> {
-        let Some(received) = self.receive()? else { return Ok(Taken::None) };
-        let label = label(&received.stamp);
-        self.hand_on(received, label)
-    }
-
     /// Waits for a frame.
-    fn receive(&mut self) -> Result<Option<Received>, DeviceError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Received>, DeviceError> {
         let mut data = match self.pace {
             Pace::Pipeline => Some(self.pool.take()),
             Pace::Devices => self.pool.try_take(),
         };
-        let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), POLL)?;
-        self.newest_seq = stamp.map(|stamp| stamp.seq).or(self.newest_seq);
-        Ok(stamp.map(|stamp| Received { stamp, data }))
+        let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), timeout)?;
+        Ok(stamp.map(|stamp| Received { stamp, seen: self.ahead.see(&stamp), data }))
     }
 
     /// Gives a frame to the assembler, or notes that there was no room for it.
-    fn hand_on(&mut self, Received { stamp, data }: Received, label: Label) -> Result<Taken, DeviceError> {
+    fn hand_on(
+        &mut self,
+        Received { stamp, data, .. }: Received,
+        label: Label,
+    ) -> Result<Taken, DeviceError> {
         self.tell_losses(stamp.seq)?;
         self.told_seq = Some(stamp.seq);
         let Some(data) = data else { return self.lose(stamp, label, LossCause::PoolEmpty) };
         let frame = Frame { data, format: self.camera.capabilities().format, stamp };
         match self.input.offer(Event::Frame(frame, label)) {
-            Ok(()) => Ok(Taken::Passed(stamp, label)),
+            Ok(()) => Ok(Taken::Passed),
             Err(QueueError::Full(_)) => self.lose(stamp, label, LossCause::QueueFull),
             Err(error @ QueueError::Closed) => Err(closed(error)),
         }
@@ -393,8 +360,8 @@ impl Sequencer {
 }
 
 /// Notices a camera that gives no frames.
+#[derive(Default)]
 struct Watchdog {
-    patience: Duration,
     waited: Duration,
 }
 
@@ -403,14 +370,19 @@ impl Watchdog {
         self.waited = Duration::ZERO;
     }
 
-    fn missed(&mut self, state: DeviceState) -> Result<(), DeviceError> {
+    fn missed(
+        &mut self,
+        waited: Duration,
+        longest_frame_us: f64,
+        state: DeviceState,
+    ) -> Result<(), DeviceError> {
         // A camera that its driver opens again comes back or ends the run itself.
         if state == DeviceState::Lost {
             self.waited = Duration::ZERO;
             return Ok(());
         }
-        self.waited += POLL;
-        if self.waited < self.patience {
+        self.waited += waited;
+        if self.waited < PATIENCE + Duration::from_secs_f64(3e-6 * longest_frame_us) {
             return Ok(());
         }
         Err(DeviceError::new(
@@ -427,3 +399,6 @@ impl Watchdog {
 fn closed<T>(_: QueueError<T>) -> DeviceError {
     DeviceError::new("camera", DeviceErrorKind::NotReady, "the pipeline has ended; the log says why")
 }
+
+#[cfg(test)]
+mod tests;

@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
-use std::time::Instant;
 
 use raysweep_core::{
-    CameraCapabilities, DeviceError, Pattern, Projector, SettingsId, Shown, VsyncStats, ns_from_us,
+    CameraCapabilities, CameraSettings, DeviceError, Pattern, Projector, SettingsId, SettingsLatency, Shown,
+    VsyncStats, ns_from_us,
 };
 use raysweep_pipeline::{
     AssemblerConfig, CycleOrder, Pipeline, PipelineConfig, PipelineError, Point, Policy, Role,
@@ -15,7 +15,7 @@ use raysweep_session::Session;
 use raysweep_session::ledger::{Entry, Ledger, State};
 
 use super::board::Board;
-use super::camera::{Attempt, CameraThread, FilmPass, FilmSetting, Gone, Pass, Work};
+use super::camera::{Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Line, Pass, Work};
 use super::film::{Account, CycleTiming, FilmSink, Solving, Worker};
 use super::orders::Orders;
 use super::storage::{PaceMeter, Storage, Verdict};
@@ -113,8 +113,10 @@ pub struct Acquired {
     pub processing: Processing,
     /// The VSYNC line.
     pub vsync: Option<VsyncStats>,
-    /// When the exposure of the last frame that a point waited for ended.
-    pub exposed_until: Option<Instant>,
+    /// When the frames that points waited for were exposed.
+    pub exposures: Exposures,
+    /// How late settings take effect, as a probe has found.
+    pub latency: Option<SettingsLatency>,
     /// Why acquisition ended early, if a fault ended it.
     pub fault: Option<RunError>,
 }
@@ -137,7 +139,7 @@ impl Run {
     /// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
     pub fn acquire(mut self) -> Result<Acquired, RunError> {
         self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: self.resumed })?;
-        let Devices { camera, vsync, projector, pace } = self.rig.open()?;
+        let Devices { camera, vsync, projector, clock, pace } = self.rig.open()?;
         let projector = Lit(projector);
         let assembler = self.assembler_config(camera.capabilities())?;
         let stack = self.session.stack()?;
@@ -193,8 +195,8 @@ impl Run {
         let (pipeline, input) = Pipeline::start(config, assembler, stages, storage)?;
 
         let vsync = VsyncThread::start(vsync, input.clone(), self.orders.clone())?;
-        let period_us = self.task.geometry.raster.period_us;
-        let camera = CameraThread::start(camera, input, pace, period_us, self.orders.clone())?;
+        let line = line_of(&self.task, trigger_latency_us);
+        let camera = CameraThread::start(camera, Drive { clock, pace, line }, input, self.orders.clone())?;
         let _ = self.board.go(RunState::Armed);
 
         let mut passes = Passes {
@@ -206,12 +208,17 @@ impl Run {
             trigger_latency_us,
         };
         let _ = self.board.go(RunState::Running);
-        let acquired = passes.acquire(missing).and_then(|()| match &cycle_plan {
-            Some(cycle_plan) if self.orders.go_on() => passes.film(cycle_plan),
-            _ => Ok(()),
-        });
+        let acquired = passes
+            .probe()
+            .map(|()| self.board.set_settings_latency(camera.latency()))
+            .and_then(|()| passes.acquire(missing))
+            .and_then(|()| match &cycle_plan {
+                Some(cycle_plan) if self.orders.go_on() => passes.film(cycle_plan),
+                _ => Ok(()),
+            });
         let _ = self.board.go(RunState::Draining);
         drop(passes);
+        let latency = camera.latency();
         let imaged = camera.join();
         let watched = vsync.join();
         let mut storage = pipeline.join()?;
@@ -226,9 +233,9 @@ impl Run {
             }
         }
         // What failed first is the cause; what it brought down comes after.
-        let (exposed_until, imaged) = match imaged {
-            Ok(exposed_until) => (exposed_until, Ok(())),
-            Err(error) => (None, Err(error)),
+        let (exposures, imaged) = match imaged {
+            Ok(exposures) => (exposures, Ok(())),
+            Err(error) => (Exposures::default(), Err(error)),
         };
         let device = watched.and(imaged).err().map(RunError::from);
         let fault = storage.write_error.map(RunError::from).or(device).or(acquired.err());
@@ -237,7 +244,8 @@ impl Run {
             ledger: storage.ledger,
             processing: storage.processing,
             vsync: storage.vsync,
-            exposed_until,
+            exposures,
+            latency,
             fault,
         })
     }
@@ -294,6 +302,14 @@ fn start_live(outlet: Outlet) -> Option<LiveEstimate> {
     started.map_err(|error| tracing::warn!(%error, "no live estimate of this run")).ok()
 }
 
+/// The line that triggers the camera through a task's settings. Dark points have a pass of their own.
+fn line_of(task: &Task, trigger_latency_us: f64) -> Line {
+    let lit = task.schedule.points.iter().filter(|point| !matches!(point.role, Role::Dark(_)));
+    let settings: Vec<CameraSettings> =
+        lit.map(|point| task.geometry.shot(point, trigger_latency_us).settings).collect();
+    Line::new(task.geometry.raster.period_us, task.plan.max_jitter_us(), &settings)
+}
+
 /// The points that the ledger does not know as stored, with the number of their next attempt; of a film those that are
 /// not in its cycles.
 pub fn missing(task: &Task, state: &State) -> Vec<SettingsId> {
@@ -320,6 +336,18 @@ struct Passes<'a> {
 }
 
 impl Passes<'_> {
+    /// Finds out how late settings take effect, where there are several.
+    fn probe(&self) -> Result<(), RunError> {
+        let mut settings = self.task.settings().map(|(_, point)| *point);
+        let Some(first) = settings.next().filter(|_| settings.next().is_some() && self.orders.go_on()) else {
+            return Ok(());
+        };
+        let shot = self.task.geometry.shot(&first, self.trigger_latency_us);
+        let probed = self.camera.acquire(Work::Probe(shot.settings)).map_err(|Gone| RunError::Interrupted)?;
+        self.results.iter().find(|verdict| matches!(verdict, Verdict::Flushed));
+        Ok(probed?)
+    }
+
     fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
         let mut todo = missing;
         for _ in 0..MAX_ATTEMPTS {

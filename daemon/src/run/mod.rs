@@ -35,6 +35,7 @@ use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
 use crate::live::{LiveFile, Outlet};
 use crate::memory::{MemoryNeed, available_bytes};
+use crate::mirror;
 use crate::processing::Task;
 use crate::results::{self, Results};
 use crate::rig::{Rig, RigError};
@@ -318,6 +319,8 @@ fn conduct(run: Run, in_strips: bool, orders: &Orders, board: &Board, dir: &Path
             missing: points - stored,
             vsync: None,
             final_s: None,
+            light_s: None,
+            settings_latency: None,
         };
         (end, Vec::new())
     });
@@ -338,6 +341,7 @@ fn conduct(run: Run, in_strips: bool, orders: &Orders, board: &Board, dir: &Path
         film: board.status().film,
         warnings,
         final_s: end.final_s,
+        light_s: end.light_s,
     };
     if board.status().state != RunState::Draining && state == RunState::Idle {
         let _ = board.go(RunState::Draining);
@@ -355,7 +359,7 @@ fn conclude(
     orders: &Orders,
     live: Option<&Outlet>,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
-    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
     let whole = fault.is_none() && engine::missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let make = || match in_strips {
@@ -378,10 +382,12 @@ fn conclude(
         missing: task.points() - stored,
         vsync,
         final_s: None,
+        light_s: exposures.light_s(),
+        settings_latency: latency,
     };
     if let (EndState::Complete, Some(results)) = (state, &mut results) {
         results.write_transport(&session, task)?;
-        end.final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+        end.final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
         let overview = results.overview();
         if let Some((live, overview)) = live.zip(overview.as_ref()) {
             show_last(live, overview, stored, computed);
@@ -409,7 +415,7 @@ fn conclude_film(
     rig: &Rig,
     orders: &Orders,
 ) -> Result<(EndEntry, Vec<String>), RunError> {
-    let Acquired { session, mut ledger, processing, vsync, exposed_until, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
     let state = match &fault {
         Some(_) => EndState::Faulted,
         None if orders.now() == Order::Cancel => EndState::Cancelled,
@@ -417,9 +423,10 @@ fn conclude_film(
     };
     let stored = ledger.state().stored_points();
     let error = fault.map(|fault| fault.to_string());
-    let final_s = exposed_until.map(|exposed_until| exposed_until.elapsed().as_secs_f64());
+    let final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
     let missing = task.points() - stored;
-    let end = EndEntry { state, error, stored, missing, vsync, final_s };
+    let (light_s, settings_latency) = (exposures.light_s(), latency);
+    let end = EndEntry { state, error, stored, missing, vsync, final_s, light_s, settings_latency };
     ledger.append(&Entry::End(end.clone()))?;
     let mut problems = processing.problems;
     if state != EndState::Faulted {
@@ -440,7 +447,7 @@ fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) 
 
 impl Control for Runner {
     fn status(&self) -> Status {
-        self.board.status()
+        Status { mirror: mirror::status(&self.data), ..self.board.status() }
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
@@ -474,6 +481,10 @@ impl Control for Runner {
         let during =
             [RunState::Preparing, RunState::Armed, RunState::Running, RunState::Paused, RunState::Draining];
         self.order(Order::Cancel, &during, None)
+    }
+
+    fn arm_light(&self) -> Result<(), RpcError> {
+        mirror::arm_light(&self.data)
     }
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {

@@ -33,6 +33,7 @@ pub(super) fn carry_out(
         Method::Pause => none(given).and_then(|()| control.pause()).and_then(done),
         Method::Continue => none(given).and_then(|()| control.go_on()).and_then(done),
         Method::Cancel => none(given).and_then(|()| control.cancel()).and_then(done),
+        Method::ArmLight => none(given).and_then(|()| control.arm_light()).and_then(done),
         Method::Subscribe => {
             none(given)?;
             return Ok(Reply { result: done(())?, events: Some(control.events()) });

@@ -87,6 +87,8 @@ fn every_other_command_prints_for_people_and_for_programs() {
     let plan = plan(&daemon, "hang");
     for (arguments, human, json) in [
         (vec!["status"], "37 of 75 stored", "/progress/points_stored"),
+        (vec!["status"], "parked, light off; light is armed", "/mirror/parked"),
+        (vec!["arm-light"], "until the next boot", ""),
         (vec!["describe"], "operator  Begins a run", "/methods/0/params/type"),
         (vec!["check", &plan], "relative rows -94 to 94", "/warnings/0"),
         (vec!["check", &plan], "assumed: state camera.electrons_per_dn", "/advice/noise/source"),

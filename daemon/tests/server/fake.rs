@@ -8,8 +8,9 @@ use raysweep::control::Control;
 use raysweep::server::{Access, Limits, Listening, serve_within};
 use raysweep_core::{Counts, LossCause, VsyncStats};
 use raysweep_proto::{
-    BetterSweep, CheckReport, Client, ErrorCode, Event, ExpectedError, NoiseEstimate, NoiseSource, Progress,
-    ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status, SweepAdvice,
+    BetterSweep, CheckReport, Client, ErrorCode, Event, ExpectedError, MirrorStatus, NoiseEstimate,
+    NoiseSource, Progress, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started, Status,
+    SweepAdvice,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -65,6 +66,7 @@ impl Fake {
             film: None,
             warnings: Vec::new(),
             final_s: None,
+            light_s: None,
         });
     }
 
@@ -170,8 +172,10 @@ impl Control for Fake {
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
             film: None,
+            settings_latency: None,
             error: None,
             live: self.live.exists().then(|| self.live.clone()),
+            mirror: Some(MirrorStatus { parked: true, laser: false, light: "armed".into() }),
         }
     }
 
@@ -217,6 +221,10 @@ impl Control for Fake {
         if self.runs.lock().unwrap().last().and_then(|run| run.note.clone()).as_deref() != Some("stubborn") {
             self.finish("cancelled", 38);
         }
+        Ok(())
+    }
+
+    fn arm_light(&self) -> Result<(), RpcError> {
         Ok(())
     }
 

@@ -1,3 +1,4 @@
 //! Cameras.
 
 pub mod aravis;
+pub mod v4l2;

@@ -4,10 +4,10 @@ use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use raysweep_core::{CameraSettings, Clock, Shutter};
+use raysweep_core::{CameraSettings, Clock, PixelFormat, Shutter};
 
 use super::faults::TriggerOrder;
-use super::features::{Access, CHUNKS, FORMATS, GLOBAL_SHUTTER, Id, SINGLE_FRAME, SOFTWARE};
+use super::features::{Access, CHUNKS, GLOBAL_SHUTTER, Id, SINGLE_FRAME, SOFTWARE};
 use super::gvcp::{Command, Request, Status, seal, u32_at};
 use super::gvsp::{MAX_PACKET_BYTES, MIN_PACKET_BYTES, View};
 use super::lock;
@@ -319,8 +319,7 @@ impl Control {
 
     fn view(&self) -> View {
         let number = |id| self.registers.number(id);
-        let code = number(Id::PixelFormat);
-        let format = FORMATS.into_iter().find(|format| format.pfnc() == code);
+        let format = PixelFormat::from_pfnc(number(Id::PixelFormat));
         let enabled = |chunk: usize| self.registers.number_for(Id::ChunkEnable, chunk as u32) == 1;
         let chunks = (number(Id::ChunkModeActive) == 1).then(|| {
             let mut all = [false; CHUNKS.len()];
@@ -329,7 +328,7 @@ impl Control {
         });
         View {
             // The register takes codes of formats alone.
-            format: format.unwrap_or(FORMATS[0]),
+            format: format.unwrap_or(PixelFormat::Mono8),
             x: number(Id::OffsetX) as usize,
             y: number(Id::OffsetY) as usize,
             width: number(Id::Width) as usize,

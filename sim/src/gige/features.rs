@@ -2,7 +2,7 @@
 //! write are both made of it, so that they cannot disagree. Names are those of the GenICam SFNC 2.7; registers below
 //! 0x1000 lie where GigE Vision 2.0 puts them.
 
-use raysweep_core::{CameraCapabilities, PixelFormat};
+use raysweep_core::{CameraCapabilities, Mosaic, PixelFormat};
 
 /// A register; its name is the feature's.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -155,20 +155,6 @@ pub const MAKERS_REGISTERS: u32 = 0x1_0000;
 /// Bytes kept for each of them.
 pub const MAKERS_STRIDE: u32 = 16;
 
-/// All formats that a simulated camera can pack.
-pub const FORMATS: [PixelFormat; 10] = [
-    PixelFormat::Mono8,
-    PixelFormat::Mono10,
-    PixelFormat::Mono12,
-    PixelFormat::Mono16,
-    PixelFormat::Mono10p,
-    PixelFormat::Mono12p,
-    PixelFormat::Mono12Packed,
-    PixelFormat::BayerRG12,
-    PixelFormat::BayerRG12p,
-    PixelFormat::BayerRG12Packed,
-];
-
 /// Longest gap between packets: what is sent in gaps is waited for.
 const MAX_PACKET_GAP_TICKS: u32 = 100_000;
 
@@ -193,11 +179,12 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
         Kind::Float { min: *camera.exposure_us.start(), max: *camera.exposure_us.end(), unit: "us" };
     let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
     let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
-    let mosaic = camera.format.is_mosaic();
+    let mosaic = camera.format.mosaic;
     // A region that starts in the middle of a 2 x 2 cell would have another mosaic.
-    let offset_step = if mosaic { 2 } else { 1 };
-    let formats = FORMATS.into_iter().filter(|format| format.is_mosaic() == mosaic);
-    let formats = Kind::Enumeration(formats.map(|format| (format!("{format:?}"), format.pfnc())).collect());
+    let offset_step = if mosaic == Mosaic::Mono { 1 } else { 2 };
+    let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
+    let formats = formats.filter_map(|format| Some((format.to_string(), format.pfnc()?)));
+    let formats = Kind::Enumeration(formats.collect());
 
     let device = Some("DeviceControl");
     let transport = Some("TransportLayerControl");
@@ -248,7 +235,13 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
         maker(Id::Height, image, ReadWriteIdle, whole(1, height, 1, Some(Id::HeightMax)), height.into()),
         maker(Id::OffsetX, image, ReadWriteIdle, whole(0, width, offset_step, Some(Id::OffsetXMax)), 0),
         maker(Id::OffsetY, image, ReadWriteIdle, whole(0, height, offset_step, Some(Id::OffsetYMax)), 0),
-        maker(Id::PixelFormat, image, ReadWriteIdle, formats, camera.format.pfnc().into()),
+        maker(
+            Id::PixelFormat,
+            image,
+            ReadWriteIdle,
+            formats,
+            camera.format.pfnc().unwrap_or_default().into(),
+        ),
         maker(Id::AcquisitionMode, acquisition, ReadWriteIdle, one_of(&["Continuous", "SingleFrame"]), 0),
         maker(Id::AcquisitionStart, acquisition, Command, Kind::any(), 0),
         maker(Id::AcquisitionStop, acquisition, Command, Kind::any(), 0),

@@ -178,7 +178,7 @@ impl Block {
                 word(&[0; 2]);
                 word(&payload_type.to_be_bytes());
                 word(&self.stamp.ticks.to_be_bytes());
-                word(&self.view.format.pfnc().to_be_bytes());
+                word(&self.view.format.pfnc().unwrap_or_default().to_be_bytes());
                 for value in [self.view.width, self.view.height, self.view.x, self.view.y] {
                     word(&(value as u32).to_be_bytes());
                 }

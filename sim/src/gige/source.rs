@@ -16,7 +16,7 @@ use crate::line::Line;
 pub use crate::line::TriggeredBy;
 
 /// Pictures that are kept for clients that miss packets; test pictures repeat after as many.
-pub const BLOCKS: usize = 8;
+pub const BLOCKS: usize = 16;
 
 /// What a client's writes do, from the thread of the control protocol.
 pub trait Controls: Send + Sync {

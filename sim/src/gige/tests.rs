@@ -208,7 +208,7 @@ fn a_region_is_bounded_by_the_sensor_and_sets_the_payload() {
     assert_eq!(bench.set(Id::OffsetX, 34), 0x8002);
     assert_eq!(bench.set(Id::Width, 32), 0x8002);
     assert_eq!(bench.set(Id::Height, 3), SUCCESS);
-    assert_eq!(bench.set(Id::PixelFormat, PixelFormat::Mono12p.pfnc()), SUCCESS);
+    assert_eq!(bench.set(Id::PixelFormat, PixelFormat::Mono12p.pfnc().unwrap()), SUCCESS);
     assert_eq!(bench.get(Id::PayloadSize), (31 * 3 * 12_u32).div_ceil(8));
     assert_eq!(bench.set(Id::ChunkModeActive, 1), SUCCESS);
     let enable = bench.address(Id::ChunkEnable);
@@ -221,7 +221,7 @@ fn a_region_is_bounded_by_the_sensor_and_sets_the_payload() {
 fn what_frames_look_like_is_locked_while_they_are_acquired() {
     let mut bench = Bench::new().started();
     for (id, value) in
-        [(Id::Width, 8), (Id::PixelFormat, PixelFormat::Mono16.pfnc()), (Id::ChunkModeActive, 1)]
+        [(Id::Width, 8), (Id::PixelFormat, PixelFormat::Mono16.pfnc().unwrap()), (Id::ChunkModeActive, 1)]
     {
         assert_eq!(bench.set(id, value), 0x8006, "{id:?}");
     }

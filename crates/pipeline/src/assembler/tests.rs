@@ -261,15 +261,6 @@ fn settling_and_idle_frames_have_columns_of_their_own() {
 }
 
 #[test]
-fn old_settings_are_told_by_frame_id() {
-    let actual = CameraSettings { shutter: Shutter::Rolling, exposure_us: 1.0, trigger_delay_us: 0.0 };
-    let mut feed = Feed::new();
-    let applied = Applied { actual, first_frame: FirstFrame::Within(3) };
-    let labels: Vec<Label> = (0..4).map(|_| Label::of(&feed.stamp(0), &applied)).collect();
-    assert_eq!(labels, [Label::Settling, Label::Settling, Label::Counted, Label::Counted]);
-}
-
-#[test]
 fn spare_frames_stand_in_for_unsound_ones_and_are_left_when_they_need_not() {
     let mut feed = Feed::new();
     feed.edges(0, 3);

@@ -45,7 +45,17 @@ fn failed(index: usize, attempt: u32) -> Entry {
 }
 
 fn end(state: EndState) -> Entry {
-    Entry::End(EndEntry { state, error: None, stored: 1, missing: 3, vsync: None, final_s: None })
+    let (vsync, final_s, light_s, settings_latency) = (None, None, None, None);
+    Entry::End(EndEntry {
+        state,
+        error: None,
+        stored: 1,
+        missing: 3,
+        vsync,
+        final_s,
+        light_s,
+        settings_latency,
+    })
 }
 
 fn all_kinds() -> Vec<Entry> {

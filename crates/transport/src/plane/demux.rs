@@ -5,9 +5,10 @@ use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axi
 use rayon::prelude::*;
 
 use super::calibrate::FlyingSpot;
+use super::class::{ClassSolver, Row};
 use super::error::check_shape;
 use super::quadratic::Quadratic;
-use super::row::{Row, RowSolver};
+
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach};
 
 /// Demultiplexes delay-exposure stacks: for each pixel, the exact minimiser of
@@ -286,26 +287,25 @@ impl Demux {
         let models = self.classify(&mut tasks);
         // A class of rows with the same model at a time, so that its factors live no longer than they are needed.
         tasks.par_chunk_by_mut(|a, b| a.class == b.class).try_for_each(|tasks| {
-            let solver = RowSolver::new(&models[tasks[0].class], &self.prior, &self.reach, self.simd)?;
-            tasks.par_iter_mut().try_for_each(|Task { at, row, profiles, .. }| {
-                if !go_on() {
-                    return Err(PlaneError::Stopped);
-                }
+            let solver = ClassSolver::new(&models[tasks[0].class], &self.prior, &self.reach, self.simd);
+            let mut rows = Vec::with_capacity(tasks.len());
+            for Task { at, row, profiles, .. } in tasks {
                 let spot = match self.spot.as_deref().zip(solver.direct_weights()) {
                     Some((spot, even)) => {
                         Some((spot, spot.weights(&self.timing, &self.settings, *row, even)?))
                     }
                     None => None,
                 };
-                solver.solve(Row {
-                    spot: spot.as_ref().map(|(spot, weights)| (*spot, &weights[..])),
+                rows.push(Row {
                     stack: stack.index_axis(Axis(1), *at),
                     valid: valid.map(|valid| valid.index_axis_move(Axis(1), *at)),
                     u0_rows: self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(*row)),
+                    spot,
                     estimate: estimate.map(|estimate| estimate.t.index_axis(Axis(1), *at)),
                     profiles: profiles.view_mut(),
-                })
-            })
+                });
+            }
+            solver.solve(&mut rows, go_on)
         })?;
         let exists = Array2::from_shape_fn((shape[0], rows.len()), |(index, at)| {
             self.timing.row_exists(u_min + index as i32, rows[at])

@@ -136,6 +136,10 @@ pub(super) struct NarrowWork<'a, S: Simd> {
     narrow: &'a Narrow,
     /// 1 where a slot is free, else 0, `[slots]`.
     masks: AVec<f64>,
+    /// `[slots]`
+    c: AVec<f64>,
+    /// The minimiser in free slots and half the gradient in the others, `[slots]`.
+    y: AVec<f64>,
     /// By joint: what carries the elimination from the joint before, and 1 / pivot where it is free, else 0.
     carries: AVec<f64>,
     reciprocals: AVec<f64>,
@@ -158,6 +162,8 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
             simd,
             narrow,
             masks: zeros(narrow.slots),
+            c: zeros(narrow.slots),
+            y: zeros(narrow.slots),
             carries: zeros(narrow.chain.len()),
             reciprocals: zeros(narrow.chain.len()),
             columns: zeros(columns),
@@ -167,25 +173,34 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
         }
     }
 
-    /// Sets `y` to the minimiser of the free slots, and in the others to half the gradient, for all lanes; `free`, `c` and
-    /// `y` are `[slots][lanes]`.
+    /// Finds the minimiser of the free slots, and in the others half the gradient, for the lanes that are given: 1 for each
+    /// free slot and 0 for the others, and `-c`.
     #[inline(always)]
-    pub fn solve(&mut self, free: &[bool], c: &[f64], y: &mut [f64]) {
-        for (mask, &free) in self.masks.iter_mut().zip(free) {
-            *mask = f64::from(u8::from(free));
+    pub fn solve<'p>(&mut self, lanes: impl Iterator<Item = (&'p [f64], &'p [f64])>) {
+        for (lane, (free, slope)) in lanes.enumerate() {
+            for (slot, (&free, &slope)) in free.iter().zip(slope).enumerate() {
+                self.masks[slot * S::F64_LANES + lane] = free;
+                self.c[slot * S::F64_LANES + lane] = -slope;
+            }
         }
-        let c = S::as_simd_f64s(c).0;
-        self.eliminate(c);
-        self.solve_system(c);
-        self.substitute(c, S::as_mut_simd_f64s(y).0);
+        self.eliminate();
+        self.solve_system();
+        self.substitute();
+    }
+
+    /// Takes a lane's solution.
+    #[inline(always)]
+    pub fn take(&self, lane: usize, y: &mut [f64]) {
+        y.iter_mut().zip(self.y.iter().skip(lane).step_by(S::F64_LANES)).for_each(|(to, y)| *to = *y);
     }
 
     /// Eliminates the joints into the system. All that a pivot is made of is positive, so that nothing cancels.
     #[inline(always)]
-    fn eliminate(&mut self, c: &[S::f64s]) {
+    fn eliminate(&mut self) {
         let (simd, narrow) = (self.simd, self.narrow);
         let (settings, size) = (narrow.settings, narrow.unknowns());
         let masks = S::as_simd_f64s(&self.masks).0;
+        let c = S::as_simd_f64s(&self.c).0;
         let carries = S::as_mut_simd_f64s(&mut self.carries).0;
         let reciprocals = S::as_mut_simd_f64s(&mut self.reciprocals).0;
         let columns = S::as_mut_simd_f64s(&mut self.columns).0;
@@ -235,10 +250,11 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
     /// Solves for `v` and the border. The settings' part is positive definite and the border's, after it, negative
     /// definite, so the factors need no exchanges.
     #[inline(always)]
-    fn solve_system(&mut self, c: &[S::f64s]) {
+    fn solve_system(&mut self) {
         let (simd, narrow) = (self.simd, self.narrow);
         let (settings, size) = (narrow.settings, narrow.unknowns());
         let masks = S::as_simd_f64s(&self.masks).0;
+        let c = S::as_simd_f64s(&self.c).0;
         let system = S::as_mut_simd_f64s(&mut self.system).0;
         let unknowns = S::as_mut_simd_f64s(&mut self.unknowns).0;
         let one = simd.splat_f64s(1.0);
@@ -292,10 +308,12 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
 
     /// Puts the unknowns back into the chains.
     #[inline(always)]
-    fn substitute(&mut self, c: &[S::f64s], y: &mut [S::f64s]) {
+    fn substitute(&mut self) {
         let (simd, narrow) = (self.simd, self.narrow);
         let settings = narrow.settings;
         let masks = S::as_simd_f64s(&self.masks).0;
+        let c = S::as_simd_f64s(&self.c).0;
+        let y = S::as_mut_simd_f64s(&mut self.y).0;
         let carries = S::as_simd_f64s(&self.carries).0;
         let reciprocals = S::as_simd_f64s(&self.reciprocals).0;
         let unknowns = S::as_simd_f64s(&self.unknowns).0;

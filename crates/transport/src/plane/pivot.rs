@@ -1,185 +1,438 @@
-use ndarray::{ArrayView1, ArrayView2};
+//! Block principal pivoting of many pixels that share a quadratic: exact in finitely many steps (Kim and Park, "Fast
+//! Nonnegative Matrix Factorization: An Active-Set-Like Method and Comparisons", 2011, section 4).
+//!
+//! All pixels go on by one step at a time, sorted anew by the size of their systems before each, so that those which share
+//! the lanes of the vector registers have as much to do. What is computed for a pixel does not depend, to the bit, on the
+//! others, so pixels may come together in any way.
 
-use super::cholesky;
-use super::quadratic::Quadratic;
+use aligned_vec::{AVec, avec};
+use ndarray::{Array1, Array2, ArrayView2, Axis};
+use pulp::{Simd, WithSimd};
+
+use super::dense::Dense;
+use super::narrow::NarrowWork;
+use super::quadratic::{Padded, Quadratic};
+use super::{SimdLevel, reference};
 
 /// Full exchanges allowed without progress before the backup rule takes over (Kim and Park recommend 3).
-pub(super) const PATIENCE: usize = 3;
+const PATIENCE: usize = 3;
 
 /// Steps after which a pixel is left to the reference solver; ordinary pixels take about five.
-pub(super) const MAX_STEPS: usize = 300;
+const MAX_STEPS: usize = 300;
 
 /// Infeasibility below this share of the problem's own scale is rounding.
-pub(super) const TOLERANCE: f64 = 1e-11;
+const TOLERANCE: f64 = 1e-11;
 
-/// Minimises `x'Hx - 2 c'x` over `x >= 0` by block principal pivoting: exact in finitely many steps (Kim and Park,
-/// "Fast Nonnegative Matrix Factorization: An Active-Set-Like Method and Comparisons", 2011, section 4).
-///
-/// One value serves one pixel after the other, and starts each from the free rows of the one before.
-pub(super) struct Pivoting {
-    free: Vec<bool>,
-    /// The minimiser once [`Self::minimise`] has returned [`Outcome::Minimum`].
-    pub x: Vec<f64>,
-    /// Half the gradient, `Hx - c`.
-    gradient: Vec<f64>,
-    free_rows: Vec<usize>,
-    zero_rows: Vec<usize>,
-    matrix: Vec<f64>,
-    values: Vec<f64>,
+/// Length of runs for [`Start::Runs`]: shorter ones have many means to solve, longer ones are less alike.
+pub(super) const RUN_PX: usize = 32;
+
+/// Which slots are free at first.
+pub(super) enum Start<'a> {
+    /// These, `[pixels, slots]`.
+    Free(ArrayView2<'a, bool>),
+    /// In runs of so many pixels, one after the other, those of the minimum for the run's mean: it has less noise than a
+    /// neighbour's.
+    Runs(&'a [usize]),
 }
 
-#[derive(Debug, PartialEq, Eq)]
-pub(super) enum Outcome {
+/// Minimises `x'Hx - 2 c'x` over `x >= 0` for pixels that share `H`. `linear` holds their `c`, `[pixels, slots]` in
+/// standard layout, and comes back with their `x`.
+pub(super) fn minimise(
+    simd: SimdLevel,
+    quadratic: &Quadratic,
+    linear: Array2<f64>,
+    start: &Start,
+) -> Array2<f64> {
+    if linear.is_empty() {
+        return linear;
+    }
+    let unconstrained = linear.dot(&quadratic.inverse());
+    let mut slope = linear;
+    slope.mapv_inplace(|c| -c);
+    let mut free = Free::all(slope.nrows(), quadratic);
+    match start {
+        Start::Free(start) => free.set(*start),
+        Start::Runs(lengths) => {
+            let mut means = Free::all(lengths.len(), quadratic);
+            let [mut slope, unconstrained] =
+                [&slope, &unconstrained].map(|pixels| means_of_runs(pixels.view(), lengths));
+            simd.run(Pivoting::new(quadratic, &unconstrained, &mut slope, &mut means));
+            let numbers = lengths.iter().enumerate();
+            let runs = numbers.flat_map(|(run, &length)| std::iter::repeat_n(run, length));
+            runs.enumerate().for_each(|(pixel, run)| free.of_mut(pixel).copy_from_slice(means.of(run)));
+        }
+    }
+    let given_up = simd.run(Pivoting::new(quadratic, &unconstrained, &mut slope, &mut free));
+    for pixel in given_up {
+        let c: Vec<f64> = slope.row(pixel).iter().map(|slope| -slope).collect();
+        slope.row_mut(pixel).assign(&Array1::from(reference::minimise(quadratic.h(), &c)));
+    }
+    slope
+}
+
+fn means_of_runs(pixels: ArrayView2<f64>, lengths: &[usize]) -> Array2<f64> {
+    let mut means = Array2::zeros((lengths.len(), pixels.ncols()));
+    let mut rest = pixels;
+    for (mut mean, &length) in means.rows_mut().into_iter().zip(lengths) {
+        let (run, after) = rest.split_at(Axis(0), length);
+        run.rows().into_iter().for_each(|pixel| mean += &pixel);
+        mean /= length as f64;
+        rest = after;
+    }
+    means
+}
+
+/// The slots of each pixel that are free: 1, and the others 0, as are those that pad the quadratic's rows.
+struct Free {
+    stride: usize,
+    marks: AVec<f64>,
+}
+
+impl Free {
+    fn all(pixels: usize, quadratic: &Quadratic) -> Self {
+        let (slots, stride) = (quadratic.slots(), quadratic.padded_h().stride);
+        let mut free = Self { stride, marks: avec![0.0; pixels * stride] };
+        free.marks.chunks_exact_mut(stride).for_each(|marks| marks[..slots].fill(1.0));
+        free
+    }
+
+    fn set(&mut self, free: ArrayView2<bool>) {
+        for (marks, free) in self.marks.chunks_exact_mut(self.stride).zip(free.rows()) {
+            marks.iter_mut().zip(free).for_each(|(mark, &free)| *mark = f64::from(u8::from(free)));
+        }
+    }
+
+    fn of(&self, pixel: usize) -> &[f64] {
+        &self.marks[pixel * self.stride..(pixel + 1) * self.stride]
+    }
+
+    fn of_mut(&mut self, pixel: usize) -> &mut [f64] {
+        &mut self.marks[pixel * self.stride..(pixel + 1) * self.stride]
+    }
+
+    fn count(&self, pixel: usize) -> usize {
+        self.of(pixel).iter().filter(|mark| **mark == 1.0).count()
+    }
+}
+
+/// Takes pixels to their minima.
+struct Pivoting<'a> {
+    quadratic: &'a Quadratic,
+    slots: usize,
+    /// `H^-1 c`, `[pixels][slots]`.
+    unconstrained: &'a [f64],
+    /// Half the gradient at `x = 0`, `-c`, `[pixels][slots]`; minima take its place.
+    slope: &'a mut [f64],
+    /// Those of the minima in the end.
+    free: &'a mut Free,
+}
+
+/// What a step solves for.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Side {
+    /// `x` in the free slots `F`: `H_FF x_F = c_F`.
+    Free,
+    /// Half the gradient `g` in the others, where it makes `x = H^-1 (c + g)` zero.
+    Zero,
+}
+
+/// How a pixel's pivoting goes.
+struct Pixel {
+    number: usize,
+    largest_c: f64,
+    fewest: usize,
+    patience: usize,
+    steps: usize,
+    /// Of the next step, and the size of its system.
+    side: Side,
+    size: usize,
+    state: State,
+}
+
+#[derive(PartialEq, Eq)]
+enum State {
+    Exchanging,
     Minimum,
     GaveUp,
 }
 
-impl Pivoting {
-    pub fn new(slots: usize) -> Self {
+impl<'a> Pivoting<'a> {
+    /// Arrays are `[pixels, slots]` in standard layout.
+    fn new(
+        quadratic: &'a Quadratic,
+        unconstrained: &'a Array2<f64>,
+        slope: &'a mut Array2<f64>,
+        free: &'a mut Free,
+    ) -> Self {
         Self {
-            free: vec![true; slots],
-            x: vec![0.0; slots],
-            gradient: vec![0.0; slots],
-            free_rows: Vec::with_capacity(slots),
-            zero_rows: Vec::with_capacity(slots),
-            matrix: Vec::with_capacity(slots * slots),
-            values: Vec::with_capacity(slots),
+            quadratic,
+            slots: quadratic.slots(),
+            unconstrained: unconstrained.as_slice().unwrap_or_default(),
+            slope: slope.as_slice_mut().unwrap_or_default(),
+            free,
         }
     }
 
-    /// `unconstrained` is `H^-1 c`.
-    pub fn minimise(&mut self, quadratic: &Quadratic, c: &[f64], unconstrained: &[f64]) -> Outcome {
-        let gradient_tolerance = TOLERANCE * largest(c);
-        let mut fewest = usize::MAX;
-        let mut patience = PATIENCE;
-        for _ in 0..MAX_STEPS {
-            if self.solve_for_free_rows(quadratic, c, unconstrained).is_err() {
-                return Outcome::GaveUp;
-            }
-            let x_tolerance = TOLERANCE * largest(&self.x);
-            let infeasible = |i: &usize| match self.free[*i] {
-                true => self.x[*i] < -x_tolerance,
-                false => self.gradient[*i] < -gradient_tolerance,
-            };
-            let wrong: Vec<usize> = (0..c.len()).filter(infeasible).collect();
-            let Some(&last) = wrong.last() else {
-                self.x.iter_mut().for_each(|x| *x = x.max(0.0));
-                return Outcome::Minimum;
-            };
-            if wrong.len() < fewest {
-                (fewest, patience) = (wrong.len(), PATIENCE);
-            } else if patience > 0 {
-                patience -= 1;
-            } else {
-                // Exchanging only the last row cannot cycle (Murty), so the count falls below `fewest` at last.
-                self.free[last] = !self.free[last];
-                continue;
-            }
-            wrong.into_iter().for_each(|i| self.free[i] = !self.free[i]);
+    /// Brings pixels together whose next systems are of the same kind and about the same size.
+    fn sort(&self, pixels: &mut [Pixel]) {
+        for pixel in &mut *pixels {
+            let free = self.free.count(pixel.number);
+            let zero = self.slots - free;
+            let inverted =
+                zero <= free && self.quadratic.well_conditioned() && self.quadratic.narrow().is_none();
+            (pixel.side, pixel.size) = if inverted { (Side::Zero, zero) } else { (Side::Free, free) };
         }
-        Outcome::GaveUp
+        pixels.sort_unstable_by_key(|pixel| (pixel.side, pixel.size, pixel.number));
     }
 
-    /// Sets `x` stationary in the free rows and 0 in the others, and the gradient there; by whichever of the two sets
-    /// is smaller, as long as the inverse is accurate.
-    fn solve_for_free_rows(
-        &mut self,
-        quadratic: &Quadratic,
-        c: &[f64],
-        unconstrained: &[f64],
-    ) -> Result<(), cholesky::NotPositiveDefinite> {
-        let slots = c.len();
-        self.free_rows.clear();
-        self.zero_rows.clear();
-        (0..slots).for_each(|i| if self.free[i] { &mut self.free_rows } else { &mut self.zero_rows }.push(i));
-
-        if quadratic.well_conditioned() && self.zero_rows.len() <= self.free_rows.len() {
-            // x = H^-1 (c + g) with g != 0 only in the zero rows, where x = 0 determines it.
-            let inverse = quadratic.inverse();
-            self.values.clear();
-            self.values.extend(self.zero_rows.iter().map(|&i| -unconstrained[i]));
-            gather(inverse, &self.zero_rows, &mut self.matrix);
-            cholesky::factor(&mut self.matrix, self.zero_rows.len())?;
-            cholesky::solve(&self.matrix, self.zero_rows.len(), &mut self.values);
-            self.x.copy_from_slice(unconstrained);
-            self.gradient.fill(0.0);
-            for (&i, &gradient) in self.zero_rows.iter().zip(&self.values) {
-                self.gradient[i] = gradient;
-                add_scaled(&mut self.x, gradient, inverse.row(i));
-            }
-            self.zero_rows.iter().for_each(|&i| self.x[i] = 0.0);
-        } else {
-            let h = quadratic.h();
-            self.values.clear();
-            self.values.extend(self.free_rows.iter().map(|&i| c[i]));
-            gather(h, &self.free_rows, &mut self.matrix);
-            cholesky::factor(&mut self.matrix, self.free_rows.len())?;
-            cholesky::solve(&self.matrix, self.free_rows.len(), &mut self.values);
-            self.x.fill(0.0);
-            self.gradient.iter_mut().zip(c).for_each(|(gradient, c)| *gradient = -c);
-            for (&i, &x) in self.free_rows.iter().zip(&self.values) {
-                self.x[i] = x;
-                add_scaled(&mut self.gradient, x, h.row(i));
-            }
+    /// The matrix of a side's systems, the mark of the slots solved for, and what a pixel has in all slots before.
+    fn system(&self, side: Side, pixel: usize) -> (&Padded, f64, &[f64]) {
+        let own = pixel * self.slots..(pixel + 1) * self.slots;
+        match side {
+            Side::Free => (self.quadratic.padded_h(), 1.0, &self.slope[own]),
+            Side::Zero => (self.quadratic.padded_inverse(), 0.0, &self.unconstrained[own]),
         }
-        Ok(())
     }
 }
 
-fn largest(values: &[f64]) -> f64 {
-    values.iter().fold(0.0, |largest, value| largest.max(value.abs()))
-}
+impl WithSimd for Pivoting<'_> {
+    /// The pixels that pivoting gave up on, left to the reference solver.
+    type Output = Vec<usize>;
 
-/// The lower triangle of the rows and columns `rows` of a symmetric matrix.
-fn gather(symmetric: ArrayView2<f64>, rows: &[usize], into: &mut Vec<f64>) {
-    into.clear();
-    for (k, &i) in rows.iter().enumerate() {
-        let row = symmetric.row(i);
-        into.extend(rows[..=k].iter().map(|&j| row[j]));
-        into.resize((k + 1) * rows.len(), 0.0);
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Vec<usize> {
+        let slots = self.slots;
+        let mut dense = Dense::new(simd, slots);
+        let mut narrow = self.quadratic.narrow().map(|narrow| NarrowWork::new(simd, narrow));
+        // The minimiser in free slots and half the gradient in the others: each is 0 where the other is not.
+        let mut y = avec![0.0; self.free.stride];
+        let mut exchanged = avec![0.0; self.free.stride];
+        let mut given_up = Vec::new();
+        let mut pixels: Vec<Pixel> = self.slope.chunks_exact(slots).enumerate().map(Pixel::new).collect();
+        while !pixels.is_empty() {
+            self.sort(&mut pixels);
+            let batches =
+                pixels.chunk_by_mut(|a, b| a.side == b.side).flat_map(|alike| alike.chunks_mut(S::F64_LANES));
+            for batch in batches {
+                let of = |pixel: &Pixel| self.system(pixel.side, pixel.number);
+                let lanes = batch.iter().map(|pixel| (self.free.of(pixel.number), of(pixel).2));
+                match &mut narrow {
+                    Some(narrow) => narrow.solve(lanes),
+                    None => dense.solve(of(&batch[0]).0, of(&batch[0]).1, lanes),
+                }
+                for (lane, pixel) in batch.iter_mut().enumerate() {
+                    match &narrow {
+                        Some(narrow) => narrow.take(lane, &mut y),
+                        None => {
+                            let (symmetric, _, before) = self.system(pixel.side, pixel.number);
+                            y[..slots].copy_from_slice(before);
+                            y[slots..].fill(0.0);
+                            dense.spread(lane, symmetric, &mut y);
+                        }
+                    }
+                    pixel.exchange(simd, &y, self.free.of_mut(pixel.number), &mut exchanged);
+                    match pixel.state {
+                        State::Exchanging => {}
+                        State::GaveUp => given_up.push(pixel.number),
+                        State::Minimum => {
+                            let to = &mut self.slope[pixel.number * slots..(pixel.number + 1) * slots];
+                            for ((x, y), free) in to.iter_mut().zip(y.iter()).zip(self.free.of(pixel.number))
+                            {
+                                *x = if *free == 1.0 { y.max(0.0) } else { 0.0 };
+                            }
+                        }
+                    }
+                }
+            }
+            pixels.retain(|pixel| pixel.state == State::Exchanging);
+        }
+        given_up
     }
 }
 
-fn add_scaled(sum: &mut [f64], factor: f64, row: ArrayView1<f64>) {
-    sum.iter_mut().zip(row).for_each(|(sum, row)| *sum += factor * row);
+impl Pixel {
+    fn new((number, slope): (usize, &[f64])) -> Self {
+        let largest_c = slope.iter().fold(0.0_f64, |most, slope| most.max(slope.abs()));
+        Self {
+            number,
+            largest_c,
+            fewest: usize::MAX,
+            patience: PATIENCE,
+            steps: 0,
+            side: Side::Free,
+            size: 0,
+            state: State::Exchanging,
+        }
+    }
+
+    /// Looks for slots with the wrong sign in a step's `y`, and has them change sides.
+    #[inline(always)]
+    fn exchange<S: Simd>(&mut self, simd: S, y: &[f64], free: &mut [f64], exchanged: &mut [f64]) {
+        let zero = simd.splat_f64s(0.0);
+        let one = simd.splat_f64s(1.0);
+        let (mut largest_x, mut sum, mut wrong) = (zero, zero, zero);
+        let ys = S::as_simd_f64s(y).0;
+        for (&y, &free) in ys.iter().zip(S::as_simd_f64s(free).0) {
+            largest_x = simd.max_f64s(largest_x, simd.mul_f64s(free, simd.abs_f64s(y)));
+            sum = simd.add_f64s(sum, y);
+        }
+        let x_limit = simd.splat_f64s(-TOLERANCE * simd.reduce_max_f64s(largest_x));
+        let slope_limit = simd.splat_f64s(-TOLERANCE * self.largest_c);
+        let to = S::as_mut_simd_f64s(exchanged).0;
+        for ((&y, &free), to) in ys.iter().zip(S::as_simd_f64s(free).0).zip(to) {
+            let limit = simd.select_f64s(simd.less_than_f64s(zero, free), x_limit, slope_limit);
+            let is_wrong = simd.select_f64s(simd.less_than_f64s(y, limit), one, zero);
+            wrong = simd.add_f64s(wrong, is_wrong);
+            *to = simd.abs_f64s(simd.sub_f64s(free, is_wrong));
+        }
+        let wrong = simd.reduce_sum_f64s(wrong) as usize;
+        self.steps += 1;
+        // The sum is NaN or infinite if any of its terms is.
+        if !simd.reduce_sum_f64s(sum).is_finite() || wrong > 0 && self.steps == MAX_STEPS {
+            self.state = State::GaveUp;
+        } else if wrong == 0 {
+            self.state = State::Minimum;
+        } else if wrong < self.fewest {
+            (self.fewest, self.patience) = (wrong, PATIENCE);
+            free.copy_from_slice(exchanged);
+        } else if self.patience > 0 {
+            self.patience -= 1;
+            free.copy_from_slice(exchanged);
+        } else if let Some(last) = (0..free.len()).rev().find(|&slot| free[slot] != exchanged[slot]) {
+            // Exchanging only the last row cannot cycle (Murty), so the count falls below `fewest` at last.
+            free[last] = exchanged[last];
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
-    use ndarray::Array2;
+    use ndarray::{Array2, ArrayView2, s};
     use proptest::prelude::*;
 
-    use super::super::{Prior, Slot, SlotKind, reference};
+    use super::super::{Prior, Slot, SlotKind};
     use super::*;
 
-    proptest! {
-        #![proptest_config(ProptestConfig::with_cases(200))]
+    fn slots(count: usize) -> Vec<Slot> {
+        (-(count as i32) / 2..).take(count).map(|u| Slot { u, kind: SlotKind::Own }).collect()
+    }
 
-        /// Random settings, priors and pixels: more unknowns than settings, both sides of the pivoting, warm starts.
-        #[test]
-        fn equals_the_reference(
-            weights in prop::collection::vec(prop_oneof![Just(0.0), 0.0..1.0], 12 * 20),
-            pixels in prop::collection::vec(-1.0..3.0, 4 * 12),
-            beta in 0.0..2.0,
-            split: bool,
-        ) {
-            let slots: Vec<Slot> = (-9..11).map(|u| Slot { u, kind: SlotKind::Own }).collect();
-            let weights = Array2::from_shape_vec((12, 20), weights).unwrap();
-            let prior =
-                if split { Prior::Split { alpha: 0.01, beta } } else { Prior::Paper { alpha: 0.01, beta } };
-            let quadratic = Quadratic::new(weights.view(), &slots, &prior).unwrap();
-            let linear = quadratic.linear(weights.view(), Array2::from_shape_vec((4, 12), pixels).unwrap().view());
-            let unconstrained = linear.dot(&quadratic.inverse());
-            let mut pivoting = Pivoting::new(slots.len());
-            for (c, unconstrained) in linear.rows().into_iter().zip(unconstrained.rows()) {
-                let (c, unconstrained) = (c.to_vec(), unconstrained.to_vec());
-                prop_assert_eq!(pivoting.minimise(&quadratic, &c, &unconstrained), Outcome::Minimum);
-                let expected = reference::minimise(quadratic.h(), &c);
-                let tolerance = 1e-8 * (1.0 + largest(&expected));
-                for (x, expected) in pivoting.x.iter().zip(&expected) {
-                    prop_assert!((x - expected).abs() < tolerance, "{x} is not {expected}");
+    /// Solves pixels at every level that the machine has, and compares each with the reference.
+    fn equals_the_reference(quadratic: &Quadratic, linear: &Array2<f64>, start: &Start) {
+        for level in SimdLevel::available() {
+            let x = minimise(level, quadratic, linear.clone(), start);
+            for (c, x) in linear.rows().into_iter().zip(x.rows()) {
+                let expected = reference::minimise(quadratic.h(), &c.to_vec());
+                let tolerance = 1e-8 * (1.0 + expected.iter().fold(0.0_f64, |a, b| a.max(b.abs())));
+                for (x, expected) in x.iter().zip(&expected) {
+                    assert!((x - expected).abs() < tolerance, "{}: {x} is not {expected}", level.name());
                 }
             }
+        }
+    }
+
+    /// Solves pixels one by one, and compares their bits with those of all together.
+    fn equals_itself_alone(quadratic: &Quadratic, linear: &Array2<f64>, start: &Array2<bool>) {
+        for level in SimdLevel::available() {
+            let together = minimise(level, quadratic, linear.clone(), &Start::Free(start.view()));
+            for (pixel, expected) in together.rows().into_iter().enumerate() {
+                let alone = |pixels: ArrayView2<f64>| {
+                    let start = start.slice(s![pixel..=pixel, ..]);
+                    minimise(level, quadratic, pixels.to_owned(), &Start::Free(start))
+                };
+                assert_eq!(alone(linear.slice(s![pixel..=pixel, ..])).row(0), expected, "{}", level.name());
+            }
+        }
+    }
+
+    fn random(seed: u64) -> impl FnMut() -> f64 {
+        // A linear congruential generator (Knuth's MMIX) is random enough for weights.
+        let mut state = seed.wrapping_mul(2).wrapping_add(1);
+        move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1_u64 << 53) as f64
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(100))]
+
+        /// Any number of unknowns, settings and pixels; both sides of the pivoting, lanes without a pixel.
+        #[test]
+        fn any_size(slot_count in 1..40_usize, settings in 1..24_usize, pixels in 1..40_usize, beta in 0.0..2.0, split: bool, warm: bool, run in 1..9_usize, seed: u64) {
+            let mut random = random(seed);
+            let weights = Array2::from_shape_simple_fn((settings, slot_count), || (2.0 * random() - 1.0).max(0.0));
+            let samples = Array2::from_shape_simple_fn((pixels, settings), || 4.0 * random() - 1.0);
+            let free = Array2::from_shape_simple_fn((pixels, slot_count), || random() < 0.5);
+            let prior = if split { Prior::Split { alpha: 0.01, beta } } else { Prior::Paper { alpha: 0.01, beta } };
+            let quadratic = Quadratic::new(weights.view(), &slots(slot_count), &prior).unwrap();
+            let linear = quadratic.linear(weights.view(), samples.view());
+            let runs: Vec<usize> = (0..pixels).step_by(run).map(|first| run.min(pixels - first)).collect();
+            let start = if warm { Start::Free(free.view()) } else { Start::Runs(&runs) };
+            equals_the_reference(&quadratic, &linear, &start);
+            equals_itself_alone(&quadratic, &linear, &free);
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(60))]
+
+        /// Few settings for many slots, which are solved along their chains: both priors, boxes and anything else, rows
+        /// that no setting sees.
+        #[test]
+        fn few_settings(slot_count in 30..90_usize, settings in 1..9_usize, pixels in 1..20_usize, beta in 0.0..1.0, split: bool, warm: bool, boxes: bool, seed: u64) {
+            let mut random = random(seed);
+            let weights = match boxes {
+                true => Array2::from_shape_fn((settings, slot_count), |(n, u)| f64::from((n * slot_count / settings).abs_diff(u) < 9)),
+                false => Array2::from_shape_simple_fn((settings, slot_count), || (2.0 * random() - 1.0).max(0.0)),
+            };
+            let samples = Array2::from_shape_simple_fn((pixels, settings), || 4.0 * random() - 1.0);
+            let free = Array2::from_shape_simple_fn((pixels, slot_count), || random() < 0.5);
+            let prior = if split { Prior::Split { alpha: 0.1, beta } } else { Prior::Paper { alpha: 0.01, beta } };
+            let quadratic = Quadratic::new(weights.view(), &slots(slot_count), &prior).unwrap();
+            prop_assert_eq!(quadratic.narrow().is_some(), 3 * (settings + 1 + usize::from(split)) <= slot_count);
+            let linear = quadratic.linear(weights.view(), samples.view());
+            let runs = [pixels];
+            let start = if warm { Start::Free(free.view()) } else { Start::Runs(&runs) };
+            equals_the_reference(&quadratic, &linear, &start);
+            equals_itself_alone(&quadratic, &linear, &free);
+        }
+    }
+
+    #[test]
+    fn the_largest_size() {
+        // Boxes as of a sweep with 512 settings over 1024 rows.
+        let weights =
+            Array2::from_shape_fn((512, 1024), |(n, u)| f64::from((2 * n).abs_diff(u) < 20 + 10 * (n % 3)));
+        let mut random = random(7);
+        let light = Array2::from_shape_simple_fn((3, 1024), || (random() - 0.8).max(0.0));
+        let samples = light.dot(&weights.t()).mapv_into(|light| light + 0.02 * (random() - 0.5));
+        for prior in [Prior::PAPER, Prior::SPLIT] {
+            let quadratic = Quadratic::new(weights.view(), &slots(1024), &prior).unwrap();
+            let linear = quadratic.linear(weights.view(), samples.view());
+            let minima = minimise(SimdLevel::best(), &quadratic, linear.clone(), &Start::Runs(&[2, 1]));
+            for (x, c) in minima.rows().into_iter().zip(linear.rows()) {
+                // The conditions of the minimum, because the reference would take minutes.
+                let gradient = quadratic.h().dot(&x) - c;
+                let scale = c.iter().fold(0.0_f64, |most, c| most.max(c.abs()));
+                for (x, gradient) in x.iter().zip(&gradient) {
+                    let violation = if *x > 0.0 { gradient.abs() } else { -gradient };
+                    assert!(*x >= 0.0 && violation <= 1e-9 * scale, "{prior:?}: {violation} of {scale}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn numbers_out_of_range_are_given_up_and_not_looped_over() {
+        let quadratic = Quadratic::new(Array2::eye(2).view(), &slots(2), &Prior::PAPER).unwrap();
+        for level in SimdLevel::available() {
+            let mut slope = ndarray::array![[f64::NAN, -1.0], [-1.0, -1.0]];
+            let unconstrained = -&slope;
+            let mut free = Free::all(2, &quadratic);
+            let given_up = level.run(Pivoting::new(&quadratic, &unconstrained, &mut slope, &mut free));
+            assert_eq!(given_up, [0]);
+            assert!(slope.row(1).iter().all(|x| *x > 0.0), "{slope}");
         }
     }
 }

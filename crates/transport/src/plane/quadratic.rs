@@ -1,5 +1,7 @@
-use ndarray::{Array2, ArrayView2, Axis, s};
+use aligned_vec::{AVec, avec};
+use ndarray::{Array2, ArrayView2, Axis, ShapeBuilder, aview2};
 
+use super::dense::MAX_LANES;
 use super::narrow::Narrow;
 use super::{PlaneError, Prior, Slot, cholesky};
 
@@ -14,10 +16,9 @@ const WELL_CONDITIONED: f64 = 1e7;
 /// `H = A'A + alpha D'D` and `c = A'I - beta/2`.
 #[derive(Debug, Clone)]
 pub(super) struct Quadratic {
-    /// `H`, then a row and a column of zeros: see [`Self::padded_h`].
-    h: Array2<f64>,
-    /// The inverse of `H`, padded likewise.
-    inverse: Array2<f64>,
+    h: Padded,
+    /// The inverse of `H`.
+    inverse: Padded,
     /// Whether solutions may be taken from the inverse. Settings that leave rows undetermined give it entries so
     /// large that nothing but rounding would remain.
     well_conditioned: bool,
@@ -44,9 +45,7 @@ impl Quadratic {
         differences: ArrayView2<f64>,
         prior: &Prior,
     ) -> Result<Self, PlaneError> {
-        let n = weights.ncols();
-        let mut h = Array2::zeros((n + 1, n + 1));
-        h.slice_mut(s![..n, ..n]).assign(&weights.t().dot(&weights));
+        let mut h = weights.t().dot(&weights);
         for difference in differences.rows() {
             let touched: Vec<(usize, f64)> = difference
                 .indexed_iter()
@@ -58,11 +57,11 @@ impl Quadratic {
             }
         }
         let narrow = Narrow::new(weights, differences, prior.alpha(), &h.diag().to_vec());
-        for diagonal in h.diag_mut().slice_mut(s![..n]) {
+        for diagonal in h.diag_mut() {
             // A slot that no setting sees and no difference holds must not make H singular; its T is 0 in any case.
             *diagonal = if *diagonal > 0.0 { *diagonal * (1.0 + RIDGE) } else { 1.0 };
         }
-        let inverse = invert(h.slice(s![..n, ..n]))?;
+        let inverse = invert(h.view())?;
         Ok(Self { narrow, ..Self::from_parts(h, inverse, prior.beta() / 2.0) })
     }
 
@@ -70,6 +69,7 @@ impl Quadratic {
         // The diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
         let condition =
             h.diag().iter().zip(inverse.diag()).fold(1.0_f64, |most, (h, inverse)| most.max(h * inverse));
+        let [h, inverse] = [h, inverse].map(|matrix| Padded::new(matrix.view()));
         Self { h, inverse, well_conditioned: condition < WELL_CONDITIONED, half_beta, narrow: None }
     }
 
@@ -77,12 +77,10 @@ impl Quadratic {
     /// a downdate of `H` and of its inverse (Sherman, Morrison and Woodbury), much cheaper than a new factorisation.
     /// None where too little would remain to be accurate.
     pub fn without(&self, dropped: ArrayView2<f64>) -> Option<Self> {
-        let n = self.slots();
         let (settings, _) = dropped.dim();
-        let mut h = self.h.clone();
-        h.slice_mut(s![..n, ..n]).zip_mut_with(&dropped.t().dot(&dropped), |h, lost| *h -= lost);
+        let h = &self.h() - &dropped.t().dot(&dropped);
         // The ridge and rounding are all that is left of rows that only the dropped settings saw.
-        let lost = h.diag().iter().zip(self.h.diag()).take(n).any(|(left, had)| *left <= 1e-9 * had);
+        let lost = h.diag().iter().zip(self.h().diag()).any(|(left, had)| *left <= 1e-9 * had);
         let seen = dropped.dot(&self.inverse());
         let mut core = (Array2::<f64>::eye(settings) - seen.dot(&dropped.t())).into_raw_vec_and_offset().0;
         let well_posed = (0..settings).all(|k| core[k * settings + k] > 1e-6);
@@ -99,10 +97,7 @@ impl Quadratic {
             }
             update.row_mut(i).mapv_inplace(|value| value / core[i * settings + i]);
         }
-        let mut inverse = self.inverse.clone();
-        inverse
-            .slice_mut(s![..n, ..n])
-            .zip_mut_with(&update.t().dot(&update), |inverse, more| *inverse += more);
+        let inverse = &self.inverse() + &update.t().dot(&update);
         Some(Self::from_parts(h, inverse, self.half_beta)).filter(|downdated| downdated.well_conditioned)
     }
 
@@ -113,27 +108,27 @@ impl Quadratic {
 
     /// How many unknowns there are.
     pub fn slots(&self) -> usize {
-        self.h.nrows() - 1
+        self.h.slots
     }
 
     /// `H`, shape `[slots, slots]`.
     pub fn h(&self) -> ArrayView2<'_, f64> {
-        self.h.slice(s![..-1, ..-1])
+        self.h.view()
     }
 
     /// The inverse of `H`.
     pub fn inverse(&self) -> ArrayView2<'_, f64> {
-        self.inverse.slice(s![..-1, ..-1])
+        self.inverse.view()
     }
 
-    /// `H` row by row, with a zero after each row and a row of zeros at the end: what is gathered for want of a slot.
-    pub fn padded_h(&self) -> &[f64] {
-        self.h.as_slice().unwrap_or_default()
+    /// `H` as systems are gathered from it.
+    pub fn padded_h(&self) -> &Padded {
+        &self.h
     }
 
-    /// The inverse, as [`Self::padded_h`], where solutions may be taken from it.
-    pub fn padded_inverse(&self) -> Option<&[f64]> {
-        self.inverse.as_slice().filter(|_| self.well_conditioned)
+    /// The inverse, as [`Self::padded_h`].
+    pub fn padded_inverse(&self) -> &Padded {
+        &self.inverse
     }
 
     /// Whether solutions may be taken from the inverse.
@@ -147,7 +142,40 @@ impl Quadratic {
     }
 }
 
-/// The inverse of a symmetric positive definite matrix of shape `[n, n]`, padded by a row and a column of zeros.
+/// A square matrix in whole vectors of any width: after each row, and after the last, come zeros.
+#[derive(Debug, Clone)]
+pub(super) struct Padded {
+    /// Rows and columns without the zeros.
+    pub slots: usize,
+    /// Columns with the zeros, of which there is at least one.
+    pub stride: usize,
+    values: AVec<f64>,
+}
+
+impl Padded {
+    fn new(matrix: ArrayView2<f64>) -> Self {
+        let slots = matrix.nrows();
+        let stride = (slots + 1).next_multiple_of(MAX_LANES);
+        let mut values = avec![0.0; (slots + 1) * stride];
+        for (to, row) in values.chunks_exact_mut(stride).zip(matrix.rows()) {
+            to.iter_mut().zip(row).for_each(|(to, value)| *to = *value);
+        }
+        Self { slots, stride, values }
+    }
+
+    /// A row with its zeros; that of number [`Self::slots`] has nothing else.
+    #[inline(always)]
+    pub fn row(&self, slot: usize) -> &[f64] {
+        &self.values[slot * self.stride..(slot + 1) * self.stride]
+    }
+
+    fn view(&self) -> ArrayView2<'_, f64> {
+        let shape = (self.slots, self.slots).strides((self.stride, 1));
+        ArrayView2::from_shape(shape, &self.values).unwrap_or(aview2::<f64, 0>(&[]))
+    }
+}
+
+/// The inverse of a symmetric positive definite matrix of shape `[n, n]`.
 fn invert(h: ArrayView2<f64>) -> Result<Array2<f64>, PlaneError> {
     let n = h.nrows();
     // Scaled to a unit diagonal, because smoothness far from u = 0 weighs a million times more than the data.
@@ -156,10 +184,7 @@ fn invert(h: ArrayView2<f64>) -> Result<Array2<f64>, PlaneError> {
     pulp::Arch::new()
         .dispatch(|| cholesky::invert(&mut matrix, n))
         .map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
-    Ok(Array2::from_shape_fn((n + 1, n + 1), |(i, j)| match i < n && j < n {
-        true => matrix[i.max(j) * n + i.min(j)] * scale[i] * scale[j],
-        false => 0.0,
-    }))
+    Ok(Array2::from_shape_fn((n, n), |(i, j)| matrix[i.max(j) * n + i.min(j)] * scale[i] * scale[j]))
 }
 
 #[cfg(test)]

@@ -1,5 +1,11 @@
 //! The figures by which an estimated transport is judged against a known one.
 
+mod edge;
+mod fidelity;
+
+pub use edge::{EdgeError, EdgeResponse, slanted_edge};
+pub use fidelity::{psnr_db, snr_db, ssim};
+
 use ndarray::{ArrayView, ArrayView3, Axis, Dimension, Zip};
 
 /// Relative l2 error of a whole array, `||estimate - truth|| / ||truth||`; used for images such as `u = 0`.

@@ -95,8 +95,13 @@ impl Inbox {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The next job, and whether it is a sliding one. Those are begun only where they will have ended before the next
-    /// cycle comes, at `solve_time` each.
+    /// Whether a whole cycle waits.
+    fn has_cycle(&self) -> bool {
+        !self.lock().cycles.is_empty()
+    }
+
+    /// The next job, and whether it is a sliding one. Those are begun only where they should have ended before the next
+    /// cycle comes, at `solve_time` each; that they do not delay it where they have not is the solver's affair.
     fn next(&self, solve_time: Duration) -> Option<(Exposed, bool)> {
         let mut waiting = self.lock();
         loop {
@@ -222,10 +227,16 @@ impl Drop for Worker {
 impl Solving {
     fn run(self, inbox: &Inbox, workers: &rayon::ThreadPool) -> raysweep_session::Result<()> {
         let mut solve_time = Duration::ZERO;
-        while let Some((exposed, is_sliding)) = inbox.next(solve_time * 3 / 2) {
+        while let Some((exposed, is_sliding)) = inbox.next(solve_time) {
             let began = Instant::now();
             let Exposed { cycle, frames, dark, .. } = &exposed;
-            let solved = workers.install(|| self.solver.solve(frames, dark, &|| true));
+            let go_on = || !is_sliding || !inbox.has_cycle();
+            let solved = workers.install(|| self.solver.solve(frames, dark, &go_on));
+            if is_sliding && solved.is_err() && !go_on() {
+                // It has given way. That it was slower than those before is worth knowing.
+                solve_time = solve_time.max(began.elapsed());
+                continue;
+            }
             solve_time = began.elapsed();
             let transport = match solved {
                 Ok(transport) => transport,
@@ -285,5 +296,52 @@ impl Solving {
             non_epipolar,
             film: self.account.summary(),
         }));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn exposed(cycle: u32) -> Exposed {
+        Exposed { cycle, frames: Vec::new(), dark: Arc::default(), start_s: 0.0, end_ns: 0 }
+    }
+
+    fn slide(inbox: &Inbox, cycle: u32, left: Duration) {
+        inbox.lock().sliding = Some((exposed(cycle), Instant::now() + left));
+    }
+
+    const HOUR: Duration = Duration::from_secs(3600);
+
+    #[test]
+    fn the_newest_frames_are_estimated_where_there_is_time() {
+        let inbox = Inbox::default();
+        slide(&inbox, 1, HOUR);
+        slide(&inbox, 2, HOUR);
+        let (newest, is_sliding) = inbox.next(Duration::from_secs(1800)).unwrap();
+        assert_eq!((newest.cycle, is_sliding), (2, true));
+        inbox.lock().closed = true;
+        assert!(inbox.next(Duration::ZERO).is_none(), "each is estimated once");
+    }
+
+    #[test]
+    fn frames_that_would_not_be_done_before_the_cycle_are_left() {
+        let inbox = Inbox::default();
+        slide(&inbox, 1, HOUR);
+        inbox.lock().closed = true;
+        assert!(inbox.next(2 * HOUR).is_none());
+    }
+
+    #[test]
+    fn a_cycle_comes_before_sliding_frames_makes_them_old_and_stops_their_estimate() {
+        let inbox = Inbox::default();
+        slide(&inbox, 1, HOUR);
+        assert!(!inbox.has_cycle());
+        inbox.lock().cycles.push_back(exposed(1));
+        assert!(inbox.has_cycle());
+        let (cycle, is_sliding) = inbox.next(Duration::ZERO).unwrap();
+        assert_eq!((cycle.cycle, is_sliding), (1, false));
+        inbox.lock().closed = true;
+        assert!(inbox.next(Duration::ZERO).is_none());
     }
 }

@@ -38,11 +38,12 @@ pub fn first_frame(triggers: Triggers, written_ns: i64, latency: Latency) -> Fir
         let passed_ns = written_ns.saturating_sub(last_ns).saturating_add(margin_ns);
         u64::try_from(passed_ns / period_ns.max(1)).unwrap_or(0)
     });
+    let earliest = next_seq + u64::from(latency.min_frames);
     let certain = next_seq + possible + u64::from(latency.max_frames);
     if possible == 0 && latency.min_frames == latency.max_frames {
         FirstFrame::Exactly(certain)
     } else {
-        FirstFrame::Within(certain)
+        FirstFrame::Within { earliest, certain }
     }
 }
 
@@ -84,7 +85,7 @@ impl<T: Copy> Promises<T> {
             .iter()
             .rev()
             .take_while(move |(first, _)| !std::mem::replace(&mut decided, first.certain() <= seq))
-            .filter(move |(first, _)| first.certain() <= seq || matches!(first, FirstFrame::Within(_)))
+            .filter(move |(first, _)| first.earliest() <= seq)
             .map(|(_, value)| *value)
     }
 }
@@ -107,16 +108,17 @@ mod tests {
         let late = Latency { min_frames: 3, max_frames: 3 };
         assert_eq!(first(6_000_000, late), FirstFrame::Exactly(13));
         let unsure = Latency { min_frames: 0, max_frames: 3 };
-        assert_eq!(first(6_000_000, unsure), FirstFrame::Within(13));
+        assert_eq!(first(6_000_000, unsure), FirstFrame::Within { earliest: 10, certain: 13 });
     }
 
     #[test]
     fn a_trigger_that_may_have_come_makes_the_promise_later_and_vague() {
         let first = |written_ns| first_frame(triggers(Some(0)), written_ns, NEXT);
-        assert_eq!(first(16_200_000), FirstFrame::Within(11), "within the margin of the next trigger");
-        assert_eq!(first(17_000_000), FirstFrame::Within(11));
-        assert_eq!(first(33_000_000), FirstFrame::Within(12));
-        assert_eq!(first(1_000_000_000), FirstFrame::Within(70), "a second without frames");
+        let within = |certain| FirstFrame::Within { earliest: 10, certain };
+        assert_eq!(first(16_200_000), within(11), "within the margin of the next trigger");
+        assert_eq!(first(17_000_000), within(11));
+        assert_eq!(first(33_000_000), within(12));
+        assert_eq!(first(1_000_000_000), within(70), "a second without frames");
     }
 
     #[test]
@@ -128,9 +130,10 @@ mod tests {
     fn frames_have_the_settings_that_were_promised_or_may_have() {
         let mut promises = Promises::new();
         promises.push(FirstFrame::Exactly(1), 'a');
-        promises.push(FirstFrame::Within(10), 'b');
+        promises.push(FirstFrame::Within { earliest: 5, certain: 10 }, 'b');
         promises.push(FirstFrame::Exactly(20), 'c');
         let possible = |seq| promises.possible(seq).collect::<String>();
+        assert_eq!(possible(4), "a");
         assert_eq!(possible(5), "ba");
         assert_eq!(possible(10), "b");
         assert_eq!(possible(19), "b");

@@ -1,8 +1,8 @@
 use ndarray::{Array1, Array2, ArrayView2, Axis};
 
-use super::super::lanes::Lanes;
+use super::super::pivot::{RUN_PX, Start, minimise};
 use super::super::quadratic::Quadratic;
-use super::super::{PlaneError, Prior, SimdLevel, cholesky, reference};
+use super::super::{PlaneError, Prior, SimdLevel, cholesky};
 
 /// The objective of one camera row, for weights that calibration varies.
 pub(super) struct RowProblem {
@@ -40,23 +40,11 @@ impl RowProblem {
     /// free slots of `near`, minimisers of like problems.
     pub fn minimise(&self, samples: ArrayView2<f64>, near: Option<&Array2<f64>>) -> Array2<f64> {
         let linear = self.quadratic.linear(self.weights.view(), samples);
-        let unconstrained = linear.dot(&self.quadratic.inverse());
-        let start = near.map(|near| near.mapv(|x| x > 0.0));
-        let mut minima = Array2::zeros(linear.dim());
-        let given_up = SimdLevel::best().run(Lanes {
-            quadratic: &self.quadratic,
-            linear: linear.view(),
-            unconstrained: unconstrained.view(),
-            start: start.as_ref().map(|start| start.view()),
-            minimum: |pixel: usize, x: &mut dyn Iterator<Item = f64>| {
-                minima.row_mut(pixel).iter_mut().zip(x).for_each(|(to, x)| *to = x);
-            },
-        });
-        for pixel in given_up {
-            let x = reference::minimise(self.quadratic.h(), &linear.row(pixel).to_vec());
-            minima.row_mut(pixel).assign(&Array1::from(x));
-        }
-        minima
+        let runs: Vec<usize> =
+            (0..linear.nrows()).step_by(RUN_PX).map(|px| RUN_PX.min(linear.nrows() - px)).collect();
+        let free = near.map(|near| near.mapv(|x| x > 0.0));
+        let start = free.as_ref().map_or(Start::Runs(&runs), |free| Start::Free(free.view()));
+        minimise(SimdLevel::best(), &self.quadratic, linear, &start)
     }
 
     /// Value of `||A x - I||^2 + alpha ||D x||^2 + beta sum(x)` for each pixel at its minimiser.

@@ -1,0 +1,272 @@
+//! Unpacking as fast as memory: the same pixels as [`Packing::unpack`], four or sixteen at a time.
+//!
+//! All packings of 10 and 12 bits are one computation. Two bytes, seen as a 16-bit word, hold all bits of a pixel:
+//! those that a shift to the right brings to their place, and those that have to be shifted to the left first, which
+//! is a multiplication. Only where the bytes lie, the factors, and the masks differ.
+
+use pulp::NullaryFnOnce;
+
+use super::Packing;
+
+/// The instructions that pixels are unpacked with. All give the same pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UnpackLevel {
+    /// What every machine has, as the compiler uses it.
+    Portable,
+    /// x86-64 with AVX2: sixteen pixels at a time.
+    Avx2,
+}
+
+impl UnpackLevel {
+    /// All levels that this machine has, the fastest last.
+    pub fn available() -> &'static [Self] {
+        match Self::best() {
+            Self::Portable => &[Self::Portable],
+            Self::Avx2 => &[Self::Portable, Self::Avx2],
+        }
+    }
+
+    /// The fastest level that this machine has.
+    pub fn best() -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if pulp::x86::V3::is_available() {
+            return Self::Avx2;
+        }
+        Self::Portable
+    }
+}
+
+/// Pixels that a [`Layout`] speaks of: as many as lie in whole bytes in every packing.
+const GROUP: usize = 4;
+
+/// Where four neighbouring pixels lie in `BYTES` bytes. Pixel `k` is
+/// `word >> shift & high_mask | word * scale[k] >> shift & low_mask` of the word that its two bytes make.
+struct Layout<const BYTES: usize> {
+    /// Low and high byte of each pixel's word.
+    word: [[u8; 2]; GROUP],
+    scale: [u16; GROUP],
+    high_mask: u16,
+    low_mask: u16,
+}
+
+const BITS10P: Layout<5> =
+    Layout { word: [[0, 1], [1, 2], [2, 3], [3, 4]], scale: [64, 16, 4, 1], high_mask: 0, low_mask: 0x3FF };
+const BITS10G40: Layout<5> = Layout {
+    word: [[4, 0], [4, 1], [4, 2], [4, 3]],
+    scale: [64, 16, 4, 1],
+    high_mask: 0x3FC,
+    low_mask: 0x003,
+};
+const BITS10PACKED: Layout<6> = Layout {
+    word: [[1, 0], [1, 2], [4, 3], [4, 5]],
+    scale: [64, 4, 64, 4],
+    high_mask: 0x3FC,
+    low_mask: 0x003,
+};
+const BITS12P: Layout<6> =
+    Layout { word: [[0, 1], [1, 2], [3, 4], [4, 5]], scale: [16, 1, 16, 1], high_mask: 0, low_mask: 0xFFF };
+const BITS12PACKED: Layout<6> = Layout {
+    word: [[1, 0], [1, 2], [4, 3], [4, 5]],
+    scale: [16, 1, 16, 1],
+    high_mask: 0xFF0,
+    low_mask: 0x00F,
+};
+const BITS12G24: Layout<6> = Layout {
+    word: [[2, 0], [2, 1], [5, 3], [5, 4]],
+    scale: [16, 1, 16, 1],
+    high_mask: 0xFF0,
+    low_mask: 0x00F,
+};
+
+/// Unpacks `bytes`, which holds exactly `pixels`.
+pub(super) fn unpack(level: UnpackLevel, packing: Packing, bytes: &[u8], pixels: &mut [u16]) {
+    run(level, Unpack { packing, bytes, pixels });
+}
+
+/// Adds the pixels of `bytes`, which holds exactly as many as there are sums.
+pub(super) fn add(level: UnpackLevel, packing: Packing, bytes: &[u8], sums: &mut [u32]) {
+    run(level, Add { packing, bytes, sums });
+}
+
+/// What can be done on every level.
+trait Task {
+    fn run<K: Kernel>(self, kernel: K);
+}
+
+fn run(level: UnpackLevel, task: impl Task) {
+    #[cfg(target_arch = "x86_64")]
+    if let (UnpackLevel::Avx2, Some(simd)) = (level, pulp::x86::V3::try_new()) {
+        return simd.vectorize(On { kernel: simd, task });
+    }
+    On { kernel: Portable, task }.call();
+}
+
+/// A task on a level's instructions.
+struct On<K, T> {
+    kernel: K,
+    task: T,
+}
+
+impl<K: Kernel, T: Task> NullaryFnOnce for On<K, T> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.task.run(self.kernel);
+    }
+}
+
+struct Unpack<'a> {
+    packing: Packing,
+    bytes: &'a [u8],
+    pixels: &'a mut [u16],
+}
+
+impl Task for Unpack<'_> {
+    #[inline(always)]
+    fn run<K: Kernel>(self, kernel: K) {
+        let Self { packing, bytes, pixels } = self;
+        match packing {
+            // What the compiler makes of the plain way is as fast as memory.
+            Packing::Bits8 | Packing::Bits10 | Packing::Bits12 | Packing::Bits16 => {
+                packing.unpack(bytes, pixels);
+            }
+            Packing::Bits10p => by_groups::<6, _, _>(kernel, packing, &BITS10P, bytes, pixels),
+            Packing::Bits10g40 => by_groups::<6, _, _>(kernel, packing, &BITS10G40, bytes, pixels),
+            Packing::Bits10Packed => by_groups::<6, _, _>(kernel, packing, &BITS10PACKED, bytes, pixels),
+            Packing::Bits12p => by_groups::<4, _, _>(kernel, packing, &BITS12P, bytes, pixels),
+            Packing::Bits12Packed => by_groups::<4, _, _>(kernel, packing, &BITS12PACKED, bytes, pixels),
+            Packing::Bits12g24 => by_groups::<4, _, _>(kernel, packing, &BITS12G24, bytes, pixels),
+        }
+    }
+}
+
+struct Add<'a> {
+    packing: Packing,
+    bytes: &'a [u8],
+    sums: &'a mut [u32],
+}
+
+impl Task for Add<'_> {
+    #[inline(always)]
+    fn run<K: Kernel>(self, kernel: K) {
+        // A block of pixels stays in the first cache; a multiple of the group, so that it begins with a whole byte.
+        const BLOCK: usize = 1024;
+        let mut block = [0; BLOCK];
+        let blocks = self.bytes.chunks(self.packing.bytes(BLOCK)).zip(self.sums.chunks_mut(BLOCK));
+        for (bytes, sums) in blocks {
+            let pixels = &mut block[..sums.len()];
+            Unpack { packing: self.packing, bytes, pixels }.run(kernel);
+            sums.iter_mut().zip(pixels).for_each(|(sum, pixel)| *sum += u32::from(*pixel));
+        }
+    }
+}
+
+/// One level's way to unpack whole groups.
+trait Kernel: Copy {
+    /// Unpacks groups from the first on, as many as it likes, and says how many.
+    fn groups<const SHIFT: u32, const BYTES: usize>(
+        self,
+        layout: &Layout<BYTES>,
+        groups: &[[u8; BYTES]],
+        pixels: &mut [[u16; GROUP]],
+    ) -> usize;
+}
+
+#[derive(Clone, Copy)]
+struct Portable;
+
+impl Kernel for Portable {
+    #[inline(always)]
+    fn groups<const SHIFT: u32, const BYTES: usize>(
+        self,
+        layout: &Layout<BYTES>,
+        groups: &[[u8; BYTES]],
+        pixels: &mut [[u16; GROUP]],
+    ) -> usize {
+        for (bytes, pixels) in groups.iter().zip(&mut *pixels) {
+            for (k, pixel) in pixels.iter_mut().enumerate() {
+                let [low, high] = layout.word[k];
+                let word = u16::from_le_bytes([bytes[usize::from(low)], bytes[usize::from(high)]]);
+                *pixel = word >> SHIFT & layout.high_mask
+                    | word.wrapping_mul(layout.scale[k]) >> SHIFT & layout.low_mask;
+            }
+        }
+        pixels.len()
+    }
+}
+
+/// The kernel's groups, the groups that it leaves over, and at last the pixels that make no whole group.
+#[inline(always)]
+fn by_groups<const SHIFT: u32, const BYTES: usize, K: Kernel>(
+    kernel: K,
+    packing: Packing,
+    layout: &Layout<BYTES>,
+    bytes: &[u8],
+    pixels: &mut [u16],
+) {
+    let (pixel_groups, last_pixels) = pixels.as_chunks_mut::<GROUP>();
+    let (groups, _) = bytes.as_chunks::<BYTES>();
+    let groups = &groups[..pixel_groups.len()];
+    let last_bytes = &bytes[groups.len() * BYTES..];
+    let done = kernel.groups::<SHIFT, BYTES>(layout, groups, pixel_groups);
+    Portable.groups::<SHIFT, BYTES>(layout, &groups[done..], &mut pixel_groups[done..]);
+    packing.unpack(last_bytes, last_pixels);
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::__m128i;
+
+    use pulp::bytemuck::cast;
+    use pulp::x86::V3;
+
+    use super::{GROUP, Kernel, Layout};
+
+    /// Groups of a vector of sixteen pixels: two in each of its halves, between which bytes cannot be shuffled.
+    const VECTOR: usize = 4;
+    const HALF: usize = VECTOR / 2;
+
+    impl Kernel for V3 {
+        #[inline(always)]
+        fn groups<const SHIFT: u32, const BYTES: usize>(
+            self,
+            layout: &Layout<BYTES>,
+            groups: &[[u8; BYTES]],
+            pixels: &mut [[u16; GROUP]],
+        ) -> usize {
+            let (avx, avx2) = (self.avx, self.avx2);
+            let shuffle = cast(std::array::from_fn::<u8, 32, _>(|i| {
+                let group = i % 16 / (2 * GROUP);
+                (group * BYTES) as u8 + layout.word[i / 2 % GROUP][i % 2]
+            }));
+            let scale = cast(std::array::from_fn::<u16, 16, _>(|i| layout.scale[i % GROUP]));
+            let (high_mask, low_mask) = (cast([layout.high_mask; 16]), cast([layout.low_mask; 16]));
+
+            let bytes = groups.as_flattened();
+            let half = |at: usize| Some(cast::<[u8; 16], __m128i>(*bytes.get(at..)?.first_chunk()?));
+            let mut done = 0;
+            for pixels in pixels.as_chunks_mut::<VECTOR>().0 {
+                // The last loads would reach beyond the end.
+                let (Some(first), Some(second)) = (half(done * BYTES), half((done + HALF) * BYTES)) else {
+                    break;
+                };
+                let word = avx2._mm256_shuffle_epi8(avx._mm256_set_m128i(second, first), shuffle);
+                let high = match SHIFT {
+                    4 => avx2._mm256_srli_epi16::<4>(word),
+                    _ => avx2._mm256_srli_epi16::<6>(word),
+                };
+                let scaled = avx2._mm256_mullo_epi16(word, scale);
+                let low = match SHIFT {
+                    4 => avx2._mm256_srli_epi16::<4>(scaled),
+                    _ => avx2._mm256_srli_epi16::<6>(scaled),
+                };
+                let high = avx2._mm256_and_si256(high, high_mask);
+                let low = avx2._mm256_and_si256(low, low_mask);
+                *pixels = cast(avx2._mm256_or_si256(high, low));
+                done += VECTOR;
+            }
+            done
+        }
+    }
+}

@@ -1,0 +1,308 @@
+use ndarray::Array3;
+
+use super::column::bits;
+use super::error::{check_range, check_shape};
+use super::sensor::median;
+use super::shape::BLOCK_PX;
+use super::{Correction, DotsError, FrameShape, Region};
+
+/// Counts that the vector kernels can take, the 12 bits of fast cameras.
+pub(crate) const NARROW_LIMIT: u16 = 1 << 12;
+
+/// Background of a hot pixel: subtracted from any narrow count it leaves less than a sound pixel can have, so a hot pixel is
+/// never the maximum. Its square is small enough for 64 of them to be summed in 32 bits.
+pub(crate) const HOT_BACKGROUND: u16 = 2 * NARROW_LIMIT - 1;
+
+/// A running mean of the frames whose light went into the beam dump: ambient light and dark level.
+///
+/// A batch has one such frame. Subtracting it alone would put its noise into every column of the batch, where sums
+/// over all dots see it N times over; the mean lowers that. It is exponential with the weight 2/(n + 1), which has
+/// the noise of a mean of the last n batches, and exact until it has seen that many.
+#[derive(Debug, Clone)]
+pub struct BackgroundMean {
+    shape: FrameShape,
+    batches: u32,
+    seen: u32,
+    mean: Vec<f32>,
+}
+
+impl BackgroundMean {
+    /// A mean worth `batches` batches.
+    ///
+    /// # Errors
+    /// [`DotsError::OutOfRange`] for 0.
+    pub fn new(shape: FrameShape, batches: u32) -> Result<Self, DotsError> {
+        check_range("background.batches", batches.into(), batches > 0, "at least 1; 64 is usual")?;
+        Ok(Self { shape, batches, seen: 0, mean: vec![0.0; shape.values()] })
+    }
+
+    /// Begins with the dark frame, `[height, width, channels]`, for the time until the first batch has ended; it
+    /// then counts no more.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if it is not of the frame's shape.
+    pub fn starting_with(mut self, dark: &Array3<f32>) -> Result<Self, DotsError> {
+        let expected = [self.shape.height(), self.shape.width(), self.shape.channels()];
+        check_shape("dark", "[height, width, channels]", dark.shape(), &expected)?;
+        self.mean.iter_mut().zip(dark).for_each(|(mean, &dark)| *mean = dark);
+        Ok(self)
+    }
+
+    /// Takes in a batch's frame.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if it is not of the frame's size.
+    pub fn push(&mut self, frame: &[u16]) -> Result<(), DotsError> {
+        check_shape("frame", "[values]", &[frame.len()], &[self.mean.len()])?;
+        self.seen = self.seen.saturating_add(1);
+        let weight = (1.0 / self.seen as f32).max(2.0 / (self.batches as f32 + 1.0));
+        for (mean, &raw) in self.mean.iter_mut().zip(frame) {
+            *mean += weight * (f32::from(raw) - *mean);
+        }
+        Ok(())
+    }
+
+    /// Frames taken in so far.
+    pub fn seen(&self) -> u32 {
+        self.seen
+    }
+
+    /// In counts, `[height, width, channels]`.
+    pub fn mean(&self) -> &[f32] {
+        &self.mean
+    }
+}
+
+/// The background of one batch, prepared for the pass over its frames.
+#[derive(Debug, Clone)]
+pub struct Background {
+    /// Mean counts, `[height, width, channels]`.
+    pub(crate) mean: Vec<f32>,
+    /// Of each pixel's luminance, rounded to whole counts; [`HOT_BACKGROUND`] at hot pixels.
+    pub(crate) counts: Vec<u16>,
+    /// Whether no sound pixel's counts are beyond the vector kernels.
+    pub(crate) narrow: bool,
+    /// What rounding took from each block's sum: rounded minus mean over its sound pixels, `[blocks, channels]`. It
+    /// would be the same in every frame, and add up over all dots. For RGB frames, which have no rounded background of
+    /// their own, minus the whole mean.
+    pub(crate) block_offset: Vec<f64>,
+    /// Sound pixels of each block.
+    pub(crate) block_sound: Vec<u32>,
+}
+
+impl Background {
+    /// From mean counts `[height, width, channels]`, as [`BackgroundMean::mean`] gives them.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if they are not of the frame's size, [`DotsError::OutOfRange`] if one is not a count.
+    pub fn new(correction: &Correction, mean: &[f32]) -> Result<Self, DotsError> {
+        let shape = correction.shape();
+        let mut background = Self {
+            mean: vec![0.0; shape.values()],
+            counts: vec![0; shape.pixels()],
+            narrow: true,
+            block_offset: vec![0.0; shape.blocks() * shape.channels()],
+            block_sound: vec![0; shape.blocks()],
+        };
+        background.set(correction, mean)?;
+        Ok(background)
+    }
+
+    /// [`Background::new`] in the memory of the batch before.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn set(&mut self, correction: &Correction, mean: &[f32]) -> Result<(), DotsError> {
+        let shape = correction.shape();
+        let channels = shape.channels();
+        check_shape("background", "[values]", &[mean.len()], &[shape.values()])?;
+        check_shape("prepared background", "[values]", &[self.mean.len()], &[shape.values()])?;
+        if let Some(&value) = mean.iter().find(|&&value| !(0.0..=f32::from(u16::MAX)).contains(&value)) {
+            check_range("background", value.into(), false, "0 to 65535 counts")?;
+        }
+        self.mean.copy_from_slice(mean);
+        self.block_offset.fill(0.0);
+        self.block_sound.fill(0);
+        self.narrow = true;
+        for (word, &hot) in correction.hot_masks().iter().enumerate() {
+            let block = shape.block_of_word(word);
+            self.block_sound[block] += (!hot).count_ones();
+            for bit in bits(hot) {
+                self.counts[word * BLOCK_PX + bit] = HOT_BACKGROUND;
+            }
+            for bit in bits(!hot) {
+                let pixel = word * BLOCK_PX + bit;
+                let of_pixel = &mean[pixel * channels..][..channels];
+                let counts = mean_luminance(of_pixel).round() as u16;
+                self.counts[pixel] = counts;
+                self.narrow &= counts < NARROW_LIMIT;
+                let rounded = if channels == 1 { f64::from(counts) } else { 0.0 };
+                let offsets = &mut self.block_offset[block * channels..][..channels];
+                offsets
+                    .iter_mut()
+                    .zip(of_pixel)
+                    .for_each(|(offset, &mean)| *offset += rounded - f64::from(mean));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Luminance of a pixel's values: itself, or (R + 2 G + B) / 4.
+fn mean_luminance(pixel: &[f32]) -> f32 {
+    match pixel {
+        [red, green, blue] => (red + 2.0 * green + blue) / 4.0,
+        _ => pixel.iter().sum(),
+    }
+}
+
+/// Luminance in whole counts, so that detection is the same for colour and monochrome frames.
+pub(crate) fn luminance(pixel: [u16; 3]) -> u16 {
+    let [red, green, blue] = pixel.map(u32::from);
+    ((red + 2 * green + blue + 2) / 4) as u16
+}
+
+/// Mean and standard deviation of raw minus background where no light falls, in counts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NoiseFloor {
+    /// Mean; 0 where the background is up to date.
+    pub mean: f64,
+    /// Standard deviation, at least that of rounding to whole counts.
+    pub sigma: f64,
+}
+
+impl NoiseFloor {
+    /// Variance of rounding to whole counts: what a perfect camera would have.
+    pub(crate) const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
+
+    /// The medians over frames of mean and variance within a region; the more frames, the less it matters which
+    /// region, and some may even have light there. Take the batch's own frames and a dark corner, or frames of the
+    /// beam dump, which may not be in the background's mean, and [`Region::whole`].
+    ///
+    /// # Errors
+    /// [`DotsError::TooFew`] without frames or with fewer than 16 sound pixels, [`DotsError::Shape`] and
+    /// [`DotsError::OutOfRange`] for frames and regions that do not fit.
+    pub fn measured<'a>(
+        frames: impl IntoIterator<Item = &'a [u16]>,
+        correction: &Correction,
+        background: &Background,
+        region: &Region,
+    ) -> Result<Self, DotsError> {
+        let (mut means, mut variances) = (Vec::new(), Vec::new());
+        for frame in frames {
+            let Self { mean, sigma } = Self::of_frame(frame, correction, background, region)?;
+            means.push(mean);
+            variances.push(sigma * sigma);
+        }
+        if means.is_empty() {
+            let what = "frames to measure the noise in: give some of the batch";
+            return Err(DotsError::TooFew { what, given: 0, needed: 1 });
+        }
+        Ok(Self { mean: median(&mut means), sigma: median(&mut variances).sqrt() })
+    }
+
+    /// Of one frame's region alone, as the paper's Algorithm 1 has it.
+    pub(crate) fn of_frame(
+        frame: &[u16],
+        correction: &Correction,
+        background: &Background,
+        region: &Region,
+    ) -> Result<Self, DotsError> {
+        const NEEDED: usize = 16;
+        let shape = correction.shape();
+        region.check(shape)?;
+        check_shape("frame", "[values]", &[frame.len()], &[shape.values()])?;
+        let (mut count, mut sum, mut squares) = (0_usize, 0_i64, 0_i64);
+        for pixel in region.pixels(shape) {
+            if correction.hot_masks()[pixel / BLOCK_PX] >> (pixel % BLOCK_PX) & 1 == 0 {
+                let raw = match shape.channels() {
+                    1 => frame[pixel],
+                    _ => luminance([frame[3 * pixel], frame[3 * pixel + 1], frame[3 * pixel + 2]]),
+                };
+                let above = i64::from(raw) - i64::from(background.counts[pixel]);
+                (count, sum, squares) = (count + 1, sum + above, squares + above * above);
+            }
+        }
+        if count < NEEDED {
+            let what = "sound pixels in the region that the noise is measured in: choose a larger one";
+            return Err(DotsError::TooFew { what, given: count, needed: NEEDED });
+        }
+        Ok(Self::of_sums(count, sum, squares))
+    }
+
+    /// From the number of pixels, their sum and their squares' sum.
+    pub(crate) fn of_sums(count: usize, sum: i64, squares: i64) -> Self {
+        let mean = sum as f64 / count as f64;
+        let variance = squares as f64 / count as f64 - mean * mean;
+        Self { mean, sigma: variance.max(Self::ROUNDING_VARIANCE).sqrt() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noisy_frames(shape: FrameShape, count: u64) -> Vec<Vec<u16>> {
+        use rand_distr::{Distribution, Normal};
+        use rand_xoshiro::rand_core::SeedableRng;
+        let noise = Normal::<f64>::new(100.3, 3.0).unwrap();
+        let frame = |seed| {
+            let mut random = rand_xoshiro::Xoshiro256PlusPlus::seed_from_u64(seed);
+            (0..shape.values()).map(|_| noise.sample(&mut random).round() as u16).collect()
+        };
+        (0..count).map(frame).collect()
+    }
+
+    #[test]
+    fn the_mean_over_batches_loses_noise_as_one_of_that_many_frames() {
+        let shape = FrameShape::new(64, 64, 1).unwrap();
+        let error = |batches: u32| {
+            let mut mean = BackgroundMean::new(shape, batches).unwrap();
+            for frame in noisy_frames(shape, 3 * u64::from(batches)) {
+                mean.push(&frame).unwrap();
+            }
+            let squares: f64 = mean.mean().iter().map(|mean| (f64::from(*mean) - 100.3).powi(2)).sum();
+            (squares / 4096.0).sqrt()
+        };
+        assert!((error(1) / 3.0 - 1.0).abs() < 0.1, "{}", error(1));
+        assert!((error(64) / (3.0 / 8.0) - 1.0).abs() < 0.1, "{}", error(64));
+    }
+
+    #[test]
+    fn the_dark_frame_serves_until_the_first_batch() {
+        let shape = FrameShape::new(2, 32, 1).unwrap();
+        let dark = Array3::from_elem((2, 32, 1), 64.0);
+        let mut mean = BackgroundMean::new(shape, 4).unwrap().starting_with(&dark).unwrap();
+        assert_eq!(mean.mean(), [64.0; 64]);
+        mean.push(&[70; 64]).unwrap();
+        assert_eq!(mean.mean(), [70.0; 64]);
+    }
+
+    #[test]
+    fn the_noise_floor_is_that_of_the_noise_wherever_it_is_measured() {
+        let shape = FrameShape::new(96, 96, 1).unwrap();
+        let correction = Correction::none(shape);
+        let background = Background::new(&correction, &vec![100.0; 96 * 96]).unwrap();
+        let mut frames = noisy_frames(shape, 50);
+        // A third of the frames have light in one of the places.
+        for frame in frames.iter_mut().step_by(3) {
+            frame[..32 * 96].iter_mut().for_each(|raw| *raw += 500);
+        }
+        let measured = |rows| {
+            let region = Region { rows, columns: 0..32 };
+            let frames = frames.iter().map(Vec::as_slice);
+            NoiseFloor::measured(frames, &correction, &background, &region).unwrap()
+        };
+        for floor in [measured(0..32), measured(64..96)] {
+            assert!((floor.mean - 0.3).abs() < 0.15, "{floor:?}");
+            assert!((floor.sigma - (9.0_f64 + 1.0 / 12.0).sqrt()).abs() < 0.15, "{floor:?}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_a_background_is_refused() {
+        let correction = Correction::none(FrameShape::new(2, 32, 1).unwrap());
+        assert!(matches!(Background::new(&correction, &[0.0; 63]), Err(DotsError::Shape { .. })));
+        assert!(matches!(Background::new(&correction, &[f32::NAN; 64]), Err(DotsError::OutOfRange { .. })));
+    }
+}

@@ -1,0 +1,83 @@
+use super::Footprints;
+use super::footprint::luminance;
+use crate::dots::batch::Word;
+use crate::dots::column::bits;
+use crate::dots::error::check_shape;
+use crate::dots::sensor::median;
+use crate::dots::shape::BLOCK_PX;
+use crate::dots::{Batch, DotsError, FrameShape};
+
+/// Where the dots land on the calibration plane.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Centroids {
+    shape: FrameShape,
+    /// Column and row in pixels, 0 in the middle of the first pixel; none for a dot that was not seen.
+    pub xy: Vec<Option<[f64; 2]>>,
+}
+
+/// How far the dots of one batch lie from those of another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Drift {
+    /// Median shift to the right.
+    pub right_px: f64,
+    /// Median shift down.
+    pub down_px: f64,
+    /// Root mean square distance of single dots from that shift.
+    pub rms_px: f64,
+    /// Dots that both have.
+    pub dots: usize,
+}
+
+impl Centroids {
+    /// Means of the pixels' places within the footprints, weighted by their light.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if the footprints are another batch's.
+    pub fn new(batch: &Batch, footprints: &Footprints) -> Result<Self, DotsError> {
+        check_shape("footprints", "[dots]", &[footprints.dots()], &[batch.dots()])?;
+        let shape = batch.shape();
+        let centroid = |dot: usize| {
+            let [mut light, mut x, mut y] = [0.0; 3];
+            let mut covered = footprints.words(dot).peekable();
+            for Word { word, mask, values } in batch.column(dot).words() {
+                let Some((_, footprint)) = covered.next_if(|(at, _)| *at == word) else { continue };
+                for (bit, value) in bits(mask).zip(values.chunks_exact(shape.channels())) {
+                    if footprint >> bit & 1 == 1 {
+                        let (pixel, value) = (word * BLOCK_PX + bit, f64::from(luminance(value)));
+                        light += value;
+                        x += value * (pixel % shape.width()) as f64;
+                        y += value * (pixel / shape.width()) as f64;
+                    }
+                }
+            }
+            (light > 0.0).then(|| [x / light, y / light])
+        };
+        Ok(Self { shape, xy: (0..batch.dots()).map(centroid).collect() })
+    }
+
+    /// Size of the frames.
+    pub fn shape(&self) -> FrameShape {
+        self.shape
+    }
+
+    /// How the dots moved from `earlier` to here. Both must show the plane, or the same part of a scene at rest.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if there are not as many dots, [`DotsError::TooFew`] if none is seen in both.
+    pub fn drift_from(&self, earlier: &Self) -> Result<Drift, DotsError> {
+        check_shape("centroids", "[dots]", &[self.xy.len()], &[earlier.xy.len()])?;
+        let both = self.xy.iter().zip(&earlier.xy).filter_map(|(now, then)| Some(((*now)?, (*then)?)));
+        let (mut right, mut down): (Vec<f64>, Vec<f64>) =
+            both.map(|(now, then)| (now[0] - then[0], now[1] - then[1])).unzip();
+        if right.is_empty() {
+            let what = "dots that both batches show: calibrate again with the plane in place";
+            return Err(DotsError::TooFew { what, given: 0, needed: 1 });
+        }
+        // The sum of squares comes first, because the median brings the values out of their order.
+        let shifts = right.clone().into_iter().zip(down.clone());
+        let (right_px, down_px) = (median(&mut right), median(&mut down));
+        let squares: f64 =
+            shifts.map(|(right, down)| (right - right_px).powi(2) + (down - down_px).powi(2)).sum();
+        Ok(Drift { right_px, down_px, rms_px: (squares / right.len() as f64).sqrt(), dots: right.len() })
+    }
+}

@@ -1,0 +1,103 @@
+use rayon::prelude::*;
+
+use super::Footprints;
+
+/// How many pixels each two dots share: the calibration confusion matrix M, symmetric, with the dots' areas on its
+/// diagonal. Rows hold only what is not 0; stored as compressed sparse rows, as `scipy.sparse.csr_matrix` takes them.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Confusion {
+    offsets: Vec<u64>,
+    neighbours: Vec<u32>,
+    overlaps_px: Vec<u32>,
+}
+
+impl Confusion {
+    /// From the footprints of the calibration plane's dots.
+    pub fn new(footprints: &Footprints) -> Self {
+        let buckets = Buckets::new(footprints);
+        let dots = footprints.dots();
+        let rows: Vec<Vec<(u32, u32)>> = (0..dots)
+            .into_par_iter()
+            .map_init(
+                || (vec![0_u32; dots], Vec::new()),
+                |(overlaps, met), dot| {
+                    for (word, mask) in footprints.words(dot) {
+                        for &(other, others) in buckets.of_word(word) {
+                            let overlap = (mask & others).count_ones();
+                            if overlap > 0 && overlaps[other as usize] == 0 {
+                                met.push(other);
+                            }
+                            overlaps[other as usize] += overlap;
+                        }
+                    }
+                    met.sort_unstable();
+                    met.drain(..)
+                        .map(|other| (other, std::mem::take(&mut overlaps[other as usize])))
+                        .collect()
+                },
+            )
+            .collect();
+        let mut confusion = Self { offsets: vec![0], ..Self::default() };
+        for row in rows {
+            confusion.neighbours.extend(row.iter().map(|(other, _)| other));
+            confusion.overlaps_px.extend(row.iter().map(|(_, overlap)| overlap));
+            confusion.offsets.push(confusion.neighbours.len() as u64);
+        }
+        confusion
+    }
+
+    /// How many dots.
+    pub fn dots(&self) -> usize {
+        self.offsets.len().saturating_sub(1)
+    }
+
+    /// The dots that share pixels with one, itself among them, ascending.
+    ///
+    /// # Panics
+    /// Where there is no such dot.
+    pub fn neighbours(&self, dot: usize) -> &[u32] {
+        &self.neighbours[self.offsets[dot] as usize..self.offsets[dot + 1] as usize]
+    }
+
+    /// Pixels that two dots share.
+    ///
+    /// # Panics
+    /// Where there is no such first dot.
+    pub fn overlap_px(&self, dot: usize, other: usize) -> u32 {
+        let at = self.neighbours(dot).binary_search(&(other as u32));
+        at.map_or(0, |at| self.overlaps_px[self.offsets[dot] as usize + at])
+    }
+
+    /// Row offsets, column indices and values.
+    pub fn arrays(&self) -> (&[u64], &[u32], &[u32]) {
+        (&self.offsets, &self.neighbours, &self.overlaps_px)
+    }
+}
+
+/// All dots' masks, sorted by word: dots that share no word are never compared.
+struct Buckets {
+    offsets: Vec<u32>,
+    dots: Vec<(u32, u32)>,
+}
+
+impl Buckets {
+    fn new(footprints: &Footprints) -> Self {
+        let dots = 0..footprints.dots();
+        let all =
+            || dots.clone().flat_map(|dot| footprints.words(dot).map(move |(word, mask)| (word, dot, mask)));
+        let mut offsets = vec![0_u32; footprints.shape().words() + 2];
+        // Counted two places on, so that filling moves each offset to its place.
+        all().for_each(|(word, ..)| offsets[word + 2] += 1);
+        (2..offsets.len()).for_each(|at| offsets[at] += offsets[at - 1]);
+        let mut sorted = vec![(0, 0); offsets.last().map_or(0, |&count| count as usize)];
+        for (word, dot, mask) in all() {
+            sorted[offsets[word + 1] as usize] = (dot as u32, mask);
+            offsets[word + 1] += 1;
+        }
+        Self { offsets, dots: sorted }
+    }
+
+    fn of_word(&self, word: usize) -> &[(u32, u32)] {
+        &self.dots[self.offsets[word] as usize..self.offsets[word + 1] as usize]
+    }
+}

@@ -1,0 +1,131 @@
+use std::collections::VecDeque;
+
+use rayon::prelude::*;
+
+use super::footprint::luminance;
+use crate::dots::shape::BLOCK_PX;
+use crate::dots::{Batch, BatchArrays, DotsError, FrameShape, SparseColumn};
+
+/// Pixels with less than this share of the peak are none of the dot's.
+const TAIL: f32 = 0.02;
+
+/// Where a dot whose estimate is not unimodal is taken to be evenly bright.
+const PILLBOX: f32 = 0.5;
+
+/// Shares of the peak at which a unimodal dot is one piece.
+const LEVELS: [f32; 3] = [0.25, 0.5, 0.75];
+
+/// A piece may have crumbs of up to this share of its pixels, from noise.
+const CRUMBS: f64 = 0.05;
+
+/// How the light of each dot is spread over the pixels, its peak 1: a column of one channel without residual.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointSpreads {
+    /// The dots' spreads.
+    pub columns: Batch,
+    /// Whether each is its own estimate; the others, such as dots on a boundary of textures, are pillboxes.
+    pub unimodal: Vec<bool>,
+}
+
+impl PointSpreads {
+    /// Of each dot's column, the discs around its brightest pixel: as they are where all contours are one piece, and
+    /// evenly 1 down to half of the peak elsewhere. The peak is that of the mean of 3 x 3 pixels, for the noise.
+    ///
+    /// # Errors
+    /// [`DotsError::Damaged`] if there are more pixels than a batch can have.
+    pub fn new(batch: &Batch) -> Result<Self, DotsError> {
+        let shape = FrameShape::new(batch.shape().height(), batch.shape().width(), 1)?;
+        let spreads: Vec<(SparseColumn, bool)> = (0..batch.dots())
+            .into_par_iter()
+            .map_init(|| Plane::new(shape), |plane, dot| plane.spread(batch, dot))
+            .collect();
+        let mut arrays = BatchArrays::default();
+        spreads.iter().for_each(|(column, _)| arrays.push(column));
+        let unimodal = spreads.iter().map(|(_, unimodal)| *unimodal).collect();
+        Ok(Self { columns: Batch::new(shape, arrays)?, unimodal })
+    }
+}
+
+/// A column laid out in the frame; outside of its mask, where it is clean between dots, it has no light.
+struct Plane {
+    shape: FrameShape,
+    light: Vec<f32>,
+    /// Means of 3 x 3 pixels; NaN, which is never bright enough, outside of the mask.
+    smooth: Vec<f32>,
+    seen: Vec<bool>,
+}
+
+impl Plane {
+    fn new(shape: FrameShape) -> Self {
+        let pixels = shape.pixels();
+        Self { shape, light: vec![0.0; pixels], smooth: vec![f32::NAN; pixels], seen: vec![false; pixels] }
+    }
+
+    fn spread(&mut self, batch: &Batch, dot: usize) -> (SparseColumn, bool) {
+        let column = batch.column(dot);
+        column.pixels().for_each(|(pixel, value)| self.light[pixel] = luminance(value));
+        let pixels: Vec<usize> = column.pixels().map(|(pixel, _)| pixel).collect();
+        for &pixel in &pixels {
+            self.smooth[pixel] = self.around(pixel).map(|near| self.light[near]).sum::<f32>() / 9.0;
+        }
+        let brightest = pixels.iter().copied().max_by(|&a, &b| self.smooth[a].total_cmp(&self.smooth[b]));
+        let peak = brightest.map_or(0.0, |pixel| self.smooth[pixel]);
+        let mut spread = SparseColumn { residual: vec![0.0; self.shape.blocks()], ..SparseColumn::default() };
+        let mut unimodal = false;
+        if let Some(brightest) = brightest.filter(|_| peak > 0.0) {
+            let disc = self.piece(brightest, f32::NEG_INFINITY);
+            unimodal = LEVELS.iter().all(|level| {
+                let above = disc.iter().filter(|&&pixel| self.smooth[pixel] >= level * peak).count();
+                self.piece(brightest, level * peak).len() as f64 >= (1.0 - CRUMBS) * above as f64
+            });
+            let mut dot = match unimodal {
+                true => self.piece(brightest, TAIL * peak),
+                false => disc.into_iter().filter(|&pixel| self.smooth[pixel] >= PILLBOX * peak).collect(),
+            };
+            dot.sort_unstable();
+            for pixel in dot {
+                let word = (pixel / BLOCK_PX) as u32;
+                if spread.words.last() != Some(&word) {
+                    spread.words.push(word);
+                    spread.masks.push(0);
+                }
+                if let Some(mask) = spread.masks.last_mut() {
+                    *mask |= 1 << (pixel % BLOCK_PX);
+                }
+                spread.values.push(if unimodal { self.light[pixel] / peak } else { 1.0 });
+            }
+        }
+        for pixel in pixels {
+            (self.light[pixel], self.smooth[pixel]) = (0.0, f32::NAN);
+        }
+        (spread, unimodal)
+    }
+
+    /// The pixels around `start` that are connected with it and at least as bright as `least`.
+    fn piece(&mut self, start: usize, least: f32) -> Vec<usize> {
+        let mut piece = Vec::new();
+        let mut next = VecDeque::from([start]);
+        self.seen[start] = true;
+        while let Some(pixel) = next.pop_front() {
+            piece.push(pixel);
+            for near in self.around(pixel) {
+                if !self.seen[near] && self.smooth[near] >= least {
+                    self.seen[near] = true;
+                    next.push_back(near);
+                }
+            }
+        }
+        piece.iter().for_each(|&pixel| self.seen[pixel] = false);
+        piece
+    }
+
+    /// The 3 x 3 pixels around one, fewer at the frame's border.
+    fn around(&self, pixel: usize) -> impl Iterator<Item = usize> + use<> {
+        let (width, height) = (self.shape.width(), self.shape.height());
+        let (row, column) = (pixel / width, pixel % width);
+        let rows = row.saturating_sub(1)..(row + 2).min(height);
+        rows.flat_map(move |row| {
+            (column.saturating_sub(1)..(column + 2).min(width)).map(move |column| row * width + column)
+        })
+    }
+}

@@ -1,0 +1,84 @@
+use std::ops::Range;
+
+use super::shape::BLOCK_PX;
+
+/// What Algorithm 1 did to one frame.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Outcome {
+    /// Discs that it took; 0: nothing stood out of the background.
+    pub discs: u32,
+    /// Whether it ended at the cap, so that light may have been left behind.
+    pub capped: bool,
+}
+
+/// The light transport of one dot: pixels in discs around its brightest points one by one, everything else as a
+/// mean of each block of 32 x 32 pixels. In counts above the background, times the flat field's gain; signed.
+///
+/// The arrays keep their memory when the column is written anew.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SparseColumn {
+    /// Which words of 32 pixels have any in the mask, ascending: pixel index / 32.
+    pub words: Vec<u32>,
+    /// Which of the word's pixels: bit `b` is pixel `32 word + b`.
+    pub masks: Vec<u32>,
+    /// Their values in the order of the bits, `[pixels, channels]`.
+    pub values: Vec<f32>,
+    /// Mean of each block's pixels outside the mask, `[block rows, block columns, channels]`; 0 where there are none.
+    pub residual: Vec<f32>,
+    /// How it came about.
+    pub outcome: Outcome,
+}
+
+impl SparseColumn {
+    /// The pixels of the mask and how many words came before, without new memory.
+    pub fn pixels(&self) -> impl Iterator<Item = usize> {
+        self.words
+            .iter()
+            .zip(&self.masks)
+            .flat_map(|(&word, &mask)| bits(mask).map(move |bit| word as usize * BLOCK_PX + bit))
+    }
+
+    pub(crate) fn clear(&mut self) {
+        self.words.clear();
+        self.masks.clear();
+        self.values.clear();
+        self.residual.clear();
+        self.outcome = Outcome::default();
+    }
+}
+
+/// The set bits of a mask from the lowest on.
+pub(crate) fn bits(mut mask: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let bit = (mask != 0).then(|| mask.trailing_zeros() as usize)?;
+        mask &= mask - 1;
+        Some(bit)
+    })
+}
+
+/// The runs of set bits of a mask from the lowest on; a disc's rows are mostly one run a word.
+pub(crate) fn runs(mask: u32) -> impl Iterator<Item = Range<usize>> {
+    // Wider than the mask, so that a run up to its last bit ends.
+    let mut rest = u64::from(mask);
+    std::iter::from_fn(move || {
+        let start = (rest != 0).then(|| rest.trailing_zeros())?;
+        let end = start + (rest >> start).trailing_ones();
+        rest &= !0 << end;
+        Some(start as usize..end as usize)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn runs_and_bits_are_those_of_the_mask() {
+        for mask in [0, 1, 1 << 31, u32::MAX, 0b1011_0111, 0xf000_000f, 0xaaaa_aaaa] {
+            let expected: Vec<usize> = (0..32).filter(|bit| mask >> bit & 1 == 1).collect();
+            assert_eq!(bits(mask).collect::<Vec<_>>(), expected);
+            assert_eq!(runs(mask).flatten().collect::<Vec<_>>(), expected);
+        }
+        assert_eq!(runs(0b1011_0111).collect::<Vec<_>>(), [0..3, 4..6, 7..8]);
+    }
+}

@@ -1,0 +1,432 @@
+//! Algorithm 1 of the paper, corrected: a frame becomes a sparse column in one pass over its raw counts.
+
+mod counts;
+mod disc;
+mod lanes;
+pub mod reference;
+mod rule;
+
+use pulp::NullaryFnOnce;
+use rayon::prelude::*;
+
+pub use rule::{DenoiseSettings, StopRule, false_alarm_sigmas};
+
+use self::counts::{Differences, Narrow, Survey, Wide};
+use self::disc::Disc;
+use self::lanes::{Lanes, Portable};
+use super::background::luminance;
+use super::column::{bits, runs};
+use super::error::check_shape;
+use super::shape::BLOCK_PX;
+use super::{Background, Batch, BatchArrays, Correction, DotsError, NoiseFloor, Outcome, SparseColumn};
+use crate::plane::SimdLevel;
+
+/// Frames that one thread takes at a time.
+const FRAMES_AT_A_TIME: usize = 32;
+
+/// Turns raw frames into sparse columns.
+///
+/// The brightest pixel above the background is found, the disc around it is taken out, and so on until the
+/// [`StopRule`] is met; what was taken is the column, and what is left is kept as the mean of each block of 32 x 32
+/// pixels. Pixels that were taken count no more for maximum and statistics. Ties go to the first pixel in reading
+/// order. Values are raw minus background times the flat field's gain; hot pixels, which are never the maximum, have
+/// the mean of their neighbours. Nothing is clamped at 0: the bias would add up over all dots.
+///
+/// Frames in colour are searched in their luminance, (R + 2 G + B) / 4 in whole counts; values stay per colour.
+#[derive(Debug, Clone)]
+pub struct Denoiser {
+    correction: Correction,
+    settings: DenoiseSettings,
+    disc: Disc,
+    /// `k` of [`StopRule::FalseAlarms`].
+    sigmas: f64,
+    level: SimdLevel,
+}
+
+/// Memory that [`Denoiser::column`] works in, to be kept from frame to frame.
+#[derive(Debug, Clone)]
+pub struct Scratch {
+    survey: Survey,
+    /// Pixels that are taken; all 0 between frames.
+    taken: Vec<u32>,
+    /// Words with any of them.
+    touched: Vec<u32>,
+    /// Luminance of a frame in colour.
+    luminance: Vec<u16>,
+    /// Sum of each block's values, background subtracted, that were taken, `[blocks, channels]`.
+    taken_sums: Vec<f64>,
+    /// Sound pixels that were taken from each block.
+    taken_pixels: Vec<u32>,
+    /// Sums of colours over blocks, `[blocks, channels]`.
+    colour_sums: Vec<i32>,
+}
+
+impl Denoiser {
+    /// # Errors
+    /// [`DotsError::OutOfRange`] for settings that cannot be.
+    pub fn new(correction: Correction, settings: DenoiseSettings) -> Result<Self, DotsError> {
+        settings.check()?;
+        let shape = correction.shape();
+        let sigmas = match &settings.stop {
+            StopRule::FalseAlarms { per_frame } => false_alarm_sigmas(*per_frame, shape.pixels()),
+            StopRule::Printed { patch, .. } => patch.check(shape).map(|()| 0.0)?,
+        };
+        let disc = Disc::new(settings.radius_px);
+        Ok(Self { correction, settings, disc, sigmas, level: SimdLevel::best() })
+    }
+
+    /// With other instructions than the fastest; the result is the same.
+    pub fn at_level(mut self, level: SimdLevel) -> Self {
+        self.level = level;
+        self
+    }
+
+    /// What is known of the sensor.
+    pub fn correction(&self) -> &Correction {
+        &self.correction
+    }
+
+    /// Memory for one thread.
+    pub fn scratch(&self) -> Scratch {
+        let shape = self.correction.shape();
+        let in_colour = |size: usize| if shape.channels() > 1 { size } else { 0 };
+        Scratch {
+            survey: Survey::new(shape),
+            taken: vec![0; shape.words()],
+            touched: Vec::with_capacity(shape.words()),
+            luminance: vec![0; in_colour(shape.pixels())],
+            taken_sums: vec![0.0; shape.blocks() * shape.channels()],
+            taken_pixels: vec![0; shape.blocks()],
+            colour_sums: vec![0; in_colour(shape.blocks() * shape.channels())],
+        }
+    }
+
+    /// Denoises one raw frame, `[height, width, channels]`, into `column`. Takes no memory once `column` has held the
+    /// largest.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if the frame is not of the correction's shape.
+    pub fn column(
+        &self,
+        frame: &[u16],
+        background: &Background,
+        floor: NoiseFloor,
+        scratch: &mut Scratch,
+        column: &mut SparseColumn,
+    ) -> Result<(), DotsError> {
+        let shape = self.correction.shape();
+        check_shape("frame", "[values]", &[frame.len()], &[shape.values()])?;
+        check_shape("background", "[values]", &[background.mean.len()], &[shape.values()])?;
+        check_shape("scratch", "[words]", &[scratch.taken.len()], &[shape.words()])?;
+        let task = FrameTask { denoiser: self, frame, background, floor, scratch, column };
+        #[cfg(target_arch = "x86_64")]
+        match (self.level, pulp::x86::V3::try_new(), pulp::x86::V4::try_new()) {
+            (SimdLevel::Avx512, _, Some(simd)) => return simd.vectorize(OnLanes(simd, task)),
+            (SimdLevel::Avx2, Some(simd), _) => return simd.vectorize(OnLanes(simd, task)),
+            _ => {}
+        }
+        OnLanes(Portable, task).call()
+    }
+
+    /// Denoises the frames of one batch in the order of their dots. The same columns for any number of threads.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if a frame is not of the correction's shape.
+    pub fn batch(
+        &self,
+        frames: &[&[u16]],
+        background: &Background,
+        floor: NoiseFloor,
+    ) -> Result<Batch, DotsError> {
+        let parts: Vec<BatchArrays> = frames
+            .par_chunks(FRAMES_AT_A_TIME)
+            .map_init(
+                || (self.scratch(), SparseColumn::default()),
+                |(scratch, column), frames| {
+                    let mut part = BatchArrays::default();
+                    for frame in frames {
+                        self.column(frame, background, floor, scratch, column)?;
+                        part.push(column);
+                    }
+                    Ok(part)
+                },
+            )
+            .collect::<Result<_, DotsError>>()?;
+        let mut arrays = BatchArrays::default();
+        parts.into_iter().for_each(|part| arrays.append(part));
+        Batch::new(self.correction.shape(), arrays)
+    }
+}
+
+/// One frame to be denoised.
+struct FrameTask<'a> {
+    denoiser: &'a Denoiser,
+    frame: &'a [u16],
+    background: &'a Background,
+    floor: NoiseFloor,
+    scratch: &'a mut Scratch,
+    column: &'a mut SparseColumn,
+}
+
+/// What is run with the instructions of `L` switched on.
+struct OnLanes<'a, L>(L, FrameTask<'a>);
+
+impl<L: Lanes> NullaryFnOnce for OnLanes<'_, L> {
+    type Output = Result<(), DotsError>;
+
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        let Self(lanes, mut task) = self;
+        let correction = &task.denoiser.correction;
+        let mut gray = std::mem::take(&mut task.scratch.luminance);
+        if correction.shape().channels() == 3 {
+            for (gray, pixel) in gray.iter_mut().zip(task.frame.as_chunks().0) {
+                *gray = luminance(*pixel);
+            }
+        }
+        let raw: &[u16] = if gray.is_empty() { task.frame } else { &gray };
+        let narrow = Narrow::new(lanes, raw, task.background, correction);
+        let outcome = match task.background.narrow && narrow.survey(&mut task.scratch.survey) {
+            true => task.take_discs(&narrow),
+            false => {
+                let wide = Wide { raw, background: task.background, correction };
+                wide.survey(&mut task.scratch.survey);
+                task.take_discs(&wide)
+            }
+        };
+        task.scratch.luminance = gray;
+        let outcome = outcome?;
+        task.extract();
+        task.column.outcome = outcome;
+        Ok(())
+    }
+}
+
+/// Mean and standard deviation of what is left of a frame.
+struct Left {
+    count: usize,
+    sum: i64,
+    squares: i64,
+}
+
+impl FrameTask<'_> {
+    /// Takes discs until the rule is met.
+    #[inline(always)]
+    fn take_discs(&mut self, differences: &impl Differences) -> Result<Outcome, DotsError> {
+        let Self { denoiser, frame, background, floor, scratch, .. } = self;
+        let shape = denoiser.correction.shape();
+        let printed = match &denoiser.settings.stop {
+            StopRule::FalseAlarms { .. } => None,
+            StopRule::Printed { patch, tolerance } => {
+                Some((NoiseFloor::of_frame(frame, &denoiser.correction, background, patch)?, *tolerance))
+            }
+        };
+        // Of the printed rule any maximum is high enough.
+        let least = match printed {
+            None => (floor.mean + denoiser.sigmas * floor.sigma).ceil().clamp(-65536.0, 65536.0) as i32,
+            Some(_) => counts::NOTHING + 1,
+        };
+        let mut left = Left {
+            count: shape.pixels() - denoiser.correction.hot().len(),
+            sum: scratch.survey.block_sums.iter().map(|&sum| i64::from(sum)).sum(),
+            squares: scratch.survey.squares as i64,
+        };
+        let mut outcome = Outcome::default();
+        loop {
+            let largest = scratch.survey.maxima.iter().fold(counts::NOTHING, |a, &b| a.max(b));
+            if largest < least {
+                return Ok(outcome);
+            }
+            if outcome.discs == denoiser.settings.max_discs {
+                outcome.capped = true;
+                return Ok(outcome);
+            }
+            let segment = scratch.survey.maxima.iter().position(|&maximum| maximum == largest);
+            let Some(centre) = segment.and_then(|segment| differences.find(segment, largest, &scratch.taken))
+            else {
+                return Ok(outcome);
+            };
+            outcome.discs += 1;
+            let Scratch { taken, touched, .. } = &mut **scratch;
+            for row in denoiser.disc.rows_around(shape, centre) {
+                take(row, taken, touched, |word, fresh| {
+                    if printed.is_some() {
+                        left.lose(word, fresh & !denoiser.correction.hot_masks()[word], |pixel| {
+                            let raw = match shape.channels() {
+                                1 => frame[pixel],
+                                _ => {
+                                    luminance([frame[3 * pixel], frame[3 * pixel + 1], frame[3 * pixel + 2]])
+                                }
+                            };
+                            i64::from(raw) - i64::from(background.counts[pixel])
+                        });
+                    }
+                });
+            }
+            let mut next = 0;
+            for row in denoiser.disc.rows_around(shape, centre) {
+                let pixels = counts::SEGMENT_WORDS * BLOCK_PX;
+                for segment in next.max(row.start / pixels)..=(row.end - 1) / pixels {
+                    // Maxima only fall: what was too low stays so.
+                    if scratch.survey.maxima[segment] >= least {
+                        scratch.survey.maxima[segment] = differences.largest(segment, &scratch.taken);
+                    }
+                    next = segment + 1;
+                }
+            }
+            if printed.is_some_and(|(patch, tolerance)| left.equals(patch, tolerance)) {
+                return Ok(outcome);
+            }
+        }
+    }
+
+    /// Reads out what was taken and what is left, and clears the scratch memory.
+    #[inline(always)]
+    fn extract(&mut self) {
+        let Self { denoiser, frame, background, scratch, column, .. } = self;
+        let correction = &denoiser.correction;
+        let shape = correction.shape();
+        let channels = shape.channels();
+        let Scratch { survey, taken, touched, taken_sums, taken_pixels, colour_sums, .. } = &mut **scratch;
+        column.clear();
+        taken_sums.fill(0.0);
+        taken_pixels.fill(0);
+        touched.sort_unstable();
+        column.values.reserve(touched.len() * BLOCK_PX * channels);
+        for &word in &*touched {
+            let at = word as usize;
+            let (mask, hot, block) = (taken[at], correction.hot_masks()[at], shape.block_of_word(at));
+            column.words.push(word);
+            column.masks.push(mask);
+            taken[at] = 0;
+            taken_pixels[block] += (mask & !hot).count_ones();
+            let sums = &mut taken_sums[block * channels..][..channels];
+            if mask & hot == 0 {
+                for run in runs(mask) {
+                    let run = (at * BLOCK_PX + run.start) * channels..(at * BLOCK_PX + run.end) * channels;
+                    let (raw, mean) = (&frame[run.clone()], &background.mean[run.clone()]);
+                    let above = raw.iter().zip(mean).map(|(&raw, mean)| f32::from(raw) - mean);
+                    column
+                        .values
+                        .extend(above.zip(&correction.gain()[run]).map(|(above, gain)| above * gain));
+                    add_run(sums, raw, mean);
+                }
+            } else {
+                for bit in bits(mask) {
+                    let pixel = at * BLOCK_PX + bit;
+                    for (channel, sum) in sums.iter_mut().enumerate() {
+                        column.values.push(correction.value(frame, &background.mean, pixel, channel));
+                        if hot >> bit & 1 == 0 {
+                            let value = pixel * channels + channel;
+                            *sum += f64::from(frame[value]) - f64::from(background.mean[value]);
+                        }
+                    }
+                }
+            }
+        }
+        touched.clear();
+
+        let sums: &[i32] = match channels {
+            1 => &survey.block_sums,
+            _ => {
+                sum_colours(frame, correction, colour_sums);
+                colour_sums
+            }
+        };
+        let blocks = sums.iter().zip(&background.block_offset).zip(&*taken_sums).zip(correction.block_gain());
+        column.residual.extend(blocks.enumerate().map(|(at, (((&sum, &offset), &taken), &gain))| {
+            let left = background.block_sound[at / channels] - taken_pixels[at / channels];
+            let sum = f64::from(sum) + offset - taken;
+            if left == 0 { 0.0 } else { (sum / f64::from(left) * f64::from(gain)) as f32 }
+        }));
+    }
+}
+
+/// Marks the pixels of a row of a disc; tells of each word which of its pixels were not marked before.
+#[inline(always)]
+fn take(
+    row: std::ops::Range<usize>,
+    taken: &mut [u32],
+    touched: &mut Vec<u32>,
+    mut fresh: impl FnMut(usize, u32),
+) {
+    let words = row.start / BLOCK_PX..=(row.end - 1) / BLOCK_PX;
+    for (word, taken) in words.clone().zip(&mut taken[words]) {
+        let first = row.start.saturating_sub(word * BLOCK_PX);
+        let count = (row.end - word * BLOCK_PX).min(BLOCK_PX) - first;
+        let mask = (u32::MAX >> (BLOCK_PX - count)) << first;
+        if *taken == 0 {
+            touched.push(word as u32);
+        }
+        fresh(word, mask & !*taken);
+        *taken |= mask;
+    }
+}
+
+/// Adds `raw - mean` of some pixels in a row to their block's sums, `[channels]`.
+///
+/// In eight partial sums, so that any instructions give the same bits and most can work side by side.
+#[inline(always)]
+fn add_run(sums: &mut [f64], raw: &[u16], mean: &[f32]) {
+    if let [sum] = sums {
+        let (raw, raw_rest) = raw.as_chunks::<8>();
+        let (mean, mean_rest) = mean.as_chunks::<8>();
+        let mut partial = [0.0; 8];
+        for (raw, mean) in raw.iter().zip(mean) {
+            for lane in 0..8 {
+                partial[lane] += f64::from(raw[lane]) - f64::from(mean[lane]);
+            }
+        }
+        for (lane, (&raw, &mean)) in raw_rest.iter().zip(mean_rest).enumerate() {
+            partial[lane] += f64::from(raw) - f64::from(mean);
+        }
+        *sum += partial.iter().sum::<f64>();
+    } else {
+        for (raw, mean) in raw.chunks_exact(sums.len()).zip(mean.chunks_exact(sums.len())) {
+            for ((sum, &raw), &mean) in sums.iter_mut().zip(raw).zip(mean) {
+                *sum += f64::from(raw) - f64::from(mean);
+            }
+        }
+    }
+}
+
+/// Sums of each colour over the sound pixels of each block, `[blocks, 3]`.
+#[inline(always)]
+fn sum_colours(frame: &[u16], correction: &Correction, sums: &mut [i32]) {
+    let (pixels, _) = frame.as_chunks::<3>();
+    let (sums, _) = sums.as_chunks_mut::<3>();
+    sums.fill([0; 3]);
+    for (word, &hot) in correction.hot_masks().iter().enumerate() {
+        let sum = &mut sums[correction.shape().block_of_word(word)];
+        let of_word = &pixels[word * BLOCK_PX..(word + 1) * BLOCK_PX];
+        for pixel in of_word {
+            (0..3).for_each(|colour| sum[colour] += i32::from(pixel[colour]));
+        }
+        for bit in bits(hot) {
+            (0..3).for_each(|colour| sum[colour] -= i32::from(of_word[bit][colour]));
+        }
+    }
+}
+
+impl Left {
+    /// Takes the pixels of a word out of the statistics.
+    #[inline(always)]
+    fn lose(&mut self, word: usize, pixels: u32, difference: impl Fn(usize) -> i64) {
+        for bit in bits(pixels) {
+            let difference = difference(word * BLOCK_PX + bit);
+            self.count -= 1;
+            self.sum -= difference;
+            self.squares -= difference * difference;
+        }
+    }
+
+    /// Whether mean and standard deviation are those of the patch, to a share of its standard deviation.
+    fn equals(&self, patch: NoiseFloor, tolerance: f64) -> bool {
+        if self.count == 0 {
+            return true;
+        }
+        let left = NoiseFloor::of_sums(self.count, self.sum, self.squares);
+        let allowed = tolerance * patch.sigma;
+        (left.mean - patch.mean).abs() <= allowed && (left.sigma - patch.sigma).abs() <= allowed
+    }
+}

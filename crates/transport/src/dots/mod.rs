@@ -1,0 +1,28 @@
+//! Light transport of a flying dot: a mirror moves one spot of light over the scene while a fast camera takes a frame of
+//! each place; every frame is a column of the scene's light transport.
+//!
+//! Raw frames become a [`Batch`] of sparse columns by way of the [`Synchroniser`], which says which dot a frame shows,
+//! and the [`Denoiser`], which keeps what stands out of the noise pixel by pixel and the rest as means of blocks.
+mod background;
+mod batch;
+pub mod calibrate;
+mod column;
+mod correction;
+mod denoise;
+mod error;
+pub mod product;
+mod sensor;
+mod shape;
+mod synchronise;
+
+pub use background::{Background, BackgroundMean, NoiseFloor};
+pub use batch::{Batch, BatchArrays, BatchCounts, Column};
+pub use column::{Outcome, SparseColumn};
+pub use correction::{Correction, Sampling};
+pub use denoise::{DenoiseSettings, Denoiser, Scratch, StopRule, false_alarm_sigmas, reference};
+pub use error::DotsError;
+pub use sensor::RunStatistics;
+pub use shape::{BLOCK_PX, FrameShape, Region};
+pub use synchronise::{
+    Cause, Decided, Fate, Observation, SyncCounts, SyncSettings, Synchroniser, pulse_threshold,
+};

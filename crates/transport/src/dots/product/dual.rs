@@ -1,0 +1,136 @@
+use ndarray::{Array2, Array3};
+use rayon::prelude::*;
+
+use crate::dots::calibrate::Centroids;
+use crate::dots::error::{check_range, check_shape};
+use crate::dots::{Batch, DotsError};
+
+/// The scene as the mirror would see it, lit from the camera.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DualImage {
+    /// `[height, width, channels]`; 1 is the calibration plane.
+    pub image: Array3<f32>,
+    /// Which pixels are dots of their own, `[height, width]`; the others are filled in.
+    pub known: Array2<bool>,
+}
+
+/// All light of each column, those outside the mask by their blocks' means; the mean of the channels. On the
+/// calibration plane, what [`dual`] divides by.
+pub fn column_energies(batch: &Batch) -> Vec<f64> {
+    let channels = batch.shape().channels() as f64;
+    energies_of_channels(batch).iter().map(|energy| energy.iter().sum::<f64>() / channels).collect()
+}
+
+fn energies_of_channels(batch: &Batch) -> Vec<[f64; 3]> {
+    let of_block = || vec![0; batch.shape().blocks()];
+    let dots = (0..batch.dots()).into_par_iter();
+    dots.map_init(of_block, |of_block, dot| batch.column(dot).energy(of_block)).collect()
+}
+
+/// Dual image by Helmholtz reciprocity: each dot's place on the calibration plane has the light of its whole column,
+/// over what the plane gave there (`plane_energies`, by [`column_energies`] of the plane's batch), holes filled. Both
+/// are sums over the same pixels, whose number drops out. `size` is (height, width); the frame is scaled to it.
+///
+/// Dots without a centroid or without light on the plane are left out; those that share a pixel are averaged.
+///
+/// # Errors
+/// [`DotsError::Shape`] if centroids or energies are not those of the batch's dots, [`DotsError::OutOfRange`] for an
+/// image without pixels.
+pub fn dual(
+    batch: &Batch,
+    centroids: &Centroids,
+    plane_energies: &[f64],
+    size: (usize, usize),
+) -> Result<DualImage, DotsError> {
+    let (shape, (height, width)) = (batch.shape(), size);
+    check_shape("centroids", "[dots]", &[centroids.xy.len()], &[batch.dots()])?;
+    check_shape("plane_energies", "[dots]", &[plane_energies.len()], &[batch.dots()])?;
+    check_range("dual image's pixels", (height * width) as f64, height * width > 0, "at least 1")?;
+    let channels = shape.channels();
+    let mut image = Array3::<f32>::zeros((height, width, channels));
+    let mut counts = Array2::<u32>::zeros((height, width));
+    let mut places = Vec::with_capacity(batch.dots());
+    let energies = energies_of_channels(batch);
+    for ((xy, &plane), energy) in centroids.xy.iter().zip(plane_energies).zip(energies) {
+        let Some([x, y]) = xy.filter(|_| plane > 0.0) else { continue };
+        let scaled =
+            |at: f64, from: usize, to: usize| (((at + 0.5) * to as f64 / from as f64) as usize).min(to - 1);
+        let at = [scaled(y, shape.height(), height), scaled(x, shape.width(), width)];
+        counts[at] += 1;
+        places.push((at, energy.map(|energy| energy / plane)));
+    }
+    for (at, light) in places {
+        for (channel, light) in light.iter().enumerate().take(channels) {
+            image[[at[0], at[1], channel]] += (light / f64::from(counts[at])) as f32;
+        }
+    }
+    let known = counts.mapv(|count| count > 0);
+    fill_holes(&mut image, &known);
+    Ok(DualImage { image, known })
+}
+
+/// Fills the pixels of an image `[height, width, channels]` that are not known, from the known ones outwards: each has
+/// the mean of its horizontal and vertical neighbours that were known or filled a step before. Without any known pixel
+/// the image stays as it is.
+///
+/// # Panics
+/// If `known` is not of the image's height and width.
+pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
+    let (height, width, channels) = image.dim();
+    assert_eq!(known.dim(), (height, width), "known must be as large as the image");
+    // With a border that is never filled and counts for nothing, so that every pixel has four neighbours.
+    let stride = width + 2;
+    let inside = |row: usize, column: usize| (row + 1) * stride + column + 1;
+    let mut filled = vec![0.0_f32; (height + 2) * stride];
+    let mut is_open = vec![false; filled.len()];
+    let mut values = vec![0.0_f32; filled.len() * channels];
+    for (row, (known, pixels)) in known.outer_iter().zip(image.outer_iter()).enumerate() {
+        let places = inside(row, 0)..inside(row, width);
+        let state = filled[places.clone()].iter_mut().zip(&mut is_open[places.clone()]);
+        for (((filled, is_open), &known), (pixel, values)) in state
+            .zip(known)
+            .zip(pixels.outer_iter().zip(values[places.start * channels..].chunks_exact_mut(channels)))
+        {
+            (*filled, *is_open) = (f32::from(u8::from(known)), !known);
+            if known {
+                values.iter_mut().zip(pixel).for_each(|(value, &light)| *value = light);
+            }
+        }
+    }
+    let neighbours = |pixel: usize| [pixel - 1, pixel + 1, pixel - stride, pixel + stride];
+    // In each step only the rim of what is filled: every pixel is reached once.
+    let at_rim = |pixel: &usize| is_open[*pixel] && neighbours(*pixel).iter().any(|&near| filled[near] > 0.0);
+    let all = (0..height).flat_map(|row| inside(row, 0)..inside(row, width));
+    let mut rim: Vec<usize> = all.filter(at_rim).collect();
+    let (mut next, mut means) = (Vec::new(), Vec::new());
+    rim.iter().for_each(|&pixel| is_open[pixel] = false);
+    while !rim.is_empty() {
+        means.clear();
+        for &pixel in &rim {
+            let near = neighbours(pixel);
+            let count: f32 = near.iter().map(|&near| filled[near]).sum();
+            means.extend((0..channels).map(|channel| {
+                // What is not filled is 0.
+                near.iter().map(|&near| values[near * channels + channel]).sum::<f32>() / count
+            }));
+        }
+        next.clear();
+        for (&pixel, means) in rim.iter().zip(means.chunks_exact(channels)) {
+            values[pixel * channels..][..channels].copy_from_slice(means);
+            filled[pixel] = 1.0;
+            for near in neighbours(pixel) {
+                if std::mem::take(&mut is_open[near]) {
+                    next.push(near);
+                }
+            }
+        }
+        std::mem::swap(&mut rim, &mut next);
+    }
+    // Where nothing is known, nothing was filled.
+    if known.iter().any(|&known| known) {
+        for (row, mut pixels) in image.outer_iter_mut().enumerate() {
+            let places = inside(row, 0) * channels..inside(row, width) * channels;
+            pixels.iter_mut().zip(&values[places]).for_each(|(pixel, &value)| *pixel = value);
+        }
+    }
+}

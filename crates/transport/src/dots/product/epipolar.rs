@@ -1,0 +1,236 @@
+use std::ops::Range;
+
+use super::Separation;
+use super::relight::floodlit;
+use super::sum::{add_blocks, blocks_of, by_bands, first_word, sum_blocks};
+use crate::dots::batch::Word;
+use crate::dots::calibrate::Fundamental;
+use crate::dots::column::runs;
+use crate::dots::error::{check_range, check_shape};
+use crate::dots::shape::BLOCK_PX;
+use crate::dots::{Batch, DotsError, FrameShape};
+
+/// Width of the frames that distances of masks are given for, in pixels.
+const REFERENCE_WIDTH_PX: f64 = 1024.0;
+
+/// A block's share of the mask is the mean over this many points a side.
+const POINTS: usize = 4;
+
+/// Farther out than this many sigmas the mask is 0; there a Gaussian is 4e-6.
+const REACH_SIGMAS: f64 = 5.0;
+
+/// How the mask falls off around an epipolar line.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum MaskRule {
+    /// 1 up to the distance, beyond it a Gaussian: the dot's whole width is direct.
+    #[default]
+    Plateau,
+    /// Eq. 7 as printed: a Gaussian around the line itself, cut off at the distance. Keeps a fifth of the paper's dot.
+    Printed,
+}
+
+/// Which light counts as direct, by its distance from the dot's epipolar line.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EpipolarMask {
+    /// The paper's d_thresh, in pixels of a frame that is 1024 wide, as 19.
+    pub distance_px: f64,
+    /// Softness, in the same pixels, as 2; 0 cuts sharply.
+    pub sigma_px: f64,
+    /// The shape of the mask.
+    pub rule: MaskRule,
+}
+
+/// A mask with distances in the batch's own pixels.
+#[derive(Clone, Copy)]
+struct Falloff {
+    distance_px: f64,
+    sigma_px: f64,
+    rule: MaskRule,
+}
+
+impl Falloff {
+    /// Nothing farther away is direct.
+    fn reach_px(&self) -> f64 {
+        self.distance_px + REACH_SIGMAS * self.sigma_px
+    }
+
+    /// Share that is direct at this distance from the line.
+    fn at(&self, px: f64) -> f64 {
+        let gaussian = |px: f64| (-0.5 * (px / self.sigma_px).powi(2)).exp();
+        if px > self.reach_px() {
+            return 0.0;
+        }
+        match self.rule {
+            MaskRule::Plateau if px <= self.distance_px => 1.0,
+            MaskRule::Plateau if self.sigma_px > 0.0 => gaussian(px - self.distance_px),
+            MaskRule::Printed if px > self.distance_px => 0.0,
+            MaskRule::Printed if self.sigma_px > 0.0 => gaussian(px),
+            MaskRule::Printed => 1.0,
+            MaskRule::Plateau => 0.0,
+        }
+    }
+}
+
+impl Falloff {
+    /// Shares of pixels side by side from (x, y) on. The distance from a line is largest at an end of them, and smallest
+    /// too where the line does not cross, so that mostly one share serves all.
+    #[inline(always)]
+    fn along(&self, line: &Line, x: f64, y: f64, shares: &mut [f64]) {
+        let (first, last) = (line.signed(x, y), line.signed(x + (shares.len() - 1) as f64, y));
+        let flat = match self.rule {
+            MaskRule::Plateau => self.distance_px,
+            MaskRule::Printed => -1.0,
+        };
+        if first.abs().max(last.abs()) <= flat {
+            shares.fill(1.0);
+        } else if first * last > 0.0 && first.abs().min(last.abs()) > self.reach_px() {
+            shares.fill(0.0);
+        } else {
+            for (step, share) in shares.iter_mut().enumerate() {
+                *share = self.at(line.distance(x + step as f64, y));
+            }
+        }
+    }
+}
+
+/// A dot's epipolar line, scaled so that it gives distances in pixels.
+#[derive(Clone, Copy)]
+struct Line {
+    x: f64,
+    y: f64,
+    constant: f64,
+}
+
+impl Line {
+    /// None where all of the image is as far away: the dot's line is the one at infinity.
+    fn new([x, y, constant]: [f64; 3]) -> Option<Self> {
+        let length = x.hypot(y);
+        (length > 0.0 && length.is_finite()).then(|| Self {
+            x: x / length,
+            y: y / length,
+            constant: constant / length,
+        })
+    }
+
+    /// Positive on one side of it, negative on the other.
+    fn signed(&self, x: f64, y: f64) -> f64 {
+        self.x * x + self.y * y + self.constant
+    }
+
+    /// Those blocks of a row that the mask may reach into; all others have none of it.
+    fn blocks_near(&self, falloff: &Falloff, band: usize, shape: FrameShape) -> Range<usize> {
+        let reach = falloff.reach_px() + (HALF_PX + 0.5) * std::f64::consts::SQRT_2;
+        let columns = shape.block_columns();
+        // Distance of the block's middle: a linear function of its column.
+        let at_0 = self.signed(HALF_PX, (band * BLOCK_PX) as f64 + HALF_PX);
+        let step = self.x * BLOCK_PX as f64;
+        let (one, other) = ((-reach - at_0) / step, (reach - at_0) / step);
+        let (first, last) = match step == 0.0 {
+            true if at_0.abs() <= reach => (0.0, columns as f64 - 1.0),
+            true => return 0..0,
+            false => (one.min(other).ceil(), one.max(other).floor()),
+        };
+        let within = |column: f64| column.clamp(0.0, columns as f64) as usize;
+        let (first, end) = (within(first), within(last + 1.0));
+        band * columns + first..band * columns + end.max(first)
+    }
+
+    fn distance(&self, x: f64, y: f64) -> f64 {
+        self.signed(x, y).abs()
+    }
+}
+
+/// Separates direct from global light by the epipolar constraint (after O'Toole et al. 2014): of each column, what lies
+/// near its dot's epipolar line is direct. `mirror` has each dot's place on the plane before the mirror, none for dots that
+/// were not calibrated; their light counts as global. Direct plus global is the floodlit image.
+///
+/// The mask of the residual, whose light has no place within its block, is the mean over the block.
+///
+/// # Errors
+/// [`DotsError::Shape`] unless `mirror` has all dots, [`DotsError::OutOfRange`] for a mask that cannot be.
+pub fn epipolar(
+    batch: &Batch,
+    fundamental: &Fundamental,
+    mirror: &[Option<[f64; 2]>],
+    mask: &EpipolarMask,
+) -> Result<Separation, DotsError> {
+    let shape = batch.shape();
+    check_shape("mirror", "[dots]", &[mirror.len()], &[batch.dots()])?;
+    for (field, value) in [("distance_px", mask.distance_px), ("sigma_px", mask.sigma_px)] {
+        check_range(field, value, value >= 0.0 && value.is_finite(), "at least 0 pixels of 1024")?;
+    }
+    let scale = shape.width() as f64 / REFERENCE_WIDTH_PX;
+    let falloff =
+        Falloff { distance_px: scale * mask.distance_px, sigma_px: scale * mask.sigma_px, rule: mask.rule };
+    let lines: Vec<Option<Line>> = mirror
+        .iter()
+        .map(|mirror| mirror.and_then(|mirror| Line::new(fundamental.epipolar_line(mirror))))
+        .collect();
+
+    let (channels, blocks) = (shape.channels(), shape.blocks());
+    let residual = sum_blocks(batch, channels, |dot, sums| {
+        let Some(line) = &lines[dot] else { return };
+        let means = batch.column(dot).residual();
+        for band in 0..shape.block_rows() {
+            for block in line.blocks_near(&falloff, band, shape) {
+                let share = share_of_block(line, &falloff, block, shape);
+                for channel in 0..channels {
+                    sums[channel * blocks + block] += share * f64::from(means[block * channels + channel]);
+                }
+            }
+        }
+    });
+    let [direct] = by_bands(shape, channels, |band, sums| {
+        let pixels = sums.len() / channels;
+        let mut weights = [0.0; BLOCK_PX];
+        for (dot, column) in batch.in_band(band) {
+            let Some(line) = &lines[dot] else { continue };
+            // Each row of a disc goes through the same few blocks.
+            let mut shares = [(usize::MAX, 0.0); 2];
+            for Word { word, mask, mut values } in column.words() {
+                let block = shape.block_of_word(word);
+                let slot = &mut shares[block % 2];
+                if slot.0 != block {
+                    *slot = (block, share_of_block(line, &falloff, block, shape));
+                }
+                let share = slot.1;
+                let first = (word - first_word(batch, band)) * BLOCK_PX;
+                let left = (word % shape.block_columns() * BLOCK_PX) as f64;
+                let y = (word / shape.block_columns()) as f64;
+                for run in runs(mask) {
+                    let (of_run, rest) = values.split_at(run.len() * channels);
+                    values = rest;
+                    let weights = &mut weights[..run.len()];
+                    falloff.along(line, left + run.start as f64, y, weights);
+                    for channel in 0..channels {
+                        let place = channel * pixels + first;
+                        let sums = sums[place + run.start..place + run.end].iter_mut();
+                        // The block's mean goes to all pixels in the end; here it is not the light.
+                        let mean = share * f64::from(column.residual()[block * channels + channel]);
+                        let light = of_run[channel..].iter().step_by(channels).zip(&*weights);
+                        sums.zip(light)
+                            .for_each(|(sum, (&value, weight))| *sum += weight * f64::from(value) - mean);
+                    }
+                }
+            }
+        }
+        for (sums, residual) in sums.chunks_exact_mut(pixels).zip(residual.chunks_exact(blocks)) {
+            add_blocks(sums, &residual[blocks_of(batch, band)]);
+        }
+    });
+    let global = floodlit(batch) - &direct;
+    Ok(Separation { direct, global })
+}
+
+/// From the middle of a block to its first pixel.
+const HALF_PX: f64 = (BLOCK_PX as f64 - 1.0) / 2.0;
+
+/// Mean of the mask over a block.
+fn share_of_block(line: &Line, falloff: &Falloff, block: usize, shape: FrameShape) -> f64 {
+    const PITCH_PX: usize = BLOCK_PX / POINTS;
+    let left = (block % shape.block_columns() * BLOCK_PX) as f64;
+    let top = (block / shape.block_columns() * BLOCK_PX) as f64;
+    let at = |point: usize| (point * PITCH_PX) as f64 + (PITCH_PX as f64 - 1.0) / 2.0;
+    let points = (0..POINTS * POINTS).map(|point| (left + at(point % POINTS), top + at(point / POINTS)));
+    points.map(|(x, y)| falloff.at(line.distance(x, y))).sum::<f64>() / (POINTS * POINTS) as f64
+}

@@ -1,0 +1,99 @@
+use ndarray::Array3;
+use pulp::Arch;
+use rayon::prelude::*;
+
+use crate::dots::shape::BLOCK_PX;
+use crate::dots::{Batch, FrameShape};
+
+/// Dots whose residuals are summed one after another; such sums are then added in order, so the number of threads
+/// changes no bit.
+const DOTS_AT_A_TIME: usize = 128;
+
+/// Makes images by rows of blocks, in parallel: `draw` has the number of the row of blocks and an accumulator of its
+/// pixels, `[images, channels, rows, width]`, which is 0.
+pub(super) fn by_bands<const IMAGES: usize>(
+    shape: FrameShape,
+    channels: usize,
+    draw: impl Fn(usize, &mut [f64]) + Sync,
+) -> [Array3<f32>; IMAGES] {
+    let of_band = BLOCK_PX * shape.width() * channels;
+    let mut images: [Array3<f32>; IMAGES] =
+        std::array::from_fn(|_| Array3::zeros((shape.height(), shape.width(), channels)));
+    let mut bands: Vec<Vec<&mut [f32]>> =
+        (0..shape.block_rows()).map(|_| Vec::with_capacity(IMAGES)).collect();
+    for values in images.iter_mut().filter_map(Array3::as_slice_mut) {
+        bands.iter_mut().zip(values.chunks_mut(of_band)).for_each(|(band, values)| band.push(values));
+    }
+    bands.into_par_iter().enumerate().for_each_init(
+        || vec![0.0; IMAGES * of_band],
+        |sums, (band, images)| {
+            let size: usize = images.iter().map(|values| values.len()).sum();
+            let sums = &mut sums[..size];
+            // With the widest instructions; they round as all others do.
+            Arch::new().dispatch(|| {
+                sums.fill(0.0);
+                draw(band, &mut *sums);
+                for (values, sums) in images.into_iter().zip(sums.chunks_exact(size / IMAGES)) {
+                    interleave(values, sums, channels);
+                }
+            });
+        },
+    );
+    images
+}
+
+/// `[channels, pixels]` to `[pixels, channels]`.
+#[inline(always)]
+fn interleave(values: &mut [f32], sums: &[f64], channels: usize) {
+    if channels == 1 {
+        values.iter_mut().zip(sums).for_each(|(value, &sum)| *value = sum as f32);
+        return;
+    }
+    for (channel, plane) in sums.chunks_exact(sums.len() / channels).enumerate() {
+        values[channel..]
+            .iter_mut()
+            .step_by(channels)
+            .zip(plane)
+            .for_each(|(value, &sum)| *value = sum as f32);
+    }
+}
+
+/// Sums over all dots of what `add` puts into an accumulator of blocks, `[planes, blocks]`.
+pub(super) fn sum_blocks(batch: &Batch, planes: usize, add: impl Fn(usize, &mut [f64]) + Sync) -> Vec<f64> {
+    let size = planes * batch.shape().blocks();
+    let parts: Vec<Vec<f64>> = (0..batch.dots().div_ceil(DOTS_AT_A_TIME))
+        .into_par_iter()
+        .map(|part| {
+            let dots = part * DOTS_AT_A_TIME..batch.dots().min((part + 1) * DOTS_AT_A_TIME);
+            let mut sums = vec![0.0; size];
+            Arch::new().dispatch(|| dots.for_each(|dot| add(dot, &mut sums)));
+            sums
+        })
+        .collect();
+    let mut sums = vec![0.0; size];
+    for part in parts {
+        sums.iter_mut().zip(part).for_each(|(sum, part)| *sum += part);
+    }
+    sums
+}
+
+/// Adds the blocks of one row, `[block columns]`, to all their pixels, `[rows, width]`.
+#[inline(always)]
+pub(super) fn add_blocks(sums: &mut [f64], blocks: &[f64]) {
+    for row in sums.chunks_exact_mut(blocks.len() * BLOCK_PX) {
+        for (pixels, value) in row.chunks_exact_mut(BLOCK_PX).zip(blocks) {
+            pixels.iter_mut().for_each(|pixel| *pixel += value);
+        }
+    }
+}
+
+/// First word of a row of blocks.
+pub(super) fn first_word(batch: &Batch, band: usize) -> usize {
+    band * batch.shape().width()
+}
+
+/// First block of a row of blocks, and one past its last.
+pub(super) fn blocks_of(batch: &Batch, band: usize) -> std::ops::Range<usize> {
+    let columns = batch.shape().block_columns();
+    band * columns..(band + 1) * columns
+}

@@ -1,0 +1,182 @@
+//! Calibration of the sensor from runs of frames: dark level, hot pixels, flat field.
+
+use ndarray::Array3;
+
+use super::error::{check_range, check_shape};
+use super::{DotsError, FrameShape};
+
+/// Pixels with less than this share of the plane's median light are taken for unlit, and their gain left at 1.
+const UNLIT: f64 = 0.1;
+
+/// Scales a median absolute deviation to the standard deviation of normal noise.
+const MAD_TO_SIGMA: f64 = 1.4826;
+
+/// Mean and variance of each value over a run of frames with constant light.
+#[derive(Debug, Clone)]
+pub struct RunStatistics {
+    shape: FrameShape,
+    frames: u64,
+    sums: Vec<u64>,
+    squares: Vec<u64>,
+}
+
+impl RunStatistics {
+    /// No frames yet.
+    pub fn new(shape: FrameShape) -> Self {
+        Self { shape, frames: 0, sums: vec![0; shape.values()], squares: vec![0; shape.values()] }
+    }
+
+    /// Adds a raw frame, `[height, width, channels]`.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if it is not of that size.
+    pub fn push(&mut self, frame: &[u16]) -> Result<(), DotsError> {
+        check_shape("frame", "[values]", &[frame.len()], &[self.shape.values()])?;
+        self.frames += 1;
+        for ((sum, square), &raw) in self.sums.iter_mut().zip(&mut self.squares).zip(frame) {
+            *sum += u64::from(raw);
+            *square += u64::from(raw).pow(2);
+        }
+        Ok(())
+    }
+
+    /// Mean of each value in counts, `[height, width, channels]`: of frames without light the dark frame.
+    ///
+    /// # Errors
+    /// [`DotsError::TooFew`] without frames.
+    pub fn mean(&self) -> Result<Array3<f32>, DotsError> {
+        self.needs(1)?;
+        let mean = self.sums.iter().map(|&sum| (sum as f64 / self.frames as f64) as f32);
+        Ok(shaped(self.shape, mean.collect()))
+    }
+
+    /// Pixels whose dark level or noise lies more than `sigmas` above that of most pixels, as (row, column). The
+    /// spread of most is taken from the median absolute deviation, so hot pixels do not hide each other; it counts
+    /// as 1/12 count squared at least, the variance of rounding.
+    ///
+    /// # Errors
+    /// [`DotsError::TooFew`] below eight frames, [`DotsError::OutOfRange`] for `sigmas` that are not above 0.
+    pub fn hot_pixels(&self, sigmas: f64) -> Result<Vec<(usize, usize)>, DotsError> {
+        self.needs(8)?;
+        check_range("sigmas", sigmas, sigmas > 0.0, "above 0, as 8")?;
+        let frames = self.frames as f64;
+        let mean: Vec<f64> = self.sums.iter().map(|&sum| sum as f64 / frames).collect();
+        let spread = self.squares.iter().zip(&mean).map(|(&square, mean)| {
+            let variance = (square as f64 / frames - mean * mean).max(0.0) * frames / (frames - 1.0);
+            variance.sqrt()
+        });
+        let spread: Vec<f64> = spread.collect();
+        let (mean_limit, spread_limit) = (limit(&mean, sigmas), limit(&spread, sigmas));
+        let channels = self.shape.channels();
+        let is_hot = |pixel: usize| {
+            (pixel * channels..(pixel + 1) * channels)
+                .any(|at| mean[at] > mean_limit || spread[at] > spread_limit)
+        };
+        let hot = (0..self.shape.pixels()).filter(|&pixel| is_hot(pixel));
+        Ok(hot.map(|pixel| (pixel / self.shape.width(), pixel % self.shape.width())).collect())
+    }
+
+    /// Gain that makes a Lambertian plane's image even, `[height, width, channels]`: the median of each channel over
+    /// the plane's light above `dark`. The plane must be lit evenly: by all dots of a dense scan, summed up, or by
+    /// another lamp. Pixels with less than a tenth of the median are unlit, their gain is 1.
+    ///
+    /// # Errors
+    /// [`DotsError::TooFew`] without frames, [`DotsError::Shape`] if `dark` is not of the frames' shape.
+    pub fn flat_gain(&self, dark: &Array3<f32>) -> Result<Array3<f32>, DotsError> {
+        let plane = self.mean()?;
+        check_shape("dark", "[height, width, channels]", dark.shape(), plane.shape())?;
+        let mut gain = plane - dark;
+        for mut channel in gain.axis_iter_mut(ndarray::Axis(2)) {
+            let mut light: Vec<f64> = channel.iter().map(|&light| f64::from(light)).collect();
+            let middle = median(&mut light);
+            channel.mapv_inplace(|light| match f64::from(light) >= UNLIT * middle && light > 0.0 {
+                true => (middle / f64::from(light)) as f32,
+                false => 1.0,
+            });
+        }
+        Ok(gain)
+    }
+
+    fn needs(&self, needed: usize) -> Result<(), DotsError> {
+        let (given, what) = (self.frames as usize, "frames of the calibration run: record a longer one");
+        if given < needed { Err(DotsError::TooFew { what, given, needed }) } else { Ok(()) }
+    }
+}
+
+fn shaped(shape: FrameShape, values: Vec<f32>) -> Array3<f32> {
+    let mut array = Array3::zeros((shape.height(), shape.width(), shape.channels()));
+    array.iter_mut().zip(values).for_each(|(place, value)| *place = value);
+    array
+}
+
+fn limit(values: &[f64], sigmas: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    let middle = median(&mut sorted);
+    sorted.iter_mut().for_each(|value| *value = (*value - middle).abs());
+    let spread = MAD_TO_SIGMA * median(&mut sorted);
+    middle + sigmas * spread.max((1.0_f64 / 12.0).sqrt())
+}
+
+/// The upper median; the values come out in another order. 0 without values.
+pub(crate) fn median(values: &mut [f64]) -> f64 {
+    let middle = values.len() / 2;
+    match values.is_empty() {
+        true => 0.0,
+        false => *values.select_nth_unstable_by(middle, f64::total_cmp).1,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_distr::{Distribution, Normal};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+    use rand_xoshiro::rand_core::SeedableRng;
+
+    use super::*;
+
+    /// 64 frames of the given mean counts with normal noise, of 20 counts at `noisy` and 3 elsewhere.
+    fn run(shape: FrameShape, noisy: usize, mean: impl Fn(usize) -> f64) -> RunStatistics {
+        let mut random = Xoshiro256PlusPlus::seed_from_u64(7);
+        let mut statistics = RunStatistics::new(shape);
+        for _ in 0..64 {
+            let frame: Vec<u16> = (0..shape.values())
+                .map(|at| {
+                    let noise = Normal::new(mean(at), if at == noisy { 20.0 } else { 3.0 }).unwrap();
+                    noise.sample(&mut random).round().max(0.0) as u16
+                })
+                .collect();
+            statistics.push(&frame).unwrap();
+        }
+        statistics
+    }
+
+    #[test]
+    fn hot_pixels_are_found_by_level_and_by_noise_and_no_others() {
+        let shape = FrameShape::new(64, 64, 1).unwrap();
+        let dark = run(shape, 100, |at| if [7, 2000].contains(&at) { 400.0 } else { 64.0 });
+        assert_eq!(dark.hot_pixels(8.0).unwrap(), [(0, 7), (1, 36), (31, 16)]);
+        let mean = dark.mean().unwrap();
+        assert!((mean[[10, 10, 0]] - 64.0).abs() < 2.0 && (mean[[0, 7, 0]] - 400.0).abs() < 2.0);
+    }
+
+    #[test]
+    fn the_flat_field_makes_the_plane_even_and_leaves_unlit_pixels() {
+        let shape = FrameShape::new(64, 64, 1).unwrap();
+        let shading = |at: usize| if at % 64 < 4 { 0.0 } else { 1.0 + 0.3 * ((at / 64) as f64 / 64.0) };
+        let dark = run(shape, usize::MAX, |_| 64.0).mean().unwrap();
+        let gain = run(shape, usize::MAX, |at| 64.0 + 1000.0 * shading(at)).flat_gain(&dark).unwrap();
+        let even = |row: usize| f64::from(gain[[row, 30, 0]]) * shading(row * 64 + 30);
+        let level = even(32);
+        for row in 0..64 {
+            assert!((even(row) / level - 1.0).abs() < 0.01, "row {row}");
+            assert_eq!(gain[[row, 1, 0]], 1.0);
+        }
+    }
+
+    #[test]
+    fn too_short_runs_are_refused() {
+        let statistics = RunStatistics::new(FrameShape::new(8, 32, 1).unwrap());
+        assert!(matches!(statistics.mean(), Err(DotsError::TooFew { needed: 1, .. })));
+        assert!(matches!(statistics.hot_pixels(8.0), Err(DotsError::TooFew { needed: 8, .. })));
+    }
+}

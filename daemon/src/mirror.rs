@@ -1,0 +1,45 @@
+//! Where a daemon keeps what it knows of its mirror, and what it tells of it.
+
+use std::path::{Path, PathBuf};
+
+use raysweep_drivers::mirror::{LightGuard, LightState, MirrorReport};
+use raysweep_proto::{ErrorCode, MirrorStatus, RpcError};
+
+/// The mirror's state in the packaged daemon's data folder.
+pub const DEFAULT_STATE: &str = "/var/lib/raysweep/mirror.json";
+
+/// The mirror's state in a data folder.
+pub fn state_file(data: &Path) -> PathBuf {
+    data.join("mirror.json")
+}
+
+/// Who permits light. No rig file names an interlock yet, so it is the operator.
+pub fn light_guard(data: &Path) -> LightGuard {
+    LightGuard { armed_file: data.join("light-armed"), interlock: None }
+}
+
+/// Takes the operator's word.
+pub(crate) fn arm_light(data: &Path) -> Result<(), RpcError> {
+    let file = light_guard(data).armed_file;
+    raysweep_drivers::mirror::arm_light(&file).map_err(|error| {
+        let what =
+            format!("cannot write {}: {error}: give the daemon a --data that it can write", file.display());
+        RpcError::new(ErrorCode::Storage, what)
+    })
+}
+
+/// The mirror as its files tell; none where none was ever moved.
+pub(crate) fn status(data: &Path) -> Option<MirrorStatus> {
+    let state = state_file(data);
+    if !state.exists() {
+        return None;
+    }
+    let MirrorReport { parked, laser, light, .. } = MirrorReport::read(&state, &light_guard(data));
+    let light = match light {
+        LightState::InterlockClosed => "interlock_closed",
+        LightState::InterlockOpen => "interlock_open",
+        LightState::Armed => "armed",
+        LightState::NotArmed => "not_armed",
+    };
+    Some(MirrorStatus { parked, laser, light: light.into() })
+}

@@ -1,0 +1,260 @@
+//! Sweeps and films: points one after the other while frames keep coming. The settings of each are written while frames
+//! of those before are still under way, so that no trigger goes by for want of them.
+
+use std::time::Duration;
+
+use raysweep_core::{Applied, CameraSettings, DeviceError, DeviceState, SettingsId};
+use raysweep_pipeline::{Event, Job, Label, Point, Role, Shot};
+
+use super::ahead::Wanted;
+use super::{Attempt, MARGIN_FRAMES, POLL, Pass, Received, Sequencer, Taken, Watchdog, closed};
+use crate::run::orders::Order;
+
+/// Settings that lead to others differ from them by so much delay: more than any jitter. [A]
+const LEAD_IN_US: f64 = 2_000.0;
+
+/// A film to take under one picture of the projector.
+#[derive(Debug, Clone)]
+pub struct FilmPass {
+    /// The settings of a cycle, in the order in which it takes them.
+    pub settings: Vec<FilmSetting>,
+    /// How many cycles.
+    pub cycles: u32,
+    /// Frames exposed earlier may still see the picture before.
+    pub not_before_ns: i64,
+}
+
+/// One setting of a film's cycle.
+#[derive(Debug, Clone, Copy)]
+pub struct FilmSetting {
+    /// Its point's ordinal in the schedule.
+    pub ordinal: u32,
+    /// What to acquire.
+    pub point: Point,
+    /// How to set the camera for it.
+    pub shot: Shot,
+    /// VSYNC periods from the frame of the setting before to this one's.
+    pub periods_from_last: u32,
+}
+
+/// A place in the sequence.
+struct Slot {
+    attempt: Attempt,
+    periods_from_last: Option<u32>,
+    /// Whether a pause may come before it.
+    may_hold: bool,
+}
+
+impl FilmPass {
+    fn slots(&self) -> impl Iterator<Item = Slot> {
+        (0..self.cycles).flat_map(|cycle| {
+            self.settings.iter().enumerate().map(move |(place, setting)| {
+                let FilmSetting { ordinal, point, shot, periods_from_last } = *setting;
+                let id = SettingsId { point: ordinal, attempt: cycle };
+                Slot {
+                    attempt: Attempt { id, point, shot },
+                    periods_from_last: Some(periods_from_last),
+                    may_hold: place == 0,
+                }
+            })
+        })
+    }
+}
+
+impl Sequencer {
+    /// Takes points. Each ends in a unit or a failure, in order.
+    pub(super) fn sweep(&mut self, pass: Pass) -> Result<(), DeviceError> {
+        self.warm_up(pass.not_before_ns)?;
+        let slots = pass.attempts.into_iter();
+        self.sequence(slots.map(|attempt| Slot { attempt, periods_from_last: None, may_hold: true }))
+    }
+
+    /// Takes a film: a sweep of one frame a point, again and again.
+    pub(super) fn film(&mut self, film: &FilmPass) -> Result<(), DeviceError> {
+        self.warm_up(film.not_before_ns)?;
+        self.sequence(film.slots())
+    }
+
+    fn sequence(&mut self, slots: impl Iterator<Item = Slot>) -> Result<(), DeviceError> {
+        let mut slots = slots.peekable();
+        let mut watchdog = Watchdog::default();
+        // Settings that no point has come first, so that the frames of a point do not hang on what was before it.
+        let mut is_led_in = false;
+        let mut runs_on = false;
+        while self.orders.go_on() {
+            let order = self.orders.now();
+            let next = slots.peek().filter(|slot| !(slot.may_hold && order == Order::Pause));
+            let next = next.map(|slot| slot.attempt.shot.settings);
+            let now_ns = self.clock.now_ns();
+            let mut due_ns = i64::MAX;
+            if let Some(settings) = next {
+                let leads_in = !is_led_in || self.ahead.needs_lead_in(&settings);
+                due_ns = self.ahead.due_ns(now_ns, leads_in);
+                if due_ns <= now_ns && leads_in {
+                    self.lead_in(&settings)?;
+                    is_led_in = true;
+                    continue;
+                }
+                if due_ns <= now_ns
+                    && let Some(slot) = slots.next()
+                {
+                    self.write(&slot, runs_on)?;
+                    runs_on = true;
+                    continue;
+                }
+            }
+            if next.is_none() && self.ahead.is_idle() {
+                if slots.peek().is_none() {
+                    break;
+                }
+                self.input.send(Event::Idle).map_err(closed)?;
+                self.orders.wait_while_paused();
+                self.told_seq = None;
+                self.ahead.lose_track();
+                (is_led_in, runs_on) = (false, false);
+                continue;
+            }
+            let until_due = Duration::from_nanos(due_ns.saturating_sub(now_ns).unsigned_abs());
+            let timeout = until_due.min(POLL);
+            match self.receive(timeout)? {
+                Some(received) => {
+                    self.deliver(received)?;
+                    watchdog.feed();
+                }
+                None => watchdog.missed(timeout, self.longest_frame_us, self.camera.state())?,
+            }
+        }
+        self.pass_frames(MARGIN_FRAMES, i64::MIN)
+    }
+
+    /// Sets the camera to what stamps tell from `settings`, at the same exposure.
+    fn lead_in(&mut self, settings: &CameraSettings) -> Result<(), DeviceError> {
+        let apart = self.apart_from(settings);
+        self.pass_through(&apart)
+    }
+
+    /// These settings with another delay.
+    pub(super) fn apart_from(&self, settings: &CameraSettings) -> CameraSettings {
+        let delay_us = settings.trigger_delay_us;
+        let range = &self.camera.capabilities().trigger_delay_us;
+        let delays_us = [delay_us + LEAD_IN_US, delay_us - LEAD_IN_US];
+        let apart_us = delays_us.into_iter().find(|delay_us| range.contains(delay_us));
+        CameraSettings { trigger_delay_us: apart_us.unwrap_or(delay_us), ..*settings }
+    }
+
+    /// Sets the camera to what no point asked for.
+    pub(super) fn pass_through(&mut self, settings: &CameraSettings) -> Result<(), DeviceError> {
+        let id = SettingsId { point: u32::MAX, attempt: self.lead_ins };
+        self.lead_ins += 1;
+        self.configure(id, settings, |_| None)
+    }
+
+    fn write(&mut self, slot: &Slot, runs_on: bool) -> Result<(), DeviceError> {
+        let Attempt { id, point, shot } = slot.attempt;
+        self.configure(id, &shot.settings, |applied| {
+            let job = Job {
+                id,
+                frames: point.frames,
+                applied,
+                delay_us: point.delay_us,
+                light_edges_later: shot.light_edges_later,
+                periods_from_last: slot.periods_from_last.filter(|_| runs_on),
+            };
+            Some(Wanted {
+                job,
+                is_lit: !matches!(point.role, Role::Dark(_)),
+                is_begun: false,
+                // A point that has failed is taken with some frames to spare, the more the oftener it failed. A film
+                // counts its cycles there.
+                frames: match slot.periods_from_last {
+                    Some(_) => point.frames,
+                    None => point.frames + id.attempt * point.frames.div_ceil(4),
+                },
+                passed: 0,
+                // Frames that found no room are taken again within the attempt, but not for ever.
+                spare_frames: 64 + 3 * point.frames,
+            })
+        })
+    }
+
+    /// Writes settings. A camera that is being opened again is waited for.
+    fn configure(
+        &mut self,
+        id: SettingsId,
+        settings: &CameraSettings,
+        work: impl FnOnce(Applied) -> Option<Wanted>,
+    ) -> Result<(), DeviceError> {
+        let (before_ns, applied) = loop {
+            let before_ns = self.clock.now_ns();
+            match self.camera.configure(id, settings) {
+                Err(_) if self.camera.state() == DeviceState::Lost => {
+                    if !self.orders.go_on() {
+                        return Ok(());
+                    }
+                    if let Some(received) = self.receive(POLL)? {
+                        self.deliver(received)?;
+                    }
+                }
+                applied => break (before_ns, applied?),
+            }
+        };
+        self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
+        self.ahead.push(applied, (before_ns, self.clock.now_ns()), work(applied));
+        Ok(())
+    }
+
+    /// Hands a frame on as that of the settings that it was exposed with; those before, whose frames never came, are
+    /// given up first.
+    fn deliver(&mut self, received: Received) -> Result<(), DeviceError> {
+        let (seq, seen) = (received.stamp.seq, received.seen);
+        for _ in 0..seen.owner.unwrap_or(0) {
+            self.close_front(seen.since_seq, seq)?;
+        }
+        let is_owned = seen.owner.is_some();
+        let Some(wanted) = self.ahead.front().filter(|_| is_owned).and_then(|front| front.open()) else {
+            // Exposed under settings that have their frames, or nobody knows under which.
+            if let Some(next) = self.ahead.opening(seq)
+                && !std::mem::replace(&mut next.is_begun, true)
+            {
+                self.input.send(Event::Begin(next.job)).map_err(closed)?;
+            }
+            self.hand_on(received, Label::Settling)?;
+            return Ok(());
+        };
+        let (job, is_lit) = (wanted.job, wanted.is_lit);
+        if !std::mem::replace(&mut wanted.is_begun, true) {
+            self.input.send(Event::Begin(job)).map_err(closed)?;
+        }
+        let stamp = received.stamp;
+        let taken = self.hand_on(received, Label::Counted)?;
+        let Some(wanted) = self.ahead.front().and_then(|front| front.work.as_mut()) else { return Ok(()) };
+        match taken {
+            Taken::Passed => wanted.passed += 1,
+            Taken::Lost => wanted.spare_frames -= 1,
+        }
+        if wanted.is_complete() {
+            self.input.send(Event::End).map_err(closed)?;
+        }
+        if let Taken::Passed = taken {
+            self.note_exposure(&stamp, &job.applied.actual, is_lit);
+        }
+        Ok(())
+    }
+
+    /// The settings in force are so no more at the frame `seq`; ids from `since_seq` on that are not there are lost frames.
+    fn close_front(&mut self, since_seq: u64, seq: u64) -> Result<(), DeviceError> {
+        let Some(mut over) = self.ahead.pop() else { return Ok(()) };
+        let first_seq = over.certain().max(since_seq);
+        let end_seq = self.ahead.front().map_or(seq, |next| next.certain().min(seq));
+        let Some(wanted) = over.open() else { return Ok(()) };
+        if !wanted.is_begun {
+            self.input.send(Event::Begin(wanted.job)).map_err(closed)?;
+        }
+        for lost_seq in first_seq..end_seq {
+            let cause = self.camera.loss_of(lost_seq);
+            self.input.send(Event::Lost(lost_seq, Some(cause))).map_err(closed)?;
+            self.told_seq = Some(lost_seq);
+        }
+        self.input.send(Event::End).map_err(closed)
+    }
+}

@@ -1,0 +1,344 @@
+//! The sequencer on a camera that is played by a script, on a virtual clock.
+
+use std::sync::Mutex;
+use std::sync::mpsc::Receiver;
+
+use raysweep_core::{Applied, CameraCapabilities, ClockHandle, FirstFrame, PixelFormat, Readout, Shutter};
+use raysweep_pipeline::{Policy, Role};
+
+use super::*;
+
+const PERIOD_NS: i64 = 16_666_667;
+const LATENCY_US: f64 = 8.0;
+
+/// What the camera is like.
+#[derive(Clone, Copy)]
+struct Script {
+    /// Frames that settings are late, drawn in turn.
+    late: &'static [u64],
+    /// What it promises: the frame itself, or any up to so many frames later than the next.
+    promise: Option<u64>,
+    /// Whether its frames carry their exposure.
+    chunk: bool,
+    /// How much longer than asked for the host sleeps, in turn, in ms.
+    oversleep_ms: &'static [i64],
+    /// Ids of frames that never arrive.
+    lost: &'static [u64],
+}
+
+const EXACT: Script = Script { late: &[0], promise: None, chunk: true, oversleep_ms: &[0], lost: &[] };
+
+/// A camera whose every trigger is answered, and whose frames are on the host 18 ms after their exposure.
+struct Scripted {
+    script: Script,
+    clock: ClockHandle,
+    capabilities: CameraCapabilities,
+    written: Vec<(u64, CameraSettings)>,
+    changes: usize,
+    sleeps: usize,
+    next_seq: u64,
+    /// The settings of each frame, in truth.
+    truth: Arc<Mutex<Vec<CameraSettings>>>,
+}
+
+impl Scripted {
+    fn settings(&self, seq: u64) -> CameraSettings {
+        let written = self.written.iter().rev().find(|(first_seq, _)| *first_seq <= seq);
+        written.map_or(settings(0.0, 100.0), |(_, settings)| *settings)
+    }
+}
+
+impl Camera for Scripted {
+    fn capabilities(&self) -> &CameraCapabilities {
+        &self.capabilities
+    }
+
+    fn state(&self) -> DeviceState {
+        DeviceState::Streaming
+    }
+
+    fn configure(&mut self, _: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
+        let next_seq = self.clock.now_ns().unsigned_abs().div_ceil(PERIOD_NS.unsigned_abs());
+        let first_seq = next_seq + self.script.late[self.changes % self.script.late.len()];
+        self.changes += 1;
+        self.written.retain(|(earlier_seq, _)| *earlier_seq < first_seq);
+        self.written.push((first_seq, *settings));
+        let first_frame = match self.script.promise {
+            None => FirstFrame::Exactly(first_seq),
+            Some(late) => FirstFrame::Within { earliest: next_seq, certain: next_seq + late },
+        };
+        Ok(Applied { actual: *settings, first_frame })
+    }
+
+    fn arm(&mut self) -> Result<(), DeviceError> {
+        Ok(())
+    }
+
+    fn next_frame(&mut self, _: &mut FrameBuf, timeout: Duration) -> Result<Option<FrameStamp>, DeviceError> {
+        let deadline_ns = self.clock.now_ns() + i64::try_from(timeout.as_nanos()).unwrap();
+        loop {
+            let seq = self.next_seq;
+            let settings = self.settings(seq);
+            let start_us = LATENCY_US + settings.trigger_delay_us;
+            let start_ns = seq as i64 * PERIOD_NS + ns_from_us(start_us);
+            let host_ns = start_ns + ns_from_us(settings.exposure_us + 18_000.0);
+            if host_ns > deadline_ns {
+                let late_ms = self.script.oversleep_ms[self.sleeps % self.script.oversleep_ms.len()];
+                self.sleeps += 1;
+                self.clock.sleep_until(deadline_ns + late_ms * 1_000_000);
+                return Ok(None);
+            }
+            self.clock.sleep_until(host_ns);
+            self.next_seq += 1;
+            let mut truth = self.truth.lock().unwrap();
+            assert_eq!(truth.len() as u64, seq);
+            truth.push(settings);
+            if !self.script.lost.contains(&seq) {
+                let exposure_us = self.script.chunk.then_some(settings.exposure_us);
+                let (device_ns, exposure_start_ns) = (start_ns, start_ns);
+                return Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }));
+            }
+        }
+    }
+
+    fn disarm(&mut self) -> Result<(), DeviceError> {
+        Ok(())
+    }
+}
+
+fn settings(trigger_delay_us: f64, exposure_us: f64) -> CameraSettings {
+    CameraSettings { shutter: Shutter::Rolling, exposure_us, trigger_delay_us }
+}
+
+/// Two exposures with six delays each.
+fn plan() -> Vec<CameraSettings> {
+    let delays = || (0..6).map(|k| 3_000.0 + 200.0 * f64::from(k));
+    [600.0, 900.0].iter().flat_map(|&exposure_us| delays().map(move |us| settings(us, exposure_us))).collect()
+}
+
+/// What the sequencer made of a plan.
+struct Played {
+    latency: Option<SettingsLatency>,
+    /// Point and id of each frame that was handed on as a point's.
+    counted: Vec<(u32, u64)>,
+    /// Points that ended without all their frames.
+    short: Vec<u32>,
+    truth: Vec<CameraSettings>,
+}
+
+impl Played {
+    /// Frames from the first to the last that counted.
+    fn frames(&self) -> u64 {
+        let ids = || self.counted.iter().map(|(_, seq)| *seq);
+        ids().max().unwrap() + 1 - ids().min().unwrap()
+    }
+
+    fn assert_true(&self, plan: &[CameraSettings]) {
+        for &(point, seq) in &self.counted {
+            assert_eq!(
+                self.truth[seq as usize],
+                plan[point as usize % plan.len()],
+                "frame {seq} of point {point}"
+            );
+        }
+    }
+}
+
+/// Takes the plan as a sweep of `frames` a point or, in `cycles`, as a film.
+fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
+    let clock = Clock::simulated();
+    let truth = Arc::new(Mutex::new(Vec::new()));
+    let camera = Scripted {
+        script,
+        clock: clock.register(),
+        capabilities: CameraCapabilities {
+            model: "scripted".into(),
+            width: 1,
+            height: 1,
+            format: PixelFormat::Mono8,
+            row_time_us: 10.0,
+            trigger_latency_us: LATENCY_US,
+            readout_us: 1_000.0,
+            readout: Readout::Sequential,
+            exposure_us: 1.0..=1e6,
+            trigger_delay_us: 0.0..=1e6,
+        },
+        written: Vec::new(),
+        changes: 0,
+        sleeps: 0,
+        next_seq: 0,
+        truth: truth.clone(),
+    };
+    let plan = plan();
+    let drive = Drive { clock, pace: Pace::Pipeline, line: Line::new(PERIOD_NS as f64 * 1e-3, 50.0, &plan) };
+    let (input, events) = Input::new(64, Policy::Wait);
+    let follower = std::thread::spawn(move || follow(&events, frames));
+    let mut sequencer = Sequencer::new(Box::new(camera), drive, input, Arc::default());
+    let latency = OnceLock::new();
+    let ended = sequencer.work(Work::Probe(plan[0]), &latency);
+    assert!(matches!(ended, Ended::Flushed(Ok(()))));
+    let shot = |settings| Shot { settings, light_edges_later: 0 };
+    let point = |index: u32, settings: CameraSettings| Point {
+        role: Role::Sweep(index),
+        delay_us: settings.trigger_delay_us,
+        exposure_us: settings.exposure_us,
+        frames,
+    };
+    let work = match cycles {
+        None => Work::Pass(Pass {
+            attempts: (0..)
+                .zip(&plan)
+                .map(|(index, &settings)| Attempt {
+                    id: SettingsId { point: index, attempt: 0 },
+                    point: point(index, settings),
+                    shot: shot(settings),
+                })
+                .collect(),
+            not_before_ns: 0,
+        }),
+        Some(cycles) => Work::Film(FilmPass {
+            settings: (0..)
+                .zip(&plan)
+                .map(|(index, &settings)| FilmSetting {
+                    ordinal: index,
+                    point: point(index, settings),
+                    shot: shot(settings),
+                    periods_from_last: 1,
+                })
+                .collect(),
+            cycles,
+            not_before_ns: 0,
+        }),
+    };
+    assert!(matches!(sequencer.work(work, &latency), Ended::Flushed(Ok(()))));
+    drop(sequencer);
+    let (counted, short) = follower.join().unwrap();
+    let truth = truth.lock().unwrap().clone();
+    Played { latency: latency.get().copied(), counted, short, truth }
+}
+
+fn follow(events: &Receiver<Event>, frames: u32) -> (Vec<(u32, u64)>, Vec<u32>) {
+    let (mut counted, mut short) = (Vec::new(), Vec::new());
+    let mut open: Option<(u32, u32)> = None;
+    for event in events.iter() {
+        match event {
+            Event::Begin(job) => {
+                assert!(open.is_none(), "a job begins within another");
+                open = Some((job.id.point, 0));
+            }
+            Event::Frame(frame, Label::Counted) => {
+                let (point, passed) = open.as_mut().expect("a job");
+                *passed += 1;
+                counted.push((*point, frame.stamp.seq));
+            }
+            Event::End => {
+                let (point, passed) = open.take().expect("a job");
+                if passed < frames {
+                    short.push(point);
+                }
+            }
+            _ => {}
+        }
+    }
+    (counted, short)
+}
+
+fn all_late() -> Vec<Script> {
+    let mut scripts = Vec::new();
+    for late in [&[0][..], &[1], &[2], &[3]] {
+        for chunk in [true, false] {
+            scripts.push(Script { late, chunk, ..EXACT });
+            scripts.push(Script { late, chunk, promise: Some(3), ..EXACT });
+        }
+    }
+    scripts
+}
+
+#[test]
+fn a_sweep_and_a_film_cost_no_frame_that_they_do_not_need() {
+    for script in all_late() {
+        let Script { late, promise, chunk, .. } = script;
+        let what = format!("{late:?} frames late, {promise:?} promised, exposure carried: {chunk}");
+        let sweep = play(script, 4, None);
+        sweep.assert_true(&plan());
+        assert_eq!((sweep.counted.len(), sweep.short.len()), (48, 0), "{what}");
+        let late_frames = late[0] as u32;
+        let found = SettingsLatency { min_frames: late_frames, max_frames: late_frames };
+        assert_eq!(sweep.latency, Some(found), "{what}");
+        // Where frames do not tell their exposure and the camera does not know, the one change of exposure costs the
+        // frames until it is certain, and the first of those.
+        let unknown = if promise.is_some() && !chunk { 3 + 1 } else { 0 };
+        assert!((48..=48 + unknown).contains(&sweep.frames()), "{what}: {} frames", sweep.frames());
+        let film = play(script, 1, Some(3));
+        film.assert_true(&plan());
+        assert_eq!((film.counted.len(), film.short.len()), (36, 0), "{what}");
+        assert!((36..=36 + 5 * unknown).contains(&film.frames()), "{what}: {} frames", film.frames());
+    }
+}
+
+#[test]
+fn settings_that_are_late_now_and_then_mislabel_nothing() {
+    let late = &[2, 0, 3, 1, 1, 3, 0, 2, 3, 0, 0, 1, 2];
+    for chunk in [true, false] {
+        let script = Script { late, chunk, promise: Some(3), ..EXACT };
+        let sweep = play(script, 4, None);
+        sweep.assert_true(&plan());
+        assert_eq!(sweep.latency, Some(SettingsLatency { min_frames: 0, max_frames: 3 }));
+        assert_eq!((sweep.counted.len(), sweep.short.len()), (48, 0));
+        // By their stamps, frames count as soon as they may: 1.4 frames a point are late on average.
+        let most = if chunk { 48 + 12 * 2 } else { 48 + 12 * 4 };
+        assert!(sweep.frames() <= most, "exposure carried: {chunk}: {} frames", sweep.frames());
+        let film = play(script, 1, Some(3));
+        film.assert_true(&plan());
+        assert_eq!((film.counted.len(), film.short.len()), (36, 0));
+    }
+}
+
+#[test]
+fn a_host_that_wakes_late_costs_a_film_nothing_while_it_is_late_by_less_than_half_a_period() {
+    for script in all_late().into_iter().filter(|script| script.chunk) {
+        let script = Script { oversleep_ms: &[0, 7, 3, 0, 6, 1, 7, 7], ..script };
+        let film = play(script, 1, Some(5));
+        film.assert_true(&plan());
+        assert_eq!((film.counted.len(), film.frames()), (60, 60), "{:?} frames late", script.late);
+    }
+}
+
+#[test]
+fn a_host_that_wakes_later_still_costs_frames_and_no_settings() {
+    for script in all_late() {
+        let script = Script { oversleep_ms: &[0, 40, 3, 0, 0, 18, 1, 0, 25, 16, 2], ..script };
+        let film = play(script, 1, Some(5));
+        film.assert_true(&plan());
+        assert_eq!((film.counted.len(), film.short.len()), (60, 0), "{:?} frames late", script.late);
+        let order: Vec<u32> = film.counted.iter().map(|(point, _)| *point).collect();
+        assert_eq!(order, (0..5).flat_map(|_| 0..12).collect::<Vec<_>>());
+    }
+}
+
+#[test]
+fn a_lost_frame_costs_its_own_point_at_the_most() {
+    for script in all_late() {
+        // Probe and lead-in are over by frame 70; the points are not before frame 95.
+        let script = Script { lost: &[75, 76, 82, 86, 88, 90], ..script };
+        let sweep = play(script, 4, None);
+        sweep.assert_true(&plan());
+        assert!(sweep.short.len() <= 6 && sweep.counted.len() >= 48 - 6, "{:?}", sweep.short);
+        let film = play(script, 1, Some(5));
+        film.assert_true(&plan());
+        assert_eq!(film.short.len() + film.counted.len(), 60);
+        assert!((1..=6).contains(&film.short.len()), "{:?}", film.short);
+    }
+}
+
+#[test]
+fn settings_that_stamps_tell_apart() {
+    let line = |plan: &[CameraSettings]| Line::new(16_666.667, 50.0, plan);
+    let tells = |plan: &[CameraSettings]| (line(plan).distinct, line(plan).distinct_without_exposure);
+    assert_eq!(tells(&plan()), (true, false), "two exposures");
+    assert_eq!(tells(&plan()[..6]), (true, true));
+    assert_eq!(tells(&[settings(100.0, 600.0), settings(149.0, 600.0)]), (false, false));
+    assert_eq!(tells(&[settings(100.0, 600.0), settings(149.0, 900.0)]), (true, false));
+    // A period apart, a delay is seen at the same distance from an edge.
+    assert_eq!(tells(&[settings(100.0, 600.0), settings(16_740.0, 600.0)]), (false, false));
+}

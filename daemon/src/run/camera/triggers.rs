@@ -1,0 +1,110 @@
+//! When the camera is triggered, by the stamps of its frames.
+
+/// A trigger this far from a whole number of periods after the one before is not the line's.
+const GATE_NS: i64 = 500_000;
+/// So many of those in a row mean that it was the one before that was not.
+const RELOCK_AFTER: u32 = 3;
+
+/// The triggers of the newest frames.
+pub struct Triggers {
+    period_ns: i64,
+    /// The newest frame whose settings are known, and when its trigger was.
+    newest: Option<(u64, i64)>,
+    astray: u32,
+}
+
+impl Triggers {
+    /// Triggers of which none is known.
+    pub fn new(period_ns: i64) -> Self {
+        Self { period_ns, newest: None, astray: 0 }
+    }
+
+    /// Their nominal period.
+    pub fn period_ns(&self) -> i64 {
+        self.period_ns
+    }
+
+    /// The newest frame that was triggered by the line, and when.
+    pub fn newest(&self) -> Option<(u64, i64)> {
+        self.newest
+    }
+
+    /// Notes the trigger of a frame.
+    pub fn note(&mut self, seq: u64, trigger_ns: i64) {
+        if self.off_ns(trigger_ns).is_some_and(|off_ns| off_ns > GATE_NS) && self.astray + 1 < RELOCK_AFTER {
+            self.astray += 1;
+        } else {
+            (self.newest, self.astray) = (Some((seq, trigger_ns)), 0);
+        }
+    }
+
+    /// What was known is too old.
+    pub fn forget(&mut self) {
+        self.newest = None;
+    }
+
+    /// How far a moment is from a whole number of periods after the newest trigger.
+    pub fn off_ns(&self, time_ns: i64) -> Option<i64> {
+        let (_, trigger_ns) = self.newest?;
+        let since_ns = (time_ns - trigger_ns).rem_euclid(self.period_ns);
+        Some(since_ns.min(self.period_ns - since_ns))
+    }
+
+    /// The first moment from `now_ns` on that lies within `window_ns` after a trigger.
+    pub fn between_ns(&self, now_ns: i64, (from_ns, to_ns): (i64, i64)) -> i64 {
+        let Some((_, trigger_ns)) = self.newest else { return now_ns };
+        let since_ns = (now_ns - trigger_ns).rem_euclid(self.period_ns);
+        if since_ns < from_ns {
+            now_ns + from_ns - since_ns
+        } else if since_ns > to_ns {
+            now_ns + self.period_ns - since_ns + from_ns
+        } else {
+            now_ns
+        }
+    }
+
+    /// Whether it is known that no trigger came between two moments.
+    pub fn none_within(&self, (from_ns, to_ns): (i64, i64)) -> bool {
+        let Some((_, trigger_ns)) = self.newest else { return false };
+        let since_ns = (from_ns - trigger_ns).rem_euclid(self.period_ns);
+        since_ns >= GATE_NS && since_ns + (to_ns - from_ns) <= self.period_ns - GATE_NS
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERIOD_NS: i64 = 16_000_000;
+
+    #[test]
+    fn a_false_trigger_does_not_move_the_line_and_a_line_that_has_moved_is_found_again() {
+        let mut triggers = Triggers::new(PERIOD_NS);
+        triggers.note(1, 0);
+        triggers.note(2, 7_000_000);
+        assert_eq!(triggers.newest(), Some((1, 0)));
+        triggers.note(3, PERIOD_NS + 5_000);
+        assert_eq!(triggers.newest(), Some((3, PERIOD_NS + 5_000)));
+        for seq in 4..7 {
+            triggers.note(seq, seq as i64 * PERIOD_NS + 3_000_000);
+        }
+        assert_eq!(triggers.newest(), Some((6, 6 * PERIOD_NS + 3_000_000)));
+    }
+
+    #[test]
+    fn moments_are_placed_between_triggers() {
+        let mut triggers = Triggers::new(PERIOD_NS);
+        assert_eq!(triggers.between_ns(123, (2_000_000, 15_000_000)), 123, "nothing is known");
+        assert!(!triggers.none_within((5_000_000, 5_100_000)));
+        triggers.note(1, 1_000);
+        let between =
+            |since_ns: i64| triggers.between_ns(1_000 + 3 * PERIOD_NS + since_ns, (2_000_000, 15_000_000));
+        let after = |since_ns: i64| 1_000 + 3 * PERIOD_NS + since_ns;
+        assert_eq!(between(500_000), after(2_000_000));
+        assert_eq!(between(9_000_000), after(9_000_000));
+        assert_eq!(between(15_500_000), after(PERIOD_NS + 2_000_000));
+        assert!(triggers.none_within((after(9_000_000), after(10_000_000))));
+        assert!(!triggers.none_within((after(9_000_000), after(PERIOD_NS + 1_000_000))), "it took too long");
+        assert!(!triggers.none_within((after(100_000), after(200_000))), "an edge may jitter");
+    }
+}

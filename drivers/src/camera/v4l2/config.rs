@@ -1,0 +1,106 @@
+//! `[camera.v4l2]` of a rig file.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use raysweep_core::{PixelFormat, Readout};
+use serde::Deserialize;
+
+/// How to open and set a V4L2 camera. Controls are called by their names, as `v4l2-ctl --list-ctrls` spells them.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct V4l2Config {
+    /// The node: better a link of `/dev/v4l/by-id`, which stays the same camera's, than `/dev/video0`.
+    pub device: PathBuf,
+    /// Columns of a frame.
+    pub width: u32,
+    /// Rows of a frame.
+    pub height: u32,
+    /// Controls with their values, written in this order: automatic functions off, gain, blanking, trigger mode.
+    #[serde(default)]
+    pub controls: Vec<(String, i64)>,
+    /// The control of the exposure; left out: whichever of the kernel's the camera has.
+    pub exposure: Option<TimeControl>,
+    /// The control of a trigger delay, which only some makers offer; left out: none.
+    pub trigger_delay: Option<TimeControl>,
+    /// Frame rate to ask for; left out: the driver's.
+    pub frames_per_s: Option<f64>,
+    /// Buffers that the driver fills in turn.
+    #[serde(default = "default_buffers")]
+    pub buffers: u32,
+    /// Frames that may still have the old settings after a change, with the one in progress [A].
+    #[serde(default = "default_late_frames")]
+    pub late_frames: u32,
+    /// From the trigger's edge to the start of row 0's exposure [A].
+    #[serde(default)]
+    pub trigger_latency_us: f64,
+    /// Whether readout overlaps the next exposure.
+    #[serde(default = "default_readout")]
+    pub readout: Readout,
+}
+
+/// A control that holds a time.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TimeControl {
+    /// Its name.
+    pub control: String,
+    /// Its unit; left out: of the kernel's absolute exposures 100 us, of other exposures the row time, of delays 1 us.
+    pub unit_us: Option<f64>,
+}
+
+/// A camera as a rig file describes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct V4l2Setup {
+    /// `[camera.v4l2]`
+    pub config: V4l2Config,
+    /// `camera.pixel_format`
+    pub format: PixelFormat,
+    /// From the start of one row's exposure to the next row's, as the rig needs it.
+    pub row_time_us: f64,
+    /// From one trigger to the next.
+    pub trigger_period_us: f64,
+    /// How long a camera that is lost may stay away.
+    pub reopen: Duration,
+}
+
+impl V4l2Config {
+    /// The first value that makes no sense: its key, and why.
+    ///
+    /// # Errors
+    /// With the key's path within `[camera.v4l2]`, value and what is allowed.
+    pub fn check(&self) -> Result<(), (&'static str, String)> {
+        let unit = |control: &Option<TimeControl>| control.as_ref().and_then(|c| c.unit_us).unwrap_or(1.0);
+        let rules = [
+            ("width", f64::from(self.width), 1.0, 65_536.0),
+            ("height", f64::from(self.height), 1.0, 65_536.0),
+            ("exposure", unit(&self.exposure), 1e-3, 1e6),
+            ("trigger_delay", unit(&self.trigger_delay), 1e-3, 1e6),
+            ("frames_per_s", self.frames_per_s.unwrap_or(1.0), 1e-3, 1e6),
+            ("buffers", f64::from(self.buffers), 2.0, 32.0),
+            ("late_frames", f64::from(self.late_frames), 0.0, 100.0),
+            ("trigger_latency_us", self.trigger_latency_us, 0.0, 1e6),
+        ];
+        for (key, value, low, high) in rules {
+            if !(low..=high).contains(&value) {
+                let what = if ["exposure", "trigger_delay"].contains(&key) { ".unit_us" } else { "" };
+                return Err((key, format!("camera.v4l2.{key}{what} = {value}: allowed is {low} to {high}")));
+            }
+        }
+        if self.device.as_os_str().as_encoded_bytes().contains(&0) {
+            return Err(("device", "camera.v4l2.device contains a NUL: give a path".into()));
+        }
+        Ok(())
+    }
+}
+
+fn default_buffers() -> u32 {
+    8
+}
+/// The sensors of Linux's camera drivers take new exposures for the second frame after the one in progress at the latest.
+fn default_late_frames() -> u32 {
+    3
+}
+fn default_readout() -> Readout {
+    Readout::Sequential
+}

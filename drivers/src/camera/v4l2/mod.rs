@@ -1,0 +1,433 @@
+//! Cameras of the Linux kernel: Video4Linux2 with single-planar, memory-mapped buffers.
+//!
+//! All calls return at once, also those to a device that is gone, so that the thread that asks for frames owns the device.
+//! Any error of a stream loses the device and opens it again: with a node that went and came back, and with one whose
+//! stream has to be built anew, the same happens.
+
+mod config;
+mod controls;
+mod formats;
+#[cfg(feature = "v4l2")]
+mod kernel;
+mod node;
+mod session;
+mod timing;
+
+use std::collections::VecDeque;
+use std::io;
+use std::ops::Range;
+use std::time::Duration;
+
+use nix::libc::{EACCES, EBUSY, EINVAL, EIO, ENODEV, ENOENT, ENOTTY, ENXIO, EPERM, ERANGE};
+use raysweep_core::{
+    Applied, Camera, CameraCapabilities, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState,
+    FirstFrame, FrameBuf, FrameStamp, LossCause, SettingsId, Shutter, us_from_ns,
+};
+
+pub use self::config::{TimeControl, V4l2Config, V4l2Setup};
+pub use self::formats::fourcc;
+pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, Opener};
+use self::session::{Layout, Session};
+use self::timing::{Exposures, Ids, exposure_start_ns, is_monotonic};
+
+/// Pause before the second attempt to open a lost camera again, the first being made at once; it doubles from attempt to
+/// attempt.
+const FIRST_PAUSE_NS: i64 = 100_000_000;
+/// The longest pause between attempts.
+const LONGEST_PAUSE_NS: i64 = 2_000_000_000;
+
+/// Opens a camera of this machine's kernel.
+///
+/// # Errors
+/// `Busy` when another process streams from it, `Disconnected` when there is none, `OutOfRange` or `Unsupported` when it
+/// cannot do what the rig file asks for.
+#[cfg(feature = "v4l2")]
+pub fn open(setup: V4l2Setup) -> Result<V4l2Camera, DeviceError> {
+    V4l2Camera::open(setup, Box::new(kernel::Kernel), Clock::real())
+}
+
+/// Says that this build cannot open V4L2 cameras.
+///
+/// # Errors
+/// Always `Unsupported`.
+#[cfg(not(feature = "v4l2"))]
+pub fn open(_setup: V4l2Setup) -> Result<V4l2Camera, DeviceError> {
+    let what = "camera.driver = \"v4l2\": this program was built without it; build it with the feature `v4l2` (cargo build --features v4l2, which needs libclang)";
+    Err(error(DeviceErrorKind::Unsupported, what))
+}
+
+/// A V4L2 camera.
+pub struct V4l2Camera {
+    setup: V4l2Setup,
+    opener: Box<dyn Opener>,
+    clock: Clock,
+    capabilities: CameraCapabilities,
+    layout: Layout,
+    armed: bool,
+    link: Link,
+    /// Before the next attempt, should the device be lost; nothing as long as frames come.
+    pause_ns: i64,
+    /// The settings that were written last, and what the camera made of them.
+    settings: (CameraSettings, CameraSettings),
+    /// The first frame that is certain to have them.
+    certain: u64,
+    ids: Ids,
+    /// When the newest frame was exposed.
+    newest_ns: Option<i64>,
+    /// Frames that went by while the camera was lost.
+    away: Range<u64>,
+    exposures: Exposures,
+    /// Frames that were there when settings were written, oldest first.
+    waiting: VecDeque<(u64, Filled, i64)>,
+    warned_of_clock: bool,
+}
+
+/// The way to the device.
+enum Link {
+    Open(Box<Session>),
+    Lost { since_ns: i64, next_attempt_ns: i64 },
+}
+
+impl V4l2Camera {
+    /// Opens a camera through any opener, on any clock.
+    ///
+    /// # Errors
+    /// As [`open`].
+    pub fn open(setup: V4l2Setup, mut opener: Box<dyn Opener>, clock: Clock) -> Result<Self, DeviceError> {
+        setup.config.check().map_err(|(_, what)| error(DeviceErrorKind::OutOfRange, what))?;
+        let session = Session::open(opener.as_mut(), &setup)?;
+        let capabilities = session.capabilities(&setup);
+        let settings = session.settings().map_err(kernel_error)?;
+        Ok(Self {
+            layout: session.layout(),
+            exposures: Exposures::new(settings.exposure_us),
+            waiting: VecDeque::with_capacity(setup.config.buffers as usize),
+            opener,
+            clock,
+            capabilities,
+            armed: false,
+            link: Link::Open(session),
+            pause_ns: 0,
+            settings: (settings, settings),
+            certain: 0,
+            ids: Ids::default(),
+            newest_ns: None,
+            away: 0..0,
+            warned_of_clock: false,
+            setup,
+        })
+    }
+
+    /// The device has failed: lets it go, to be opened again.
+    fn lose(&mut self, cause: &io::Error) {
+        tracing::warn!(%cause, device = %self.setup.config.device.display(), "camera lost; opening it again");
+        self.waiting.clear();
+        self.schedule_attempt(self.clock.now_ns());
+    }
+
+    fn schedule_attempt(&mut self, since_ns: i64) {
+        self.link = Link::Lost { since_ns, next_attempt_ns: self.clock.now_ns() + self.pause_ns };
+        self.pause_ns = (2 * self.pause_ns).clamp(FIRST_PAUSE_NS, LONGEST_PAUSE_NS);
+    }
+
+    /// Opens the device as it was: same formats, same settings, streaming if it was.
+    fn reopened(&mut self) -> Result<Box<Session>, DeviceError> {
+        let mut session = Session::open(self.opener.as_mut(), &self.setup)?;
+        let found = session.capabilities(&self.setup);
+        if found != self.capabilities || session.layout() != self.layout {
+            let what = format!(
+                "at {} there is now {}, with other abilities than {}: plug the camera in again that the run began with",
+                self.setup.config.device.display(),
+                found.model,
+                self.capabilities.model
+            );
+            return Err(error(DeviceErrorKind::Unsupported, what));
+        }
+        session.write(&self.settings.0).map_err(kernel_error)?;
+        if self.armed {
+            session.start().map_err(kernel_error)?;
+        }
+        Ok(session)
+    }
+
+    /// Tries to open a lost device, at most once, and not before it is time.
+    fn reopen(&mut self, now_ns: i64) {
+        let Link::Lost { since_ns, next_attempt_ns } = self.link else { return };
+        if now_ns < next_attempt_ns {
+            return;
+        }
+        match self.reopened() {
+            Ok(session) => {
+                tracing::info!(device = %self.setup.config.device.display(), "camera is back");
+                self.resume_ids();
+                self.link = Link::Open(session);
+            }
+            Err(cause) => {
+                tracing::debug!(%cause, "camera still lost");
+                self.schedule_attempt(since_ns);
+            }
+        }
+    }
+
+    /// Ids go on as if the camera had counted the triggers that it missed.
+    fn resume_ids(&mut self) {
+        let next = self.ids.next();
+        let missed = self.newest_ns.map_or(0, |newest_ns| {
+            let period_us = self.setup.trigger_period_us;
+            let periods = self.capabilities.periods_per_frame(&self.settings.1, period_us);
+            let away_us = us_from_ns(self.clock.now_ns() - newest_ns);
+            (away_us / (f64::from(periods) * period_us)) as u64
+        });
+        self.away = next..next + missed;
+        self.ids.stream_begins(self.away.end);
+    }
+
+    /// Takes a filled buffer off the kernel, with its id and when that was.
+    fn dequeue(&mut self) -> io::Result<Option<(u64, Filled, i64)>> {
+        let Link::Open(session) = &mut self.link else { return Ok(None) };
+        let Some(filled) = session.node.dequeue()? else { return Ok(None) };
+        Ok(Some((self.ids.take(filled.sequence), filled, self.clock.now_ns())))
+    }
+
+    /// Takes what is filled already, so that the newest frame's id is known.
+    fn drain(&mut self) -> io::Result<()> {
+        if !self.armed {
+            return Ok(());
+        }
+        while let Some(frame) = self.dequeue()? {
+            self.waiting.push_back(frame);
+        }
+        Ok(())
+    }
+
+    /// A frame that has come, copied into `into`; `None` when none has, or it is damaged.
+    fn take(&mut self, into: &mut [u8]) -> io::Result<Option<FrameStamp>> {
+        let frame = match self.waiting.pop_front() {
+            Some(frame) => Some(frame),
+            None => self.dequeue()?,
+        };
+        let (Some((id, filled, dequeued_ns)), Link::Open(session)) = (frame, &mut self.link) else {
+            return Ok(None);
+        };
+        let sound = session.copy(&filled, into)?;
+        session.node.queue(filled.index)?;
+        if !sound {
+            // Its id is missing from now on, and so it is counted as lost.
+            tracing::debug!(id, flags = filled.flags, bytes = filled.bytes_used, "damaged frame");
+            return Ok(None);
+        }
+        self.pause_ns = 0;
+        if !is_monotonic(&filled) && !self.warned_of_clock {
+            tracing::warn!(
+                flags = filled.flags,
+                "this camera's time stamps are not of the monotonic clock: frames are timed by their arrival, to milliseconds"
+            );
+            self.warned_of_clock = true;
+        }
+        let exposure_us = self.exposures.of(id);
+        let start_ns = exposure_start_ns(&filled, exposure_us, self.capabilities.readout_us, dequeued_ns);
+        self.newest_ns = Some(start_ns);
+        Ok(Some(FrameStamp {
+            seq: id,
+            // The kernel's clock is the host's.
+            device_ns: start_ns,
+            exposure_start_ns: start_ns,
+            host_ns: dequeued_ns,
+            exposure_us: None,
+        }))
+    }
+
+    /// Waits for a buffer or the deadline; with a lost device, for the next attempt to open it.
+    fn wait(&mut self, now_ns: i64, deadline_ns: i64) -> io::Result<()> {
+        match &mut self.link {
+            Link::Open(session) => {
+                session.node.wait(Duration::from_nanos((deadline_ns - now_ns).unsigned_abs()))
+            }
+            Link::Lost { next_attempt_ns, .. } => {
+                self.clock.register().sleep_until(deadline_ns.min(*next_attempt_ns));
+                Ok(())
+            }
+        }
+    }
+
+    /// Writes settings; where the camera refuses them, the old ones stay.
+    fn write(&mut self, wanted: &CameraSettings) -> Result<CameraSettings, DeviceError> {
+        let Link::Open(session) = &mut self.link else { return Err(lost()) };
+        let cause = match session.write(wanted) {
+            Ok(actual) => return Ok(actual),
+            Err(cause) => cause,
+        };
+        if !matches!(cause.raw_os_error(), Some(EACCES | EBUSY | EINVAL | ERANGE)) {
+            self.lose(&cause);
+            return Err(kernel_error(cause));
+        }
+        // The exposure may be written and the delay refused; should this fail too, the first error tells more.
+        let _ = session.write(&self.settings.0);
+        let what = format!(
+            "exposure_us = {}, trigger_delay_us = {}: the camera's driver refuses them{}: {cause}",
+            wanted.exposure_us,
+            wanted.trigger_delay_us,
+            if self.armed { " while it streams" } else { "" }
+        );
+        Err(error(DeviceErrorKind::OutOfRange, what))
+    }
+
+    /// The settings as the camera will take them.
+    fn nearest(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError> {
+        if settings.shutter != Shutter::Rolling {
+            let what = "shutter = Global: V4L2 has no control for it; a rig of this camera is swept with a rolling shutter";
+            return Err(error(DeviceErrorKind::Unsupported, what));
+        }
+        self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
+        match &self.link {
+            Link::Open(session) => Ok(session.nearest(settings)),
+            Link::Lost { .. } => Err(lost()),
+        }
+    }
+}
+
+impl Camera for V4l2Camera {
+    fn capabilities(&self) -> &CameraCapabilities {
+        &self.capabilities
+    }
+
+    fn state(&self) -> DeviceState {
+        match (&self.link, self.armed) {
+            (Link::Lost { .. }, _) => DeviceState::Lost,
+            (Link::Open(_), true) => DeviceState::Streaming,
+            (Link::Open(_), false) => DeviceState::Ready,
+        }
+    }
+
+    fn configure(&mut self, _id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
+        let wanted = self.nearest(settings)?;
+        if let Err(cause) = self.drain() {
+            self.lose(&cause);
+            return Err(kernel_error(cause));
+        }
+        if wanted != self.settings.0 {
+            let actual = self.write(&wanted)?;
+            self.settings = (wanted, actual);
+            // V4L2 does not say when a control takes effect: the frame in progress and some after it may be as before.
+            self.certain = self.ids.next() + u64::from(self.setup.config.late_frames);
+            self.exposures.set(self.certain, actual.exposure_us);
+        }
+        let earliest = self.ids.next();
+        let first_frame = FirstFrame::Within { earliest, certain: self.certain.max(earliest) };
+        Ok(Applied { actual: self.settings.1, first_frame })
+    }
+
+    fn arm(&mut self) -> Result<(), DeviceError> {
+        if self.armed {
+            return Ok(());
+        }
+        let started = match &mut self.link {
+            Link::Open(session) => session.start().map_err(kernel_error),
+            Link::Lost { .. } => self.reopened().and_then(|mut session| {
+                session.start().map_err(kernel_error)?;
+                self.link = Link::Open(session);
+                Ok(())
+            }),
+        };
+        started?;
+        self.ids.stream_begins(self.ids.next());
+        self.newest_ns = None;
+        self.armed = true;
+        Ok(())
+    }
+
+    fn next_frame(
+        &mut self,
+        buf: &mut FrameBuf,
+        timeout: Duration,
+    ) -> Result<Option<FrameStamp>, DeviceError> {
+        if !self.armed {
+            return Err(error(DeviceErrorKind::NotReady, "next_frame before arm: arm the camera first"));
+        }
+        if buf.len() != self.layout.frame_bytes() {
+            let what = format!(
+                "a buffer of {} bytes for frames of {}: make the pool for the camera's format and size",
+                buf.len(),
+                self.layout.frame_bytes()
+            );
+            return Err(error(DeviceErrorKind::OutOfRange, what));
+        }
+        let timeout_ns = i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX);
+        let deadline_ns = self.clock.now_ns().saturating_add(timeout_ns);
+        loop {
+            self.reopen(self.clock.now_ns());
+            let now_ns = self.clock.now_ns();
+            if let Link::Lost { since_ns, .. } = self.link
+                && now_ns - since_ns > i64::try_from(self.setup.reopen.as_nanos()).unwrap_or(i64::MAX)
+            {
+                let what = format!(
+                    "was lost and did not come back within camera.reopen_s = {} s",
+                    self.setup.reopen.as_secs_f64()
+                );
+                return Err(error(DeviceErrorKind::Disconnected, what));
+            }
+            match self.take(buf) {
+                Ok(Some(stamp)) => return Ok(Some(stamp)),
+                Ok(None) if now_ns >= deadline_ns => return Ok(None),
+                Ok(None) => {
+                    if let Err(cause) = self.wait(now_ns, deadline_ns) {
+                        self.lose(&cause);
+                    }
+                }
+                Err(cause) => self.lose(&cause),
+            }
+        }
+    }
+
+    fn loss_of(&self, seq: u64) -> LossCause {
+        if self.away.contains(&seq) { LossCause::CameraLost } else { LossCause::CameraGap }
+    }
+
+    fn disarm(&mut self) -> Result<(), DeviceError> {
+        self.waiting.clear();
+        if !std::mem::replace(&mut self.armed, false) {
+            return Ok(());
+        }
+        let Link::Open(session) = &mut self.link else { return Ok(()) };
+        session.node.stop().map_err(|cause| {
+            self.lose(&cause);
+            kernel_error(cause)
+        })
+    }
+}
+
+fn lost() -> DeviceError {
+    error(DeviceErrorKind::Disconnected, "it is lost and being opened again")
+}
+
+fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
+    DeviceError::new("camera", kind, what.into())
+}
+
+/// What the kernel's number means for whoever has to act on it.
+fn kernel_error(cause: io::Error) -> DeviceError {
+    kernel_error_at("", cause)
+}
+
+fn kernel_error_at(what: &str, cause: io::Error) -> DeviceError {
+    let (kind, advice) = match cause.raw_os_error().unwrap_or_default() {
+        EBUSY => (DeviceErrorKind::Busy, "; another program uses the camera (fuser shows which): end it"),
+        ENODEV | ENXIO | ENOENT => {
+            (DeviceErrorKind::Disconnected, "; is it plugged in, and is camera.v4l2.device its node?")
+        }
+        EACCES | EPERM => {
+            (DeviceErrorKind::NotReady, "; may this user open it? It has to be in the group video")
+        }
+        EIO => (DeviceErrorKind::Disconnected, "; the stream has failed"),
+        EINVAL | ENOTTY => (DeviceErrorKind::Unsupported, "; the camera's driver does not know the request"),
+        ERANGE => (DeviceErrorKind::OutOfRange, ""),
+        _ => (DeviceErrorKind::Protocol, ""),
+    };
+    let at = if what.is_empty() { String::new() } else { format!("{what}: ") };
+    error(kind, format!("{at}{cause}{advice}"))
+}
+
+#[cfg(test)]
+mod scripted;
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,343 @@
+//! What resonance a mirror has, from a chirp that it was commanded and the angles that were measured.
+//!
+//! Per axis: the ratio of the two spectra is fitted with `g exp(-i 2 pi f delay) / (1 - r^2 + i r / Q)`, r = f / f0. The
+//! start comes from a straight problem, `1 / |H|^2 = (1 + (1/Q^2 - 2) r^2 + r^4) / g^2`; Gauss-Newton does the rest.
+
+use std::f64::consts::{PI, TAU};
+use std::ops::RangeInclusive;
+
+use num_complex::Complex64;
+use raysweep_core::SecondOrder;
+
+/// Frequencies at which the spectra are compared.
+const FREQUENCIES: usize = 400;
+/// Steps of Gauss-Newton; five are enough from a good start.
+const STEPS: usize = 30;
+/// Share of the measured movement that the model may leave unexplained.
+const LARGEST_RESIDUAL: f64 = 0.2;
+
+/// What an axis answers to its command.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Identified {
+    /// Its resonance.
+    pub response: SecondOrder,
+    /// Measured angle over commanded angle at rest.
+    pub gain: f64,
+    /// How late it answers: the controller's filter, and the measurement.
+    pub delay_s: f64,
+    /// Share of the measured movement, in the band and by amplitude, that this does not explain.
+    pub residual: f64,
+}
+
+/// Why nothing could be identified.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum IdentifyError {
+    /// The two records do not belong together.
+    #[error(
+        "{commanded} angles commanded, {measured} measured: give one measured angle for each sample, 100 at least"
+    )]
+    Lengths {
+        /// How many were commanded.
+        commanded: usize,
+        /// How many were measured.
+        measured: usize,
+    },
+    /// The band makes no sense.
+    #[error("band = {low_hz} to {high_hz} Hz: allowed is from above 0 to half the rate, low before high")]
+    Band {
+        /// Its lower end.
+        low_hz: f64,
+        /// Its upper end.
+        high_hz: f64,
+    },
+    /// The angles are no numbers, or nothing moves.
+    #[error(
+        "nothing moves between {low_hz} and {high_hz} Hz: command a chirp over that band and measure its angles"
+    )]
+    Still {
+        /// The band's lower end.
+        low_hz: f64,
+        /// The band's upper end.
+        high_hz: f64,
+    },
+    /// It is no resonator.
+    #[error(
+        "a resonator leaves {residual:.2} of the movement unexplained: {LARGEST_RESIDUAL} is allowed; measure with less noise, a wider band, or a smaller amplitude"
+    )]
+    NoResonator {
+        /// Share of it.
+        residual: f64,
+    },
+}
+
+/// A sine that sweeps `band` once in `seconds`, with soft ends, then stands for `rest_s` so that the ringing is in the record.
+pub fn chirp(
+    band: &RangeInclusive<f64>,
+    amplitude_deg: f64,
+    seconds: f64,
+    rest_s: f64,
+    rate_hz: f64,
+) -> Vec<f64> {
+    let samples = (seconds * rate_hz).round().max(0.0) as usize;
+    let rest = (rest_s * rate_hz).round().max(0.0) as usize;
+    let sweep = (0..samples).map(|n| {
+        let t = n as f64 / rate_hz;
+        let phase = TAU * (band.start() * t + (band.end() - band.start()) * t * t / (2.0 * seconds));
+        // A twentieth at each end rises and falls as half a cosine.
+        let edge = (n.min(samples - n) as f64 / (0.05 * samples as f64)).min(1.0);
+        amplitude_deg * phase.sin() * (1.0 - (PI * edge).cos()) / 2.0
+    });
+    sweep.chain(std::iter::repeat_n(0.0, rest)).collect()
+}
+
+/// Fits one axis. `commanded` and `measured` are degrees of the same kind, sample by sample, at rest at both ends.
+///
+/// # Errors
+/// When the records, the band or the movement make no resonator.
+pub fn identify(
+    commanded: &[f64],
+    measured: &[f64],
+    rate_hz: f64,
+    band: &RangeInclusive<f64>,
+) -> Result<Identified, IdentifyError> {
+    if commanded.len() != measured.len() || commanded.len() < 100 {
+        return Err(IdentifyError::Lengths { commanded: commanded.len(), measured: measured.len() });
+    }
+    let (low_hz, high_hz) = (*band.start(), *band.end());
+    if !(low_hz > 0.0 && low_hz < high_hz && high_hz <= rate_hz / 2.0) {
+        return Err(IdentifyError::Band { low_hz, high_hz });
+    }
+    let frequencies: Vec<f64> =
+        (0..FREQUENCIES).map(|k| low_hz + (high_hz - low_hz) * k as f64 / (FREQUENCIES - 1) as f64).collect();
+    let points: Vec<Point> = frequencies
+        .into_iter()
+        .map(|hz| {
+            let [command, answer] = [commanded, measured].map(|values| spectrum_at(values, hz / rate_hz));
+            Point { hz, command: command.norm(), ratio: answer / command }
+        })
+        .filter(|point| point.ratio.is_finite() && point.ratio.norm() > 0.0)
+        .collect();
+    let still = IdentifyError::Still { low_hz, high_hz };
+    let start = Model::start(&points).ok_or(still)?;
+    let model = start.refined(&points);
+    let residual = (model.error(&points) / points.iter().map(Point::energy).sum::<f64>()).sqrt();
+    if !(residual <= LARGEST_RESIDUAL && model.q > 0.0 && model.f0_hz > 0.0) {
+        return Err(IdentifyError::NoResonator { residual });
+    }
+    let response = SecondOrder { f0_hz: model.f0_hz, q: model.q };
+    Ok(Identified { response, gain: model.gain, delay_s: model.delay_s, residual })
+}
+
+/// The spectra at one frequency.
+struct Point {
+    hz: f64,
+    command: f64,
+    ratio: Complex64,
+}
+
+impl Point {
+    fn energy(&self) -> f64 {
+        (self.command * self.ratio.norm()).powi(2)
+    }
+}
+
+fn spectrum_at(values: &[f64], cycles_per_sample: f64) -> Complex64 {
+    let turn = Complex64::cis(-TAU * cycles_per_sample);
+    let mut unit = Complex64::ONE;
+    let mut sum = Complex64::ZERO;
+    for &value in values {
+        sum += unit * value;
+        unit *= turn;
+    }
+    sum
+}
+
+#[derive(Clone, Copy)]
+struct Model {
+    gain: f64,
+    f0_hz: f64,
+    q: f64,
+    delay_s: f64,
+}
+
+impl Model {
+    /// From the magnitudes, then the delay from how the phases that they leave turn with frequency.
+    fn start(points: &[Point]) -> Option<Self> {
+        let mut normal = [[0.0; 4]; 3];
+        let scale = points.last()?.hz;
+        for point in points {
+            let squared = point.ratio.norm_sqr();
+            let f2 = (point.hz / scale).powi(2);
+            // An error of H counts in 1/|H|^2 by |H|^-3.
+            let weight = point.command.powi(2) * squared.powi(3);
+            accumulate(&mut normal, [1.0, f2, f2 * f2], 1.0 / squared, weight);
+        }
+        let [c0, c1, c2] = solve(normal)?;
+        if !(c0 > 0.0 && c2 > 0.0) {
+            return None;
+        }
+        let f0 = (c0 / c2).powf(0.25);
+        let q2 = 1.0 / (c1 / c0 * f0 * f0 + 2.0).max(1e-6);
+        let mut model = Self { gain: 1.0 / c0.sqrt(), f0_hz: f0 * scale, q: q2.sqrt(), delay_s: 0.0 };
+        let left = |point: &Point| point.ratio / model.at(point.hz);
+        let turns: Complex64 = points
+            .windows(2)
+            .map(|pair| left(&pair[1]) * left(&pair[0]).conj() * (pair[0].energy() * pair[1].energy()).sqrt())
+            .sum();
+        let spacing_hz = points.get(1)?.hz - points.first()?.hz;
+        model.delay_s = -turns.arg() / (TAU * spacing_hz);
+        Some(model)
+    }
+
+    fn denominator(&self, hz: f64) -> Complex64 {
+        let r = hz / self.f0_hz;
+        Complex64::new(1.0 - r * r, r / self.q)
+    }
+
+    fn at(&self, hz: f64) -> Complex64 {
+        Complex64::cis(-TAU * hz * self.delay_s) * self.gain / self.denominator(hz)
+    }
+
+    fn error(&self, points: &[Point]) -> f64 {
+        points.iter().map(|p| (p.ratio - self.at(p.hz)).norm_sqr() * p.command * p.command).sum()
+    }
+
+    /// Gauss-Newton on relative parameters; a step that does not help is halved.
+    fn refined(self, points: &[Point]) -> Self {
+        let mut model = self;
+        for _ in 0..STEPS {
+            let mut normal = [[0.0; 5]; 4];
+            for point in points {
+                let (h, d) = (model.at(point.hz), model.denominator(point.hz));
+                let r = point.hz / model.f0_hz;
+                let derivatives = [
+                    h,
+                    -h / d * Complex64::new(2.0 * r * r, -r / model.q),
+                    h / d * Complex64::new(0.0, r / model.q),
+                    // In periods of the resonance.
+                    h * Complex64::new(0.0, -TAU * r),
+                ];
+                let error = point.ratio - h;
+                let weight = point.command * point.command;
+                accumulate(&mut normal, derivatives.map(|d| d.re), error.re, weight);
+                accumulate(&mut normal, derivatives.map(|d| d.im), error.im, weight);
+            }
+            let Some([gain, f0, q, delay]) = solve(normal) else { break };
+            let before = model.error(points);
+            let better = (0..10).map(|halving| 0.5_f64.powi(halving)).find_map(|share| {
+                let next = Self {
+                    gain: model.gain * (1.0 + share * gain),
+                    f0_hz: model.f0_hz * (1.0 + share * f0),
+                    q: model.q * (1.0 + share * q),
+                    delay_s: model.delay_s + share * delay / model.f0_hz,
+                };
+                (next.error(points) < before).then_some(next)
+            });
+            let Some(next) = better else { break };
+            model = next;
+        }
+        model
+    }
+}
+
+/// Adds an equation `row . x = value` to the normal equations, whose last column is the right side.
+fn accumulate<const N: usize, const M: usize>(
+    normal: &mut [[f64; M]; N],
+    row: [f64; N],
+    value: f64,
+    weight: f64,
+) {
+    for (equation, a) in normal.iter_mut().zip(row) {
+        for (entry, b) in equation.iter_mut().zip(row.into_iter().chain([value])) {
+            *entry += weight * a * b;
+        }
+    }
+}
+
+/// Gaussian elimination with pivoting; `None` for a singular matrix.
+fn solve<const N: usize, const M: usize>(mut rows: [[f64; M]; N]) -> Option<[f64; N]> {
+    for column in 0..N {
+        let pivot = (column..N).max_by(|&a, &b| rows[a][column].abs().total_cmp(&rows[b][column].abs()))?;
+        rows.swap(column, pivot);
+        let pivot_row = rows[column];
+        if !(pivot_row[column].abs() > 0.0 && pivot_row[column].is_finite()) {
+            return None;
+        }
+        for row in (0..N).filter(|&row| row != column) {
+            let factor = rows[row][column] / pivot_row[column];
+            for (entry, above) in rows[row].iter_mut().zip(pivot_row) {
+                *entry -= factor * above;
+            }
+        }
+    }
+    Some(std::array::from_fn(|row| rows[row][N] / rows[row][row]))
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_core::Tilt;
+    use raysweep_sim::mirror::{Mechanics, MechanicsConfig};
+
+    use super::*;
+
+    const RATE_HZ: f64 = 39_000.0;
+    const BAND: RangeInclusive<f64> = 100.0..=900.0;
+
+    /// What a simulated mirror measures when it is commanded a chirp, x and y.
+    fn measure(config: MechanicsConfig, noise_deg: f64) -> (Vec<f64>, [Vec<f64>; 2]) {
+        let commanded = chirp(&BAND, 0.1, 0.8, 0.3, RATE_HZ);
+        let mut mechanics = Mechanics::new(config, RATE_HZ);
+        let mut noise = 1_u64;
+        let mut uniform = || {
+            noise = noise.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (noise >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
+        };
+        let mut measured = [Vec::new(), Vec::new()];
+        for &command in &commanded {
+            let moved = mechanics.hold(Tilt::new(command, command)).deg();
+            (0..2).for_each(|axis| measured[axis].push(moved[axis] + noise_deg * uniform()));
+        }
+        (commanded, measured)
+    }
+
+    #[test]
+    fn resonances_are_found_again_through_the_controllers_filter_and_noise() {
+        let config = MechanicsConfig { filter_hz: 5000.0, q: [30.0, 12.0], ..Default::default() };
+        for (noise_deg, tolerance) in [(0.0, 0.01), (0.05, 0.03)] {
+            let (commanded, measured) = measure(config, noise_deg);
+            for (axis, measured) in measured.iter().enumerate() {
+                let found = identify(&commanded, measured, RATE_HZ, &BAND).unwrap();
+                let (f0, q) = (found.response.f0_hz / config.f0_hz[axis], found.response.q / config.q[axis]);
+                assert!((f0 - 1.0).abs() < tolerance / 10.0, "axis {axis}: {found:?}");
+                assert!(
+                    (q - 1.0).abs() < 2.0 * tolerance && (found.gain - 1.0).abs() < tolerance,
+                    "{found:?}"
+                );
+                // The Bessel filter's delay at low frequencies, and half a sample of holding.
+                let delay_s = 2.703_395 / (TAU * 5000.0) - 0.5 / RATE_HZ;
+                assert!(
+                    (found.delay_s - delay_s).abs() < 0.5 / RATE_HZ,
+                    "{} against {delay_s}",
+                    found.delay_s
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_no_resonator_is_refused() {
+        let (commanded, _) = measure(MechanicsConfig::default(), 0.0);
+        let still = vec![0.0; commanded.len()];
+        assert!(matches!(identify(&commanded, &still, RATE_HZ, &BAND), Err(IdentifyError::Still { .. })));
+        assert!(matches!(identify(&still, &commanded, RATE_HZ, &BAND), Err(IdentifyError::Still { .. })));
+        assert!(matches!(
+            identify(&commanded, &commanded[1..], RATE_HZ, &BAND),
+            Err(IdentifyError::Lengths { .. })
+        ));
+        let wrong = 900.0..=100.0;
+        assert!(matches!(identify(&commanded, &commanded, RATE_HZ, &wrong), Err(IdentifyError::Band { .. })));
+        let nonsense: Vec<f64> =
+            (0..commanded.len()).map(|n| ((n * n * 7919) % 1013) as f64 / 1013.0).collect();
+        assert!(identify(&commanded, &nonsense, RATE_HZ, &BAND).is_err());
+    }
+}

@@ -1,0 +1,28 @@
+//! MEMS mirrors over serial lines: Mirrorcle's PlayzerX and MTI controllers, Optotune's MR-E-2.
+//!
+//! A driver keeps a [`StateFile`]: what it is about to send is on disk before the first sample leaves, and how much of
+//! it was sent beside it. Whoever comes after a crash ([`park()`], a [`Guardian`], the next run) knows from it where the
+//! mirror is and takes it to the origin, light off first.
+
+mod guardian;
+pub mod identify;
+mod light;
+mod mti;
+mod optotune;
+mod park;
+pub mod playzerx;
+mod points;
+mod port;
+mod sequence;
+mod state;
+pub mod wire;
+
+pub use guardian::{Guardian, park_when_closed};
+pub use light::{LightGuard, LightState, NoLight, arm_light};
+pub use mti::{Mti, MtiCommand, MtiConfig, MtiDrive, MtiReply, parse_mti};
+pub use optotune::{
+    Laser, Optotune, OptotuneCommand, OptotuneConfig, OptotuneReply, RtsLaser, parse_optotune,
+};
+pub use park::{ParkError, Parked, park};
+pub use playzerx::{Link, PlayzerX, PlayzerXConfig};
+pub use state::{MirrorReport, StateError, StateFile};

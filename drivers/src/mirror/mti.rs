@@ -1,0 +1,310 @@
+//! Mirrorcle's MTI controllers in their ASCII mode: one line a command, `MTI-OK` or `MTI-ERR ...` back.
+
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use raysweep_core::{
+    DeviceError, DeviceErrorKind, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath,
+    MirrorPoint, MirrorProgress, Tilt,
+};
+
+use super::light::LightGuard;
+use super::points::{self, PointController, PointMirror};
+use super::port::{Port, fault};
+use super::state::{MirrorState, Reach, Sent};
+use super::wire::{Parsed, line};
+
+const BAUD: u32 = 115_200;
+const REPLY_WAIT: Duration = Duration::from_millis(300);
+/// The high voltage takes its time.
+const ENABLE_WAIT: Duration = Duration::from_secs(2);
+
+/// What the controller drives the mirror with. Too much of it destroys the mirror.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MtiDrive {
+    /// Bias, 0..=100 V.
+    pub bias_v: u32,
+    /// Largest difference between the electrodes of an axis, 0..=200 V.
+    pub difference_v: u32,
+    /// -3 dB frequency of the controller's low-pass, 50..=15,000 Hz.
+    pub bandwidth_hz: u32,
+}
+
+impl MtiDrive {
+    /// The most that Mirrorcle's A7B2.3-3600AL takes.
+    pub const A7B2_3_3600AL: Self = Self { bias_v: 80, difference_v: 150, bandwidth_hz: 200 };
+
+    /// # Errors
+    /// The first value beyond `most` or beyond what the controller takes.
+    fn check(&self, most: &Self) -> Result<(), DeviceError> {
+        let rules = [
+            ("bias_v", self.bias_v, 0, most.bias_v.min(100)),
+            ("difference_v", self.difference_v, 0, most.difference_v.min(200)),
+            ("bandwidth_hz", self.bandwidth_hz, 50, most.bandwidth_hz.min(15_000)),
+        ];
+        for (field, value, low, high) in rules {
+            if !(low..=high).contains(&value) {
+                let what = format!("{field} = {value}: this mirror takes {low} to {high}");
+                return Err(fault(DeviceErrorKind::OutOfRange, what));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Which MTI controller and mirror.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MtiConfig {
+    /// Its serial port.
+    pub port: PathBuf,
+    /// What to drive the mirror with.
+    pub drive: MtiDrive,
+    /// The most that the mirror takes, from its data sheet.
+    pub most: MtiDrive,
+    /// Tilt of the mirror at the controller's full scale, under this drive.
+    pub full_scale: MechanicalDeg,
+    /// What the mirror survives.
+    pub limits: MirrorLimits,
+    /// Where the driver keeps what a crash must not lose.
+    pub state: PathBuf,
+    /// Who permits light.
+    pub light: LightGuard,
+}
+
+/// What the controller can be told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum MtiCommand {
+    /// Enters the command mode.
+    Enter,
+    /// Bias in volts; only while the high voltage is off.
+    Bias(u32),
+    /// Largest difference in volts; only while the high voltage is off.
+    Difference(u32),
+    /// Bandwidth in hertz; only while the high voltage is off.
+    Bandwidth(u32),
+    /// High voltage on.
+    Enable,
+    /// High voltage off.
+    Disable,
+    /// Goes to a place, -1..=1 of the full scale, with light 0..=255.
+    GoTo {
+        /// Part of the full scale.
+        x: f64,
+        /// Part of the full scale.
+        y: f64,
+        /// 0: off, 255: full.
+        light: u8,
+    },
+    /// Answers to commands, please.
+    Echo,
+    /// Leaves the command mode.
+    Exit,
+}
+
+impl MtiCommand {
+    /// Appends the command as it goes over the wire.
+    pub fn to_bytes(self, out: &mut Vec<u8>) {
+        let text = match self {
+            Self::Enter => "$MTI$".into(),
+            Self::Bias(volts) => format!("MTI+VB {volts}"),
+            Self::Difference(volts) => format!("MTI+VD {volts}"),
+            Self::Bandwidth(hz) => format!("MTI+BW {hz}"),
+            Self::Enable => "MTI+EN".into(),
+            Self::Disable => "MTI+DI".into(),
+            Self::GoTo { x, y, light } => format!("MTI+GT {x:.5} {y:.5} {light}"),
+            Self::Echo => "MTI+EC".into(),
+            Self::Exit => "MTI+EX".into(),
+        };
+        out.extend_from_slice(text.as_bytes());
+        out.push(b'\n');
+    }
+}
+
+/// What the controller says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum MtiReply {
+    /// Done.
+    Done,
+    /// Not done, and why.
+    Refused(String),
+    /// Who it is, on entering or leaving the command mode.
+    Device(String),
+}
+
+/// Reads the reply that `bytes` begin with.
+pub fn parse_mti(bytes: &[u8]) -> Parsed<MtiReply> {
+    let (text, used) = match line(bytes) {
+        Ok(Some(line)) => line,
+        Ok(None) => return Parsed::Incomplete,
+        Err(used) => return Parsed::Garbage { used },
+    };
+    let reply = match text.split_at_checked(4) {
+        Some(("MTI-", "OK")) => MtiReply::Done,
+        Some(("MTI-", said)) if said.starts_with("ERR") => MtiReply::Refused(said[3..].trim().to_owned()),
+        Some(("MTI-", said)) if said.starts_with("Device ") => MtiReply::Device(said[7..].to_owned()),
+        // A reply may follow garbage on the same line.
+        _ => {
+            let next = text.get(1..).and_then(|rest| rest.find("MTI-")).map(|at| at + 1);
+            return Parsed::Garbage { used: next.unwrap_or(used) };
+        }
+    };
+    Parsed::Reply { reply, used }
+}
+
+/// An MTI controller in its command mode.
+pub struct MtiLine {
+    port: Port,
+    full_scale: MechanicalDeg,
+}
+
+impl MtiLine {
+    fn ask(&mut self, command: MtiCommand, wait: Duration) -> Result<MtiReply, DeviceError> {
+        let mut bytes = Vec::new();
+        command.to_bytes(&mut bytes);
+        self.port.send(&bytes)?;
+        self.port.await_reply(wait, parse_mti, Some)?.ok_or_else(|| {
+            let what = format!("no answer to {command:?}: check the controller's power and cable");
+            fault(DeviceErrorKind::Timeout, what)
+        })
+    }
+
+    fn tell(&mut self, command: MtiCommand, wait: Duration) -> Result<(), DeviceError> {
+        match self.ask(command, wait)? {
+            MtiReply::Refused(why) => {
+                Err(fault(DeviceErrorKind::Protocol, format!("the controller refuses {command:?}: {why}")))
+            }
+            MtiReply::Done | MtiReply::Device(_) => Ok(()),
+        }
+    }
+
+    /// Ends whatever line is begun and enters the command mode, or finds itself in it already.
+    fn enter(port: &std::path::Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
+        let mut line = Self { port: Port::open(port, BAUD)?, full_scale };
+        line.port.send(b"\n")?;
+        line.port.await_reply(Duration::from_millis(50), parse_mti, Some)?;
+        let model = match line.ask(MtiCommand::Enter, REPLY_WAIT)? {
+            MtiReply::Device(model) => model,
+            MtiReply::Done | MtiReply::Refused(_) => "MTI controller".into(),
+        };
+        line.tell(MtiCommand::Echo, REPLY_WAIT)?;
+        Ok((line, model))
+    }
+}
+
+impl PointController for MtiLine {
+    /// At 115,200 baud a point and its answer take 3 ms.
+    const RATE_HZ: RangeInclusive<f64> = 1.0..=300.0;
+
+    fn go(&mut self, point: MirrorPoint) -> Result<(), DeviceError> {
+        let [x, y] = point.tilt.deg().map(|deg| (deg / self.full_scale.0).clamp(-1.0, 1.0));
+        self.tell(MtiCommand::GoTo { x, y, light: point.light }, REPLY_WAIT)
+    }
+
+    fn release(&mut self) -> Result<(), DeviceError> {
+        self.tell(MtiCommand::Disable, ENABLE_WAIT)?;
+        self.tell(MtiCommand::Exit, REPLY_WAIT)
+    }
+}
+
+/// A mirror behind an MTI controller.
+pub struct Mti(PointMirror<MtiLine>);
+
+impl Mti {
+    /// Opens the controller, sets the drive and switches the high voltage on. A mirror that a crashed process has left
+    /// somewhere is parked first.
+    ///
+    /// # Errors
+    /// `OutOfRange` for a drive that would destroy the mirror, `Busy`, `Disconnected`, `Timeout`, `Protocol`.
+    pub fn open(config: MtiConfig) -> Result<Self, DeviceError> {
+        let MtiConfig { port, drive, most, full_scale, limits, state, light } = config;
+        drive.check(&most)?;
+        let reach = Reach::Mti { port: port.clone(), full_scale };
+        let mirror = PointMirror::open(&state, limits, light, reach, || {
+            let (mut line, model) = MtiLine::enter(&port, full_scale)?;
+            // The drive can be set only with the high voltage off.
+            line.tell(MtiCommand::Disable, ENABLE_WAIT)?;
+            line.tell(MtiCommand::Bias(drive.bias_v), REPLY_WAIT)?;
+            line.tell(MtiCommand::Difference(drive.difference_v), REPLY_WAIT)?;
+            line.tell(MtiCommand::Bandwidth(drive.bandwidth_hz), REPLY_WAIT)?;
+            line.tell(MtiCommand::Enable, ENABLE_WAIT)?;
+            line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
+            Ok((line, model))
+        })?;
+        Ok(Self(mirror))
+    }
+}
+
+impl Mirror for Mti {
+    fn capabilities(&self) -> &MirrorCapabilities {
+        self.0.capabilities()
+    }
+    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
+        self.0.load(path)
+    }
+    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
+        self.0.start(batches)
+    }
+    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
+        self.0.feed()
+    }
+    fn park(&mut self) -> Result<(), DeviceError> {
+        self.0.park()
+    }
+}
+
+/// Parks a mirror that a process has left behind. `None`: its drive was off, so it is at rest.
+pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
+    let Reach::Mti { port, full_scale } = &state.reach else { return Ok(None) };
+    let (mut line, _) = MtiLine::enter(port, *full_scale)?;
+    match points::recover(&mut line, state, sent) {
+        Err(error) if error.kind == DeviceErrorKind::Protocol => Ok(None),
+        recovered => recovered,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn commands_are_the_documented_lines() {
+        let text = |command: MtiCommand| {
+            let mut out = Vec::new();
+            command.to_bytes(&mut out);
+            String::from_utf8(out).unwrap()
+        };
+        assert_eq!(text(MtiCommand::Enter), "$MTI$\n");
+        assert_eq!(text(MtiCommand::Bias(80)), "MTI+VB 80\n");
+        assert_eq!(text(MtiCommand::GoTo { x: -0.5, y: 1.0, light: 7 }), "MTI+GT -0.50000 1.00000 7\n");
+    }
+
+    #[test]
+    fn replies_are_told_from_garbage() {
+        let reply = |bytes: &[u8]| match parse_mti(bytes) {
+            Parsed::Reply { reply, used } => (reply, used),
+            other => panic!("{other:?}"),
+        };
+        assert_eq!(reply(b"MTI-OK\r\nMTI"), (MtiReply::Done, 8));
+        assert_eq!(reply(b"MTI-ERR InvalidCommand\r\n").0, MtiReply::Refused("InvalidCommand".into()));
+        assert_eq!(reply(b"MTI-Device MTI-MZ\n").0, MtiReply::Device("MTI-MZ".into()));
+        assert_eq!(parse_mti(b"xyMTI-OK\r\n"), Parsed::Garbage { used: 2 });
+        assert_eq!(parse_mti(b"M\x80TI-OK\r\n"), Parsed::Garbage { used: 2 });
+        assert_eq!(parse_mti(b"hello\r\n"), Parsed::Garbage { used: 7 });
+        assert_eq!(parse_mti(b"MTI-O"), Parsed::Incomplete);
+    }
+
+    #[test]
+    fn a_drive_beyond_the_mirrors_is_refused() {
+        let most = MtiDrive::A7B2_3_3600AL;
+        assert!(most.check(&most).is_ok());
+        for drive in [
+            MtiDrive { bias_v: 81, ..most },
+            MtiDrive { difference_v: 151, ..most },
+            MtiDrive { bandwidth_hz: 201, ..most },
+            MtiDrive { bandwidth_hz: 49, ..most },
+        ] {
+            assert_eq!(drive.check(&most).unwrap_err().kind, DeviceErrorKind::OutOfRange);
+        }
+    }
+}

@@ -1,0 +1,272 @@
+//! Optotune's MR-E-2 in its simple mode: one line a command, `OK`, `NO`, `OL` or `OU` back. It has no output for a
+//! light, so the light hangs on a [`Laser`] of its own.
+
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use raysweep_core::{
+    DeviceError, DeviceErrorKind, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
+    MirrorProgress, Tilt,
+};
+
+use super::light::LightGuard;
+use super::points::{self, PointController, PointMirror};
+use super::port::{Port, fault};
+use super::state::{MirrorState, Reach, Sent};
+use super::wire::{Parsed, line};
+
+const BAUD: u32 = 256_000;
+const REPLY_WAIT: Duration = Duration::from_millis(300);
+/// The controller's coordinates are tangents of the optical angle over that of this one.
+const FULL_SCALE_OPTICAL_DEG: f64 = 50.0;
+
+/// A light that is switched apart from the mirror.
+pub trait Laser: Send {
+    /// On or off; returns when it is so.
+    ///
+    /// # Errors
+    /// `Disconnected` when it cannot be told.
+    fn switch(&mut self, on: bool) -> Result<(), DeviceError>;
+}
+
+/// A laser whose enable input hangs on the RTS line of a serial port: it goes off by itself when the process ends.
+pub struct RtsLaser {
+    port: Port,
+}
+
+impl RtsLaser {
+    /// Opens the port, light off.
+    ///
+    /// # Errors
+    /// When the port cannot be opened or has no RTS line.
+    pub fn open(port: &Path) -> Result<Self, DeviceError> {
+        let mut laser = Self { port: Port::open(port, 9600)? };
+        laser.switch(false)?;
+        Ok(laser)
+    }
+}
+
+impl Laser for RtsLaser {
+    fn switch(&mut self, on: bool) -> Result<(), DeviceError> {
+        self.port.set_rts(on)
+    }
+}
+
+/// Which MR-E-2.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OptotuneConfig {
+    /// Its serial port.
+    pub port: PathBuf,
+    /// The port whose RTS line enables the laser, for [`super::park()`] after a crash; none where the laser needs
+    /// something else.
+    pub laser_port: Option<PathBuf>,
+    /// What the mirror survives.
+    pub limits: MirrorLimits,
+    /// Where the driver keeps what a crash must not lose.
+    pub state: PathBuf,
+    /// Who permits light.
+    pub light: LightGuard,
+}
+
+/// What the controller can be told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum OptotuneCommand {
+    /// Are you there?
+    Start,
+    /// Goes to tan(optical angle) / tan 50 degrees, -1..=1, both axes.
+    GoTo {
+        /// Of the x axis.
+        x: f64,
+        /// Of the y axis.
+        y: f64,
+    },
+}
+
+impl OptotuneCommand {
+    /// Appends the command as it goes over the wire.
+    pub fn to_bytes(self, out: &mut Vec<u8>) {
+        let text = match self {
+            Self::Start => "START".into(),
+            Self::GoTo { x, y } => format!("XY={x:.5};{y:.5}"),
+        };
+        out.extend_from_slice(text.as_bytes());
+        out.extend_from_slice(b"\r\n");
+    }
+}
+
+/// What the controller says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OptotuneReply {
+    /// Done.
+    Ok,
+    /// Not understood.
+    No,
+    /// Below the lowest value.
+    TooLow,
+    /// Above the highest value.
+    TooHigh,
+}
+
+/// Reads the reply that `bytes` begin with.
+pub fn parse_optotune(bytes: &[u8]) -> Parsed<OptotuneReply> {
+    let (text, used) = match line(bytes) {
+        Ok(Some(line)) => line,
+        Ok(None) => return Parsed::Incomplete,
+        Err(used) => return Parsed::Garbage { used },
+    };
+    let reply = match text {
+        "OK" => OptotuneReply::Ok,
+        "NO" => OptotuneReply::No,
+        "OL" => OptotuneReply::TooLow,
+        "OU" => OptotuneReply::TooHigh,
+        // A reply may follow garbage on the same line.
+        _ if ["OK", "NO", "OL", "OU"].iter().any(|reply| text.ends_with(reply)) => {
+            return Parsed::Garbage { used: text.len() - 2 };
+        }
+        _ => return Parsed::Garbage { used },
+    };
+    Parsed::Reply { reply, used }
+}
+
+/// The controller and the laser beside it.
+pub struct OptotuneLine {
+    port: Port,
+    laser: Box<dyn Laser>,
+    lit: bool,
+}
+
+impl OptotuneLine {
+    fn open(port: &Path, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
+        let mut line = Self { port: Port::open(port, BAUD)?, laser, lit: true };
+        line.light(false)?;
+        // Ends whatever line is begun; what is said to that is no answer to us.
+        line.port.send(b"\r\n")?;
+        line.port.await_reply(Duration::from_millis(50), parse_optotune, Some)?;
+        line.tell(OptotuneCommand::Start)?;
+        Ok(line)
+    }
+
+    fn light(&mut self, on: bool) -> Result<(), DeviceError> {
+        if self.lit != on {
+            self.laser.switch(on)?;
+            self.lit = on;
+        }
+        Ok(())
+    }
+
+    fn tell(&mut self, command: OptotuneCommand) -> Result<(), DeviceError> {
+        let mut bytes = Vec::new();
+        command.to_bytes(&mut bytes);
+        self.port.send(&bytes)?;
+        match self.port.await_reply(REPLY_WAIT, parse_optotune, Some)? {
+            Some(OptotuneReply::Ok) => Ok(()),
+            Some(refused) => {
+                let what = format!("the controller answers {refused:?} to {command:?}");
+                Err(fault(DeviceErrorKind::Protocol, what))
+            }
+            None => {
+                let what = format!("no answer to {command:?}: check the controller's power and cable");
+                Err(fault(DeviceErrorKind::Timeout, what))
+            }
+        }
+    }
+}
+
+impl PointController for OptotuneLine {
+    /// At 256,000 baud a point and its answer take 1 ms.
+    const RATE_HZ: RangeInclusive<f64> = 1.0..=500.0;
+
+    fn go(&mut self, point: MirrorPoint) -> Result<(), DeviceError> {
+        // Off before the mirror moves, on after it has been told to.
+        if point.light == 0 {
+            self.light(false)?;
+        }
+        let full_scale = FULL_SCALE_OPTICAL_DEG.to_radians().tan();
+        let [x, y] = point.tilt.deg().map(|deg| (2.0 * deg).to_radians().tan() / full_scale);
+        self.tell(OptotuneCommand::GoTo { x, y })?;
+        self.light(point.light > 0)
+    }
+
+    fn release(&mut self) -> Result<(), DeviceError> {
+        self.light(false)
+    }
+}
+
+/// An MR-E-2.
+pub struct Optotune(PointMirror<OptotuneLine>);
+
+impl Optotune {
+    /// Opens the controller. A mirror that a crashed process has left somewhere is parked first.
+    ///
+    /// # Errors
+    /// `Busy`, `Disconnected`, `Timeout`, `Protocol`.
+    pub fn open(config: OptotuneConfig, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
+        let OptotuneConfig { port, laser_port, limits, state, light } = config;
+        let reach = Reach::Optotune { port: port.clone(), laser_port };
+        let mirror = PointMirror::open(&state, limits, light, reach, || {
+            let mut line = OptotuneLine::open(&port, laser)?;
+            line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
+            Ok((line, "Optotune MR-E-2".into()))
+        })?;
+        Ok(Self(mirror))
+    }
+}
+
+impl Mirror for Optotune {
+    fn capabilities(&self) -> &MirrorCapabilities {
+        self.0.capabilities()
+    }
+    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
+        self.0.load(path)
+    }
+    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
+        self.0.start(batches)
+    }
+    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
+        self.0.feed()
+    }
+    fn park(&mut self) -> Result<(), DeviceError> {
+        self.0.park()
+    }
+}
+
+/// A laser that nobody but the lab can reach.
+struct NoLaser;
+
+impl Laser for NoLaser {
+    fn switch(&mut self, _: bool) -> Result<(), DeviceError> {
+        Ok(())
+    }
+}
+
+/// Parks a mirror that a process has left behind.
+pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
+    let Reach::Optotune { port, laser_port } = &state.reach else { return Ok(None) };
+    let laser: Box<dyn Laser> = match laser_port {
+        Some(port) => Box::new(RtsLaser::open(port)?),
+        None => Box::new(NoLaser),
+    };
+    points::recover(&mut OptotuneLine::open(port, laser)?, state, sent)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn commands_and_replies_are_the_documented_lines() {
+        let text = |command: OptotuneCommand| {
+            let mut out = Vec::new();
+            command.to_bytes(&mut out);
+            String::from_utf8(out).unwrap()
+        };
+        assert_eq!(text(OptotuneCommand::Start), "START\r\n");
+        assert_eq!(text(OptotuneCommand::GoTo { x: 0.25, y: -1.0 }), "XY=0.25000;-1.00000\r\n");
+        assert_eq!(parse_optotune(b"OK\r\nNO"), Parsed::Reply { reply: OptotuneReply::Ok, used: 4 });
+        assert_eq!(parse_optotune(b"OL\r\n"), Parsed::Reply { reply: OptotuneReply::TooLow, used: 4 });
+        assert_eq!(parse_optotune(b"xOU\r\n"), Parsed::Garbage { used: 1 });
+        assert_eq!(parse_optotune(b"maybe\r\n"), Parsed::Garbage { used: 7 });
+        assert_eq!(parse_optotune(b"O"), Parsed::Incomplete);
+    }
+}

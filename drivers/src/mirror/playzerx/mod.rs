@@ -1,0 +1,382 @@
+//! The driver of Mirrorcle's PlayzerX: streams samples into the controller's FIFO.
+//!
+//! FIFO accounting: one question `g` for the samples left is on the wire at a time. The controller takes its input in
+//! order, so its answer counts every sample that was sent before the question, and the FIFO holds at most that many plus
+//! those sent since: the bound that keeps it from overfilling. Samples played = sent before the question - left.
+
+pub mod protocol;
+mod stream;
+
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use raysweep_core::{
+    DeviceError, DeviceErrorKind, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath,
+    MirrorProgress, Tilt,
+};
+
+use self::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, parse_response};
+use self::stream::Stream;
+use super::light::LightGuard;
+use super::park::park_left;
+use super::port::{Port, fault};
+use super::sequence::Sequence;
+use super::state::{MirrorState, Reach, Sent, StateFile, of_state};
+
+/// The controller's baud rate; a virtual serial port ignores it.
+const BAUD: u32 = 921_600;
+/// Rates that the controller takes.
+const RATE_HZ: RangeInclusive<f64> = 50.0..=50_000.0;
+/// How long an answer may take.
+const REPLY_WAIT: Duration = Duration::from_millis(300);
+/// How often the light's permission is looked at.
+const LIGHT_CHECK: Duration = Duration::from_millis(50);
+/// Longest time to wait for whoever drives the mirror to let go of it.
+const LOCK_WAIT: Duration = Duration::from_secs(1);
+/// How far the rate that the controller keeps may be from the one it was given; measuring it takes as much.
+const RATE_TOLERANCE: f64 = 0.03;
+
+/// How the controller is connected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Link {
+    /// Over USB, as a virtual serial port: faster than any rate needs.
+    VirtualCom,
+    /// Over a UART at 921,600 baud: 10 bits a byte, 9 bytes a sample, 10,240 samples/s at most.
+    Uart,
+}
+
+/// Which PlayzerX, and what it may do.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlayzerXConfig {
+    /// Its serial port.
+    pub port: PathBuf,
+    /// How it is connected.
+    pub link: Link,
+    /// Tilt of the mirror at the controller's full scale.
+    pub full_scale: MechanicalDeg,
+    /// What its mirror survives.
+    pub limits: MirrorLimits,
+    /// Where the driver keeps what a crash must not lose.
+    pub state: PathBuf,
+    /// Who permits light.
+    pub light: LightGuard,
+}
+
+/// A PlayzerX.
+pub struct PlayzerX {
+    port: Port,
+    config: PlayzerXConfig,
+    capabilities: MirrorCapabilities,
+    state: StateFile,
+    phase: Phase,
+}
+
+/// Where the mirror is in its life.
+enum Phase {
+    /// At the origin, dark, nothing in the FIFO.
+    Parked,
+    /// Dark on the first point of this path, nothing in the FIFO.
+    Ready(MirrorPath),
+    /// Samples are under way.
+    Moving(Box<Stream>),
+}
+
+impl PlayzerX {
+    /// Opens the controller. A mirror that a crashed process has left somewhere is parked first.
+    ///
+    /// # Errors
+    /// `Busy` when another process has it, `Disconnected` and `Timeout` when it is not there, `Unsupported` when it is
+    /// another device, `NotReady` when it plays samples that nobody here has sent.
+    pub fn open(config: PlayzerXConfig) -> Result<Self, DeviceError> {
+        let state = StateFile::open(&config.state, LOCK_WAIT).map_err(of_state)?;
+        park_left(&state).map_err(|error| fault(DeviceErrorKind::NotReady, error.to_string()))?;
+        let mut port = Port::open(&config.port, BAUD)?;
+        let device = hello(&mut port)?;
+        let left = samples_left(&mut port, REPLY_WAIT)?;
+        if left != Some(0) {
+            return Err(fault(
+                DeviceErrorKind::NotReady,
+                format!(
+                    "the controller at {} has samples to play that this daemon did not send: end the other program, or switch the controller off and on",
+                    config.port.display()
+                ),
+            ));
+        }
+        let top_hz = match config.link {
+            Link::VirtualCom => *RATE_HZ.end(),
+            Link::Uart => f64::from(BAUD / 10) / SAMPLE_BYTES as f64,
+        };
+        let capabilities = MirrorCapabilities {
+            model: device,
+            limits: config.limits,
+            rate_hz: *RATE_HZ.start()..=top_hz,
+            fifo_samples: FIFO_SAMPLES,
+        };
+        Ok(Self { port, config, capabilities, state, phase: Phase::Parked })
+    }
+
+    /// Bytes from the controller so far that made no reply: a measure of the wire's health.
+    pub fn garbage_bytes(&self) -> u64 {
+        self.port.garbage_bytes()
+    }
+
+    fn state(&self, rate_hz: f64, playing: Option<Sequence>) -> Result<MirrorState, DeviceError> {
+        let PlayzerXConfig { port, full_scale, limits, .. } = &self.config;
+        let reach = Reach::PlayzerX { port: port.clone(), full_scale: *full_scale };
+        MirrorState::new(reach, *limits, rate_hz, playing).map_err(of_state)
+    }
+
+    /// Puts a sequence on disk: only then a sample of it may leave.
+    fn record(&self, sequence: &Sequence, rate_hz: f64) -> Result<(), DeviceError> {
+        self.state.write(&self.state(rate_hz, Some(sequence.clone()))?).map_err(of_state)
+    }
+
+    fn stream(&self, sequence: Sequence, rate_hz: f64) -> Box<Stream> {
+        Box::new(Stream::new(sequence, rate_hz, self.config.full_scale))
+    }
+
+    /// Sends a sequence and waits until it is played; at which rate it was.
+    fn play_out(
+        &mut self,
+        sequence: Sequence,
+        rate_hz: f64,
+        recorded: bool,
+    ) -> Result<Option<f64>, DeviceError> {
+        self.phase = Phase::Moving(self.stream(sequence, rate_hz));
+        let Phase::Moving(stream) = &mut self.phase else { return Ok(None) };
+        play_out(stream, &mut self.port, recorded.then_some(&self.state))?;
+        Ok(stream.rate_hz())
+    }
+
+    /// Notes that the mirror is at the origin, dark.
+    fn note_parked(&mut self) -> Result<(), DeviceError> {
+        self.phase = Phase::Parked;
+        self.state.write(&self.state(*RATE_HZ.start(), None)?).map_err(of_state)
+    }
+
+    fn load_fallibly(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
+        let limits = self.config.limits;
+        // The path may have been made for another mirror.
+        let path = MirrorPath::new(path.points().to_vec(), path.rate_hz(), &limits)
+            .map_err(|error| fault(DeviceErrorKind::OutOfRange, error.to_string()))?;
+        let rate_hz = path.rate_hz();
+        if rate_hz.fract() != 0.0 || !self.capabilities.rate_hz.contains(&rate_hz) {
+            let (low, high) = self.capabilities.rate_hz.clone().into_inner();
+            return Err(fault(
+                DeviceErrorKind::OutOfRange,
+                format!(
+                    "rate_hz = {rate_hz}: the controller takes whole numbers from {low} to {high:.0} over this link"
+                ),
+            ));
+        }
+        if path
+            .points()
+            .iter()
+            .any(|point| point.tilt.deg().iter().any(|deg| deg.abs() > self.config.full_scale.0))
+        {
+            return Err(fault(
+                DeviceErrorKind::OutOfRange,
+                format!("the path goes beyond full_scale = {} degrees", self.config.full_scale.0),
+            ));
+        }
+        let mut set_rate = Vec::new();
+        Command::SetRate(rate_hz as u32).to_bytes(&mut set_rate);
+        self.port.send(&set_rate)?;
+        let sequence = Sequence::approach(Tilt::ORIGIN, path.at(0).tilt, rate_hz, &limits);
+        self.record(&sequence, rate_hz)?;
+        let actual_hz = self.play_out(sequence, rate_hz, true)?.unwrap_or(rate_hz);
+        if (actual_hz / rate_hz - 1.0).abs() > RATE_TOLERANCE {
+            return Err(fault(
+                DeviceErrorKind::OutOfRange,
+                format!(
+                    "rate_hz = {rate_hz}: the controller plays {actual_hz:.0} samples/s instead; take a rate that it keeps"
+                ),
+            ));
+        }
+        self.phase = Phase::Ready(path);
+        Ok(actual_hz)
+    }
+
+    fn feed_fallibly(&mut self) -> Result<MirrorProgress, DeviceError> {
+        let Phase::Moving(stream) = &mut self.phase else {
+            return Err(fault(
+                DeviceErrorKind::NotReady,
+                "nothing is being played: load a path and start it",
+            ));
+        };
+        if stream.has_light() && stream.light_checked.elapsed() >= LIGHT_CHECK {
+            self.config.light.permits().map_err(|no| fault(DeviceErrorKind::NotReady, no.to_string()))?;
+            stream.light_checked = Instant::now();
+        }
+        stream.step(&mut self.port, Some(&self.state))?;
+        let mut progress = stream.progress();
+        if stream.is_played() {
+            self.note_parked()?;
+            progress.parked = true;
+        }
+        Ok(progress)
+    }
+
+    /// Parks after an error, and says what went wrong first.
+    fn park_after(&mut self, error: DeviceError) -> DeviceError {
+        if let Err(second) = self.park() {
+            tracing::error!(error = %second, "the mirror could not be parked");
+        }
+        error
+    }
+}
+
+impl Mirror for PlayzerX {
+    fn capabilities(&self) -> &MirrorCapabilities {
+        &self.capabilities
+    }
+
+    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
+        self.park()?;
+        self.load_fallibly(path).map_err(|error| self.park_after(error))
+    }
+
+    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
+        let Phase::Ready(path) = &self.phase else {
+            return Err(fault(DeviceErrorKind::NotReady, "no path is loaded: load one before each start"));
+        };
+        if batches == 0 {
+            return Err(fault(DeviceErrorKind::OutOfRange, "batches = 0: play the path once at least"));
+        }
+        if path.is_lit() {
+            self.config.light.permits().map_err(|no| fault(DeviceErrorKind::NotReady, no.to_string()))?;
+        }
+        let rate_hz = path.rate_hz();
+        let sequence = Sequence::play(path, batches, &self.config.limits);
+        self.record(&sequence, rate_hz).map_err(|error| self.park_after(error))?;
+        self.phase = Phase::Moving(self.stream(sequence, rate_hz));
+        Ok(())
+    }
+
+    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
+        self.feed_fallibly().map_err(|error| self.park_after(error))
+    }
+
+    fn park(&mut self) -> Result<(), DeviceError> {
+        let (place, rate_hz) = match &mut self.phase {
+            Phase::Parked => return Ok(()),
+            Phase::Ready(path) => (path.at(0).tilt, path.rate_hz()),
+            Phase::Moving(stream) => (stream.halt(&mut self.port)?, stream.asked_rate_hz()),
+        };
+        darken(&mut self.port, place, self.config.full_scale)?;
+        let sequence = Sequence::travel(place, Tilt::ORIGIN, rate_hz, &self.config.limits);
+        // A disk that is full keeps no mirror from being parked.
+        let recorded = self.record(&sequence, rate_hz);
+        self.play_out(sequence, rate_hz, recorded.is_ok())?;
+        self.note_parked().and(recorded)
+    }
+}
+
+impl Drop for PlayzerX {
+    fn drop(&mut self) {
+        if let Err(error) = self.park() {
+            tracing::error!(%error, "the mirror could not be parked");
+        }
+    }
+}
+
+/// Ends what a broken-off write may have left on the wire, and asks who is there.
+fn hello(port: &mut Port) -> Result<String, DeviceError> {
+    let mut bytes = PADDING.to_vec();
+    Command::SetReport(0).to_bytes(&mut bytes);
+    Command::Info.to_bytes(&mut bytes);
+    for _ in 0..3 {
+        port.send(&bytes)?;
+        let info = port.await_reply(REPLY_WAIT, parse_response, |reply| match reply {
+            Reply::Info { device, firmware, format } => Some((device, firmware, format)),
+            _ => None,
+        })?;
+        match info {
+            Some((device, firmware, format)) if format == "XYM" => {
+                return Ok(format!("{device}, firmware {firmware}"));
+            }
+            Some((device, _, format)) => {
+                return Err(fault(
+                    DeviceErrorKind::Unsupported,
+                    format!("{device} takes {format}: this driver drives monochrome controllers (XYM)"),
+                ));
+            }
+            None => {}
+        }
+    }
+    Err(fault(
+        DeviceErrorKind::Timeout,
+        "no PlayzerX answers: check the rig file's port and the controller's power",
+    ))
+}
+
+/// Asks until an answer comes, `timeout` each time, three times at most.
+fn samples_left(port: &mut Port, timeout: Duration) -> Result<Option<u32>, DeviceError> {
+    let mut question = Vec::new();
+    Command::SamplesLeft.to_bytes(&mut question);
+    for _ in 0..3 {
+        port.send(&question)?;
+        if let Some(left) = port.await_reply(timeout, parse_response, left_of)? {
+            return Ok(Some(left));
+        }
+    }
+    Ok(None)
+}
+
+fn left_of(reply: Reply) -> Option<u32> {
+    match reply {
+        Reply::Left(left) => Some(left),
+        _ => None,
+    }
+}
+
+/// Light off where the mirror stands. The FIFO is empty, so the sample is played at once.
+fn darken(port: &mut Port, place: Tilt, full_scale: MechanicalDeg) -> Result<(), DeviceError> {
+    let mut bytes = Vec::new();
+    let point = raysweep_core::MirrorPoint { tilt: place, light: 0 };
+    Command::Sample(protocol::Sample::of(point, full_scale)).to_bytes(&mut bytes);
+    port.send(&bytes)
+}
+
+/// Parks a mirror that a process has left behind. Returns where it was found; `None` if that could not be known and the
+/// controller was started anew instead.
+pub(super) fn recover(
+    file: &StateFile,
+    state: &MirrorState,
+    sent: Sent,
+) -> Result<Option<Tilt>, DeviceError> {
+    let (Reach::PlayzerX { port, full_scale }, Some(sequence)) = (&state.reach, &state.playing) else {
+        return Ok(None);
+    };
+    let mut port = Port::open(port, BAUD)?;
+    let left = if state.is_of_this_boot() { stream::halt(&mut port, 0)? } else { None };
+    let Some(left) = left else {
+        // The light and the drive go off with the controller; the mirror springs back through the drive's own filter.
+        let mut bytes = PADDING.to_vec();
+        Command::Reset.to_bytes(&mut bytes);
+        port.send(&bytes)?;
+        return Ok(None);
+    };
+    // Where the process died within a write, the middle of what may have left is within a write of the truth.
+    let gone = u64::midpoint(sent.certainly, sent.possibly);
+    let place = sequence.after(gone.saturating_sub(u64::from(left)));
+    darken(&mut port, place, *full_scale)?;
+    let sequence = Sequence::travel(place, Tilt::ORIGIN, state.rate_hz, &state.limits);
+    let travelling = MirrorState { playing: Some(sequence.clone()), ..state.clone() };
+    file.write(&travelling).map_err(of_state)?;
+    let mut stream = Stream::new(sequence, state.rate_hz, *full_scale);
+    play_out(&mut stream, &mut port, Some(file))?;
+    Ok(Some(place))
+}
+
+/// Sends and reads until all samples are played.
+fn play_out(stream: &mut Stream, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
+    loop {
+        stream.step(port, record)?;
+        if stream.is_played() {
+            return Ok(());
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}

@@ -1,0 +1,308 @@
+//! One sequence on its way into the controller's FIFO.
+
+use std::time::{Duration, Instant};
+
+use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorProgress, Tilt};
+
+use super::REPLY_WAIT;
+use super::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, Sample, parse_response};
+use crate::mirror::port::{Port, fault};
+use crate::mirror::sequence::Sequence;
+use crate::mirror::state::{Sent, StateFile, of_state};
+
+/// Samples in one write: what may be uncertain after a crash, 1.6 ms at 39,000 samples/s, less than any mirror's filter
+/// lets through.
+const WRITE_SAMPLES: u64 = 64;
+/// Writes in one step, so that the caller comes back to look at its other duties.
+const WRITES_PER_STEP: usize = 64;
+/// Room that is never used, should the controller keep some of its FIFO for itself [A].
+const SPARE_SAMPLES: u64 = 1000;
+/// How often the controller is asked how many samples are left.
+const ASK_EVERY: Duration = Duration::from_millis(10);
+/// Answers that took longer say too little about when they were true.
+const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
+/// How long a controller may stand still before it takes an order.
+const HALT_WAIT: Duration = Duration::from_secs(1);
+/// How long after an answer to wait for the others that were asked for with it.
+const QUIET: Duration = Duration::from_millis(3);
+/// How many times the place is asked for: an answer may be lost in garbage, and the FIFO can be emptied only once.
+const QUESTIONS: usize = 3;
+
+/// A sequence being played.
+pub struct Stream {
+    sequence: Sequence,
+    asked_rate_hz: f64,
+    full_scale: MechanicalDeg,
+    /// What is being written: samples from `certain` to `next`, then perhaps a question.
+    out: Vec<u8>,
+    written: usize,
+    /// Samples that are wholly on the wire, before `out`.
+    certain: u64,
+    next: u64,
+    /// When it was asked, and the samples sent before.
+    question: Option<(Instant, u64)>,
+    asked: Instant,
+    /// Samples sent before the question that was answered last, and how many of them were left.
+    answer: (u64, u64),
+    played: u64,
+    moved: Instant,
+    began: Option<Instant>,
+    rate: RateFit,
+    /// When the light's permission was looked at last.
+    pub light_checked: Instant,
+}
+
+impl Stream {
+    /// To be called with an empty FIFO.
+    pub fn new(sequence: Sequence, rate_hz: f64, full_scale: MechanicalDeg) -> Self {
+        let now = Instant::now();
+        Self {
+            sequence,
+            asked_rate_hz: rate_hz,
+            full_scale,
+            out: Vec::with_capacity(2 * WRITE_SAMPLES as usize * SAMPLE_BYTES),
+            written: 0,
+            certain: 0,
+            next: 0,
+            question: None,
+            asked: now,
+            answer: (0, 0),
+            played: 0,
+            moved: now,
+            began: None,
+            rate: RateFit::default(),
+            light_checked: now,
+        }
+    }
+
+    /// Reads what has come and sends what there is room for; notes in `record` what was sent.
+    pub fn step(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
+        while let Some(reply) = port.reply(parse_response)? {
+            if let Reply::Left(left) = reply {
+                self.take_answer(u64::from(left))?;
+            }
+        }
+        for _ in 0..WRITES_PER_STEP {
+            if self.written == self.out.len() && !self.fill() {
+                break;
+            }
+            if !self.write(port, record)? {
+                break;
+            }
+        }
+        self.check_life()
+    }
+
+    /// Puts the next samples and questions into `out`; `false` if there is nothing to send now.
+    fn fill(&mut self) -> bool {
+        self.out.clear();
+        self.written = 0;
+        let (asked_after, left) = self.answer;
+        let held_at_most = left + (self.next - asked_after);
+        let room = (u64::from(FIFO_SAMPLES) - SPARE_SAMPLES).saturating_sub(held_at_most);
+        let samples = room.min(WRITE_SAMPLES).min(self.sequence.len() - self.next);
+        for index in self.next..self.next + samples {
+            let sample = Sample::of(self.sequence.at(index), self.full_scale);
+            Command::Sample(sample).to_bytes(&mut self.out);
+        }
+        self.next += samples;
+        if self.question.is_none() && self.asked.elapsed() >= ASK_EVERY {
+            Command::SamplesLeft.to_bytes(&mut self.out);
+        }
+        !self.out.is_empty()
+    }
+
+    /// Writes of `out` what the port takes; `false` if it takes no more now.
+    fn write(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<bool, DeviceError> {
+        let note = |sent| record.map_or(Ok(()), |record| record.note_sent(sent).map_err(of_state));
+        note(Sent { certainly: self.certain_now(), possibly: self.next })?;
+        let written = port.write_some(&self.out[self.written..])?;
+        self.written += written;
+        if self.began.is_none() && written > 0 {
+            (self.began, self.moved) = (Some(Instant::now()), Instant::now());
+        }
+        if self.written < self.out.len() {
+            return Ok(false);
+        }
+        let samples = self.next - self.certain;
+        if self.out.len() > samples as usize * SAMPLE_BYTES {
+            self.asked = Instant::now();
+            self.question = Some((self.asked, self.next));
+        }
+        self.certain = self.next;
+        note(Sent { certainly: self.certain, possibly: self.certain })?;
+        Ok(true)
+    }
+
+    /// Samples that are wholly on the wire, those of a broken-off write too.
+    fn certain_now(&self) -> u64 {
+        (self.certain + (self.written / SAMPLE_BYTES) as u64).min(self.next)
+    }
+
+    fn take_answer(&mut self, left: u64) -> Result<(), DeviceError> {
+        // An answer to nothing, or one that cannot be true, is garbage that looks like an answer.
+        let Some((asked, sent)) = self.question else { return Ok(()) };
+        let possible =
+            self.began.map_or(0.0, |began| began.elapsed().as_secs_f64()) * self.asked_rate_hz * 1.1 + 2.0;
+        let Some(played) =
+            sent.checked_sub(left).filter(|&played| played >= self.played && played as f64 <= possible)
+        else {
+            return Ok(());
+        };
+        self.question = None;
+        self.answer = (sent, left);
+        if played > self.played {
+            self.moved = Instant::now();
+        }
+        self.played = played;
+        if left > 0 && asked.elapsed() <= LONGEST_ROUND_TRIP {
+            let began = self.began.unwrap_or(asked);
+            let seconds = (asked.duration_since(began) + asked.elapsed() / 2).as_secs_f64();
+            self.rate.push(seconds, played as f64);
+        }
+        let lead = self.sequence.lead_len();
+        if left == 0 && self.sequence.path_len() > 0 && sent > lead && sent < self.sequence.len() {
+            return Err(fault(
+                DeviceErrorKind::Protocol,
+                format!(
+                    "the controller ran out of samples after {played}: the host was too slow; end other work on it or take a lower rate_hz"
+                ),
+            ));
+        }
+        Ok(())
+    }
+
+    /// A controller that does not answer, or whose FIFO does not drain, does not move the mirror.
+    fn check_life(&self) -> Result<(), DeviceError> {
+        if self.question.is_some_and(|(asked, _)| asked.elapsed() > REPLY_WAIT) {
+            return Err(fault(
+                DeviceErrorKind::Timeout,
+                "the controller no longer answers: check its cable, or switch it off and on",
+            ));
+        }
+        let waiting = self.began.is_some() && self.played < self.certain;
+        if waiting && self.moved.elapsed() > REPLY_WAIT {
+            return Err(fault(
+                DeviceErrorKind::Timeout,
+                format!(
+                    "the controller confirms no motion: it stands after {} samples; switch it off and on",
+                    self.played
+                ),
+            ));
+        }
+        Ok(())
+    }
+
+    /// Empties the FIFO. Where the mirror stands then: as the controller says, or, if its answers are lost, as
+    /// the clock does.
+    pub fn halt(&mut self, port: &mut Port) -> Result<Tilt, DeviceError> {
+        let certain = self.certain_now();
+        let unanswered = usize::from(self.question.is_some());
+        let seconds = self.moved.elapsed().as_secs_f64();
+        let left = halt(port, unanswered)?;
+        let played = match left {
+            Some(left) => certain.saturating_sub(u64::from(left)),
+            None => {
+                let rate_hz = self.rate.rate_hz().unwrap_or(self.asked_rate_hz);
+                (self.played + (seconds * rate_hz) as u64).min(certain)
+            }
+        };
+        Ok(self.sequence.after(played))
+    }
+
+    pub fn is_played(&self) -> bool {
+        self.played == self.sequence.len()
+    }
+
+    pub fn has_light(&self) -> bool {
+        self.sequence.is_lit()
+    }
+
+    pub fn asked_rate_hz(&self) -> f64 {
+        self.asked_rate_hz
+    }
+
+    /// The rate at which the FIFO drains.
+    pub fn rate_hz(&self) -> Option<f64> {
+        self.rate.rate_hz()
+    }
+
+    pub fn progress(&self) -> MirrorProgress {
+        MirrorProgress {
+            played: self.sequence.of_path(self.played),
+            sent: self.sequence.of_path(self.certain),
+            total: self.sequence.path_len(),
+            parked: false,
+            rate_hz: self.rate.rate_hz(),
+        }
+    }
+}
+
+/// Empties the FIFO; how many samples it held just before, if the controller says so. `unanswered` questions are still
+/// on their way.
+///
+/// A controller that says nothing at all has not taken the order yet, so there is time to wait for it; one that answers
+/// the ping behind the questions has taken them, and its answers are lost.
+pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
+    let mut bytes = PADDING.to_vec();
+    (0..QUESTIONS).for_each(|_| Command::SamplesLeft.to_bytes(&mut bytes));
+    Command::Clear.to_bytes(&mut bytes);
+    Command::Ping.to_bytes(&mut bytes);
+    port.send(&bytes)?;
+    let (mut answers, mut last) = (0, None);
+    loop {
+        // The last answer is the one nearest to the clearing.
+        let known = last.filter(|_| answers > unanswered);
+        let wait = if known.is_some() { QUIET } else { HALT_WAIT };
+        match port.await_reply(wait, parse_response, Some)? {
+            Some(Reply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
+            Some(Reply::Info { .. }) => {}
+            Some(Reply::Alive) | None => return Ok(known),
+        }
+    }
+}
+
+/// A straight line through (seconds, samples).
+#[derive(Debug, Default)]
+struct RateFit {
+    count: f64,
+    seconds: f64,
+    samples: f64,
+    seconds_squared: f64,
+    product: f64,
+}
+
+impl RateFit {
+    /// Fewer points make no rate.
+    const FEWEST: f64 = 8.0;
+
+    fn push(&mut self, seconds: f64, samples: f64) {
+        self.count += 1.0;
+        self.seconds += seconds;
+        self.samples += samples;
+        self.seconds_squared += seconds * seconds;
+        self.product += seconds * samples;
+    }
+
+    fn rate_hz(&self) -> Option<f64> {
+        let spread = self.count * self.seconds_squared - self.seconds * self.seconds;
+        (self.count >= Self::FEWEST && spread > 0.0)
+            .then(|| (self.count * self.product - self.seconds * self.samples) / spread)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rate_is_the_slope_of_its_points() {
+        let mut fit = RateFit::default();
+        for n in 0..20 {
+            assert_eq!(fit.rate_hz().is_some(), n >= 8);
+            let seconds = f64::from(n) * 0.01;
+            fit.push(seconds, 39_000.0 * seconds + 17.0);
+        }
+        assert!((fit.rate_hz().unwrap() - 39_000.0).abs() < 1e-6);
+    }
+}

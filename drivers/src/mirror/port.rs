@@ -1,0 +1,147 @@
+//! A serial port to a mirror's controller.
+
+use std::io::{self, Read, Write};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use raysweep_core::{DeviceError, DeviceErrorKind};
+use serialport::{DataBits, FlowControl, Parity, SerialPort, StopBits, TTYPort};
+
+use super::wire::{Parsed, Receiver};
+
+/// How long one call waits for the port to take bytes: a feeding loop must come back to read.
+const WRITE_WAIT: Duration = Duration::from_millis(5);
+/// How long the port's other end may take no byte at all before a whole message is given up.
+const SEND_WAIT: Duration = Duration::from_millis(500);
+
+/// An error of the mirror.
+pub(super) fn fault(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
+    DeviceError::new("mirror", kind, what.into())
+}
+
+/// An open port, exclusively ours, and what came over it.
+pub(super) struct Port {
+    tty: TTYPort,
+    name: String,
+    received: Receiver,
+}
+
+impl Port {
+    /// Opens it, 8N1 without flow control.
+    pub fn open(path: &Path, baud: u32) -> Result<Self, DeviceError> {
+        let name = path.display().to_string();
+        let tty = serialport::new(&name, baud)
+            .data_bits(DataBits::Eight)
+            .parity(Parity::None)
+            .stop_bits(StopBits::One)
+            .flow_control(FlowControl::None)
+            .timeout(WRITE_WAIT)
+            .open_native()
+            .map_err(|error| {
+                let kind = match error.kind() {
+                    serialport::ErrorKind::NoDevice => DeviceErrorKind::Disconnected,
+                    serialport::ErrorKind::Io(io::ErrorKind::NotFound) => DeviceErrorKind::Disconnected,
+                    serialport::ErrorKind::Io(io::ErrorKind::ResourceBusy) => DeviceErrorKind::Busy,
+                    _ => DeviceErrorKind::NotReady,
+                };
+                fault(kind, format!("cannot open {name}: {error}: check the cable, the rig file's port, and who else has it open"))
+            })?;
+        Ok(Self { tty, name, received: Receiver::default() })
+    }
+
+    /// Writes what the port takes now; how much that was.
+    pub fn write_some(&mut self, bytes: &[u8]) -> Result<usize, DeviceError> {
+        match self.tty.write(bytes) {
+            Ok(written) => Ok(written),
+            Err(error) if is_passing(&error) => Ok(0),
+            Err(error) => Err(self.lost(&error)),
+        }
+    }
+
+    /// Writes all of it.
+    pub fn send(&mut self, mut bytes: &[u8]) -> Result<(), DeviceError> {
+        let mut last = Instant::now();
+        while !bytes.is_empty() {
+            let written = self.write_some(bytes)?;
+            bytes = &bytes[written..];
+            if written > 0 {
+                last = Instant::now();
+            } else if last.elapsed() > SEND_WAIT {
+                return Err(fault(
+                    DeviceErrorKind::Timeout,
+                    format!("{} takes no bytes: the controller hangs; switch it off and on", self.name),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// The next reply that is there, without waiting.
+    pub fn reply<R>(&mut self, parse: impl Fn(&[u8]) -> Parsed<R>) -> Result<Option<R>, DeviceError> {
+        let mut buffer = [0; 1024];
+        loop {
+            let waiting = self.tty.bytes_to_read().map_err(|error| self.lost(&error.into()))?;
+            if waiting == 0 {
+                return Ok(self.received.next(&parse));
+            }
+            let wanted = buffer.len().min(waiting as usize);
+            match self.tty.read(&mut buffer[..wanted]) {
+                Ok(0) => return Err(self.lost(&io::ErrorKind::BrokenPipe.into())),
+                Ok(read) => self.received.push(&buffer[..read]),
+                Err(error) if is_passing(&error) => {}
+                Err(error) => return Err(self.lost(&error)),
+            }
+            if let Some(reply) = self.received.next(&parse) {
+                return Ok(Some(reply));
+            }
+        }
+    }
+
+    /// The next reply that `pick` takes; `None` when it does not come within `timeout`.
+    pub fn await_reply<R, T>(
+        &mut self,
+        timeout: Duration,
+        parse: impl Fn(&[u8]) -> Parsed<R>,
+        mut pick: impl FnMut(R) -> Option<T>,
+    ) -> Result<Option<T>, DeviceError> {
+        let deadline = Instant::now() + timeout;
+        loop {
+            while let Some(reply) = self.reply(&parse)? {
+                if let Some(picked) = pick(reply) {
+                    return Ok(Some(picked));
+                }
+            }
+            if Instant::now() >= deadline {
+                return Ok(None);
+            }
+            std::thread::sleep(Duration::from_micros(200));
+        }
+    }
+
+    /// Bytes so far that belonged to no reply.
+    pub fn garbage_bytes(&self) -> u64 {
+        self.received.garbage_bytes()
+    }
+
+    /// Sets the modem line RTS.
+    pub fn set_rts(&mut self, on: bool) -> Result<(), DeviceError> {
+        self.tty.write_request_to_send(on).map_err(|error| self.lost(&error.into()))
+    }
+
+    fn lost(&self, error: &io::Error) -> DeviceError {
+        fault(
+            DeviceErrorKind::Disconnected,
+            format!("{}: {error}: the controller is gone; check its cable and its power", self.name),
+        )
+    }
+}
+
+fn is_passing(error: &io::Error) -> bool {
+    let again = error.raw_os_error() == Some(Errno::EAGAIN as i32);
+    again
+        || matches!(
+            error.kind(),
+            io::ErrorKind::TimedOut | io::ErrorKind::Interrupted | io::ErrorKind::WouldBlock
+        )
+}

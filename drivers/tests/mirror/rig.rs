@@ -1,0 +1,143 @@
+//! A simulated mirror on a pseudo-terminal, and a folder for its driver's state.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use raysweep_core::{Mirror, MirrorLimits, MirrorPath, MirrorProgress, Tilt};
+use raysweep_drivers::mirror::playzerx::protocol::Sample;
+use raysweep_drivers::mirror::{self, LightGuard, PlayzerX, arm_light};
+use raysweep_sim::mirror::{
+    Held, Link, MechanicsConfig, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults,
+};
+use tempfile::TempDir;
+
+pub const RATE_HZ: f64 = 39_000.0;
+pub const LIMITS: MirrorLimits = MirrorLimits::A7B2_3_3600AL;
+
+/// A batch of the flying-dot rig, 6500 samples.
+pub fn batch() -> MirrorPath {
+    let scan = raysweep_core::RasterScan { amplitude: Tilt::new(2.3, 1.3), lines: 40, flyback: 0.1 };
+    MirrorPath::raster(&scan, 6500, RATE_HZ, &LIMITS).unwrap()
+}
+
+pub struct Rig {
+    pub pty: MirrorPty,
+    pub folder: TempDir,
+}
+
+impl Rig {
+    pub fn playzerx(config: PlayzerXConfig, faults: WireFaults) -> Self {
+        let pty = MirrorPty::plug(PlayzerXController::new(config), Link::VirtualCom, faults).unwrap();
+        Self { pty, folder: tempfile::tempdir().unwrap() }
+    }
+
+    pub fn good() -> Self {
+        Self::playzerx(PlayzerXConfig::default(), WireFaults::default())
+    }
+
+    pub fn state(&self) -> PathBuf {
+        self.folder.path().join("mirror.json")
+    }
+
+    /// A guard whose light an operator has armed.
+    pub fn armed(&self) -> LightGuard {
+        let guard = LightGuard { armed_file: self.folder.path().join("armed"), interlock: None };
+        arm_light(&guard.armed_file).unwrap();
+        guard
+    }
+
+    pub fn config(&self) -> mirror::PlayzerXConfig {
+        mirror::PlayzerXConfig {
+            port: self.pty.path().to_owned(),
+            link: mirror::Link::VirtualCom,
+            full_scale: MechanicsConfig::default().max_tilt,
+            limits: LIMITS,
+            state: self.state(),
+            light: self.armed(),
+        }
+    }
+
+    pub fn open(&self) -> PlayzerX {
+        PlayzerX::open(self.config()).unwrap()
+    }
+
+    /// Waits until the controller has played so many samples with light.
+    pub fn await_light(&self, samples: usize) {
+        let deadline = Instant::now() + Duration::from_secs(30);
+        while self.pty.look(|truth| truth.held.iter().filter(|held| held.light > 0).count()) < samples {
+            assert!(Instant::now() < deadline, "no light after 30 s");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// Waits until the mirror is parked, with the light off before, and without a step on the way; says when.
+    pub fn assert_parked(&self) -> Timing {
+        let deadline = Instant::now() + Duration::from_secs(10);
+        loop {
+            let parked = self.pty.look(|truth| truth.parked_since_ns.zip(truth.dark_since_ns));
+            if let Some((parked_ns, dark_ns)) = parked {
+                assert!(dark_ns <= parked_ns);
+                break;
+            }
+            assert!(Instant::now() < deadline, "not parked after 10 s");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let truth = self.pty.truth();
+        let step = largest_step(&truth.held);
+        // Two codes: the rounding of both ends.
+        let allowed = LIMITS.max_step.0 / 6.5 * 2047.0 + 2.0;
+        assert!(step <= allowed, "a step of {step} codes, {allowed} are allowed");
+        assert_eq!(truth.overfills, 0);
+        Timing {
+            dark_ns: truth.dark_since_ns.unwrap(),
+            parked_ns: truth.parked_since_ns.unwrap(),
+            largest_step: step,
+        }
+    }
+}
+
+/// When, on the host's monotonic clock.
+pub struct Timing {
+    pub dark_ns: i64,
+    pub parked_ns: i64,
+    /// From one output to the next, in the wire's units.
+    pub largest_step: f64,
+}
+
+impl Timing {
+    pub fn print(&self, way: &str, since_ns: i64) -> &Self {
+        let ms = |ns: i64| (ns - since_ns) as f64 / 1e6;
+        let (dark_ms, parked_ms) = (ms(self.dark_ns), ms(self.parked_ns));
+        println!(
+            "{way}: light off after {dark_ms:.1} ms, parked after {parked_ms:.1} ms, largest step {}",
+            self.largest_step
+        );
+        self
+    }
+}
+
+pub fn largest_step(held: &[Held]) -> f64 {
+    held.windows(2)
+        .map(|pair| (pair[1].x - pair[0].x).abs().max((pair[1].y - pair[0].y).abs()))
+        .fold(0.0, f64::max)
+}
+
+/// A path's samples as the controller should hold them.
+pub fn codes(path: &MirrorPath) -> Vec<Held> {
+    path.points()
+        .iter()
+        .map(|point| Sample::of(*point, MechanicsConfig::default().max_tilt))
+        .map(|Sample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
+        .collect()
+}
+
+/// Feeds until the path is at its end.
+pub fn play(mirror: &mut dyn Mirror) -> MirrorProgress {
+    loop {
+        let progress = mirror.feed().unwrap();
+        if progress.parked {
+            return progress;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}

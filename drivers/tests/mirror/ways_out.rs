@@ -1,0 +1,283 @@
+//! Every way out leaves the mirror parked and the light off. How long it took is printed.
+
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::ExitStatusExt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use raysweep_core::{Clock, DeviceErrorKind, Mirror};
+use raysweep_drivers::mirror::{
+    self, Guardian, LightGuard, Mti, ParkError, Parked, PlayzerX, StateError, arm_light, park,
+    park_when_closed,
+};
+use raysweep_sim::mirror::{Held, PlayzerXConfig, WireFaults};
+
+use crate::points::{circle, mti_config, mti_rig};
+use crate::rig::{LIMITS, Rig, batch, codes, largest_step};
+
+/// A mirror in the middle of a path.
+fn playing(rig: &Rig) -> PlayzerX {
+    let mut mirror = rig.open();
+    mirror.load(&batch()).unwrap();
+    mirror.start(1000).unwrap();
+    for _ in 0..300 {
+        mirror.feed().unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    mirror
+}
+
+fn now_ns() -> i64 {
+    Clock::real().now_ns()
+}
+
+#[test]
+fn stop_and_drop() {
+    let rig = Rig::good();
+    let mut mirror = playing(&rig);
+    let since_ns = now_ns();
+    mirror.park().unwrap();
+    rig.assert_parked().print("stop", since_ns);
+    drop(mirror);
+    let mirror = playing(&rig);
+    let since_ns = now_ns();
+    drop(mirror);
+    rig.assert_parked().print("drop (an error or a cancelled run)", since_ns);
+}
+
+#[test]
+fn panic() {
+    let rig = Rig::good();
+    let mirror = playing(&rig);
+    let since_ns = now_ns();
+    let panicked = catch_unwind(AssertUnwindSafe(move || {
+        let _mirror = mirror;
+        panic!("as planned");
+    }));
+    assert!(panicked.is_err());
+    rig.assert_parked().print("panic", since_ns);
+}
+
+#[test]
+fn stop_with_garbage_on_the_wire() {
+    for seed in 0..6 {
+        let faults = WireFaults { seed, garbage: 0.5, stalls: 0.0, stall_ms: 0 };
+        let rig = Rig::playzerx(PlayzerXConfig::default(), faults);
+        let mut mirror = playing(&rig);
+        let since_ns = now_ns();
+        mirror.park().unwrap();
+        let step = rig.assert_parked().print("stop with garbage", since_ns).largest_step;
+        assert!(step <= 2.0 * largest_step(&codes(&batch())), "the ramp begins elsewhere: {step} codes");
+    }
+}
+
+#[test]
+fn stop_of_a_controller_that_stalls() {
+    for seed in 0..6 {
+        let faults = WireFaults { seed, garbage: 0.1, stalls: 0.005, stall_ms: 50 };
+        let rig = Rig::playzerx(PlayzerXConfig::default(), faults);
+        let mut mirror = playing(&rig);
+        let since_ns = now_ns();
+        mirror.park().unwrap();
+        let step = rig.assert_parked().print("stop with stalls", since_ns).largest_step;
+        assert!(step <= 2.0 * largest_step(&codes(&batch())), "the ramp begins elsewhere: {step} codes");
+    }
+}
+
+#[test]
+fn stop_with_a_disk_that_takes_nothing() {
+    let rig = Rig::good();
+    let mut mirror = playing(&rig);
+    std::fs::remove_dir_all(rig.folder.path()).unwrap();
+    let since_ns = now_ns();
+    assert!(mirror.park().is_err(), "what could not be noted is said");
+    rig.assert_parked().print("stop without a disk", since_ns);
+}
+
+#[test]
+fn unplug_and_plug_in_again() {
+    let mut rig = Rig::good();
+    let mut mirror = playing(&rig);
+    let since_ns = now_ns();
+    // The power goes with the plug: the light is off and the mirror springs back.
+    rig.pty.unplug();
+    let error = loop {
+        if let Err(error) = mirror.feed() {
+            break error;
+        }
+        std::thread::sleep(Duration::from_millis(2));
+    };
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
+    println!("unplug: noticed after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
+    drop(mirror);
+    // Its state still says that it was left somewhere, so whoever comes next does not take it for parked.
+    assert!(matches!(park(&rig.state()), Err(ParkError::Device(_))));
+}
+
+/// The process that the tests below end: plays until it is told otherwise.
+#[test]
+#[ignore = "run by the other tests, as a process of its own"]
+fn child() {
+    let Ok(port) = std::env::var("MIRROR_PORT") else { return };
+    let state = std::path::PathBuf::from(std::env::var("MIRROR_STATE").unwrap());
+    let _guardian = std::env::var("MIRROR_GUARDIAN").ok().map(|_| {
+        let mut command = test_process("guardian");
+        command.env("MIRROR_STATE", &state);
+        Guardian::start(command).unwrap()
+    });
+    let light = LightGuard { armed_file: state.with_extension("armed"), interlock: None };
+    arm_light(&light.armed_file).unwrap();
+    let mut mirror: Box<dyn Mirror> = if std::env::var("MIRROR_DRIVER").unwrap() == "mti" {
+        Box::new(Mti::open(mti_config(port.into(), state, light)).unwrap())
+    } else {
+        let config = mirror::PlayzerXConfig {
+            port: port.into(),
+            link: mirror::Link::VirtualCom,
+            full_scale: LIMITS.max_tilt,
+            limits: LIMITS,
+            state,
+            light,
+        };
+        Box::new(PlayzerX::open(config).unwrap())
+    };
+    let path = if mirror.capabilities().fifo_samples == 1 { circle(60) } else { batch() };
+    mirror.load(&path).unwrap();
+    mirror.start(100_000).unwrap();
+    println!("playing");
+    loop {
+        mirror.feed().unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// The guardian's process.
+#[test]
+#[ignore = "run by the other tests, as a process of its own"]
+fn guardian() {
+    let Ok(state) = std::env::var("MIRROR_STATE") else { return };
+    park_when_closed(std::io::stdin(), Path::new(&state)).unwrap();
+}
+
+fn test_process(name: &str) -> Command {
+    let mut command = Command::new(std::env::current_exe().unwrap());
+    command.args(["--exact", &format!("ways_out::{name}"), "--ignored", "--nocapture"]);
+    command
+}
+
+fn start_child(rig: &Rig, driver: &str, guarded: bool) -> Child {
+    let mut command = test_process("child");
+    command
+        .env("MIRROR_DRIVER", driver)
+        .env("MIRROR_PORT", rig.pty.path())
+        .env("MIRROR_STATE", rig.state())
+        .stdout(Stdio::piped());
+    if guarded {
+        command.env("MIRROR_GUARDIAN", "1");
+    }
+    let mut child = command.spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    assert!(lines.any(|line| line.unwrap().contains("playing")), "the child ended early");
+    // What it still says goes nowhere.
+    std::thread::spawn(move || lines.for_each(drop));
+    child
+}
+
+fn end(child: &mut Child, signal: Signal) {
+    kill(Pid::from_raw(child.id().try_into().unwrap()), signal).unwrap();
+    assert_eq!(child.wait().unwrap().signal(), Some(signal as i32));
+}
+
+#[test]
+fn sigkill_then_park() {
+    let rig = Rig::good();
+    // Several times, so that the process dies at different places of the path and of its loop.
+    for round in 0..5 {
+        let held = rig.pty.look(|truth| truth.held.len());
+        let mut child = start_child(&rig, "playzerx", false);
+        rig.await_light(20_000 + 3_000 * round);
+        assert!(matches!(park(&rig.state()), Err(ParkError::State(StateError::Locked { .. }))));
+        let since_ns = now_ns();
+        end(&mut child, Signal::SIGKILL);
+        let parked = park(&rig.state()).unwrap();
+        assert!(matches!(parked, Parked::From(_)), "{parked:?}");
+        rig.assert_parked().print("SIGKILL, then park", since_ns);
+        assert_eq!(park(&rig.state()).unwrap(), Parked::Already);
+        // Up to where it was stopped the path was the path.
+        let truth = rig.pty.truth();
+        let codes = codes(&batch());
+        let lit: Vec<&Held> = truth.held[held..].iter().filter(|held| held.light > 0).collect();
+        assert!(lit.iter().zip(codes.iter().cycle()).all(|(held, code)| **held == *code));
+    }
+}
+
+#[test]
+fn sigkill_of_what_drives_an_mti() {
+    let rig = mti_rig(WireFaults::default());
+    let mut child = start_child(&rig, "mti", false);
+    rig.await_light(30);
+    let since_ns = now_ns();
+    end(&mut child, Signal::SIGKILL);
+    assert!(rig.pty.look(|truth| truth.dark_since_ns.is_none()), "the light is still on");
+    assert!(matches!(park(&rig.state()).unwrap(), Parked::From(_)));
+    rig.assert_parked().print("SIGKILL, MTI, then park", since_ns);
+}
+
+#[test]
+fn sigkill_with_a_guardian() {
+    let rig = Rig::good();
+    let mut child = start_child(&rig, "playzerx", true);
+    rig.await_light(20_000);
+    let since_ns = now_ns();
+    end(&mut child, Signal::SIGKILL);
+    rig.assert_parked().print("SIGKILL, guardian", since_ns);
+    assert_eq!(park(&rig.state()).unwrap(), Parked::Already, "the guardian has noted it");
+}
+
+#[test]
+fn sigterm_without_a_handler_with_a_guardian() {
+    let rig = Rig::good();
+    let mut child = start_child(&rig, "playzerx", true);
+    rig.await_light(20_000);
+    let since_ns = now_ns();
+    end(&mut child, Signal::SIGTERM);
+    rig.assert_parked().print("SIGTERM, guardian", since_ns);
+    assert_eq!(park(&rig.state()).unwrap(), Parked::Already, "the guardian has noted it");
+}
+
+#[test]
+fn the_next_driver_parks_what_the_last_one_left() {
+    let rig = Rig::good();
+    let mut child = start_child(&rig, "playzerx", false);
+    rig.await_light(20_000);
+    let since_ns = now_ns();
+    end(&mut child, Signal::SIGKILL);
+    let mirror = rig.open();
+    rig.assert_parked().print("SIGKILL, next driver", since_ns);
+    drop(mirror);
+}
+
+#[test]
+fn a_state_of_another_boot_is_not_trusted() {
+    let rig = Rig::playzerx(PlayzerXConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
+    let mut child = start_child(&rig, "playzerx", false);
+    rig.await_light(20_000);
+    end(&mut child, Signal::SIGKILL);
+    let text = std::fs::read_to_string(rig.state()).unwrap();
+    let boot_id = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap();
+    let other = text.replace(boot_id.trim(), "00000000-0000-0000-0000-000000000000");
+    std::fs::write(rig.state(), other).unwrap();
+    assert_eq!(park(&rig.state()).unwrap(), Parked::ByReset);
+    std::thread::sleep(Duration::from_millis(50));
+    assert!(rig.pty.look(|truth| truth.parked_since_ns.is_some()));
+}
+
+/// A mirror that has never been moved is parked, and parking it needs no controller.
+#[test]
+fn nothing_to_park() {
+    let folder = tempfile::tempdir().unwrap();
+    assert_eq!(park(&folder.path().join("mirror.json")).unwrap(), Parked::Already);
+}
