@@ -54,17 +54,25 @@ fn ours(size: u32, period_us: u32, packet_size: u32) -> Result<f64, Box<dyn Erro
     Ok((cpu_us(UsageWho::RUSAGE_SELF)? - begun_us) / frames as f64)
 }
 
-fn theirs(size: u32, packet_size: u32) -> Result<f64, Box<dyn Error>> {
+/// CPU time and frames of the library's own client, on the same kind of socket.
+fn client(size: u32, packet_size: u32, seconds: u64) -> Result<(f64, f64), Box<dyn Error>> {
     let before_us = cpu_us(UsageWho::RUSAGE_CHILDREN)?;
     let size = size.to_string();
     let output = Command::new("arv-camera-test-0.8")
-        .args(["-n", ADDRESS, "--auto", "-w", &size, "-h", &size])
-        .args(["-i", &packet_size.to_string(), "--duration", &DURATION.as_secs().to_string()])
+        .args(["-n", ADDRESS, "--auto", "--no-packet-socket", "-w", &size, "-h", &size])
+        .args(["-j", "never", "-i", &packet_size.to_string(), "--duration", &seconds.to_string()])
         .output()?;
     let text = String::from_utf8(output.stdout)?;
     let line = text.lines().find(|line| line.starts_with("n_completed_buffers")).ok_or("no frames")?;
-    let frames: u64 = line.rsplit(' ').next().unwrap_or_default().parse()?;
-    Ok((cpu_us(UsageWho::RUSAGE_CHILDREN)? - before_us) / frames as f64)
+    let frames = line.rsplit(' ').next().unwrap_or_default().parse()?;
+    Ok((cpu_us(UsageWho::RUSAGE_CHILDREN)? - before_us, frames))
+}
+
+/// What a frame costs the library's own client beyond its start.
+fn theirs(size: u32, packet_size: u32) -> Result<f64, Box<dyn Error>> {
+    let (short_us, short_frames) = client(size, packet_size, 1)?;
+    let (long_us, long_frames) = client(size, packet_size, 1 + DURATION.as_secs())?;
+    Ok((long_us - short_us) / (long_frames - short_frames))
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
