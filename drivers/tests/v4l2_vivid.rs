@@ -1,26 +1,24 @@
-//! The V4L2 driver against the kernel's virtual camera `vivid`, for a machine whose kernel has that module: the test
+//! The V4L2 driver against the kernel's virtual camera `vivid`, on a machine whose kernel has that module: the kernel
 //! guest, or by hand as root
 //!
 //! ```text
 //! modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=3
-//! RAYSWEEP_V4L2_DEVICE=/dev/video0 cargo test -p raysweep-drivers --features v4l2 --test v4l2_vivid
+//! RAYSWEEP_V4L2_DEVICE=/dev/video0 cargo test -p raysweep-drivers --features v4l2 --test v4l2_vivid -- --ignored --test-threads 1
 //! ```
 //!
-//! Without `RAYSWEEP_V4L2_DEVICE` no test runs, and the program says so.
-//! `RAYSWEEP_VIVID_UNBIND=1` besides allows the test that unbinds the driver.
-//!
-//! vivid's only input must take any size (HDMI). It has no exposure control: its brightness stands for one. Order,
-//! counts and values are looked at, never times: the guest's clock jitters by a tenth of a second.
+//! vivid's only input is such that it takes any size (HDMI). It has no exposure control: its brightness stands for one.
+//! Its controls are set from outside by `v4l2-ctl`. Order, counts and values are looked at, never times: the guest's clock
+//! jitters by a tenth of a second.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
-use std::path::PathBuf;
-use std::process::ExitCode;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use raysweep_core::{
     Camera, CameraSettings, DeviceErrorKind, DeviceState, FrameBuf, FramePool, FrameStamp, PixelFormat,
-    SettingsId, Shutter,
+    Readout, SettingsId, Shutter,
 };
 use raysweep_drivers::camera::v4l2::{self, TimeControl, V4l2Camera, V4l2Config, V4l2Setup, fourcc};
 
@@ -29,43 +27,16 @@ const HEIGHT: u32 = 180;
 /// A frame comes within this, or never.
 const PATIENCE: Duration = Duration::from_secs(10);
 
-type Test = fn(&Device);
-
-const TESTS: [(&str, Test); 7] = [
-    ("frames_come_in_every_format_that_the_kernel_has", every_format),
-    ("controls_are_set_and_read_back", controls),
-    ("frame_rates_that_the_driver_clamps_are_refused", frame_rates),
-    ("a_second_program_is_told_that_the_camera_is_busy", busy),
-    ("ids_rise_over_a_wrap_of_the_kernels_count", wrap),
-    ("damaged_frames_are_left_out_and_counted", damaged),
-    ("a_failed_stream_is_built_anew", failed_stream),
-];
-
-fn main() -> ExitCode {
-    let Some(path) = std::env::var_os("RAYSWEEP_V4L2_DEVICE").map(PathBuf::from) else {
-        println!("v4l2_vivid: not run, RAYSWEEP_V4L2_DEVICE names no vivid node (see docs/rig.md)");
-        return ExitCode::SUCCESS;
-    };
-    let device = Device { path };
-    for (name, test) in TESTS {
-        println!("{name}");
-        test(&device);
-    }
-    if std::env::var_os("RAYSWEEP_VIVID_UNBIND").is_some() {
-        println!("a_camera_that_is_unbound_and_bound_goes_on");
-        unbound(&device);
-    } else {
-        println!("a_camera_that_is_unbound_and_bound_goes_on: not run, RAYSWEEP_VIVID_UNBIND is not set");
-    }
-    println!("v4l2_vivid: passed");
-    ExitCode::SUCCESS
-}
-
 struct Device {
     path: PathBuf,
 }
 
 impl Device {
+    fn named() -> Self {
+        let path = std::env::var_os("RAYSWEEP_V4L2_DEVICE");
+        Self { path: path.expect("RAYSWEEP_V4L2_DEVICE names vivid's node").into() }
+    }
+
     fn setup(&self, format: PixelFormat, controls: &[(&str, i64)]) -> V4l2Setup {
         // Stamps at the start of exposure: vivid's others lie in the future.
         let controls = [("timestamp_source", 1)].iter().chain(controls);
@@ -81,7 +52,7 @@ impl Device {
                 buffers: 4,
                 late_frames: 2,
                 trigger_latency_us: 0.0,
-                readout: raysweep_core::Readout::Sequential,
+                readout: Readout::Sequential,
             },
             format,
             row_time_us: 20.0,
@@ -116,7 +87,7 @@ impl Feed {
 
     /// Presses one of vivid's buttons or sets one of its controls, from outside, as `v4l2-ctl` would.
     fn press(&self, device: &Device, control: &str, value: i64) {
-        let status = std::process::Command::new("v4l2-ctl")
+        let status = Command::new("v4l2-ctl")
             .arg("--device")
             .arg(&device.path)
             .arg("--set-ctrl")
@@ -127,7 +98,10 @@ impl Feed {
     }
 }
 
-fn every_format(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn frames_come_in_every_format_that_the_kernel_has() {
+    let device = &Device::named();
     for format in PixelFormat::all().filter(|format| fourcc(*format).is_some()) {
         let name = format.to_string();
         let mut camera = match v4l2::open(device.setup(format, &[])) {
@@ -156,7 +130,10 @@ fn every_format(device: &Device) {
     }
 }
 
-fn controls(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn controls_are_set_and_read_back() {
+    let device = &Device::named();
     let mut camera = v4l2::open(device.setup(PixelFormat::Mono8, &[("contrast", 100)])).unwrap();
     let settings = CameraSettings { shutter: Shutter::Rolling, exposure_us: 1_234.0, trigger_delay_us: 0.0 };
     let id = SettingsId { point: 0, attempt: 0 };
@@ -170,17 +147,24 @@ fn controls(device: &Device) {
     assert!(refused.to_string().contains("brightness"), "{refused}");
 }
 
-fn frame_rates(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn frame_rates_that_the_driver_clamps_are_refused() {
+    let device = &Device::named();
     let mut setup = device.setup(PixelFormat::Mono8, &[]);
-    setup.config.frames_per_s = Some(30.0);
+    // An HDMI input has one rate.
+    setup.config.frames_per_s = Some(60.0);
     v4l2::open(setup.clone()).unwrap();
-    setup.config.frames_per_s = Some(5_000.0);
+    setup.config.frames_per_s = Some(30.0);
     let refused = v4l2::open(setup).err().unwrap();
     assert_eq!(refused.kind, DeviceErrorKind::OutOfRange);
-    assert!(refused.to_string().contains("frames_per_s = 5000"), "{refused}");
+    assert!(refused.to_string().contains("frames_per_s = 30: the driver makes it 60"), "{refused}");
 }
 
-fn busy(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn a_second_program_is_told_that_the_camera_is_busy() {
+    let device = &Device::named();
     let mut feed = device.streaming(PixelFormat::Mono8, &[]);
     feed.next();
     let refused = v4l2::open(device.setup(PixelFormat::Mono8, &[])).err().unwrap();
@@ -188,7 +172,10 @@ fn busy(device: &Device) {
     feed.next();
 }
 
-fn wrap(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn ids_rise_over_a_wrap_of_the_kernels_count() {
+    let device = &Device::named();
     // The kernel's count begins 128 before its end.
     let mut feed = device.streaming(PixelFormat::Mono8, &[("wrap_sequence_number", 1)]);
     let seqs: Vec<u64> = (0..200).map(|_| feed.next().seq).collect();
@@ -197,7 +184,10 @@ fn wrap(device: &Device) {
     feed.press(device, "wrap_sequence_number", 0);
 }
 
-fn damaged(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn damaged_frames_are_left_out_and_counted() {
+    let device = &Device::named();
     // Some percent of the frames are flagged, the others come.
     let mut feed = device.streaming(PixelFormat::Mono8, &[("percentage_of_dropped_buffers", 50)]);
     let first = feed.next().seq;
@@ -209,7 +199,10 @@ fn damaged(device: &Device) {
     assert!(after.is_sorted_by(|a, b| a < b), "{after:?}");
 }
 
-fn failed_stream(device: &Device) {
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn a_stream_that_fails_is_built_anew() {
+    let device = &Device::named();
     // The last is a node that stays and says ENODEV until all have closed it.
     for button in ["inject_vidioc_qbuf_error", "inject_fatal_streaming_error", "disconnect"] {
         let mut feed = device.streaming(PixelFormat::Mono8, &[]);
@@ -221,8 +214,11 @@ fn failed_stream(device: &Device) {
     }
 }
 
-fn unbound(device: &Device) {
-    let driver = PathBuf::from("/sys/bus/platform/drivers/vivid");
+#[test]
+#[ignore = "needs vivid: cargo xtask guest"]
+fn a_camera_that_is_unbound_and_bound_goes_on() {
+    let device = &Device::named();
+    let driver = Path::new("/sys/bus/platform/drivers/vivid");
     let bind = |file: &str| std::fs::write(driver.join(file), "vivid.0").unwrap();
     let mut feed = device.streaming(PixelFormat::Mono8, &[]);
     let before = feed.next().seq;
