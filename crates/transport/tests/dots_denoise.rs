@@ -283,6 +283,28 @@ fn columns_are_the_same_for_any_number_of_threads() {
 }
 
 #[test]
+fn memory_is_taken_once() {
+    let shape = FrameShape::new(192, 192, 1).unwrap();
+    let correction = Correction::none(shape);
+    let background = Background::new(&correction, &vec![100.3; shape.pixels()]).unwrap();
+    let denoiser = Denoiser::new(correction, DenoiseSettings::default()).unwrap();
+    let floor = NoiseFloor { mean: 0.0, sigma: SIGMA };
+    let (mut scratch, mut column) = (denoiser.scratch(), SparseColumn::default());
+    let frames = scan(shape, 20);
+    let mut places = || {
+        let mut all = Vec::new();
+        for frame in &frames {
+            denoiser.column(frame, &background, floor, &mut scratch, &mut column).unwrap();
+            let SparseColumn { words, masks, values, residual, .. } = &column;
+            all.push((words.as_ptr(), masks.as_ptr(), values.as_ptr(), residual.as_ptr()));
+        }
+        all
+    };
+    let after_the_largest = *places().last().unwrap();
+    assert!(places().iter().all(|place| *place == after_the_largest));
+}
+
+#[test]
 fn frames_of_another_size_are_refused() {
     let shape = FrameShape::new(64, 64, 1).unwrap();
     let correction = Correction::none(shape);

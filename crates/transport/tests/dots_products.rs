@@ -167,7 +167,7 @@ fn shadow_dots_are_the_extremes_over_images_with_one_dot_missing() {
             largest.zip_mut_with(&without, |most, &value| *most = most.max(value));
             least.zip_mut_with(&without, |least, &value| *least = least.min(value));
         }
-        let Separation { direct, global } = shadow_dot(&batch).unwrap();
+        let Separation { direct, global } = shadow_dot(&batch, &floodlit(&batch)).unwrap();
         assert_near(&direct, &(&largest - &least), 1e-5);
         assert_near(&global, &(&least * 9.0 / 8.0), 1e-5);
     }
@@ -241,8 +241,8 @@ fn neighbours_give_the_direct_light_of_overlapping_dots_on_and_off_the_plane() {
         let batch = batch(scan.shape, &scan.images, 3.0);
         let of_truth =
             |separation: &Separation| middle(&separation.direct.mapv(f64::from)) / middle(&scan.direct);
-        let naive = of_truth(&shadow_dot(&batch).unwrap());
-        let separation = shadow_neighbours(&batch, &confusion).unwrap();
+        let naive = of_truth(&shadow_dot(&batch, &floodlit(&batch)).unwrap());
+        let separation = shadow_neighbours(&batch, &floodlit(&batch), &confusion).unwrap();
         assert!((0.25..0.6).contains(&naive), "naive: {naive}");
         assert!((of_truth(&separation) - 1.0).abs() < 0.02, "{}", of_truth(&separation));
         let global = middle(&separation.global.mapv(f64::from)) / (6400.0 * 256.0 * 2.0);
@@ -268,7 +268,7 @@ fn masks_split_the_floodlit_image_as_dense_masks_do() {
         for sigma_px in [0.0, 40.0] {
             // Given for frames 1024 wide; here 8 and 3.75 pixels.
             let mask = EpipolarMask { distance_px: 8.0 * 1024.0 / 96.0, sigma_px, rule };
-            let separation = epipolar(&batch, &fundamental, &mirror, &mask).unwrap();
+            let separation = epipolar(&batch, &floodlit(&batch), &fundamental, &mirror, &mask).unwrap();
             let sigma = sigma_px * 96.0 / 1024.0;
             let weight = |distance: f64| {
                 let gaussian =
@@ -318,7 +318,8 @@ fn a_mask_of_the_dots_own_width_keeps_the_planes_light_and_the_printed_one_a_fif
         // The paper's d_thresh and sigma for its dots, 16 pixels in radius of 1024; here 8 of 160.
         let scale = 8.0 * 1024.0 / 160.0 / 16.0;
         let mask = EpipolarMask { distance_px: 19.0 * scale, sigma_px: 2.0 * scale, rule };
-        let separation = epipolar(&batch, &fundamental, &mirror(&plane.centres), &mask).unwrap();
+        let separation =
+            epipolar(&batch, &floodlit(&batch), &fundamental, &mirror(&plane.centres), &mask).unwrap();
         f64::from(separation.direct.sum()) / plane.direct.sum()
     };
     assert!(share(MaskRule::Plateau) >= 0.98, "{}", share(MaskRule::Plateau));
@@ -467,9 +468,9 @@ fn products_are_the_same_for_any_number_of_threads() {
             let mirror = vec![Some([0.0, 30.0]); 20];
             let mask = EpipolarMask { distance_px: 100.0, sigma_px: 10.0, rule: MaskRule::Plateau };
             let separations = [
-                shadow_dot(&batch).unwrap(),
-                shadow_neighbours(&batch, &confusion).unwrap(),
-                epipolar(&batch, &fundamental, &mirror, &mask).unwrap(),
+                shadow_dot(&batch, &floodlit(&batch)).unwrap(),
+                shadow_neighbours(&batch, &floodlit(&batch), &confusion).unwrap(),
+                epipolar(&batch, &floodlit(&batch), &fundamental, &mirror, &mask).unwrap(),
             ];
             (floodlit(&batch), confusion, separations)
         })

@@ -226,13 +226,13 @@ pub fn of_columns(columns: &Columns) -> Result<Vec<Figure>, Box<dyn Error>> {
             black_box(relight(batch, weights.view()).is_ok());
         };
         let mut shadow = || {
-            black_box(shadow_dot(batch).is_ok());
+            black_box(shadow_dot(batch, &light).is_ok());
         };
         let mut neighbours = || {
-            black_box(shadow_neighbours(batch, &confusion).is_ok());
+            black_box(shadow_neighbours(batch, &light, &confusion).is_ok());
         };
         let mut lines = || {
-            black_box(epipolar(batch, fundamental, mirror, mask).is_ok());
+            black_box(epipolar(batch, &light, fundamental, mirror, mask).is_ok());
         };
         let mut mirrored = || {
             black_box(dual(batch, &centroids, &energies, (1024, 1024)).is_ok());

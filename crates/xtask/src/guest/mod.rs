@@ -58,6 +58,13 @@ const TESTS: &[GuestTest] = &[
         pipes: &["serial"],
         environment: &[],
     },
+    GuestTest {
+        name: "v4l2_vivid",
+        modules: &["vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=3"],
+        devices: &[],
+        pipes: &[],
+        environment: &[("RAYSWEEP_V4L2_DEVICE", "/dev/video0")],
+    },
 ];
 
 /// Runs the tests that are named, or all.

@@ -78,59 +78,52 @@ pub fn dual(
 pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     let (height, width, channels) = image.dim();
     assert_eq!(known.dim(), (height, width), "known must be as large as the image");
-    // With a border that is never filled and counts for nothing, so that every pixel has four neighbours.
+    // With a border that is never filled, so that every pixel has four neighbours. What is not filled is NaN.
     let stride = width + 2;
-    let inside = |row: usize, column: usize| (row + 1) * stride + column + 1;
-    let mut filled = vec![0.0_f32; (height + 2) * stride];
-    let mut is_open = vec![false; filled.len()];
-    let mut values = vec![0.0_f32; filled.len() * channels];
+    let row_of = |row: usize| (row + 1) * stride + 1..(row + 1) * stride + 1 + width;
+    let mut values = vec![f32::NAN; (height + 2) * stride * channels];
+    let mut is_open = vec![false; (height + 2) * stride];
     for (row, (known, pixels)) in known.outer_iter().zip(image.outer_iter()).enumerate() {
-        let places = inside(row, 0)..inside(row, width);
-        let state = filled[places.clone()].iter_mut().zip(&mut is_open[places.clone()]);
-        for (((filled, is_open), &known), (pixel, values)) in state
-            .zip(known)
-            .zip(pixels.outer_iter().zip(values[places.start * channels..].chunks_exact_mut(channels)))
-        {
-            (*filled, *is_open) = (f32::from(u8::from(known)), !known);
-            if known {
-                values.iter_mut().zip(pixel).for_each(|(value, &light)| *value = light);
-            }
+        is_open[row_of(row)].iter_mut().zip(known).for_each(|(is_open, known)| *is_open = !known);
+        let values = values[row_of(row).start * channels..].chunks_exact_mut(channels);
+        for ((values, pixel), _) in values.zip(pixels.outer_iter()).zip(known).filter(|(_, known)| **known) {
+            values.iter_mut().zip(pixel).for_each(|(value, &light)| *value = light);
         }
     }
     let neighbours = |pixel: usize| [pixel - 1, pixel + 1, pixel - stride, pixel + stride];
+    let at_rim = |&pixel: &usize| {
+        is_open[pixel] && neighbours(pixel).iter().any(|near| !values[near * channels].is_nan())
+    };
     // In each step only the rim of what is filled: every pixel is reached once.
-    let at_rim = |pixel: &usize| is_open[*pixel] && neighbours(*pixel).iter().any(|&near| filled[near] > 0.0);
-    let all = (0..height).flat_map(|row| inside(row, 0)..inside(row, width));
-    let mut rim: Vec<usize> = all.filter(at_rim).collect();
-    let (mut next, mut means) = (Vec::new(), Vec::new());
+    let mut rim: Vec<usize> = (0..height).flat_map(row_of).filter(at_rim).collect();
     rim.iter().for_each(|&pixel| is_open[pixel] = false);
+    let (mut next, mut means) = (Vec::new(), Vec::new());
     while !rim.is_empty() {
         means.clear();
         for &pixel in &rim {
-            let near = neighbours(pixel);
-            let count: f32 = near.iter().map(|&near| filled[near]).sum();
             means.extend((0..channels).map(|channel| {
-                // What is not filled is 0.
-                near.iter().map(|&near| values[near * channels + channel]).sum::<f32>() / count
+                let (mut sum, mut count) = (0.0, 0.0);
+                for near in neighbours(pixel) {
+                    let value = values[near * channels + channel];
+                    let is_filled = !value.is_nan();
+                    sum += if is_filled { value } else { 0.0 };
+                    count += if is_filled { 1.0 } else { 0.0 };
+                }
+                sum / count
             }));
         }
         next.clear();
         for (&pixel, means) in rim.iter().zip(means.chunks_exact(channels)) {
             values[pixel * channels..][..channels].copy_from_slice(means);
-            filled[pixel] = 1.0;
-            for near in neighbours(pixel) {
-                if std::mem::take(&mut is_open[near]) {
-                    next.push(near);
-                }
-            }
+            next.extend(neighbours(pixel).into_iter().filter(|&near| std::mem::take(&mut is_open[near])));
         }
         std::mem::swap(&mut rim, &mut next);
     }
     // Where nothing is known, nothing was filled.
     if known.iter().any(|&known| known) {
         for (row, mut pixels) in image.outer_iter_mut().enumerate() {
-            let places = inside(row, 0) * channels..inside(row, width) * channels;
-            pixels.iter_mut().zip(&values[places]).for_each(|(pixel, &value)| *pixel = value);
+            let values = &values[row_of(row).start * channels..row_of(row).end * channels];
+            pixels.iter_mut().zip(values).for_each(|(pixel, &value)| *pixel = value);
         }
     }
 }

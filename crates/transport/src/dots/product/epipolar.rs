@@ -1,8 +1,9 @@
 use std::ops::Range;
 
-use super::Separation;
-use super::relight::floodlit;
+use ndarray::Array3;
+
 use super::sum::{add_blocks, blocks_of, by_bands, first_word, sum_blocks};
+use super::{Separation, check_light};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Fundamental;
 use crate::dots::column::runs;
@@ -142,19 +143,21 @@ impl Line {
 
 /// Separates direct from global light by the epipolar constraint (after O'Toole et al. 2014): of each column, what lies
 /// near its dot's epipolar line is direct. `mirror` has each dot's place on the plane before the mirror, none for dots that
-/// were not calibrated; their light counts as global. Direct plus global is the floodlit image.
+/// were not calibrated; their light counts as global. Direct plus global is `light`, the floodlit image.
 ///
 /// The mask of the residual, whose light has no place within its block, is the mean over the block.
 ///
 /// # Errors
-/// [`DotsError::Shape`] unless `mirror` has all dots, [`DotsError::OutOfRange`] for a mask that cannot be.
+/// [`DotsError::Shape`] unless `mirror` has all dots and `light` the batch's shape, [`DotsError::OutOfRange`] for a mask that cannot be.
 pub fn epipolar(
     batch: &Batch,
+    light: &Array3<f32>,
     fundamental: &Fundamental,
     mirror: &[Option<[f64; 2]>],
     mask: &EpipolarMask,
 ) -> Result<Separation, DotsError> {
     let shape = batch.shape();
+    check_light(batch, light)?;
     check_shape("mirror", "[dots]", &[mirror.len()], &[batch.dots()])?;
     for (field, value) in [("distance_px", mask.distance_px), ("sigma_px", mask.sigma_px)] {
         check_range(field, value, value >= 0.0 && value.is_finite(), "at least 0 pixels of 1024")?;
@@ -218,7 +221,7 @@ pub fn epipolar(
             add_blocks(sums, &residual[blocks_of(batch, band)]);
         }
     });
-    let global = floodlit(batch) - &direct;
+    let global = light - &direct;
     Ok(Separation { direct, global })
 }
 

@@ -12,11 +12,28 @@ mod sum;
 
 use ndarray::Array3;
 
+use super::error::check_shape;
+use super::{Batch, DotsError};
+
 pub use dual::{DualImage, column_energies, dual, fill_holes};
 pub use epipolar::{EpipolarMask, MaskRule, epipolar};
 pub use overlap::{compensate, coverage};
 pub use relight::{floodlit, pattern_weights, relight, relight_sequence};
 pub use shadow::{shadow_dot, shadow_neighbours};
+
+/// The values of a floodlit image, if it is of the batch's shape.
+fn check_light<'a>(batch: &Batch, light: &'a Array3<f32>) -> Result<&'a [f32], DotsError> {
+    let shape = batch.shape();
+    let expected = [shape.height(), shape.width(), shape.channels()];
+    check_shape("light", "[height, width, channels]", light.shape(), &expected)?;
+    // An image in another order of axes than ours is not the floodlit image that we made.
+    light.as_slice().ok_or_else(|| DotsError::Shape {
+        array: "light",
+        axes: "[height, width, channels] in this order in memory",
+        actual: light.shape().to_vec(),
+        expected: expected.to_vec(),
+    })
+}
 
 /// Light that came straight from the mirror, and all other light.
 #[derive(Debug, Clone, PartialEq)]

@@ -2,7 +2,7 @@ use ndarray::Array3;
 use rayon::prelude::*;
 
 use super::Separation;
-use super::relight::floodlit;
+use super::check_light;
 use super::sum::{blocks_of, by_bands, first_word};
 use crate::dots::batch::Word;
 use crate::dots::calibrate::Confusion;
@@ -16,18 +16,18 @@ use crate::dots::{Batch, DotsError};
 const NONE: u32 = u32::MAX;
 
 /// Separates direct from global light by the extremes over images that are lit by all dots but one, as Nayar et al. (2006)
-/// do with patterns: `direct = L_max - L_min`, `global = L_min N / (N - 1)` for N dots.
+/// do with patterns: `direct = L_max - L_min`, `global = L_min N / (N - 1)` for N dots. `light` is the floodlit image.
 ///
 /// A dot's shadow is where its mask is; beyond it the light stays. Where several dots cover a pixel, one of them missing does
 /// not make it dark: see [`shadow_neighbours`].
 ///
 /// # Errors
-/// [`DotsError::OutOfRange`] below two dots.
-pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
+/// [`DotsError::OutOfRange`] below two dots, [`DotsError::Shape`] if `light` is not of the batch's shape.
+pub fn shadow_dot(batch: &Batch, light: &Array3<f32>) -> Result<Separation, DotsError> {
     let dots = batch.dots();
     check_range("dots", dots as f64, dots >= 2, "at least 2")?;
+    let light = check_light(batch, light)?;
     let channels = batch.shape().channels();
-    let light = floodlit(batch);
     let share = dots as f64 / (dots - 1) as f64;
     let [direct, global] = by_bands(batch.shape(), channels, |band, sums| {
         let pixels = sums.len() / (2 * channels);
@@ -56,7 +56,7 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
                 }
             }
         }
-        let light = of_band(&light, band, pixels * channels);
+        let light = of_band(light, band, pixels * channels, batch);
         for channel in 0..channels {
             let at = channel * pixels..(channel + 1) * pixels;
             let extremes = most[at.clone()].iter_mut().zip(&mut least[at]);
@@ -72,23 +72,25 @@ pub fn shadow_dot(batch: &Batch) -> Result<Separation, DotsError> {
     Ok(Separation { direct, global })
 }
 
-/// The part of an image that a row of blocks has, `[pixels, channels]`.
-fn of_band(image: &Array3<f32>, band: usize, values: usize) -> &[f32] {
-    let (_, width, channels) = image.dim();
-    let first = band * BLOCK_PX * width * channels;
-    image.as_slice().map_or(&[], |image| &image[first..first + values])
+/// The values of a row of blocks, `[pixels, channels]`.
+fn of_band<'a>(light: &'a [f32], band: usize, values: usize, batch: &Batch) -> &'a [f32] {
+    &light[band * BLOCK_PX * batch.shape().width() * batch.shape().channels()..][..values]
 }
 
 /// Separates direct from global light where dots overlap: at each pixel, all dots are switched off that share pixels of the
 /// calibration plane with the one that is brightest there, `S = {j : M_ij > 0}`. What is left is global light from the
-/// other dots: `global = L_min N / (N - |S|)`, `direct = floodlit - global`.
+/// other dots: `global = L_min N / (N - |S|)`, `direct = floodlit - global`. `light` is the floodlit image.
 ///
 /// The neighbours hold off the plane as well, where the dots' places on it do not. Pixels that no mask has are global.
 ///
 /// # Errors
-/// [`DotsError::Shape`] if the confusion matrix is not of the batch's dots, [`DotsError::OutOfRange`] if a dot has all
-/// others for neighbours.
-pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separation, DotsError> {
+/// [`DotsError::Shape`] if the confusion matrix is not of the batch's dots or `light` not of its shape,
+/// [`DotsError::OutOfRange`] if a dot has all others for neighbours.
+pub fn shadow_neighbours(
+    batch: &Batch,
+    light: &Array3<f32>,
+    confusion: &Confusion,
+) -> Result<Separation, DotsError> {
     let (shape, dots) = (batch.shape(), batch.dots());
     let channels = shape.channels();
     check_shape("confusion", "[dots]", &[confusion.dots()], &[dots])?;
@@ -99,8 +101,8 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
         most < dots,
         "fewer than there are dots: binarise higher",
     )?;
+    let light = check_light(batch, light)?;
     let is_neighbour = Neighbours::new(confusion);
-    let light = floodlit(batch);
     let [direct, global] = by_bands(shape, channels, |band, sums| {
         let pixels = sums.len() / (2 * channels);
         // First what the dots that are switched off would give, then direct and global light.
@@ -146,7 +148,7 @@ pub fn shadow_neighbours(batch: &Batch, confusion: &Confusion) -> Result<Separat
             }
         }
         // The neighbours' residual too is switched off; one sum serves all pixels of a block with the same dot.
-        let light = of_band(&light, band, pixels * channels);
+        let light = of_band(light, band, pixels * channels, batch);
         let mut residuals: Vec<Option<[f64; 3]>> = vec![None; dots];
         let mut met = Vec::new();
         for (column, block) in blocks_of(batch, band).enumerate() {
