@@ -1,7 +1,9 @@
 //! `cargo xtask demo | test | bench`: the project's own commands. Plain std, so that they build at once everywhere.
 
 mod bench;
+mod daemon;
 mod demo;
+mod live;
 mod packages;
 mod python;
 mod run;
