@@ -184,6 +184,7 @@ impl DemuxFold {
             regular: None,
             noise: None,
             variance_ratio: None,
+            u0_rows: None,
         })
     }
 

@@ -171,6 +171,7 @@ impl Choices {
         stack.timing = self.demux.timing().clone();
         stack.prior = self.demux.prior();
         stack.noise = self.noise;
+        stack.u0_rows = self.demux.u0_rows().map(|u0_rows| u0_rows.slice(s![rows.clone(), ..]).to_owned());
         let images = coupled.as_ref().unwrap_or(&stack.images);
         let valid = stack.valid.as_ref().map(|valid| valid.view());
         let rows: Vec<usize> = rows.collect();

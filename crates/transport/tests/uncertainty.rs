@@ -60,7 +60,7 @@ fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Cou
         }
         let estimate = demux.solve(stack.view(), None).unwrap();
         let variance_ratio = variance_ratio.as_ref().map(|ratio| ratio.view());
-        let samples = Samples { stack: stack.view(), valid: None, variance_ratio };
+        let samples = Samples { stack: stack.view(), valid: None, variance_ratio, u0_rows: None };
         let sd = of.of_bands(&estimate, &samples, &bands()).unwrap();
         let lights = bands().map(|band| light(&estimate, &band).insert_axis(Axis(0)));
         let lights = concatenate(Axis(0), &lights.each_ref().map(|light| light.view())).unwrap();
@@ -165,7 +165,12 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
             };
             let stack = Array3::from_shape_fn((24, 1, 1), |(n, ..)| all_samples[n] as f32);
             let valid = Array3::from_shape_fn((24, 1, 1), |(n, ..)| !masked.contains(&n));
-            let samples = Samples { stack: stack.view(), valid: Some(valid.view()), variance_ratio: None };
+            let samples = Samples {
+                stack: stack.view(),
+                valid: Some(valid.view()),
+                variance_ratio: None,
+                u0_rows: None,
+            };
             let of = Uncertainty { timing: &timing, settings: &settings, prior, noise, frames: &frames };
             let sd = of.of_bands(&transport, &samples, &bands).unwrap();
             for (sd, variance) in sd.iter().zip(variances) {
@@ -185,7 +190,7 @@ fn dark_pixels_are_certain_and_misfits_are_refused() {
     let stack = Array3::<f32>::zeros((75, 2, 3));
     let transport =
         Demux::new(timing.clone(), paper_sweep(), Prior::SPLIT).unwrap().solve(stack.view(), None).unwrap();
-    let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None };
+    let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows: None };
     let of = |frames: &[usize], samples: &Samples| {
         let settings = paper_sweep();
         let noise = camera_noise();
@@ -198,4 +203,69 @@ fn dark_pixels_are_certain_and_misfits_are_refused() {
     assert!(matches!(of(&[1; 75], &misfit), Err(PlaneError::Shape { array: "stack", .. })));
     assert!(matches!(of(&[1; 74], &samples), Err(PlaneError::Shape { array: "frames", .. })));
     assert!(matches!(of(&[0; 75], &samples), Err(PlaneError::OutOfRange { field: "frames", .. })));
+}
+
+#[test]
+fn direct_light_between_rows_is_judged_where_it_lies() {
+    let timing = RowTiming::new(32, 22.22, 16_667.0).unwrap().window(16, 1).unwrap();
+    // Edges cut the rows around u = 0.
+    let settings: Vec<Setting> = (0..24)
+        .map(|n| Setting::new(-250.0 + 45.3 * f64::from(n % 12), 150.0 + 83.0 * f64::from(n / 12)))
+        .collect();
+    let bands = [vec![0..=0], vec![i32::MIN..=-1, 1..=i32::MAX], vec![-1..=1]];
+    let centred = Demux::new(timing.clone(), settings.clone(), Prior::SPLIT).unwrap();
+    let model = RowModel::new(&timing, &settings, &centred.reach(), 0);
+    for u0 in [0.3_f32, -0.4] {
+        let light = |u: i32| match u {
+            0 => 0.6 * (1.0 - f64::from(u0.abs())),
+            u => profile(0)(u) + if u == u0.signum() as i32 { 0.6 * f64::from(u0.abs()) } else { 0.0 },
+        };
+        let truth: Array1<f64> = model.slots.iter().map(|slot| light(slot.u)).collect();
+        let stack =
+            model.weights.dot(&truth).mapv(|light| light as f32 + 0.003 * (90.0 * light as f32).sin());
+        let stack = stack.into_shape_with_order((24, 1, 1)).unwrap();
+        let u0_rows = Array2::from_elem((1, 1), u0);
+        let demux = centred.with_spike(u0_rows.clone()).unwrap();
+        let transport = demux.solve(stack.view(), None).unwrap();
+        let light = |stack: &Array3<f32>| {
+            let transport = demux.solve(stack.view(), None).unwrap();
+            bands.each_ref().map(|band| f64::from(light_of(&transport, band)))
+        };
+        let frames = [1; 24];
+        let mut variances = [0.0; 3];
+        for n in 0..24 {
+            let step = 1e-3_f32;
+            let [less, more] = [-step, step].map(|step| {
+                let mut changed = stack.clone();
+                changed[[n, 0, 0]] += step;
+                light(&changed)
+            });
+            let noise = camera_noise().variance(f64::from(stack[[n, 0, 0]]), 1);
+            for ((variance, less), more) in variances.iter_mut().zip(less).zip(more) {
+                *variance += ((more - less) / (2.0 * f64::from(step))).powi(2) * noise;
+            }
+        }
+        let of = Uncertainty {
+            timing: &timing,
+            settings: &settings,
+            prior: Prior::SPLIT,
+            noise: camera_noise(),
+            frames: &frames,
+        };
+        let sd = |u0_rows| {
+            let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows };
+            of.of_bands(&transport, &samples, &bands).unwrap()
+        };
+        let (with, without) = (sd(Some(u0_rows.view())), sd(None));
+        for (band, variance) in variances.into_iter().enumerate() {
+            let ratio = |sd: &Array3<f32>| f64::from(sd[[band, 0, 0]]) / variance.sqrt();
+            assert!((ratio(&with) - 1.0).abs() < 0.02, "u0 {u0}, band {band}: {}", ratio(&with));
+        }
+        let off = (f64::from(without[[0, 0, 0]]) / variances[0].sqrt() - 1.0).abs();
+        assert!(off > 0.1, "u0 {u0}: {off}");
+    }
+}
+
+fn light_of(transport: &Transport, band: &[RangeInclusive<i32>]) -> f32 {
+    light(transport, band)[[0, 0]]
 }

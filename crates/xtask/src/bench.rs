@@ -1,7 +1,7 @@
 //! `cargo xtask bench`: what is fast enough, and how we know.
 
-use crate::python;
 use crate::run::{Done, cargo, run};
+use crate::{live, python};
 
 const BENCHES: &str = "\
 benchmarks: cargo xtask bench <name> [options]
@@ -9,10 +9,12 @@ benchmarks: cargo xtask bench <name> [options]
   demux   the demultiplexer: seconds, share of the machine's GEMM peak, distance from the f64 reference
           --peers  beside CVXPY, SciPy and NumPy on the same stack, in a Python environment made for it
           --json   JSON lines instead of tables: bench, case, method, seconds, ratio, gap
+  live    the paper's sweep on the simulated rig in real time, 30 frames a second of 128x128 and 512x512 pixels: seconds
+          from the last frame to the transport on disk, and what the simulator takes of the cores
+          --json   JSON lines: bench, case, seconds, and the other figures
   dots    the flying dot's stages: time, ratio to a plain read of the same bytes, frames a second
           --peers  beside NumPy, SciPy and OpenCV on the same frames and columns
           --json   JSON lines instead of tables: bench, case, stage, method, seconds, times_read, ratio
-
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
 
 /// Runs the benchmark that the first argument names with the options that follow; without a name, lists all.
@@ -28,6 +30,9 @@ pub fn bench(arguments: &[&str]) -> Done {
         }
         ["unpack"] => run(cargo().args(["bench", "--package", "raysweep-core", "--bench", "unpack"])),
         ["unpack", option, ..] => Err(format!("`unpack` has no option `{option}`\n{BENCHES}")),
+        ["live"] => live::live(live::Print::Text),
+        ["live", "--json"] => live::live(live::Print::JsonLines),
+        ["live", unknown, ..] => Err(format!("`live` has no option `{unknown}`\n{BENCHES}")),
         [unknown, ..] => Err(format!("no benchmark `{unknown}`\n{BENCHES}")),
     }
 }
@@ -55,9 +60,14 @@ mod tests {
 
     #[test]
     fn unknown_names_and_options_are_told_what_there_is() {
-        for arguments in
-            [&["demuxx"] as &[&str], &["demux", "--fast"], &["dots", "--fast"], &["unpack", "--json"]]
-        {
+        let unknown: [&[&str]; 5] = [
+            &["demuxx"],
+            &["demux", "--fast"],
+            &["dots", "--fast"],
+            &["live", "--fast"],
+            &["unpack", "--json"],
+        ];
+        for arguments in unknown {
             let message = bench(arguments).unwrap_err();
             assert!(
                 message.contains(arguments[arguments.len() - 1]) && message.contains(BENCHES),

@@ -1,8 +1,10 @@
 //! `cargo xtask demo | test | guest | bench`: the project's own commands. Plain std, so that they build at once everywhere.
 
 mod bench;
+mod daemon;
 mod demo;
 mod guest;
+mod live;
 mod packages;
 mod python;
 mod run;

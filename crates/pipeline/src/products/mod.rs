@@ -44,6 +44,8 @@ pub struct SweepStack {
     pub noise: Option<NoiseModel>,
     /// Share of the noise's variance that spatial coupling left, `[t, s]`; none: not coupled.
     pub variance_ratio: Option<Array2<f32>>,
+    /// Where direct light was taken to lie, in rows beside its own, `[t, s]`; none: in its own row.
+    pub u0_rows: Option<Array2<f32>>,
 }
 
 impl SweepStack {
@@ -59,6 +61,7 @@ impl SweepStack {
             regular: None,
             noise: None,
             variance_ratio: None,
+            u0_rows: None,
         }
     }
 

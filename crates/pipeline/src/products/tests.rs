@@ -76,6 +76,7 @@ fn stack() -> SweepStack {
         regular: None,
         noise: None,
         variance_ratio: None,
+        u0_rows: None,
     }
 }
 

@@ -21,6 +21,7 @@ pub(super) fn make(
         stack: stack.images.view(),
         valid: stack.valid.as_ref().map(|valid| valid.view()),
         variance_ratio: stack.variance_ratio.as_ref().map(|ratio| ratio.view()),
+        u0_rows: stack.u0_rows.as_ref().map(|u0_rows| u0_rows.view()),
     };
     let model = Uncertainty {
         timing: &stack.timing,

@@ -20,7 +20,7 @@ use std::process::{Command, Stdio};
 use std::time::Instant;
 
 use ndarray::Axis;
-use raysweep_transport::plane::{Demux, Prior, Transport};
+use raysweep_transport::plane::{Demux, Prior, SimdLevel, Transport};
 use serde::{Deserialize, Serialize};
 
 use check::{Accuracy, Sample};
@@ -29,10 +29,14 @@ use scene::Case;
 
 const PRIORS: [Prior; 2] = [Prior::PAPER, Prior::SPLIT];
 
+/// The pixels by which slower instructions are checked.
+const FEW: Sample = Sample { every_row: 8, every_column: 8 };
+
 /// What was measured of one case under one prior.
 #[derive(Debug, Serialize, Deserialize)]
 struct Figures {
     case: String,
+    instructions: String,
     prior: String,
     settings: usize,
     /// Unknowns of most pixels; those near the projector's borders have fewer.
@@ -86,7 +90,7 @@ impl Options {
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse()?;
     if let Some(prior) = options.large {
-        let (figures, _) = measure(&scene::whole_projector()?, prior)?;
+        let (figures, _) = measure(&scene::whole_projector()?, prior, SimdLevel::best())?;
         println!("{}", serde_json::to_string(&figures)?);
         return Ok(());
     }
@@ -95,7 +99,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mut measured: Vec<(Figures, Vec<Peer>)> = Vec::new();
     for case in [scene::paper_sized()?, scene::paper_sweep()?] {
         for prior in PRIORS {
-            let (figures, best) = measure(&case, prior)?;
+            let (figures, best) = measure(&case, prior, SimdLevel::best())?;
             let timed = match &options.peers {
                 Some(python) if case.with_peers => peers::time(python, &case, prior, &best)?,
                 _ => Vec::new(),
@@ -106,6 +110,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     for prior in PRIORS {
         measured.push((in_a_process_of_its_own(prior)?, Vec::new()));
     }
+    let slower = Case { sample: FEW, repetitions: 3, ..scene::paper_sized()? };
+    for level in SimdLevel::available().into_iter().rev().skip(1) {
+        for prior in PRIORS {
+            measured.push((measure(&slower, prior, level)?.0, Vec::new()));
+        }
+    }
     match options.json {
         true => print::json_lines(&measured, &peak),
         false => print::tables(&measured, &peak),
@@ -114,9 +124,13 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 /// Times one case, then compares it with the reference; gives the reference's objective values too, `[t, s]`.
-fn measure(case: &Case, prior: Prior) -> Result<(Figures, ndarray::Array2<f64>), Box<dyn Error>> {
-    eprintln!("{}, {} prior", case.name, prior.name());
-    let demux = Demux::new(case.timing.clone(), case.settings.clone(), prior)?;
+fn measure(
+    case: &Case,
+    prior: Prior,
+    level: SimdLevel,
+) -> Result<(Figures, ndarray::Array2<f64>), Box<dyn Error>> {
+    eprintln!("{}, {} prior, {}", case.name, prior.name(), level.name());
+    let demux = Demux::new(case.timing.clone(), case.settings.clone(), prior)?.with_simd(level);
     let mut seconds = Vec::with_capacity(case.repetitions);
     let mut solve = || {
         let began = Instant::now();
@@ -136,6 +150,7 @@ fn measure(case: &Case, prior: Prior) -> Result<(Figures, ndarray::Array2<f64>),
     let pixels = case.stack.len_of(Axis(1)) * case.stack.len_of(Axis(2));
     let figures = Figures {
         case: case.name.to_owned(),
+        instructions: level.name().to_owned(),
         prior: prior.name().to_owned(),
         settings: case.settings.len(),
         unknowns: demux.reach().count(),

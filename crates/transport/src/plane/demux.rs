@@ -5,9 +5,10 @@ use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axi
 use rayon::prelude::*;
 
 use super::calibrate::FlyingSpot;
-use super::class::{ClassSolver, Row};
 use super::error::check_shape;
+use super::pivot::{Start, minimise};
 use super::quadratic::Quadratic;
+use super::tiles::{Objectives, Problem, Row, Spike, Tile};
 
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach};
 
@@ -116,6 +117,11 @@ impl Demux {
     /// The settings, in the order of the stack.
     pub fn settings(&self) -> &[Setting] {
         &self.settings
+    }
+
+    /// Where direct light lies, `[t, s]`, as [`Self::with_spike`] was told.
+    pub fn u0_rows(&self) -> Option<&Array2<f32>> {
+        self.u0_rows.as_deref()
     }
 
     /// The prior.
@@ -278,35 +284,33 @@ impl Demux {
         }
 
         let mut t = Array3::zeros(shape);
-        let mut tasks: Vec<Task> = t
+        let mut solved: Vec<Row<Data>> = t
             .axis_iter_mut(Axis(1))
             .zip(rows)
             .enumerate()
-            .map(|(at, (profiles, &row))| Task { at, row, class: 0, profiles })
+            .map(|(at, (profiles, &row))| {
+                let stack = stack.index_axis_move(Axis(1), at);
+                let valid = valid.map(|valid| valid.index_axis_move(Axis(1), at));
+                let u0_rows = self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(row));
+                let estimate = estimate.map(|estimate| estimate.t.index_axis(Axis(1), at));
+                Row::new(row, columns, valid, u0_rows, Data { stack, estimate, profiles })
+            })
             .collect();
-        let models = self.classify(&mut tasks);
-        // A class of rows with the same model at a time, so that its factors live no longer than they are needed.
-        tasks.par_chunk_by_mut(|a, b| a.class == b.class).try_for_each(|tasks| {
-            let solver = ClassSolver::new(&models[tasks[0].class], &self.prior, &self.reach, self.simd);
-            let mut rows = Vec::with_capacity(tasks.len());
-            for Task { at, row, profiles, .. } in tasks {
-                let spot = match self.spot.as_deref().zip(solver.direct_weights()) {
-                    Some((spot, even)) => {
-                        Some((spot, spot.weights(&self.timing, &self.settings, *row, even)?))
-                    }
-                    None => None,
-                };
-                rows.push(Row {
-                    stack: stack.index_axis(Axis(1), *at),
-                    valid: valid.map(|valid| valid.index_axis_move(Axis(1), *at)),
-                    u0_rows: self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(*row)),
-                    spot,
-                    estimate: estimate.map(|estimate| estimate.t.index_axis(Axis(1), *at)),
-                    profiles: profiles.view_mut(),
-                });
-            }
-            solver.solve(&mut rows, go_on)
-        })?;
+        let objectives = Objectives {
+            timing: &self.timing,
+            settings: &self.settings,
+            prior: self.prior,
+            reach: &self.reach,
+            spot: self.spot.as_deref(),
+        };
+        objectives.for_each_tile(
+            &mut solved,
+            go_on,
+            &|problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
+                self.solve_tile(problem, tile, rows);
+                Ok(())
+            },
+        )?;
         let exists = Array2::from_shape_fn((shape[0], rows.len()), |(index, at)| {
             self.timing.row_exists(u_min + index as i32, rows[at])
         });
@@ -316,28 +320,54 @@ impl Demux {
         Ok(Transport { t, u_min, exists, saturated })
     }
 
-    /// Gives neighbouring rows with the same model the same class, and returns each class's model.
-    fn classify(&self, tasks: &mut [Task]) -> Vec<RowModel> {
-        let mut models: Vec<RowModel> = Vec::new();
-        for task in tasks {
-            let model = self.model(task.row);
-            if models.last() != Some(&model) {
-                models.push(model);
+    fn solve_tile(&self, problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]) {
+        let Problem { settings, weights, quadratic, .. } = problem;
+        let Tile { pixels, runs } = tile;
+        let mut samples = Array2::zeros((pixels.len(), settings.len()));
+        for (samples, &setting) in samples.columns_mut().into_iter().zip(settings) {
+            for (sample, &(at, column)) in samples.into_iter().zip(pixels) {
+                *sample = f64::from(rows[at].data.stack[[setting, column]]);
             }
-            task.class = models.len() - 1;
         }
-        models
+        let linear = quadratic.linear(weights.view(), samples.view());
+        let places: Vec<(usize, usize)> = problem.places(*self.reach.start()).collect();
+        let estimated = rows.iter().all(|row| row.data.estimate.is_some());
+        let free = estimated.then(|| {
+            let mut free = Array2::from_elem(linear.dim(), true);
+            for (mut free, &(at, column)) in free.rows_mut().into_iter().zip(pixels) {
+                let Some(estimate) = rows[at].data.estimate else { continue };
+                places.iter().for_each(|&(slot, place)| free[slot] = estimate[[place, column]] > 0.0);
+            }
+            free
+        });
+        let start = free.as_ref().map_or(Start::Runs(runs), |free| Start::Free(free.view()));
+        let minima = minimise(self.simd, quadratic, linear, &start);
+
+        let place_of = |slot: usize| places.iter().find(|(own, _)| *own == slot).map(|(_, place)| *place);
+        for &(slot, place) in &places {
+            for (&x, &(at, column)) in minima.column(slot).iter().zip(pixels) {
+                rows[at].data.profiles[[place, column]] = x as f32;
+            }
+        }
+        if let Some(Spike { own, neighbour, share }) = problem.spike {
+            let [own_place, neighbour] = [Some(own), neighbour].map(|slot| place_of(slot?));
+            for (&direct, &(at, column)) in minima.column(own).iter().zip(pixels) {
+                let profiles = &mut rows[at].data.profiles;
+                own_place
+                    .into_iter()
+                    .for_each(|own| profiles[[own, column]] = (direct * (1.0 - share)) as f32);
+                neighbour.into_iter().for_each(|place| profiles[[place, column]] += (direct * share) as f32);
+            }
+        }
     }
 }
 
 /// A camera row that is to be solved.
-struct Task<'a> {
-    /// Its place in the stack.
-    at: usize,
-    /// The camera's row.
-    row: usize,
-    /// The model that it shares with its neighbours.
-    class: usize,
+struct Data<'a> {
+    /// `[settings, columns]`
+    stack: ArrayView2<'a, f32>,
+    /// What to start from, `[reach, columns]`.
+    estimate: Option<ArrayView2<'a, f32>>,
     /// Its part of the transport, `[reach, columns]`.
     profiles: ArrayViewMut2<'a, f32>,
 }

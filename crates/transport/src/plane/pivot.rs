@@ -70,6 +70,26 @@ pub(super) fn minimise(
     slope
 }
 
+/// Minimises `x'Hx - 2 c'x` with `x = 0` in all slots that are not free, whatever sign `x` has in the others. `free` is
+/// `[pixels, slots]`; `linear` as in [`minimise`].
+pub(super) fn minimise_free(
+    simd: SimdLevel,
+    quadratic: &Quadratic,
+    linear: Array2<f64>,
+    free: ArrayView2<bool>,
+) -> Array2<f64> {
+    if linear.is_empty() {
+        return linear;
+    }
+    let unconstrained = linear.dot(&quadratic.inverse());
+    let mut slope = linear;
+    slope.mapv_inplace(|c| -c);
+    let mut marks = Free::all(slope.nrows(), quadratic);
+    marks.set(free);
+    simd.run(Pivoting { aim: Aim::Free, ..Pivoting::new(quadratic, &unconstrained, &mut slope, &mut marks) });
+    slope
+}
+
 fn means_of_runs(pixels: ArrayView2<f64>, lengths: &[usize]) -> Array2<f64> {
     let mut means = Array2::zeros((lengths.len(), pixels.ncols()));
     let mut rest = pixels;
@@ -115,8 +135,18 @@ impl Free {
     }
 }
 
+/// Which minimum is sought.
+#[derive(Clone, Copy)]
+enum Aim {
+    /// Over `x >= 0`.
+    NonNegative,
+    /// Over the free slots as they are.
+    Free,
+}
+
 /// Takes pixels to their minima.
 struct Pivoting<'a> {
+    aim: Aim,
     quadratic: &'a Quadratic,
     slots: usize,
     /// `H^-1 c`, `[pixels][slots]`.
@@ -165,6 +195,7 @@ impl<'a> Pivoting<'a> {
         free: &'a mut Free,
     ) -> Self {
         Self {
+            aim: Aim::NonNegative,
             quadratic,
             slots: quadratic.slots(),
             unconstrained: unconstrained.as_slice().unwrap_or_default(),
@@ -230,15 +261,24 @@ impl WithSimd for Pivoting<'_> {
                             dense.spread(lane, symmetric, &mut y);
                         }
                     }
-                    pixel.exchange(simd, &y, self.free.of_mut(pixel.number), &mut exchanged);
+                    let least = match self.aim {
+                        Aim::NonNegative => {
+                            pixel.exchange(simd, &y, self.free.of_mut(pixel.number), &mut exchanged);
+                            0.0
+                        }
+                        Aim::Free => {
+                            pixel.state = State::Minimum;
+                            f64::NEG_INFINITY
+                        }
+                    };
                     match pixel.state {
                         State::Exchanging => {}
                         State::GaveUp => given_up.push(pixel.number),
                         State::Minimum => {
                             let to = &mut self.slope[pixel.number * slots..(pixel.number + 1) * slots];
-                            for ((x, y), free) in to.iter_mut().zip(y.iter()).zip(self.free.of(pixel.number))
-                            {
-                                *x = if *free == 1.0 { y.max(0.0) } else { 0.0 };
+                            let free = self.free.of(pixel.number);
+                            for ((x, y), free) in to.iter_mut().zip(y.iter()).zip(free) {
+                                *x = if *free == 1.0 { y.max(least) } else { 0.0 };
                             }
                         }
                     }

@@ -1,13 +1,12 @@
 use std::ops::RangeInclusive;
 
-use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, Axis, s};
-use rayon::prelude::*;
+use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, Axis};
 
 use super::error::check_shape;
 use super::noise::check_shapes;
-use super::{
-    NoiseModel, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind, Transport, cholesky,
-};
+use super::pivot::minimise_free;
+use super::tiles::{Objectives, Problem, Row, Spike, Tile};
+use super::{NoiseModel, PlaneError, Prior, RowTiming, Setting, SimdLevel, SlotKind, Transport};
 
 /// How uncertain a transport is through the noise of its stack.
 ///
@@ -41,12 +40,13 @@ pub struct Samples<'a> {
     pub valid: Option<ArrayView3<'a, bool>>,
     /// [`super::Coupled::variance_ratio`] if the stack was coupled, `[t, s]`.
     pub variance_ratio: Option<ArrayView2<'a, f32>>,
+    /// Where direct light was taken to lie, as in [`super::Demux::with_spike`] but of these rows alone, `[t, s]`; `None` for
+    /// row 0.
+    pub u0_rows: Option<ArrayView2<'a, f32>>,
 }
 
-/// Condition of `H`, scaled to a unit diagonal, up to which the row's inverse serves all pixels.
-const WELL_CONDITIONED: f64 = 1e8;
-/// Relative increase of the diagonal of `H`: rows that nothing determines become very uncertain, not singular.
-const RIDGE: f64 = 1e-12;
+/// Light of a row that is less than this share of the direct light which reaches it is rounding.
+const ROUNDING: f32 = 1e-6;
 
 impl Uncertainty<'_> {
     /// Standard deviation of the light in each band of relative rows, `[bands, t, s]`, in the units of the transport.
@@ -83,20 +83,63 @@ impl Uncertainty<'_> {
         self.check(first_row, transport, samples)?;
         let (_, rows, columns) = transport.t.dim();
         let mut sd = Array3::zeros((bands.len(), rows, columns));
-        sd.axis_iter_mut(Axis(1)).into_par_iter().enumerate().try_for_each(|(t, mut sd)| {
-            let row = Row::new(self, transport, bands, first_row + t);
-            let profiles = transport.t.index_axis(Axis(1), t);
-            let valid = samples.valid.map(|valid| valid.index_axis_move(Axis(1), t));
-            // The change of each band of each column with each sample, [columns * bands, settings].
-            let gains = row.solve(profiles, valid)?.dot(&row.weights.t());
-            for (column, gains) in gains.axis_chunks_iter(Axis(0), bands.len().max(1)).enumerate() {
-                let pixel = Pixel::new(self, samples, t, column);
-                let variances = gains.rows().into_iter().map(|gains| pixel.variance_of(gains));
-                sd.column_mut(column).iter_mut().zip(variances).for_each(|(sd, v)| *sd = v.sqrt() as f32);
-            }
-            Ok(())
-        })?;
+        if bands.is_empty() {
+            return Ok(sd);
+        }
+        let mut judged: Vec<Row<Data>> = sd
+            .axis_iter_mut(Axis(1))
+            .enumerate()
+            .map(|(t, sd)| {
+                let valid = samples.valid.map(|valid| valid.index_axis_move(Axis(1), t));
+                let u0_rows = samples.u0_rows.map(|u0_rows| u0_rows.index_axis_move(Axis(0), t));
+                let profiles = transport.t.index_axis(Axis(1), t);
+                Row::new(first_row + t, columns, valid, u0_rows, Data { t, profiles, sd })
+            })
+            .collect();
+        let reach = transport.u_min..=transport.u_max();
+        let Self { timing, settings, prior, .. } = *self;
+        let objectives = Objectives { timing, settings, prior, reach: &reach, spot: None };
+        let work = |problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
+            self.judge_tile(samples, bands, transport.u_min, problem, tile, rows)
+        };
+        objectives.for_each_tile(&mut judged, &|| true, &work)?;
         Ok(sd)
+    }
+
+    fn judge_tile(
+        &self,
+        samples: &Samples,
+        bands: &[Vec<RangeInclusive<i32>>],
+        u_min: i32,
+        problem: &Problem,
+        tile: &Tile,
+        rows: &mut [Row<Data>],
+    ) -> Result<(), PlaneError> {
+        let sums = problem.sums(bands);
+        let places: Vec<(usize, usize)> = problem.places(u_min).collect();
+        let shape = (tile.pixels.len() * bands.len(), problem.model.slots.len());
+        let mut linear = Array2::zeros(shape);
+        let mut free = Array2::from_elem(shape, true);
+        let of_pixels = linear.axis_chunks_iter_mut(Axis(0), bands.len());
+        let of_pixels = of_pixels.zip(free.axis_chunks_iter_mut(Axis(0), bands.len()));
+        for ((mut linear, mut free), &(at, column)) in of_pixels.zip(&tile.pixels) {
+            linear.assign(&sums);
+            let lit = problem.lit(&places, rows[at].data.profiles.column(column));
+            free.rows_mut().into_iter().for_each(|mut free| free.assign(&lit));
+        }
+        let solutions = minimise_free(SimdLevel::best(), &problem.quadratic, linear, free.view());
+        if solutions.iter().any(|entry| !entry.is_finite()) {
+            return Err(PlaneError::NotConvex);
+        }
+        // The change of each band of each pixel with each sample.
+        let gains = solutions.dot(&problem.weights.t());
+        for (gains, &(at, column)) in gains.axis_chunks_iter(Axis(0), bands.len()).zip(&tile.pixels) {
+            let Data { t, sd, .. } = &mut rows[at].data;
+            let pixel = Pixel::new(self, samples, &problem.settings, *t, column);
+            let variances = gains.rows().into_iter().map(|gains| pixel.variance_of(gains));
+            sd.column_mut(column).iter_mut().zip(variances).for_each(|(sd, v)| *sd = v.sqrt() as f32);
+        }
+        Ok(())
     }
 
     fn check(&self, first_row: usize, transport: &Transport, samples: &Samples) -> Result<(), PlaneError> {
@@ -112,84 +155,58 @@ impl Uncertainty<'_> {
         let expected = [self.settings.len(), rows, columns];
         check_shape("stack", "[settings, camera rows, columns]", samples.stack.shape(), &expected)?;
         let ratio = samples.variance_ratio;
-        ratio.map_or(Ok(()), |ratio| {
-            check_shape("variance_ratio", "[camera rows, columns]", ratio.shape(), &[rows, columns])
-        })
+        for (name, map) in [("variance_ratio", ratio), ("u0_rows", samples.u0_rows)] {
+            map.map_or(Ok(()), |map| {
+                check_shape(name, "[camera rows, columns]", map.shape(), &[rows, columns])
+            })?;
+        }
+        Ok(())
     }
 }
 
-/// The problem of one camera row, with its unknowns scaled so that `H` of all settings has a unit diagonal: smoothness
-/// far from `u = 0` weighs a million times more than the data.
-struct Row {
-    /// `A`, `[settings, slots]`.
-    weights: Array2<f64>,
-    /// `alpha D'D`, `[slots, slots]`.
-    smoothness: Array2<f64>,
-    /// Index of each slot in the profile, `None` for a wrapped one.
-    profile_index: Vec<Option<usize>>,
-    /// 1 in the slots of each band, `[bands, slots]`.
-    bands: Array2<f64>,
+/// A camera row that is to be judged.
+struct Data<'a> {
+    /// Its place in the stack.
+    t: usize,
+    /// Its part of the transport, `[reach, columns]`.
+    profiles: ArrayView2<'a, f32>,
+    /// The result, `[bands, columns]`.
+    sd: ArrayViewMut2<'a, f32>,
 }
 
-impl Row {
-    fn new(of: &Uncertainty, transport: &Transport, bands: &[Vec<RangeInclusive<i32>>], t: usize) -> Self {
-        let reach = transport.u_min..=transport.u_max();
-        let RowModel { slots, mut weights } = RowModel::new(of.timing, of.settings, &reach, t);
-        let differences = of.prior.differences(&slots);
-        let mut smoothness = of.prior.alpha() * differences.t().dot(&differences);
-        let mut indicators = Array2::from_shape_fn((bands.len(), slots.len()), |(band, slot)| {
+impl Problem<'_> {
+    /// What each unknown adds to the light of each band, `[bands, slots]`.
+    fn sums(&self, bands: &[Vec<RangeInclusive<i32>>]) -> Array2<f64> {
+        let slots = &self.model.slots;
+        let mut sums = Array2::from_shape_fn((bands.len(), slots.len()), |(band, slot)| {
             let inside = bands[band].iter().any(|range| range.contains(&slots[slot].u));
-            f64::from(slots[slot].kind == SlotKind::Own && inside)
+            f64::from(u8::from(slots[slot].kind == SlotKind::Own && inside))
         });
-        for slot in 0..slots.len() {
-            let diagonal = weights.column(slot).dot(&weights.column(slot)) + smoothness[[slot, slot]];
-            let scale = if diagonal > 0.0 { diagonal.sqrt().recip() } else { 1.0 };
-            weights.column_mut(slot).mapv_inplace(|weight| weight * scale);
-            smoothness.column_mut(slot).mapv_inplace(|entry| entry * scale);
-            smoothness.row_mut(slot).mapv_inplace(|entry| entry * scale);
-            indicators.column_mut(slot).mapv_inplace(|indicator| indicator * scale);
+        if let Some(Spike { own, neighbour, share }) = self.spike {
+            for mut sums in sums.rows_mut() {
+                sums[own] =
+                    (1.0 - share) * sums[own] + neighbour.map_or(0.0, |neighbour| share * sums[neighbour]);
+            }
         }
-        let profile_index = |slot: &Slot| match slot.kind {
-            SlotKind::Own => Some((slot.u - transport.u_min) as usize),
-            SlotKind::Wrapped => None,
-        };
-        let profile_index = slots.iter().map(profile_index).collect();
-        Self { weights, smoothness, profile_index, bands: indicators }
+        sums
     }
 
-    /// Solves `H_FF y_F = b_F`, 0 elsewhere, for each pixel and each band's indicator `b`: `[columns * bands, slots]`.
-    fn solve(
-        &self,
-        profiles: ArrayView2<f32>,
-        valid: Option<ArrayView2<bool>>,
-    ) -> Result<Array2<f64>, PlaneError> {
-        let settings = self.weights.nrows();
-        let (bands, slots) = self.bands.dim();
-        let mut solutions = Array2::zeros((profiles.ncols() * bands, slots));
-        let complete = System::new(self, (0..settings).collect())?;
-        let mut masked: Option<System> = None;
-        for (column, profile) in profiles.columns().into_iter().enumerate() {
-            let is_used = |n: &usize| valid.is_none_or(|valid| valid[[*n, column]]);
-            let used: Vec<usize> = (0..settings).filter(is_used).collect();
-            let system = if used.len() == settings {
-                &complete
-            } else {
-                // Neighbouring pixels of a highlight mostly lose the same settings.
-                match masked.take().filter(|system| system.settings == used) {
-                    Some(known) => masked.insert(known),
-                    None => masked.insert(System::new(self, used)?),
-                }
-            };
-            let is_free = |slot: &usize| self.profile_index[*slot].is_none_or(|index| profile[index] > 0.0);
-            let (free, fixed): (Vec<usize>, Vec<usize>) = (0..slots).partition(is_free);
-            let solution = system.solve_free(&self.bands, &free, &fixed)?;
-            solutions.slice_mut(s![column * bands..(column + 1) * bands, ..]).assign(&solution);
+    /// The unknowns that are free in a pixel's profile, by slot. Those without a place in it count as free.
+    fn lit(&self, places: &[(usize, usize)], profile: ArrayView1<f32>) -> Array1<bool> {
+        let mut light = Array1::from_elem(self.model.slots.len(), 1.0_f32);
+        places.iter().for_each(|&(slot, place)| light[slot] = profile[place]);
+        if let Some(Spike { own, neighbour: Some(neighbour), share }) = self.spike {
+            // What the direct light sends to the neighbour is no light of the neighbour's own.
+            let share = share as f32;
+            let direct = if share < 1.0 { light[own] / (1.0 - share) } else { light[neighbour] };
+            light[own] = direct;
+            light[neighbour] -= direct * (share + ROUNDING);
         }
-        Ok(solutions)
+        light.mapv(|light| light > 0.0)
     }
 }
 
-/// One pixel's samples; masked ones are 0 without variance.
+/// One pixel's samples.
 struct Pixel {
     light: Array1<f64>,
     /// Before coupling.
@@ -198,14 +215,13 @@ struct Pixel {
 }
 
 impl Pixel {
-    fn new(of: &Uncertainty, samples: &Samples, t: usize, column: usize) -> Self {
-        let index = |n| [n, t, column];
-        let is_valid = |n| samples.valid.is_none_or(|valid| valid[index(n)]);
-        let light = |n| if is_valid(n) { f64::from(samples.stack[index(n)]) } else { 0.0 };
-        let light = Array1::from_shape_fn(of.settings.len(), light);
-        let variance = |n| if is_valid(n) { of.noise.variance(light[n], of.frames[n]) } else { 0.0 };
+    /// Those of some settings.
+    fn new(of: &Uncertainty, samples: &Samples, settings: &[usize], t: usize, column: usize) -> Self {
+        let light: Array1<f64> = settings.iter().map(|&n| f64::from(samples.stack[[n, t, column]])).collect();
+        let variances =
+            settings.iter().zip(&light).map(|(&n, &light)| of.noise.variance(light, of.frames[n]));
         Self {
-            variance: Array1::from_shape_fn(of.settings.len(), variance),
+            variance: variances.collect(),
             light,
             variance_ratio: samples.variance_ratio.map_or(1.0, |ratio| f64::from(ratio[[t, column]])),
         }
@@ -221,65 +237,4 @@ impl Pixel {
         let scaling = (gains.dot(&self.light) / self.light.sum()).powi(2) * self.variance.sum();
         self.variance_ratio * independent + (1.0 - self.variance_ratio) * scaling
     }
-}
-
-/// The quadratic part of the objective for some of the settings.
-struct System {
-    settings: Vec<usize>,
-    h: Array2<f64>,
-    /// The inverse of `H`, unless too little would remain of it in floating point.
-    inverse: Option<Array2<f64>>,
-}
-
-impl System {
-    fn new(row: &Row, settings: Vec<usize>) -> Result<Self, PlaneError> {
-        let weights = row.weights.select(Axis(0), &settings);
-        let mut h = weights.t().dot(&weights) + &row.smoothness;
-        h.diag_mut().mapv_inplace(|diagonal| if diagonal > 0.0 { diagonal + RIDGE } else { 1.0 });
-        let inverse = solve(h.clone(), Array2::eye(h.nrows()))?;
-        let condition = inverse.diag().iter().fold(1.0, |most, &entry| f64::max(most, entry));
-        Ok(Self { settings, h, inverse: (condition < WELL_CONDITIONED).then_some(inverse) })
-    }
-
-    /// Solves `H_FF y_F = b_F` for each row `b` of `right_sides`; 0 in the fixed slots.
-    fn solve_free(
-        &self,
-        right_sides: &Array2<f64>,
-        free: &[usize],
-        fixed: &[usize],
-    ) -> Result<Array2<f64>, PlaneError> {
-        match &self.inverse {
-            // On the side of the fewer slots: the forces on the fixed ones that hold them at 0.
-            Some(inverse) if fixed.len() < free.len() => {
-                let unheld = right_sides.dot(inverse);
-                let to_fixed = inverse.select(Axis(0), fixed);
-                let forces =
-                    solve(to_fixed.select(Axis(1), fixed), unheld.select(Axis(1), fixed).reversed_axes())?;
-                Ok(unheld - forces.t().dot(&to_fixed))
-            }
-            _ => {
-                let h = self.h.select(Axis(0), free).select(Axis(1), free);
-                let solution = solve(h, right_sides.select(Axis(1), free).reversed_axes())?;
-                let mut all = Array2::zeros(right_sides.raw_dim());
-                free.iter()
-                    .zip(solution.rows())
-                    .for_each(|(&slot, values)| all.column_mut(slot).assign(&values));
-                Ok(all)
-            }
-        }
-    }
-}
-
-/// Solves `matrix x = b` for each column `b` of `right_sides`; `matrix` is symmetric positive definite.
-fn solve(matrix: Array2<f64>, right_sides: Array2<f64>) -> Result<Array2<f64>, PlaneError> {
-    let n = matrix.nrows();
-    let mut factor: Vec<f64> = matrix.iter().copied().collect();
-    cholesky::factor(&mut factor, n).map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
-    let mut solutions = right_sides;
-    for mut column in solutions.columns_mut() {
-        let mut values = column.to_vec();
-        cholesky::solve(&factor, n, &mut values);
-        column.assign(&Array1::from(values));
-    }
-    Ok(solutions)
 }

@@ -1,0 +1,274 @@
+//! An image's pixels in tiles that share an objective: what [`super::Demux`] solves and [`super::Uncertainty`] judges.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
+
+use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
+use rayon::prelude::*;
+
+use super::calibrate::FlyingSpot;
+use super::pivot::RUN_PX;
+use super::quadratic::Quadratic;
+use super::{PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind};
+
+/// Pixels that are solved together: as many as keep their vectors in the cache beside the model.
+const TILE_PX: usize = 512;
+
+/// Objectives that are held at a time: few enough for the memory, enough for all threads.
+const PROBLEMS: usize = 16;
+
+/// Steps, per projector row, of the place of direct light: pixels within one step share an objective.
+const SPIKE_STEPS: f32 = 64.0;
+
+/// What the objectives of all pixels are made of.
+#[derive(Clone, Copy)]
+pub(super) struct Objectives<'a> {
+    pub timing: &'a RowTiming,
+    pub settings: &'a [Setting],
+    pub prior: Prior,
+    pub reach: &'a RangeInclusive<i32>,
+    pub spot: Option<&'a FlyingSpot>,
+}
+
+/// A camera row, and what is done with it.
+pub(super) struct Row<'a, T> {
+    /// Its number in the camera.
+    t: usize,
+    columns: usize,
+    /// `[settings, columns]`
+    valid: Option<ArrayView2<'a, bool>>,
+    /// `[columns]`
+    u0_rows: Option<ArrayView1<'a, f32>>,
+    pub data: T,
+    /// Columns by their direct light, once they are known.
+    groups: BTreeMap<Direct, Vec<usize>>,
+}
+
+/// Where and when direct light arrives: the place in steps, and its weights as bits where they are not even.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Direct {
+    step: i32,
+    weights: Option<Vec<u64>>,
+}
+
+/// The objective of pixels with the same direct light and the same valid samples.
+pub(super) struct Problem<'a> {
+    pub model: &'a RowModel,
+    /// Which of the settings count.
+    pub settings: Vec<usize>,
+    /// `[settings, slots]`
+    pub weights: Array2<f64>,
+    pub quadratic: Quadratic,
+    pub spike: Option<Spike>,
+}
+
+/// Direct light between rows: one unknown, in the slot of row 0, that stands for light in two rows.
+#[derive(Clone, Copy)]
+pub(super) struct Spike {
+    /// The slot of row 0.
+    pub own: usize,
+    /// The slot of the row on the other side, if the projector has it.
+    pub neighbour: Option<usize>,
+    /// The neighbour's share of the light.
+    pub share: f64,
+}
+
+/// Pixels that share an objective, each as the index of its row and its column.
+#[derive(Default)]
+pub(super) struct Tile {
+    pub pixels: Vec<(usize, usize)>,
+    /// Lengths of the runs that they come in: neighbours in one row, so that an image which is solved in parts is solved as
+    /// it would be in one.
+    pub runs: Vec<usize>,
+}
+
+/// What is done with a tile, whose pixels lie in these rows.
+pub(super) trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
+impl<T, F: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync> Work<T> for F {}
+
+impl Objectives<'_> {
+    /// Does `work` with all pixels of some camera rows, ascending, for as long as `go_on` says yes; tiles in parallel, with
+    /// each pixel in the same run however the rows come together.
+    ///
+    /// # Errors
+    /// Those of `work`; [`PlaneError::NotConvex`]; [`PlaneError::Stopped`].
+    pub fn for_each_tile<T: Send>(
+        &self,
+        rows: &mut [Row<T>],
+        go_on: &(dyn Fn() -> bool + Sync),
+        work: &impl Work<T>,
+    ) -> Result<(), PlaneError> {
+        // Neighbouring rows with the same model, a class at a time, so that its factors live no longer than they are needed.
+        let mut classes: Vec<(RowModel, &mut [Row<T>])> = Vec::new();
+        let mut rest = rows;
+        while let Some(first) = rest.first() {
+            let model = self.model(first.t);
+            let alike = rest.iter().take_while(|row| row.t == first.t || self.model(row.t) == model).count();
+            let (class, after) = rest.split_at_mut(alike);
+            classes.push((model, class));
+            rest = after;
+        }
+        classes.into_par_iter().try_for_each(|(model, rows)| self.for_class(&model, rows, go_on, work))
+    }
+
+    fn model(&self, t: usize) -> RowModel {
+        RowModel::new(self.timing, self.settings, self.reach, t)
+    }
+
+    /// Rows that have the same model.
+    fn for_class<T: Send>(
+        &self,
+        model: &RowModel,
+        rows: &mut [Row<T>],
+        go_on: &(dyn Fn() -> bool + Sync),
+        work: &impl Work<T>,
+    ) -> Result<(), PlaneError> {
+        for row in &mut *rows {
+            row.groups = self.group(model, row)?;
+        }
+        let directs: BTreeSet<Direct> = rows.iter().flat_map(|row| row.groups.keys().cloned()).collect();
+        let directs: Vec<Direct> = directs.into_iter().collect();
+        // Rows of narrow images fill a tile together.
+        let columns = rows.first().map_or(1, |row| row.columns.max(1));
+        let tile_rows = (TILE_PX / columns).max(1);
+        for directs in directs.chunks(PROBLEMS) {
+            let problems: Vec<Problem> = directs
+                .par_iter()
+                .map(|direct| Problem::new(model, &self.prior, direct))
+                .collect::<Result<_, _>>()?;
+            rows.par_chunks_mut(tile_rows).try_for_each(|rows| {
+                directs.iter().zip(&problems).try_for_each(|(direct, problem)| match go_on() {
+                    true => self.for_group(problem, direct, rows, work),
+                    false => Err(PlaneError::Stopped),
+                })
+            })?;
+        }
+        Ok(())
+    }
+
+    /// The pixels of these rows that have this direct light.
+    fn for_group<T>(
+        &self,
+        problem: &Problem,
+        direct: &Direct,
+        rows: &mut [Row<T>],
+        work: &impl Work<T>,
+    ) -> Result<(), PlaneError> {
+        let mut tile = Tile::default();
+        for at in 0..rows.len() {
+            let Some(columns) = rows[at].groups.remove(direct) else { continue };
+            let valid = rows[at].valid;
+            let is_whole =
+                |column: &usize| valid.is_none_or(|valid| valid.column(*column).iter().all(|v| *v));
+            let (whole, masked): (Vec<usize>, Vec<usize>) =
+                columns.iter().partition(|column| is_whole(column));
+            for columns in whole.chunks(TILE_PX) {
+                tile.add(at, columns);
+                if tile.pixels.len() >= TILE_PX {
+                    work(problem, &std::mem::take(&mut tile), rows)?;
+                }
+            }
+            let Some(valid) = valid else { continue };
+            // Neighbouring pixels of a highlight mostly lack the same samples.
+            for alike in masked.chunk_by(|&a, &b| valid.column(a) == valid.column(b)) {
+                let mut tile = Tile::default();
+                tile.add(at, alike);
+                work(&problem.masked(valid.column(alike[0]), &self.prior)?, &tile, rows)?;
+            }
+        }
+        work(problem, &tile, rows)
+    }
+
+    /// Columns of a row by where and when their direct light arrives.
+    fn group<T>(&self, model: &RowModel, row: &Row<T>) -> Result<BTreeMap<Direct, Vec<usize>>, PlaneError> {
+        let own = slot_of(model, 0);
+        let uneven = match self.spot.zip(own) {
+            Some((spot, own)) => {
+                let even = model.weights.column(own);
+                Some((spot, spot.weights(self.timing, self.settings, row.t, even)?))
+            }
+            None => None,
+        };
+        let mut by_part: BTreeMap<(i32, Option<usize>), Vec<usize>> = BTreeMap::new();
+        for column in 0..row.columns {
+            let u0_rows = row.u0_rows.filter(|_| own.is_some()).map_or(0.0, |u0_rows| u0_rows[column]);
+            let part = uneven.as_ref().map(|(spot, weights)| (spot.part(column), weights));
+            let part = part.and_then(|(part, weights)| weights[part].as_ref().map(|_| part));
+            by_part.entry(((u0_rows * SPIKE_STEPS).round() as i32, part)).or_default().push(column);
+        }
+        // Parts that are drawn alike have the same weights, in other rows too.
+        let mut groups: BTreeMap<Direct, Vec<usize>> = BTreeMap::new();
+        for ((step, part), columns) in by_part {
+            let weights = part.zip(uneven.as_ref()).and_then(|(part, (_, weights))| weights[part].as_ref());
+            let weights = weights.map(|weights| weights.iter().map(|weight| weight.to_bits()).collect());
+            groups.entry(Direct { step, weights }).or_default().extend(columns);
+        }
+        Ok(groups)
+    }
+}
+
+impl<'a, T> Row<'a, T> {
+    /// A camera row of so many columns. `valid`, `[settings, columns]`, tells which samples count; `u0_rows`, `[columns]`,
+    /// where direct light lies.
+    pub fn new(
+        t: usize,
+        columns: usize,
+        valid: Option<ArrayView2<'a, bool>>,
+        u0_rows: Option<ArrayView1<'a, f32>>,
+        data: T,
+    ) -> Self {
+        Self { t, columns, valid, u0_rows, data, groups: BTreeMap::new() }
+    }
+}
+
+impl Tile {
+    fn add(&mut self, row: usize, columns: &[usize]) {
+        self.pixels.extend(columns.iter().map(|&column| (row, column)));
+        self.runs.extend(columns.chunks(RUN_PX).map(<[usize]>::len));
+    }
+}
+
+impl<'a> Problem<'a> {
+    fn new(model: &'a RowModel, prior: &Prior, direct: &Direct) -> Result<Self, PlaneError> {
+        let mut weights = model.weights.clone();
+        let own = slot_of(model, 0);
+        if let Some((own, direct)) = own.zip(direct.weights.as_ref()) {
+            weights.column_mut(own).iter_mut().zip(direct).for_each(|(to, &bits)| *to = f64::from_bits(bits));
+        }
+        let spike = own.filter(|_| direct.step != 0).map(|own| Spike {
+            own,
+            neighbour: slot_of(model, direct.step.signum()),
+            share: f64::from(direct.step.unsigned_abs()) / f64::from(SPIKE_STEPS),
+        });
+        if let Some(Spike { own, neighbour, share }) = spike {
+            let other = neighbour.map(|neighbour| weights.column(neighbour).to_owned());
+            let mut column = weights.column_mut(own);
+            column *= 1.0 - share;
+            other.into_iter().for_each(|other| column.scaled_add(share, &other));
+        }
+        let quadratic = Quadratic::new(weights.view(), &model.slots, prior)?;
+        Ok(Self { model, settings: (0..weights.nrows()).collect(), weights, quadratic, spike })
+    }
+
+    /// The same for pixels of which only some samples are valid.
+    fn masked(&self, valid: ArrayView1<bool>, prior: &Prior) -> Result<Self, PlaneError> {
+        let (settings, dropped): (Vec<usize>, Vec<usize>) = self.settings.iter().partition(|&&n| valid[n]);
+        let weights = self.weights.select(Axis(0), &settings);
+        let downdated = self.quadratic.without(self.weights.select(Axis(0), &dropped).view());
+        let quadratic = match downdated {
+            Some(quadratic) => quadratic,
+            None => Quadratic::new(weights.view(), &self.model.slots, prior)?,
+        };
+        Ok(Self { model: self.model, settings, weights, quadratic, spike: self.spike })
+    }
+
+    /// The slots that a profile has a value for, `[slot, relative row - u_min]`.
+    pub fn places(&self, u_min: i32) -> impl Iterator<Item = (usize, usize)> {
+        let own = self.model.slots.iter().enumerate().filter(|(_, slot)| slot.kind == SlotKind::Own);
+        own.map(move |(slot, own)| (slot, (own.u - u_min) as usize))
+    }
+}
+
+fn slot_of(model: &RowModel, u: i32) -> Option<usize> {
+    model.slots.iter().position(|slot| *slot == Slot { u, kind: SlotKind::Own })
+}

@@ -1,0 +1,80 @@
+//! The daemon as a child process, for the commands that need one.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+use std::time::{Duration, Instant};
+
+use crate::run::{Done, run};
+
+/// Starting takes longer only where something is wrong; a large simulated scene is rendered first.
+const START_TIMEOUT: Duration = Duration::from_secs(120);
+
+const SOCKET: &str = "raysweepd.sock";
+
+/// The daemon, ended in order when all is well and in any case when not.
+pub struct Daemon {
+    process: Child,
+    runtime: PathBuf,
+}
+
+impl Daemon {
+    /// Starts the daemon of a folder of programs, and waits until it listens.
+    pub fn start(programs: &Path, rig: &Path, data: &Path) -> Done<Self> {
+        // Socket paths are short by law (108 bytes), checkouts are not.
+        let runtime = std::env::temp_dir().join(format!("raysweep-xtask-{}", std::process::id()));
+        std::fs::create_dir_all(&runtime).map_err(|error| format!("{}: {error}", runtime.display()))?;
+        let process = Command::new(programs.join("raysweepd"))
+            .arg("--rig")
+            .arg(rig)
+            .arg("--socket")
+            .arg(runtime.join(SOCKET))
+            .arg("--data")
+            .arg(data)
+            .spawn()
+            .map_err(|error| format!("cannot start raysweepd: {error}"))?;
+        let mut daemon = Self { process, runtime };
+        daemon.wait()?;
+        Ok(daemon)
+    }
+
+    /// Where clients connect.
+    pub fn socket(&self) -> PathBuf {
+        self.runtime.join(SOCKET)
+    }
+
+    /// The process's number.
+    pub fn id(&self) -> u32 {
+        self.process.id()
+    }
+
+    fn wait(&mut self) -> Done {
+        let socket = self.socket();
+        let began = Instant::now();
+        while !socket.exists() {
+            if let Ok(Some(status)) = self.process.try_wait() {
+                return Err(format!("raysweepd ended with {status}; its message stands above"));
+            }
+            if began.elapsed() > START_TIMEOUT {
+                return Err(format!("raysweepd does not listen on {}", socket.display()));
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        Ok(())
+    }
+
+    /// Asks the daemon to end, as systemd does, and waits until it has.
+    pub fn stop(mut self) -> Done {
+        run(Command::new("kill").args(["-TERM", &self.process.id().to_string()]))?;
+        let status = self.process.wait().map_err(|error| format!("raysweepd: {error}"))?;
+        if status.success() { Ok(()) } else { Err(format!("raysweepd ended with {status}")) }
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        // Both fail where the daemon has ended in order, which is how it should be.
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+        let _ = std::fs::remove_dir_all(&self.runtime);
+    }
+}
