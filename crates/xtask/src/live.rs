@@ -119,7 +119,7 @@ fn ran(rig: &Path, plan: &Path, folder: &Path) -> Done<Ran> {
     if !output.status.success() {
         return Err(format!("raysweep run ended with {}: {said}", output.status));
     }
-    let cpu_s = cpu_s.map_err(|_| "the thread that looks at /proc panicked")?;
+    let cpu_s = cpu_s.map_err(|_panic| "the thread that looks at /proc panicked")?;
     daemon.stop()?;
     let spent = |wanted: &dyn Fn(&str) -> bool| -> f64 {
         let threads = cpu_s.iter().filter(|(_, (name, _))| wanted(name));

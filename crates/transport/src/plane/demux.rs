@@ -16,8 +16,8 @@ use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind
 /// `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` over `T >= 0` (the paper's section 4).
 ///
 /// All pixels of a camera row share one model, and rows whose model is the same share its factors, so a pixel costs a
-/// few small triangular systems. Rows are solved in parallel, and the result does not depend, to the bit, on how many
-/// threads there are. Channels are pixels too: an RGB stack is solved as one with three times the columns, a Bayer
+/// few small triangular systems. Tiles of pixels are solved in parallel, and the result does not depend, to the bit, on how
+/// many threads there are, nor a row's on which other rows are solved. Channels are pixels too: an RGB stack is solved as one with three times the columns, a Bayer
 /// mosaic as it is.
 #[derive(Debug, Clone)]
 pub struct Demux {
@@ -161,7 +161,7 @@ impl Demux {
         self.solve_while(stack, valid, &|| true)
     }
 
-    /// [`Self::solve`] for as long as `go_on` says yes; it is asked before each camera row.
+    /// [`Self::solve`] for as long as `go_on` says yes; it is asked before every few camera rows.
     ///
     /// # Errors
     /// Those of [`Self::solve`]; [`PlaneError::Stopped`] once `go_on` said no.
