@@ -59,7 +59,10 @@ fn frames_come_whole_and_in_order_with_their_times() {
     let too_early = camera.next_frame(&mut buf, Duration::ZERO).unwrap_err();
     assert_eq!(too_early.kind, DeviceErrorKind::NotReady);
     let applied = camera.configure(ID, &SETTINGS).unwrap();
-    assert_eq!((applied.actual, applied.first_frame), (SETTINGS, FirstFrame::Within { earliest: 1, certain: 4 }));
+    assert_eq!(
+        (applied.actual, applied.first_frame),
+        (SETTINGS, FirstFrame::Within { earliest: 1, certain: 4 })
+    );
     assert_eq!(camera.state(), DeviceState::Ready);
     camera.arm().unwrap();
     assert_eq!(camera.state(), DeviceState::Streaming);
