@@ -29,21 +29,22 @@ pub struct Triggers {
 
 /// The first frame with settings whose last register was written at `written_ns`.
 ///
-/// It is exactly known where no trigger can have come between the newest frame and the end of the writing: whether the
-/// triggers after that are answered or missed, the next frame is the first. Where triggers may have come, each may have made a frame or
-/// none, before the registers were written or after.
+/// While a camera is armed it is never known exactly: each trigger that may have come since the newest known one may have
+/// made a frame or none, before the registers were written or after, and a false edge may have come at any time.
 pub fn first_frame(triggers: Triggers, written_ns: i64, latency: Latency) -> FirstFrame {
     let Triggers { next_seq, last_ns, period_ns, margin_ns } = triggers;
-    let possible = last_ns.map_or(0, |last_ns| {
-        let passed_ns = written_ns.saturating_sub(last_ns).saturating_add(margin_ns);
-        u64::try_from(passed_ns / period_ns.max(1)).unwrap_or(0)
-    });
-    let earliest = next_seq + u64::from(latency.min_frames);
-    let certain = next_seq + possible + u64::from(latency.max_frames);
-    if possible == 0 && latency.min_frames == latency.max_frames {
-        FirstFrame::Exactly(certain)
-    } else {
-        FirstFrame::Within { earliest, certain }
+    let Some(last_ns) = last_ns else {
+        // Nothing is exposed, so that settings may act on the next frame however late they act otherwise.
+        return match latency.max_frames {
+            0 => FirstFrame::Exactly(next_seq),
+            late => FirstFrame::Within { earliest: next_seq, certain: next_seq + u64::from(late) },
+        };
+    };
+    let passed_ns = written_ns.saturating_sub(last_ns).saturating_add(margin_ns);
+    let possible = u64::try_from(passed_ns / period_ns.max(1)).unwrap_or(0);
+    FirstFrame::Within {
+        earliest: next_seq + u64::from(latency.min_frames),
+        certain: next_seq + possible + u64::from(latency.max_frames),
     }
 }
 
@@ -100,30 +101,34 @@ mod tests {
         Triggers { next_seq: 10, last_ns, period_ns: 16_666_667, margin_ns: 500_000 }
     }
 
-    #[test]
-    fn settings_written_between_triggers_hold_exactly_from_the_next_frame_on() {
-        let first = |written_ns, latency| first_frame(triggers(Some(0)), written_ns, latency);
-        assert_eq!(first(6_000_000, NEXT), FirstFrame::Exactly(10));
-        assert_eq!(first(16_100_000, NEXT), FirstFrame::Exactly(10));
-        let late = Latency { min_frames: 3, max_frames: 3 };
-        assert_eq!(first(6_000_000, late), FirstFrame::Exactly(13));
-        let unsure = Latency { min_frames: 0, max_frames: 3 };
-        assert_eq!(first(6_000_000, unsure), FirstFrame::Within { earliest: 10, certain: 13 });
+    fn within(earliest: u64, certain: u64) -> FirstFrame {
+        FirstFrame::Within { earliest, certain }
     }
 
     #[test]
-    fn a_trigger_that_may_have_come_makes_the_promise_later_and_vague() {
+    fn a_promise_leaves_room_for_every_trigger_that_may_have_come() {
         let first = |written_ns| first_frame(triggers(Some(0)), written_ns, NEXT);
-        let within = |certain| FirstFrame::Within { earliest: 10, certain };
-        assert_eq!(first(16_200_000), within(11), "within the margin of the next trigger");
-        assert_eq!(first(17_000_000), within(11));
-        assert_eq!(first(33_000_000), within(12));
-        assert_eq!(first(1_000_000_000), within(70), "a second without frames");
+        assert_eq!(first(6_000_000), within(10, 10));
+        assert_eq!(first(16_100_000), within(10, 10));
+        assert_eq!(first(16_200_000), within(10, 11), "within the margin of the next trigger");
+        assert_eq!(first(33_000_000), within(10, 12));
+        assert_eq!(first(1_000_000_000), within(10, 70), "a second without frames");
+    }
+
+    #[test]
+    fn a_promise_is_as_late_as_the_camera() {
+        let first = |min_frames, max_frames| {
+            first_frame(triggers(Some(0)), 6_000_000, Latency { min_frames, max_frames })
+        };
+        assert_eq!(first(3, 3), within(13, 13));
+        assert_eq!(first(0, 3), within(10, 13));
     }
 
     #[test]
     fn a_camera_that_is_not_armed_answers_no_trigger() {
-        assert_eq!(first_frame(triggers(None), 1_000_000_000, NEXT), FirstFrame::Exactly(10));
+        let first = |latency| first_frame(triggers(None), 1_000_000_000, latency);
+        assert_eq!(first(NEXT), FirstFrame::Exactly(10));
+        assert_eq!(first(Latency { min_frames: 2, max_frames: 3 }), within(10, 13));
     }
 
     #[test]
