@@ -492,6 +492,12 @@ mod tests {
     }
 
     #[test]
+    fn a_region_that_stays_lit_synchronises_nothing() {
+        let (_, _, counts) = ten_scans(|stream| stream.iter_mut().for_each(|(_, seen)| seen.energy = 5000));
+        assert_eq!((counts.used, counts.unsynchronised), (0, 500));
+    }
+
+    #[test]
     fn the_threshold_lies_between_dark_and_lit_and_needs_a_dot() {
         let run: Vec<_> = (0..200).map(|step| at(step, step, 3).1).collect();
         assert_eq!(pulse_threshold(&run).unwrap(), 1000);

@@ -28,10 +28,7 @@ impl Footprints {
             .into_par_iter()
             .map(|dot| {
                 let column = batch.column(dot);
-                let lights =
-                    column.words().flat_map(|word| word.values.chunks_exact(channels)).map(luminance);
-                let least =
-                    level as f32 * lights.fold(0.0, |most, light| if light > most { light } else { most });
+                let least = level as f32 * brightest(column.values(), channels);
                 // A column without light has no footprint.
                 let words = column.words().filter(|_| least > 0.0).map(|Word { word, mask, values }| {
                     let above = bits(mask).zip(values.chunks_exact(channels));
@@ -67,6 +64,19 @@ impl Footprints {
         let range = self.offsets[dot] as usize..self.offsets[dot + 1] as usize;
         self.words[range.clone()].iter().zip(&self.masks[range]).map(|(&word, &mask)| (word as usize, mask))
     }
+}
+
+/// Largest luminance of some pixels, `[pixels, channels]`; 0 if none is above.
+fn brightest(values: &[f32], channels: usize) -> f32 {
+    let larger = |most: f32, light: f32| if light > most { light } else { most };
+    // Side by side: one comparison after another would wait for each.
+    let mut most = [0.0; 8];
+    for pixels in values.chunks(8 * channels) {
+        for (most, pixel) in most.iter_mut().zip(pixels.chunks_exact(channels)) {
+            *most = larger(*most, luminance(pixel));
+        }
+    }
+    most.into_iter().fold(0.0, larger)
 }
 
 /// Luminance of a pixel's values: itself, or (R + 2 G + B) / 4.
