@@ -156,7 +156,8 @@ fn a_camera_that_dies_in_the_middle_costs_the_frames_of_its_absence() {
     let (stack, counts) = over_the_wire("", &[], |probe, event| match (event, died) {
         (Event::Progress(progress), None) if progress.points_stored >= 3 => {
             probe.set_faults(Faults { dead: true, ..Faults::default() }).unwrap();
-            died = Some(thread::sleep(Duration::from_secs(2)));
+            thread::sleep(Duration::from_secs(2));
+            died = Some(());
             probe.set_faults(Faults::default()).unwrap();
         }
         _ => {}
