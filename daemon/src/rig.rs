@@ -147,7 +147,9 @@ impl Rig {
         self.check_rows(camera.capabilities())?;
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera, vsync, projector, clock: sim.clock, pace })
+        // Real devices know no time but the machine's, also where others of the rig are simulated.
+        let clock = if self.file.camera.driver == CameraDriver::Sim { sim.clock } else { Clock::real() };
+        Ok(Devices { camera, vsync, projector, clock, pace })
     }
 
     fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {
