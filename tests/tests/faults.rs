@@ -84,7 +84,9 @@ fn without_faults_nothing_is_lost() {
 fn settings_three_frames_late() {
     survive("[sim.camera]\nlate_frames_min = 3\nlate_frames_max = 3\n");
     survive("[sim.camera]\nlate_frames_min = 3\nlate_frames_max = 3\nchunk_exposure = false\n");
-    survive("[sim.camera]\nlate_frames_min = 3\nlate_frames_max = 3\ndropped = 0.05\n[sim.vsync]\nmissing = 0.05\n");
+    survive(
+        "[sim.camera]\nlate_frames_min = 3\nlate_frames_max = 3\ndropped = 0.05\n[sim.vsync]\nmissing = 0.05\n",
+    );
 }
 
 #[test]
