@@ -216,6 +216,23 @@ fn cameras_that_are_busy_at_the_edge_resume_to_the_same_bits_too() {
 }
 
 #[test]
+fn cameras_that_say_nothing_of_the_exposure_resume_to_the_same_bits_too() {
+    // Which of a point's frames count must not hang on the point before it, which a resumed run may not have taken.
+    let late = "late_frames_max = 3\nchunk_exposure = false";
+    let varying = RIG.replace("late_frames_max = 3", late);
+    // Written ahead of frames that are still on their way, settings may cut a point short where a fault hits those
+    // before it: then its bits are those of another attempt.
+    let constant = RIG
+        .replace("late_frames_max = 3", &format!("late_frames_min = 3\n{late}"))
+        .replace("missing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\n", "")
+        .replace("dropped = 0.02\n", "");
+    for line in [8, 9, 10, 12, 14] {
+        resumes_to_the_same_bits(&varying, PLAN, line);
+        resumes_to_the_same_bits(&constant, PLAN, line);
+    }
+}
+
+#[test]
 fn the_same_seed_gives_the_same_bits_with_one_thread_and_with_two() {
     let [one, two] = [1, 2].map(|threads| {
         let folder = folder(RIG);

@@ -110,6 +110,21 @@ fn settings(trigger_delay_us: f64, exposure_us: f64) -> CameraSettings {
     CameraSettings { shutter: Shutter::Rolling, exposure_us, trigger_delay_us }
 }
 
+fn capabilities() -> CameraCapabilities {
+    CameraCapabilities {
+        model: "scripted".into(),
+        width: 1,
+        height: 1,
+        format: PixelFormat::Mono8,
+        row_time_us: 10.0,
+        trigger_latency_us: LATENCY_US,
+        readout_us: 1_000.0,
+        readout: Readout::Sequential,
+        exposure_us: 1.0..=1e6,
+        trigger_delay_us: 0.0..=1e6,
+    }
+}
+
 /// Two exposures with six delays each.
 fn plan() -> Vec<CameraSettings> {
     let delays = || (0..6).map(|k| 3_000.0 + 200.0 * f64::from(k));
@@ -151,18 +166,7 @@ fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
     let camera = Scripted {
         script,
         clock: clock.register(),
-        capabilities: CameraCapabilities {
-            model: "scripted".into(),
-            width: 1,
-            height: 1,
-            format: PixelFormat::Mono8,
-            row_time_us: 10.0,
-            trigger_latency_us: LATENCY_US,
-            readout_us: 1_000.0,
-            readout: Readout::Sequential,
-            exposure_us: 1.0..=1e6,
-            trigger_delay_us: 0.0..=1e6,
-        },
+        capabilities: capabilities(),
         written: Vec::new(),
         changes: 0,
         sleeps: 0,
@@ -341,4 +345,38 @@ fn settings_that_stamps_tell_apart() {
     assert_eq!(tells(&[settings(100.0, 600.0), settings(149.0, 900.0)]), (true, false));
     // A period apart, a delay is seen at the same distance from an edge.
     assert_eq!(tells(&[settings(100.0, 600.0), settings(16_740.0, 600.0)]), (false, false));
+}
+
+#[test]
+fn a_frame_whose_stamps_leave_a_doubt_is_nobodys() {
+    // Frame 1 has the first settings; frames 2 to 4 may have the second already.
+    let owner = |second: CameraSettings, shown: CameraSettings, chunk: bool| {
+        let mut ahead = Ahead::new(capabilities(), Line::new(PERIOD_NS as f64 * 1e-3, 50.0, &plan()));
+        let see = |seq: u64, settings: CameraSettings, ahead: &mut Ahead| {
+            let start_us = LATENCY_US + settings.trigger_delay_us;
+            let start_ns = seq as i64 * PERIOD_NS + ns_from_us(start_us);
+            let exposure_us = chunk.then_some(settings.exposure_us);
+            let (device_ns, exposure_start_ns, host_ns) = (start_ns, start_ns, start_ns + 1_000_000);
+            ahead.see(&FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }).owner
+        };
+        let first = settings(3_000.0, 600.0);
+        ahead.push(Applied { actual: first, first_frame: FirstFrame::Exactly(1) }, (0, 0), None);
+        assert_eq!(see(1, first, &mut ahead), Some(0));
+        let first_frame = FirstFrame::Within { earliest: 2, certain: 5 };
+        ahead.push(Applied { actual: second, first_frame }, (PERIOD_NS, PERIOD_NS), None);
+        see(2, shown, &mut ahead)
+    };
+    let first = settings(3_000.0, 600.0);
+    let second = settings(3_200.0, 600.0);
+    assert_eq!((owner(second, first, true), owner(second, second, true)), (Some(0), Some(1)));
+    assert_eq!((owner(second, first, false), owner(second, second, false)), (Some(0), Some(1)));
+    assert_eq!(owner(second, settings(3_100.0, 600.0), true), None, "a delay that nobody asked for");
+    assert_eq!(owner(second, settings(3_200.0, 900.0), true), None, "an exposure that nobody asked for");
+    assert_eq!(owner(settings(3_010.0, 600.0), settings(3_005.0, 600.0), true), None, "either might be");
+    let longer = settings(3_200.0, 900.0);
+    assert_eq!(
+        (owner(longer, longer, true), owner(longer, longer, false)),
+        (Some(1), None),
+        "who knows how long"
+    );
 }
