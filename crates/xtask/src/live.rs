@@ -1,24 +1,28 @@
 //! `cargo xtask bench live`: the daemon on the simulated rig in real time.
 
 use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use crate::daemon::Daemon;
 use crate::run::{Done, cargo, root, run, target};
 
 const SIDES_PX: [u32; 2] = [128, 512];
 
-/// Threads that a simulated device runs in, and the pool's workers, which draw its noise; the pool has the daemon's name.
+/// Threads that a simulated device runs in, and the pool's workers, which draw its noise until the last frame and have nothing
+/// else to do before; the pool has the daemon's name.
 const SIMULATOR: [&str; 3] = ["camera", "vsync", "raysweepd"];
 
 /// Clock ticks of `/proc/PID/task/TID/stat` in a second: Linux has had 100 on all machines for decades.
 const TICKS_PER_S: f64 = 100.0;
 
-/// How often threads are looked at, whose times go with them when they end.
-const LOOK: Duration = Duration::from_millis(50);
+/// The event that follows the last frame.
+const DRAINING: &str = "\"draining\"";
+
+/// By thread: its name and its processor time in seconds.
+type Times = BTreeMap<String, (String, f64)>;
 
 /// How figures are printed.
 pub enum Print {
@@ -32,10 +36,11 @@ pub enum Print {
 struct Ran {
     run_s: f64,
     /// From the last frame to the transport on disk.
-    final_s: Option<f64>,
-    /// Processor time of the simulator's threads and the pool's, and of all threads.
-    simulator_s: f64,
+    final_s: f64,
+    /// Processor time of all threads.
     all_s: f64,
+    /// Processor time of the simulator's threads over the time from the run's start to its last frame.
+    simulator_cores: f64,
 }
 
 /// Builds the daemon, and runs the sweep at each size.
@@ -54,19 +59,14 @@ pub fn live(print: Print) -> Done {
         let rig = written("rig.toml", rig(side_px))?;
         let plan = root().join("deploy/plans/paper.toml");
         let plan = std::fs::read_to_string(&plan).map_err(|error| format!("{}: {error}", plan.display()))?;
-        let plan = plan.replace("average = 8", "average = 1");
-        let (sweep, _) = plan.split_once("[[stage]]").ok_or("paper.toml has no stage")?;
-        // What the simulator takes shows where nothing is computed beside it.
-        let idle = ran(&rig, &written("sweep.toml", sweep.to_owned())?, &folder)?;
-        let full = ran(&rig, &written("plan.toml", plan.clone())?, &folder)?;
-        let final_s = full.final_s.ok_or("the run has made no transport; its message stands above")?;
+        let plan = written("plan.toml", plan.replace("average = 8", "average = 1"))?;
+        let Ran { run_s, final_s, all_s, simulator_cores } = ran(&rig, &plan, &folder)?;
         let case = format!("{side_px}x{side_px} at 30 frames/s");
-        let simulator_share = idle.simulator_s / idle.run_s / cores as f64;
-        let Ran { run_s, all_s, .. } = full;
+        let simulator_share = simulator_cores / cores as f64;
         match print {
             Print::Text => println!(
                 "{case}: transport on disk {final_s:.2} s after the last frame, run {run_s:.1} s, {all_s:.1} s of {cores} cores; \
-                 the simulator alone takes {:.1} % of the cores while it sends frames",
+                 the simulator takes {:.1} % of the cores while it sends frames",
                 100.0 * simulator_share
             ),
             Print::JsonLines => println!(
@@ -92,49 +92,48 @@ fn ran(rig: &Path, plan: &Path, folder: &Path) -> Done<Ran> {
     let programs = target().join("release");
     let daemon = Daemon::start(&programs, rig, &folder.join("sessions"))?;
     let before = cpu_s(daemon.id());
-    let ended = AtomicBool::new(false);
     let began = Instant::now();
-    let (output, cpu_s) = std::thread::scope(|scope| {
-        let watcher = scope.spawn(|| {
-            let mut latest = before.clone();
-            while !ended.load(Ordering::Relaxed) {
-                latest.extend(cpu_s(daemon.id()));
-                std::thread::sleep(LOOK);
-            }
-            latest
-        });
-        let output = Command::new(programs.join("raysweep"))
-            .arg("--socket")
-            .arg(daemon.socket())
-            .args(["run", "--json"])
-            .arg(plan)
-            .stderr(Stdio::inherit())
-            .output();
-        ended.store(true, Ordering::Relaxed);
-        (output, watcher.join())
-    });
-    let run_s = began.elapsed().as_secs_f64();
-    let output = output.map_err(|error| format!("cannot start raysweep: {error}"))?;
-    let said = String::from_utf8_lossy(&output.stdout);
-    if !output.status.success() {
-        return Err(format!("raysweep run ended with {}: {said}", output.status));
+    let mut client = Command::new(programs.join("raysweep"))
+        .arg("--socket")
+        .arg(daemon.socket())
+        .args(["run", "--json"])
+        .arg(plan)
+        .stdout(Stdio::piped())
+        .spawn()
+        .map_err(|error| format!("cannot start raysweep: {error}"))?;
+    let events = client.stdout.take().map(BufReader::new).ok_or("raysweep run has no output")?;
+    let mut latest = before.clone();
+    let (mut simulator_cores, mut final_s) = (None, None);
+    // A run says something at each point, often enough to see threads before they end.
+    for event in events.lines() {
+        let event = event.map_err(|error| format!("raysweep run: {error}"))?;
+        latest.extend(cpu_s(daemon.id()));
+        if event.contains(DRAINING) {
+            let simulator = spent_s(&before, &latest, |name| SIMULATOR.contains(&name));
+            simulator_cores = Some(simulator / began.elapsed().as_secs_f64());
+        }
+        final_s = number_after(&event, "\"final_s\":").or(final_s);
     }
-    let cpu_s = cpu_s.map_err(|_panic| "the thread that looks at /proc panicked")?;
+    let run_s = began.elapsed().as_secs_f64();
+    let status = client.wait().map_err(|error| format!("raysweep run: {error}"))?;
     daemon.stop()?;
-    let spent = |wanted: &dyn Fn(&str) -> bool| -> f64 {
-        let threads = cpu_s.iter().filter(|(_, (name, _))| wanted(name));
-        threads.map(|(thread, (_, s))| s - before.get(thread).map_or(0.0, |(_, s)| *s)).sum()
-    };
-    Ok(Ran {
-        run_s,
-        final_s: said.lines().find_map(|line| number_after(line, "\"final_s\":")),
-        simulator_s: spent(&|name| SIMULATOR.contains(&name)),
-        all_s: spent(&|_| true),
-    })
+    match (simulator_cores, final_s) {
+        (Some(simulator_cores), Some(final_s)) if status.success() => {
+            let all_s = spent_s(&before, &latest, |_| true);
+            Ok(Ran { run_s, final_s, all_s, simulator_cores })
+        }
+        _ => Err(format!("raysweep run ended with {status} and no transport; its message stands above")),
+    }
+}
+
+/// Processor time of some threads, chosen by name, since `before`.
+fn spent_s(before: &Times, latest: &Times, wanted: impl Fn(&str) -> bool) -> f64 {
+    let threads = latest.iter().filter(|(_, (name, _))| wanted(name));
+    threads.map(|(thread, (_, s))| s - before.get(thread).map_or(0.0, |(_, s)| *s)).sum()
 }
 
 /// Processor time of each thread of a process so far, with its name; nothing of those that ended.
-fn cpu_s(process: u32) -> BTreeMap<String, (String, f64)> {
+fn cpu_s(process: u32) -> Times {
     let threads = std::fs::read_dir(format!("/proc/{process}/task")).into_iter().flatten().flatten();
     let times = threads.filter_map(|thread| {
         let stat = std::fs::read_to_string(thread.path().join("stat")).ok()?;

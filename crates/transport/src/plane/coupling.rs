@@ -80,7 +80,14 @@ impl Coupling {
         let mut coupled = Coupled { stack: stack.to_owned(), variance_ratio: Array2::ones((rows, columns)) };
         let out = coupled.stack.axis_iter_mut(Axis(1)).into_par_iter();
         let ratios = coupled.variance_ratio.axis_iter_mut(Axis(0)).into_par_iter();
-        out.zip(ratios).enumerate().for_each(|(t, (out, ratio))| images.couple_row(t, out, ratio));
+        // The compiler's vectors are as wide as the machine's; the bits are the same at any width.
+        let arch = pulp::Arch::new();
+        out.zip(ratios).enumerate().for_each(|(t, (out, ratio))| {
+            arch.dispatch(
+                #[inline(always)]
+                || images.couple_row(t, out, ratio),
+            );
+        });
         Ok(coupled)
     }
 }
@@ -95,6 +102,7 @@ struct Images<'a> {
 
 impl Images<'_> {
     /// Couples camera row `t`: `out` `[settings, columns]` holds its samples, `ratio` `[columns]` ones.
+    #[inline(always)]
     fn couple_row(&self, t: usize, mut out: ArrayViewMut2<f32>, mut ratio: ArrayViewMut1<f32>) {
         let (settings, rows, columns) = self.stack.dim();
         let window = t.saturating_sub(self.radius_px)..=(t + self.radius_px).min(rows - 1);
@@ -159,6 +167,7 @@ struct Row {
 
 impl Row {
     /// Samples of one setting from column `first` of the framed row on, and whether they are valid.
+    #[inline(always)]
     fn at(&self, setting: usize, first: usize) -> (Lanes, Lanes) {
         let first = setting * self.width + first;
         let lanes = |values: &[f32]| {
@@ -182,6 +191,7 @@ impl SampleNoise {
         Self { read_variance: (noise.read_variance / frames) as f32, gain: (noise.gain / frames) as f32 }
     }
 
+    #[inline(always)]
     fn variance(self, sample: f32) -> f32 {
         self.read_variance + self.gain * sample.max(0.0)
     }

@@ -202,10 +202,14 @@ impl Ahead {
     /// Whether frames cannot tell when the exposure of `next` acts, while their delays have told when settings do: the
     /// exposure must then come first, and be certain.
     pub fn needs_lead_in(&self, next: &CameraSettings) -> bool {
+        let changes_exposure = |last: &Written| {
+            let change_us = last.settings.exposure_us - next.exposure_us;
+            last.work.is_some() && change_us.abs() > EXPOSURE_TOLERANCE_US
+        };
         !self.frames_carry_exposure
             && !self.camera_is_exact
             && self.constant_latency().is_some()
-            && self.written.back().is_none_or(|last| last.settings.exposure_us != next.exposure_us)
+            && self.written.back().is_some_and(changes_exposure)
     }
 
     fn constant_latency(&self) -> Option<u64> {
