@@ -35,7 +35,9 @@ struct Process(Child);
 
 impl Process {
     fn start(program: &str, arguments: &[&str]) -> Self {
-        Self(Command::new(program).args(arguments).stdout(Stdio::null()).spawn().unwrap())
+        let mut command = Command::new(program);
+        command.args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
+        Self(command.spawn().unwrap())
     }
 }
 

@@ -77,14 +77,16 @@ mod tests {
     fn short_ids_wrap_past_zero_and_gaps_stay_gaps() {
         let mut ids = FrameIds::default();
         ids.restart(1);
-        // Three times round, every seventh frame lost.
-        let mut seen = 0;
-        for seq in (1..=3 * SHORT_IDS).filter(|seq| seq % 7 != 0) {
-            assert_eq!(ids.extend((seq - 1) % SHORT_IDS + 1), Some(seq));
-            seen = seq;
+        // Three times round, every seventh frame lost; a 16-bit counter that skips 0.
+        let mut raw = 0_u16;
+        for seq in 1..=3 * 65_535 {
+            raw = raw.checked_add(1).unwrap_or(1);
+            if seq % 7 != 0 {
+                assert_eq!(ids.extend(raw.into()), Some(seq));
+            }
         }
-        assert_eq!(ids.next(), seen + 1);
-        assert_eq!(ids.extend((seen - 1) % SHORT_IDS + 1), None, "the same frame again");
+        assert_eq!((ids.next(), raw), (3 * 65_535 + 1, 65_535));
+        assert_eq!(ids.extend(65_535), None, "the same frame again");
     }
 
     #[test]
