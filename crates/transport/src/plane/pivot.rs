@@ -24,7 +24,7 @@ const MAX_STEPS: usize = 300;
 const TOLERANCE: f64 = 1e-11;
 
 /// Length of runs for [`Start::Runs`]: shorter ones have many means to solve, longer ones are less alike.
-pub(super) const RUN_PX: usize = 32;
+pub(super) const RUN_PX: usize = 64;
 
 /// Which slots are free at first.
 pub(super) enum Start<'a> {
@@ -334,14 +334,29 @@ impl Pixel {
             self.state = State::Minimum;
         } else if wrong < self.fewest {
             (self.fewest, self.patience) = (wrong, PATIENCE);
-            free.copy_from_slice(exchanged);
+            self.exchange_most(y, free, exchanged);
         } else if self.patience > 0 {
             self.patience -= 1;
-            free.copy_from_slice(exchanged);
+            self.exchange_most(y, free, exchanged);
         } else if let Some(last) = (0..free.len()).rev().find(|&slot| free[slot] != exchanged[slot]) {
             // Exchanging only the last row cannot cycle (Murty), so the count falls below `fewest` at last.
             free[last] = exchanged[last];
         }
+    }
+
+    /// Exchanges all slots, but where free ones are what a step costs, of neighbours that are to become free only those
+    /// that gain most: they are mostly enough, and the others would have to go again.
+    #[inline(always)]
+    fn exchange_most(&self, y: &[f64], free: &mut [f64], exchanged: &mut [f64]) {
+        if self.side == Side::Free {
+            let neighbourhoods = y.windows(3).zip(free.windows(3));
+            for ((y, free), exchanged) in neighbourhoods.zip(&mut exchanged[1..]) {
+                let is_outdone_by = |other: usize| (free[other] == 0.0) & (y[other] < y[1]);
+                let stays = (free[1] == 0.0) & (is_outdone_by(0) | is_outdone_by(2));
+                *exchanged = if stays { 0.0 } else { *exchanged };
+            }
+        }
+        free.copy_from_slice(exchanged);
     }
 }
 
