@@ -135,9 +135,9 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     processing.feed_stored(&task, state, &session.stack()?, &|| true);
     let mut results = match in_strips {
         true => Results::in_strips(processing, &session, state, &task, &|| true)?,
-        false => Results::whole(processing, &|| true),
+        false => Results::whole(processing, &session, &task, &|| true)?,
     };
-    results.write_transport(&session, &task)?;
+    results.write_transport()?;
     let overview = results.overview();
     results::write_products(&session, &task, &results.products)?;
     results::write_report(&session, state, &task, &results, overview.as_ref())?;

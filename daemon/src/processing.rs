@@ -222,7 +222,7 @@ impl Processing {
         self.folds.iter_mut().for_each(|fold| fold.keep_no_images());
     }
 
-    /// [`Self::finish`] after [`Self::keep_no_images`]: the transport goes into `write`, strip by strip, and is not among
+    /// [`Self::finish`] and [`Self::make_named`] after [`Self::keep_no_images`]: the transport goes into `write`, strip by strip, and is not among
     /// the products.
     pub fn finish_in_strips(
         mut self,
@@ -267,9 +267,8 @@ impl Processing {
         (products, self.problems)
     }
 
-    /// The products of all folds and those that the plan names, and everything that could not be done. Ends early soon
-    /// after `go_on` says no.
-    pub fn finish(mut self, go_on: &(dyn Fn() -> bool + Sync)) -> (Vec<Product>, Vec<String>) {
+    /// The products of all folds. Ends early soon after `go_on` says no.
+    pub fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
         let mut products = Vec::new();
         for fold in &mut self.folds {
             let name = fold.name().to_owned();
@@ -278,13 +277,11 @@ impl Processing {
                 Err(problem) => self.problems.push(problem),
             }
         }
-        products.extend(self.make_named(&products, go_on));
-        products.retain(|product| !matches!(product, Product::Stack(_)));
-        (products, self.problems)
+        products
     }
 
     /// The products that the plan names, if the folds have made what they are made of.
-    fn make_named(&mut self, made: &[Product], go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
+    pub fn make_named(&mut self, made: &[Product], go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
         let transport = made.iter().find_map(|product| match product {
             Product::Transport(transport) => Some(&**transport),
             _ => None,

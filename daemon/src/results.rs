@@ -30,17 +30,35 @@ pub struct Results {
     pub products: Vec<Product>,
     /// What could not be made, and why.
     pub problems: Vec<String>,
-    /// A transport that was made in strips: its files, not in place yet.
+    /// The transport's files, not in place yet.
     writer: Option<TransportWriter>,
-    /// And its sums.
+    /// The sums of a transport that was made in strips.
     overview: Option<Overview>,
 }
 
 impl Results {
     /// Makes them in one piece; ends early, and short of results, soon after `go_on` says no.
-    pub fn whole(processing: Processing, go_on: &(dyn Fn() -> bool + Sync)) -> Self {
-        let (products, problems) = processing.finish(go_on);
-        Self { products, problems, writer: None, overview: None }
+    ///
+    /// # Errors
+    /// When the disk refuses the transport.
+    pub fn whole(
+        mut processing: Processing,
+        session: &Session,
+        task: &Task,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Self> {
+        let mut products = processing.finish(go_on);
+        let write = || {
+            let Some(transport) = transport_in(&products) else { return Ok(None) };
+            let mut writer = TransportWriter::create(session, task, findings_in(&products), transport)?;
+            writer.append(transport)?;
+            Ok(Some(writer))
+        };
+        // Somebody may be waiting for the transport, and the disk is slower than what is made of it.
+        let (writer, named) = rayon::join(write, || processing.make_named(&products, go_on));
+        products.extend(named);
+        products.retain(|product| !matches!(product, Product::Stack(_)));
+        Ok(Self { products, problems: processing.problems, writer: writer?, overview: None })
     }
 
     /// Makes them strip by strip from what is stored, of folds that have kept no images; otherwise as [`Self::whole`].
@@ -89,34 +107,28 @@ impl Results {
     ///
     /// # Errors
     /// When the disk refuses.
-    pub fn write_transport(&mut self, session: &Session, task: &Task) -> Result<()> {
-        if let Some(writer) = self.writer.take() {
-            return writer.commit();
-        }
-        let Some(transport) = self.transport() else { return Ok(()) };
-        let mut writer = TransportWriter::create(session, task, self.findings(), transport)?;
-        writer.append(transport)?;
-        writer.commit()
+    pub fn write_transport(&mut self) -> Result<()> {
+        self.writer.take().map_or(Ok(()), TransportWriter::commit)
     }
 
     /// The transport's sums, if there is one.
     pub fn overview(&mut self) -> Option<Overview> {
-        self.overview.take().or_else(|| self.transport().map(Overview::of))
+        self.overview.take().or_else(|| transport_in(&self.products).map(Overview::of))
     }
+}
 
-    fn transport(&self) -> Option<&Transport> {
-        self.products.iter().find_map(|product| match product {
-            Product::Transport(transport) => Some(&**transport),
-            _ => None,
-        })
-    }
+fn transport_in(products: &[Product]) -> Option<&Transport> {
+    products.iter().find_map(|product| match product {
+        Product::Transport(transport) => Some(&**transport),
+        _ => None,
+    })
+}
 
-    fn findings(&self) -> Option<&Findings> {
-        self.products.iter().find_map(|product| match product {
-            Product::Findings(findings) => Some(&**findings),
-            _ => None,
-        })
-    }
+fn findings_in(products: &[Product]) -> Option<&Findings> {
+    products.iter().find_map(|product| match product {
+        Product::Findings(findings) => Some(&**findings),
+        _ => None,
+    })
 }
 
 /// Writes a transport from its first camera row to its last, as NPY and Zarr; nothing is seen of it before the end.

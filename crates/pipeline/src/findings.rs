@@ -9,7 +9,9 @@ use raysweep_transport::plane::calibrate::{
     BeamEstimate, CalibrateError, Choice, FlyingSpot, OpticsEstimate, Sample, candidates, choose_prior,
     estimate_optics, settings_on_direct_row,
 };
-use raysweep_transport::plane::{Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, Transport};
+use raysweep_transport::plane::{
+    Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, RowTiming, Transport,
+};
 
 use crate::demux::DemuxOptions;
 use crate::products::SweepStack;
@@ -88,23 +90,35 @@ pub fn choose(
     stack.keep(|n| !cut.contains(&n));
     let uncut: Vec<usize> = all.iter().copied().filter(|n| !cut.contains(n)).collect();
     let planned = planned.with_settings(stack.settings.clone())?;
-    let noise = fit_noise(&stack, &mut findings);
-    let coupling = noise.filter(|_| options.coupling).map(|_| Coupling::default());
-    let coupled = match noise.zip(coupling) {
-        Some((noise, coupling)) => {
-            let Coupled { stack, variance_ratio } = couple(&coupling, &noise, &stack)?;
-            findings.remarks.push((
-                "spatial coupling",
-                format!(
-                    "like neighbours averaged before demultiplexing: the variance of noise falls to {:.0} % on average",
-                    100.0 * variance_ratio.mean().unwrap_or(1.0)
-                ),
-            ));
-            Some(stack)
-        }
-        None => None,
+    let sample_of = |images: &Array3<f32>| {
+        let valid = stack.valid.as_ref().map(|valid| valid.view());
+        Sample::of_rows(stack.timing.clone(), stack.settings.clone(), rows, images.view(), valid)
     };
-    let demux = match calibrate(&planned, options, geometry, rows, &stack, coupled.as_ref(), &mut findings) {
+    let ((noise, coupling, coupled), optics) = rayon::join(
+        || {
+            let noise = fit_noise(&stack, &mut findings);
+            let coupling = noise.filter(|_| options.coupling).map(|_| Coupling::default());
+            let coupled = noise.zip(coupling).map(|(noise, coupling)| couple(&coupling, &noise, &stack));
+            (noise, coupling, coupled)
+        },
+        // From the images as they were taken.
+        || estimate_optics(&sample_of(&stack.images)?, geometry.beam_sigma_rows),
+    );
+    let coupled = coupled.transpose()?;
+    if let Some(Coupled { variance_ratio, .. }) = &coupled {
+        findings.remarks.push((
+            "spatial coupling",
+            format!(
+                "like neighbours averaged before demultiplexing: the variance of noise falls to {:.0} % on average",
+                100.0 * variance_ratio.mean().unwrap_or(1.0)
+            ),
+        ));
+    }
+    // Of the images that are solved.
+    let sample = || sample_of(coupled.as_ref().map_or(&stack.images, |coupled| &coupled.stack));
+    let calibrated =
+        optics.and_then(|optics| calibrate(&planned, options, &stack.timing, optics, &sample, &mut findings));
+    let demux = match calibrated {
         Ok(demux) => demux,
         Err(error) => {
             findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
@@ -204,22 +218,15 @@ fn couple(coupling: &Coupling, noise: &NoiseModel, stack: &SweepStack) -> Result
     coupling.apply(stack.images.view(), valid, noise, &frames_of(stack))
 }
 
-/// Estimates the optics from the images as they were taken, and chooses the prior for those that are solved.
+/// Takes the optics for what they were estimated to be, and chooses the prior for a sample of the images that are solved.
 fn calibrate(
     planned: &Demux,
     options: &DemuxOptions,
-    geometry: &SweepGeometry,
-    rows: &[usize],
-    stack: &SweepStack,
-    coupled: Option<&Array3<f32>>,
+    timing: &RowTiming,
+    OpticsEstimate { mut optics, beam, spike }: OpticsEstimate,
+    sample: &dyn Fn() -> Result<Sample, CalibrateError>,
     findings: &mut Findings,
 ) -> Result<Demux, CalibrateError> {
-    let valid = stack.valid.as_ref().map(|valid| valid.view());
-    let sample_of = |images: &Array3<f32>| {
-        Sample::of_rows(stack.timing.clone(), stack.settings.clone(), rows, images.view(), valid)
-    };
-    let sample = sample_of(&stack.images)?;
-    let OpticsEstimate { mut optics, beam, spike } = estimate_optics(&sample, geometry.beam_sigma_rows)?;
     if beam.is_some() && optics.beam_sigma_rows > 0.0 {
         findings.warnings.push(format!(
             "the beam's width, {:.2} rows, was estimated from this scene, and light that spreads by about a row under the surface looks the same: measure it once on a matt white surface and state it as projector.beam_sigma_rows in the rig file",
@@ -229,7 +236,7 @@ fn calibrate(
     findings.remarks.push(("beam", say_beam(beam.as_ref(), optics.beam_sigma_rows)));
     let sigma_rows = optics.beam_sigma_rows;
     let beam = Beam::of_sigma(sigma_rows);
-    let mut demux = planned.with_timing(stack.timing.clone().with_beam(beam)?)?;
+    let mut demux = planned.with_timing(timing.clone().with_beam(beam)?)?;
     findings.beam_sigma_rows = sigma_rows;
 
     let said = match &spike {
@@ -261,8 +268,7 @@ fn calibrate(
             let others = candidates().into_iter().filter(|prior| *prior != default);
             let compared: Vec<Prior> = std::iter::once(default).chain(others).collect();
             // Noise asks for smoothness, and coupling has taken most of it.
-            let solved = coupled.map_or(Ok(sample), sample_of);
-            match solved.and_then(|solved| choose_prior(&solved, &optics, &compared)) {
+            match sample().and_then(|sample| choose_prior(&sample, &optics, &compared)) {
                 Ok(choice) => {
                     findings.prior = choice.prior();
                     let reason = choice.reason();

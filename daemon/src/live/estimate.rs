@@ -13,7 +13,7 @@ use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::{EPIPOLAR, INDIRECT, LiveError, LiveFile, TOTAL};
-use crate::run::Board;
+use crate::run::{Board, priority};
 
 /// Between two estimates, at least: no display or subscriber wants more.
 const REST: Duration = Duration::from_millis(100);
@@ -104,7 +104,11 @@ impl LiveEstimate {
     /// # Errors
     /// What the system said, where it gives no thread.
     pub fn start(outlet: Outlet) -> Result<Self, Box<dyn std::error::Error + Send + Sync>> {
-        let pool = ThreadPoolBuilder::new().num_threads(1).thread_name(|_| "live-solver".into()).build()?;
+        let pool = ThreadPoolBuilder::new()
+            .num_threads(1)
+            .thread_name(|_| "live-solver".into())
+            .start_handler(|_| priority::for_computing())
+            .build()?;
         let inbox = Arc::new(Inbox::default());
         let thread = thread::Builder::new().name("live".into()).spawn({
             let inbox = inbox.clone();

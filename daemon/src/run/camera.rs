@@ -20,6 +20,7 @@ pub use self::ahead::Line;
 use self::ahead::{Ahead, Seen};
 pub use self::sequence::{FilmPass, FilmSetting};
 use super::orders::Orders;
+use super::priority;
 use crate::rig::Pace;
 
 /// One attempt at a point.
@@ -128,6 +129,7 @@ impl CameraThread {
             .spawn({
                 let latency = latency.clone();
                 move || {
+                    priority::for_device("camera");
                     let mut sequencer = Sequencer::new(camera, drive, input, orders);
                     for work in todo {
                         if done.send(sequencer.work(work, &latency)).is_err() {

@@ -5,6 +5,7 @@ mod camera;
 mod engine;
 mod film;
 mod orders;
+pub(crate) mod priority;
 mod storage;
 mod vsync;
 
@@ -364,7 +365,7 @@ fn conclude(
     let began = Instant::now();
     let make = || match in_strips {
         true => Results::in_strips(processing, &session, ledger.state(), task, &|| orders.go_on()),
-        false => Ok(Results::whole(processing, &|| orders.go_on())),
+        false => Results::whole(processing, &session, task, &|| orders.go_on()),
     };
     let mut results = whole.then(make).transpose()?;
     let computed = began.elapsed();
@@ -386,7 +387,7 @@ fn conclude(
         settings_latency: latency,
     };
     if let (EndState::Complete, Some(results)) = (state, &mut results) {
-        results.write_transport(&session, task)?;
+        results.write_transport()?;
         end.final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
         let overview = results.overview();
         if let Some((live, overview)) = live.zip(overview.as_ref()) {

@@ -9,6 +9,7 @@ use raysweep_core::{DeviceError, DeviceErrorKind, Vsync};
 use raysweep_pipeline::{Event, Input};
 
 use super::orders::{Order, Orders};
+use super::priority;
 
 const POLL: Duration = Duration::from_millis(100);
 
@@ -58,6 +59,7 @@ impl VsyncThread {
             .spawn({
                 let stop = stop.clone();
                 move || {
+                    priority::for_device("vsync");
                     let mut alarm = Alarm { orders, armed: true };
                     while !stop.load(Ordering::Relaxed) {
                         match vsync.next_edge(POLL) {

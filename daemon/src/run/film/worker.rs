@@ -17,6 +17,7 @@ use crate::live::{EPIPOLAR, INDIRECT, Outlet};
 use crate::rig::Pace;
 use crate::run::board::Board;
 use crate::run::orders::{Order, Orders};
+use crate::run::priority;
 
 /// Cycles that may wait for the solver.
 const WAITING_CYCLES: usize = 4;
@@ -157,6 +158,7 @@ impl Worker {
     pub fn start(solving: Solving) -> Result<Self, PipelineError> {
         let workers = rayon::ThreadPoolBuilder::new()
             .thread_name(|index| format!("film-{index}"))
+            .start_handler(|_| priority::for_computing())
             .build()
             .map_err(|error| PipelineError::Spawn { name: "film", source: error.into() })?;
         let inbox = Arc::new(Inbox::default());

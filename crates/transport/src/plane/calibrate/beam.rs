@@ -145,14 +145,16 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
 /// the width that moves until it holds its minimum.
 fn refine(
     rough_rows: f64,
-    log_residual: impl Fn(f64) -> Result<Array1<f64>, PlaneError>,
+    log_residual: impl Fn(f64) -> Result<Array1<f64>, PlaneError> + Sync,
 ) -> Result<(f64, f64), PlaneError> {
     let step = FINE_STEP.ln();
     let (mut sigma_rows, mut relative_error) = (rough_rows, f64::INFINITY);
     for _ in 0..FINE_ROUNDS {
-        let middle = log_residual(sigma_rows)?;
-        let narrower = log_residual(sigma_rows / FINE_STEP)?;
-        let wider = log_residual(sigma_rows * FINE_STEP)?;
+        let (middle, (narrower, wider)) = rayon::join(
+            || log_residual(sigma_rows),
+            || rayon::join(|| log_residual(sigma_rows / FINE_STEP), || log_residual(sigma_rows * FINE_STEP)),
+        );
+        let (middle, narrower, wider) = (middle?, narrower?, wider?);
         let slope = (&wider - &narrower) / (2.0 * step);
         let curvature = (&wider + &narrower - 2.0 * &middle).sum() / step.powi(2);
         let change = match curvature > 0.0 {
@@ -169,8 +171,8 @@ fn refine(
 }
 
 /// Index of the coarse width of the least score.
-fn best_coarse(score: impl Fn(f64) -> Result<f64, PlaneError>) -> Result<usize, PlaneError> {
-    let scores: Vec<f64> = COARSE_ROWS.into_iter().map(score).collect::<Result<_, _>>()?;
+fn best_coarse(score: impl Fn(f64) -> Result<f64, PlaneError> + Sync) -> Result<usize, PlaneError> {
+    let scores: Vec<f64> = COARSE_ROWS.into_par_iter().map(&score).collect::<Result<_, _>>()?;
     Ok((0..scores.len()).min_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0))
 }
 
@@ -199,13 +201,13 @@ fn golden_section(
 
 /// The split prior's objective at the minimum, for each pixel.
 fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
-    let by_row: Vec<Vec<f64>> = sample
-        .rows
+    let by_class: Vec<Vec<f64>> = sample
+        .classes
         .par_iter()
-        .map(|row| {
-            let mut objectives = vec![0.0; row.columns.len()];
-            for (problem, pixels) in row.problems(&Prior::SPLIT, optics)? {
-                let intensities = row.intensities.select(Axis(0), &pixels);
+        .map(|class| {
+            let mut objectives = vec![0.0; class.pixels.len()];
+            for (problem, pixels) in class.problems(&Prior::SPLIT, optics)? {
+                let intensities = class.intensities.select(Axis(0), &pixels);
                 let x = problem.minimise(intensities.view(), None);
                 let minima = problem.minima(x.view(), intensities.view());
                 pixels.iter().zip(minima).for_each(|(&pixel, minimum)| objectives[pixel] = minimum);
@@ -213,7 +215,7 @@ fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
             Ok(objectives)
         })
         .collect::<Result<_, PlaneError>>()?;
-    Ok(by_row.concat())
+    Ok(by_class.concat())
 }
 
 /// The logarithm lets each pixel count by its own noise.
@@ -229,7 +231,5 @@ fn with_direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Sample, Ca
     if direct.len() < MIN_PIXELS {
         return Err(CalibrateError::NoDirectLight { pixels: direct.len(), needed: MIN_PIXELS });
     }
-    let rows = sample.rows.iter().map(|row| row.keep(|pixel| direct.contains(&(row.t, row.columns[pixel]))));
-    let rows = rows.filter(|row| !row.columns.is_empty()).collect();
-    Ok(Sample { rows, ..sample.clone() })
+    Ok(sample.keep(|pixel| direct.contains(&pixel)))
 }

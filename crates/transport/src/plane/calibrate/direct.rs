@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use super::super::{PlaneError, Prior};
 use super::Sample;
 use super::problem::RowProblem;
-use super::sample::SampledRow;
+use super::sample::SampledClass;
 
 /// Direct light counts where it exceeds the light of the neighbouring rows by so many standard errors.
 const STANDS_OUT: f64 = 5.0;
@@ -30,27 +30,27 @@ pub(super) struct DirectLight {
 /// prior has: light in rows 1 and -1 that no smoothness binds. Pixels at the border, whose row 1 or -1 does not exist,
 /// are left out.
 pub(super) fn direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, PlaneError> {
-    let by_row: Vec<Vec<DirectLight>> =
-        sample.rows.par_iter().map(|row| of_row(row, beam_sigma_rows)).collect::<Result<_, _>>()?;
-    Ok(by_row.concat())
+    let by_class: Vec<Vec<DirectLight>> =
+        sample.classes.par_iter().map(|class| of_class(class, beam_sigma_rows)).collect::<Result<_, _>>()?;
+    Ok(by_class.concat())
 }
 
-fn of_row(row: &SampledRow, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, PlaneError> {
-    let (Some(above), Some(own), Some(below)) = (row.slot(-1), row.slot(0), row.slot(1)) else {
+fn of_class(class: &SampledClass, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, PlaneError> {
+    let (Some(above), Some(own), Some(below)) = (class.slot(-1), class.slot(0), class.slot(1)) else {
         return Ok(Vec::new());
     };
     let prior = Prior::SPLIT;
-    let weights = row.weights(beam_sigma_rows);
-    let slots = row.slots.len();
+    let weights = class.weights(beam_sigma_rows);
+    let slots = class.slots.len();
     let neighbours = weights.select(Axis(1), &[above, below]);
     let mut extended = Array2::zeros((weights.nrows(), slots + 2));
     extended.slice_mut(s![.., ..slots]).assign(&weights);
     extended.slice_mut(s![.., slots..]).assign(&neighbours);
-    let differences = prior.differences(&row.slots);
+    let differences = prior.differences(&class.slots);
     let mut extended_differences = Array2::zeros((differences.nrows(), slots + 2));
     extended_differences.slice_mut(s![.., ..slots]).assign(&differences);
     let problem = RowProblem::new(extended, extended_differences, &prior)?;
-    let x = problem.minimise(row.intensities.view(), None);
+    let x = problem.minimise(class.intensities.view(), None);
 
     let moment = combination(slots + 2, &[(slots, -1.0), (slots + 1, 1.0)]);
     // What lies at u = 0 is direct light on top of indirect light, which is about that of the neighbours.
@@ -58,14 +58,14 @@ fn of_row(row: &SampledRow, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, Pl
         combination(slots + 2, &[(slots, 1.0), (own, 1.0), (slots + 1, 1.0), (above, -0.5), (below, -0.5)]);
     let plan_variance = moment.dot(&problem.inverse().dot(&moment));
     let amount_variance = amount.dot(&problem.inverse().dot(&amount));
-    let residual = x.dot(&problem.weights.t()) - &row.intensities;
-    let minima = problem.minima(x.view(), row.intensities.view());
-    let pixels = x.rows().into_iter().zip(residual.rows()).zip(minima).zip(&row.columns);
-    let light = pixels.map(|(((x, residual), objective), &s)| {
+    let residual = x.dot(&problem.weights.t()) - &class.intensities;
+    let minima = problem.minima(x.view(), class.intensities.view());
+    let pixels = x.rows().into_iter().zip(residual.rows()).zip(minima).zip(&class.pixels);
+    let light = pixels.map(|(((x, residual), objective), &(t, s))| {
         let noise_variance = residual.dot(&residual) / residual.len() as f64;
         let light = x.dot(&amount);
         DirectLight {
-            t: row.t,
+            t,
             s,
             stands_out: light > STANDS_OUT * (noise_variance * amount_variance).sqrt(),
             u0_rows: x.dot(&moment) / light,

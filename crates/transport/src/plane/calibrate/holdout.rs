@@ -118,8 +118,10 @@ pub fn choose_prior(
     candidates.iter().try_for_each(Prior::check)?;
     let sample = sample.thinned();
     let folds = folds(&sample)?;
-    let errors: Vec<Array2<f64>> =
-        candidates.iter().map(|prior| held_out(&sample, prior, optics, &folds)).collect::<Result<_, _>>()?;
+    let errors: Vec<Array2<f64>> = candidates
+        .par_iter()
+        .map(|prior| held_out(&sample, prior, optics, &folds))
+        .collect::<Result<_, _>>()?;
     let default = errors.first().ok_or(CalibrateError::NoCandidates)?;
     let default = log_residuals(default);
     let curve: Vec<Candidate> = candidates
@@ -213,33 +215,35 @@ pub(super) fn held_out(
     folds: &[Vec<usize>],
 ) -> Result<Array2<f64>, PlaneError> {
     let settings = sample.settings.len();
-    let by_row: Vec<Array2<f64>> = sample
-        .rows
+    let by_class: Vec<Array2<f64>> = sample
+        .classes
         .par_iter()
-        .map(|row| {
-            let mut errors = Array2::zeros((row.columns.len(), folds.len()));
-            for (problem, pixels) in row.problems(prior, optics)? {
-                let intensities = row.intensities.select(Axis(0), &pixels);
+        .map(|class| {
+            let mut errors = Array2::zeros((class.pixels.len(), folds.len()));
+            for (problem, pixels) in class.problems(prior, optics)? {
+                let intensities = class.intensities.select(Axis(0), &pixels);
                 let whole = problem.minimise(intensities.view(), None);
-                for (fold, held) in folds.iter().enumerate() {
+                let by_fold = errors.axis_iter_mut(Axis(1)).into_par_iter().zip(folds);
+                by_fold.try_for_each(|(mut errors, held)| {
                     let kept: Vec<usize> = (0..settings).filter(|n| !held.contains(n)).collect();
                     let part = problem.without(&kept, held)?;
                     let x = part.minimise(intensities.select(Axis(1), &kept).view(), Some(&whole));
                     let predicted = x.dot(&problem.weights.select(Axis(0), held).t());
                     let residual = predicted - intensities.select(Axis(1), held);
                     for (residual, &pixel) in residual.rows().into_iter().zip(&pixels) {
-                        errors[[pixel, fold]] = residual.dot(&residual) / held.len() as f64;
+                        errors[pixel] = residual.dot(&residual) / held.len() as f64;
                     }
-                }
+                    Ok::<_, PlaneError>(())
+                })?;
             }
             Ok(errors)
         })
         .collect::<Result<_, PlaneError>>()?;
     let mut all = Array2::zeros((sample.pixels().count(), folds.len()));
     let mut first = 0;
-    for row in by_row {
-        all.slice_mut(s![first..first + row.nrows(), ..]).assign(&row);
-        first += row.nrows();
+    for class in by_class {
+        all.slice_mut(s![first..first + class.nrows(), ..]).assign(&class);
+        first += class.nrows();
     }
     Ok(all)
 }

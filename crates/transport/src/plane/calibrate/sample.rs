@@ -1,6 +1,6 @@
 use std::ops::RangeInclusive;
 
-use ndarray::{Array2, ArrayView3, s};
+use ndarray::{Array2, ArrayView3, Axis, concatenate, s};
 use rayon::prelude::*;
 
 use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, reach};
@@ -29,17 +29,18 @@ pub struct Sample {
     pub(super) settings: Vec<Setting>,
     pub(super) reach: RangeInclusive<i32>,
     pub(super) columns: usize,
-    pub(super) rows: Vec<SampledRow>,
+    pub(super) classes: Vec<SampledClass>,
 }
 
+/// Pixels of neighbouring rows of the sample that share a model, so that it is factored once for all of them.
 #[derive(Debug, Clone)]
-pub(super) struct SampledRow {
-    pub t: usize,
-    pub columns: Vec<usize>,
+pub(super) struct SampledClass {
+    /// Camera row and column, ascending.
+    pub pixels: Vec<(usize, usize)>,
     /// Shape `[pixels, settings]`.
     pub intensities: Array2<f64>,
     pub slots: Vec<Slot>,
-    /// Weight of every row of the projector under an ideal beam, shape `[settings, projector rows]`.
+    /// Weight of every row of the projector for the first pixel under an ideal beam, shape `[settings, projector rows]`.
     ideal: Array2<f64>,
     own_row: usize,
 }
@@ -54,7 +55,7 @@ pub struct Optics {
 }
 
 impl Optics {
-    fn u0(&self, t: usize, s: usize) -> f64 {
+    fn u0(&self, (t, s): (usize, usize)) -> f64 {
         self.spike.as_ref().map_or(0.0, |spike| f64::from(spike.u0[[t, s]]))
     }
 }
@@ -111,7 +112,7 @@ impl Sample {
             valid.is_none_or(|valid| valid.slice(s![.., at, *column]).iter().all(|v| *v))
         };
         let unspread = timing.clone().with_beam(Beam::Ideal)?;
-        let rows: Vec<SampledRow> = Self::rows_of(height)
+        let rows: Vec<SampledClass> = Self::rows_of(height)
             .enumerate()
             .collect::<Vec<_>>()
             .into_par_iter()
@@ -139,14 +140,21 @@ impl Sample {
                 let ideal = Array2::from_shape_vec((settings.len(), timing.projector_rows()), ideal)
                     .unwrap_or_default();
                 let own_row = timing.camera().own_row(t);
-                Ok(SampledRow { t, columns, intensities, slots, ideal, own_row })
+                let pixels = columns.into_iter().map(|column| (t, column)).collect();
+                Ok(SampledClass { pixels, intensities, slots, ideal, own_row })
             })
             .collect::<Result<_, _>>()?;
-        let rows: Vec<SampledRow> = rows.into_iter().filter(|row| !row.columns.is_empty()).collect();
-        if rows.is_empty() {
+        let mut classes: Vec<SampledClass> = Vec::new();
+        for row in rows.into_iter().filter(|row| !row.pixels.is_empty()) {
+            match classes.last_mut() {
+                Some(class) if class.has_model_of(&row) => class.append(row),
+                _ => classes.push(row),
+            }
+        }
+        if classes.is_empty() {
             return Err(CalibrateError::NoPixels);
         }
-        Ok(Self { timing, settings, reach, columns, rows })
+        Ok(Self { timing, settings, reach, columns, classes })
     }
 
     /// A quarter of the rows and half the pixels of each, unless that leaves few: enough where every pixel is solved
@@ -155,24 +163,44 @@ impl Sample {
         if self.pixels().count() <= MIN_PIXELS_TO_THIN {
             return self.clone();
         }
-        let rows = self.rows.iter().skip(self.rows.len().min(2) - 1).step_by(4);
-        let rows = rows.map(|row| row.keep(|pixel| pixel % 2 == 0)).collect();
-        Self { rows, ..self.clone() }
+        let mut rows: Vec<usize> = self.pixels().map(|(t, _)| t).collect();
+        rows.dedup();
+        let rows: Vec<usize> = rows.iter().copied().skip(rows.len().min(2) - 1).step_by(4).collect();
+        let mut place_in_row = (0, 0);
+        self.keep(|(t, _)| {
+            place_in_row = (t, if place_in_row.0 == t { place_in_row.1 + 1 } else { 0 });
+            rows.contains(&t) && place_in_row.1 % 2 == 0
+        })
+    }
+
+    /// The sample with only those of its pixels, asked for in order, that are kept.
+    pub(super) fn keep(&self, mut kept: impl FnMut((usize, usize)) -> bool) -> Self {
+        let classes = self.classes.iter().map(|class| class.keep(&mut kept));
+        let classes = classes.filter(|class| !class.pixels.is_empty()).collect();
+        Self { classes, ..self.clone() }
     }
 
     /// The pixels of the sample, `(t, s)`, in the order of all per-pixel results.
     pub fn pixels(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
-        self.rows.iter().flat_map(|row| row.columns.iter().map(|&s| (row.t, s)))
+        self.classes.iter().flat_map(|class| class.pixels.iter().copied())
     }
 }
 
-impl SampledRow {
-    /// The row with only those of its pixels whose index is kept.
-    pub fn keep(&self, kept: impl Fn(usize) -> bool) -> Self {
-        let kept: Vec<usize> = (0..self.columns.len()).filter(|&pixel| kept(pixel)).collect();
+impl SampledClass {
+    fn has_model_of(&self, row: &Self) -> bool {
+        self.slots == row.slots && self.weights(0.0) == row.weights(0.0)
+    }
+
+    fn append(&mut self, row: Self) {
+        self.pixels.extend(row.pixels);
+        self.intensities = concatenate![Axis(0), self.intensities, row.intensities];
+    }
+
+    fn keep(&self, mut kept: impl FnMut((usize, usize)) -> bool) -> Self {
+        let kept: Vec<usize> = (0..self.pixels.len()).filter(|&pixel| kept(self.pixels[pixel])).collect();
         Self {
-            columns: kept.iter().map(|&pixel| self.columns[pixel]).collect(),
-            intensities: self.intensities.select(ndarray::Axis(0), &kept),
+            pixels: kept.iter().map(|&pixel| self.pixels[pixel]).collect(),
+            intensities: self.intensities.select(Axis(0), &kept),
             ..self.clone()
         }
     }
@@ -201,7 +229,7 @@ impl SampledRow {
         weights
     }
 
-    /// The row's pixels by what they must be solved with: one problem for each place of direct light, with the
+    /// The pixels by what they must be solved with: one problem for each place of direct light, with the
     /// indices of its pixels. The paper's prior knows no direct light, so it has one.
     pub fn problems(
         &self,
@@ -212,14 +240,14 @@ impl SampledRow {
         let weights = self.weights(optics.beam_sigma_rows);
         let step = |pixel: usize| match prior {
             Prior::Paper { .. } => 0,
-            Prior::Split { .. } => (optics.u0(self.t, self.columns[pixel]) / U0_STEP_ROWS).round() as i32,
+            Prior::Split { .. } => (optics.u0(self.pixels[pixel]) / U0_STEP_ROWS).round() as i32,
         };
-        let mut places: Vec<i32> = (0..self.columns.len()).map(step).collect();
+        let mut places: Vec<i32> = (0..self.pixels.len()).map(step).collect();
         places.sort_unstable();
         places.dedup();
         let problem = |place: i32| {
             let weights = self.with_spike_at(&weights, f64::from(place) * U0_STEP_ROWS);
-            let pixels = (0..self.columns.len()).filter(|&pixel| step(pixel) == place).collect();
+            let pixels = (0..self.pixels.len()).filter(|&pixel| step(pixel) == place).collect();
             Ok((RowProblem::new(weights, differences.clone(), prior)?, pixels))
         };
         places.into_iter().map(problem).collect()
