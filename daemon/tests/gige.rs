@@ -168,8 +168,9 @@ fn a_sweep_over_the_wire_stores_what_the_scene_gives() {
 #[test]
 fn lost_packets_are_sent_again() {
     let (counts, wire) = over_the_wire("", &["packet_loss=0.01", "reordering=0.01"], nothing);
-    assert!(wire.packets_lost > 0 && wire.packets_resent >= wire.packets_lost, "{wire:?}");
-    println!("{counts:?} {wire:?}");
+    assert!(wire.packets_lost > 0 && wire.packets_resent > 0, "{wire:?}");
+    // Frames that resends hold up are taken for those that they are.
+    assert!(!counts.lost.contains_key(&LossCause::SettingsMismatch), "{counts:?}");
 }
 
 #[test]
