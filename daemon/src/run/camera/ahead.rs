@@ -341,9 +341,6 @@ impl Ahead {
     /// Looks at a frame.
     pub fn see(&mut self, stamp: &FrameStamp) -> Seen {
         let trigger_ns = self.trigger_of(stamp);
-        if let Some((before, trigger_ns)) = self.triggers.newest().zip(trigger_ns) {
-            self.learn_from_gap(before, (stamp.seq, trigger_ns));
-        }
         self.learn(stamp.seq, stamp.exposure_start_ns, trigger_ns);
         let owner = self.owner(stamp);
         let since_seq = self.newest_seq.map_or(stamp.seq, |newest| newest + 1);
@@ -371,22 +368,6 @@ impl Ahead {
     /// When a frame's settings are taken, at the latest.
     fn taken_ns(&self, trigger_ns: i64, start_ns: i64) -> i64 {
         start_ns.min(trigger_ns + self.triggers.period_ns() / 2)
-    }
-
-    /// Learns from frames that never came: their triggers are known where each since the frame before them was answered.
-    fn learn_from_gap(&mut self, (last_seq, last_ns): (u64, i64), (seq, trigger_ns): (u64, i64)) {
-        let period_ns = self.triggers.period_ns();
-        let frames = i64::try_from(seq.saturating_sub(last_seq)).unwrap_or(i64::MAX);
-        let off_ns = trigger_ns.saturating_sub(last_ns).abs_diff(frames.saturating_mul(period_ns));
-        if off_ns > ns_from_us(self.line.max_jitter_us).unsigned_abs() {
-            return;
-        }
-        let delays_us = self.written.iter().map(|written| written.settings.trigger_delay_us);
-        let longest_ns = ns_from_us(self.camera.trigger_latency_us + delays_us.fold(0.0, f64::max));
-        for (lost_seq, frames_later) in (last_seq + 1..seq).zip(1..) {
-            let trigger_ns = last_ns + frames_later * period_ns;
-            self.learn(lost_seq, trigger_ns + longest_ns, Some(trigger_ns));
-        }
     }
 
     /// When a frame was triggered, if all settings that fit its stamps agree on that.
