@@ -1,6 +1,6 @@
 //! `cargo xtask bench`: what is fast enough, and how we know.
 
-use crate::run::{Done, cargo, run};
+use crate::run::{Done, cargo, run, target};
 use crate::{live, python};
 
 const BENCHES: &str = "\
@@ -15,6 +15,11 @@ benchmarks: cargo xtask bench <name> [options]
   dots    the flying dot's stages: time, ratio to a plain read of the same bytes, frames a second
           --peers  beside NumPy, SciPy and OpenCV on the same frames and columns
           --json   JSON lines instead of tables: bench, case, stage, method, seconds, times_read, ratio
+  camera  the driver aravis on the simulated GigE camera: frames a second, processor time of a frame beside
+          arv-camera-test-0.8 in the same run, and from a frame's last packet until it is in the pool; best as root
+          --sweep  instead, the paper's sweep over the wire in real time, with late settings, lost packets and a
+                   camera that dies: seconds of light and frames lost, each image held against the scene; as root
+          --json   JSON lines
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
 
 /// Runs the benchmark that the first argument names with the options that follow; without a name, lists all.
@@ -30,6 +35,7 @@ pub fn bench(arguments: &[&str]) -> Done {
         }
         ["unpack"] => run(cargo().args(["bench", "--package", "raysweep-core", "--bench", "unpack"])),
         ["unpack", option, ..] => Err(format!("`unpack` has no option `{option}`\n{BENCHES}")),
+        ["camera", options @ ..] => camera(options),
         ["live"] => live::live(live::Print::Text),
         ["live", "--json"] => live::live(live::Print::JsonLines),
         ["live", unknown, ..] => Err(format!("`live` has no option `{unknown}`\n{BENCHES}")),
@@ -54,18 +60,47 @@ fn transport(name: &str, environment: &str, requirements: &str, options: &[&str]
     run(&mut bench)
 }
 
+/// The camera's driver, alone or under a whole sweep.
+fn camera(options: &[&str]) -> Done {
+    if let Some(unknown) = options.iter().find(|option| !["--json", "--sweep"].contains(option)) {
+        return Err(format!("`camera` has no option `{unknown}`\n{BENCHES}"));
+    }
+    let mut bench = cargo();
+    if options.contains(&"--sweep") {
+        bench.args(["bench", "--package", "raysweep", "--features", "aravis", "--bench", "wire_sweep", "--"]);
+    } else {
+        run(cargo().args(["build", "--package", "raysweep", "--bin", "raysweep-sim-camera", "--release"]))?;
+        bench.args([
+            "bench",
+            "--package",
+            "raysweep-drivers",
+            "--features",
+            "aravis",
+            "--bench",
+            "camera",
+            "--",
+        ]);
+        bench.arg("--camera").arg(target().join("release/raysweep-sim-camera"));
+    }
+    if options.contains(&"--json") {
+        bench.arg("--json");
+    }
+    run(&mut bench)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn unknown_names_and_options_are_told_what_there_is() {
-        let unknown: [&[&str]; 5] = [
+        let unknown: [&[&str]; 6] = [
             &["demuxx"],
             &["demux", "--fast"],
             &["dots", "--fast"],
             &["live", "--fast"],
             &["unpack", "--json"],
+            &["camera", "--peers"],
         ];
         for arguments in unknown {
             let message = bench(arguments).unwrap_err();

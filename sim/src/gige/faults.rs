@@ -66,6 +66,8 @@ impl Default for Faults {
 pub struct WireTruth {
     /// Frames sent, whatever became of their packets.
     pub frames: u64,
+    /// When the last packet of the newest of them left, on the host's clock.
+    pub last_left_ns: i64,
     /// Frames kept back by [`Faults::frame_loss`].
     pub frames_lost: u64,
     /// Packets sent for the first time, those lost included.

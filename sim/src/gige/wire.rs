@@ -59,6 +59,9 @@ impl Wire {
             }
             let bytes = block.packet(number, &mut self.datagram);
             truth.packets += 1;
+            if number + 1 == block.packets() {
+                truth.last_left_ns = self.clock.now_ns();
+            }
             self.pass(bytes, route.to, faults, [block.stamp.seq, number.into(), 0], &mut truth);
         }
         self.release(route.to, &mut truth);
@@ -136,6 +139,7 @@ impl Wire {
     fn note(&self, sent: WireTruth) {
         let mut truth = lock(&self.truth);
         truth.frames += sent.frames;
+        truth.last_left_ns = truth.last_left_ns.max(sent.last_left_ns);
         truth.packets += sent.packets;
         truth.packets_lost += sent.packets_lost;
         truth.packets_duplicated += sent.packets_duplicated;

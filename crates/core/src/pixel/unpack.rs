@@ -47,36 +47,27 @@ struct Layout<const BYTES: usize> {
     scale: [u16; GROUP],
     high_mask: u16,
     low_mask: u16,
+    /// The same for the portable kernel, made when this is compiled.
+    moves: [Move; MOVES],
 }
 
-const BITS10P: Layout<5> =
-    Layout { word: [[0, 1], [1, 2], [2, 3], [3, 4]], scale: [64, 16, 4, 1], high_mask: 0, low_mask: 0x3FF };
-const BITS10G40: Layout<5> = Layout {
-    word: [[4, 0], [4, 1], [4, 2], [4, 3]],
-    scale: [64, 16, 4, 1],
-    high_mask: 0x3FC,
-    low_mask: 0x003,
-};
-const BITS10PACKED: Layout<6> = Layout {
-    word: [[1, 0], [1, 2], [4, 3], [4, 5]],
-    scale: [64, 4, 64, 4],
-    high_mask: 0x3FC,
-    low_mask: 0x003,
-};
-const BITS12P: Layout<6> =
-    Layout { word: [[0, 1], [1, 2], [3, 4], [4, 5]], scale: [16, 1, 16, 1], high_mask: 0, low_mask: 0xFFF };
-const BITS12PACKED: Layout<6> = Layout {
-    word: [[1, 0], [1, 2], [4, 3], [4, 5]],
-    scale: [16, 1, 16, 1],
-    high_mask: 0xFF0,
-    low_mask: 0x00F,
-};
-const BITS12G24: Layout<6> = Layout {
-    word: [[2, 0], [2, 1], [5, 3], [5, 4]],
-    scale: [16, 1, 16, 1],
-    high_mask: 0xFF0,
-    low_mask: 0x00F,
-};
+const BITS10P: Layout<5> = Layout::new(6, [[0, 1], [1, 2], [2, 3], [3, 4]], [64, 16, 4, 1], [0, 0x3FF]);
+const BITS10G40: Layout<5> = Layout::new(6, [[4, 0], [4, 1], [4, 2], [4, 3]], [64, 16, 4, 1], [0x3FC, 0x003]);
+const BITS10PACKED: Layout<6> =
+    Layout::new(6, [[1, 0], [1, 2], [4, 3], [4, 5]], [64, 4, 64, 4], [0x3FC, 0x003]);
+const BITS12P: Layout<6> = Layout::new(4, [[0, 1], [1, 2], [3, 4], [4, 5]], [16, 1, 16, 1], [0, 0xFFF]);
+const BITS12PACKED: Layout<6> =
+    Layout::new(4, [[1, 0], [1, 2], [4, 3], [4, 5]], [16, 1, 16, 1], [0xFF0, 0x00F]);
+const BITS12G24: Layout<6> = Layout::new(4, [[2, 0], [2, 1], [5, 3], [5, 4]], [16, 1, 16, 1], [0xFF0, 0x00F]);
+
+impl<const BYTES: usize> Layout<BYTES> {
+    const fn new(shift: u32, word: [[u8; 2]; GROUP], scale: [u16; GROUP], masks: [u16; 2]) -> Self {
+        let [high_mask, low_mask] = masks;
+        let moves = [Move { by: 0, mask: 0 }; MOVES];
+        let layout = Self { word, scale, high_mask, low_mask, moves };
+        Self { moves: layout.moved(shift), ..layout }
+    }
+}
 
 /// Unpacks `bytes`, which holds exactly `pixels`.
 pub(super) fn unpack(level: UnpackLevel, packing: Packing, bytes: &[u8], pixels: &mut [u16]) {
@@ -177,6 +168,7 @@ trait Kernel: Copy {
 struct Portable;
 
 impl Kernel for Portable {
+    /// Whole groups as numbers of 64 bits: bits that move equally far move at once, and vectors hold several groups.
     #[inline(always)]
     fn groups<const SHIFT: u32, const BYTES: usize>(
         self,
@@ -184,19 +176,75 @@ impl Kernel for Portable {
         groups: &[[u8; BYTES]],
         pixels: &mut [[u16; GROUP]],
     ) -> usize {
-        for (bytes, pixels) in groups.iter().zip(&mut *pixels) {
-            for (k, pixel) in pixels.iter_mut().enumerate() {
-                let [low, high] = layout.word[k];
-                let word = u16::from_le_bytes([bytes[usize::from(low)], bytes[usize::from(high)]]);
-                *pixel = word >> SHIFT & layout.high_mask
-                    | word.wrapping_mul(layout.scale[k]) >> SHIFT & layout.low_mask;
+        let bytes = groups.as_flattened();
+        let mut done = 0;
+        for pixels in pixels.as_chunks_mut::<ABREAST>().0 {
+            // The last load reaches beyond its group.
+            let Some(bytes) = bytes.get(done * BYTES..(done + ABREAST - 1) * BYTES + 8) else { break };
+            let groups: [u64; ABREAST] = std::array::from_fn(|group| {
+                let bytes = bytes[group * BYTES..].first_chunk();
+                bytes.map_or(0, |bytes| u64::from_le_bytes(*bytes))
+            });
+            for (group, pixels) in groups.into_iter().zip(pixels) {
+                let unpacked = layout.moves.iter().fold(0, |unpacked, step| unpacked | step.of(group));
+                *pixels = std::array::from_fn(|k| (unpacked >> (16 * k)) as u16);
             }
+            done += ABREAST;
         }
-        pixels.len()
+        done
     }
 }
 
-/// The kernel's groups, the groups that it leaves over, and at last the pixels that make no whole group.
+/// Groups that the portable kernel unpacks in one step.
+const ABREAST: usize = 4;
+/// No packing needs more.
+const MOVES: usize = 8;
+
+/// Bits of a group that move equally far to the left, to where they are in four unpacked pixels.
+#[derive(Clone, Copy)]
+struct Move {
+    by: i32,
+    mask: u64,
+}
+
+impl Move {
+    #[inline(always)]
+    fn of(self, group: u64) -> u64 {
+        let moved = if self.by < 0 { group >> -self.by } else { group << self.by };
+        moved & self.mask
+    }
+}
+
+impl<const BYTES: usize> Layout<BYTES> {
+    /// What the portable kernel does to a group.
+    const fn moved(&self, shift: u32) -> [Move; MOVES] {
+        let mut moves = [Move { by: 0, mask: 0 }; MOVES];
+        let mut to = 0;
+        while to < 16 * GROUP {
+            let (pixel, bit) = (to / 16, to as u32 % 16);
+            let from = if self.high_mask >> bit & 1 == 1 {
+                Some(bit + shift)
+            } else if self.low_mask >> bit & 1 == 1 {
+                Some(bit + shift - self.scale[pixel].trailing_zeros())
+            } else {
+                None
+            };
+            if let Some(from) = from {
+                let byte = self.word[pixel][from as usize / 8] as i32;
+                let by = to as i32 - 8 * byte - from as i32 % 8;
+                let mut place = 0;
+                while moves[place].mask != 0 && moves[place].by != by {
+                    place += 1;
+                }
+                moves[place] = Move { by, mask: moves[place].mask | 1 << to };
+            }
+            to += 1;
+        }
+        moves
+    }
+}
+
+/// The kernel's groups, and the plain way for the few pixels that it leaves over.
 #[inline(always)]
 fn by_groups<const SHIFT: u32, const BYTES: usize, K: Kernel>(
     kernel: K,
@@ -205,13 +253,11 @@ fn by_groups<const SHIFT: u32, const BYTES: usize, K: Kernel>(
     bytes: &[u8],
     pixels: &mut [u16],
 ) {
-    let (pixel_groups, last_pixels) = pixels.as_chunks_mut::<GROUP>();
+    let (pixel_groups, _) = pixels.as_chunks_mut::<GROUP>();
     let (groups, _) = bytes.as_chunks::<BYTES>();
     let groups = &groups[..pixel_groups.len()];
-    let last_bytes = &bytes[groups.len() * BYTES..];
     let done = kernel.groups::<SHIFT, BYTES>(layout, groups, pixel_groups);
-    Portable.groups::<SHIFT, BYTES>(layout, &groups[done..], &mut pixel_groups[done..]);
-    packing.unpack(last_bytes, last_pixels);
+    packing.unpack(&bytes[done * BYTES..], &mut pixels[done * GROUP..]);
 }
 
 #[cfg(target_arch = "x86_64")]

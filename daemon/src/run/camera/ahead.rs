@@ -6,6 +6,7 @@
 //! triggers are, the clock says, by the stamps of the frames before.
 
 use std::collections::VecDeque;
+use std::ops::RangeInclusive;
 
 use raysweep_core::{
     Applied, CameraCapabilities, CameraSettings, FirstFrame, FrameStamp, SettingsLatency, ns_from_us,
@@ -14,7 +15,9 @@ use raysweep_pipeline::{EXPOSURE_TOLERANCE_US, Job};
 
 use super::triggers::Triggers;
 
-/// Settings are written so long after the exposure before them has begun: a sensor holds its registers by then. [A]
+/// A sensor holds its registers so long after an exposure has begun. [A]
+const HELD_AFTER_US: f64 = 500.0;
+/// Settings are written so long after the exposure before them has begun. [A]
 const AFTER_START_US: f64 = 1_000.0;
 /// Nothing is written so shortly before a trigger, which might come first. [A]
 const BEFORE_TRIGGER_US: f64 = 1_000.0;
@@ -28,39 +31,29 @@ pub struct Line {
     pub period_us: f64,
     /// Frames whose measured delay is further off do not count.
     pub max_jitter_us: f64,
-    /// Whether the stamps of a frame tell each settings of the plan from all others, where frames carry their exposure.
+    /// Whether a frame's delay tells each settings of the plan from all others of the same exposure.
     pub distinct: bool,
-    /// The same where they do not.
-    pub distinct_without_exposure: bool,
 }
 
 impl Line {
     /// A line whose camera is taken through these settings.
     pub fn new(period_us: f64, max_jitter_us: f64, plan: &[CameraSettings]) -> Self {
         let phase_us = |settings: &CameraSettings| settings.trigger_delay_us.rem_euclid(period_us);
-        let are_apart = |by_exposure: bool| {
-            let mut sorted: Vec<&CameraSettings> = plan.iter().collect();
-            sorted.sort_by(|a, b| {
-                let exposures = a.exposure_us.total_cmp(&b.exposure_us);
-                exposures.then(phase_us(a).total_cmp(&phase_us(b)))
-            });
-            let same_exposure = |a: &CameraSettings, b: &CameraSettings| {
-                (a.exposure_us - b.exposure_us).abs() <= 2.0 * EXPOSURE_TOLERANCE_US
-            };
-            sorted.chunk_by(|a, b| same_exposure(a, b)).enumerate().all(|(group, settings)| {
-                let (first, last) = (phase_us(settings[0]), phase_us(settings[settings.len() - 1]));
-                let wraps = settings.len() == 1 || first + period_us - last > max_jitter_us;
-                let steps =
-                    settings.windows(2).all(|pair| phase_us(pair[1]) - phase_us(pair[0]) > max_jitter_us);
-                wraps && steps && (by_exposure || group == 0)
-            })
+        let mut sorted: Vec<&CameraSettings> = plan.iter().collect();
+        sorted.sort_by(|a, b| {
+            let exposures = a.exposure_us.total_cmp(&b.exposure_us);
+            exposures.then(phase_us(a).total_cmp(&phase_us(b)))
+        });
+        let same_exposure = |a: &CameraSettings, b: &CameraSettings| {
+            (a.exposure_us - b.exposure_us).abs() <= 2.0 * EXPOSURE_TOLERANCE_US
         };
-        Self {
-            period_us,
-            max_jitter_us,
-            distinct: are_apart(true),
-            distinct_without_exposure: are_apart(false),
-        }
+        let distinct = sorted.chunk_by(|a, b| same_exposure(a, b)).all(|settings| {
+            let (first, last) = (phase_us(settings[0]), phase_us(settings[settings.len() - 1]));
+            let wraps = settings.len() == 1 || first + period_us - last > max_jitter_us;
+            let mut steps = settings.windows(2).map(|pair| phase_us(pair[1]) - phase_us(pair[0]));
+            wraps && steps.all(|step_us| step_us > max_jitter_us)
+        });
+        Self { period_us, max_jitter_us, distinct }
     }
 }
 
@@ -68,13 +61,18 @@ impl Line {
 pub struct Written {
     /// As the hardware took them.
     pub settings: CameraSettings,
-    /// The frames that have them; the next settings end their time.
-    first: FirstFrame,
+    /// The first frame that has them, by the camera's word; the next settings end their time.
+    promised: FirstFrame,
+    /// The first frame to be triggered after they were written lies between these, by the stamps of frames.
+    next_seq: (u64, u64),
+    /// How many frames later than that they act, where it is known.
+    late_frames: Option<u64>,
+    /// The first frame that has them if every trigger is answered.
+    planned_seq: u64,
     /// Whether stamps may tell its frames from those of the settings before.
     by_stamps: bool,
-    written_ns: i64,
-    /// The first frame to be triggered after they were written, by its stamps.
-    next_seq: Option<u64>,
+    /// From the first register's write to the last one's.
+    written_ns: (i64, i64),
     /// What they are for; nothing where they only lead from one to the next.
     pub work: Option<Wanted>,
 }
@@ -107,7 +105,7 @@ impl Written {
     fn is_complete(&self, newest_seq: Option<u64>) -> bool {
         match &self.work {
             Some(wanted) => wanted.is_complete(),
-            None => newest_seq.is_some_and(|seq| seq >= self.first.certain()),
+            None => newest_seq.is_some_and(|seq| seq >= self.certain()),
         }
     }
 
@@ -116,9 +114,39 @@ impl Written {
         self.work.as_mut().filter(|wanted| !wanted.is_complete())
     }
 
+    /// The first frame that may have the settings.
+    fn earliest(&self) -> u64 {
+        match self.promised {
+            FirstFrame::Exactly(seq) => seq,
+            FirstFrame::Within { earliest, certain } => {
+                earliest.max(self.next_seq.0 + self.late_frames.unwrap_or(0)).min(certain)
+            }
+        }
+    }
+
     /// The first frame that is certain to have the settings.
     pub fn certain(&self) -> u64 {
-        self.first.certain()
+        match (self.promised, self.late_frames) {
+            (FirstFrame::Within { certain, .. }, Some(late_frames)) => {
+                certain.min(self.next_seq.1.saturating_add(late_frames)).max(self.earliest())
+            }
+            (promised, _) => promised.certain(),
+        }
+    }
+
+    /// The first frame that has the settings if all goes as planned.
+    fn planned(&self) -> u64 {
+        self.planned_seq.clamp(self.earliest(), self.certain())
+    }
+
+    /// Learns from a frame: its registers were held before these settings were written, or it was triggered after.
+    fn learn(&mut self, seq: u64, held_ns: i64, trigger_ns: Option<i64>) {
+        let (from_ns, to_ns) = self.written_ns;
+        if held_ns <= from_ns {
+            self.next_seq.0 = self.next_seq.0.max(seq + 1);
+        } else if trigger_ns.is_some_and(|trigger_ns| trigger_ns > to_ns) {
+            self.next_seq.1 = self.next_seq.1.min(seq);
+        }
     }
 }
 
@@ -196,7 +224,7 @@ impl Ahead {
     pub fn opening(&mut self, seq: u64) -> Option<&mut Wanted> {
         let newest_seq = self.newest_seq;
         let next = self.written.iter_mut().find(|written| !written.is_complete(newest_seq))?;
-        if seq < next.first.earliest() { None } else { next.open() }
+        if seq < next.earliest() { None } else { next.open() }
     }
 
     /// Whether frames cannot tell when the exposure of `next` acts, while their delays have told when settings do: the
@@ -225,7 +253,7 @@ impl Ahead {
         let due_ns = match (&last.work, lead) {
             _ if last.is_complete(self.newest_seq) => now_ns,
             (None, None) => return i64::MAX,
-            (None, Some(lead)) => self.after_trigger_ns(last.first.certain().saturating_sub(lead)),
+            (None, Some(lead)) => self.after_trigger_ns(last.planned().saturating_sub(lead)),
             (Some(wanted), lead) => {
                 self.after_trigger_ns(self.end_seq(last, wanted).saturating_sub(lead.unwrap_or(0)))
             }
@@ -240,7 +268,7 @@ impl Ahead {
     /// The last frame that a job waits for, if none is lost.
     fn end_seq(&self, written: &Written, wanted: &Wanted) -> u64 {
         let next_seq = self.newest_seq.map_or(0, |seq| seq + 1);
-        let first_seq = if wanted.passed > 0 { next_seq } else { written.first.certain().max(next_seq) };
+        let first_seq = if wanted.passed > 0 { next_seq } else { written.planned().max(next_seq) };
         first_seq + u64::from(wanted.frames - wanted.passed) - 1
     }
 
@@ -272,96 +300,104 @@ impl Ahead {
             return i64::MAX;
         }
         let trigger_ns = known_ns + (known_seq..seq).map(|seq| self.step_ns(seq)).sum::<i64>();
-        trigger_ns + self.settings_of(seq).map_or(0, |settings| self.window_ns(settings).0)
+        let possible = self.possible(seq).into_iter().flatten().map(|place| &self.written[place].settings);
+        trigger_ns + possible.map(|settings| self.window_ns(settings).0).max().unwrap_or(0)
     }
 
     /// The settings that a frame will have if all goes as planned.
     fn settings_of(&self, seq: u64) -> Option<&CameraSettings> {
-        let planned = self.written.iter().rev().find(|written| written.first.certain() <= seq);
+        let planned = self.written.iter().rev().find(|written| written.planned() <= seq);
         planned.or(self.written.front()).map(|written| &written.settings)
     }
 
     /// From when to when, after a trigger of a frame with these settings, others may be written.
     fn window_ns(&self, settings: &CameraSettings) -> (i64, i64) {
-        let start_us = self.camera.trigger_latency_us + settings.trigger_delay_us;
-        let from_us = start_us.min(self.line.period_us / 2.0) + AFTER_START_US;
-        (ns_from_us(from_us), ns_from_us(self.line.period_us - BEFORE_TRIGGER_US))
+        let start_ns = ns_from_us(self.camera.trigger_latency_us + settings.trigger_delay_us);
+        let from_ns = self.taken_ns(0, start_ns) + ns_from_us(AFTER_START_US);
+        (from_ns, ns_from_us(self.line.period_us - BEFORE_TRIGGER_US))
     }
 
     /// Notes settings that were written between two moments. Without `work` they only lead to others.
     pub fn push(&mut self, applied: Applied, written_ns: (i64, i64), work: Option<Wanted>) {
         self.camera_is_exact = matches!(applied.first_frame, FirstFrame::Exactly(_));
-        let by_stamps = work.is_none()
-            || if self.frames_carry_exposure {
-                self.line.distinct
-            } else {
-                self.line.distinct_without_exposure
-            };
-        let first = match (applied.first_frame, self.constant_latency()) {
-            (FirstFrame::Within { earliest, certain }, Some(frames))
-                if work.is_some() && self.triggers.none_within(written_ns) =>
-            {
-                // A driver knows of no trigger whose frame it has not seen. The clock does, but not whether it was
-                // answered: what hangs on it must show in the stamps.
-                let next_seq = self.seq_after(written_ns.0).unwrap_or(earliest).max(earliest);
-                if by_stamps || next_seq == earliest {
-                    FirstFrame::Exactly((next_seq + frames).min(certain))
-                } else {
-                    applied.first_frame
-                }
-            }
-            (promised, _) => promised,
-        };
+        let by_stamps = work.is_none() || self.line.distinct;
+        // Where frames do not tell their exposure, the probe found out when delays act and no more than that.
+        let late_frames = self.constant_latency().filter(|_| work.is_some());
+        let certain = applied.first_frame.certain();
+        let planned_seq =
+            late_frames.zip(self.seq_after(written_ns.0)).map_or(certain, |(late, next)| next + late);
         self.written.push_back(Written {
             settings: applied.actual,
-            first,
+            promised: applied.first_frame,
+            next_seq: (self.newest_seq.map_or(0, |seq| seq + 1), u64::MAX),
+            late_frames,
+            planned_seq,
             by_stamps,
-            written_ns: written_ns.1,
-            next_seq: None,
+            written_ns,
             work,
         });
     }
 
     /// Looks at a frame.
     pub fn see(&mut self, stamp: &FrameStamp) -> Seen {
+        let trigger_ns = self.trigger_of(stamp);
+        self.learn(stamp.seq, stamp.exposure_start_ns, trigger_ns);
         let owner = self.owner(stamp);
         let since_seq = self.newest_seq.map_or(stamp.seq, |newest| newest + 1);
         self.newest_seq = Some(stamp.seq);
         self.frames_carry_exposure = stamp.exposure_us.is_some();
-        let Some(settings) = owner.and_then(|owner| self.written.get(owner)).map(|written| written.settings)
-        else {
+        let Some(written) = owner.and_then(|owner| self.written.get(owner)) else {
             return Seen { owner, late_frames: None, since_seq };
         };
-        let trigger_ns = self.trigger_ns(stamp, &settings);
-        let before = self.triggers.newest().filter(|(seq, _)| seq + 1 == stamp.seq);
-        if let (Some((_, before_ns)), Some(last)) = (before, self.written.back_mut())
-            && last.next_seq.is_none()
-            && before_ns <= last.written_ns
-            && last.written_ns < trigger_ns
-        {
-            last.next_seq = Some(stamp.seq);
-        }
-        self.triggers.note(stamp.seq, trigger_ns);
-        let is_new = owner.is_some_and(|owner| owner > 0) && before.is_some();
-        let next_seq = owner.filter(|_| is_new).and_then(|owner| self.written[owner].next_seq);
-        let late_frames = next_seq.and_then(|next_seq| u32::try_from(stamp.seq.checked_sub(next_seq)?).ok());
+        self.triggers.note(stamp.seq, self.trigger_ns(stamp, &written.settings));
+        let is_new = owner.is_some_and(|owner| owner > 0) && since_seq == stamp.seq;
+        let (next_seq, latest_seq) = written.next_seq;
+        let late_frames = u32::try_from(stamp.seq.saturating_sub(next_seq)).ok();
+        let late_frames = late_frames.filter(|_| is_new && next_seq == latest_seq);
         Seen { owner, late_frames, since_seq }
+    }
+
+    /// Learns from a frame which settings were written before it and which after.
+    fn learn(&mut self, seq: u64, start_ns: i64, trigger_ns: Option<i64>) {
+        let taken_ns = trigger_ns.map_or(start_ns, |trigger_ns| self.taken_ns(trigger_ns, start_ns));
+        for written in &mut self.written {
+            written.learn(seq, taken_ns + ns_from_us(HELD_AFTER_US), trigger_ns);
+        }
+    }
+
+    /// When a frame's settings are taken, at the latest.
+    fn taken_ns(&self, trigger_ns: i64, start_ns: i64) -> i64 {
+        start_ns.min(trigger_ns + self.triggers.period_ns() / 2)
+    }
+
+    /// When a frame was triggered, if all settings that fit its stamps agree on that.
+    fn trigger_of(&self, stamp: &FrameStamp) -> Option<i64> {
+        let fitting = self.written.iter().filter(|written| self.fits(stamp, &written.settings));
+        let mut triggers = fitting.map(|written| self.trigger_ns(stamp, &written.settings));
+        let first_ns = triggers.next()?;
+        let jitter_ns = ns_from_us(self.line.max_jitter_us).unsigned_abs();
+        triggers.all(|trigger_ns| trigger_ns.abs_diff(first_ns) <= jitter_ns).then_some(first_ns)
     }
 
     fn trigger_ns(&self, stamp: &FrameStamp, settings: &CameraSettings) -> i64 {
         stamp.exposure_start_ns - ns_from_us(self.camera.trigger_latency_us + settings.trigger_delay_us)
     }
 
+    /// Which settings a frame may have, by its id.
+    fn possible(&self, seq: u64) -> Option<RangeInclusive<usize>> {
+        let latest = self.written.iter().rposition(|written| written.earliest() <= seq)?;
+        let certain = self.written.iter().rposition(|written| written.certain() <= seq);
+        Some(certain.unwrap_or(0)..=latest)
+    }
+
     /// Which settings a frame has: by its id, and where that leaves several, by its own exposure and delay.
     fn owner(&self, stamp: &FrameStamp) -> Option<usize> {
-        let latest = self.written.iter().rposition(|written| written.first.earliest() <= stamp.seq)?;
-        let certain = self.written.iter().rposition(|written| written.first.certain() <= stamp.seq);
-        if certain == Some(latest) {
-            return certain;
+        let candidates = self.possible(stamp.seq)?;
+        if self.written[*candidates.end()].certain() <= stamp.seq {
+            return Some(*candidates.end());
         }
-        let candidates = certain.unwrap_or(0)..=latest;
         let among = || candidates.clone().map(|place| (place, &self.written[place]));
-        let exposure_us = self.written[latest].settings.exposure_us;
+        let exposure_us = self.written[*candidates.end()].settings.exposure_us;
         let exposure_shows = stamp.exposure_us.is_some()
             || among().all(|(_, written)| written.settings.exposure_us == exposure_us);
         let stamps_tell = among().skip(1).all(|(_, written)| written.by_stamps);

@@ -62,13 +62,6 @@ impl Triggers {
             now_ns
         }
     }
-
-    /// Whether it is known that no trigger came between two moments.
-    pub fn none_within(&self, (from_ns, to_ns): (i64, i64)) -> bool {
-        let Some((_, trigger_ns)) = self.newest else { return false };
-        let since_ns = (from_ns - trigger_ns).rem_euclid(self.period_ns);
-        since_ns >= GATE_NS && since_ns + (to_ns - from_ns) <= self.period_ns - GATE_NS
-    }
 }
 
 #[cfg(test)]
@@ -95,7 +88,6 @@ mod tests {
     fn moments_are_placed_between_triggers() {
         let mut triggers = Triggers::new(PERIOD_NS);
         assert_eq!(triggers.between_ns(123, (2_000_000, 15_000_000)), 123, "nothing is known");
-        assert!(!triggers.none_within((5_000_000, 5_100_000)));
         triggers.note(1, 1_000);
         let between =
             |since_ns: i64| triggers.between_ns(1_000 + 3 * PERIOD_NS + since_ns, (2_000_000, 15_000_000));
@@ -103,8 +95,5 @@ mod tests {
         assert_eq!(between(500_000), after(2_000_000));
         assert_eq!(between(9_000_000), after(9_000_000));
         assert_eq!(between(15_500_000), after(PERIOD_NS + 2_000_000));
-        assert!(triggers.none_within((after(9_000_000), after(10_000_000))));
-        assert!(!triggers.none_within((after(9_000_000), after(PERIOD_NS + 1_000_000))), "it took too long");
-        assert!(!triggers.none_within((after(100_000), after(200_000))), "an edge may jitter");
     }
 }

@@ -10,6 +10,10 @@ use super::config::AravisConfig;
 
 /// Where the system says how large socket buffers may be.
 const RMEM_MAX: &str = "/proc/sys/net/core/rmem_max";
+/// What every GigE Vision device sends.
+const MIN_PACKET_BYTES: u32 = 576;
+/// Packets of a frame that may always be asked for again.
+const FEWEST_REQUESTS: f64 = 8.0;
 /// The least that a socket buffer is asked to hold.
 const MIN_SOCKET_BUFFER_BYTES: u64 = 1 << 20;
 
@@ -70,14 +74,21 @@ pub fn prepare(camera: &Camera, config: &AravisConfig, socket: SocketBuffer) {
 }
 
 /// Once the stream is made. Packets are asked for again where the camera can send them again: libaravis finds out.
-pub fn tune(stream: &Stream, socket: SocketBuffer) {
+pub fn tune(camera: &Camera, stream: &Stream, socket: SocketBuffer, payload_bytes: usize) {
     if let Some(stream) = stream.downcast_ref::<GvStream>() {
-        // A quarter of the packets, libaravis' own limit, is none of a frame that is three jumbo packets.
-        stream.set_packet_request_ratio(1.0);
+        let packet_bytes = camera.gv_get_packet_size().unwrap_or(MIN_PACKET_BYTES);
+        stream.set_packet_request_ratio(request_ratio(payload_bytes, packet_bytes));
         stream.set_socket_buffer(GvStreamSocketBuffer::Fixed);
         let bytes = socket.wanted_bytes.min(socket.allowed_bytes);
         stream.set_socket_buffer_size(bytes.try_into().unwrap_or(i32::MAX));
     }
+}
+
+/// What of a frame's packets may be asked for again. A quarter, libaravis' own limit, is none of a frame that is three jumbo
+/// packets; much more of a large frame would bury a host that is too slow for its camera.
+fn request_ratio(payload_bytes: usize, packet_bytes: u32) -> f64 {
+    let packets = payload_bytes as f64 / f64::from(packet_bytes.max(1));
+    (FEWEST_REQUESTS / packets.max(1.0)).clamp(0.25, 1.0)
 }
 
 #[cfg(test)]
@@ -90,6 +101,13 @@ mod tests {
         let warning = small.warning().unwrap();
         assert!(warning.contains("sysctl -w net.core.rmem_max=4000000"), "{warning}");
         assert_eq!(SocketBuffer { allowed_bytes: 4_000_000, ..small }.warning(), None);
+    }
+
+    #[test]
+    fn a_few_packets_of_any_frame_may_be_asked_for_again() {
+        assert_eq!(request_ratio(24_576, 9_000), 1.0, "three packets");
+        assert!((request_ratio(24_576, 1_536) - 0.5).abs() < 1e-12, "sixteen");
+        assert_eq!(request_ratio(2_880_000, 1_500), 0.25);
     }
 
     #[test]

@@ -188,7 +188,7 @@ impl Owner {
             tracing::warn!(camera = device.model(), "the camera lacks {}", set_up.lacks.join("; "));
         }
         let stream = device.camera.create_stream().map_err(|error| device_error("no stream", &error))?;
-        network::tune(&stream, socket);
+        network::tune(&device.camera, &stream, socket, payload_bytes);
         for _ in 0..BUFFERS {
             stream.push_buffer(Buffer::new_allocate(payload_bytes));
         }

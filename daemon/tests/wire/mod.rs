@@ -1,0 +1,189 @@
+//! The whole rig over a real wire: raysweepd with the driver `aravis`, the simulated GigE Vision camera, and the bench beside
+//! it, each a process of its own. Without noise and jitter, what is stored must be what the scene gives for the settings
+//! in the ledger, pixel for pixel, whatever the wire loses.
+
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on may panic")]
+
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use ndarray::Axis;
+use nix::sched::{CloneFlags, unshare};
+use raysweep::rig::Rig;
+use raysweep_core::{CameraSettings, Counts, FramePool, Pattern, SettingsId, Shutter, ns_from_us};
+use raysweep_proto::{Client, Event, RunParams};
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, PointEntry};
+use raysweep_session::stack::ArrayName;
+use raysweep_sim::bench::BenchProbe;
+use raysweep_sim::gige::{Faults, WireTruth};
+use raysweep_sim::{Devices, PlaneRig};
+
+/// A sweep and what happens to it.
+pub struct Sweep<'a> {
+    /// Rows and columns of the scene, and rows of the projector.
+    pub side_px: usize,
+    /// The plan's `[sweep]`.
+    pub plan: &'a str,
+    /// Lines of `[sim.camera]`.
+    pub camera: &'a str,
+    /// What goes wrong on the wire from the start, each as `key=value`.
+    pub faults: &'a [&'a str],
+    /// After so many points the camera loses its power for two seconds.
+    pub dies_after: Option<usize>,
+}
+
+/// What came of it.
+pub struct Swept {
+    /// What became of the frames.
+    pub counts: Counts,
+    /// What really left the camera.
+    pub wire: WireTruth,
+    /// How the run ended.
+    pub end: EndEntry,
+}
+
+impl Sweep<'_> {
+    /// Runs it to its end on a network of its own and holds its images against the scene.
+    pub fn run(&self) -> Swept {
+        unshare(CloneFlags::CLONE_NEWNET)
+            .expect("a network namespace needs root: run `cargo xtask test` as root");
+        assert!(Command::new("ip").args(["link", "set", "lo", "up"]).status().unwrap().success());
+        let folder = tempfile::tempdir().unwrap();
+        let rig = folder.path().join("rig.toml");
+        std::fs::write(&rig, self.rig()).unwrap();
+        let mut arguments = vec!["--rig", rig.to_str().unwrap()];
+        arguments.extend(self.faults.iter().flat_map(|fault| ["--fault", fault]));
+        let _camera = Process::start(env!("CARGO_BIN_EXE_raysweep-sim-camera"), &arguments);
+        let bench = folder.path().join("bench.sock");
+        let mut probe = wait_for("the camera does not start", || BenchProbe::open(&bench).ok());
+        let session = self.run_daemon(folder.path(), &mut probe);
+        assert_images_of_the_scene(&session, &Rig::load(&rig).unwrap());
+        let state = session.state().unwrap();
+        assert!(state.counts.balanced(), "{:?}", state.counts);
+        Swept { counts: state.counts, wire: probe.truth().unwrap().wire, end: state.end.unwrap() }
+    }
+
+    fn rig(&self) -> String {
+        let Self { side_px, camera, .. } = self;
+        format!(
+            "kind = \"plane\"\n[camera]\npixel_format = \"Mono12p\"\ndriver = \"aravis\"\n\
+             aravis.address = \"127.0.0.1\"\naravis.trigger_latency_us = 8\n[vsync]\ndriver = \"sim\"\n\
+             [projector]\ndriver = \"sim\"\nrows = {side_px}\nrow_time_us = 22.22\nfirst_row_us = 2200\n\
+             [sim]\nbench = \"bench.sock\"\nscene = \"v-groove\"\nscene_rows = {side_px}\n\
+             scene_columns = {side_px}\n[sim.sensor]\nnoise = false\n[sim.vsync]\njitter_us = 0\n\
+             [sim.camera]\n{camera}"
+        )
+    }
+
+    fn run_daemon(&self, folder: &Path, probe: &mut BenchProbe) -> Session {
+        let (rig, socket, data) = (folder.join("rig.toml"), folder.join("socket"), folder.join("sessions"));
+        let arguments = [("--rig", &rig), ("--socket", &socket), ("--data", &data)];
+        let arguments = arguments.iter().flat_map(|(flag, path)| [*flag, path.to_str().unwrap()]);
+        let _daemon = Process::start(env!("CARGO_BIN_EXE_raysweepd"), &arguments.collect::<Vec<_>>());
+        let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
+        let events = Client::connect(&socket).unwrap().subscribe().unwrap();
+        let plan = format!("kind = \"sweep\"\nname = \"wire\"\n[sweep]\n{}", self.plan);
+        client.run(&RunParams { plan, ..RunParams::default() }).unwrap();
+        let mut dies_after = self.dies_after;
+        for event in events {
+            match event.unwrap() {
+                Event::Progress(progress)
+                    if dies_after.is_some_and(|points| progress.points_stored >= points) =>
+                {
+                    dies_after = None;
+                    probe.set_faults(Faults { dead: true, ..Faults::default() }).unwrap();
+                    thread::sleep(Duration::from_secs(2));
+                    probe.set_faults(Faults::default()).unwrap();
+                }
+                Event::Finished { session, state, missing, error, .. } => {
+                    assert_eq!((state.as_str(), missing), ("complete", 0), "{error:?}");
+                    assert_eq!(dies_after, None, "the camera did not die");
+                    return Session::open(&session).unwrap();
+                }
+                _ => {}
+            }
+        }
+        panic!("the daemon ended before the run");
+    }
+}
+
+/// Ended with the test.
+struct Process(Child);
+
+impl Process {
+    fn start(program: &str, arguments: &[&str]) -> Self {
+        let mut command = Command::new(program);
+        command.args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
+        Self(command.spawn().unwrap())
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Waits until something is there.
+fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let patience = Instant::now() + Duration::from_secs(60);
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(Instant::now() < patience, "{what}");
+        thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// Each stored image is so many times what the scene gives for the settings that the ledger has of it.
+fn assert_images_of_the_scene(session: &Session, rig: &Rig) {
+    let state = session.state().unwrap();
+    for (array, pattern) in [(ArrayName::Sum, Pattern::White), (ArrayName::Dark, Pattern::Black)] {
+        let stored = session.stack().unwrap().read(array).unwrap();
+        assert_eq!(state.stored(array).count(), stored.len_of(Axis(0)));
+        for entry in state.stored(array) {
+            let found = stored.index_axis(Axis(0), entry.index);
+            let counts = scene_counts(rig, &pattern, entry);
+            let expected = counts.iter().map(|count| count * entry.frames);
+            let wrong = found.iter().zip(expected).filter(|(found, expected)| **found != *expected).count();
+            assert_eq!(wrong, 0, "pixels of {array:?} {}, attempt {}", entry.index, entry.attempt);
+        }
+    }
+}
+
+/// One frame of the simulated camera itself, without wire or daemon, under an entry's settings.
+fn scene_counts(rig: &Rig, pattern: &Pattern, entry: &PointEntry) -> Vec<u32> {
+    let scene: &PlaneRig = rig.simulated();
+    let Devices { mut camera, mut projector, vsync, .. } = scene.open();
+    // Time waits for every device.
+    drop(vsync);
+    let (raster, format) = (rig.file.raster(), camera.capabilities().format);
+    let latency_us = camera.capabilities().trigger_latency_us;
+    let trigger = raster.trigger(scene.first_row(), entry.delay_us, entry.exposure_us, latency_us);
+    let settings = CameraSettings {
+        shutter: Shutter::Rolling,
+        exposure_us: entry.exposure_us,
+        trigger_delay_us: trigger.trigger_delay_us,
+    };
+    let applied = camera.configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
+    let shown = projector.show(pattern).unwrap();
+    camera.arm().unwrap();
+    let pixels = camera.capabilities().width * camera.capabilities().height;
+    let mut frame = FramePool::new(1, format.frame_bytes(pixels)).take();
+    // Light of the period before may reach into the first frame.
+    let from_ns = shown.not_before_ns + ns_from_us(raster.period_us);
+    loop {
+        let stamp = camera.next_frame(&mut frame, Duration::from_secs(1)).unwrap().unwrap();
+        if stamp.exposure_start_ns >= from_ns && stamp.seq >= applied.first_frame.certain() {
+            break;
+        }
+    }
+    let mut counts = vec![0; pixels];
+    format.add_to(&frame, &mut counts).unwrap();
+    counts
+}
