@@ -3,6 +3,8 @@
 mod ioctl;
 pub mod modemline;
 pub mod pps;
+pub mod reopen;
+pub mod triggerbox;
 
 use std::path::Path;
 
