@@ -1,5 +1,6 @@
 //! Watchers of the projector's VSYNC line.
 
+pub mod fx2lafw;
 mod ioctl;
 pub mod modemline;
 pub mod pps;

@@ -88,7 +88,7 @@ impl Timer {
             let ticks = (period_us * 1e3 / prescaler.tick_ns() as f64).round();
             // Four times the pulse at least, so that most of a period lies after it.
             let allowed = f64::from(4 * PULSE_TICKS)..=65_536.0;
-            allowed.contains(&ticks).then(|| Self { top: (ticks - 1.0) as u16, prescaler })
+            allowed.contains(&ticks).then_some(Self { top: (ticks - 1.0) as u16, prescaler })
         };
         timer(Prescaler::By8).or_else(|| timer(Prescaler::By64))
     }
@@ -130,10 +130,7 @@ pub enum Reply {
 
 /// What the bytes begin with.
 pub fn parse_reply(bytes: &[u8]) -> Parsed<Reply> {
-    let is_head = |bytes: &[u8]| match bytes {
-        [b'P' | b'V', PAYLOAD_BYTES, ..] | [b'P' | b'V'] | [] => true,
-        _ => false,
-    };
+    let is_head = |bytes: &[u8]| matches!(bytes, [b'P' | b'V', PAYLOAD_BYTES, ..] | [b'P' | b'V'] | []);
     if !is_head(bytes) {
         let used = (1..bytes.len()).find(|&start| is_head(&bytes[start..])).unwrap_or(bytes.len());
         return Parsed::Garbage { used };
