@@ -6,6 +6,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
+use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Receiver};
+use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
 use raysweep_drivers::vsync::triggerbox::{Link, TriggerBox, TriggerBoxConfig};
 use raysweep_sim::mirror::{Link as Wire, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
@@ -76,4 +78,33 @@ fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
     assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
     let error = TriggerBox::open(config(Path::new("/dev/ttyNONE")), 1e6).err().unwrap();
     assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
+}
+
+/// Uniform bytes and bytes that replies are made of, in pieces; every byte is in a reply, garbage, or waits for more.
+#[test]
+fn ten_million_bytes_of_noise_are_accounted_for() {
+    let mut state = 5_u64;
+    let mut next = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state >> 33
+    };
+    let alphabet = b"PV\x07\x00\x01\x0e\x10";
+    let mut receiver = Receiver::default();
+    let (mut pushed, mut replies) = (0, 0);
+    while pushed < 10_000_000 {
+        let mut byte = || match next() {
+            random if random % 4 == 0 => (random >> 8) as u8,
+            random => alphabet[(random >> 8) as usize % alphabet.len()],
+        };
+        let length = 1 + usize::from(byte()) % 40;
+        let piece: Vec<u8> = (0..length).map(|_| byte()).collect();
+        receiver.push(&piece);
+        pushed += piece.len();
+        while receiver.next(parse_reply).is_some() {
+            replies += 1;
+        }
+        assert!(receiver.waiting_bytes() < LONGEST_REPLY);
+        assert_eq!(replies * 10 + receiver.garbage_bytes() as usize + receiver.waiting_bytes(), pushed);
+    }
+    assert!(replies > 0 && receiver.garbage_bytes() > 5_000_000, "{replies}");
 }

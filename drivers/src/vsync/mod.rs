@@ -15,9 +15,11 @@ use raysweep_core::{DeviceError, DeviceErrorKind};
 const DEVICE: &str = "vsync";
 
 /// Which change of the line is the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Polarity {
     /// The line becomes asserted.
+    #[default]
     Assert,
     /// The line becomes clear.
     Clear,

@@ -2,12 +2,15 @@
 //!
 //! The analyser cannot be asked for its time; samples come in transfers, and a transfer is complete a little after its last sample
 //! was taken: by the bus's own latency at best, by much more where the host was busy. So of each quarter of a second the transfer
-//! that was least late counts, as a round trip of twice that latency.
+//! that was least late counts, as a round trip that ends where its last sample was taken.
 
 use raysweep_core::{ClockModel, ClockQuality, RoundTrip};
 
-/// Over which time the least late transfer is sought: at first, and from then on.
+/// Over which time the least late transfer is sought: for the first few times, and from then on.
 const WINDOW_NS: [i64; 2] = [50_000_000, 250_000_000];
+const SHORT_WINDOWS: usize = 8;
+/// How far the least late transfer of a window may be from the bus's latency [A].
+const UNCERTAINTY_NS: i64 = 5_000;
 /// Windows of the fit.
 const WINDOWS: usize = 100;
 
@@ -27,7 +30,7 @@ struct Window {
 impl SampleClock {
     /// A clock whose transfers arrive `latency_ns` after their last sample when nothing delays them.
     pub fn new(latency_ns: i64) -> Self {
-        Self { latency_ns: latency_ns.max(1), model: ClockModel::new(WINDOWS), window: None }
+        Self { latency_ns, model: ClockModel::new(WINDOWS), window: None }
     }
 
     /// Notes that the samples up to `device_ns` had arrived at `host_ns`.
@@ -39,10 +42,12 @@ impl SampleClock {
         if lateness((device_ns, host_ns)) <= lateness(window.best) {
             window.best = (device_ns, host_ns);
         }
-        let begun = self.model.quality().is_some();
-        if host_ns - window.began_ns >= WINDOW_NS[usize::from(begun)] {
-            let (device_ns, receive_ns) = window.best;
-            self.model.add(RoundTrip { request_ns: receive_ns - 2 * self.latency_ns, device_ns, receive_ns });
+        let windows = self.model.quality().map_or(0, |quality| quality.round_trips);
+        if host_ns - window.began_ns >= WINDOW_NS[usize::from(windows >= SHORT_WINDOWS)] {
+            let (device_ns, arrived_ns) = window.best;
+            let taken_ns = arrived_ns - self.latency_ns;
+            let (request_ns, receive_ns) = (taken_ns - UNCERTAINTY_NS, taken_ns + UNCERTAINTY_NS);
+            self.model.add(RoundTrip { request_ns, device_ns, receive_ns });
             self.window = None;
         }
     }
