@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 
 use raysweep::rig::{Devices, Rig};
 use raysweep_core::{
-    Camera, CameraSettings, Clock, DeviceErrorKind, DeviceState, FramePool, Pattern, Projector, SettingsId, Shutter,
-    Vsync,
+    Camera, CameraSettings, Clock, DeviceErrorKind, DeviceState, FramePool, Pattern, Projector, SettingsId,
+    Shutter, Vsync,
 };
 use raysweep_sim::mirror::{Link, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
@@ -39,7 +39,10 @@ fn vsync_conforms(vsync: &mut dyn Vsync, clock: &Clock, period_us: f64) {
     assert!((median_us / period_us - 1.0).abs() < 0.02, "a period of {median_us} us, not {period_us}");
     vsync.next_edge(Duration::ZERO).unwrap();
     if let Some(clock) = vsync.clock() {
-        assert!(clock.residual_us.is_finite() && clock.rate_ppm.abs() < 1000.0 && clock.round_trips > 0, "{clock:?}");
+        assert!(
+            clock.residual_us.is_finite() && clock.rate_ppm.abs() < 1000.0 && clock.round_trips > 0,
+            "{clock:?}"
+        );
     }
 }
 
@@ -124,7 +127,8 @@ fn the_simulated_rig_in_the_host_s_time() {
 #[test]
 fn a_triggerbox_on_its_wire() {
     let pty = TriggerBoxPty::plug(16_666_667, Link::VirtualCom, WireFaults::default()).unwrap();
-    let vsync = format!("driver = \"triggerbox\"\ntriggerbox = {{ port = {:?}, link = \"usb\" }}", pty.path());
+    let vsync =
+        format!("driver = \"triggerbox\"\ntriggerbox = {{ port = {:?}, link = \"usb\" }}", pty.path());
     let (_folder, path) = rig_file(&vsync, "realtime = true");
     rig_conforms(&path);
 }
