@@ -313,18 +313,18 @@ pub(crate) fn accounts(state: &State) -> Vec<Block> {
         }
     }
     if let Some(vsync) = state.end.as_ref().and_then(|end| end.vsync) {
-        blocks.push(Block::Facts(
-            [
-                ("VSYNC period", format!("{:.3} µs", vsync.period_us)),
-                ("period jitter (sigma)", format!("{:.2} µs", vsync.jitter_us)),
-                (
-                    "edges seen / missed / false",
-                    format!("{} / {} / {}", vsync.edges, vsync.missed, vsync.false_edges),
-                ),
-            ]
-            .map(|(key, value)| (key.to_owned(), value))
-            .to_vec(),
-        ));
+        let allan = vsync.allan_1s.map(|allan| ("Allan deviation over 1 s", format!("{allan:.1e}")));
+        let facts = [
+            ("VSYNC period", format!("{:.3} µs", vsync.period_us)),
+            ("edge jitter (sigma)", format!("{:.2} µs", vsync.jitter_us)),
+            ("99 % of the edges within", format!("{:.1} µs", vsync.jitter_p99_us)),
+            (
+                "edges seen / missed / false",
+                format!("{} / {} / {}", vsync.edges, vsync.missed, vsync.false_edges),
+            ),
+        ];
+        let facts = facts.into_iter().chain(allan);
+        blocks.push(Block::Facts(facts.map(|(key, value)| (key.to_owned(), value)).collect()));
     }
     blocks
 }

@@ -1,15 +1,18 @@
 //! The factory: from a rig file to open devices.
 
+mod vsync;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
 use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
+use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
-use crate::config::{CameraDriver, ConfigError, Driver, RigFile};
+use crate::config::{CameraDriver, ConfigError, DrmSection, ProjectorDriver, RigFile, VsyncDriver};
 
 /// Why a rig cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -129,15 +132,21 @@ impl Rig {
     /// # Errors
     /// The first device that does not open.
     pub fn open(&self) -> Result<Devices, RigError> {
-        let (Driver::Sim, Driver::Sim) = (self.file.vsync.driver, self.file.projector.driver);
         if self.file.sim.bench.is_some() && self.file.camera.driver == CameraDriver::Sim {
             let message = "sim.bench: the camera of a bench is reached over its wire: set camera.driver to the driver that does, or leave sim.bench out";
             return Err(RigError::Config(message.into()));
         }
+        self.check_pace()?;
         let sim = self.sim.open();
-        let (vsync, projector): (Box<dyn Vsync>, Box<dyn Projector>) = match &self.file.sim.bench {
-            Some(bench) => (Box::new(RemoteVsync::open(bench)?), Box::new(RemoteProjector::open(bench)?)),
-            None => (sim.vsync, sim.projector),
+        let vsync: Box<dyn Vsync> = match (vsync::open(&self.file.vsync)?, &self.file.sim.bench) {
+            (Some(real), _) => real,
+            (None, Some(bench)) => Box::new(RemoteVsync::open(bench)?),
+            (None, None) => sim.vsync,
+        };
+        let projector: Box<dyn Projector> = match (self.file.projector.driver, &self.file.sim.bench) {
+            (ProjectorDriver::Drm, _) => Box::new(self.open_drm()?),
+            (ProjectorDriver::Sim, Some(bench)) => Box::new(RemoteProjector::open(bench)?),
+            (ProjectorDriver::Sim, None) => sim.projector,
         };
         let camera = match self.file.camera.driver {
             CameraDriver::Sim => sim.camera,
@@ -150,6 +159,23 @@ impl Rig {
         // Real devices know no time but the machine's, also where others of the rig are simulated.
         let clock = if self.file.camera.driver == CameraDriver::Sim { sim.clock } else { Clock::real() };
         Ok(Devices { camera, vsync, projector, clock, pace })
+    }
+
+    /// Real devices know no time but the machine's, so a simulated camera beside them must keep to it.
+    fn check_pace(&self) -> Result<(), RigError> {
+        let RigFile { camera, vsync, projector, sim, .. } = &self.file;
+        let real = vsync.driver != VsyncDriver::Sim || projector.driver != ProjectorDriver::Sim;
+        if real && camera.driver == CameraDriver::Sim && !sim.realtime {
+            let message = "sim.realtime = false: a simulated camera beside a real VSYNC line or projector runs by the host's clock; set sim.realtime = true";
+            return Err(RigError::Config(message.into()));
+        }
+        Ok(())
+    }
+
+    fn open_drm(&self) -> Result<DrmProjector, RigError> {
+        let DrmSection { card, connector, settle_frames } = self.file.projector.drm.clone();
+        let config = DrmConfig { card, connector, timing: Timing::HD_720P60, settle_frames };
+        Ok(DrmProjector::open(&config)?)
     }
 
     fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {

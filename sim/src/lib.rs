@@ -15,6 +15,7 @@ pub mod optics;
 mod rig;
 pub mod scene;
 mod sensor;
+pub mod triggerbox;
 pub mod usb;
 
 pub use config::SimConfig;

@@ -114,6 +114,22 @@ fn edges_that_the_watcher_misses() {
 }
 
 #[test]
+fn no_frame_of_a_bad_line_is_tied_to_a_wrong_edge_and_its_jitter_is_known() {
+    let rig = rig("[sim.vsync]\njitter_us = 5\nmissing = 0.01\nfalse_edges = 0.01\n");
+    let bench = Bench::new(&rig);
+    let ended = bench.run(&PLAN.replace("average = 4", "average = 40"));
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    assert_true(&rig, &ended);
+    let vsync = ended.open().1.end.unwrap().vsync.unwrap();
+    println!("{vsync:?}");
+    assert!(vsync.missed > 5 && vsync.false_edges > 5, "{vsync:?}");
+    assert!((vsync.jitter_us / 5.0 - 1.0).abs() < 0.1, "{vsync:?}");
+    // Of a normal distribution and of white phase noise.
+    assert!((vsync.jitter_p99_us / (2.576 * 5.0) - 1.0).abs() < 0.2, "{vsync:?}");
+    assert!((vsync.allan_1s.unwrap() / (3_f64.sqrt() * 5e-6) - 1.0).abs() < 0.2, "{vsync:?}");
+}
+
+#[test]
 fn frames_dropped_on_the_way() {
     let lost = survive("[sim.camera]\ndropped = 0.05\n");
     assert!(lost.contains_key(&LossCause::CameraGap), "{lost:?}");

@@ -42,6 +42,17 @@ pub struct ClockModel {
     fit: Option<Fit>,
 }
 
+/// How well a device's clock is known.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct ClockQuality {
+    /// Weighted root mean square of the round trips' middles about the line.
+    pub residual_us: f64,
+    /// By how many parts in a million the host's clock runs faster than the device's.
+    pub rate_ppm: f64,
+    /// Round trips that the line goes through.
+    pub round_trips: usize,
+}
+
 /// host = host_ns + (device - device_ns) (1 + rate), with both origins within the data, so that no digit is lost.
 #[derive(Debug, Clone, Copy)]
 struct Fit {
@@ -91,6 +102,15 @@ impl ClockModel {
     /// Weighted root mean square of the round trips' middles about the line.
     pub fn residual_ns(&self) -> Option<f64> {
         self.fit.map(|fit| fit.residual_ns)
+    }
+
+    /// How well the clock is known; nothing before the first round trip.
+    pub fn quality(&self) -> Option<ClockQuality> {
+        self.fit.map(|fit| ClockQuality {
+            residual_us: fit.residual_ns / 1e3,
+            rate_ppm: fit.rate * 1e6,
+            round_trips: self.trips.len(),
+        })
     }
 
     fn fitted(&self) -> Option<Fit> {

@@ -100,6 +100,12 @@ pub struct VsyncStats {
     pub false_edges: u64,
     /// Mean period.
     pub period_us: f64,
-    /// Standard deviation of single periods.
+    /// Standard deviation of edges from the straight line through their neighbours; 0 before enough are seen.
     pub jitter_us: f64,
+    /// What 99 % of the edges deviate less than.
+    #[serde(default)]
+    pub jitter_p99_us: f64,
+    /// Allan deviation of the line's frequency over one second, once two seconds of it were seen.
+    #[serde(default)]
+    pub allan_1s: Option<f64>,
 }

@@ -3,7 +3,7 @@
 use std::ops::RangeInclusive;
 use std::time::Duration;
 
-use crate::{DeviceError, Edge, FrameBuf, FrameStamp, LossCause, Pattern, PixelFormat};
+use crate::{ClockQuality, DeviceError, Edge, FrameBuf, FrameStamp, LossCause, Pattern, PixelFormat};
 
 /// How a sensor exposes its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -234,6 +234,11 @@ pub trait Vsync: Send {
     /// # Errors
     /// `Disconnected` when the device is gone.
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError>;
+
+    /// How well the device's own clock is known; nothing where edges are stamped by the host's.
+    fn clock(&self) -> Option<ClockQuality> {
+        None
+    }
 }
 
 /// From when on a pattern is certain to be in the light.

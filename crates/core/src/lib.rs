@@ -18,7 +18,7 @@ mod raster;
 mod units;
 
 pub use clock::{Clock, ClockHandle};
-pub use clock_model::{ClockModel, RoundTrip};
+pub use clock_model::{ClockModel, ClockQuality, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Projector, Readout,

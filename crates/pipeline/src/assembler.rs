@@ -85,6 +85,13 @@ pub struct AssemblerConfig {
     pub edge_gate_us: f64,
 }
 
+impl AssemblerConfig {
+    /// The VSYNC line as its tracker must know it.
+    pub fn line(&self) -> Line {
+        Line { period_ns: ns_from_us(self.raster.period_us), gate_ns: ns_from_us(self.edge_gate_us) }
+    }
+}
+
 /// A frame is tied to the edge within this of the one that must have triggered it.
 const TRIGGER_TOLERANCE_NS: i64 = 200_000;
 /// A frame waits this long, on the host's clock, for the edges around it.
@@ -148,11 +155,9 @@ enum Verdict {
 impl Assembler {
     /// An assembler that has seen nothing.
     pub fn new(config: AssemblerConfig) -> Self {
-        let line =
-            Line { period_ns: ns_from_us(config.raster.period_us), gate_ns: ns_from_us(config.edge_gate_us) };
         Self {
+            tracker: EdgeTracker::new(config.line()),
             config,
-            tracker: EdgeTracker::new(line),
             waiting: VecDeque::new(),
             attempt: None,
             chain: Chain::default(),

@@ -12,6 +12,7 @@ mod pipeline;
 mod products;
 mod queue;
 mod registry;
+mod regularity;
 mod schedule;
 mod stage;
 mod strips;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use raysweep_core::{Counts, FilmSummary, SettingsLatency, VsyncStats};
+use raysweep_core::{ClockQuality, Counts, FilmSummary, SettingsLatency, VsyncStats};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -88,9 +88,24 @@ fn vsync_schema(_: &mut SchemaGenerator) -> Schema {
             "missed": edges,
             "false_edges": edges,
             "period_us": { "type": "number" },
-            "jitter_us": { "type": "number" },
+            "jitter_us": { "type": "number", "description": "Standard deviation of edges from the line through their neighbours." },
+            "jitter_p99_us": { "type": "number" },
+            "allan_1s": { "type": ["number", "null"], "description": "Allan deviation over one second." },
         },
         "required": ["edges", "missed", "false_edges", "period_us", "jitter_us"],
+    })
+}
+
+fn clock_schema(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({
+        "type": ["object", "null"],
+        "description": "The fit of a device's clock to the host's, null where the host stamps.",
+        "properties": {
+            "residual_us": { "type": "number" },
+            "rate_ppm": { "type": "number" },
+            "round_trips": { "type": "integer", "minimum": 0 },
+        },
+        "required": ["residual_us", "rate_ppm", "round_trips"],
     })
 }
 
@@ -181,9 +196,13 @@ pub struct Status {
     pub session: Option<PathBuf>,
     /// How far that run is, or was.
     pub progress: Option<Progress>,
-    /// Its VSYNC line, as of the last pass.
+    /// Its VSYNC line, renewed once a second.
     #[schemars(schema_with = "vsync_schema")]
     pub vsync: Option<VsyncStats>,
+    /// How well the clock of the device that watches the line is known.
+    #[serde(default)]
+    #[schemars(schema_with = "clock_schema")]
+    pub vsync_clock: Option<ClockQuality>,
     /// The film, where the run is one.
     #[serde(default)]
     #[schemars(schema_with = "film_schema")]
@@ -330,7 +349,7 @@ pub enum Event {
         #[schemars(schema_with = "counts_schema")]
         counts: Counts,
     },
-    /// The VSYNC line at the end of a pass.
+    /// The VSYNC line so far: once a second and at the end of a pass.
     Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
     /// The light transport was estimated during a film.
     Film(FilmEstimate),

@@ -228,7 +228,7 @@ fn error_codes() -> Vec<ErrorInfo> {
 mod tests {
     use std::collections::BTreeSet;
 
-    use raysweep_core::{Counts, FilmSummary, LossCause, VsyncStats};
+    use raysweep_core::{ClockQuality, Counts, FilmSummary, LossCause, VsyncStats};
     use serde_json::{Value, json};
 
     use super::*;
@@ -280,6 +280,8 @@ mod tests {
         );
         let vsync = serde_json::to_value(VsyncStats::default()).unwrap();
         assert_eq!(described(schema::<Status>(), "vsync"), keys(&vsync));
+        let clock = ClockQuality { residual_us: 3.0, rate_ppm: -20.0, round_trips: 100 };
+        assert_eq!(described(schema::<Status>(), "vsync_clock"), keys(&serde_json::to_value(clock).unwrap()));
         let film = serde_json::to_value(FilmSummary::default()).unwrap();
         assert_eq!(described(schema::<Status>(), "film"), keys(&film));
     }

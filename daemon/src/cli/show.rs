@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
-use raysweep_core::{Counts, FilmSummary, Percentiles, SettingsLatency};
+use raysweep_core::{ClockQuality, Counts, FilmSummary, Percentiles, SettingsLatency};
 use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
     BetterSweep, CheckReport, Description, ExpectedError, MirrorStatus, NoiseSource, Progress, Role,
@@ -34,10 +34,19 @@ pub(super) fn status(status: &Status) -> String {
         rows.push((
             "vsync",
             format!(
-                "{:.2} us, jitter {:.2} us; {} edges, {} missed, {} false",
-                vsync.period_us, vsync.jitter_us, vsync.edges, vsync.missed, vsync.false_edges
+                "{:.2} us, jitter {:.2} us (99 % within {:.1} us); {} edges, {} missed, {} false",
+                vsync.period_us,
+                vsync.jitter_us,
+                vsync.jitter_p99_us,
+                vsync.edges,
+                vsync.missed,
+                vsync.false_edges
             ),
         ));
+        rows.extend(vsync.allan_1s.map(|allan| ("", format!("Allan deviation over 1 s {allan:.1e}"))));
+    }
+    if let Some(ClockQuality { residual_us, rate_ppm, .. }) = status.vsync_clock {
+        rows.push(("clock", format!("residual {residual_us:.1} us, {rate_ppm:+.2} ppm against the host's")));
     }
     if let Some(SettingsLatency { min_frames, max_frames }) = status.settings_latency {
         rows.push(("settings", format!("act {min_frames} to {max_frames} frames late")));

@@ -4,6 +4,7 @@ mod film;
 mod plan;
 mod product;
 mod rig;
+mod vsync;
 
 use std::ops::Range;
 
@@ -13,8 +14,9 @@ pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};
 pub use rig::{
-    CameraDriver, CameraNoise, CameraSection, Driver, ProjectorSection, RigFile, RigKind, VsyncSection,
+    CameraDriver, CameraNoise, CameraSection, DrmSection, ProjectorDriver, ProjectorSection, RigFile, RigKind,
 };
+pub use vsync::{VsyncDriver, VsyncSection};
 
 /// What is wrong with a rig or plan file, and where.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -1,5 +1,7 @@
 //! `rig.toml`: what the rig is made of and what is known of its timing.
 
+use std::path::PathBuf;
+
 use raysweep_core::{PixelFormat, Raster};
 use raysweep_drivers::camera::aravis::{AravisConfig, ConfigFault};
 use raysweep_drivers::camera::v4l2::V4l2Config;
@@ -10,7 +12,7 @@ use raysweep_sim::config::Spot as SimSpot;
 use raysweep_transport::plane::{PlaneError, RowTiming};
 use serde::Deserialize;
 
-use super::ConfigError;
+use super::{ConfigError, VsyncSection};
 
 /// A rig.
 #[derive(Debug, Clone, Deserialize)]
@@ -49,12 +51,32 @@ pub enum CameraDriver {
     V4l2,
 }
 
-/// Drivers by the names that rig files use.
+/// Drivers of projectors by the names that rig files use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Driver {
+pub enum ProjectorDriver {
     /// The simulated rig.
     Sim,
+    /// A display output of this machine.
+    Drm,
+}
+
+/// `[projector.drm]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DrmSection {
+    /// The graphics card.
+    pub card: PathBuf,
+    /// The output by the kernel's name; left out: the first with a display.
+    pub connector: Option<String>,
+    /// Video frames from a flip until the picture is certain to be in the light.
+    pub settle_frames: u32,
+}
+
+impl Default for DrmSection {
+    fn default() -> Self {
+        Self { card: "/dev/dri/card0".into(), connector: None, settle_frames: 2 } // [A]
+    }
 }
 
 /// `[camera]`
@@ -125,26 +147,15 @@ const TYPICAL_FULL_SCALE_E: f64 = 8000.0;
 /// Electrons of read noise of a typical camera [A].
 const TYPICAL_READ_NOISE_E: f64 = 15.0;
 
-/// `[vsync]`
-#[derive(Debug, Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct VsyncSection {
-    /// Which driver watches the line.
-    pub driver: Driver,
-    /// From one edge to the next.
-    #[serde(default = "default_period_us")]
-    pub period_us: f64,
-    /// An edge this far from where the one before puts it is not the projector's.
-    #[serde(default = "default_gate_us")]
-    pub gate_us: f64,
-}
-
 /// `[projector]`
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProjectorSection {
     /// Which driver shows pictures.
-    pub driver: Driver,
+    pub driver: ProjectorDriver,
+    /// `[projector.drm]`, for the driver `drm`: 1280x720 at 60 Hz.
+    #[serde(default)]
+    pub drm: DrmSection,
     /// Rows that it draws.
     #[serde(default = "default_rows")]
     pub rows: usize,
@@ -193,12 +204,6 @@ fn default_row_pitch() -> f64 {
 }
 fn default_pixel_format() -> PixelFormat {
     PixelFormat::Mono12
-}
-fn default_period_us() -> f64 {
-    16_666.667
-}
-fn default_gate_us() -> f64 {
-    500.0
 }
 fn default_rows() -> usize {
     720
@@ -285,9 +290,10 @@ impl RigFile {
     fn check(&self, text: &str) -> Result<(), ConfigError> {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
         let max_dn = f64::from(camera.pixel_format.max_value());
-        let rules: [(&[&str], f64, f64, f64); 13] = [
+        let rules: [(&[&str], f64, f64, f64); 14] = [
             (&["vsync", "period_us"], vsync.period_us, 4000.0, 1e6),
             (&["vsync", "gate_us"], vsync.gate_us, 1.0, vsync.period_us / 4.0),
+            (&["vsync", "reopen_s"], vsync.reopen_s, 0.0, 3600.0),
             (&["projector", "rows"], projector.rows as f64, 1.0, MAX_ROWS as f64),
             (&["projector", "row_time_us"], projector.row_time_us, 0.1, 10_000.0),
             (&["projector", "first_row_us"], projector.first_row_us, 0.0, vsync.period_us),
@@ -339,6 +345,7 @@ impl RigFile {
             return Err(ConfigError::at(text, &["sim", "projector", "spot"], message));
         }
         self.check_row_table(text)?;
+        vsync.check(text)?;
         if camera.driver == CameraDriver::Aravis {
             let placed = |fault: ConfigFault| {
                 ConfigError::at(text, &["camera", "aravis", fault.key], fault.to_string())
@@ -437,6 +444,21 @@ mod tests {
             (MINIMAL.replace("\"plane\"", "\"plan\""), "plane"),
             (MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"fx3\""), "sim"),
             (MINIMAL.replace("[vsync]\n", "[vsync]\nperiod_us = 5\n"), "vsync.period_us = 5"),
+            (
+                MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"modemline\""),
+                "[vsync.modemline]",
+            ),
+            (
+                MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"triggerbox\""),
+                "[vsync.triggerbox]",
+            ),
+            (
+                MINIMAL.replace(
+                    "[vsync]\ndriver = \"sim\"",
+                    "[vsync]\ndriver = \"fx2lafw\"\nfx2lafw.sample_rate_hz = 7",
+                ),
+                "vsync.fx2lafw.sample_rate_hz = 7",
+            ),
             (MINIMAL.replace("[camera]\n", "[camera]\ngain = 3\n"), "gain"),
             (MINIMAL.replace("[camera]\n", "[camera]\nwhite_dn = 5000\n"), "4095"),
             (

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use raysweep_core::{FilmSummary, SettingsLatency};
+use raysweep_core::{ClockQuality, FilmSummary, SettingsLatency};
 use raysweep_proto::{Event, RunState, Status};
 use tokio::sync::broadcast;
 
@@ -30,6 +30,7 @@ impl Board {
             session: None,
             progress: None,
             vsync: None,
+            vsync_clock: None,
             film: None,
             settings_latency: None,
             error: None,
@@ -65,7 +66,7 @@ impl Board {
         status.state = next;
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
-            (status.film, status.settings_latency) = (None, None);
+            (status.film, status.settings_latency, status.vsync_clock) = (None, None, None);
         }
         let event = Event::State { state: next, session: status.session.clone() };
         // Sent under the lock, so that subscribers see states in their true order.
@@ -86,6 +87,11 @@ impl Board {
     /// Notes how late the camera's settings take effect.
     pub fn set_settings_latency(&self, latency: Option<SettingsLatency>) {
         self.lock().settings_latency = latency;
+    }
+
+    /// Notes how well the clock of the VSYNC line's watcher is known.
+    pub fn set_vsync_clock(&self, clock: Option<ClockQuality>) {
+        self.lock().vsync_clock = clock;
     }
 
     /// Names the file with the live images.

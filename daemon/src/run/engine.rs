@@ -192,9 +192,11 @@ impl Run {
             worker_threads: 0,
         };
         let trigger_latency_us = assembler.camera.trigger_latency_us;
+        let vsync_line = assembler.line();
         let (pipeline, input) = Pipeline::start(config, assembler, stages, storage)?;
 
-        let vsync = VsyncThread::start(vsync, input.clone(), self.orders.clone())?;
+        let board = self.board.clone();
+        let vsync = VsyncThread::start(vsync, vsync_line, board, input.clone(), self.orders.clone())?;
         let line = line_of(&self.task, trigger_latency_us);
         let camera = CameraThread::start(camera, Drive { clock, pace, line }, input, self.orders.clone())?;
         let _ = self.board.go(RunState::Armed);

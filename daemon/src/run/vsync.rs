@@ -1,17 +1,21 @@
-//! The VSYNC watcher's thread: hands edges on.
+//! The VSYNC watcher's thread: hands edges on and shows once a second what the line is like.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Vsync};
-use raysweep_pipeline::{Event, Input};
+use raysweep_pipeline::{EdgeTracker, Event, Input, Line};
+use raysweep_proto::Event as Told;
 
+use super::board::Board;
 use super::orders::{Order, Orders};
 use super::priority;
 
 const POLL: Duration = Duration::from_millis(100);
+/// How often the line is shown.
+const SHOWN_EVERY: Duration = Duration::from_secs(1);
 
 /// The watcher's thread as the run sees it.
 pub struct VsyncThread {
@@ -43,6 +47,28 @@ impl Drop for Alarm {
     }
 }
 
+/// The line while it is watched. Its tracker knows nothing of the assembler's, which sees the same edges when it gets to
+/// them: what is shown must not wait for frames.
+struct Meter {
+    tracker: EdgeTracker,
+    board: Arc<Board>,
+    shown: Instant,
+}
+
+impl Meter {
+    fn new(line: Line, board: Arc<Board>) -> Self {
+        Self { tracker: EdgeTracker::new(line), board, shown: Instant::now() }
+    }
+
+    fn show(&mut self, vsync: &dyn Vsync) {
+        if self.shown.elapsed() >= SHOWN_EVERY {
+            self.shown = Instant::now();
+            self.board.set_vsync_clock(vsync.clock());
+            self.board.publish(Told::Vsync(self.tracker.stats()));
+        }
+    }
+}
+
 impl VsyncThread {
     /// Starts to watch.
     ///
@@ -50,6 +76,8 @@ impl VsyncThread {
     /// When the system gives no thread.
     pub fn start(
         mut vsync: Box<dyn Vsync>,
+        line: Line,
+        board: Arc<Board>,
         input: Input<Event>,
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
@@ -61,9 +89,11 @@ impl VsyncThread {
                 move || {
                     priority::for_device("vsync");
                     let mut alarm = Alarm { orders, armed: true };
+                    let mut meter = Meter::new(line, board);
                     while !stop.load(Ordering::Relaxed) {
                         match vsync.next_edge(POLL) {
                             Ok(Some(edge)) => {
+                                meter.tracker.push(edge);
                                 if input.send(Event::Edge(edge)).is_err() {
                                     break;
                                 }
@@ -71,6 +101,7 @@ impl VsyncThread {
                             Ok(None) => {}
                             Err(error) => return Err(error),
                         }
+                        meter.show(&*vsync);
                     }
                     alarm.armed = false;
                     Ok(())

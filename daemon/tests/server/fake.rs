@@ -171,6 +171,7 @@ impl Control for Fake {
             session: Some(session()),
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),
+            vsync_clock: None,
             film: None,
             settings_latency: None,
             error: None,

@@ -12,7 +12,7 @@ mod optotune;
 mod park;
 pub mod playzerx;
 mod points;
-mod port;
+pub(crate) mod port;
 mod sequence;
 mod state;
 pub mod wire;

@@ -1,4 +1,4 @@
-//! A serial port to a mirror's controller.
+//! A serial port to a controller.
 
 use std::io::{self, Read, Write};
 use std::path::Path;
@@ -21,15 +21,21 @@ pub(super) fn fault(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceErr
 }
 
 /// An open port, exclusively ours, and what came over it.
-pub(super) struct Port {
+pub(crate) struct Port {
+    device: &'static str,
     tty: TTYPort,
     name: String,
     received: Receiver,
 }
 
 impl Port {
-    /// Opens it, 8N1 without flow control.
+    /// Opens the port of a mirror, 8N1 without flow control.
     pub fn open(path: &Path, baud: u32) -> Result<Self, DeviceError> {
+        Self::open_for("mirror", path, baud)
+    }
+
+    /// Opens the port of a device, 8N1 without flow control.
+    pub fn open_for(device: &'static str, path: &Path, baud: u32) -> Result<Self, DeviceError> {
         let name = path.display().to_string();
         let tty = serialport::new(&name, baud)
             .data_bits(DataBits::Eight)
@@ -45,9 +51,10 @@ impl Port {
                     serialport::ErrorKind::Io(io::ErrorKind::ResourceBusy) => DeviceErrorKind::Busy,
                     _ => DeviceErrorKind::NotReady,
                 };
-                fault(kind, format!("cannot open {name}: {error}: check the cable, the rig file's port, and who else has it open"))
+                let what = format!("cannot open {name}: {error}: check the cable, the rig file's port, and who else has it open");
+                DeviceError::new(device, kind, what)
             })?;
-        Ok(Self { tty, name, received: Receiver::default() })
+        Ok(Self { device, tty, name, received: Receiver::default() })
     }
 
     /// Writes what the port takes now; how much that was.
@@ -68,13 +75,29 @@ impl Port {
             if written > 0 {
                 last = Instant::now();
             } else if last.elapsed() > SEND_WAIT {
-                return Err(fault(
-                    DeviceErrorKind::Timeout,
-                    format!("{} takes no bytes: the controller hangs; switch it off and on", self.name),
-                ));
+                let what =
+                    format!("{} takes no bytes: the controller hangs; switch it off and on", self.name);
+                return Err(DeviceError::new(self.device, DeviceErrorKind::Timeout, what));
             }
         }
         Ok(())
+    }
+
+    /// Waits until bytes are there, for `timeout` at the most: the caller's clock is read right after.
+    pub fn wait(&mut self, timeout: Duration) -> Result<(), DeviceError> {
+        let mut buffer = [0; 64];
+        self.tty.set_timeout(timeout).map_err(|error| self.lost(&error.into()))?;
+        let read = self.tty.read(&mut buffer);
+        self.tty.set_timeout(WRITE_WAIT).map_err(|error| self.lost(&error.into()))?;
+        match read {
+            Ok(0) => Err(self.lost(&io::ErrorKind::BrokenPipe.into())),
+            Ok(read) => {
+                self.received.push(&buffer[..read]);
+                Ok(())
+            }
+            Err(error) if is_passing(&error) => Ok(()),
+            Err(error) => Err(self.lost(&error)),
+        }
     }
 
     /// The next reply that is there, without waiting.
@@ -130,10 +153,8 @@ impl Port {
     }
 
     fn lost(&self, error: &io::Error) -> DeviceError {
-        fault(
-            DeviceErrorKind::Disconnected,
-            format!("{}: {error}: the controller is gone; check its cable and its power", self.name),
-        )
+        let what = format!("{}: {error}: the controller is gone; check its cable and its power", self.name);
+        DeviceError::new(self.device, DeviceErrorKind::Disconnected, what)
     }
 }
 

@@ -1,8 +1,11 @@
 //! Watchers of the projector's VSYNC line.
 
+pub mod fx2lafw;
 mod ioctl;
 pub mod modemline;
 pub mod pps;
+pub mod reopen;
+pub mod triggerbox;
 
 use std::path::Path;
 
@@ -12,9 +15,11 @@ use raysweep_core::{DeviceError, DeviceErrorKind};
 const DEVICE: &str = "vsync";
 
 /// Which change of the line is the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Polarity {
     /// The line becomes asserted.
+    #[default]
     Assert,
     /// The line becomes clear.
     Clear,

@@ -36,10 +36,26 @@ const DOUBTS: u8 = 8;
 /// How long closing waits for the thread, which wakes at the next transition.
 const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
 
+/// `[vsync.modemline]`
+#[derive(Debug, Clone, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ModemLineConfig {
+    /// The serial port.
+    pub port: PathBuf,
+    /// The line that carries the VSYNC.
+    #[serde(default)]
+    pub line: Line,
+    /// Which change of it is the edge.
+    #[serde(default)]
+    pub edge: Polarity,
+}
+
 /// A modem line that the VSYNC may be wired to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Line {
     /// Data carrier detect.
+    #[default]
     Dcd,
     /// Clear to send.
     Cts,

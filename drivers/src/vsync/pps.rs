@@ -18,6 +18,17 @@ const LOOK: Duration = Duration::from_millis(250);
 /// The kernel counts waits in ticks of up to 10 ms and does not wait at all for less than one.
 const TICK: Duration = Duration::from_millis(10);
 
+/// `[vsync.pps]`
+#[derive(Debug, Clone, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PpsConfig {
+    /// The source, `/dev/pps0`.
+    pub source: PathBuf,
+    /// Which change of the line is the edge.
+    #[serde(default)]
+    pub edge: Polarity,
+}
+
 /// A VSYNC line that the kernel stamps.
 pub struct Pps {
     path: PathBuf,

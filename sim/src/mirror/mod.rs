@@ -13,4 +13,4 @@ pub use mti::MtiController;
 pub use optotune::OptotuneController;
 pub use plant::{Held, MirrorTruth, Plant};
 pub use playzerx::{PlayzerXConfig, PlayzerXController};
-pub use pty::{Controller, Link, MirrorPty, WireFaults};
+pub use pty::{Controller, Link, MirrorPty, Pty, Run, WireFaults};

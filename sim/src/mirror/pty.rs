@@ -1,4 +1,4 @@
-//! A controller at the far end of a pseudo-terminal, with the faults of its wire.
+//! A controller, of a mirror or of anything else, at the far end of a pseudo-terminal, with the faults of its wire.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -57,12 +57,67 @@ impl Default for WireFaults {
     }
 }
 
-/// A controller on a pseudo-terminal. Dropping it unplugs it.
-pub struct MirrorPty {
+/// What a device does with what comes over its wire: [`Controller::run`].
+pub type Run = Box<dyn FnMut(&[u8], i64, &mut Vec<u8>) + Send>;
+
+/// A device on a pseudo-terminal. Dropping it unplugs it.
+pub struct Pty {
     path: PathBuf,
-    truth: Arc<Mutex<MirrorTruth>>,
     unplugged: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
+}
+
+impl Pty {
+    /// Plugs a device in.
+    ///
+    /// # Errors
+    /// When there is no pseudo-terminal or no thread.
+    pub fn plug(run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
+        // Closed on exec: a process that a test starts must not keep an unplugged controller's port alive. The other end
+        // is left to the driver, so that it can be opened and closed like a real port.
+        let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC)?;
+        grantpt(&master)?;
+        unlockpt(&master)?;
+        let path = ptsname_r(&master)?.into();
+        let unplugged = Arc::new(AtomicBool::new(false));
+        let mut wire = Wire {
+            master: File::from(OwnedFd::from(master)),
+            device: run,
+            link,
+            faults,
+            unplugged: unplugged.clone(),
+            clock: Clock::real(),
+            replies: 0,
+        };
+        let thread = std::thread::Builder::new().name("pty".into()).spawn(move || wire.run())?;
+        Ok(Self { path, unplugged, thread: Some(thread) })
+    }
+
+    /// The port that a driver opens.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Pulls the plug: the port goes away, and with it the power.
+    pub fn unplug(&mut self) {
+        self.unplugged.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // A device that panicked has said so on stderr.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Drop for Pty {
+    fn drop(&mut self) {
+        self.unplug();
+    }
+}
+
+/// A mirror's controller on a pseudo-terminal. Dropping it unplugs it.
+pub struct MirrorPty {
+    pty: Pty,
+    truth: Arc<Mutex<MirrorTruth>>,
 }
 
 impl MirrorPty {
@@ -70,31 +125,15 @@ impl MirrorPty {
     ///
     /// # Errors
     /// When there is no pseudo-terminal or no thread.
-    pub fn plug(controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
-        // Closed on exec: a process that a test starts must not keep an unplugged controller's port alive. The other end
-        // is left to the driver, so that it can be opened and closed like a real port.
-        let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC)?;
-        grantpt(&master)?;
-        unlockpt(&master)?;
-        let path = ptsname_r(&master)?.into();
+    pub fn plug(mut controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
         let truth = controller.truth();
-        let unplugged = Arc::new(AtomicBool::new(false));
-        let mut wire = Wire {
-            master: File::from(OwnedFd::from(master)),
-            controller,
-            link,
-            faults,
-            unplugged: unplugged.clone(),
-            clock: Clock::real(),
-            replies: 0,
-        };
-        let thread = std::thread::Builder::new().name("mirror-pty".into()).spawn(move || wire.run())?;
-        Ok(Self { path, truth, unplugged, thread: Some(thread) })
+        let run = move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| controller.run(bytes, now_ns, replies);
+        Ok(Self { pty: Pty::plug(Box::new(run), link, faults)?, truth })
     }
 
     /// The port that a driver opens.
     pub fn path(&self) -> &Path {
-        &self.path
+        self.pty.path()
     }
 
     /// What the controller did so far.
@@ -109,23 +148,13 @@ impl MirrorPty {
 
     /// Pulls the plug: the port goes away, and with it the power.
     pub fn unplug(&mut self) {
-        self.unplugged.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
-            // A controller that panicked has said so on stderr.
-            let _ = thread.join();
-        }
+        self.pty.unplug();
     }
 }
 
-impl Drop for MirrorPty {
-    fn drop(&mut self) {
-        self.unplug();
-    }
-}
-
-struct Wire<C> {
+struct Wire {
     master: File,
-    controller: C,
+    device: Run,
     link: Link,
     faults: WireFaults,
     unplugged: Arc<AtomicBool>,
@@ -133,7 +162,7 @@ struct Wire<C> {
     replies: u64,
 }
 
-impl<C: Controller> Wire<C> {
+impl Wire {
     fn run(&mut self) {
         let start_ns = self.clock.now_ns();
         let (mut taken, mut stalled_until_ns, mut last_ms) = (0_u64, 0, 0);
@@ -165,12 +194,12 @@ impl<C: Controller> Wire<C> {
                 _ => self.master.read(&mut buffer[..room]).unwrap_or(0),
             };
             taken += read as u64;
-            self.controller.run(&buffer[..read], self.clock.now_ns(), &mut replies);
+            (self.device)(&buffer[..read], self.clock.now_ns(), &mut replies);
             if !stalled && !replies.is_empty() {
                 self.answer(&mut replies);
             }
         }
-        // The power goes with the plug: whatever the controller held, the mirror springs back and the light goes out.
+        // The power goes with the plug: whatever a mirror's controller held, the mirror springs back and the light goes out.
     }
 
     /// Until something comes, a millisecond at most, and never at full speed on a port that nobody has open.

@@ -2,10 +2,12 @@
 //! network. Plugging one in takes root and that kernel module, which the kernel guest (`cargo xtask guest`) has.
 
 mod ftdi;
+mod fx2lafw;
 mod responder;
 mod vhci;
 
 pub use ftdi::{Ftdi, FtdiLine};
+pub use fx2lafw::{Fx2Blank, Fx2Faults, Fx2Lafw, Fx2Memory, Signal};
 pub use responder::respond;
 pub use vhci::Plugged;
 

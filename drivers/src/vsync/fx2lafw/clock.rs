@@ -1,0 +1,95 @@
+//! When a sample was taken, on the host's clock.
+//!
+//! The analyser cannot be asked for its time; samples come in transfers, and a transfer is complete a little after its last sample
+//! was taken: by the bus's own latency at best, by much more where the host was busy. So of each quarter of a second the transfer
+//! that was least late counts, as a round trip that ends where its last sample was taken.
+
+use raysweep_core::{ClockModel, ClockQuality, RoundTrip};
+
+/// Over which time the least late transfer is sought: for the first few times, and from then on.
+const WINDOW_NS: [i64; 2] = [50_000_000, 250_000_000];
+const SHORT_WINDOWS: usize = 8;
+/// How far the least late transfer of a window may be from the bus's latency [A].
+const UNCERTAINTY_NS: i64 = 5_000;
+/// Windows of the fit.
+const WINDOWS: usize = 100;
+
+/// The relation of samples to the host's clock.
+pub struct SampleClock {
+    latency_ns: i64,
+    model: ClockModel,
+    window: Option<Window>,
+}
+
+struct Window {
+    began_ns: i64,
+    /// Device's and host's time of the least late transfer.
+    best: (i64, i64),
+}
+
+impl SampleClock {
+    /// A clock whose transfers arrive `latency_ns` after their last sample when nothing delays them.
+    pub fn new(latency_ns: i64) -> Self {
+        Self { latency_ns, model: ClockModel::new(WINDOWS), window: None }
+    }
+
+    /// Notes that the samples up to `device_ns` had arrived at `host_ns`.
+    pub fn arrived(&mut self, device_ns: i64, host_ns: i64) {
+        let lateness = |(device_ns, host_ns): (i64, i64)| {
+            host_ns.saturating_sub(self.model.host_ns(device_ns).unwrap_or(device_ns))
+        };
+        let window = self.window.get_or_insert(Window { began_ns: host_ns, best: (device_ns, host_ns) });
+        if lateness((device_ns, host_ns)) <= lateness(window.best) {
+            window.best = (device_ns, host_ns);
+        }
+        let windows = self.model.quality().map_or(0, |quality| quality.round_trips);
+        if host_ns - window.began_ns >= WINDOW_NS[usize::from(windows >= SHORT_WINDOWS)] {
+            let (device_ns, arrived_ns) = window.best;
+            let taken_ns = arrived_ns - self.latency_ns;
+            let (request_ns, receive_ns) = (taken_ns - UNCERTAINTY_NS, taken_ns + UNCERTAINTY_NS);
+            self.model.add(RoundTrip { request_ns, device_ns, receive_ns });
+            self.window = None;
+        }
+    }
+
+    /// The host's time at a moment of the analyser's clock; nothing before the first window.
+    pub fn host_ns(&self, device_ns: i64) -> Option<i64> {
+        self.model.host_ns(device_ns)
+    }
+
+    /// How well the clock is known.
+    pub fn quality(&self) -> Option<ClockQuality> {
+        self.model.quality()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_busy_host_moves_no_stamp() {
+        // 30 ppm fast, transfers every 4 ms, 100 us late at best and in most cases later, some by 20 ms.
+        let mut clock = SampleClock::new(100_000);
+        let mut state = 1_u64;
+        let truth_ns = |device_ns: i64| 7_000_000_000_000 + (device_ns as f64 * (1.0 + 30e-6)) as i64;
+        let mut worst_ns = 0;
+        for k in 1..5000_i64 {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let late_ns = match state >> 60 {
+                0..4 => 0,
+                15 => 20_000_000,
+                _ => (state >> 40) as i64 % 400_000,
+            };
+            let device_ns = k * 4_000_000;
+            clock.arrived(device_ns, truth_ns(device_ns) + 100_000 + late_ns);
+            if k > 500 {
+                let off_ns = clock.host_ns(device_ns).unwrap() - truth_ns(device_ns);
+                worst_ns = off_ns.abs().max(worst_ns);
+            }
+        }
+        assert!(worst_ns < 5_000, "{worst_ns} ns");
+        let quality = clock.quality().unwrap();
+        assert!((quality.rate_ppm - 30.0).abs() < 0.5 && quality.residual_us < 2.0, "{quality:?}");
+    }
+}

@@ -1,0 +1,318 @@
+//! A box that makes the VSYNC: strawlab's triggerbox, an Arduino whose timer pulses at the rig's period.
+//!
+//! The box tells nothing of its pulses by itself. The host asks it for its time, fits a line to the answers
+//! ([`ClockModel`]), and knows from that line when each pulse began. On a UART the bytes of question and answer take known times, of
+//! which the box reads its clock between the two; without them the line would be off by a third of a millisecond.
+
+pub mod protocol;
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use raysweep_core::{
+    Clock, ClockModel, ClockQuality, DeviceError, DeviceErrorKind, Edge, RoundTrip, Vsync, ns_from_us,
+};
+
+use self::protocol::{Command, QUESTION_BYTES, REPLY_BYTES, Reply, Timer, VERSION, parse_reply};
+use super::DEVICE;
+use crate::mirror::port::Port;
+
+const BAUD: u32 = 115_200;
+/// Opening the port resets an Arduino, whose loader and handshake then take up to 7 s.
+const HELLO_PATIENCE: Duration = Duration::from_secs(10);
+const HELLO_EVERY: Duration = Duration::from_millis(500);
+/// Round trips of the fit.
+const ROUND_TRIPS: usize = 100;
+/// From so many on the fit is used.
+const MIN_ROUND_TRIPS: usize = 8;
+/// Until there are `MIN_ROUND_TRIPS`, and from then on: no multiple of a usual period, so that answers come at all of its phases.
+const ASK_EVERY: [Duration; 2] = [Duration::from_millis(13), Duration::from_millis(97)];
+/// An answer that has not come by then is not waited for.
+const ANSWER_WAIT: Duration = Duration::from_millis(200);
+/// Without a good answer for so long, nothing is known of the box's pulses any more.
+const SILENCE: Duration = Duration::from_secs(3);
+/// An answer further from the line than this, and than its own round trip allows, is no time of this clock.
+const STRAY_NS: i64 = 1_000_000;
+/// So many of them in a row mean that the clock is another one: the box was reset.
+const STRAYS: u32 = 5;
+
+/// `[vsync.triggerbox]`
+#[derive(Debug, Clone, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TriggerBoxConfig {
+    /// Its serial port.
+    pub port: PathBuf,
+    /// What lies between the port and the box.
+    #[serde(default)]
+    pub link: Link,
+}
+
+/// How bytes get to the box.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Link {
+    /// A UART (Arduino Uno and Nano): each byte takes 87 us.
+    #[default]
+    Uart,
+    /// The box's own USB (Raspberry Pi Pico): bytes take no time.
+    Usb,
+}
+
+impl Link {
+    fn bytes_ns(self, bytes: usize) -> i64 {
+        match self {
+            // Ten bits a byte.
+            Self::Uart => bytes as i64 * 10 * 1_000_000_000 / i64::from(BAUD),
+            Self::Usb => 0,
+        }
+    }
+}
+
+/// Why a box cannot be used, or no longer.
+#[derive(Debug, thiserror::Error)]
+enum TriggerBoxError {
+    #[error("vsync.period_us = {0}: a triggerbox makes 2000 to 262144; choose another period or driver")]
+    Period(f64),
+    #[error("{port}: firmware {found} is spoken to as if it were {VERSION}: flash firmware {VERSION}")]
+    Firmware { port: String, found: u8 },
+    #[error("{port}: no answer within {HELLO_PATIENCE:?} ({garbage} bytes of garbage): is it a triggerbox?")]
+    NoHello { port: String, garbage: u64 },
+    #[error(
+        "{port}: no usable answer for {SILENCE:?} ({garbage} bytes of garbage so far): check its cable; of a box with its own USB say vsync.triggerbox.link = \"usb\""
+    )]
+    Silent { port: String, garbage: u64 },
+    #[error("{port}: the box was reset: its clock began anew")]
+    Reset { port: String },
+}
+
+/// A triggerbox.
+pub struct TriggerBox {
+    config: TriggerBoxConfig,
+    timer: Timer,
+    port: Port,
+    clock: Clock,
+    stage: Stage,
+}
+
+enum Stage {
+    /// It has not said its version yet.
+    Greeting {
+        asked: Option<Instant>,
+    },
+    Running(Running),
+}
+
+struct Running {
+    model: ClockModel,
+    trips: usize,
+    number: u8,
+    /// The question under way: when it was asked.
+    asked_ns: Option<i64>,
+    next_question: Instant,
+    last_good: Instant,
+    strays: u32,
+    /// Of the last answer.
+    pulses: i64,
+    /// The last pulse that was told, or that began before the fit could tell when.
+    told: i64,
+}
+
+impl TriggerBox {
+    /// Opens the box and lets it pulse with the nearest period that it can. Edges have the numbers of its pulses.
+    ///
+    /// # Errors
+    /// `Disconnected` or `Busy` if the port cannot be had, `Timeout` if no box answers, `Unsupported` if its firmware is
+    /// another one, `OutOfRange` for a period that it cannot make.
+    pub fn open(config: TriggerBoxConfig, period_us: f64) -> Result<Self, DeviceError> {
+        let mut device = Self::connect(config, period_us)?;
+        let deadline = Instant::now() + HELLO_PATIENCE;
+        while matches!(device.stage, Stage::Greeting { .. }) {
+            device.greet(HELLO_EVERY)?;
+            if Instant::now() > deadline {
+                let garbage = device.port.garbage_bytes();
+                return Err(
+                    device.error(DeviceErrorKind::Timeout, |port| TriggerBoxError::NoHello { port, garbage })
+                );
+            }
+        }
+        Ok(device)
+    }
+
+    /// Opens the port and leaves the greeting to [`Vsync::next_edge`]: a box that comes back takes its time.
+    ///
+    /// # Errors
+    /// As [`Self::open`], but for a box that does not answer.
+    pub fn connect(config: TriggerBoxConfig, period_us: f64) -> Result<Self, DeviceError> {
+        let Some(timer) = Timer::with_period_us(period_us) else {
+            let error = TriggerBoxError::Period(period_us);
+            return Err(DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, error));
+        };
+        let port = Port::open_for(DEVICE, &config.port, BAUD)?;
+        Ok(Self { config, timer, port, clock: Clock::real(), stage: Stage::Greeting { asked: None } })
+    }
+
+    fn error(&self, kind: DeviceErrorKind, what: impl FnOnce(String) -> TriggerBoxError) -> DeviceError {
+        DeviceError::new(DEVICE, kind, what(self.config.port.display().to_string()))
+    }
+
+    /// Asks for the version until it comes, for `timeout` at the most, and then sets the timer going.
+    fn greet(&mut self, timeout: Duration) -> Result<(), DeviceError> {
+        let Stage::Greeting { asked } = &mut self.stage else { return Ok(()) };
+        if asked.is_none_or(|asked| asked.elapsed() >= HELLO_EVERY) {
+            *asked = Some(Instant::now());
+            self.port.send(&Command::Version.to_bytes())?;
+        }
+        let version = self.port.await_reply(timeout, parse_reply, |reply| match reply {
+            Reply::Version(version) => Some(version),
+            Reply::Time { .. } => None,
+        })?;
+        match version {
+            None => Ok(()),
+            Some(VERSION) => {
+                for command in [Command::Stop, Command::Period(self.timer), Command::Start] {
+                    self.port.send(&command.to_bytes())?;
+                }
+                self.stage = Stage::Running(Running::new());
+                Ok(())
+            }
+            Some(found) => {
+                Err(self
+                    .error(DeviceErrorKind::Unsupported, |port| TriggerBoxError::Firmware { port, found }))
+            }
+        }
+    }
+
+    /// Takes what answers there are, waits for them until `until_ns`, and asks again when it is time.
+    fn converse(&mut self, until_ns: i64) -> Result<(), DeviceError> {
+        let Stage::Running(running) = &mut self.stage else { return Ok(()) };
+        let now_ns = self.clock.now_ns();
+        if running.asked_ns.is_some_and(|at_ns| now_ns - at_ns > ANSWER_WAIT.as_nanos() as i64) {
+            running.asked_ns = None;
+        }
+        if running.asked_ns.is_none() && Instant::now() >= running.next_question {
+            running.number = running.number.wrapping_add(1);
+            running.next_question = Instant::now() + ASK_EVERY[usize::from(running.trips >= MIN_ROUND_TRIPS)];
+            running.asked_ns = Some(self.clock.now_ns());
+            self.port.send(&Command::Time(running.number).to_bytes())?;
+        }
+        let wait = Duration::from_nanos(u64::try_from(until_ns - now_ns).unwrap_or(0));
+        if running.asked_ns.is_none() {
+            let quiet = running.next_question.saturating_duration_since(Instant::now());
+            std::thread::sleep(wait.min(quiet));
+            return Ok(());
+        }
+        self.port.wait(wait.min(ANSWER_WAIT))?;
+        let receive_ns = self.clock.now_ns();
+        while let Some(reply) = self.port.reply(parse_reply)? {
+            let Reply::Time { number, pulses, ticks } = reply else { continue };
+            if number == running.number
+                && let Some(asked_ns) = running.asked_ns.take()
+            {
+                let link = self.config.link;
+                let request_ns = asked_ns + link.bytes_ns(QUESTION_BYTES);
+                let receive_ns = receive_ns - link.bytes_ns(REPLY_BYTES);
+                running.take(self.timer, pulses, ticks, (request_ns, receive_ns));
+            }
+        }
+        let (strays, silence) = (running.strays, running.last_good.elapsed());
+        if strays >= STRAYS {
+            return Err(self.error(DeviceErrorKind::Disconnected, |port| TriggerBoxError::Reset { port }));
+        }
+        if silence > SILENCE {
+            let garbage = self.port.garbage_bytes();
+            return Err(
+                self.error(DeviceErrorKind::Timeout, |port| TriggerBoxError::Silent { port, garbage })
+            );
+        }
+        Ok(())
+    }
+}
+
+impl Running {
+    fn new() -> Self {
+        let now = Instant::now();
+        Self {
+            model: ClockModel::new(ROUND_TRIPS),
+            trips: 0,
+            number: 0,
+            asked_ns: None,
+            next_question: now,
+            last_good: now,
+            strays: 0,
+            pulses: 0,
+            told: 0,
+        }
+    }
+
+    /// Takes an answer into the fit, if it says what time it was for certain.
+    fn take(&mut self, timer: Timer, pulses: u32, ticks: u16, (request_ns, receive_ns): (i64, i64)) {
+        if !timer.is_counted(ticks) || receive_ns < request_ns {
+            return;
+        }
+        // Pulses are counted with 32 bits.
+        let since = pulses.wrapping_sub(self.pulses as u32).cast_signed();
+        let pulses = self.pulses + i64::from(since);
+        let trip = RoundTrip { request_ns, device_ns: timer.device_ns(pulses, ticks), receive_ns };
+        let expected_ns = self.model.host_ns(trip.device_ns).filter(|_| self.trips >= MIN_ROUND_TRIPS);
+        if expected_ns.is_some_and(|ns| !(request_ns - STRAY_NS..=receive_ns + STRAY_NS).contains(&ns)) {
+            self.strays += 1;
+            return;
+        }
+        self.pulses = pulses;
+        self.model.add(trip);
+        self.trips += 1;
+        if self.trips <= MIN_ROUND_TRIPS {
+            self.told = pulses;
+        }
+        self.strays = 0;
+        self.last_good = Instant::now();
+    }
+
+    /// The next pulse to be told and when it began, or will begin.
+    fn next_edge(&self, timer: Timer) -> Option<Edge> {
+        if self.trips < MIN_ROUND_TRIPS {
+            return None;
+        }
+        let pulse = self.told + 1;
+        Some(Edge {
+            seq: u64::try_from(pulse).ok()?,
+            host_ns: self.model.host_ns(timer.device_ns(pulse, 0))?,
+        })
+    }
+}
+
+impl Vsync for TriggerBox {
+    fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
+        let deadline_ns = self.clock.now_ns() + ns_from_us(timeout.as_secs_f64() * 1e6);
+        loop {
+            let now_ns = self.clock.now_ns();
+            let (timer, mut until_ns) = (self.timer, deadline_ns);
+            match &mut self.stage {
+                Stage::Greeting { .. } => {
+                    let left_ns = (deadline_ns - now_ns).max(0).unsigned_abs();
+                    self.greet(HELLO_EVERY.min(Duration::from_nanos(left_ns)))?;
+                }
+                Stage::Running(running) => {
+                    if let Some(edge) = running.next_edge(timer) {
+                        if edge.host_ns <= now_ns {
+                            running.told += 1;
+                            return Ok(Some(edge));
+                        }
+                        until_ns = until_ns.min(edge.host_ns);
+                    }
+                    self.converse(until_ns)?;
+                }
+            }
+            if self.clock.now_ns() >= deadline_ns {
+                return Ok(None);
+            }
+        }
+    }
+
+    fn clock(&self) -> Option<ClockQuality> {
+        match &self.stage {
+            Stage::Greeting { .. } => None,
+            Stage::Running(running) => running.model.quality(),
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! The analyser's driver on samples of a line whose truth is known, in time that the test makes.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use raysweep_core::{DeviceError, DeviceErrorKind, Vsync};
+use raysweep_drivers::vsync::fx2lafw::{Change, Fx2Lafw, Fx2LafwConfig, Link, Slope};
+use raysweep_sim::usb::Signal;
+
+/// Host's time of the first sample.
+const START_NS: i64 = 4_000_000_000_000;
+const LATENCY_NS: i64 = 100_000;
+/// The analyser's clock is slow by this.
+const RATE_PPM: f64 = 35.0;
+
+/// An analyser whose transfers of 4 ms arrive late by the bus's latency and more.
+struct Scripted {
+    signal: Signal,
+    step_ns: f64,
+    taken: u64,
+    transfers: u64,
+    last: u64,
+}
+
+impl Link for Scripted {
+    fn receive(&mut self, _: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError> {
+        if self.transfers == self.last {
+            return Err(DeviceError::new("vsync", DeviceErrorKind::Disconnected, "the script is over"));
+        }
+        self.transfers += 1;
+        let mut samples = vec![0; (4e6 / self.step_ns) as usize];
+        let first_ns = START_NS as f64 + self.taken as f64 * self.step_ns;
+        self.signal.samples(first_ns, self.step_ns, &mut samples);
+        self.taken += samples.len() as u64;
+        // Two in three are late, by up to 9 ms.
+        let late_ns = (self.transfers % 3 * (self.transfers * 7919 % 4500)) as i64 * 1000;
+        let end_ns = (START_NS as f64 + self.taken as f64 * self.step_ns) as i64;
+        take(&samples, end_ns + LATENCY_NS + late_ns);
+        Ok(())
+    }
+}
+
+fn signal() -> Signal {
+    Signal {
+        seed: 11,
+        period_ns: 16_666_667,
+        pulse_ns: 500_000,
+        jitter_ns: 5_000.0,
+        missing: 0.01,
+        false_edges: 0.01,
+        exposure_after_ns: 700_000,
+        exposure_ns: 900_000,
+    }
+}
+
+fn analyser(sample_rate_hz: u32, seconds: u64) -> (Fx2Lafw<Scripted>, Fx2LafwConfig) {
+    let config = Fx2LafwConfig {
+        sample_rate_hz,
+        channels: BTreeMap::from([("vsync".into(), 0), ("exposure".into(), 1)]),
+        latency_us: LATENCY_NS as f64 / 1e3,
+        ..Fx2LafwConfig::default()
+    };
+    let step_ns = 1e9 / f64::from(sample_rate_hz) * (1.0 + RATE_PPM * 1e-6);
+    let link = Scripted { signal: signal(), step_ns, taken: 0, transfers: 0, last: seconds * 250 };
+    (Fx2Lafw::new(link, &config).unwrap(), config)
+}
+
+/// Every edge that the line has in this time.
+fn truth(seconds: i64) -> Vec<i64> {
+    let signal = signal();
+    let periods =
+        START_NS / signal.period_ns - 1..(START_NS + seconds * 1_000_000_000) / signal.period_ns + 2;
+    let mut edges: Vec<i64> = periods.flat_map(|k| signal.edges(k)).flatten().collect();
+    edges.retain(|edge_ns| *edge_ns > START_NS);
+    edges.sort_unstable();
+    edges
+}
+
+/// All changes until the script is over.
+fn changes(analyser: &mut Fx2Lafw<Scripted>) -> Vec<Change> {
+    let next = || analyser.next_change(Duration::from_secs(1)).ok().flatten();
+    std::iter::from_fn(next).collect()
+}
+
+#[test]
+fn every_edge_is_seen_once_when_it_was() {
+    let (mut analyser, _) = analyser(1_000_000, 30);
+    assert_eq!(analyser.channels(), ["exposure", "vsync"]);
+    let seen = changes(&mut analyser);
+    let rising = |channel| seen.iter().filter(move |c| c.channel == channel && c.slope == Slope::Rising);
+    let truth = truth(30);
+    let vsync: Vec<&Change> = rising(1).collect();
+    // Those of the first moments, before the clock is known, are numbered and not told.
+    assert!(vsync.len() > truth.len() - 10, "{} of {}", vsync.len(), truth.len());
+    for change in &vsync {
+        let off_ns = change.host_ns - truth[change.seq as usize - 1];
+        // A sample's length, and what late transfers leave of the fit.
+        assert!((-5_000..12_000).contains(&off_ns), "{change:?}: {off_ns} ns");
+    }
+    for pair in vsync.iter().zip(rising(0).skip_while(|c| c.seq < vsync[0].seq)) {
+        let after_ns = pair.1.host_ns - pair.0.host_ns;
+        assert!((after_ns - 700_000).abs() < 2_000, "one clock: {after_ns} ns");
+    }
+    let clock = analyser.clock().unwrap();
+    assert!((clock.rate_ppm - RATE_PPM).abs() < 3.0, "{clock:?}");
+}
+
+#[test]
+fn the_line_s_edges_are_the_vsync_alone() {
+    let (mut analyser, _) = analyser(100_000, 5);
+    let truth = truth(5);
+    let mut last = 0;
+    while let Ok(edge) = analyser.next_edge(Duration::from_secs(1)) {
+        let edge = edge.unwrap();
+        assert!((edge.host_ns - truth[edge.seq as usize - 1]).abs() < 30_000, "{edge:?}");
+        last = edge.seq;
+    }
+    assert!(last as usize > truth.len() - 2, "{last} of {}", truth.len());
+}
+
+/// A link that gives bytes as they are.
+struct Bytes(Vec<Vec<u8>>, i64);
+
+impl Link for Bytes {
+    fn receive(&mut self, _: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError> {
+        self.1 += 60_000_000;
+        match self.0.pop() {
+            Some(block) => take(&block, self.1),
+            None => return Err(DeviceError::new("vsync", DeviceErrorKind::Disconnected, "over")),
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn a_line_that_rings_has_one_edge() {
+    // Two quiet blocks for the clock, then a pulse that rings at both of its ends.
+    let mut ringing = vec![0_u8; 100];
+    ringing.extend([1, 0, 1, 1, 0, 1]);
+    ringing.extend([1; 200]);
+    ringing.extend([0, 1, 0, 0, 1, 0]);
+    ringing.extend([0; 100]);
+    let config = Fx2LafwConfig::default();
+    let mut analyser =
+        Fx2Lafw::new(Bytes(vec![ringing, vec![0; 60_000], vec![0; 60_000]], 0), &config).unwrap();
+    let edge = analyser.next_edge(Duration::from_secs(1)).unwrap().unwrap();
+    assert_eq!(edge.seq, 1);
+    assert_eq!(analyser.next_edge(Duration::from_secs(1)).unwrap_err().kind, DeviceErrorKind::Disconnected);
+}
+
+#[test]
+fn any_bytes_are_samples() {
+    let mut state = 1_u64;
+    let block = |len: usize, state: &mut u64| {
+        let next = |_| {
+            *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (*state >> 56) as u8
+        };
+        (0..len).map(next).collect::<Vec<u8>>()
+    };
+    let blocks = (0..1000).map(|k| block(10_000 + k % 7, &mut state)).collect();
+    let config = Fx2LafwConfig { quiet_us: 0.0, ..Fx2LafwConfig::default() };
+    let mut analyser = Fx2Lafw::new(Bytes(blocks, 0), &config).unwrap();
+    let mut changes = 0_u64;
+    while analyser.next_change(Duration::from_secs(1)).is_ok_and(|change| change.is_some()) {
+        changes += 1;
+    }
+    assert!(changes > 1_000_000, "{changes}");
+}
+
+#[test]
+fn what_cannot_be_is_refused_with_its_key() {
+    let refused = |config: Fx2LafwConfig, key: &str| {
+        let (found, message) = config.check().unwrap_err();
+        assert!(found == key && message.contains(key), "{message}");
+        assert_eq!(
+            Fx2Lafw::new(Bytes(Vec::new(), 0), &config).err().unwrap().kind,
+            DeviceErrorKind::OutOfRange
+        );
+    };
+    let config = Fx2LafwConfig::default;
+    refused(Fx2LafwConfig { sample_rate_hz: 7, ..config() }, "sample_rate_hz");
+    refused(Fx2LafwConfig { channels: [("exposure".to_owned(), 0)].into(), ..config() }, "channels");
+    refused(Fx2LafwConfig { channels: [("vsync".to_owned(), 8)].into(), ..config() }, "channels");
+    refused(Fx2LafwConfig { quiet_us: f64::NAN, ..config() }, "quiet_us");
+    refused(Fx2LafwConfig { latency_us: -1.0, ..config() }, "latency_us");
+}

@@ -1,0 +1,110 @@
+//! The driver of the triggerbox against a simulated box on a pseudo-terminal.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
+use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Receiver};
+use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
+use raysweep_drivers::vsync::triggerbox::{Link, TriggerBox, TriggerBoxConfig};
+use raysweep_sim::mirror::{Link as Wire, WireFaults};
+use raysweep_sim::triggerbox::TriggerBoxPty;
+
+const PERIOD_NS: i64 = 16_666_667;
+const PERIOD_US: f64 = 16_666.667;
+const PATIENCE: Duration = Duration::from_secs(30);
+
+fn plug(faults: WireFaults) -> TriggerBoxPty {
+    TriggerBoxPty::plug(PERIOD_NS, Wire::VirtualCom, faults).unwrap()
+}
+
+fn config(path: &Path) -> TriggerBoxConfig {
+    TriggerBoxConfig { port: path.to_owned(), link: Link::Usb }
+}
+
+fn edges(vsync: &mut dyn Vsync, count: usize) -> Vec<Edge> {
+    let began = Instant::now();
+    let mut edges = Vec::new();
+    while edges.len() < count {
+        assert!(began.elapsed() < PATIENCE, "{} edges", edges.len());
+        edges.extend(vsync.next_edge(Duration::from_millis(100)).unwrap());
+    }
+    edges
+}
+
+/// Every pulse once, in order, at the multiples of the line's period: to what a busy machine's round trips tell.
+fn assert_on_grid(edges: &[Edge]) {
+    assert!(edges.windows(2).all(|pair| pair[1].seq == pair[0].seq + 1), "{edges:?}");
+    for edge in edges {
+        let off_ns = (edge.host_ns + PERIOD_NS / 2).rem_euclid(PERIOD_NS) - PERIOD_NS / 2;
+        assert!(off_ns.abs() < 2_000_000, "{off_ns} ns off");
+        assert!(edge.host_ns <= Clock::real().now_ns(), "an edge from the future");
+    }
+}
+
+#[test]
+fn every_pulse_is_told_when_it_was() {
+    let pty = plug(WireFaults::default());
+    let mut vsync = TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
+    let edges = edges(&mut vsync, 120);
+    assert_on_grid(&edges);
+    let clock = vsync.clock().unwrap();
+    println!("{clock:?}");
+    assert!(clock.round_trips >= 8);
+}
+
+#[test]
+fn garbage_and_stalls_on_the_wire_cost_nothing_but_round_trips() {
+    let pty = plug(WireFaults { seed: 3, garbage: 0.3, stalls: 0.02, stall_ms: 30 });
+    let mut vsync = TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
+    assert_on_grid(&edges(&mut vsync, 120));
+}
+
+#[test]
+fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
+    let mut pty = plug(WireFaults::default());
+    let mut vsync = TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
+    edges(&mut vsync, 10);
+    pty.unplug();
+    let error = loop {
+        if let Err(error) = vsync.next_edge(Duration::from_millis(100)) {
+            break error;
+        }
+    };
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
+    let error = TriggerBox::open(config(Path::new("/dev/ttyNONE")), PERIOD_US).err().unwrap();
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
+    let error = TriggerBox::open(config(Path::new("/dev/ttyNONE")), 1e6).err().unwrap();
+    assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
+}
+
+/// Uniform bytes and bytes that replies are made of, in pieces; every byte is in a reply, garbage, or waits for more.
+#[test]
+fn ten_million_bytes_of_noise_are_accounted_for() {
+    let mut state = 5_u64;
+    let mut next = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state >> 33
+    };
+    let alphabet = b"PV\x07\x00\x01\x0e\x10";
+    let mut receiver = Receiver::default();
+    let (mut pushed, mut replies) = (0, 0);
+    while pushed < 10_000_000 {
+        let mut byte = || match next() {
+            random if random % 4 == 0 => (random >> 8) as u8,
+            random => alphabet[(random >> 8) as usize % alphabet.len()],
+        };
+        let length = 1 + usize::from(byte()) % 40;
+        let piece: Vec<u8> = (0..length).map(|_| byte()).collect();
+        receiver.push(&piece);
+        pushed += piece.len();
+        while receiver.next(parse_reply).is_some() {
+            replies += 1;
+        }
+        assert!(receiver.waiting_bytes() < LONGEST_REPLY);
+        assert_eq!(replies * 10 + receiver.garbage_bytes() as usize + receiver.waiting_bytes(), pushed);
+    }
+    assert!(replies > 0 && receiver.garbage_bytes() > 5_000_000, "{replies}");
+}

@@ -1,0 +1,18 @@
+#![no_main]
+//! Bytes from a triggerbox, in pieces: the first byte of each says how long it is.
+
+use libfuzzer_sys::fuzz_target;
+use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Receiver};
+use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
+
+fuzz_target!(|data: &[u8]| {
+    let mut receiver = Receiver::default();
+    let mut rest = data;
+    while let [length, after @ ..] = rest {
+        let (piece, later) = after.split_at(after.len().min(usize::from(*length)));
+        receiver.push(piece);
+        while receiver.next(parse_reply).is_some() {}
+        assert!(receiver.waiting_bytes() < LONGEST_REPLY);
+        rest = later;
+    }
+});

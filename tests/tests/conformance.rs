@@ -1,0 +1,141 @@
+//! What every driver of a trait must do, whatever is behind it: the simulated rig, a simulated device on its real wire, and with
+//! `RAYSWEEP_HIL=rig.toml` the hardware of a lab, whose camera must be triggered and whose projector may light up.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use raysweep::rig::{Devices, Rig};
+use raysweep_core::{
+    Camera, CameraSettings, Clock, DeviceErrorKind, DeviceState, FramePool, Pattern, Projector, SettingsId,
+    Shutter, Vsync,
+};
+use raysweep_sim::mirror::{Link, WireFaults};
+use raysweep_sim::triggerbox::TriggerBoxPty;
+use raysweep_tests::rig_text;
+
+/// Only what never comes may fail a test.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Edges are numbered and stamped in order, none is of the future, and the most frequent distance is the period.
+fn vsync_conforms(vsync: &mut dyn Vsync, clock: &Clock, period_us: f64) {
+    let began = Instant::now();
+    let mut edges = Vec::new();
+    while edges.len() < 60 {
+        assert!(began.elapsed() < PATIENCE, "{} edges: is there a VSYNC on the line?", edges.len());
+        let edge = vsync.next_edge(Duration::from_millis(100)).unwrap();
+        assert!(edge.is_none_or(|edge| edge.host_ns <= clock.now_ns()), "{edge:?} is of the future");
+        edges.extend(edge);
+    }
+    let in_order = edges.is_sorted_by(|a, b| a.seq < b.seq && a.host_ns < b.host_ns);
+    assert!(in_order, "{edges:?}");
+    let period = |pair: &[raysweep_core::Edge]| {
+        (pair[1].host_ns - pair[0].host_ns) as f64 / 1e3 / (pair[1].seq - pair[0].seq) as f64
+    };
+    let mut periods_us: Vec<f64> = edges.windows(2).map(period).collect();
+    periods_us.sort_by(f64::total_cmp);
+    let median_us = periods_us[periods_us.len() / 2];
+    assert!((median_us / period_us - 1.0).abs() < 0.02, "a period of {median_us} us, not {period_us}");
+    vsync.next_edge(Duration::ZERO).unwrap();
+    if let Some(clock) = vsync.clock() {
+        assert!(
+            clock.residual_us.is_finite() && clock.rate_ppm.abs() < 1000.0 && clock.round_trips > 0,
+            "{clock:?}"
+        );
+    }
+}
+
+/// Settings are taken or refused whole, frames are numbered and stamped in order, and disarming can be said twice.
+fn camera_conforms(camera: &mut dyn Camera) {
+    let capabilities = camera.capabilities().clone();
+    let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
+    let pool = FramePool::new(2, bytes);
+    let error = camera.next_frame(&mut pool.take(), Duration::ZERO).unwrap_err();
+    assert_eq!(error.kind, DeviceErrorKind::NotReady, "{error}");
+    assert_eq!(camera.state(), DeviceState::Ready);
+
+    let id = SettingsId { point: 0, attempt: 0 };
+    let exposure_us = 500.0_f64.clamp(*capabilities.exposure_us.start(), *capabilities.exposure_us.end());
+    let settings = CameraSettings {
+        shutter: Shutter::Rolling,
+        exposure_us,
+        trigger_delay_us: *capabilities.trigger_delay_us.start(),
+    };
+    let impossible = CameraSettings { exposure_us: capabilities.exposure_us.end() * 10.0 + 1.0, ..settings };
+    let error = camera.configure(id, &impossible).unwrap_err();
+    assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
+    assert!(error.to_string().contains("exposure_us"), "{error}");
+
+    let applied = camera.configure(id, &settings).unwrap();
+    assert!(capabilities.allows(&applied.actual).is_ok(), "{applied:?}");
+    assert!(applied.first_frame.earliest() <= applied.first_frame.certain());
+    camera.arm().unwrap();
+    assert_eq!(camera.state(), DeviceState::Streaming);
+    let began = Instant::now();
+    let mut stamps = Vec::new();
+    while stamps.len() < 8 {
+        assert!(began.elapsed() < PATIENCE, "{} frames: is the camera triggered?", stamps.len());
+        stamps.extend(camera.next_frame(&mut pool.take(), Duration::from_millis(200)).unwrap());
+        if stamps.len() == 4 {
+            camera.configure(SettingsId { point: 1, attempt: 0 }, &settings).unwrap();
+        }
+    }
+    let in_order = |a: &raysweep_core::FrameStamp, b: &raysweep_core::FrameStamp| {
+        a.seq < b.seq && a.exposure_start_ns < b.exposure_start_ns
+    };
+    assert!(stamps.is_sorted_by(in_order), "{stamps:?}");
+    assert!(stamps.iter().all(|stamp| stamp.exposure_start_ns < stamp.host_ns), "{stamps:?}");
+    camera.disarm().unwrap();
+    camera.disarm().unwrap();
+    assert_eq!(camera.state(), DeviceState::Ready);
+}
+
+/// What is shown is told when it is certain, which is not before it was asked for; dark can be said twice.
+fn projector_conforms(projector: &mut dyn Projector, clock: &Clock) {
+    let asked_ns = clock.now_ns();
+    assert!(projector.show(&Pattern::White).unwrap().not_before_ns >= asked_ns);
+    let dark = projector.blank().unwrap();
+    assert!(projector.blank().unwrap().not_before_ns >= dark.not_before_ns);
+}
+
+fn rig_conforms(path: &Path) {
+    let rig = Rig::load(path).unwrap();
+    let Devices { mut camera, mut vsync, mut projector, clock, .. } = rig.open().unwrap();
+    vsync_conforms(&mut *vsync, &clock, rig.file.vsync.period_us);
+    projector_conforms(&mut *projector, &clock);
+    // The watcher lives on its own thread, as in a run: in virtual time, nobody's time goes on without it.
+    drop(vsync);
+    camera_conforms(&mut *camera);
+}
+
+fn rig_file(vsync: &str, sim: &str) -> (tempfile::TempDir, std::path::PathBuf) {
+    let sim = format!("{sim}\nscene = \"slab\"\nscene_rows = 16\nscene_columns = 8");
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("rig.toml");
+    let text = rig_text(16, &sim, "").replace("[vsync]\ndriver = \"sim\"", &format!("[vsync]\n{vsync}"));
+    std::fs::write(&path, text).unwrap();
+    (folder, path)
+}
+
+#[test]
+fn the_simulated_rig_in_the_host_s_time() {
+    let (_folder, path) = rig_file("driver = \"sim\"", "realtime = true");
+    rig_conforms(&path);
+}
+
+#[test]
+fn a_triggerbox_on_its_wire() {
+    let pty = TriggerBoxPty::plug(16_666_667, Link::VirtualCom, WireFaults::default()).unwrap();
+    let vsync =
+        format!("driver = \"triggerbox\"\ntriggerbox = {{ port = {:?}, link = \"usb\" }}", pty.path());
+    let (_folder, path) = rig_file(&vsync, "realtime = true");
+    rig_conforms(&path);
+}
+
+#[test]
+#[ignore = "needs hardware: RAYSWEEP_HIL=rig.toml cargo test -p raysweep-tests --test conformance -- --ignored"]
+fn the_hardware_of_a_lab() {
+    let path = std::env::var_os("RAYSWEEP_HIL").expect("RAYSWEEP_HIL names the lab's rig file");
+    rig_conforms(Path::new(&path));
+}
