@@ -1,5 +1,6 @@
 //! Rig and plan files: TOML with unknown keys refused and errors that point at the place in the text.
 
+mod batches;
 mod film;
 mod plan;
 mod product;
@@ -9,6 +10,7 @@ use std::ops::Range;
 
 use toml::de::DeValue;
 
+pub use batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
 pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};

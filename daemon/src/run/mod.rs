@@ -252,6 +252,7 @@ impl Runner {
             shape: StackShape {
                 points: task.points(),
                 settings: if task.is_film() { task.settings().count() } else { 0 },
+                dots: 0,
                 exposures: task.schedule.dark_len(),
                 rows: self.camera.height,
                 columns: self.camera.width,
