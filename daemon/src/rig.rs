@@ -1,5 +1,7 @@
 //! The factory: from a rig file to open devices.
 
+mod dots;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,7 +11,9 @@ use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
-use crate::config::{CameraDriver, ConfigError, Driver, RigFile};
+use crate::config::{CameraDriver, ConfigError, Driver, RigFile, RigKind};
+
+pub use self::dots::{DotDevices, DotRig, Stand};
 
 /// Why a rig cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -30,7 +34,32 @@ pub enum RigError {
     Device(#[from] DeviceError),
 }
 
-/// A rig whose devices can be opened, one run at a time.
+/// A rig of either kind.
+pub enum AnyRig {
+    /// Raster projector and rolling-shutter camera.
+    Plane(Rig),
+    /// Mirror and fast camera.
+    Dots(DotRig),
+}
+
+impl AnyRig {
+    /// Reads a rig file of whatever kind.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+        let kind = RigKind::of(&text)
+            .map_err(|error| RigError::Config(error.render(&path.display().to_string(), &text)))?;
+        match kind {
+            RigKind::Plane => Rig::load(path).map(Self::Plane),
+            RigKind::Dots => DotRig::load(path).map(Self::Dots),
+        }
+    }
+}
+
+/// A plane rig whose devices can be opened, one run at a time.
 pub struct Rig {
     /// What its file says.
     pub file: RigFile,
@@ -184,10 +213,15 @@ impl Rig {
 
     #[cfg(not(feature = "aravis"))]
     fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
-        Err(RigError::Config(
-            "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
-        ))
+        Err(built_without_aravis())
     }
+}
+
+#[cfg(not(feature = "aravis"))]
+fn built_without_aravis() -> RigError {
+    RigError::Config(
+        "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
+    )
 }
 
 #[cfg(test)]

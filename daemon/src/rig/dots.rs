@@ -1,0 +1,213 @@
+//! From the file of a dot rig to its open devices.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror};
+use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
+use raysweep_drivers::mirror::{
+    LightGuard, Mti, MtiConfig, MtiDrive, Optotune, OptotuneConfig, PlayzerX, PlayzerXConfig, RtsLaser,
+};
+use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, Subject, SubjectSwitch};
+
+use super::{Pace, RigError};
+use crate::config::{ConfigError, DotCameraDriver, DotRigFile, MirrorDriver, MirrorSection};
+use crate::mirror;
+
+/// A dot rig whose devices can be opened, one run at a time.
+pub struct DotRig {
+    /// What its file says.
+    pub file: DotRigFile,
+    /// The file's text, as sessions keep it.
+    pub text: String,
+    sim: Option<Arc<DotsRig>>,
+    /// The file's folder, from which its paths go.
+    folder: PathBuf,
+}
+
+/// The open devices of a dot rig.
+pub struct DotDevices {
+    /// The camera, one dot a frame.
+    pub camera: Box<dyn Camera>,
+    /// The mirror and its light; none where frames come from a recording.
+    pub mirror: Option<Box<dyn Mirror>>,
+    /// Who puts planes and scene before the camera.
+    pub stand: Stand,
+    /// The clock that the camera's stamps are on.
+    pub clock: Clock,
+    /// Whether the camera waits for the pipeline or frames come as they come.
+    pub pace: Pace,
+    /// What really happens, of a simulated camera: for tests alone.
+    pub truth: Option<DotsTruth>,
+}
+
+/// Who puts planes and scene before the camera.
+#[derive(Clone)]
+pub enum Stand {
+    /// The simulator, at a word.
+    Simulated(SubjectSwitch),
+    /// An operator: the run must wait for one.
+    Operator,
+    /// Nobody: it was done when the frames were recorded, in the plan's order.
+    Recorded,
+}
+
+impl Stand {
+    /// Puts it there, where that needs nobody; `false` if an operator must do it.
+    ///
+    /// # Errors
+    /// `OutOfRange` for a plane that the rig does not have.
+    pub fn place(&self, subject: Subject) -> Result<bool, DeviceError> {
+        match self {
+            Self::Simulated(switch) => switch.place(subject).map(|()| true),
+            Self::Recorded => Ok(true),
+            Self::Operator => Ok(false),
+        }
+    }
+}
+
+impl DotRig {
+    /// Reads a rig file and builds what can be built before devices are opened.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+        let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
+        let file = DotRigFile::parse(&text).map_err(shown)?;
+        let folder = path.parent().unwrap_or(Path::new(".")).to_owned();
+        let setup = DotsSetup {
+            format: file.camera.pixel_format,
+            white_dn: file.camera.white_dn(),
+            white_exposure_us: file.camera.white_exposure_us,
+            black_dn: file.camera.black_dn(),
+            incidence: file.incidence(),
+            limits: file.limits(),
+        };
+        let sim = match file.camera.driver {
+            DotCameraDriver::Sim => {
+                let sim = DotsRig::new(file.sim.dots.clone(), setup, &folder).map_err(|error| {
+                    let path: Vec<&str> = ["sim", "dots"].into_iter().chain(error.key().split('.')).collect();
+                    shown(ConfigError::at(&text, &path, error.to_string()))
+                })?;
+                Some(Arc::new(sim))
+            }
+            _ => None,
+        };
+        Ok(Self { file, text, sim, folder })
+    }
+
+    /// The simulated rig, where its camera is simulated.
+    pub fn simulated(&self) -> Option<&DotsRig> {
+        self.sim.as_deref()
+    }
+
+    /// Opens all devices; the mirror's driver keeps its state in the daemon's data folder. A camera that sets its own
+    /// pace makes `frame_rate_hz` frames a second.
+    ///
+    /// # Errors
+    /// The first device that does not open.
+    pub fn open(&self, data: &Path, frame_rate_hz: f64) -> Result<DotDevices, RigError> {
+        let mirror = match &self.file.mirror {
+            Some(section) => self.open_mirror(section, data)?,
+            None => None,
+        };
+        if let Some(sim) = &self.sim {
+            let pace =
+                if self.file.sim.dots.realtime || mirror.is_some() { Pace::Devices } else { Pace::Pipeline };
+            let DotsDevices { camera, mirror, subject, clock, truth } = sim.open(frame_rate_hz, mirror);
+            return Ok(DotDevices {
+                camera,
+                mirror: Some(mirror),
+                stand: Stand::Simulated(subject),
+                clock,
+                pace,
+                truth: Some(truth),
+            });
+        }
+        let (camera, pace, stand): (Box<dyn Camera>, _, _) = match self.file.camera.driver {
+            DotCameraDriver::Replay => {
+                return Err(RigError::Config(format!(
+                    "camera.driver = \"replay\": {}",
+                    self.folder.display()
+                )));
+            }
+            DotCameraDriver::Aravis => (self.open_aravis(frame_rate_hz)?, Pace::Devices, Stand::Operator),
+            _ => (self.open_v4l2(frame_rate_hz)?, Pace::Devices, Stand::Operator),
+        };
+        Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace, truth: None })
+    }
+
+    /// Opens a mirror that has a driver of its own.
+    fn open_mirror(&self, section: &MirrorSection, data: &Path) -> Result<Option<Box<dyn Mirror>>, RigError> {
+        let (state, light) = (mirror::state_file(data), self.light_guard(data));
+        let full_scale = MechanicalDeg(section.full_scale_deg);
+        let limits = section.limits;
+        let port = section.port.clone().unwrap_or_default();
+        Ok(Some(match section.driver {
+            MirrorDriver::Sim => return Ok(None),
+            MirrorDriver::PlayzerX => {
+                let link = section.link();
+                Box::new(PlayzerX::open(PlayzerXConfig { port, link, full_scale, limits, state, light })?)
+            }
+            MirrorDriver::Mti => {
+                let (drive, most) = (section.drive(), MtiDrive::A7B2_3_3600AL);
+                Box::new(Mti::open(MtiConfig { port, drive, most, full_scale, limits, state, light })?)
+            }
+            MirrorDriver::Optotune => {
+                let laser_port = section.laser_port.clone();
+                let Some(laser) = &laser_port else {
+                    return Err(RigError::Config(
+                        "mirror.laser_port is missing: an MR-E-2 has no output for a laser; name the serial port whose RTS line enables it".into(),
+                    ));
+                };
+                let laser = Box::new(RtsLaser::open(laser)?);
+                Box::new(Optotune::open(OptotuneConfig { port, laser_port, limits, state, light }, laser)?)
+            }
+        }))
+    }
+
+    /// Who permits light on this rig.
+    pub fn light_guard(&self, data: &Path) -> LightGuard {
+        let interlock = self.file.mirror.as_ref().and_then(|mirror| mirror.interlock.clone());
+        LightGuard { interlock, ..mirror::light_guard(data) }
+    }
+
+    fn open_v4l2(&self, frame_rate_hz: f64) -> Result<Box<dyn Camera>, RigError> {
+        let camera = &self.file.camera;
+        let Some(config) = camera.v4l2.clone() else {
+            return Err(RigError::Config("[camera.v4l2] is missing".into()));
+        };
+        let setup = V4l2Setup {
+            config,
+            format: camera.pixel_format,
+            row_time_us: 0.0,
+            trigger_period_us: 1e6 / frame_rate_hz,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(v4l2::open(setup)?))
+    }
+
+    #[cfg(feature = "aravis")]
+    fn open_aravis(&self, frame_rate_hz: f64) -> Result<Box<dyn Camera>, RigError> {
+        use raysweep_drivers::camera::aravis::{AravisCamera, RigFacts};
+
+        let camera = &self.file.camera;
+        let period_us = 1e6 / frame_rate_hz;
+        let facts = RigFacts {
+            format: camera.pixel_format,
+            row_time_us: 0.0,
+            trigger_period_us: period_us,
+            trigger_margin_us: period_us / 8.0,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
+    }
+
+    #[cfg(not(feature = "aravis"))]
+    fn open_aravis(&self, _: f64) -> Result<Box<dyn Camera>, RigError> {
+        Err(super::built_without_aravis())
+    }
+}
