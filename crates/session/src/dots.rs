@@ -16,6 +16,7 @@
 //! stored.
 
 use std::fs::{self, File};
+use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -187,6 +188,106 @@ impl Dots {
     }
 }
 
+/// `raw.npy` and `raw.csv`: the raw frames of a flying dot in the order in which they came, uint16 `[frame, t, s]`, and
+/// a line for each with its number in the file, the camera's id, and its batch and dot, both empty where it has none.
+/// Lines come when that is certain, so not quite in order. A file that a crash cut short says that it has no frames; its
+/// length tells how many there are.
+pub struct RawFrames {
+    path: PathBuf,
+    frames: BufWriter<File>,
+    lines: BufWriter<File>,
+    size: [usize; 2],
+    count: u64,
+}
+
+/// Bytes of the header of `raw.npy`, whatever the number of frames.
+const HEADER_BYTES: usize = 128;
+
+impl RawFrames {
+    /// Makes both files, without frames; `path` is that of `raw.npy`.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses.
+    pub fn create(path: &Path, rows: usize, columns: usize) -> Result<Self> {
+        let make = |path: &Path| File::create(path).map(BufWriter::new).map_err(Error::io("create", path));
+        let table = path.with_extension("csv");
+        let (mut frames, mut lines) = (make(path)?, make(&table)?);
+        let size = [rows, columns];
+        frames.write_all(&header(0, size)).map_err(Error::io("write", path))?;
+        lines.write_all(b"frame,id,batch,dot\n").map_err(Error::io("write", &table))?;
+        Ok(Self { path: path.to_owned(), frames, lines, size, count: 0 })
+    }
+
+    /// Frames so far.
+    pub fn len(&self) -> u64 {
+        self.count
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// Appends a frame, row by row.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for a frame of another size, [`Error::Io`] where the file system refuses.
+    pub fn push(&mut self, frame: &[u16]) -> Result<()> {
+        let [rows, columns] = self.size;
+        if frame.len() != rows * columns {
+            let what = "a raw frame".to_owned();
+            return Err(Error::Shape { what, found: vec![frame.len()], allowed: format!("[{}]", rows * columns) });
+        }
+        let mut written = Ok(());
+        for row in frame.chunks(columns) {
+            let bytes: Vec<u8> = row.iter().flat_map(|counts| counts.to_le_bytes()).collect();
+            written = written.and_then(|()| self.frames.write_all(&bytes));
+        }
+        self.count += 1;
+        written.map_err(Error::io("write", &self.path))
+    }
+
+    /// Notes which dot of which batch a frame shows.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses.
+    pub fn note(&mut self, frame: u64, id: u64, place: Option<(usize, usize)>) -> Result<()> {
+        let written = match place {
+            Some((batch, dot)) => writeln!(self.lines, "{frame},{id},{batch},{dot}"),
+            None => writeln!(self.lines, "{frame},{id},,"),
+        };
+        written.map_err(Error::io("write", &self.path.with_extension("csv")))
+    }
+
+    /// Ends the files; when this returns, they are durable.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses.
+    pub fn finish(self) -> Result<()> {
+        let Self { path, frames, lines, size, count } = self;
+        for (file, header) in [(frames, Some(header(count, size))), (lines, None)] {
+            let mut file = file.into_inner().map_err(|error| Error::io("write", &path)(error.into_error()))?;
+            let written = match header {
+                Some(header) => file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&header)),
+                None => Ok(()),
+            };
+            written.and_then(|()| file.sync_all()).map_err(Error::io("write", &path))?;
+        }
+        path.parent().map_or(Ok(()), durable::sync_dir)
+    }
+}
+
+/// The header of an NPY file, version 1.0.
+fn header(count: u64, [rows, columns]: [usize; 2]) -> [u8; HEADER_BYTES] {
+    let text = format!("{{'descr': '<u2', 'fortran_order': False, 'shape': ({count}, {rows}, {columns}), }}");
+    let mut header = [b' '; HEADER_BYTES];
+    header[..10].copy_from_slice(b"\x93NUMPY\x01\x00\x76\x00");
+    // At most 20 digits a length: it always fits.
+    header[10..10 + text.len()].copy_from_slice(text.as_bytes());
+    header[HEADER_BYTES - 1] = b'\n';
+    header
+}
+
 struct Put<'a> {
     store: &'a Arc<DurableStore>,
 }
@@ -304,6 +405,24 @@ mod tests {
         };
         dots.write(0, &dark, Map::new()).unwrap();
         assert_eq!(dots.read(0).unwrap(), dark);
+    }
+
+    #[test]
+    fn raw_frames_are_a_file_that_numpy_reads() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("raw.npy");
+        let mut raw = RawFrames::create(&path, 3, 5).unwrap();
+        let frame = |seed: u16| (0..15).map(|pixel| seed * 1000 + pixel).collect::<Vec<u16>>();
+        raw.push(&frame(1)).unwrap();
+        raw.push(&frame(2)).unwrap();
+        raw.note(0, 17, Some((3, 4))).unwrap();
+        raw.note(1, 18, None).unwrap();
+        assert!(raw.push(&[0; 14]).is_err());
+        raw.finish().unwrap();
+        let read: ndarray::Array3<u16> = ndarray_npy::read_npy(&path).unwrap();
+        assert_eq!((read.dim(), read.into_raw_vec_and_offset().0), ((2, 3, 5), [frame(1), frame(2)].concat()));
+        let table = fs::read_to_string(path.with_extension("csv")).unwrap();
+        assert_eq!(table, "frame,id,batch,dot\n0,17,3,4\n1,18,,\n");
     }
 
     #[test]

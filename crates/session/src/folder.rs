@@ -165,6 +165,16 @@ impl Session {
         self.dir.join("dots.zarr")
     }
 
+    /// `raw.npy`, the raw frames of a flying dot, where they are kept; see [`crate::dots::RawFrames`].
+    pub fn raw_path(&self) -> PathBuf {
+        self.dir.join("raw.npy")
+    }
+
+    /// Where the lighting pattern of a product is kept.
+    pub fn pattern_path(&self, product: &str) -> PathBuf {
+        self.dir.join("patterns").join(format!("{product}.npy"))
+    }
+
     /// `products`, see [`crate::products`].
     pub fn products_path(&self) -> PathBuf {
         self.dir.join("products")

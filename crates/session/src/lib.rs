@@ -23,6 +23,7 @@ pub mod film;
 mod folder;
 pub mod ledger;
 pub mod manifest;
+pub mod pattern;
 pub mod products;
 pub mod report;
 pub mod stack;

@@ -1,6 +1,6 @@
 //! `[batches]`: what a dot rig's mirror scans and its camera takes.
 
-use raysweep_core::mirror::{MirrorLimits, MirrorPath, MirrorPoint, PathError, RasterScan, Tilt};
+use raysweep_core::{MirrorLimits, MirrorPath, MirrorPoint, PathError, RasterScan, Tilt};
 use raysweep_pipeline::dots::Scan;
 use raysweep_transport::dots::{FrameShape, Region};
 use serde::Deserialize;
@@ -269,13 +269,6 @@ impl BatchesPlan {
         };
         Ok(path.with_light(|sample| if dumped(sample) { 0 } else { 255 }))
     }
-
-    /// Mechanical tilt of the mirror in the middle of each frame, x and y in degrees.
-    pub fn tilts_deg(&self, path: &MirrorPath) -> Vec<[f64; 2]> {
-        let samples = path.points().len() as f64;
-        let middle = |index: u32| ((f64::from(index) + 0.5) * samples / f64::from(self.dots)) as u64;
-        (0..self.dots).map(|index| path.at(middle(index)).tilt.deg()).collect()
-    }
 }
 
 impl PathPlan {
@@ -351,8 +344,6 @@ mod tests {
         let path = plan.mirror_path(&MirrorLimits::A7B2_3_3600AL).unwrap();
         let dark: Vec<usize> = (0..1000).filter(|&sample| path.points()[sample].light == 0).collect();
         assert_eq!(dark, (30..40).collect::<Vec<_>>());
-        let tilts = plan.tilts_deg(&path);
-        assert_eq!((tilts.len(), tilts[7]), (100, path.at(75).tilt.deg()));
     }
 
     #[test]

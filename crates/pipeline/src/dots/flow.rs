@@ -61,7 +61,7 @@ pub struct DotsFlowConfig {
 pub struct DotsFlow<S> {
     workers: Vec<JoinHandle<()>>,
     gatherer: JoinHandle<Gathered<S>>,
-    enough: Arc<AtomicBool>,
+    is_blind: Arc<AtomicBool>,
 }
 
 /// What a flow leaves behind.
@@ -115,15 +115,15 @@ impl<S: CutSink + 'static> DotsFlow<S> {
             format,
             floor,
         });
-        let enough = Arc::new(AtomicBool::new(false));
+        let is_blind = Arc::new(AtomicBool::new(false));
         let (done, looked) = sync_channel::<Numbered>(config.queue_frames + threads);
-        let mut gatherer = Gatherer::new(scan, format, background, sink, enough.clone());
+        let mut gatherer = Gatherer::new(scan, format, background, sink);
         let gatherer = spawn("dots".into(), {
             let shop = shop.clone();
-            let enough = enough.clone();
+            let is_blind = is_blind.clone();
             move || {
                 let _closing = Closing(&shop.backgrounds);
-                let error = gather(&mut gatherer, &shop, &correction, &looked, &enough).err();
+                let error = gather(&mut gatherer, &shop, &correction, &looked, &is_blind).err();
                 let Gatherer { sink, background, .. } = gatherer;
                 Gathered { sink, background, error }
             }
@@ -133,12 +133,12 @@ impl<S: CutSink + 'static> DotsFlow<S> {
             spawn(format!("dots-{index}"), move || shop.work(&mut *worker, &done))
         });
         let workers = workers.collect::<Result<_, _>>()?;
-        Ok((Self { workers, gatherer, enough }, input))
+        Ok((Self { workers, gatherer, is_blind }, input))
     }
 
-    /// Set when all batches that were wanted have been cut.
-    pub fn enough(&self) -> Arc<AtomicBool> {
-        self.enough.clone()
+    /// Set when the trailing dot is not seen where it should be: what still comes is counted and thrown away.
+    pub fn is_blind(&self) -> Arc<AtomicBool> {
+        self.is_blind.clone()
     }
 
     /// Waits for the end of everything sent.
@@ -245,7 +245,7 @@ fn gather<S: CutSink>(
     shop: &Shop,
     correction: &Correction,
     looked: &Receiver<Numbered>,
-    enough: &AtomicBool,
+    is_blind: &AtomicBool,
 ) -> Result<(), DotsError> {
     let mut early: VecDeque<Option<Looked>> = VecDeque::new();
     let mut next = 0;
@@ -260,7 +260,7 @@ fn gather<S: CutSink>(
         while let Some(frame) = early.front_mut().and_then(Option::take) {
             early.pop_front();
             if let Err(error) = gatherer.take(frame, &mut spare) {
-                enough.store(true, Ordering::Relaxed);
+                is_blind.store(true, Ordering::Relaxed);
                 cut = Err(error);
             }
             shop.backgrounds.decided(next, || {

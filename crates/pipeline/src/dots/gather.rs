@@ -1,8 +1,6 @@
 //! Columns in the order of their frames become batches; every frame ends in exactly one column of the account.
 
 use std::collections::VecDeque;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use raysweep_core::{Counts, Frame, LossCause, PixelFormat};
 use raysweep_transport::dots::{
@@ -74,8 +72,9 @@ pub trait CutSink: Send {
     /// Looks at a raw frame, in the order of arrival.
     fn frame(&mut self, _frame: &Frame) {}
 
-    /// Learns the batch, among those wanted, and the index of the frame with this id; none if it has none.
-    fn fate(&mut self, _id: u64, _place: Option<(u32, u32)>) {}
+    /// Learns the id, the batch among those wanted, and the index of a frame that [`Self::frame`] has seen as number
+    /// `arrival`, from 0; no batch and index if it has none.
+    fn fate(&mut self, _arrival: u64, _id: u64, _place: Option<(u32, u32)>) {}
 }
 
 /// A frame as a worker has seen it.
@@ -133,7 +132,6 @@ pub(super) struct Gatherer<S> {
     blank: SparseColumn,
     /// Words and values of the batch before: what the next will need.
     usual: (usize, usize),
-    enough: Arc<AtomicBool>,
     ending: bool,
 }
 
@@ -143,7 +141,6 @@ impl<S: CutSink> Gatherer<S> {
         format: PixelFormat,
         background: BackgroundMean,
         sink: S,
-        enough: Arc<AtomicBool>,
     ) -> Self {
         let shape = scan.shape;
         let learning = LEARNT_FROM_BATCHES * scan.dots as usize + 2;
@@ -167,7 +164,6 @@ impl<S: CutSink> Gatherer<S> {
             scan,
             format,
             sink,
-            enough,
             ending: false,
         }
     }
@@ -272,12 +268,18 @@ impl<S: CutSink> Gatherer<S> {
                 self.pending.pop_front();
                 self.first_pending += 1;
             }
-            self.settle(waiting, fate, spare);
+            self.settle(arrival, waiting, fate, spare);
         }
         self.decided = decided;
     }
 
-    fn settle(&mut self, waiting: Waiting, fate: Fate, spare: &mut dyn FnMut(Box<SparseColumn>)) {
+    fn settle(
+        &mut self,
+        arrival: u64,
+        waiting: Waiting,
+        fate: Fate,
+        spare: &mut dyn FnMut(Box<SparseColumn>),
+    ) {
         let Waiting { id, column, frame, lost_before, start_ns, end_ns } = waiting;
         let mut place = None;
         match fate {
@@ -330,7 +332,7 @@ impl<S: CutSink> Gatherer<S> {
                 }
             }
         }
-        self.sink.fate(id, place);
+        self.sink.fate(arrival, id, place);
         if let Ok(column) = column {
             spare(column);
         }
@@ -394,11 +396,8 @@ impl<S: CutSink> Gatherer<S> {
 
     fn close(&mut self) {
         self.fill_to(self.scan.dots);
-        let Some(Building { number, cut }) = self.building.take() else { return };
+        let Some(Building { cut, .. }) = self.building.take() else { return };
         self.usual = (cut.columns.words.len(), cut.columns.values.len());
-        if number >= u64::from(self.scan.batches) {
-            self.enough.store(true, Ordering::Relaxed);
-        }
         self.sink.take(cut);
     }
 

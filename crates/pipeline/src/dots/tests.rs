@@ -94,7 +94,7 @@ impl CutSink for Kept {
         self.outside.add(&counts);
     }
 
-    fn fate(&mut self, id: u64, place: Option<(u32, u32)>) {
+    fn fate(&mut self, _: u64, id: u64, place: Option<(u32, u32)>) {
         self.fates.push((id, place));
     }
 }
