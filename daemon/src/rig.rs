@@ -42,6 +42,18 @@ pub enum AnyRig {
     Dots(DotRig),
 }
 
+impl From<Rig> for AnyRig {
+    fn from(rig: Rig) -> Self {
+        Self::Plane(rig)
+    }
+}
+
+impl From<DotRig> for AnyRig {
+    fn from(rig: DotRig) -> Self {
+        Self::Dots(rig)
+    }
+}
+
 impl AnyRig {
     /// Reads a rig file of whatever kind.
     ///

@@ -15,6 +15,8 @@ benchmarks: cargo xtask bench <name> [options]
   dots    the flying dot's stages: time, ratio to a plain read of the same bytes, frames a second
           --peers  beside NumPy, SciPy and OpenCV on the same frames and columns
           --json   JSON lines instead of tables: bench, case, stage, method, seconds, times_read, ratio
+          --live   frames of 1024x1024 pixels from memory through pool, queue and stages, as fast as they are taken and for a
+                   minute at 0.95 of that, beside the same kernels in a plain loop; with --json one line
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
 
 /// Runs the benchmark that the first argument names with the options that follow; without a name, lists all.
@@ -25,6 +27,11 @@ pub fn bench(arguments: &[&str]) -> Done {
             Ok(())
         }
         ["demux", options @ ..] => transport("demux", "python-peers", "peers-requirements.txt", options),
+        ["dots", "--live", options @ ..] if options.is_empty() || options == ["--json"] => {
+            let mut bench = cargo();
+            bench.args(["bench", "--package", "raysweep-pipeline", "--bench", "dots", "--"]);
+            run(bench.args(options))
+        }
         ["dots", options @ ..] => {
             transport("dots", "python-peers-dots", "peers-dots-requirements.txt", options)
         }
@@ -63,7 +70,7 @@ mod tests {
         let unknown: [&[&str]; 5] = [
             &["demuxx"],
             &["demux", "--fast"],
-            &["dots", "--fast"],
+            &["dots", "--live", "--fast"],
             &["live", "--fast"],
             &["unpack", "--json"],
         ];

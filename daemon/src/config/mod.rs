@@ -1,5 +1,6 @@
 //! Rig and plan files: TOML with unknown keys refused and errors that point at the place in the text.
 
+mod batches;
 mod dots;
 mod film;
 mod plan;
@@ -10,6 +11,7 @@ use std::ops::Range;
 
 use toml::de::DeValue;
 
+pub use batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
 pub use dots::{DotCameraDriver, DotCameraSection, DotRigFile, DotSimSection, MirrorDriver, MirrorSection};
 pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
