@@ -73,6 +73,14 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
         // Before a mirror's driver is opened, which refuses one that was left behind.
         park_left_behind(&arguments.data);
     }
+    // It outlives the runner, and so the mirror's driver.
+    let _guardian = match &rig {
+        AnyRig::Dots(rig) if !arguments.check && rig.has_real_mirror() => Some(
+            mirror::guardian(&arguments.data)
+                .map_err(|error| format!("cannot start `raysweep park`, which guards the mirror: {error}"))?,
+        ),
+        _ => None,
+    };
     let runner = Runner::new(rig, arguments.data.clone(), Registry::default())?;
     let camera = runner.camera();
     let opened = format!(

@@ -177,7 +177,7 @@ impl DotRig {
     }
 
     /// Whether a real mirror moves real light.
-    pub fn needs_guardian(&self) -> bool {
+    pub fn has_real_mirror(&self) -> bool {
         self.file.mirror.as_ref().is_some_and(|mirror| mirror.driver != MirrorDriver::Sim)
     }
 
@@ -215,5 +215,56 @@ impl DotRig {
     #[cfg(not(feature = "aravis"))]
     fn open_aravis(&self, _: f64) -> Result<Box<dyn Camera>, RigError> {
         Err(super::built_without_aravis())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_core::{DeviceState, FramePool};
+
+    use super::*;
+    use crate::rig::AnyRig;
+
+    fn load(folder: &Path, text: &str) -> Result<DotRig, RigError> {
+        let path = folder.join("rig.toml");
+        std::fs::write(&path, text).unwrap();
+        match AnyRig::load(&path)? {
+            AnyRig::Dots(rig) => Ok(rig),
+            AnyRig::Plane(_) => panic!("its kind is another"),
+        }
+    }
+
+    #[test]
+    fn a_simulated_rig_opens_with_camera_mirror_and_stand() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n[sim.dots]\nrows = 16\n";
+        let rig = load(folder.path(), text).unwrap();
+        let devices = rig.open(folder.path(), 13_500.0).unwrap();
+        assert_eq!((devices.camera.capabilities().height, devices.pace), (32, Pace::Pipeline));
+        assert!(devices.mirror.is_some() && devices.truth.is_some() && !rig.has_real_mirror());
+        assert!(devices.stand.place(Subject::Plane(1)).unwrap());
+        assert!(devices.stand.place(Subject::Plane(2)).is_err());
+        let refused = load(folder.path(), &text.replace("rows = 16", "scene = \"teapot\"")).err().unwrap();
+        let refused = refused.to_string();
+        assert!(refused.contains("line 7") && refused.contains("teapot"), "{refused}");
+    }
+
+    #[test]
+    fn a_recording_beside_the_rig_file_is_its_camera_and_needs_no_mirror() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("frames.raw"), [7_u8; 3 * 2 * 4 * 8]).unwrap();
+        let text = "kind = \"dots\"\n[camera]\ndriver = \"replay\"\n\
+                    [camera.replay]\npath = \"frames.raw\"\nwidth = 8\nheight = 4\n";
+        let rig = load(folder.path(), text).unwrap();
+        let DotDevices { mut camera, mirror, stand, pace, .. } = rig.open(folder.path(), 1000.0).unwrap();
+        assert!(mirror.is_none() && matches!(stand, Stand::Recorded) && pace == Pace::Pipeline);
+        camera.arm().unwrap();
+        let mut buffer = FramePool::new(1, 64).take();
+        for _ in 0..3 {
+            assert_eq!(camera.state(), DeviceState::Streaming);
+            camera.next_frame(&mut buffer, Duration::ZERO).unwrap().unwrap();
+            assert!(buffer.iter().all(|byte| *byte == 7));
+        }
+        assert_eq!(camera.state(), DeviceState::Ready);
     }
 }

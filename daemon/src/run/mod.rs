@@ -580,10 +580,11 @@ fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) 
 
 impl Control for Runner {
     fn status(&self) -> Status {
-        Status {
-            mirror: mirror::status(&self.data, &mirror::light_guard(&self.data, None)),
-            ..self.board.status()
-        }
+        let guard = match &self.rig {
+            Bench::Plane(_) => mirror::light_guard(&self.data, None),
+            Bench::Dots(rig) => rig.light_guard(&self.data),
+        };
+        Status { mirror: mirror::status(&self.data, &guard), ..self.board.status() }
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
