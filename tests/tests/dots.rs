@@ -2,9 +2,15 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+use std::process::Command;
+
+use ndarray::{Array3, Axis};
+use raysweep::control::Control;
+use raysweep::process::process;
 use raysweep_core::LossCause;
 use raysweep_session::dots::BatchEntry;
-use raysweep_tests::{Bench, Ended};
+use raysweep_tests::{Bench, Ended, data};
+use raysweep_transport::quality::snr_db;
 
 /// A moving V-groove of 112 x 128 pixels with 16 rows for the trailing dot below it.
 fn rig(more: &str) -> String {
@@ -56,4 +62,116 @@ fn lost_and_repeated_frames_cost_their_dots_alone() {
     assert!(counts.lost[&LossCause::CameraGap] > 5 && counts.lost[&LossCause::Saturated] > 1, "{counts:?}");
     assert!(entries.iter().map(|entry| entry.duplicates).sum::<u64>() > 5);
     assert!(entries.iter().all(|entry| entry.missing.len() < 20 && entry.counts.balanced()));
+}
+
+/// A video of one channel, `[k, t, s]`.
+fn video(ended: &Ended, name: &str) -> Array3<f32> {
+    let path = ended.open().0.products_path().join(format!("{name}.npy"));
+    ndarray_npy::read_npy(path).unwrap()
+}
+
+/// The floodlit scene without noise, `[k, t, s]` in counts of 12 bits: the sum of raw frames of 16 bits a batch.
+fn true_floodlit() -> Array3<f32> {
+    let text = rig("[sim.dots.sensor]\nnoise = false\n").replace("[camera]\n", "[camera]\npixel_format = \"Mono16\"\n");
+    let bench = Bench::dots(&text);
+    let ended = bench.run(&plan("", 3).replace("[batches]\n", "[batches]\nkeep_raw = true\n"));
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    let raw: Array3<u16> = ndarray_npy::read_npy(ended.open().0.raw_path()).unwrap();
+    let table = std::fs::read_to_string(ended.session.join("raw.csv")).unwrap();
+    let mut sum = Array3::zeros((3, 128, 128));
+    let mut dots = 0;
+    for line in table.lines().skip(1) {
+        let cells: Vec<&str> = line.split(',').collect();
+        let (Ok(frame), Ok(batch), Ok(dot)) =
+            (cells[0].parse::<usize>(), cells[2].parse::<usize>(), cells[3].parse::<usize>())
+        else {
+            continue;
+        };
+        // The last three batches are the scene's; neither beam dump nor trailing dot is of it.
+        if batch >= 4 && ![0, 299].contains(&dot) {
+            let above = raw.index_axis(Axis(0), frame).mapv(|counts| (f32::from(counts) - 1024.0) / 16.0);
+            let mut image = sum.index_axis_mut(Axis(0), batch - 4);
+            image += &above;
+            dots += 1;
+        }
+    }
+    assert_eq!(dots, 3 * 298);
+    sum
+}
+
+#[test]
+fn the_residual_brings_back_the_light_that_discs_leave_behind() {
+    let truth = true_floodlit();
+    let bench = Bench::dots(&rig(""));
+    let stage = |residual: bool| format!("[[stage]]\nname = \"denoise\"\nresidual = {residual}\n");
+    let whole = bench.run(&(plan("", 3) + &stage(true)));
+    let bare = bench.run(&(plan("", 3) + &stage(false)));
+    for image in 0..3 {
+        let truth = truth.index_axis(Axis(0), image).insert_axis(Axis(2)).to_owned();
+        let snr = |ended: &Ended| {
+            let video = video(ended, "floodlit");
+            let light = video.index_axis(Axis(0), image).insert_axis(Axis(2)).to_owned();
+            (snr_db(light.view(), truth.view()), light.sum() / truth.sum())
+        };
+        let ((with, energy), (without, bare_energy)) = (snr(&whole), snr(&bare));
+        println!("image {image}: {with:.1} dB, energy {energy:.4}; discs alone {without:.1} dB, {bare_energy:.4}");
+        assert!((energy - 1.0).abs() < 0.01, "{energy}");
+        assert!(with >= without + 5.0, "{with} dB with the residual, {without} without");
+    }
+}
+
+#[test]
+fn products_made_again_have_the_same_bits() {
+    let bench = Bench::dots(&rig("[sim.dots.camera]\ndropped = 0.01\n"));
+    let ended = bench.run(&plan("", 2));
+    let (session, _) = ended.open();
+    let names = ["floodlit", "relit", "neighbours-direct", "epipolar-global", "dual", "confusion", "dots"];
+    let bytes = |name: &str| std::fs::read(session.products_path().join(format!("{name}.npy"))).unwrap();
+    let before: Vec<_> = names.map(bytes).into();
+    std::fs::remove_dir_all(session.products_path()).unwrap();
+    let made = process(&ended.session).unwrap();
+    assert_eq!((made.stored, made.points), (6, 6));
+    assert!(names.iter().zip(&before).all(|(name, before)| bytes(name) == *before));
+}
+
+#[test]
+fn python_reads_the_columns_as_the_docs_show() {
+    let python = std::env::var_os("RAYSWEEP_PYTHON").expect(
+        "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
+    );
+    let bench = Bench::dots(&rig(""));
+    let ended = bench.run(&plan("", 1));
+    let script = data("").join("../python/read_dots.py");
+    let output = Command::new(python).arg(script).arg(&ended.session).arg("4").output().unwrap();
+    let errors = String::from_utf8_lossy(&output.stderr);
+    let read: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{errors}"));
+    let stored = ended.open().0.dots().unwrap().read(4).unwrap();
+    assert_eq!(read["shape"], serde_json::json!([300, 128 * 128]));
+    let zeros = stored.values.iter().filter(|value| **value == 0.0).count();
+    let pixels = read["pixels"].as_u64().unwrap() as usize;
+    assert!(pixels == stored.values.len() || pixels == stored.values.len() - zeros);
+    let mut first = 0;
+    for (dot, light) in read["dots"].as_array().unwrap().iter().enumerate() {
+        let words = stored.word_offsets[dot] as usize..stored.word_offsets[dot + 1] as usize;
+        let end = first + stored.masks[words].iter().map(|mask| mask.count_ones() as usize).sum::<usize>();
+        let expected: f64 = stored.values[first..end].iter().map(|&value| f64::from(value)).sum();
+        assert!((light.as_f64().unwrap() - expected).abs() < 1e-3 * expected.abs().max(1.0), "dot {dot}");
+        first = end;
+    }
+}
+
+#[test]
+fn what_a_dot_rig_cannot_do_is_said_before_anything_moves() {
+    let bench = Bench::dots(&rig(""));
+    let refused = |plan: &str| bench.runner.check(plan).unwrap_err().message;
+    assert!(refused("kind = \"sweep\"").contains("\"batches\""));
+    assert!(refused(&plan("", 2).replace("[112, 128, 48, 80]", "[112, 129, 48, 80]")).contains("trailing_region"));
+    assert!(refused(&plan("", 2).replace("[2.3, 1.3]", "[9.3, 1.3]")).contains("6.5"));
+    assert!(refused(&(plan("", 2) + "[[stage]]\nname = \"demux\"\n")).contains("denoise-reference"));
+    let report = bench.runner.check(&plan("", 2)).unwrap();
+    let batches = report.batches.unwrap();
+    assert_eq!((report.points, batches.planes, batches.dots), (6, vec![2, 2], 300));
+    // Two rounds of dark frames, and two to spare of each pass.
+    assert_eq!(report.frames, 300 * (2 + 4 + 4 + 4));
+    assert!((batches.batch_s - 0.05).abs() < 1e-12);
 }

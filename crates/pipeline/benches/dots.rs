@@ -96,7 +96,7 @@ impl Memory {
     }
 
     fn sensor(&self) -> Result<Sensor, Box<dyn Error>> {
-        let mut run = DarkRun::new(self.shape, 16, 64)?;
+        let mut run = DarkRun::new(self.shape, FORMAT.max_value(), 16, 64)?;
         while run.push(&self.frames[0])? {}
         Ok(run.finish(8.0, None, Sampling::Full)?)
     }
@@ -144,6 +144,7 @@ fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran
     let config = DotsFlowConfig {
         scan: memory.scan(),
         format: FORMAT,
+        saturation_dn: FORMAT.max_value(),
         stage: stage.into(),
         correction,
         background,

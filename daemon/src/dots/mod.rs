@@ -19,6 +19,7 @@ use serde_json::Value;
 
 pub(crate) use self::product::DotSpec;
 pub(crate) use self::results::{keep_patterns, make};
+use crate::processing::SATURATION;
 use crate::config::{BatchesPlan, ConfigError, DotRigFile, Plan, PlanKind, StageTable};
 
 /// A plan of batches on a dot rig: everything that acquisition and processing have in common.
@@ -122,6 +123,11 @@ impl DotTask {
             settings: 0,
             dots: self.batches().dots as usize,
         }
+    }
+
+    /// Counts from which on a pixel is overexposed: wells may be full before the converter is.
+    pub fn saturation_dn(&self) -> u16 {
+        (SATURATION * f64::from(self.format.max_value())) as u16
     }
 
     /// How the sensor samples colour.

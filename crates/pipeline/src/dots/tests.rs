@@ -67,7 +67,7 @@ fn frame(pool: &FramePool, format: PixelFormat, step: u64) -> Frame {
 
 fn sensor(format: PixelFormat) -> Sensor {
     let pool = FramePool::new(1, format.frame_bytes(shape().pixels()));
-    let mut run = DarkRun::new(shape(), 64, 16).unwrap();
+    let mut run = DarkRun::new(shape(), 4000, 64, 16).unwrap();
     let mut unpacked = vec![0; shape().pixels()];
     for number in 0..64 {
         // The steps of the beam dump are dark.
@@ -119,6 +119,7 @@ fn cut(
     let config = DotsFlowConfig {
         scan: scan(batches),
         format,
+        saturation_dn: 4000,
         stage,
         correction,
         background,

@@ -194,7 +194,7 @@ impl Passes<'_> {
     fn dark(&mut self) -> Result<Option<Sensor>, RunError> {
         let (task, plan) = (self.task, self.task.batches());
         let options = &task.correct;
-        let mut run = DarkRun::new(task.shape, plan.dark_frames, options.background_batches)?;
+        let mut run = DarkRun::new(task.shape, task.saturation_dn(), plan.dark_frames, options.background_batches)?;
         let path = task.path.clone().with_light(|_| 0);
         let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
         let has_enough = AtomicBool::new(false);
@@ -244,6 +244,7 @@ impl Passes<'_> {
         let config = DotsFlowConfig {
             scan: plan.scan(task.shape, batches),
             format: task.format,
+            saturation_dn: task.saturation_dn(),
             stage: stage.into(),
             correction: correction.clone(),
             background,
