@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use raysweep_core::{MechanicalDeg, MirrorLimits, PixelFormat, SecondOrder};
 use raysweep_drivers::camera::aravis::{AravisConfig, ConfigFault};
+use raysweep_drivers::camera::replay::ReplayConfig;
 use raysweep_drivers::camera::v4l2::V4l2Config;
 use raysweep_drivers::mirror::{Link, MtiDrive};
 use raysweep_sim::dots::DotsConfig;
@@ -73,6 +74,8 @@ pub struct DotCameraSection {
     pub aravis: AravisConfig,
     /// `[camera.v4l2]`, for the driver `v4l2`.
     pub v4l2: Option<V4l2Config>,
+    /// `[camera.replay]`, for the driver `replay`; its path is relative to the rig file.
+    pub replay: Option<ReplayConfig>,
 }
 
 impl DotCameraSection {
@@ -140,6 +143,9 @@ pub struct MirrorSection {
     /// What an MTI controller drives the mirror with.
     #[serde(default)]
     drive: DriveTable,
+    /// The most that the mirror takes of it, from its data sheet.
+    #[serde(default)]
+    max_drive: DriveTable,
     /// The axes' responses, x and y, as identified; paths are then distorted beforehand so that the mirror follows them.
     pub response: Option<[SecondOrder; 2]>,
     /// A file that begins with `1` while the interlock is closed, such as a GPIO's value; left out: the operator's word.
@@ -171,6 +177,12 @@ impl Default for DriveTable {
     }
 }
 
+impl From<DriveTable> for MtiDrive {
+    fn from(DriveTable { bias_v, difference_v, bandwidth_hz }: DriveTable) -> Self {
+        Self { bias_v, difference_v, bandwidth_hz }
+    }
+}
+
 impl MirrorSection {
     /// How a PlayzerX is connected.
     pub fn link(&self) -> Link {
@@ -182,8 +194,12 @@ impl MirrorSection {
 
     /// What an MTI controller drives the mirror with.
     pub fn drive(&self) -> MtiDrive {
-        let DriveTable { bias_v, difference_v, bandwidth_hz } = self.drive;
-        MtiDrive { bias_v, difference_v, bandwidth_hz }
+        self.drive.into()
+    }
+
+    /// The most that the mirror takes of it.
+    pub fn max_drive(&self) -> MtiDrive {
+        self.max_drive.into()
     }
 }
 
@@ -261,7 +277,12 @@ impl DotRigFile {
     fn check_camera(&self, text: &str) -> Result<(), ConfigError> {
         let camera = &self.camera;
         match camera.driver {
-            DotCameraDriver::Sim | DotCameraDriver::Replay => Ok(()),
+            DotCameraDriver::Sim => Ok(()),
+            DotCameraDriver::Replay if camera.replay.is_some() => Ok(()),
+            DotCameraDriver::Replay => {
+                let message = "camera.driver = \"replay\": a table [camera.replay] with the path of the recording is missing";
+                Err(ConfigError::at(text, &["camera", "driver"], message))
+            }
             DotCameraDriver::Aravis => camera.aravis.check().map_err(|fault: ConfigFault| {
                 ConfigError::at(text, &["camera", "aravis", fault.key], fault.to_string())
             }),
@@ -289,6 +310,10 @@ impl DotRigFile {
             let message = format!(
                 "mirror.driver = \"{driver}\": a mirror.port is missing, such as \"/dev/serial/by-id/...\""
             );
+            return Err(ConfigError::at(text, &["mirror", "driver"], message));
+        }
+        if mirror.driver == MirrorDriver::Optotune && mirror.laser_port.is_none() {
+            let message = "mirror.driver = \"optotune\": a mirror.laser_port is missing: an MR-E-2 has no output for a laser; name the serial port whose RTS line enables it";
             return Err(ConfigError::at(text, &["mirror", "driver"], message));
         }
         if mirror.driver == MirrorDriver::Sim && self.camera.driver != DotCameraDriver::Sim {
@@ -326,8 +351,24 @@ mod tests {
         let cases = [
             (MINIMAL.replace("\"dots\"", "\"plane\""), "\"dots\""),
             (MINIMAL.replace("[mirror]\ndriver = \"sim\"", "[mirror]\ndriver = \"playzerx\""), "mirror.port"),
+            (
+                MINIMAL
+                    .replace("[mirror]\ndriver = \"sim\"", "[mirror]\ndriver = \"optotune\"\nport = \"a\""),
+                "mirror.laser_port",
+            ),
             (MINIMAL.replace("[mirror]\ndriver = \"sim\"\n", ""), "[mirror] is missing"),
             (MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\""), "[camera.v4l2]"),
+            (
+                MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"replay\""),
+                "[camera.replay]",
+            ),
+            (
+                MINIMAL.replace(
+                    "[camera]\ndriver = \"sim\"",
+                    "[camera]\ndriver = \"replay\"\nreplay.path = \"a.npy\"",
+                ),
+                "leave [mirror] out for a recording",
+            ),
             (MINIMAL.replace("[mirror]\n", "[mirror]\nincidence_deg = 80\n"), "mirror.incidence_deg = 80"),
             (
                 MINIMAL.replace("[camera]\n", "[camera]\nwhite_exposure_us = 0\n"),
@@ -341,5 +382,16 @@ mod tests {
             assert!(error.message.contains(expected), "{text:?}: {}", error.message);
             assert!(error.span.is_some(), "{text:?} has no place");
         }
+    }
+
+    #[test]
+    fn the_documented_rig_file_is_the_defaults() {
+        let page = include_str!("../../../docs/rig.md");
+        let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
+        let documented = blocks.find(|block| block.contains("kind = \"dots\"")).unwrap();
+        assert_eq!(
+            format!("{:#?}", DotRigFile::parse(documented).unwrap()),
+            format!("{:#?}", DotRigFile::parse(MINIMAL).unwrap())
+        );
     }
 }

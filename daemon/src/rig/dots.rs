@@ -5,9 +5,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror};
+use raysweep_drivers::camera::replay::{ReplayCamera, ReplayConfig, ReplayPace};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::mirror::{
-    LightGuard, Mti, MtiConfig, MtiDrive, Optotune, OptotuneConfig, PlayzerX, PlayzerXConfig, RtsLaser,
+    LightGuard, Mti, MtiConfig, Optotune, OptotuneConfig, PlayzerX, PlayzerXConfig, RtsLaser,
 };
 use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, Subject, SubjectSwitch};
 
@@ -129,10 +130,16 @@ impl DotRig {
         }
         let (camera, pace, stand): (Box<dyn Camera>, _, _) = match self.file.camera.driver {
             DotCameraDriver::Replay => {
-                return Err(RigError::Config(format!(
-                    "camera.driver = \"replay\": {}",
-                    self.folder.display()
-                )));
+                let Some(replay) = &self.file.camera.replay else {
+                    return Err(RigError::Config("[camera.replay] is missing".into()));
+                };
+                let pace = match replay.pace {
+                    ReplayPace::Pipeline => Pace::Pipeline,
+                    ReplayPace::Recorded => Pace::Devices,
+                };
+                let config = ReplayConfig { path: self.folder.join(&replay.path), ..replay.clone() };
+                let format = self.file.camera.pixel_format;
+                (Box::new(ReplayCamera::open(&config, format, frame_rate_hz)?), pace, Stand::Recorded)
             }
             DotCameraDriver::Aravis => (self.open_aravis(frame_rate_hz)?, Pace::Devices, Stand::Operator),
             _ => (self.open_v4l2(frame_rate_hz)?, Pace::Devices, Stand::Operator),
@@ -153,17 +160,12 @@ impl DotRig {
                 Box::new(PlayzerX::open(PlayzerXConfig { port, link, full_scale, limits, state, light })?)
             }
             MirrorDriver::Mti => {
-                let (drive, most) = (section.drive(), MtiDrive::A7B2_3_3600AL);
+                let (drive, most) = (section.drive(), section.max_drive());
                 Box::new(Mti::open(MtiConfig { port, drive, most, full_scale, limits, state, light })?)
             }
             MirrorDriver::Optotune => {
                 let laser_port = section.laser_port.clone();
-                let Some(laser) = &laser_port else {
-                    return Err(RigError::Config(
-                        "mirror.laser_port is missing: an MR-E-2 has no output for a laser; name the serial port whose RTS line enables it".into(),
-                    ));
-                };
-                let laser = Box::new(RtsLaser::open(laser)?);
+                let laser = Box::new(RtsLaser::open(laser_port.as_deref().unwrap_or(Path::new("")))?);
                 Box::new(Optotune::open(OptotuneConfig { port, laser_port, limits, state, light }, laser)?)
             }
         }))
@@ -171,8 +173,12 @@ impl DotRig {
 
     /// Who permits light on this rig.
     pub fn light_guard(&self, data: &Path) -> LightGuard {
-        let interlock = self.file.mirror.as_ref().and_then(|mirror| mirror.interlock.clone());
-        LightGuard { interlock, ..mirror::light_guard(data) }
+        mirror::light_guard(data, self.file.mirror.as_ref().and_then(|mirror| mirror.interlock.clone()))
+    }
+
+    /// Whether a real mirror moves real light.
+    pub fn needs_guardian(&self) -> bool {
+        self.file.mirror.as_ref().is_some_and(|mirror| mirror.driver != MirrorDriver::Sim)
     }
 
     fn open_v4l2(&self, frame_rate_hz: f64) -> Result<Box<dyn Camera>, RigError> {

@@ -580,7 +580,10 @@ fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) 
 
 impl Control for Runner {
     fn status(&self) -> Status {
-        Status { mirror: mirror::status(&self.data), ..self.board.status() }
+        Status {
+            mirror: mirror::status(&self.data, &mirror::light_guard(&self.data, None)),
+            ..self.board.status()
+        }
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {

@@ -13,6 +13,7 @@ mod park;
 pub mod playzerx;
 mod points;
 mod port;
+mod rules;
 mod sequence;
 mod state;
 pub mod wire;

@@ -22,8 +22,7 @@ pub struct DotCamera {
     clock: ClockHandle,
     capabilities: CameraCapabilities,
     exposure_us: f64,
-    /// What stands before it, and in which batch of which path.
-    still: Option<((Subject, u64, u64), Arc<dyn Still>)>,
+    before: Option<Before>,
     light: Light,
     /// The whole sensor's light and counts, `[row, column]` row-major.
     sensor_light: Vec<f32>,
@@ -32,6 +31,13 @@ pub struct DotCamera {
     trailing: Vec<f32>,
     /// The frame that came last, if it comes twice.
     again: Option<FrameStamp>,
+}
+
+/// What stands before the camera in a batch of a path.
+struct Before {
+    still: Arc<dyn Still>,
+    /// Which it is: subject, path, batch.
+    key: (Subject, u64, u64),
 }
 
 impl DotCamera {
@@ -63,7 +69,7 @@ impl DotCamera {
             clock,
             capabilities,
             exposure_us: period_us,
-            still: None,
+            before: None,
             light: world.dark(),
             sensor_light: vec![0.0; height * width],
             counts: vec![0; height * width],
@@ -79,14 +85,15 @@ impl DotCamera {
 
     fn expose(&mut self, due: &Due) {
         let [scan, frame] = due.key;
-        let place = (due.subject, scan, due.batch);
-        if self.still.as_ref().is_none_or(|(of, _)| *of != place) {
-            self.still = self.world.still_in(due.subject, due.batch).map(|still| (place, still));
+        let key = (due.subject, scan, due.batch);
+        if self.before.as_ref().is_none_or(|before| before.key != key) {
+            let still = self.world.still_in(due.subject, due.batch);
+            self.before = still.map(|still| Before { still, key });
         }
         self.light.direct.fill(0.0);
         self.light.global.fill(0.0);
         let mut trailing = 0.0;
-        if let Some((_, still)) = &self.still {
+        if let Some(Before { still, .. }) = &self.before {
             trailing = self.world.render(&due.lit, self.exposure_us, &**still, &mut self.light);
         }
         let Light { direct, global } = &self.light;

@@ -1,5 +1,6 @@
 //! The simulated dot rig and what it takes to build it.
 
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -113,6 +114,13 @@ impl DotsRig {
     /// Rows of the scene: the margin begins below them.
     pub fn scene_rows(&self) -> usize {
         self.bench.scene.view().size.0
+    }
+
+    /// Camera rows and columns in which the trailing dot shows, and nothing else: it fills less than half of them.
+    pub fn trailing_region(&self) -> (Range<usize>, Range<usize>) {
+        let (rows, columns) = self.bench.size;
+        let (middle, margin) = (columns / 2, self.bench.config.margin_rows);
+        (self.scene_rows()..rows, middle.saturating_sub(margin)..(middle + margin).min(columns))
     }
 
     /// Opens the devices, with a camera that makes `frame_rate_hz` frames a second. With a mirror that is driven by its

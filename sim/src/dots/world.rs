@@ -360,24 +360,31 @@ impl World {
         Light { direct: vec![0.0; rows * columns], global: vec![0.0; rows * columns] }
     }
 
-    /// Adds the light of an exposure; how much went onto the trailing dot's plane.
+    /// Adds the light of an exposure; how much went onto the trailing dot's plane. Light that has no fine detail is that
+    /// of the exposure's middle.
     pub fn render(&self, lit: &[Lit], exposure_us: f64, still: &dyn Still, light: &mut Light) -> f64 {
         let dot = &self.bench.config.dot;
-        let ghost = dot.ghost_deg.map(|deg| deg.to_radians().tan());
         let share = self.bench.exposed(exposure_us) / lit.len() as f64;
-        let mut trailing = 0.0;
+        let (mut trailing, mut on_scene, mut middle) = (0.0, 0.0, [0.0; 2]);
         for lit in lit {
             match *lit {
                 Lit::Nowhere => {}
                 Lit::Trailing(part) => trailing += part * share,
                 Lit::Scene(centre, part) => {
-                    let spot = self.bench.beam.spot(centre, part * share);
-                    still.add(&spot, light);
-                    if dot.ghost > 0.0 {
-                        let beside = [centre[0] + ghost[0], centre[1] + ghost[1]];
-                        still.add_ghost(&self.bench.beam.spot(beside, part * share * dot.ghost), light);
-                    }
+                    let part = part * share;
+                    still.add_direct(&self.bench.beam.spot(centre, part), &mut light.direct);
+                    on_scene += part;
+                    (0..2).for_each(|axis| middle[axis] += part * centre[axis]);
                 }
+            }
+        }
+        if on_scene > 0.0 {
+            let middle = middle.map(|sum| sum / on_scene);
+            still.add_global(&self.bench.beam.spot(middle, on_scene), &mut light.global);
+            if dot.ghost > 0.0 {
+                let beside = [0, 1].map(|axis| middle[axis] + dot.ghost_deg[axis].to_radians().tan());
+                let ghost = self.bench.beam.spot(beside, on_scene * dot.ghost);
+                still.add_direct(&ghost, &mut light.global);
             }
         }
         trailing

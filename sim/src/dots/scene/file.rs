@@ -12,7 +12,7 @@ use ndarray::{Array2, ArrayD, Axis, Ix2, IxDyn, OwnedRepr};
 use ndarray_npy::{NpzReader, ReadNpyError, ReadNpyExt, ReadNpzError};
 use raysweep_core::Mosaic;
 
-use super::{DotSceneError, Light, Still, seen};
+use super::{DotSceneError, Still, seen};
 use crate::dots::beam::Spot;
 use crate::dots::view::View;
 
@@ -167,8 +167,8 @@ impl FileScene {
     }
 }
 
-impl FileScene {
-    fn add_to(&self, spot: &Spot, image: &mut [f32]) {
+impl Still for FileScene {
+    fn add_direct(&self, spot: &Spot, image: &mut [f32]) {
         for (dot, weight) in self.neighbours(self.view.uv(spot.centre)) {
             let weight = (weight * spot.light) as f32;
             if weight > 0.0 {
@@ -176,16 +176,8 @@ impl FileScene {
             }
         }
     }
-}
 
-impl Still for FileScene {
-    fn add(&self, spot: &Spot, light: &mut Light) {
-        self.add_to(spot, &mut light.direct);
-    }
-
-    fn add_ghost(&self, ghost: &Spot, light: &mut Light) {
-        self.add_to(ghost, &mut light.global);
-    }
+    fn add_global(&self, _: &Spot, _: &mut [f32]) {}
 }
 
 /// Columns and rows of the grid on which the dots lie, row by row, if they do.

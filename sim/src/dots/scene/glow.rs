@@ -27,7 +27,10 @@ const FOG_DEPTHS: [f64; 6] = [0.90, 0.92, 0.94, 0.96, 0.98, 1.00];
 /// Light scattered towards the camera at each of them, of a beam through the thickest fog.
 const FOG_STREAK: f64 = 0.02;
 /// The same that comes out after several scatterings, and how wide.
-const FOG_HALO: (f64, f64) = (0.03, 0.5);
+const FOG_HALO: (f64, f64) = (0.012, 0.5);
+
+/// The light at a coarse pixel, from its number, its direction and its place.
+type LightAt<'a> = Box<dyn Fn(usize, [f64; 2], &Place) -> f64 + 'a>;
 
 impl Glow {
     /// Whether it falls on the surface, whose albedo then counts; else it comes from what is before it.
@@ -37,7 +40,7 @@ impl Glow {
 
     /// The light at the coarse pixels, of what has no fine detail.
     pub fn coarse(&self, spot: &Spot, model: &Model, view: &View, coarse: &Coarse) -> Option<Vec<f32>> {
-        let light: Box<dyn Fn(usize, [f64; 2], &Place) -> f64> = match self {
+        let light: LightAt = match self {
             Self::None | Self::Caustic { .. } => return None,
             Self::Bounce => {
                 let from = model.place(spot.centre);

@@ -31,11 +31,11 @@ pub struct Light {
 
 /// A scene at rest.
 pub trait Still: Send + Sync {
-    /// Adds the image under a spot.
-    fn add(&self, spot: &Spot, light: &mut Light);
+    /// Adds the light of a spot that comes straight from the mirror; of a scene from a file, all light.
+    fn add_direct(&self, spot: &Spot, image: &mut [f32]);
 
-    /// Adds what the cover glass sends beside the spot; its light counts as global.
-    fn add_ghost(&self, ghost: &Spot, light: &mut Light);
+    /// Adds all other light of a spot.
+    fn add_global(&self, spot: &Spot, image: &mut [f32]);
 }
 
 /// A scene that may move, and the planes that can stand in its place.

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use raysweep_core::Mosaic;
 
 use super::glow::{self, Glow};
-use super::{Light, Still, seen};
+use super::{Still, seen};
 use crate::dots::beam::Spot;
 use crate::dots::view::View;
 use crate::scene::texture::{noise, printed_page};
@@ -229,21 +229,23 @@ impl Surface {
             coarse,
         }
     }
+}
 
-    fn add_direct(&self, spot: &Spot, direct: &mut [f32]) {
+impl Still for Surface {
+    fn add_direct(&self, spot: &Spot, image: &mut [f32]) {
         let columns = self.view.size.1;
-        direct.par_chunks_mut(columns).enumerate().for_each(|(row, direct)| {
+        image.par_chunks_mut(columns).enumerate().for_each(|(row, image)| {
             let first = row * columns;
-            for (column, value) in direct.iter_mut().enumerate() {
+            for (column, value) in image.iter_mut().enumerate() {
                 let irradiance = spot.at(self.directions[first + column]) as f32;
                 *value += irradiance * self.albedo[first + column] * self.facing[first + column];
             }
         });
     }
 
-    fn add_global(&self, spot: &Spot, global: &mut [f32]) {
+    fn add_global(&self, spot: &Spot, image: &mut [f32]) {
         if let Glow::Caustic { centre, radius } = self.model.glow {
-            glow::caustic(centre, radius, spot).iter().for_each(|spot| self.add_direct(spot, global));
+            glow::caustic(centre, radius, spot).iter().for_each(|spot| self.add_direct(spot, image));
             return;
         }
         let Some(values) = self.model.glow.coarse(spot, &self.model, &self.view, &self.coarse) else {
@@ -251,22 +253,11 @@ impl Surface {
         };
         let columns = self.view.size.1;
         let of_surface = self.model.glow.is_of_surface();
-        global.par_chunks_mut(columns).enumerate().for_each(|(row, global)| {
-            for (column, value) in global.iter_mut().enumerate() {
+        image.par_chunks_mut(columns).enumerate().for_each(|(row, image)| {
+            for (column, value) in image.iter_mut().enumerate() {
                 let albedo = if of_surface { self.albedo[row * columns + column] } else { 1.0 };
                 *value += albedo * self.coarse.at(&values, row, column);
             }
         });
-    }
-}
-
-impl Still for Surface {
-    fn add(&self, spot: &Spot, light: &mut Light) {
-        self.add_direct(spot, &mut light.direct);
-        self.add_global(spot, &mut light.global);
-    }
-
-    fn add_ghost(&self, ghost: &Spot, light: &mut Light) {
-        self.add_direct(ghost, &mut light.global);
     }
 }
