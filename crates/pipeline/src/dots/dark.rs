@@ -2,7 +2,8 @@
 
 use ndarray::ArrayView3;
 use raysweep_transport::dots::{
-    Background, BackgroundMean, Correction, DotsError, FrameShape, NoiseFloor, Observation, Region, RunStatistics, Sampling,
+    Background, BackgroundMean, Correction, DotsError, FrameShape, NoiseFloor, Observation, Region,
+    RunStatistics, Sampling,
 };
 
 /// Frames in which the noise is measured; they are not in the mean that is subtracted from them.
@@ -112,7 +113,10 @@ mod tests {
         let mut run = DarkRun::new(shape, 4000, 40, 64).unwrap();
         assert!(run.push(&vec![4095; shape.pixels()]).unwrap(), "a flash is no dark frame");
         for number in 0..40_u64 {
-            let noise = |pixel: u64| (pixel.wrapping_mul(6364136223846793005) ^ number << 40).wrapping_mul(1442695040888963407) >> 61;
+            let noise = |pixel: u64| {
+                (pixel.wrapping_mul(6364136223846793005) ^ number << 40).wrapping_mul(1442695040888963407)
+                    >> 61
+            };
             let frame: Vec<u16> = (0..shape.pixels() as u64)
                 .map(|pixel| if pixel == 70 { 900 } else { 100 + noise(pixel) as u16 })
                 .collect();

@@ -102,7 +102,9 @@ impl<S: CutSink + 'static> DotsFlow<S> {
     /// # Errors
     /// When the system gives no thread, or the background does not fit the frames.
     pub fn start(config: DotsFlowConfig, sink: S) -> Result<(Self, Input<Arrival>), PipelineError> {
-        let DotsFlowConfig { scan, format, saturation_dn, stage, correction, background, floor, policy, .. } = config;
+        let DotsFlowConfig {
+            scan, format, saturation_dn, stage, correction, background, floor, policy, ..
+        } = config;
         let threads = match config.threads {
             0 => thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
@@ -213,7 +215,8 @@ impl Shop {
         let Scan { shape, trailing_region, .. } = &self.scan;
         let seen = Observation::new(frame.stamp.seq, counts, *shape, trailing_region, self.saturation_dn);
         let mut column = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
-        let made = catch_unwind(AssertUnwindSafe(|| worker.column(counts, background, self.floor, &mut column)));
+        let made =
+            catch_unwind(AssertUnwindSafe(|| worker.column(counts, background, self.floor, &mut column)));
         let made = match made {
             Ok(Ok(())) => Ok(column),
             Ok(Err(error)) => Err(error.to_string()),

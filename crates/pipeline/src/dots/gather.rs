@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 
 use raysweep_core::{Counts, Frame, LossCause, PixelFormat};
 use raysweep_transport::dots::{
-    BackgroundMean, BatchArrays, Cause, Decided, DotsError, Fate, FrameShape, Observation, Region, SparseColumn,
-    SyncSettings, Synchroniser, pulse_threshold,
+    BackgroundMean, BatchArrays, Cause, Decided, DotsError, Fate, FrameShape, Observation, Region,
+    SparseColumn, SyncSettings, Synchroniser, pulse_threshold,
 };
 
 use super::flow::Loss;
@@ -136,12 +136,7 @@ pub(super) struct Gatherer<S> {
 }
 
 impl<S: CutSink> Gatherer<S> {
-    pub fn new(
-        scan: Scan,
-        format: PixelFormat,
-        background: BackgroundMean,
-        sink: S,
-    ) -> Self {
+    pub fn new(scan: Scan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
         let shape = scan.shape;
         let learning = LEARNT_FROM_BATCHES * scan.dots as usize + 2;
         Self {
@@ -172,7 +167,11 @@ impl<S: CutSink> Gatherer<S> {
     ///
     /// # Errors
     /// When the trailing dot is not seen where it should be.
-    pub fn take(&mut self, looked: Looked, spare: &mut dyn FnMut(Box<SparseColumn>)) -> Result<(), DotsError> {
+    pub fn take(
+        &mut self,
+        looked: Looked,
+        spare: &mut dyn FnMut(Box<SparseColumn>),
+    ) -> Result<(), DotsError> {
         let Looked { seen, column, frame, lost_before } = looked;
         if let Cutter::Blind = self.cutter {
             // Taken in so that it is accounted for.

@@ -60,8 +60,13 @@ fn frame(pool: &FramePool, format: PixelFormat, step: u64) -> Frame {
     let mut data = pool.take();
     format.pack_into(&counts(step), &mut data).unwrap();
     let at_ns = step as i64 * 1000;
-    let stamp =
-        FrameStamp { seq: step, device_ns: at_ns, exposure_start_ns: at_ns, host_ns: at_ns + 900, exposure_us: None };
+    let stamp = FrameStamp {
+        seq: step,
+        device_ns: at_ns,
+        exposure_start_ns: at_ns,
+        host_ns: at_ns + 900,
+        exposure_us: None,
+    };
     Frame { data, format, stamp }
 }
 
