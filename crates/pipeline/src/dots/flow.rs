@@ -87,7 +87,7 @@ struct Shop {
     source: Mutex<Source>,
     backgrounds: Backgrounds,
     /// Columns whose memory is free.
-    spare: Mutex<Vec<Box<SparseColumn>>>,
+    spare: Mutex<Vec<SparseColumn>>,
     scan: Scan,
     format: PixelFormat,
     saturation_dn: u16,
@@ -205,7 +205,7 @@ impl Shop {
         frame: &Frame,
         unpacked: &mut Vec<u16>,
         background: &Background,
-    ) -> (Observation, Result<Box<SparseColumn>, String>) {
+    ) -> (Observation, Result<SparseColumn, String>) {
         // Of a frame that cannot be read nothing is seen.
         let unseen = Observation { id: frame.stamp.seq, energy: 0, saturated: true };
         let counts = match counts_of(frame, self.format, unpacked, self.scan.shape.values()) {

@@ -80,7 +80,7 @@ pub trait CutSink: Send {
 /// A frame as a worker has seen it.
 pub(super) struct Looked {
     pub seen: Observation,
-    pub column: Result<Box<SparseColumn>, String>,
+    pub column: Result<SparseColumn, String>,
     pub frame: Frame,
     pub lost_before: Vec<Loss>,
 }
@@ -88,7 +88,7 @@ pub(super) struct Looked {
 /// A frame whose index is not certain yet.
 struct Waiting {
     id: u64,
-    column: Result<Box<SparseColumn>, String>,
+    column: Result<SparseColumn, String>,
     /// Only of a frame that may be one of the beam dump.
     frame: Option<Frame>,
     lost_before: Vec<Loss>,
@@ -170,7 +170,7 @@ impl<S: CutSink> Gatherer<S> {
     pub fn take(
         &mut self,
         looked: Looked,
-        spare: &mut dyn FnMut(Box<SparseColumn>),
+        spare: &mut dyn FnMut(SparseColumn),
     ) -> Result<(), DotsError> {
         let Looked { seen, column, frame, lost_before } = looked;
         if let Cutter::Blind = self.cutter {
@@ -203,7 +203,7 @@ impl<S: CutSink> Gatherer<S> {
     ///
     /// # Errors
     /// As [`Self::take`].
-    pub fn finish(&mut self, spare: &mut dyn FnMut(Box<SparseColumn>)) -> Result<(), DotsError> {
+    pub fn finish(&mut self, spare: &mut dyn FnMut(SparseColumn)) -> Result<(), DotsError> {
         self.decided.clear();
         let learnt = match &self.cutter {
             Cutter::Learning(run) if !run.is_empty() => self.begin_cutting(),
@@ -258,7 +258,7 @@ impl<S: CutSink> Gatherer<S> {
         })
     }
 
-    fn settle_all(&mut self, spare: &mut dyn FnMut(Box<SparseColumn>)) {
+    fn settle_all(&mut self, spare: &mut dyn FnMut(SparseColumn)) {
         let mut decided = std::mem::take(&mut self.decided);
         for Decided { arrival, fate } in decided.drain(..) {
             let place = (arrival - self.first_pending) as usize;
@@ -277,7 +277,7 @@ impl<S: CutSink> Gatherer<S> {
         arrival: u64,
         waiting: Waiting,
         fate: Fate,
-        spare: &mut dyn FnMut(Box<SparseColumn>),
+        spare: &mut dyn FnMut(SparseColumn),
     ) {
         let Waiting { id, column, frame, lost_before, start_ns, end_ns } = waiting;
         let mut place = None;
@@ -376,7 +376,7 @@ impl<S: CutSink> Gatherer<S> {
         }
     }
 
-    fn add(&mut self, is_scene: bool, column: &Result<Box<SparseColumn>, String>) {
+    fn add(&mut self, is_scene: bool, column: &Result<SparseColumn, String>) {
         let Some(Building { cut, .. }) = &mut self.building else { return };
         match column {
             Ok(column) => {
