@@ -98,8 +98,9 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     let plan = Plan::parse(&plan_text)
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
     if plan.kind == PlanKind::Batches {
-        let rig = DotRigFile::parse(&rig_text)
-            .map_err(|error| ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text)))?;
+        let rig = DotRigFile::parse(&rig_text).map_err(|error| {
+            ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text))
+        })?;
         return process_batches(&session, ledger.state(), (plan, &plan_text), &rig, asked);
     }
     let rig = RigFile::parse(&rig_text)

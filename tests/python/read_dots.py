@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 session, *batches = sys.argv[1:]
-page = (Path(__file__).parents[2] / "docs" / "plan.md").read_text()
+page = (Path(__file__).resolve().parents[2] / "docs" / "plan.md").read_text()
 example = re.search(r"```python\n(.*?)```", page, re.S).group(1)
 for batch in batches:
     names = {"session": session}

@@ -96,7 +96,7 @@ impl Memory {
     }
 
     fn sensor(&self) -> Result<Sensor, Box<dyn Error>> {
-        let mut run = DarkRun::new(self.shape, 16, 64)?;
+        let mut run = DarkRun::new(self.shape, FORMAT.max_value(), 16, 64)?;
         while run.push(&self.frames[0])? {}
         Ok(run.finish(8.0, None, Sampling::Full)?)
     }
@@ -144,6 +144,7 @@ fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran
     let config = DotsFlowConfig {
         scan: memory.scan(),
         format: FORMAT,
+        saturation_dn: FORMAT.max_value(),
         stage: stage.into(),
         correction,
         background,
@@ -238,17 +239,29 @@ fn main() -> Result<(), Box<dyn Error>> {
     if is_json {
         println!(
             "{{\"bench\":\"dots-live\",\"case\":\"{case}\",\"plain_hz\":{bare_hz:.1},\"copied_hz\":{copied_hz:.1},\"pipeline_hz\":{:.1},\"ratio\":{ratio:.3},\"paced_hz\":{:.1},\"paced_seconds\":{:.1},\"paced_frames\":{},\"paced_lost\":{},\"paced_batches\":{}}}",
-            free.rate_hz(), paced.rate_hz(), paced.seconds, paced.frames, paced.lost, paced.batches
+            free.rate_hz(),
+            paced.rate_hz(),
+            paced.seconds,
+            paced.frames,
+            paced.lost,
+            paced.batches
         );
         return Ok(());
     }
     println!("{case}: frames a second");
     println!("  kernels in a plain loop           {bare_hz:8.0}");
     println!("  the same, frames copied first     {copied_hz:8.0}");
-    println!("  pool, queue, workers, batches     {:8.0}   {ratio:.2} of the plain loop with its copy, {of_bare:.2} without", free.rate_hz());
+    println!(
+        "  pool, queue, workers, batches     {:8.0}   {ratio:.2} of the plain loop with its copy, {of_bare:.2} without",
+        free.rate_hz()
+    );
     println!(
         "  the same, paced, for {:.0} s        {:8.0}   {paced_ratio:.2} of the plain loop with its copy; {} frames, {} lost, {} batches",
-        paced.seconds, paced.rate_hz(), paced.frames, paced.lost, paced.batches
+        paced.seconds,
+        paced.rate_hz(),
+        paced.frames,
+        paced.lost,
+        paced.batches
     );
     if paced.lost > 0 { Err("frames were lost".into()) } else { Ok(()) }
 }

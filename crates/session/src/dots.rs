@@ -141,7 +141,8 @@ impl Dots {
             ("capped", columns.capped.len(), dots),
             ("seen", columns.seen.len(), dots),
         ];
-        if let Some((name, found, allowed)) = lengths.into_iter().find(|(_, found, allowed)| found != allowed) {
+        if let Some((name, found, allowed)) = lengths.into_iter().find(|(_, found, allowed)| found != allowed)
+        {
             let what = format!("{name} of batch {batch}");
             return Err(Error::Shape { what, found: vec![found], allowed: format!("[{allowed}]") });
         }
@@ -150,7 +151,14 @@ impl Dots {
         zarr::create_group(&store, attributes)?;
         let put = Put { store: &store };
         let words = columns.words.len();
-        put.array("word_offsets", &[dots + 1], &["dot"], data_type::uint64(), 0u64.into(), &columns.word_offsets)?;
+        put.array(
+            "word_offsets",
+            &[dots + 1],
+            &["dot"],
+            data_type::uint64(),
+            0u64.into(),
+            &columns.word_offsets,
+        )?;
         put.array("words", &[words], &["word"], data_type::uint32(), 0u32.into(), &columns.words)?;
         put.array("masks", &[words], &["word"], data_type::uint32(), 0u32.into(), &columns.masks)?;
         let pixels = columns.values.len();
@@ -236,7 +244,11 @@ impl RawFrames {
         let [rows, columns] = self.size;
         if frame.len() != rows * columns {
             let what = "a raw frame".to_owned();
-            return Err(Error::Shape { what, found: vec![frame.len()], allowed: format!("[{}]", rows * columns) });
+            return Err(Error::Shape {
+                what,
+                found: vec![frame.len()],
+                allowed: format!("[{}]", rows * columns),
+            });
         }
         let mut written = Ok(());
         for row in frame.chunks(columns) {
@@ -266,7 +278,8 @@ impl RawFrames {
     pub fn finish(self) -> Result<()> {
         let Self { path, frames, lines, size, count } = self;
         for (file, header) in [(frames, Some(header(count, size))), (lines, None)] {
-            let mut file = file.into_inner().map_err(|error| Error::io("write", &path)(error.into_error()))?;
+            let mut file =
+                file.into_inner().map_err(|error| Error::io("write", &path)(error.into_error()))?;
             let written = match header {
                 Some(header) => file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&header)),
                 None => Ok(()),
@@ -328,7 +341,9 @@ impl Get {
             return Ok(Vec::new());
         }
         let path = self.store.root().join(name);
-        array.retrieve_array_subset_opt(&array.subset_all(), &zarr::codec_options()).map_err(Error::zarr("read", &path))
+        array
+            .retrieve_array_subset_opt(&array.subset_all(), &zarr::codec_options())
+            .map_err(Error::zarr("read", &path))
     }
 }
 
@@ -420,7 +435,10 @@ mod tests {
         assert!(raw.push(&[0; 14]).is_err());
         raw.finish().unwrap();
         let read: ndarray::Array3<u16> = ndarray_npy::read_npy(&path).unwrap();
-        assert_eq!((read.dim(), read.into_raw_vec_and_offset().0), ((2, 3, 5), [frame(1), frame(2)].concat()));
+        assert_eq!(
+            (read.dim(), read.into_raw_vec_and_offset().0),
+            ((2, 3, 5), [frame(1), frame(2)].concat())
+        );
         let table = fs::read_to_string(path.with_extension("csv")).unwrap();
         assert_eq!(table, "frame,id,batch,dot\n0,17,3,4\n1,18,,\n");
     }

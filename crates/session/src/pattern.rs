@@ -21,7 +21,9 @@ pub fn read(path: &Path) -> Result<Array4<f32>> {
         _ => return Err(Error::codec("read", path.display())("a lighting pattern is a .png or a .npy file")),
     };
     if patterns.is_empty() || patterns.iter().any(|light| !light.is_finite()) {
-        return Err(Error::codec("read", path.display())("a lighting pattern has pixels, all of them finite"));
+        return Err(Error::codec("read", path.display())(
+            "a lighting pattern has pixels, all of them finite",
+        ));
     }
     Ok(patterns)
 }
@@ -37,8 +39,8 @@ pub fn write(path: &Path, patterns: &Array4<f32>) -> Result<()> {
 
 fn read_npy(path: &Path) -> Result<Array4<f32>> {
     let file = File::open(path).map_err(Error::io("read", path))?;
-    let array: ArrayD<f32> =
-        ndarray_npy::ReadNpyExt::read_npy(BufReader::new(file)).map_err(Error::codec("read", path.display()))?;
+    let array: ArrayD<f32> = ndarray_npy::ReadNpyExt::read_npy(BufReader::new(file))
+        .map_err(Error::codec("read", path.display()))?;
     let found = array.shape().to_vec();
     let array = match found.len() {
         2 => array.insert_axis(Axis(0)).insert_axis(Axis(3)),
@@ -98,7 +100,8 @@ mod tests {
     fn sequences_read_back_and_what_is_none_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("pattern.npy");
-        let patterns = Array4::from_shape_fn((2, 3, 4, 3), |(k, t, s, c)| (k * 36 + t * 12 + s * 3 + c) as f32);
+        let patterns =
+            Array4::from_shape_fn((2, 3, 4, 3), |(k, t, s, c)| (k * 36 + t * 12 + s * 3 + c) as f32);
         write(&path, &patterns).unwrap();
         assert_eq!(read(&path).unwrap(), patterns);
         write(&path, &Array4::zeros((2, 3, 4, 2))).unwrap();

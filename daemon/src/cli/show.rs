@@ -119,7 +119,10 @@ pub(super) fn check(report: &CheckReport) -> String {
         let planes = if planes.is_empty() { "no".into() } else { planes.join(" and ") };
         rows[0] = (
             "batches",
-            format!("{} of the scene and {planes} of calibration planes, {} dots each", batches.scene, batches.dots),
+            format!(
+                "{} of the scene and {planes} of calibration planes, {} dots each",
+                batches.scene, batches.dots
+            ),
         );
         let raw = BinaryBytes(batches.raw_bytes_per_s);
         let pace = format!(

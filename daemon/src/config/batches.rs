@@ -133,15 +133,20 @@ impl BatchesPlan {
     pub(super) fn check(&self, text: &str) -> Result<(), ConfigError> {
         let refused = |key: &str, message: String| Err(ConfigError::at(text, &["batches", key], message));
         if !(1..=MAX_BATCHES).contains(&self.count) {
-            return refused("count", format!("batches.count = {}: 1 to {MAX_BATCHES} are allowed", self.count));
+            return refused(
+                "count",
+                format!("batches.count = {}: 1 to {MAX_BATCHES} are allowed", self.count),
+            );
         }
         if !(8..=MAX_DOTS).contains(&self.dots) {
             return refused("dots", format!("batches.dots = {}: 8 to {MAX_DOTS} are allowed", self.dots));
         }
         let dots = self.dots;
         if self.trailing_index() >= dots {
-            let message =
-                format!("batches.trailing_index = {}: give one below batches.dots = {dots}", self.trailing_index());
+            let message = format!(
+                "batches.trailing_index = {}: give one below batches.dots = {dots}",
+                self.trailing_index()
+            );
             return refused("trailing_index", message);
         }
         if self.background_indices.is_empty() {
@@ -165,7 +170,8 @@ impl BatchesPlan {
             return refused("trailing_region", message);
         }
         if !(self.exposure_us > 0.0 && self.exposure_us.is_finite()) {
-            let message = format!("batches.exposure_us = {}: give microseconds greater than 0", self.exposure_us);
+            let message =
+                format!("batches.exposure_us = {}: give microseconds greater than 0", self.exposure_us);
             return refused("exposure_us", message);
         }
         if !(16..=1 << 20).contains(&self.dark_frames) {
@@ -175,7 +181,8 @@ impl BatchesPlan {
         self.path.check(text)?;
         let camera_rate_hz = self.camera_rate_hz();
         if !(camera_rate_hz > 0.0 && camera_rate_hz.is_finite()) {
-            let message = format!("batches.camera_rate_hz = {camera_rate_hz}: give frames a second, more than 0");
+            let message =
+                format!("batches.camera_rate_hz = {camera_rate_hz}: give frames a second, more than 0");
             return refused("camera_rate_hz", message);
         }
         let frames = camera_rate_hz * self.path.duration_s();
@@ -195,14 +202,17 @@ impl BatchesPlan {
             return refused("exposure_us", message);
         }
         if self.calibration.len() > 2 {
-            let message = format!("batches.calibration has {} planes: give one or two", self.calibration.len());
+            let message =
+                format!("batches.calibration has {} planes: give one or two", self.calibration.len());
             return refused("calibration", message);
         }
         for (index, plane) in self.calibration.iter().enumerate() {
             let path = ["batches", "calibration", &index.to_string(), "batches"];
             if !(1..=MAX_BATCHES).contains(&plane.batches) {
-                let message =
-                    format!("batches.calibration: batches = {}: 1 to {MAX_BATCHES} are allowed", plane.batches);
+                let message = format!(
+                    "batches.calibration: batches = {}: 1 to {MAX_BATCHES} are allowed",
+                    plane.batches
+                );
                 return Err(ConfigError::at(text, &path, message));
             }
         }
@@ -273,9 +283,11 @@ impl BatchesPlan {
 
 impl PathPlan {
     fn check(&self, text: &str) -> Result<(), ConfigError> {
-        let refused = |key: &str, message: String| Err(ConfigError::at(text, &["batches", "path", key], message));
+        let refused =
+            |key: &str, message: String| Err(ConfigError::at(text, &["batches", "path", key], message));
         if !(self.rate_hz > 0.0 && self.rate_hz.is_finite()) {
-            let message = format!("batches.path.rate_hz = {}: give samples a second, more than 0", self.rate_hz);
+            let message =
+                format!("batches.path.rate_hz = {}: give samples a second, more than 0", self.rate_hz);
             return refused("rate_hz", message);
         }
         if self.samples() == 0 {
@@ -310,7 +322,8 @@ impl PathPlan {
             Shape::Lissajous => MirrorPath::lissajous(amplitude, self.cycles, samples, rate_hz, limits),
             Shape::Spiral => MirrorPath::spiral(amplitude, self.turns, samples, rate_hz, limits),
             Shape::Points => {
-                let point = |&[x_deg, y_deg]: &[f64; 2]| MirrorPoint { tilt: Tilt::new(x_deg, y_deg), light: 255 };
+                let point =
+                    |&[x_deg, y_deg]: &[f64; 2]| MirrorPoint { tilt: Tilt::new(x_deg, y_deg), light: 255 };
                 MirrorPath::new(self.points_deg.iter().map(point).collect(), rate_hz, limits)
             }
         }

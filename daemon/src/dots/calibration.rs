@@ -136,9 +136,13 @@ impl Calibration {
             ("column_px", place(0)),
             ("row_px", place(1)),
             ("light_dn", self.energies.clone()),
-            ("neighbours", (0..self.confusion.dots()).map(|dot| self.confusion.neighbours(dot).len() as f64).collect()),
+            (
+                "neighbours",
+                (0..self.confusion.dots()).map(|dot| self.confusion.neighbours(dot).len() as f64).collect(),
+            ),
         ];
-        let mut metadata = about("where the dots land on the first calibration plane; -1: not seen", &["dot", "column"]);
+        let mut metadata =
+            about("where the dots land on the first calibration plane; -1: not seen", &["dot", "column"]);
         if let Ok(fundamental) = &self.fundamental {
             metadata.insert("fundamental".into(), json!(fundamental.rows()));
             metadata.insert("epipole".into(), json!(fundamental.epipole()));
@@ -166,7 +170,10 @@ fn epipolar_geometry(
     second: Option<&Centroids>,
 ) -> (std::result::Result<Fundamental, String>, Option<f64>) {
     let Some(second) = second else {
-        return (Err("an epipolar mask needs planes at two depths: add a second [[batches.calibration]]".into()), None);
+        return (
+            Err("an epipolar mask needs planes at two depths: add a second [[batches.calibration]]".into()),
+            None,
+        );
     };
     let both: Vec<([f64; 2], [f64; 2])> =
         first.xy.iter().zip(&second.xy).filter_map(|(first, second)| Some(((*first)?, (*second)?))).collect();
@@ -197,7 +204,9 @@ mod tests {
         let batch = Batch::new(shape, raysweep_transport::dots::BatchArrays::default()).unwrap();
         let footprints = Footprints::new(&batch, 0.5).unwrap();
         let mut first = Centroids::new(&batch, &footprints).unwrap();
-        first.xy = (0..100).map(|dot| Some([20.0 + 20.0 * f64::from(dot % 10), 20.0 + 20.0 * f64::from(dot / 10)])).collect();
+        first.xy = (0..100)
+            .map(|dot| Some([20.0 + 20.0 * f64::from(dot % 10), 20.0 + 20.0 * f64::from(dot / 10)]))
+            .collect();
         // Places farther away move towards an epipole at (600, 90), by shares that hang on the place.
         let mut second = first.clone();
         for xy in second.xy.iter_mut().flatten() {

@@ -49,14 +49,19 @@ pub(crate) fn check(
     if plan.calibration.is_empty() {
         warnings.push("no calibration plane: there will be no relit, separated or dual images; add [[batches.calibration]]".into());
     } else if plan.calibration.len() == 1 {
-        warnings.push("one calibration plane: an epipolar mask needs two depths; add a second [[batches.calibration]]".into());
+        warnings.push(
+            "one calibration plane: an epipolar mask needs two depths; add a second [[batches.calibration]]"
+                .into(),
+        );
     }
     Ok(CheckReport {
         points: plan.total(),
         extra_points: 0,
         frames: u64::from(rounds) * dots,
         light_s: f64::from(rounds) * batch_s,
-        memory_bytes: FRAMES_UNDER_WAY as u64 * frame_bytes + BATCHES_IN_MEMORY * batch_bytes + 16 * image_bytes,
+        memory_bytes: FRAMES_UNDER_WAY as u64 * frame_bytes
+            + BATCHES_IN_MEMORY * batch_bytes
+            + 16 * image_bytes,
         memory_free_bytes: available_bytes(memory_limit_bytes),
         disk_bytes: total * (batch_bytes + 4 * 8 * image_bytes) + raw_bytes + OTHER_BYTES,
         disk_free_bytes: free_bytes(data),

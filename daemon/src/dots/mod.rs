@@ -20,6 +20,7 @@ use serde_json::Value;
 pub(crate) use self::product::DotSpec;
 pub(crate) use self::results::{keep_patterns, make};
 use crate::config::{BatchesPlan, ConfigError, DotRigFile, Plan, PlanKind, StageTable};
+use crate::processing::SATURATION;
 
 /// A plan of batches on a dot rig: everything that acquisition and processing have in common.
 pub struct DotTask {
@@ -81,9 +82,9 @@ impl DotTask {
             refused(&["kind"], format!("the camera's frames: {error}; read out another region of its sensor"))
         })?;
         let scan = plan.batches.scan(shape, plan.batches.count);
-        scan.trailing_region
-            .check(shape)
-            .map_err(|error| refused(&["batches", "trailing_region"], format!("batches.trailing_region: {error}")))?;
+        scan.trailing_region.check(shape).map_err(|error| {
+            refused(&["batches", "trailing_region"], format!("batches.trailing_region: {error}"))
+        })?;
         let broken = |error: PathError| refused(&["batches", "path"], format!("batches.path: {error}"));
         let limits = rig.limits();
         let wanted = plan.batches.mirror_path(&limits).map_err(broken)?;
@@ -124,6 +125,11 @@ impl DotTask {
         }
     }
 
+    /// Counts from which on a pixel is overexposed: wells may be full before the converter is.
+    pub fn saturation_dn(&self) -> u16 {
+        (SATURATION * f64::from(self.format.max_value())) as u16
+    }
+
     /// How the sensor samples colour.
     pub fn sampling(&self) -> Sampling {
         match self.format.mosaic.red() {
@@ -162,10 +168,14 @@ fn stages(plan: &Plan, text: &str) -> Result<(CorrectOptions, StageTable), Confi
                 .map_err(|error| refused(format!("stage correct: {error}")))?;
             let CorrectOptions { hot_sigmas, background_batches } = correct;
             if !(hot_sigmas > 0.0 && hot_sigmas.is_finite()) {
-                return Err(refused(format!("stage correct: hot_sigmas = {hot_sigmas}: give more than 0, as 8")));
+                return Err(refused(format!(
+                    "stage correct: hot_sigmas = {hot_sigmas}: give more than 0, as 8"
+                )));
             }
             if background_batches == 0 {
-                return Err(refused("stage correct: background_batches = 0: give at least 1; 64 is usual".into()));
+                return Err(refused(
+                    "stage correct: background_batches = 0: give at least 1; 64 is usual".into(),
+                ));
             }
         } else if denoise.replace(stage.clone()).is_some() {
             return Err(refused(format!(

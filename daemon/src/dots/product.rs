@@ -76,7 +76,13 @@ struct Separation {
 
 impl Default for Separation {
     fn default() -> Self {
-        Self { method: Method::Neighbours, distance_px: 19.0, sigma_px: 2.0, printed: false, compensate: false }
+        Self {
+            method: Method::Neighbours,
+            distance_px: 19.0,
+            sigma_px: 2.0,
+            printed: false,
+            compensate: false,
+        }
     }
 }
 
@@ -121,7 +127,8 @@ pub(super) struct Scene<'a> {
     pub light: &'a Array3<f32>,
 }
 
-const NO_PLANE: &str = "it needs a calibration plane: add [[batches.calibration]], and see that its batches are stored";
+const NO_PLANE: &str =
+    "it needs a calibration plane: add [[batches.calibration]], and see that its batches are stored";
 
 impl DotSpec {
     /// The products that a plan names, or else what its calibration allows.
@@ -192,7 +199,9 @@ impl DotSpec {
                 let Separation { distance_px, sigma_px, .. } = separation;
                 for (key, value) in [("distance_px", distance_px), ("sigma_px", sigma_px)] {
                     if !(0.0..=1024.0).contains(&value) {
-                        return Err(format!("product {kind_name}: {key} = {value}: 0 to 1024 pixels are allowed"));
+                        return Err(format!(
+                            "product {kind_name}: {key} = {value}: 0 to 1024 pixels are allowed"
+                        ));
                     }
                 }
                 let name = separation.method.name();
@@ -201,7 +210,10 @@ impl DotSpec {
             "dual" => {
                 let size: DualSize = read(kind_name, options)?;
                 if size.size_px.is_some_and(|size| size.iter().any(|side| !(1..=8192).contains(side))) {
-                    return Err(format!("product {kind_name}: size_px = {:?}: 1 to 8192 pixels a side are allowed", size.size_px));
+                    return Err(format!(
+                        "product {kind_name}: size_px = {:?}: 1 to 8192 pixels a side are allowed",
+                        size.size_px
+                    ));
                 }
                 (Kind::Dual(size), "dual")
             }
@@ -214,7 +226,9 @@ impl DotSpec {
         let name = name.clone().unwrap_or_else(|| default_name.into());
         let is_plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
         if name.is_empty() || !name.chars().all(is_plain) {
-            return Err(format!("product {kind_name}: name = {name:?}: letters, digits, `-` and `_` are allowed"));
+            return Err(format!(
+                "product {kind_name}: name = {name:?}: letters, digits, `-` and `_` are allowed"
+            ));
         }
         Ok(Self { name, kind })
     }
@@ -247,7 +261,10 @@ impl DotSpec {
                 ]
             }
             Kind::Dual(_) => {
-                vec![(name.clone(), "as the mirror would see it, lit from the camera; 1 = the calibration plane".into())]
+                vec![(
+                    name.clone(),
+                    "as the mirror would see it, lit from the camera; 1 = the calibration plane".into(),
+                )]
             }
         }
     }
@@ -309,7 +326,8 @@ impl DotSpec {
                 let shape = batch.shape();
                 let [height, width] = size_px.unwrap_or_else(|| {
                     let pitch = (shape.pixels() as f64 / batch.dots() as f64).sqrt().max(1.0);
-                    [shape.height(), shape.width()].map(|side| ((side as f64 / pitch).round() as usize).max(1))
+                    [shape.height(), shape.width()]
+                        .map(|side| ((side as f64 / pitch).round() as usize).max(1))
                 });
                 let made = dual(batch, &centroids, &calibration.energies, (height, width)).map_err(told)?;
                 Ok(vec![made.image])

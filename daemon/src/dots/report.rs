@@ -74,7 +74,10 @@ fn video(strip: &Strip) -> Section {
     };
     Section {
         title: strip.name.clone(),
-        intro: format!("Some of the batches, evenly spread: {}. All are in products/{}.", strip.about, strip.name),
+        intro: format!(
+            "Some of the batches, evenly spread: {}. All are in products/{}.",
+            strip.about, strip.name
+        ),
         blocks: vec![Block::Pictures(strip.images.iter().map(picture).collect())],
     }
 }
@@ -85,14 +88,21 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
         (0..calibration.confusion.dots()).map(|dot| calibration.confusion.neighbours(dot).len()).sum();
     let mut entries = vec![
         ("dots seen on the plane", format!("{seen} of {}", calibration.centroids.xy.len())),
-        ("neighbours of a dot, itself among them", format!("{:.1} in the mean", neighbours as f64 / seen.max(1) as f64)),
+        (
+            "neighbours of a dot, itself among them",
+            format!("{:.1} in the mean", neighbours as f64 / seen.max(1) as f64),
+        ),
         ("dots that are not one piece", calibration.not_unimodal.to_string()),
     ];
-    for (plane, depth_mm) in task.batches().calibration.iter().enumerate().filter_map(|(plane, of)| Some((plane, of.depth_mm?))) {
+    for (plane, depth_mm) in
+        task.batches().calibration.iter().enumerate().filter_map(|(plane, of)| Some((plane, of.depth_mm?)))
+    {
         entries.push(("depth of a plane", format!("{}: {depth_mm} mm", plane + 1)));
     }
     match (&calibration.fundamental, calibration.epipolar_px) {
-        (Ok(_), Some(px)) => entries.push(("the second plane's dots from their epipolar lines", format!("{px:.3} px rms"))),
+        (Ok(_), Some(px)) => {
+            entries.push(("the second plane's dots from their epipolar lines", format!("{px:.3} px rms")))
+        }
         (Ok(_), None) => {}
         (Err(why), _) => entries.push(("epipolar geometry", why.clone())),
     }
@@ -106,9 +116,11 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
         ]
     });
     let rows: Vec<Vec<String>> = rows.collect();
-    let mut blocks = vec![Block::Facts(entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect())];
+    let mut blocks =
+        vec![Block::Facts(entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect())];
     if !rows.is_empty() {
-        let headers = ["batch", "right / px", "down / px", "single dots / px rms", "dots"].map(str::to_owned).to_vec();
+        let headers =
+            ["batch", "right / px", "down / px", "single dots / px rms", "dots"].map(str::to_owned).to_vec();
         blocks.push(Block::Table(Table { headers, rows }));
     }
     let confusion = calibration.confusion_image();
@@ -117,11 +129,13 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
     blocks.push(Block::Pictures(vec![
         Picture::grey(confusion.view(), ToneMap { white: largest })
             .with_caption("confusion matrix: pixels that two dots share"),
-        Picture::grey(cover, ToneMap::percentile(&[cover], PERCENTILE)).with_caption("coverage: sum of the dots' spreads"),
+        Picture::grey(cover, ToneMap::percentile(&[cover], PERCENTILE))
+            .with_caption("coverage: sum of the dots' spreads"),
     ]));
     Section {
         title: "Calibration planes".into(),
-        intro: "How the dots land on the plane, and how they drift from its first batch to the others.".into(),
+        intro: "How the dots land on the plane, and how they drift from its first batch to the others."
+            .into(),
         blocks,
     }
 }

@@ -13,10 +13,10 @@ use raysweep_session::report::ToneMap;
 use raysweep_session::{Result, Session, manifest, pattern};
 use serde_json::{Map, Value, json};
 
+use super::DotTask;
 use super::calibration::{Calibration, read_batch};
 use super::product::{DotSpec, Scene, light_of, read_pattern};
 use super::report::{self, Strip};
-use super::DotTask;
 use crate::config::DotRigFile;
 
 /// What was made of a session, and what was not.
@@ -67,7 +67,12 @@ pub fn make(
         }
         let Ok((batch, seen)) = read_batch(&dots, task.shape, entry) else { continue };
         let light = light_of(&batch);
-        let scene = Scene { calibration: calibration.as_ref(), image: (image, sound.len()), seen: &seen, light: &light };
+        let scene = Scene {
+            calibration: calibration.as_ref(),
+            image: (image, sound.len()),
+            seen: &seen,
+            light: &light,
+        };
         let mut drawn = Vec::new();
         for video in videos {
             match video.spec.draw(&batch, &scene, video.patterns.as_ref()) {
@@ -152,7 +157,11 @@ impl Video<'_> {
             let scale: ToneMap = self.writers[place].1.append(image.view())?;
             let step = count.div_ceil(SHOWN);
             if number.is_multiple_of(step) {
-                self.strips[place].images.push((format!("{} ({:.2} s)", entry.batch, entry.start_s), image, scale));
+                self.strips[place].images.push((
+                    format!("{} ({:.2} s)", entry.batch, entry.start_s),
+                    image,
+                    scale,
+                ));
             }
         }
         Ok(())
@@ -166,8 +175,7 @@ struct Encoder {
 
 impl Encoder {
     fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) {
-        const MISSING: &str =
-            "ffmpeg is not installed: there are no video files, the PNG sequences are complete; install it and run `raysweep process`";
+        const MISSING: &str = "ffmpeg is not installed: there are no video files, the PNG sequences are complete; install it and run `raysweep process`";
         let target = products.join(format!("{name}.mp4"));
         let ended = Command::new("ffmpeg")
             .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])

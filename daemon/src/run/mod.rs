@@ -28,15 +28,15 @@ use tokio::sync::broadcast;
 
 pub(crate) use self::board::Board;
 use self::board::WrongState;
-pub(crate) use self::dots::FRAMES_UNDER_WAY;
 use self::dots::DotRun;
+pub(crate) use self::dots::FRAMES_UNDER_WAY;
 use self::engine::{Acquired, Run, RunError};
 use self::orders::{Order, Orders};
 use crate::advice;
 use crate::check;
 use crate::config::{ConfigError, Plan, PlanKind};
-use crate::dots::{self as dot_rig, DotTask};
 use crate::control::Control;
+use crate::dots::{self as dot_rig, DotTask};
 use crate::live::{LiveFile, Outlet};
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::mirror;
@@ -146,7 +146,8 @@ impl Runner {
                 ..self.camera.clone()
             };
             let limit_bytes = self.memory_limit_bytes;
-            let report = dot_rig::check::check(&task, plan, &self.registry, &camera, &self.data, limit_bytes)?;
+            let report =
+                dot_rig::check::check(&task, plan, &self.registry, &camera, &self.data, limit_bytes)?;
             Ok((task, report))
         };
         foreseen().map_err(|error| invalid_plan(&error))
@@ -195,7 +196,10 @@ impl Runner {
     }
 
     /// Claims the daemon for a run, prepares it and starts its thread; on any error the daemon is free again.
-    fn start(&self, begin: impl FnOnce() -> Result<(Started, Current), RpcError>) -> Result<Started, RpcError> {
+    fn start(
+        &self,
+        begin: impl FnOnce() -> Result<(Started, Current), RpcError>,
+    ) -> Result<Started, RpcError> {
         let mut current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         if self.closed.load(Ordering::Relaxed) {
             return Err(RpcError::new(ErrorCode::Busy, "the daemon is ending: start it again first"));
@@ -222,8 +226,14 @@ impl Runner {
     fn begin_batches(&self, rig: &Arc<DotRig>, params: &RunParams) -> Result<(Started, Current), RpcError> {
         let (task, report) = self.foresee_batches(rig, &params.plan)?;
         self.check_room(&report, "take fewer or smaller frames")?;
-        let (session, ledger) =
-            self.create_session(params, PlanKind::Batches, &task.plan.name, task.stack_shape(), 0, &rig.text)?;
+        let (session, ledger) = self.create_session(
+            params,
+            PlanKind::Batches,
+            &task.plan.name,
+            task.stack_shape(),
+            0,
+            &rig.text,
+        )?;
         let dir = session.dir().to_owned();
         let task = Arc::new(task);
         let patterns = dot_rig::keep_patterns(&session, &task);
@@ -407,10 +417,14 @@ fn conduct_batches(run: DotRun, orders: &Orders, board: &Board, dir: &Path) {
             None => EndState::Complete,
         };
         let missing = task.batches().total() - stored;
-        let end = EndEntry { error: fault.map(|fault| fault.to_string()), ..end_entry(state, stored, missing) };
+        let end =
+            EndEntry { error: fault.map(|fault| fault.to_string()), ..end_entry(state, stored, missing) };
         ledger.append(&Entry::End(end.clone()))?;
         if state == EndState::Complete {
-            let made = dot_rig::make(&session, ledger.state(), &task, &rig.file, &task.specs, problems, &|| orders.go_on())?;
+            let made =
+                dot_rig::make(&session, ledger.state(), &task, &rig.file, &task.specs, problems, &|| {
+                    orders.go_on()
+                })?;
             problems = made.problems;
         }
         Ok((end, problems))

@@ -2,7 +2,8 @@
 
 use ndarray::ArrayView3;
 use raysweep_transport::dots::{
-    Background, BackgroundMean, Correction, DotsError, FrameShape, NoiseFloor, Region, RunStatistics, Sampling,
+    Background, BackgroundMean, Correction, DotsError, FrameShape, NoiseFloor, Observation, Region,
+    RunStatistics, Sampling,
 };
 
 /// Frames in which the noise is measured; they are not in the mean that is subtracted from them.
@@ -11,6 +12,7 @@ const NOISE_FRAMES: usize = 8;
 /// Dark frames on their way to a [`Sensor`].
 pub struct DarkRun {
     shape: FrameShape,
+    saturation_dn: u16,
     wanted: u32,
     taken: u32,
     statistics: RunStatistics,
@@ -29,11 +31,17 @@ pub struct Sensor {
 }
 
 impl DarkRun {
-    /// A run of `frames` dark frames, the first part of a rolling mean worth `background_batches` frames.
+    /// A run of `frames` dark frames, the first part of a rolling mean worth `background_batches` frames. Frames in which
+    /// most pixels have `saturation_dn` or more are left out.
     ///
     /// # Errors
     /// [`DotsError::OutOfRange`] for no batch, [`DotsError::TooFew`] for fewer frames than a sensor is known from.
-    pub fn new(shape: FrameShape, frames: u32, background_batches: u32) -> Result<Self, DotsError> {
+    pub fn new(
+        shape: FrameShape,
+        saturation_dn: u16,
+        frames: u32,
+        background_batches: u32,
+    ) -> Result<Self, DotsError> {
         let needed = 2 * NOISE_FRAMES;
         if (frames as usize) < needed {
             let what = "dark frames: raise batches.dark_frames";
@@ -41,6 +49,7 @@ impl DarkRun {
         }
         Ok(Self {
             shape,
+            saturation_dn,
             wanted: frames,
             taken: 0,
             statistics: RunStatistics::new(shape),
@@ -54,7 +63,9 @@ impl DarkRun {
     /// # Errors
     /// [`DotsError::Shape`] if it is not of the frames' size.
     pub fn push(&mut self, frame: &[u16]) -> Result<bool, DotsError> {
-        if self.taken < self.wanted {
+        let whole = Region::whole(self.shape);
+        let is_flash = Observation::new(0, frame, self.shape, &whole, self.saturation_dn)?.saturated;
+        if self.taken < self.wanted && !is_flash {
             self.taken += 1;
             self.statistics.push(frame)?;
             match self.noisy.len() < NOISE_FRAMES {
@@ -99,9 +110,13 @@ mod tests {
     #[test]
     fn a_dark_run_knows_level_noise_and_hot_pixels() {
         let shape = FrameShape::new(32, 64, 1).unwrap();
-        let mut run = DarkRun::new(shape, 40, 64).unwrap();
+        let mut run = DarkRun::new(shape, 4000, 40, 64).unwrap();
+        assert!(run.push(&vec![4095; shape.pixels()]).unwrap(), "a flash is no dark frame");
         for number in 0..40_u64 {
-            let noise = |pixel: u64| (pixel.wrapping_mul(6364136223846793005) ^ number << 40).wrapping_mul(1442695040888963407) >> 61;
+            let noise = |pixel: u64| {
+                (pixel.wrapping_mul(6364136223846793005) ^ number << 40).wrapping_mul(1442695040888963407)
+                    >> 61
+            };
             let frame: Vec<u16> = (0..shape.pixels() as u64)
                 .map(|pixel| if pixel == 70 { 900 } else { 100 + noise(pixel) as u16 })
                 .collect();
@@ -118,8 +133,8 @@ mod tests {
     #[test]
     fn too_few_frames_are_no_calibration() {
         let shape = FrameShape::new(32, 64, 1).unwrap();
-        assert!(matches!(DarkRun::new(shape, 15, 64), Err(DotsError::TooFew { needed: 16, .. })));
-        let run = DarkRun::new(shape, 16, 64).unwrap();
+        assert!(matches!(DarkRun::new(shape, 4000, 15, 64), Err(DotsError::TooFew { needed: 16, .. })));
+        let run = DarkRun::new(shape, 4000, 16, 64).unwrap();
         assert!(matches!(run.finish(8.0, None, Sampling::Full), Err(DotsError::TooFew { given: 0, .. })));
     }
 }

@@ -41,6 +41,8 @@ pub struct DotsFlowConfig {
     pub scan: Scan,
     /// How frames are packed.
     pub format: PixelFormat,
+    /// Counts from which on a pixel is overexposed.
+    pub saturation_dn: u16,
     /// What makes columns of them.
     pub stage: Arc<dyn ColumnStage>,
     /// What the stage knows of the sensor.
@@ -85,9 +87,10 @@ struct Shop {
     source: Mutex<Source>,
     backgrounds: Backgrounds,
     /// Columns whose memory is free.
-    spare: Mutex<Vec<Box<SparseColumn>>>,
+    spare: Mutex<Vec<SparseColumn>>,
     scan: Scan,
     format: PixelFormat,
+    saturation_dn: u16,
     floor: NoiseFloor,
 }
 
@@ -99,7 +102,9 @@ impl<S: CutSink + 'static> DotsFlow<S> {
     /// # Errors
     /// When the system gives no thread, or the background does not fit the frames.
     pub fn start(config: DotsFlowConfig, sink: S) -> Result<(Self, Input<Arrival>), PipelineError> {
-        let DotsFlowConfig { scan, format, stage, correction, background, floor, policy, .. } = config;
+        let DotsFlowConfig {
+            scan, format, saturation_dn, stage, correction, background, floor, policy, ..
+        } = config;
         let threads = match config.threads {
             0 => thread::available_parallelism().map_or(1, usize::from),
             threads => threads,
@@ -113,6 +118,7 @@ impl<S: CutSink + 'static> DotsFlow<S> {
             spare: Mutex::default(),
             scan: scan.clone(),
             format,
+            saturation_dn,
             floor,
         });
         let is_blind = Arc::new(AtomicBool::new(false));
@@ -199,7 +205,7 @@ impl Shop {
         frame: &Frame,
         unpacked: &mut Vec<u16>,
         background: &Background,
-    ) -> (Observation, Result<Box<SparseColumn>, String>) {
+    ) -> (Observation, Result<SparseColumn, String>) {
         // Of a frame that cannot be read nothing is seen.
         let unseen = Observation { id: frame.stamp.seq, energy: 0, saturated: true };
         let counts = match counts_of(frame, self.format, unpacked, self.scan.shape.values()) {
@@ -207,10 +213,10 @@ impl Shop {
             Err(problem) => return (unseen, Err(problem)),
         };
         let Scan { shape, trailing_region, .. } = &self.scan;
-        let full_scale = self.format.max_value();
-        let seen = Observation::new(frame.stamp.seq, counts, *shape, trailing_region, full_scale);
+        let seen = Observation::new(frame.stamp.seq, counts, *shape, trailing_region, self.saturation_dn);
         let mut column = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
-        let made = catch_unwind(AssertUnwindSafe(|| worker.column(counts, background, self.floor, &mut column)));
+        let made =
+            catch_unwind(AssertUnwindSafe(|| worker.column(counts, background, self.floor, &mut column)));
         let made = match made {
             Ok(Ok(())) => Ok(column),
             Ok(Err(error)) => Err(error.to_string()),

@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 
 use raysweep_core::{Counts, Frame, LossCause, PixelFormat};
 use raysweep_transport::dots::{
-    BackgroundMean, BatchArrays, Cause, Decided, DotsError, Fate, FrameShape, Observation, Region, SparseColumn,
-    SyncSettings, Synchroniser, pulse_threshold,
+    BackgroundMean, BatchArrays, Cause, Decided, DotsError, Fate, FrameShape, Observation, Region,
+    SparseColumn, SyncSettings, Synchroniser, pulse_threshold,
 };
 
 use super::flow::Loss;
@@ -80,7 +80,7 @@ pub trait CutSink: Send {
 /// A frame as a worker has seen it.
 pub(super) struct Looked {
     pub seen: Observation,
-    pub column: Result<Box<SparseColumn>, String>,
+    pub column: Result<SparseColumn, String>,
     pub frame: Frame,
     pub lost_before: Vec<Loss>,
 }
@@ -88,7 +88,7 @@ pub(super) struct Looked {
 /// A frame whose index is not certain yet.
 struct Waiting {
     id: u64,
-    column: Result<Box<SparseColumn>, String>,
+    column: Result<SparseColumn, String>,
     /// Only of a frame that may be one of the beam dump.
     frame: Option<Frame>,
     lost_before: Vec<Loss>,
@@ -136,12 +136,7 @@ pub(super) struct Gatherer<S> {
 }
 
 impl<S: CutSink> Gatherer<S> {
-    pub fn new(
-        scan: Scan,
-        format: PixelFormat,
-        background: BackgroundMean,
-        sink: S,
-    ) -> Self {
+    pub fn new(scan: Scan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
         let shape = scan.shape;
         let learning = LEARNT_FROM_BATCHES * scan.dots as usize + 2;
         Self {
@@ -172,7 +167,11 @@ impl<S: CutSink> Gatherer<S> {
     ///
     /// # Errors
     /// When the trailing dot is not seen where it should be.
-    pub fn take(&mut self, looked: Looked, spare: &mut dyn FnMut(Box<SparseColumn>)) -> Result<(), DotsError> {
+    pub fn take(
+        &mut self,
+        looked: Looked,
+        spare: &mut dyn FnMut(SparseColumn),
+    ) -> Result<(), DotsError> {
         let Looked { seen, column, frame, lost_before } = looked;
         if let Cutter::Blind = self.cutter {
             // Taken in so that it is accounted for.
@@ -204,7 +203,7 @@ impl<S: CutSink> Gatherer<S> {
     ///
     /// # Errors
     /// As [`Self::take`].
-    pub fn finish(&mut self, spare: &mut dyn FnMut(Box<SparseColumn>)) -> Result<(), DotsError> {
+    pub fn finish(&mut self, spare: &mut dyn FnMut(SparseColumn)) -> Result<(), DotsError> {
         self.decided.clear();
         let learnt = match &self.cutter {
             Cutter::Learning(run) if !run.is_empty() => self.begin_cutting(),
@@ -259,7 +258,7 @@ impl<S: CutSink> Gatherer<S> {
         })
     }
 
-    fn settle_all(&mut self, spare: &mut dyn FnMut(Box<SparseColumn>)) {
+    fn settle_all(&mut self, spare: &mut dyn FnMut(SparseColumn)) {
         let mut decided = std::mem::take(&mut self.decided);
         for Decided { arrival, fate } in decided.drain(..) {
             let place = (arrival - self.first_pending) as usize;
@@ -278,7 +277,7 @@ impl<S: CutSink> Gatherer<S> {
         arrival: u64,
         waiting: Waiting,
         fate: Fate,
-        spare: &mut dyn FnMut(Box<SparseColumn>),
+        spare: &mut dyn FnMut(SparseColumn),
     ) {
         let Waiting { id, column, frame, lost_before, start_ns, end_ns } = waiting;
         let mut place = None;
@@ -377,7 +376,7 @@ impl<S: CutSink> Gatherer<S> {
         }
     }
 
-    fn add(&mut self, is_scene: bool, column: &Result<Box<SparseColumn>, String>) {
+    fn add(&mut self, is_scene: bool, column: &Result<SparseColumn, String>) {
         let Some(Building { cut, .. }) = &mut self.building else { return };
         match column {
             Ok(column) => {

@@ -266,6 +266,9 @@ mod tests {
         assert!(refused("demux", json!({})).contains("known are denoise, denoise-reference"));
         assert!(refused("denoise", json!({ "radius": 3 })).contains("radius"));
         assert!(refused("denoise", json!({ "radius_px": -1.0 })).contains("radius_px"));
-        assert!(refused("denoise-reference", json!({ "stop": "printed", "patch": [0, 99, 0, 8] })).contains("rows"));
+        assert!(
+            refused("denoise-reference", json!({ "stop": "printed", "patch": [0, 99, 0, 8] }))
+                .contains("rows")
+        );
     }
 }

@@ -60,14 +60,19 @@ fn frame(pool: &FramePool, format: PixelFormat, step: u64) -> Frame {
     let mut data = pool.take();
     format.pack_into(&counts(step), &mut data).unwrap();
     let at_ns = step as i64 * 1000;
-    let stamp =
-        FrameStamp { seq: step, device_ns: at_ns, exposure_start_ns: at_ns, host_ns: at_ns + 900, exposure_us: None };
+    let stamp = FrameStamp {
+        seq: step,
+        device_ns: at_ns,
+        exposure_start_ns: at_ns,
+        host_ns: at_ns + 900,
+        exposure_us: None,
+    };
     Frame { data, format, stamp }
 }
 
 fn sensor(format: PixelFormat) -> Sensor {
     let pool = FramePool::new(1, format.frame_bytes(shape().pixels()));
-    let mut run = DarkRun::new(shape(), 64, 16).unwrap();
+    let mut run = DarkRun::new(shape(), 4000, 64, 16).unwrap();
     let mut unpacked = vec![0; shape().pixels()];
     for number in 0..64 {
         // The steps of the beam dump are dark.
@@ -119,6 +124,7 @@ fn cut(
     let config = DotsFlowConfig {
         scan: scan(batches),
         format,
+        saturation_dn: 4000,
         stage,
         correction,
         background,

@@ -155,7 +155,9 @@ mod tests {
         for name in ["relit/0000.exr", "relit/0001.png", "relit.json"] {
             assert!(dir.path().join(name).exists(), "{name}");
         }
-        let decoder = png::Decoder::new(io::BufReader::new(std::fs::File::open(dir.path().join("relit/0001.png")).unwrap()));
+        let decoder = png::Decoder::new(io::BufReader::new(
+            std::fs::File::open(dir.path().join("relit/0001.png")).unwrap(),
+        ));
         assert_eq!(decoder.read_info().unwrap().info().size(), (6, 4));
     }
 

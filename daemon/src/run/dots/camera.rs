@@ -2,9 +2,7 @@
 
 use std::time::Duration;
 
-use raysweep_core::{
-    Camera, DeviceError, DeviceErrorKind, Frame, FramePool, LossCause,
-};
+use raysweep_core::{Camera, DeviceError, DeviceErrorKind, Frame, FramePool, LossCause};
 use raysweep_pipeline::QueueError;
 use raysweep_pipeline::dots::{Arrival, Loss};
 
@@ -165,7 +163,8 @@ mod tests {
             Ok(())
         }
         fn next_frame(&mut self, _: &mut FrameBuf, _: Duration) -> Result<Option<FrameStamp>, DeviceError> {
-            let stamp = |seq| FrameStamp { seq, device_ns: 0, exposure_start_ns: 0, host_ns: 0, exposure_us: None };
+            let stamp =
+                |seq| FrameStamp { seq, device_ns: 0, exposure_start_ns: 0, host_ns: 0, exposure_us: None };
             Ok(self.1.next().map(stamp))
         }
         fn disarm(&mut self) -> Result<(), DeviceError> {
@@ -222,7 +221,10 @@ mod tests {
                 (7, vec![]),
             ]
         );
-        assert_eq!(rest, [loss(2, LossCause::PoolEmpty), loss(2, LossCause::CameraGap), loss(1, LossCause::PoolEmpty)]);
+        assert_eq!(
+            rest,
+            [loss(2, LossCause::PoolEmpty), loss(2, LossCause::CameraGap), loss(1, LossCause::PoolEmpty)]
+        );
     }
 
     #[test]

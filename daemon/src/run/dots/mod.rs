@@ -14,8 +14,8 @@ use raysweep_pipeline::dots::{Arrival, DarkRun, DotsFlow, DotsFlowConfig, Gather
 use raysweep_pipeline::{PipelineError, Policy, Registry, message_of};
 use raysweep_proto::{Event, RunState};
 use raysweep_session::Session;
-use raysweep_session::ledger::{Entry, Ledger};
 use raysweep_session::dots::RawFrames;
+use raysweep_session::ledger::{Entry, Ledger};
 use raysweep_sim::dots::Subject;
 
 use self::camera::{Refused, Source, Wanted};
@@ -178,7 +178,11 @@ impl Passes<'_> {
         self.orders.wait_while_paused();
         if !self.stand.place(plane.map_or(Subject::Scene, Subject::Plane))? {
             let text = match plane {
-                Some(plane) => format!("put calibration plane {} of {} before the camera", plane + 1, self.task.batches().calibration.len()),
+                Some(plane) => format!(
+                    "put calibration plane {} of {} before the camera",
+                    plane + 1,
+                    self.task.batches().calibration.len()
+                ),
                 None => "put the scene before the camera, and the calibration plane away".into(),
             };
             self.orders.give(Order::Pause);
@@ -194,29 +198,31 @@ impl Passes<'_> {
     fn dark(&mut self) -> Result<Option<Sensor>, RunError> {
         let (task, plan) = (self.task, self.task.batches());
         let options = &task.correct;
-        let mut run = DarkRun::new(task.shape, plan.dark_frames, options.background_batches)?;
+        let mut run =
+            DarkRun::new(task.shape, task.saturation_dn(), plan.dark_frames, options.background_batches)?;
         let path = task.path.clone().with_light(|_| 0);
         let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
         let has_enough = AtomicBool::new(false);
-        let lost = self.play(&path, plan.dark_rounds(), plan.dark_frames.into(), &has_enough, &mut |arrival| {
-            // Whoever waits for the camera's last frame sees some more.
-            if !has_enough.load(Ordering::Relaxed) {
-                let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
-                let pushed = match unpacked {
-                    Ok(()) => run.push(&counts).map_err(RunError::from),
-                    Err(error) => Err(RunError::Frame(error.to_string())),
-                };
-                match pushed {
-                    Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
-                    Err(error) => {
-                        failed = Some(error);
-                        return Err(Refused::Closed);
+        let lost =
+            self.play(&path, plan.dark_rounds(), plan.dark_frames.into(), &has_enough, &mut |arrival| {
+                // Whoever waits for the camera's last frame sees some more.
+                if !has_enough.load(Ordering::Relaxed) {
+                    let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
+                    let pushed = match unpacked {
+                        Ok(()) => run.push(&counts).map_err(RunError::from),
+                        Err(error) => Err(RunError::Frame(error.to_string())),
+                    };
+                    match pushed {
+                        Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
+                        Err(error) => {
+                            failed = Some(error);
+                            return Err(Refused::Closed);
+                        }
                     }
                 }
-            }
-            frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
-            Ok(())
-        })?;
+                frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
+                Ok(())
+            })?;
         frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
         // No batch waits for any of them.
         self.storage.outside(Counts { expected: frames, settling: frames, ..Counts::default() });
@@ -244,6 +250,7 @@ impl Passes<'_> {
         let config = DotsFlowConfig {
             scan: plan.scan(task.shape, batches),
             format: task.format,
+            saturation_dn: task.saturation_dn(),
             stage: stage.into(),
             correction: correction.clone(),
             background,
