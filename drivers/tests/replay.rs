@@ -47,7 +47,7 @@ fn mraw(frame: usize) -> Vec<u8> {
 /// An `.npy` file of version 1 as NumPy writes it.
 fn npy(dtype: &str, shape: &str, data: &[u8]) -> Vec<u8> {
     let mut header = format!("{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}");
-    while (10 + header.len() + 1) % 64 != 0 {
+    while !(10 + header.len() + 1).is_multiple_of(64) {
         header.push(' ');
     }
     header.push('\n');

@@ -187,8 +187,8 @@ fn a_coloured_scene_is_seen_through_the_mosaic_and_by_a_monochrome_camera_as_its
 /// The middle of a frame's light in the scene, (row, column).
 fn centroid(counts: &[u16], rows: usize, columns: usize) -> [f64; 2] {
     let (mut sum, mut y, mut x) = (0.0, 0.0, 0.0);
-    for pixel in 0..rows * columns {
-        let light = f64::from(counts[pixel]) - BLACK_DN;
+    for (pixel, &count) in counts[..rows * columns].iter().enumerate() {
+        let light = f64::from(count) - BLACK_DN;
         sum += light;
         y += light * ((pixel / columns) as f64 + 0.5);
         x += light * ((pixel % columns) as f64 + 0.5);
