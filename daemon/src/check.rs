@@ -123,6 +123,7 @@ pub fn check(
         // Worked out on request alone: a run must not wait for it.
         advice: None,
         film,
+        batches: None,
         warnings,
     })
 }

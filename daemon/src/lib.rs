@@ -5,6 +5,7 @@ pub mod check;
 pub mod cli;
 pub mod config;
 pub mod control;
+mod dots;
 mod film;
 pub mod live;
 mod memory;

@@ -1,8 +1,10 @@
 //! Where a daemon keeps what it knows of its mirror, and what it tells of it.
 
+use std::io;
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 
-use raysweep_drivers::mirror::{LightGuard, LightState, MirrorReport};
+use raysweep_drivers::mirror::{Guardian, LightGuard, LightState, MirrorReport};
 use raysweep_proto::{ErrorCode, MirrorStatus, RpcError};
 
 /// The mirror's state in the packaged daemon's data folder.
@@ -13,14 +15,24 @@ pub fn state_file(data: &Path) -> PathBuf {
     data.join("mirror.json")
 }
 
-/// Who permits light. No rig file names an interlock yet, so it is the operator.
-pub fn light_guard(data: &Path) -> LightGuard {
-    LightGuard { armed_file: data.join("light-armed"), interlock: None }
+/// Who permits light: the rig's interlock, or, without one, the operator.
+pub fn light_guard(data: &Path, interlock: Option<PathBuf>) -> LightGuard {
+    LightGuard { armed_file: data.join("light-armed"), interlock }
+}
+
+/// Starts the process that parks the mirror of a data folder should this one be killed.
+///
+/// # Errors
+/// When the client `raysweep` is not beside the daemon or cannot be started.
+pub fn guardian(data: &Path) -> io::Result<Guardian> {
+    let mut command = Command::new(std::env::current_exe()?.with_file_name("raysweep"));
+    command.args(["park", "--when-closed", "--state"]).arg(state_file(data)).stdout(Stdio::null());
+    Guardian::start(command)
 }
 
 /// Takes the operator's word.
 pub(crate) fn arm_light(data: &Path) -> Result<(), RpcError> {
-    let file = light_guard(data).armed_file;
+    let file = light_guard(data, None).armed_file;
     raysweep_drivers::mirror::arm_light(&file).map_err(|error| {
         let what =
             format!("cannot write {}: {error}: give the daemon a --data that it can write", file.display());
@@ -29,12 +41,12 @@ pub(crate) fn arm_light(data: &Path) -> Result<(), RpcError> {
 }
 
 /// The mirror as its files tell; none where none was ever moved.
-pub(crate) fn status(data: &Path) -> Option<MirrorStatus> {
+pub(crate) fn status(data: &Path, guard: &LightGuard) -> Option<MirrorStatus> {
     let state = state_file(data);
     if !state.exists() {
         return None;
     }
-    let MirrorReport { parked, laser, light, .. } = MirrorReport::read(&state, &light_guard(data));
+    let MirrorReport { parked, laser, light, .. } = MirrorReport::read(&state, guard);
     let light = match light {
         LightState::InterlockClosed => "interlock_closed",
         LightState::InterlockOpen => "interlock_open",

@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 
 use raysweep_pipeline::Registry;
 use raysweep_session::Session;
+use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 
-use crate::config::{Plan, RigFile, append_argument};
+use crate::config::{DotRigFile, Plan, PlanKind, RigFile, append_argument};
+use crate::dots::{self, DotSpec, DotTask};
 use crate::film;
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::processing::Task;
@@ -95,6 +97,12 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     let (rig_path, rig_text) = read(session.rig_path())?;
     let plan = Plan::parse(&plan_text)
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
+    if plan.kind == PlanKind::Batches {
+        let rig = DotRigFile::parse(&rig_text).map_err(|error| {
+            ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text))
+        })?;
+        return process_batches(&session, ledger.state(), (plan, &plan_text), &rig, asked);
+    }
     let rig = RigFile::parse(&rig_text)
         .map_err(|error| ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text)))?;
     let state = ledger.state();
@@ -150,6 +158,33 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     })
 }
 
+/// The products of a flying dot's batches.
+fn process_batches(
+    session: &Session,
+    state: &State,
+    (plan, plan_text): (Plan, &str),
+    rig: &DotRigFile,
+    asked: &Asked,
+) -> Result<Processed, ProcessError> {
+    let shape = state.session.shape;
+    let size = (shape.rows, shape.columns);
+    let task = DotTask::new(plan, plan_text, rig, rig.camera.pixel_format, size)
+        .map_err(|error| ProcessError::Config(error.to_string()))?;
+    let mut specs = if asked.only { Vec::new() } else { task.specs.clone() };
+    for argument in &asked.products {
+        let spec = DotSpec::from_argument(argument).map_err(ProcessError::Product)?;
+        specs.retain(|other| other.name != spec.name);
+        specs.push(spec);
+    }
+    let made = dots::make(session, state, &task, rig, &specs, Vec::new(), &|| true)?;
+    Ok(Processed {
+        report: session.report_path(),
+        stored: state.stored_points(),
+        points: shape.points,
+        problems: made.problems,
+    })
+}
+
 /// Copies a session's products, report and manifest into `to`, a folder that is made and must not exist.
 ///
 /// # Errors
@@ -162,14 +197,23 @@ pub fn export(dir: &Path, to: &Path) -> Result<usize, ProcessError> {
     std::fs::create_dir(to).map_err(|source| ProcessError::Copy { path: to.to_owned(), source })?;
     let mut files =
         vec![session.report_path(), session.manifest_path(), session.plan_path(), session.rig_path()];
-    if let Ok(products) = std::fs::read_dir(session.products_path()) {
-        files.extend(products.flatten().map(|entry| entry.path()));
-    }
+    let listed = |dir: &Path| {
+        let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
+        entries.map(|entry| entry.path()).collect::<Vec<_>>()
+    };
+    // Videos have folders of their own.
+    let products = listed(&session.products_path());
+    files.extend(products.iter().filter(|path| path.is_dir()).flat_map(|dir| listed(dir)));
+    files.extend(products);
     files.push(session.ledger_path());
     let mut copied = 0;
     for file in files.iter().filter(|file| file.is_file()) {
+        let parent = file.parent().filter(|parent| parent.parent() == Some(&session.products_path()));
+        let folder = parent.and_then(Path::file_name).map_or_else(|| to.to_owned(), |name| to.join(name));
         let Some(name) = file.file_name() else { continue };
-        let target = to.join(name);
+        let target = folder.join(name);
+        std::fs::create_dir_all(&folder)
+            .map_err(|source| ProcessError::Copy { path: folder.clone(), source })?;
         std::fs::copy(file, &target).map_err(|source| ProcessError::Copy { path: target, source })?;
         copied += 1;
     }

@@ -32,7 +32,7 @@ pub struct Task {
 
 /// Share of the converter's range from which on a mean counts as saturated: the noise of single frames must not have
 /// been cut off.
-const SATURATION: f64 = 0.97;
+pub(crate) const SATURATION: f64 = 0.97;
 
 impl Task {
     /// A plan on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its row 0.

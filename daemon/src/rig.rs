@@ -1,5 +1,6 @@
 //! The factory: from a rig file to open devices.
 
+mod dots;
 mod vsync;
 
 use std::path::{Path, PathBuf};
@@ -12,7 +13,11 @@ use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
-use crate::config::{CameraDriver, ConfigError, DrmSection, ProjectorDriver, RigFile, VsyncDriver};
+use crate::config::{
+    CameraDriver, ConfigError, DrmSection, ProjectorDriver, RigFile, RigKind, VsyncDriver,
+};
+
+pub use self::dots::{DotDevices, DotRig, Stand};
 
 /// Why a rig cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -33,7 +38,44 @@ pub enum RigError {
     Device(#[from] DeviceError),
 }
 
-/// A rig whose devices can be opened, one run at a time.
+/// A rig of either kind.
+pub enum AnyRig {
+    /// Raster projector and rolling-shutter camera.
+    Plane(Rig),
+    /// Mirror and fast camera.
+    Dots(DotRig),
+}
+
+impl From<Rig> for AnyRig {
+    fn from(rig: Rig) -> Self {
+        Self::Plane(rig)
+    }
+}
+
+impl From<DotRig> for AnyRig {
+    fn from(rig: DotRig) -> Self {
+        Self::Dots(rig)
+    }
+}
+
+impl AnyRig {
+    /// Reads a rig file of whatever kind.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+        let kind = RigKind::of(&text)
+            .map_err(|error| RigError::Config(error.render(&path.display().to_string(), &text)))?;
+        match kind {
+            RigKind::Plane => Rig::load(path).map(Self::Plane),
+            RigKind::Dots => DotRig::load(path).map(Self::Dots),
+        }
+    }
+}
+
+/// A plane rig whose devices can be opened, one run at a time.
 pub struct Rig {
     /// What its file says.
     pub file: RigFile,
@@ -210,10 +252,15 @@ impl Rig {
 
     #[cfg(not(feature = "aravis"))]
     fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
-        Err(RigError::Config(
-            "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
-        ))
+        Err(built_without_aravis())
     }
+}
+
+#[cfg(not(feature = "aravis"))]
+fn built_without_aravis() -> RigError {
+    RigError::Config(
+        "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
+    )
 }
 
 #[cfg(test)]

@@ -210,6 +210,8 @@ pub struct SimSensor {
     pub read_noise_e: f64,
     /// Spread of the pixels' offsets.
     pub dsnu_e: f64,
+    /// Spread of the columns' offsets.
+    pub column_e: f64,
     /// Spread of the pixels' gains, in percent.
     pub prnu_percent: f64,
     /// Share of hot pixels.
@@ -230,8 +232,9 @@ impl Default for SimSensor {
             noise: true,
             electrons_per_dn: 1.66,
             full_well_e: 6800.0,
-            read_noise_e: 9.0,           // [A] rolling shutter
-            dsnu_e: 3.0,                 // [A]
+            read_noise_e: 9.0, // [A] rolling shutter
+            dsnu_e: 3.0,       // [A]
+            column_e: 0.0,
             prnu_percent: 1.0,           // [A]
             hot_pixels: 1e-4,            // [A]
             hot_pixel_e_per_s: 50_000.0, // [A]

@@ -26,6 +26,10 @@ pub enum Purpose {
     MirrorRepeat,
     /// Faults of a mirror's controller and its wire.
     MirrorWire,
+    /// Offsets of the sensor's columns.
+    Columns,
+    /// What becomes of one frame of a dot.
+    DotFrame,
 }
 
 /// A generator for `purpose` under the rig's `seed`, told apart by `key`.

@@ -7,6 +7,7 @@
 pub mod bench;
 pub mod config;
 mod devices;
+pub mod dots;
 pub mod gige;
 mod keyed;
 mod line;

@@ -335,6 +335,7 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("sensor.full_well_e", config.sensor.full_well_e, "more than 0"),
         ("sensor.read_noise_e", config.sensor.read_noise_e, not_negative),
         ("sensor.dsnu_e", config.sensor.dsnu_e, not_negative),
+        ("sensor.column_e", config.sensor.column_e, not_negative),
         ("sensor.prnu_percent", config.sensor.prnu_percent, not_negative),
         ("sensor.vignetting_percent", config.sensor.vignetting_percent, "0 to 100"),
         ("sensor.adc_bits", f64::from(config.sensor.adc_bits), "1 to 12"),

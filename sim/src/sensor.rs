@@ -63,7 +63,7 @@ impl Sensor {
             let vignetting = 1.0 - config.vignetting_percent / 100.0 * 2.0 * (x * x + y * y);
             scale.white_dn * electrons_per_dn * vignetting * (1.0 + spread(config.prnu_percent / 100.0))
         });
-        let offset_e = (0..height * width).map(|_| spread(config.dsnu_e) as f32).collect();
+        let mut offset_e: Vec<f32> = (0..height * width).map(|_| spread(config.dsnu_e) as f32).collect();
         let dark_e_per_us = (0..height * width)
             .map(|_| {
                 let hot = config.noise && uniform(&mut random) < config.hot_pixels;
@@ -71,6 +71,13 @@ impl Sensor {
                 ((if hot { config.hot_pixel_e_per_s } else { dark }) * 1e-6) as f32
             })
             .collect();
+        if config.noise && config.column_e > 0.0 {
+            let mut random = keyed(seed, Purpose::Columns, &[]);
+            let columns: Vec<f32> = (0..width)
+                .map(|_| (config.column_e * Distribution::<f64>::sample(&StandardNormal, &mut random)) as f32)
+                .collect();
+            offset_e.iter_mut().zip(columns.iter().cycle()).for_each(|(offset, column)| *offset += column);
+        }
         let step_dn = 2_f32.powi(scale.bits.saturating_sub(config.adc_bits.max(1)) as i32);
         Self {
             config: config.clone(),

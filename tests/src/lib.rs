@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 use raysweep::control::Control;
-use raysweep::rig::Rig;
+use raysweep::rig::{DotRig, Rig};
 use raysweep::run::Runner;
 use raysweep_pipeline::Registry;
 use raysweep_proto::{Event, ResumeParams, RunParams};
@@ -91,6 +91,26 @@ impl Bench {
         Self { folder, runner }
     }
 
+    /// A bench with a dot rig.
+    ///
+    /// # Panics
+    /// When the rig cannot be built.
+    pub fn dots(rig: &str) -> Self {
+        Self::dots_with_registry(rig, Registry::default())
+    }
+
+    /// A bench with a dot rig and these stages.
+    ///
+    /// # Panics
+    /// When the rig cannot be built.
+    pub fn dots_with_registry(rig: &str, registry: Registry) -> Self {
+        let folder = TempDir::new().expect("a temporary folder");
+        std::fs::write(folder.path().join("rig.toml"), rig).expect("rig.toml written");
+        let rig = DotRig::load(&folder.path().join("rig.toml")).unwrap_or_else(|error| panic!("{error}"));
+        let runner = Runner::new(rig, folder.path().join("sessions"), registry);
+        Self { runner: Arc::new(runner.unwrap_or_else(|error| panic!("{error}"))), folder }
+    }
+
     /// Ends the daemon's core and starts another over the same folder.
     ///
     /// # Panics
@@ -159,6 +179,10 @@ impl Ended {
     fn accounted_for(self) -> Self {
         let (_, state) = self.open();
         assert!(state.counts.balanced(), "{:?}", state.counts);
+        if state.session.shape.is_batches() {
+            assert!(state.batches().all(|batch| batch.counts.balanced()));
+            return self;
+        }
         if state.session.shape.is_film() {
             assert!(state.cycles().all(|cycle| cycle.counts.balanced()));
             return self;

@@ -32,6 +32,14 @@ pub enum LossCause {
     QueueFull,
     /// The data could not be written.
     WriterError,
+    /// No trailing dots enclose the frame, so that nobody knows which dot it shows.
+    Unsynchronised,
+    /// The frame is overexposed.
+    Saturated,
+    /// Its batch was longer by a frame, and another is nearer to the dot.
+    Surplus,
+    /// The stage that makes its column failed.
+    StageFailed,
 }
 
 /// Where the triggers of a point, an attempt or a run went.

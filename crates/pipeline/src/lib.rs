@@ -5,6 +5,7 @@
 
 mod assembler;
 mod demux;
+pub mod dots;
 mod edges;
 mod film;
 mod findings;

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 
 use crate::demux::{DemuxFold, DemuxOptions};
+use crate::dots::DotStages;
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage::{Fold, HotPixels, Stage};
 
@@ -50,12 +51,14 @@ type Make = Box<dyn Fn(Value, &Schedule, &SweepGeometry) -> Result<Entry, Regist
 /// All stages and folds that plans may name.
 pub struct Registry {
     makers: BTreeMap<&'static str, Make>,
+    /// The column stages of the dot rig.
+    pub dots: DotStages,
 }
 
 impl Default for Registry {
     /// The stages and folds of the plane rig.
     fn default() -> Self {
-        let mut registry = Self { makers: BTreeMap::new() };
+        let mut registry = Self { makers: BTreeMap::new(), dots: DotStages::default() };
         registry.register("hot-pixels", |options, _, _| {
             let stage: HotPixels = parse("hot-pixels", options)?;
             stage.check().map_err(|what| RegistryError::Invalid { name: "hot-pixels".into(), what })?;

@@ -183,6 +183,54 @@ pub struct FilmCheck {
     pub reason: String,
 }
 
+/// A batch of a flying dot was stored; its floodlit image is in the live file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct BatchStored {
+    /// Its index in `dots.zarr`.
+    pub batch: usize,
+    /// The calibration plane that it shows, from 0; nothing: the scene.
+    pub plane: Option<usize>,
+    /// Start of its first exposure, in seconds after that of the run's first batch.
+    pub start_s: f64,
+    /// Dots of the scene without a frame.
+    pub missing: usize,
+    /// Dots in whose frames nothing stood out of the background.
+    pub empty: usize,
+    /// Dots whose frames ended at the cap on discs.
+    pub capped: usize,
+    /// Frames that came twice.
+    pub duplicates: u64,
+    /// Mean over all pixels of the floodlit image, in counts.
+    pub floodlit: f64,
+    /// Of that image in the live file, where there is one.
+    pub sequence: Option<u64>,
+}
+
+/// What `check` says of a plan of batches.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct BatchesCheck {
+    /// Batches of the scene.
+    pub scene: u32,
+    /// Batches of each calibration plane.
+    pub planes: Vec<u32>,
+    /// Frames of a batch.
+    pub dots: u32,
+    /// Frames a second.
+    pub camera_rate_hz: f64,
+    /// Seconds of a batch.
+    pub batch_s: f64,
+    /// Frames without light before the first batch.
+    pub dark_frames: u32,
+    /// Samples of the mirror's path.
+    pub samples: usize,
+    /// Samples a second.
+    pub rate_hz: f64,
+    /// What the camera sends.
+    pub raw_bytes_per_s: u64,
+    /// What a batch takes on the disk.
+    pub disk_bytes_per_batch: u64,
+}
+
 /// `status`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Status {
@@ -270,6 +318,9 @@ pub struct CheckReport {
     /// Where the plan is a film.
     #[serde(default)]
     pub film: Option<FilmCheck>,
+    /// Where the plan is one of batches; reach and condition then mean nothing.
+    #[serde(default)]
+    pub batches: Option<BatchesCheck>,
     /// What an operator should know; none of it stops the run.
     pub warnings: Vec<String>,
 }
@@ -353,6 +404,13 @@ pub enum Event {
     Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
     /// The light transport was estimated during a film.
     Film(FilmEstimate),
+    /// A batch of a flying dot was stored.
+    Batch(BatchStored),
+    /// The run waits for an operator, who is to do this.
+    Ask {
+        /// What to do.
+        text: String,
+    },
     /// A running estimate is in the live file, made from the points stored so far.
     Live {
         /// Of its last image in the live file.

@@ -65,6 +65,7 @@ fn acquire(
         rows,
         columns,
         settings: 0,
+        dots: 0,
     };
     let header = SessionEntry {
         format: raysweep_session::ledger::FORMAT,

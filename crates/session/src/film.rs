@@ -250,7 +250,7 @@ mod tests {
     use super::*;
 
     fn shape(rows: usize, columns: usize) -> StackShape {
-        StackShape { points: 4, exposures: 1, rows, columns, settings: 3 }
+        StackShape { points: 4, exposures: 1, rows, columns, settings: 3, dots: 0 }
     }
 
     fn frames(rows: usize, columns: usize, seed: usize) -> Array3<u16> {

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
 
+use crate::dots::Dots;
 use crate::film::Film;
 use crate::ledger::{self, EndState, Ledger, SessionEntry, State};
 use crate::products::Products;
@@ -42,7 +43,10 @@ impl Session {
         durable::write(&created.plan_path(), plan.as_bytes())?;
         durable::write(&created.rig_path(), rig.as_bytes())?;
         durable::create_dir(&created.products_path())?;
-        Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
+        match session.shape.is_batches() {
+            true => drop(Dots::create(&created.dots_path(), &session.shape)?),
+            false => drop(Stack::create(&created.stack_path(), &session.shape, &session.kind)?),
+        }
         if session.shape.is_film() {
             Film::create(&created.film_path(), &session.shape)?;
         }
@@ -103,6 +107,14 @@ impl Session {
         Film::open(&self.film_path(), &self.state()?.session.shape)
     }
 
+    /// The batches of a flying dot, to read them and to add to them.
+    ///
+    /// # Errors
+    /// Where the ledger cannot be read.
+    pub fn dots(&self) -> Result<Dots> {
+        Ok(Dots::open(&self.dots_path(), &self.state()?.session.shape))
+    }
+
     /// The folder of the products.
     pub fn products(&self) -> Products {
         Products::new(self.products_path())
@@ -148,6 +160,21 @@ impl Session {
         self.dir.join("transport_film.zarr")
     }
 
+    /// `dots.zarr`, see [`crate::dots`].
+    pub fn dots_path(&self) -> PathBuf {
+        self.dir.join("dots.zarr")
+    }
+
+    /// `raw.npy`, the raw frames of a flying dot, where they are kept; see [`crate::dots::RawFrames`].
+    pub fn raw_path(&self) -> PathBuf {
+        self.dir.join("raw.npy")
+    }
+
+    /// Where the lighting pattern of a product is kept.
+    pub fn pattern_path(&self, product: &str) -> PathBuf {
+        self.dir.join("patterns").join(format!("{product}.npy"))
+    }
+
     /// `products`, see [`crate::products`].
     pub fn products_path(&self) -> PathBuf {
         self.dir.join("products")
@@ -175,7 +202,7 @@ pub struct SessionSummary {
     pub kind: String,
     /// UTC.
     pub created: Timestamp,
-    /// Points of the sweep, or cycles of the film, that are planned.
+    /// Points of the sweep, cycles of the film, or batches that are planned.
     pub points: usize,
     /// Those of them that are stored.
     pub stored: usize,
@@ -270,7 +297,7 @@ mod tests {
             tags: vec!["test".into()],
             created: "2026-03-04T05:06:07Z".parse().unwrap(),
             software: "raysweep 0.1.0".into(),
-            shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0 },
+            shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0, dots: 0 },
             first_row: 0,
         }
     }

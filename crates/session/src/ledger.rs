@@ -13,6 +13,7 @@ use jiff::Timestamp;
 use raysweep_core::{Counts, FilmSummary, SettingsLatency, VsyncStats};
 use serde::{Deserialize, Serialize};
 
+use crate::dots::BatchEntry;
 use crate::film::CycleEntry;
 use crate::stack::{ArrayName, StackShape};
 use crate::{Error, Result};
@@ -65,6 +66,15 @@ pub enum Entry {
         cycle: usize,
         /// The settings without a sound frame.
         missing: Vec<usize>,
+        /// What became of its frames.
+        counts: Counts,
+    },
+    /// A batch of a flying dot is durable in `dots.zarr`.
+    Batch(BatchEntry),
+    /// A batch lacks too many frames, or could not be written, and is not stored: it is not taken again.
+    BatchLost {
+        /// Counted from 0.
+        batch: usize,
         /// What became of its frames.
         counts: Counts,
     },
@@ -195,6 +205,7 @@ pub struct State {
     pub film: Option<FilmSummary>,
     stored: BTreeMap<(ArrayName, usize), PointEntry>,
     cycles: BTreeMap<usize, CycleEntry>,
+    batches: BTreeMap<usize, BatchEntry>,
     next_attempts: BTreeMap<(ArrayName, usize), u32>,
 }
 
@@ -215,6 +226,7 @@ impl State {
             film: None,
             stored: BTreeMap::new(),
             cycles: BTreeMap::new(),
+            batches: BTreeMap::new(),
             next_attempts: BTreeMap::new(),
         };
         for (entry, line) in rest.iter().zip(1..) {
@@ -233,9 +245,14 @@ impl State {
         self.cycles.values()
     }
 
-    /// How many of the plan's points are stored: of a sweep's points, or of a film's cycles.
+    /// The stored batches of a flying dot, in order.
+    pub fn batches(&self) -> impl Iterator<Item = &BatchEntry> {
+        self.batches.values()
+    }
+
+    /// How many of the plan's points are stored: of a sweep's points, of a film's cycles, or of a flying dot's batches.
     pub fn stored_points(&self) -> usize {
-        self.stored(ArrayName::Sum).count() + self.cycles.len()
+        self.stored(ArrayName::Sum).count() + self.cycles.len() + self.batches.len()
     }
 
     /// A stored point.
@@ -278,6 +295,14 @@ impl State {
                     Err(format!("cycle {cycle} is outside of the film, which has {cycles} cycles"))
                 }
             }
+            Entry::Batch(BatchEntry { batch, .. }) | Entry::BatchLost { batch, .. } => {
+                let batches = self.session.shape.points * usize::from(self.session.shape.is_batches());
+                if *batch < batches {
+                    Ok(())
+                } else {
+                    Err(format!("batch {batch} is outside of the plan, which has {batches} batches"))
+                }
+            }
             Entry::Run { .. } | Entry::Film(_) | Entry::Outside { .. } | Entry::End(_) => Ok(()),
         }
     }
@@ -303,7 +328,11 @@ impl State {
                 self.counts.add(&cycle.counts);
                 self.cycles.insert(cycle.cycle, cycle.clone());
             }
-            Entry::CycleLost { counts, .. } => self.counts.add(counts),
+            Entry::Batch(batch) => {
+                self.counts.add(&batch.counts);
+                self.batches.insert(batch.batch, batch.clone());
+            }
+            Entry::CycleLost { counts, .. } | Entry::BatchLost { counts, .. } => self.counts.add(counts),
             Entry::Film(film) => self.film = Some(film.clone()),
             Entry::Outside { counts } => self.counts.add(counts),
             Entry::StageFailed { .. } => {}

@@ -7,6 +7,7 @@
 //! | `stack.zarr` | the summed frames, Zarr v3 ([`stack`]) |
 //! | `transport.zarr` | the light transport, Zarr v3 ([`transport`]) |
 //! | `film.zarr`, `transport_film.zarr` | of a film: the frames and the light transport of each cycle, Zarr v3 ([`film`]) |
+//! | `dots.zarr` | of a flying dot: the sparse columns of each batch, Zarr v3 ([`dots`]) |
 //! | `products/` | images as EXR and NPY, volumes as NPY, each with a JSON sidecar ([`products`]) |
 //! | `report.html` | one self-contained page ([`report`]) |
 //! | `manifest.json` | versions, settings, counts and checksums ([`manifest`]) |
@@ -14,6 +15,7 @@
 //! The ledger is what knows, and nothing else does: data without its line does not exist. So the order of a write is
 //! data, fsync, rename, fsync of the folder ([`durable`]), and only then the ledger's line, fsync.
 
+pub mod dots;
 pub mod durable;
 mod error;
 mod exr_file;
@@ -21,6 +23,7 @@ pub mod film;
 mod folder;
 pub mod ledger;
 pub mod manifest;
+pub mod pattern;
 pub mod products;
 pub mod report;
 pub mod stack;

@@ -4,6 +4,7 @@
 //! (float32 `[t, s]`, or `[t, s, 3]`); a volume is `NAME.npy` alone. A sequence of images is `NAME.npy` (`[k, t, s]`) and
 //! one `NAME.exr` with a layer for each; a table is `NAME.npy` (`[row, column]`) and `NAME.csv`. Beside each lies
 //! `NAME.json` with the metadata.
+//! A video is described at [`VideoWriter`].
 //! Values are linear. Every file is written durably, and the same input gives the same bytes.
 
 use std::io::{self, BufWriter};
@@ -13,9 +14,11 @@ use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
 use ndarray_npy::WriteNpyExt;
 use serde_json::{Map, Value};
 
+pub use self::video::VideoWriter;
 pub use self::volume::VolumeWriter;
 use crate::{Error, Result, durable, exr_file};
 
+mod video;
 mod volume;
 
 /// The folder of the products.

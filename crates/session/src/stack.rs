@@ -63,7 +63,7 @@ impl ArrayName {
 /// The shapes of the stack's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StackShape {
-    /// Planned points of the sweep; of a film, its cycles.
+    /// Planned points of the sweep; of a film, its cycles; of a flying dot, its batches.
     pub points: usize,
     /// Exposures, each with a dark frame.
     pub exposures: usize,
@@ -74,25 +74,37 @@ pub struct StackShape {
     /// Settings of a film's cycle; 0 where it is a sweep.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub settings: usize,
+    /// Frames of a flying dot's batch; 0 for the other kinds.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub dots: usize,
 }
 
-fn is_zero(settings: &usize) -> bool {
-    *settings == 0
+fn is_zero(count: &usize) -> bool {
+    *count == 0
 }
 
 impl StackShape {
     /// Points of an array.
     pub fn len(&self, array: ArrayName) -> usize {
         match array {
-            ArrayName::Sum => self.points * usize::from(!self.is_film()),
+            ArrayName::Sum => self.points * usize::from(self.is_sweep()),
             ArrayName::Dark => self.exposures,
-            ArrayName::Regular => usize::from(!self.is_film()),
+            ArrayName::Regular => usize::from(self.is_sweep()),
         }
     }
 
     /// Whether the points are cycles, whose frames are in `film.zarr`.
     pub fn is_film(&self) -> bool {
         self.settings > 0
+    }
+
+    /// Whether the points are batches, whose columns are in `dots.zarr`; there is no stack then.
+    pub fn is_batches(&self) -> bool {
+        self.dots > 0
+    }
+
+    fn is_sweep(&self) -> bool {
+        !self.is_film() && !self.is_batches()
     }
 
     /// The arrays of the stack.
@@ -102,7 +114,8 @@ impl StackShape {
 
     pub(crate) fn check(&self) -> Result<()> {
         let found = vec![self.points, self.exposures, self.rows, self.columns];
-        if found.contains(&0) {
+        let has_stack = !self.is_batches();
+        if found.iter().enumerate().any(|(axis, &len)| len == 0 && (axis != 1 || has_stack)) {
             return Err(Error::Shape {
                 what: "the stack [points, exposures, rows, columns]".into(),
                 found,

@@ -30,12 +30,20 @@ pub(crate) const CHUNK_PX: usize = 64;
 pub(crate) struct DurableStore {
     root: PathBuf,
     files: FilesystemStore,
+    /// Whether the folder is a draft, which is made durable as a whole.
+    draft: bool,
 }
 
 impl DurableStore {
     pub(crate) fn new(root: &Path) -> Result<Arc<DurableStore>> {
         let files = FilesystemStore::new(root).map_err(Error::zarr("open", root))?;
-        Ok(Arc::new(DurableStore { root: root.to_owned(), files }))
+        Ok(Arc::new(DurableStore { root: root.to_owned(), files, draft: false }))
+    }
+
+    /// A store in a folder that nobody reads yet: whoever puts it in its place makes all its files durable before.
+    pub(crate) fn draft(root: &Path) -> Result<Arc<DurableStore>> {
+        let files = FilesystemStore::new(root).map_err(Error::zarr("open", root))?;
+        Ok(Arc::new(DurableStore { root: root.to_owned(), files, draft: true }))
     }
 
     pub(crate) fn root(&self) -> &Path {
@@ -65,6 +73,10 @@ impl WritableStorageTraits for DurableStore {
     fn set(&self, key: &StoreKey, value: Bytes) -> std::result::Result<(), StorageError> {
         let path = self.files.key_to_fspath(key);
         let parent = path.parent().unwrap_or(&self.root);
+        if self.draft {
+            let written = std::fs::create_dir_all(parent).and_then(|()| std::fs::write(&path, &value));
+            return written.map_err(StorageError::from);
+        }
         durable::create_dir_all(parent)
             .and_then(|()| durable::write(&path, &value))
             .map_err(|error| StorageError::Other(error.to_string()))

@@ -15,6 +15,8 @@ benchmarks: cargo xtask bench <name> [options]
   dots    the flying dot's stages: time, ratio to a plain read of the same bytes, frames a second
           --peers  beside NumPy, SciPy and OpenCV on the same frames and columns
           --json   JSON lines instead of tables: bench, case, stage, method, seconds, times_read, ratio
+          --live   frames of 1024x1024 pixels from memory through pool, queue and stages, as fast as they are taken and for a
+                   minute at 0.95 of that, beside the same kernels in a plain loop; with --json one line
   camera  the driver aravis on the simulated GigE camera: frames a second, processor time of a frame beside
           arv-camera-test-0.8 in the same run, and from a frame's last packet until it is in the pool; best as root
           --sweep  instead, the paper's sweep over the wire in real time, with late settings, lost packets and a
@@ -30,6 +32,11 @@ pub fn bench(arguments: &[&str]) -> Done {
             Ok(())
         }
         ["demux", options @ ..] => transport("demux", "python-peers", "peers-requirements.txt", options),
+        ["dots", "--live", options @ ..] if options.is_empty() || options == ["--json"] => {
+            let mut bench = cargo();
+            bench.args(["bench", "--package", "raysweep-pipeline", "--bench", "dots", "--"]);
+            run(bench.args(options))
+        }
         ["dots", options @ ..] => {
             transport("dots", "python-peers-dots", "peers-dots-requirements.txt", options)
         }
@@ -97,7 +104,7 @@ mod tests {
         let unknown: [&[&str]; 6] = [
             &["demuxx"],
             &["demux", "--fast"],
-            &["dots", "--fast"],
+            &["dots", "--live", "--fast"],
             &["live", "--fast"],
             &["unpack", "--json"],
             &["camera", "--peers"],

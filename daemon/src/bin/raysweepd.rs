@@ -11,7 +11,7 @@ use clap::Parser;
 use raysweep::control::Control;
 use raysweep::live::{LiveError, LiveFile};
 use raysweep::mirror;
-use raysweep::rig::Rig;
+use raysweep::rig::AnyRig;
 use raysweep::run::Runner;
 use raysweep::server::{self, Access, Listening};
 use raysweep_drivers::mirror::{Parked, park};
@@ -65,7 +65,22 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
-    let rig = Rig::load(&arguments.rig)?;
+    let rig = AnyRig::load(&arguments.rig)?;
+    if !arguments.check {
+        prepare_data(&arguments.data).map_err(|error| {
+            format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
+        })?;
+        // Before a mirror's driver is opened, which refuses one that was left behind.
+        park_left_behind(&arguments.data);
+    }
+    // It outlives the runner, and so the mirror's driver.
+    let _guardian = match &rig {
+        AnyRig::Dots(rig) if !arguments.check && rig.has_real_mirror() => Some(
+            mirror::guardian(&arguments.data)
+                .map_err(|error| format!("cannot start `raysweep park`, which guards the mirror: {error}"))?,
+        ),
+        _ => None,
+    };
     let runner = Runner::new(rig, arguments.data.clone(), Registry::default())?;
     let camera = runner.camera();
     let opened = format!(
@@ -81,10 +96,6 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
         return Ok(());
     }
     tracing::info!("{opened}");
-    prepare_data(&arguments.data).map_err(|error| {
-        format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
-    })?;
-    park_left_behind(&arguments.data);
     let runner = match arguments.memory {
         Some(size) => runner.with_memory_limit(size.as_u64()),
         None => runner,

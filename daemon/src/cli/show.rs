@@ -122,6 +122,29 @@ pub(super) fn check(report: &CheckReport) -> String {
         rows.insert(1, ("pace", pace));
         rows.insert(2, ("a minute", format!("{minute} on disk, uncompressed; latency hangs on the machine")));
     }
+    if let Some(batches) = &report.batches {
+        rows.truncate(5);
+        let planes: Vec<String> = batches.planes.iter().map(u32::to_string).collect();
+        let planes = if planes.is_empty() { "no".into() } else { planes.join(" and ") };
+        rows[0] = (
+            "batches",
+            format!(
+                "{} of the scene and {planes} of calibration planes, {} dots each",
+                batches.scene, batches.dots
+            ),
+        );
+        let raw = BinaryBytes(batches.raw_bytes_per_s);
+        let pace = format!(
+            "{:.2} batches/s, {:.0} frames/s ({raw}/s raw); mirror: {} samples at {:.0} Hz",
+            1.0 / batches.batch_s,
+            batches.camera_rate_hz,
+            batches.samples,
+            batches.rate_hz
+        );
+        rows.insert(1, ("pace", pace));
+        rows.insert(2, ("dark", format!("{} frames before the first batch", batches.dark_frames)));
+        rows.push(("a batch", format!("about {} on disk", BinaryBytes(batches.disk_bytes_per_batch))));
+    }
     rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
     better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.sweep.trim_end()))

@@ -54,7 +54,8 @@ impl View {
                 self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
             Event::Film(estimate) => self.film(estimate),
-            Event::Vsync(_) => {}
+            Event::Vsync(_) | Event::Batch(_) => {}
+            Event::Ask { text } => self.note(text),
             Event::Live { points, .. } => self.live = Some(*points),
             Event::Finished {
                 session,

@@ -1,5 +1,7 @@
 //! Rig and plan files: TOML with unknown keys refused and errors that point at the place in the text.
 
+mod batches;
+mod dots;
 mod film;
 mod plan;
 mod product;
@@ -10,6 +12,8 @@ use std::ops::Range;
 
 use toml::de::DeValue;
 
+pub use batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
+pub use dots::{DotCameraDriver, DotCameraSection, DotRigFile, DotSimSection, MirrorDriver, MirrorSection};
 pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};
@@ -96,7 +100,12 @@ mod tests {
         };
         let (rigs, plans) = (texts("rigs"), texts("plans"));
         assert!(rigs.len() >= 2 && plans.len() >= 3);
-        rigs.iter().for_each(|text| drop(RigFile::parse(text).unwrap()));
+        for text in &rigs {
+            match RigKind::of(text).unwrap() {
+                RigKind::Plane => drop(RigFile::parse(text).unwrap()),
+                RigKind::Dots => drop(DotRigFile::parse(text).unwrap()),
+            }
+        }
         plans.iter().for_each(|text| drop(Plan::parse(text).unwrap()));
     }
 }

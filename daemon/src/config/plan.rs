@@ -4,7 +4,7 @@ use raysweep_pipeline::{Point, Role, Schedule};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::{ConfigError, FilmPlan, ProductTable, span_of};
+use super::{BatchesPlan, ConfigError, FilmPlan, ProductTable, span_of};
 
 /// A plan.
 #[derive(Debug, Clone, Deserialize)]
@@ -21,6 +21,9 @@ pub struct Plan {
     /// `[film]`, where it is one.
     #[serde(default)]
     pub film: FilmPlan,
+    /// `[batches]`, where it is a flying dot's.
+    #[serde(default)]
+    pub batches: BatchesPlan,
     /// `[[stage]]`: stages in order, then folds; none: `demux`.
     #[serde(default = "default_stages")]
     pub stage: Vec<StageTable>,
@@ -36,6 +39,21 @@ pub enum PlanKind {
     Sweep,
     /// A short sweep again and again, each time with a light transport of its own.
     Film,
+    /// Batches of frames of a flying dot.
+    Batches,
+}
+
+impl PlanKind {
+    const ALL: [Self; 3] = [Self::Sweep, Self::Film, Self::Batches];
+
+    /// Its name in plans, which is also that of its table.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Sweep => "sweep",
+            Self::Film => "film",
+            Self::Batches => "batches",
+        }
+    }
 }
 
 /// `[sweep]`: the grid of delays and exposures; the defaults are the paper's.
@@ -138,8 +156,12 @@ impl Plan {
     /// With the place in the text, for anything that is not a plan that can be run.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut plan: Self = toml::from_str(text).map_err(|error| ConfigError::parse(&error))?;
-        if plan.kind == PlanKind::Film && span_of(text, &["name"]).is_none() {
-            plan.name = "film".into();
+        let (own_name, is_named) = (plan.kind.name(), span_of(text, &["name"]).is_some());
+        if !is_named {
+            plan.name = own_name.into();
+        }
+        if plan.kind == PlanKind::Batches && span_of(text, &["stage"]).is_none() {
+            plan.stage = vec![StageTable { name: "denoise".into(), options: Map::new() }];
         }
         plan.check(text)?;
         Ok(plan)
@@ -150,6 +172,8 @@ impl Plan {
         match self.kind {
             PlanKind::Sweep => self.sweep.max_jitter_us,
             PlanKind::Film => self.film.max_jitter_us,
+            // A flying dot has no line to be late for.
+            PlanKind::Batches => f64::INFINITY,
         }
     }
 
@@ -159,15 +183,16 @@ impl Plan {
     /// Those of [`Self::parse`].
     pub(crate) fn check(&self, text: &str) -> Result<(), ConfigError> {
         let sweep = &self.sweep;
-        let (kind, own, other) = match self.kind {
-            PlanKind::Sweep => ("sweep", "sweep", "film"),
-            PlanKind::Film => ("film", "film", "sweep"),
-        };
-        if span_of(text, &[other]).is_some() {
-            let message = format!("kind = \"{kind}\" has no [{other}]: give [{own}], or another kind");
-            return Err(ConfigError::at(text, &[other], message));
+        let own = self.kind.name();
+        let others = PlanKind::ALL.map(PlanKind::name).into_iter().filter(|other| *other != own);
+        for other in others {
+            if span_of(text, &[other]).is_some() {
+                let message = format!("kind = \"{own}\" has no [{other}]: give [{own}], or another kind");
+                return Err(ConfigError::at(text, &[other], message));
+            }
         }
         self.film.check(text)?;
+        self.batches.check(text)?;
         if self.name.trim().is_empty() {
             return Err(ConfigError::at(text, &["name"], "name is empty: give the session a name"));
         }

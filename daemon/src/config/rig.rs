@@ -37,6 +37,22 @@ pub struct RigFile {
 pub enum RigKind {
     /// Raster projector and rolling-shutter camera.
     Plane,
+    /// Mirror and fast camera.
+    Dots,
+}
+
+impl RigKind {
+    /// The kind that a rig file says, whatever else is in it.
+    ///
+    /// # Errors
+    /// With the place in the text, where it is no TOML or names no kind.
+    pub fn of(text: &str) -> Result<Self, ConfigError> {
+        #[derive(Deserialize)]
+        struct Kind {
+            kind: RigKind,
+        }
+        toml::from_str::<Kind>(text).map(|rig| rig.kind).map_err(|error| ConfigError::parse(&error))
+    }
 }
 
 /// Drivers of cameras by the names that rig files use.
@@ -195,14 +211,14 @@ impl ProjectorSection {
 }
 
 /// Longer than a camera takes to start.
-fn default_reopen_s() -> f64 {
+pub(super) fn default_reopen_s() -> f64 {
     60.0
 }
 /// Rectified rows of the same height.
 fn default_row_pitch() -> f64 {
     1.0
 }
-fn default_pixel_format() -> PixelFormat {
+pub(super) fn default_pixel_format() -> PixelFormat {
     PixelFormat::Mono12
 }
 fn default_rows() -> usize {
@@ -231,6 +247,9 @@ impl RigFile {
     /// With the place in the text, for anything that is not a rig.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let rig: Self = toml::from_str(text).map_err(|error| ConfigError::parse(&error))?;
+        if rig.kind != RigKind::Plane {
+            return Err(ConfigError::at(text, &["kind"], "kind: a plane rig's is \"plane\""));
+        }
         rig.check(text)?;
         Ok(rig)
     }

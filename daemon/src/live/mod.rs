@@ -20,6 +20,9 @@ pub const INDIRECT: &str = "indirect";
 /// All light.
 pub const TOTAL: &str = "total";
 
+/// Name of the image that a flying dot's newest batch is shown by.
+pub const FLOODLIT: &str = "floodlit";
+
 /// Why there are no live images.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {

@@ -60,6 +60,12 @@ pub enum RunError {
         /// Of the session.
         expected: (usize, usize),
     },
+    /// The frames, or the calibration, of a dot rig cannot be used.
+    #[error(transparent)]
+    Dots(#[from] raysweep_transport::dots::DotsError),
+    /// A frame cannot be read.
+    #[error("{0}")]
+    Frame(String),
     /// The plan makes no model on this rig.
     #[error("{0}")]
     Plan(#[from] ConfigError),

@@ -2,6 +2,7 @@
 
 mod board;
 mod camera;
+mod dots;
 mod engine;
 mod film;
 mod orders;
@@ -28,23 +29,29 @@ use tokio::sync::broadcast;
 
 pub(crate) use self::board::Board;
 use self::board::WrongState;
+use self::dots::DotRun;
+pub(crate) use self::dots::FRAMES_UNDER_WAY;
 use self::engine::{Acquired, Run, RunError};
 use self::orders::{Order, Orders};
 use crate::advice;
 use crate::check;
 use crate::config::{ConfigError, Plan, PlanKind};
 use crate::control::Control;
+use crate::dots::{self as dot_rig, DotTask};
 use crate::live::{LiveFile, Outlet};
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::mirror;
 use crate::processing::Task;
 use crate::results::{self, Results};
-use crate::rig::{Rig, RigError};
+use crate::rig::{AnyRig, DotRig, Rig, RigError};
 use crate::strips::Overview;
+
+/// At which rate a dot rig's camera is opened to see that it is there; each run opens it at its own.
+const LEAST_FRAME_RATE_HZ: f64 = 100.0;
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
-    rig: Arc<Rig>,
+    rig: Bench,
     /// The rig's camera, as it was when the daemon began.
     camera: CameraCapabilities,
     data: PathBuf,
@@ -55,6 +62,13 @@ pub struct Runner {
     current: Mutex<Option<Current>>,
     /// Set once, when no further run may begin.
     closed: AtomicBool,
+}
+
+/// The daemon's rig.
+#[derive(Clone)]
+enum Bench {
+    Plane(Arc<Rig>),
+    Dots(Arc<DotRig>),
 }
 
 /// The run under way, or the last one.
@@ -78,14 +92,23 @@ impl Runner {
     ///
     /// # Errors
     /// The first device that does not open.
-    pub fn new(rig: Rig, data: PathBuf, registry: Registry) -> Result<Self, RigError> {
-        let camera = rig.open()?.camera.capabilities().clone();
+    pub fn new(rig: impl Into<AnyRig>, data: PathBuf, registry: Registry) -> Result<Self, RigError> {
+        let (rig, camera, kind) = match rig.into() {
+            AnyRig::Plane(rig) => {
+                let camera = rig.open()?.camera.capabilities().clone();
+                (Bench::Plane(Arc::new(rig)), camera, "plane")
+            }
+            AnyRig::Dots(rig) => {
+                let camera = rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone();
+                (Bench::Dots(Arc::new(rig)), camera, "dots")
+            }
+        };
         Ok(Self {
-            rig: Arc::new(rig),
+            rig,
             camera,
             data,
             registry: Arc::new(registry),
-            board: Arc::new(Board::new("plane")),
+            board: Arc::new(Board::new(kind)),
             live: None,
             memory_limit_bytes: None,
             current: Mutex::default(),
@@ -114,11 +137,32 @@ impl Runner {
         &self.camera
     }
 
+    /// A plan of batches on this rig, and what it would do.
+    fn foresee_batches(&self, rig: &DotRig, plan: &str) -> Result<(DotTask, CheckReport), RpcError> {
+        let foreseen = || {
+            let size = (self.camera.height, self.camera.width);
+            let task = DotTask::new(Plan::parse(plan)?, plan, &rig.file, self.camera.format, size)?;
+            let camera = CameraCapabilities {
+                exposure_us: *self.camera.exposure_us.start()..=1e6 / task.batches().camera_rate_hz(),
+                ..self.camera.clone()
+            };
+            let limit_bytes = self.memory_limit_bytes;
+            let report =
+                dot_rig::check::check(&task, plan, &self.registry, &camera, &self.data, limit_bytes)?;
+            Ok((task, report))
+        };
+        foreseen().map_err(|error| invalid_plan(&error))
+    }
+
     /// A plan on this rig, and what it would do.
-    fn foresee(&self, plan: &str) -> Result<(Task, CheckReport), RpcError> {
+    fn foresee(&self, rig: &Rig, plan: &str) -> Result<(Task, CheckReport), RpcError> {
         let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
+        if parsed.kind == PlanKind::Batches {
+            let message = "kind = \"batches\": a plane rig runs plans of kind \"sweep\" and \"film\"";
+            return Err(invalid_plan(&ConfigError::at(plan, &["kind"], message)));
+        }
         let size = (self.camera.height, self.camera.width);
-        let task = Task::new(parsed, &self.rig.file, self.rig.first_row(&self.camera), size);
+        let task = Task::new(parsed, &rig.file, rig.first_row(&self.camera), size);
         let processing = task.processing(&self.registry, plan).map_err(|error| invalid_plan(&error))?;
         let limit_bytes = self.memory_limit_bytes;
         let report = check::check(&task, &processing.products, &self.camera, &self.data, limit_bytes)
@@ -153,7 +197,10 @@ impl Runner {
     }
 
     /// Claims the daemon for a run, prepares it and starts its thread; on any error the daemon is free again.
-    fn start(&self, prepare: impl FnOnce() -> Result<Prepared, RpcError>) -> Result<Started, RpcError> {
+    fn start(
+        &self,
+        begin: impl FnOnce() -> Result<(Started, Current), RpcError>,
+    ) -> Result<Started, RpcError> {
         let mut current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         if self.closed.load(Ordering::Relaxed) {
             return Err(RpcError::new(ErrorCode::Busy, "the daemon is ending: start it again first"));
@@ -163,8 +210,7 @@ impl Runner {
             // Its thread has nothing left to do once the state allowed a new run.
             let _ = last.thread.join();
         }
-        let started = prepare().and_then(|prepared| self.spawn(prepared));
-        match started {
+        match begin() {
             Ok((started, run)) => {
                 *current = Some(run);
                 Ok(started)
@@ -177,7 +223,51 @@ impl Runner {
         }
     }
 
-    fn spawn(&self, prepared: Prepared) -> Result<(Started, Current), RpcError> {
+    /// Prepares a run of batches and starts its thread.
+    fn begin_batches(&self, rig: &Arc<DotRig>, params: &RunParams) -> Result<(Started, Current), RpcError> {
+        let (task, report) = self.foresee_batches(rig, &params.plan)?;
+        self.check_room(&report, "take fewer or smaller frames")?;
+        let (session, ledger) = self.create_session(
+            params,
+            PlanKind::Batches,
+            &task.plan.name,
+            task.stack_shape(),
+            0,
+            &rig.text,
+        )?;
+        let dir = session.dir().to_owned();
+        let task = Arc::new(task);
+        let patterns = dot_rig::keep_patterns(&session, &task);
+        patterns.map_err(|error| RpcError::new(ErrorCode::InvalidPlan, error))?;
+        self.board.set_session(dir.clone());
+        let orders = Arc::new(Orders::default());
+        let run = DotRun {
+            rig: rig.clone(),
+            task,
+            plan_text: params.plan.clone(),
+            registry: self.registry.clone(),
+            session,
+            ledger,
+            data: self.data.clone(),
+            orders: orders.clone(),
+            board: self.board.clone(),
+            live: self.outlet(&dir),
+        };
+        let board = self.board.clone();
+        let thread = spawn_run({
+            let (orders, dir) = (orders.clone(), dir.clone());
+            move || conduct_batches(run, &orders, &board, &dir)
+        })?;
+        Ok((Started { session: dir }, Current { orders, thread }))
+    }
+
+    fn outlet(&self, dir: &Path) -> Option<Outlet> {
+        let session = dir.display().to_string();
+        let outlet = |file: &Arc<LiveFile>| Outlet { file: file.clone(), board: self.board.clone(), session };
+        self.live.as_ref().map(outlet)
+    }
+
+    fn spawn(&self, rig: &Arc<Rig>, prepared: Prepared) -> Result<(Started, Current), RpcError> {
         let Prepared { task, session, ledger, plan_text, resumed } = prepared;
         let mut processing =
             task.processing(&self.registry, &plan_text).map_err(|error| invalid_plan(&error))?;
@@ -191,7 +281,7 @@ impl Runner {
         self.board.set_session(dir.clone());
         let orders = Arc::new(Orders::default());
         let run = Run {
-            rig: self.rig.clone(),
+            rig: rig.clone(),
             task,
             session,
             ledger,
@@ -199,26 +289,18 @@ impl Runner {
             resumed,
             orders: orders.clone(),
             board: self.board.clone(),
-            live: self.live.as_ref().map(|file| Outlet {
-                file: file.clone(),
-                board: self.board.clone(),
-                session: dir.display().to_string(),
-            }),
+            live: self.outlet(&dir),
         };
         let board = self.board.clone();
-        let thread = thread::Builder::new()
-            .name("run".into())
-            .spawn({
-                let orders = orders.clone();
-                let dir = dir.clone();
-                move || conduct(run, in_strips, &orders, &board, &dir)
-            })
-            .map_err(|error| RpcError::new(ErrorCode::Internal, format!("no thread for the run: {error}")))?;
+        let thread = spawn_run({
+            let (orders, dir) = (orders.clone(), dir.clone());
+            move || conduct(run, in_strips, &orders, &board, &dir)
+        })?;
         Ok((Started { session: dir }, Current { orders, thread }))
     }
 
-    fn prepare_new(&self, params: &RunParams) -> Result<Prepared, RpcError> {
-        let (task, report) = self.foresee(&params.plan)?;
+    /// Whether disk and memory suffice; `instead` is what to do where memory does not.
+    fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
                 "the session needs {} MB, {} has {} MB: free some space or give the daemon another --data",
@@ -229,42 +311,63 @@ impl Runner {
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
         if report.memory_bytes > report.memory_free_bytes {
-            let (at_least, instead) = match task.is_film() {
-                true => ("", "take fewer settings"),
-                false => (" even some camera rows at a time", "make shorter sequences"),
-            };
             let what = format!(
-                "the run needs {} MB of memory{at_least}, {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
+                "the run needs {} MB of memory, {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
                 report.memory_bytes / 1_000_000,
                 report.memory_free_bytes / 1_000_000
             );
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
+        Ok(())
+    }
+
+    fn create_session(
+        &self,
+        params: &RunParams,
+        kind: PlanKind,
+        name: &str,
+        shape: StackShape,
+        first_row: usize,
+        rig_text: &str,
+    ) -> Result<(Session, Ledger), RpcError> {
         let entry = SessionEntry {
             format: raysweep_session::ledger::FORMAT,
-            name: task.plan.name.clone(),
-            kind: if task.is_film() { "film" } else { "sweep" }.into(),
+            name: name.into(),
+            kind: kind.name().into(),
             operator: params.operator.clone(),
             sample: params.sample.clone(),
             note: params.note.clone(),
             tags: params.tags.clone(),
             created: jiff::Timestamp::now(),
             software: crate::SOFTWARE.into(),
-            shape: StackShape {
-                points: task.points(),
-                settings: if task.is_film() { task.settings().count() } else { 0 },
-                exposures: task.schedule.dark_len(),
-                rows: self.camera.height,
-                columns: self.camera.width,
-            },
-            first_row: self.rig.first_row(&self.camera),
+            shape,
+            first_row,
         };
-        let (session, ledger) = Session::create(&self.data, entry, &params.plan, &self.rig.text)
-            .map_err(|error| storage(&error))?;
+        Session::create(&self.data, entry, &params.plan, rig_text).map_err(|error| storage(&error))
+    }
+
+    fn prepare_new(&self, rig: &Rig, params: &RunParams) -> Result<Prepared, RpcError> {
+        let (task, report) = self.foresee(rig, &params.plan)?;
+        let instead = match task.is_film() {
+            true => "take fewer settings",
+            false => "even some camera rows at a time; make shorter sequences",
+        };
+        self.check_room(&report, instead)?;
+        let shape = StackShape {
+            points: task.points(),
+            settings: if task.is_film() { task.settings().count() } else { 0 },
+            dots: 0,
+            exposures: task.schedule.dark_len(),
+            rows: self.camera.height,
+            columns: self.camera.width,
+        };
+        let first_row = rig.first_row(&self.camera);
+        let (session, ledger) =
+            self.create_session(params, task.plan.kind, &task.plan.name, shape, first_row, &rig.text)?;
         Ok(Prepared { task: Arc::new(task), session, ledger, plan_text: params.plan.clone(), resumed: false })
     }
 
-    fn prepare_resumed(&self, params: &ResumeParams) -> Result<Prepared, RpcError> {
+    fn prepare_resumed(&self, rig: &Rig, params: &ResumeParams) -> Result<Prepared, RpcError> {
         let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
         let session =
             Session::open(&self.data.join(&params.session)).map_err(|error| no_session(error.to_string()))?;
@@ -273,7 +376,7 @@ impl Runner {
                 .map_err(|error| no_session(format!("cannot read {}: {error}", path.display())))
         };
         let plan_text = read(session.plan_path())?;
-        if read(session.rig_path())? != self.rig.text {
+        if read(session.rig_path())? != rig.text {
             return Err(no_session(format!(
                 "{} was taken on another rig file than the daemon's: start the daemon with {}",
                 session.dir().display(),
@@ -289,8 +392,58 @@ impl Runner {
         }
         let ledger = session.resume().map_err(|error| storage(&error))?;
         let entry = &ledger.state().session;
-        let task = Task::new(plan, &self.rig.file, entry.first_row, (entry.shape.rows, entry.shape.columns));
+        let task = Task::new(plan, &rig.file, entry.first_row, (entry.shape.rows, entry.shape.columns));
         Ok(Prepared { task: Arc::new(task), session, ledger, plan_text, resumed: true })
+    }
+}
+
+fn spawn_run(run: impl FnOnce() + Send + 'static) -> Result<JoinHandle<()>, RpcError> {
+    thread::Builder::new()
+        .name("run".into())
+        .spawn(run)
+        .map_err(|error| RpcError::new(ErrorCode::Internal, format!("no thread for the run: {error}")))
+}
+
+/// The run's thread on a dot rig; see [`conduct`].
+fn conduct_batches(run: DotRun, orders: &Orders, board: &Board, dir: &Path) {
+    let task = run.task.clone();
+    let rig = run.rig.clone();
+    tracing::info!(session = %dir.display(), "run begins");
+    let ended = catch_unwind(AssertUnwindSafe(|| -> Result<(EndEntry, Vec<String>), RunError> {
+        let dots::Acquired { session, mut ledger, mut problems, fault } = run.acquire()?;
+        let stored = ledger.state().stored_points();
+        let state = match &fault {
+            Some(_) => EndState::Faulted,
+            None if orders.now() == Order::Cancel => EndState::Cancelled,
+            None => EndState::Complete,
+        };
+        let missing = task.batches().total() - stored;
+        let end =
+            EndEntry { error: fault.map(|fault| fault.to_string()), ..end_entry(state, stored, missing) };
+        ledger.append(&Entry::End(end.clone()))?;
+        if state == EndState::Complete {
+            let made =
+                dot_rig::make(&session, ledger.state(), &task, &rig.file, &task.specs, problems, &|| {
+                    orders.go_on()
+                })?;
+            problems = made.problems;
+        }
+        Ok((end, problems))
+    }))
+    .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
+    finish(ended, task.batches().total(), board, dir);
+}
+
+fn end_entry(state: EndState, stored: usize, missing: usize) -> EndEntry {
+    EndEntry {
+        state,
+        error: None,
+        stored,
+        missing,
+        vsync: None,
+        final_s: None,
+        light_s: None,
+        settings_latency: None,
     }
 }
 
@@ -308,22 +461,16 @@ fn conduct(run: Run, in_strips: bool, orders: &Orders, board: &Board, dir: &Path
         }
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
+    finish(ended, task.points(), board, dir);
+}
+
+/// Says how a run of so many points ended.
+fn finish(ended: Result<(EndEntry, Vec<String>), RunError>, points: usize, board: &Board, dir: &Path) {
     let (end, warnings) = ended.unwrap_or_else(|error| {
-        let points = task.points();
         let stored = Session::open(dir).and_then(|session| session.state());
         let stored = stored.map_or(0, |state| state.stored_points());
-        let error = Some(error.to_string());
-        let end = EndEntry {
-            state: EndState::Faulted,
-            error,
-            stored,
-            missing: points - stored,
-            vsync: None,
-            final_s: None,
-            light_s: None,
-            settings_latency: None,
-        };
-        (end, Vec::new())
+        let end = end_entry(EndState::Faulted, stored, points - stored);
+        (EndEntry { error: Some(error.to_string()), ..end }, Vec::new())
     });
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
@@ -448,13 +595,21 @@ fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) 
 
 impl Control for Runner {
     fn status(&self) -> Status {
-        Status { mirror: mirror::status(&self.data), ..self.board.status() }
+        let guard = match &self.rig {
+            Bench::Plane(_) => mirror::light_guard(&self.data, None),
+            Bench::Dots(rig) => rig.light_guard(&self.data),
+        };
+        Status { mirror: mirror::status(&self.data, &guard), ..self.board.status() }
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
-        let (task, mut report) = self.foresee(plan)?;
+        let rig = match &self.rig {
+            Bench::Plane(rig) => rig,
+            Bench::Dots(rig) => return Ok(self.foresee_batches(rig, plan)?.1),
+        };
+        let (task, mut report) = self.foresee(rig, plan)?;
         if !task.is_film() {
-            match advice::advise(&task, &self.rig.file, &self.camera) {
+            match advice::advise(&task, &rig.file, &self.camera) {
                 Ok(advice) => report.advice = Some(advice),
                 Err(none) => report.warnings.push(none.to_string()),
             }
@@ -463,11 +618,20 @@ impl Control for Runner {
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
-        self.start(|| self.prepare_new(&params))
+        self.start(|| match &self.rig {
+            Bench::Plane(rig) => self.spawn(rig, self.prepare_new(rig, &params)?),
+            Bench::Dots(rig) => self.begin_batches(rig, &params),
+        })
     }
 
     fn resume(&self, params: ResumeParams) -> Result<Started, RpcError> {
-        self.start(|| self.prepare_resumed(&params))
+        self.start(|| match &self.rig {
+            Bench::Plane(rig) => self.spawn(rig, self.prepare_resumed(rig, &params)?),
+            Bench::Dots(_) => {
+                let what = "batches cannot be resumed: their time has passed. `raysweep process` makes the products of those that are there; run the plan again for more";
+                Err(RpcError::new(ErrorCode::NoSession, what))
+            }
+        })
     }
 
     fn pause(&self) -> Result<(), RpcError> {

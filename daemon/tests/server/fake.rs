@@ -139,6 +139,7 @@ pub fn report() -> CheckReport {
             }),
         }),
         film: None,
+        batches: None,
         warnings: vec!["few points".into()],
     }
 }

@@ -1,4 +1,5 @@
 //! Cameras.
 
 pub mod aravis;
+pub mod replay;
 pub mod v4l2;

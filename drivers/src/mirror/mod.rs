@@ -13,6 +13,7 @@ mod park;
 pub mod playzerx;
 mod points;
 pub(crate) mod port;
+mod rules;
 mod sequence;
 mod state;
 pub mod wire;

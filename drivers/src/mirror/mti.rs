@@ -4,10 +4,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use raysweep_core::{
-    DeviceError, DeviceErrorKind, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath,
-    MirrorPoint, MirrorProgress, Tilt,
-};
+use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorLimits, MirrorPoint, Tilt};
 
 use super::light::LightGuard;
 use super::points::{self, PointController, PointMirror};
@@ -208,9 +205,9 @@ impl PointController for MtiLine {
 }
 
 /// A mirror behind an MTI controller.
-pub struct Mti(PointMirror<MtiLine>);
+pub type Mti = PointMirror<MtiLine>;
 
-impl Mti {
+impl PointMirror<MtiLine> {
     /// Opens the controller, sets the drive and switches the high voltage on. A mirror that a crashed process has left
     /// somewhere is parked first.
     ///
@@ -220,7 +217,7 @@ impl Mti {
         let MtiConfig { port, drive, most, full_scale, limits, state, light } = config;
         drive.check(&most)?;
         let reach = Reach::Mti { port: port.clone(), full_scale };
-        let mirror = PointMirror::open(&state, limits, light, reach, || {
+        PointMirror::open_with(&state, limits, light, reach, || {
             let (mut line, model) = MtiLine::enter(&port, full_scale)?;
             // The drive can be set only with the high voltage off.
             line.tell(MtiCommand::Disable, ENABLE_WAIT)?;
@@ -230,26 +227,7 @@ impl Mti {
             line.tell(MtiCommand::Enable, ENABLE_WAIT)?;
             line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
             Ok((line, model))
-        })?;
-        Ok(Self(mirror))
-    }
-}
-
-impl Mirror for Mti {
-    fn capabilities(&self) -> &MirrorCapabilities {
-        self.0.capabilities()
-    }
-    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
-        self.0.load(path)
-    }
-    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
-        self.0.start(batches)
-    }
-    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
-        self.0.feed()
-    }
-    fn park(&mut self) -> Result<(), DeviceError> {
-        self.0.park()
+        })
     }
 }
 

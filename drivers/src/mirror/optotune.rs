@@ -5,10 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use raysweep_core::{
-    DeviceError, DeviceErrorKind, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath, MirrorPoint,
-    MirrorProgress, Tilt,
-};
+use raysweep_core::{DeviceError, DeviceErrorKind, MirrorLimits, MirrorPoint, Tilt};
 
 use super::light::LightGuard;
 use super::points::{self, PointController, PointMirror};
@@ -194,9 +191,9 @@ impl PointController for OptotuneLine {
 }
 
 /// An MR-E-2.
-pub struct Optotune(PointMirror<OptotuneLine>);
+pub type Optotune = PointMirror<OptotuneLine>;
 
-impl Optotune {
+impl PointMirror<OptotuneLine> {
     /// Opens the controller. A mirror that a crashed process has left somewhere is parked first.
     ///
     /// # Errors
@@ -204,30 +201,11 @@ impl Optotune {
     pub fn open(config: OptotuneConfig, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
         let OptotuneConfig { port, laser_port, limits, state, light } = config;
         let reach = Reach::Optotune { port: port.clone(), laser_port };
-        let mirror = PointMirror::open(&state, limits, light, reach, || {
+        PointMirror::open_with(&state, limits, light, reach, || {
             let mut line = OptotuneLine::open(&port, laser)?;
             line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
             Ok((line, "Optotune MR-E-2".into()))
-        })?;
-        Ok(Self(mirror))
-    }
-}
-
-impl Mirror for Optotune {
-    fn capabilities(&self) -> &MirrorCapabilities {
-        self.0.capabilities()
-    }
-    fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
-        self.0.load(path)
-    }
-    fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
-        self.0.start(batches)
-    }
-    fn feed(&mut self) -> Result<MirrorProgress, DeviceError> {
-        self.0.feed()
-    }
-    fn park(&mut self) -> Result<(), DeviceError> {
-        self.0.park()
+        })
     }
 }
 

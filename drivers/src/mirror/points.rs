@@ -12,6 +12,7 @@ use raysweep_core::{
 use super::light::LightGuard;
 use super::park::park_left;
 use super::port::fault;
+use super::rules;
 use super::sequence::Sequence;
 use super::state::{MirrorState, Reach, Sent, StateFile, of_state};
 
@@ -128,7 +129,7 @@ impl Pace {
 impl<C: PointController> PointMirror<C> {
     /// Takes the lock, parks what a crashed process has left, then opens the controller with `open`, which returns it
     /// with its name.
-    pub(super) fn open(
+    pub(super) fn open_with(
         state: &Path,
         limits: MirrorLimits,
         light: LightGuard,
@@ -158,8 +159,7 @@ impl<C: PointController> PointMirror<C> {
 
     fn load_fallibly(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
         let limits = self.capabilities.limits;
-        let path = MirrorPath::new(path.points().to_vec(), path.rate_hz(), &limits)
-            .map_err(|error| fault(DeviceErrorKind::OutOfRange, error.to_string()))?;
+        let path = rules::fitting(path, &limits)?;
         let rate_hz = path.rate_hz();
         if !C::RATE_HZ.contains(&rate_hz) {
             let (low, high) = C::RATE_HZ.into_inner();
@@ -175,10 +175,7 @@ impl<C: PointController> PointMirror<C> {
 
     fn feed_fallibly(&mut self) -> Result<MirrorProgress, DeviceError> {
         let Phase::Moving(pace) = &mut self.phase else {
-            return Err(fault(
-                DeviceErrorKind::NotReady,
-                "nothing is being played: load a path and start it",
-            ));
+            return Err(rules::nothing_played());
         };
         let lit = pace.sequence.is_lit() && pace.first.is_some();
         if pace.sequence.is_lit() && pace.light_checked.elapsed() >= LIGHT_CHECK {
@@ -223,15 +220,8 @@ impl<C: PointController> Mirror for PointMirror<C> {
     }
 
     fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
-        let Phase::Ready(path) = &self.phase else {
-            return Err(fault(DeviceErrorKind::NotReady, "no path is loaded: load one before each start"));
-        };
-        if batches == 0 {
-            return Err(fault(DeviceErrorKind::OutOfRange, "batches = 0: play the path once at least"));
-        }
-        if path.is_lit() {
-            self.light.permits().map_err(|no| fault(DeviceErrorKind::NotReady, no.to_string()))?;
-        }
+        let Phase::Ready(path) = &self.phase else { return Err(rules::nothing_loaded()) };
+        rules::may_start(path, batches, &self.light)?;
         let rate_hz = path.rate_hz();
         let sequence = Sequence::play(path, batches, &self.capabilities.limits);
         self.record(rate_hz, Some(&sequence)).map_err(|error| self.park_after(error))?;

@@ -206,7 +206,7 @@ impl MirrorReport {
             Ok(None) => (true, false),
             Ok(Some((state, sent))) => match state.playing {
                 None => (true, false),
-                Some(sequence) => (false, sequence.of_path(sent.possibly) > 0),
+                Some(sequence) => (false, sequence.is_lit() && sequence.of_path(sent.possibly) > 0),
             },
             Err(_) => (false, true),
         };

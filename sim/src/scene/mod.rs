@@ -21,7 +21,7 @@ mod npz;
 mod projector;
 mod quadrature;
 mod slab;
-mod texture;
+pub(crate) mod texture;
 mod translucent;
 mod vector;
 

@@ -31,7 +31,7 @@ impl Dice {
 }
 
 /// A printed page: paragraphs of text and coloured pictures on paper, `[rows, columns, 3]` linear RGB albedo.
-pub(super) fn printed_page(rows: usize, columns: usize, seed: u64) -> Array3<f32> {
+pub(crate) fn printed_page(rows: usize, columns: usize, seed: u64) -> Array3<f32> {
     let mut dice = Dice::new(seed);
     let mut page = Array3::from_shape_fn((rows, columns, 3), |(y, x, c)| {
         PAPER[c] * (0.97 + 0.03 * noise(seed, x as f64 / 3.0, y as f64 / 3.0) as f32)
@@ -112,7 +112,7 @@ fn paint_picture(
 }
 
 /// Smooth noise in 0..1 over a unit lattice (value noise).
-pub(super) fn noise(seed: u64, x: f64, y: f64) -> f64 {
+pub(crate) fn noise(seed: u64, x: f64, y: f64) -> f64 {
     let (x0, y0) = (x.floor(), y.floor());
     let fade = |f: f64| f * f * (3.0 - 2.0 * f);
     let (fx, fy) = (fade(x - x0), fade(y - y0));

@@ -13,7 +13,7 @@ fn session() -> SessionEntry {
         tags: vec!["a".into(), "b".into()],
         created: "2026-03-04T05:06:07.25Z".parse().unwrap(),
         software: "raysweep 0.1.0".into(),
-        shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0 },
+        shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0, dots: 0 },
         first_row: 0,
     }
 }

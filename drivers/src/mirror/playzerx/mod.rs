@@ -21,6 +21,7 @@ use self::stream::Stream;
 use super::light::LightGuard;
 use super::park::park_left;
 use super::port::{Port, fault};
+use super::rules;
 use super::sequence::Sequence;
 use super::state::{MirrorState, Reach, Sent, StateFile, of_state};
 
@@ -157,9 +158,7 @@ impl PlayzerX {
 
     fn load_fallibly(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
         let limits = self.config.limits;
-        // The path may have been made for another mirror.
-        let path = MirrorPath::new(path.points().to_vec(), path.rate_hz(), &limits)
-            .map_err(|error| fault(DeviceErrorKind::OutOfRange, error.to_string()))?;
+        let path = rules::fitting(path, &limits)?;
         let rate_hz = path.rate_hz();
         if rate_hz.fract() != 0.0 || !self.capabilities.rate_hz.contains(&rate_hz) {
             let (low, high) = self.capabilities.rate_hz.clone().into_inner();
@@ -200,10 +199,7 @@ impl PlayzerX {
 
     fn feed_fallibly(&mut self) -> Result<MirrorProgress, DeviceError> {
         let Phase::Moving(stream) = &mut self.phase else {
-            return Err(fault(
-                DeviceErrorKind::NotReady,
-                "nothing is being played: load a path and start it",
-            ));
+            return Err(rules::nothing_played());
         };
         if stream.has_light() && stream.light_checked.elapsed() >= LIGHT_CHECK {
             self.config.light.permits().map_err(|no| fault(DeviceErrorKind::NotReady, no.to_string()))?;
@@ -238,15 +234,8 @@ impl Mirror for PlayzerX {
     }
 
     fn start(&mut self, batches: u32) -> Result<(), DeviceError> {
-        let Phase::Ready(path) = &self.phase else {
-            return Err(fault(DeviceErrorKind::NotReady, "no path is loaded: load one before each start"));
-        };
-        if batches == 0 {
-            return Err(fault(DeviceErrorKind::OutOfRange, "batches = 0: play the path once at least"));
-        }
-        if path.is_lit() {
-            self.config.light.permits().map_err(|no| fault(DeviceErrorKind::NotReady, no.to_string()))?;
-        }
+        let Phase::Ready(path) = &self.phase else { return Err(rules::nothing_loaded()) };
+        rules::may_start(path, batches, &self.config.light)?;
         let rate_hz = path.rate_hz();
         let sequence = Sequence::play(path, batches, &self.config.limits);
         self.record(&sequence, rate_hz).map_err(|error| self.park_after(error))?;

@@ -1,0 +1,79 @@
+//! Which background a frame is denoised with.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+
+use raysweep_transport::dots::Background;
+
+/// Backgrounds by epoch, as many frames each as a batch has. That of an epoch is known when all frames up to the one
+/// before the last epoch are decided: whoever asks earlier waits. So it never depends on the threads.
+pub(super) struct Backgrounds {
+    frames_per_epoch: u64,
+    known: Mutex<Known>,
+    changed: Condvar,
+}
+
+struct Known {
+    first_epoch: u64,
+    backgrounds: VecDeque<Arc<Background>>,
+    /// Nothing is decided any more: the last one serves.
+    closed: bool,
+}
+
+/// Epochs that may be worked on at once: frames of one, and stragglers of the one before.
+const KEPT: usize = 3;
+
+impl Backgrounds {
+    /// With what serves the first two epochs.
+    pub fn new(frames_per_epoch: u64, first: Arc<Background>) -> Self {
+        let backgrounds = VecDeque::from([first.clone(), first]);
+        let known = Known { first_epoch: 0, backgrounds, closed: false };
+        Self { frames_per_epoch, known: Mutex::new(known), changed: Condvar::new() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Known> {
+        self.known.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub fn epoch_of(&self, arrival: u64) -> u64 {
+        arrival / self.frames_per_epoch
+    }
+
+    /// The background of an epoch; waits until it is known.
+    pub fn of(&self, epoch: u64) -> Option<Arc<Background>> {
+        let mut known = self.lock();
+        loop {
+            let at = epoch.saturating_sub(known.first_epoch) as usize;
+            if let Some(background) = known.backgrounds.get(at) {
+                return Some(background.clone());
+            }
+            if known.closed {
+                return known.backgrounds.back().cloned();
+            }
+            known = self.changed.wait(known).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    /// Frame `arrival` and all before it are decided; `next` tells the background of the epoch after the next, if one
+    /// begins; none: as before.
+    pub fn decided(&self, arrival: u64, next: impl FnOnce() -> Option<Arc<Background>>) {
+        if !(arrival + 1).is_multiple_of(self.frames_per_epoch) {
+            return;
+        }
+        let fresh = next();
+        let mut known = self.lock();
+        if let Some(background) = fresh.or_else(|| known.backgrounds.back().cloned()) {
+            known.backgrounds.push_back(background);
+        }
+        while known.backgrounds.len() > KEPT {
+            known.backgrounds.pop_front();
+            known.first_epoch += 1;
+        }
+        self.changed.notify_all();
+    }
+
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_all();
+    }
+}

@@ -1,0 +1,281 @@
+//! The threads: `dots-N` make columns of frames, `dots` puts them in order and cuts them into batches.
+
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+
+use raysweep_core::{Frame, LossCause, PixelFormat};
+use raysweep_transport::dots::{
+    Background, BackgroundMean, Correction, DotsError, NoiseFloor, Observation, SparseColumn,
+};
+
+use super::background::Backgrounds;
+use super::gather::{CutSink, Gatherer, Looked, Scan};
+use super::stage::{ColumnStage, ColumnWorker};
+use crate::pipeline::{PipelineError, message_of};
+use crate::queue::{Input, Policy};
+
+/// Exposures in a row of which no frame came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Loss {
+    /// How many.
+    pub frames: u64,
+    /// Why.
+    pub cause: LossCause,
+}
+
+/// A frame, and what was lost since the one before.
+pub struct Arrival {
+    /// The frame; its id is `stamp.seq`.
+    pub frame: Frame,
+    /// Mostly nothing.
+    pub lost_before: Vec<Loss>,
+}
+
+/// How frames become batches.
+pub struct DotsFlowConfig {
+    /// What is scanned.
+    pub scan: Scan,
+    /// How frames are packed.
+    pub format: PixelFormat,
+    /// Counts from which on a pixel is overexposed.
+    pub saturation_dn: u16,
+    /// What makes columns of them.
+    pub stage: Arc<dyn ColumnStage>,
+    /// What the stage knows of the sensor.
+    pub correction: Correction,
+    /// The background so far.
+    pub background: BackgroundMean,
+    /// Noise above it.
+    pub floor: NoiseFloor,
+    /// Threads that make columns; 0: one a processor.
+    pub threads: usize,
+    /// Frames that may wait for them.
+    pub queue_frames: usize,
+    /// What happens to a frame when so many do.
+    pub policy: Policy,
+}
+
+/// Frames on their way to batches. It ends when every clone of its [`Input`] is dropped.
+pub struct DotsFlow<S> {
+    workers: Vec<JoinHandle<()>>,
+    gatherer: JoinHandle<Gathered<S>>,
+    is_blind: Arc<AtomicBool>,
+}
+
+/// What a flow leaves behind.
+pub struct Gathered<S> {
+    /// Where the batches went.
+    pub sink: S,
+    /// The background by now.
+    pub background: BackgroundMean,
+    /// Why the stream could not be cut.
+    pub error: Option<DotsError>,
+}
+
+/// The frames' queue, and the number of the next.
+struct Source {
+    frames: Receiver<Arrival>,
+    next: u64,
+}
+
+/// What the workers share.
+struct Shop {
+    source: Mutex<Source>,
+    backgrounds: Backgrounds,
+    /// Columns whose memory is free.
+    spare: Mutex<Vec<SparseColumn>>,
+    scan: Scan,
+    format: PixelFormat,
+    saturation_dn: u16,
+    floor: NoiseFloor,
+}
+
+type Numbered = (u64, Looked);
+
+impl<S: CutSink + 'static> DotsFlow<S> {
+    /// Starts the threads; frames go into the returned input.
+    ///
+    /// # Errors
+    /// When the system gives no thread, or the background does not fit the frames.
+    pub fn start(config: DotsFlowConfig, sink: S) -> Result<(Self, Input<Arrival>), PipelineError> {
+        let DotsFlowConfig {
+            scan, format, saturation_dn, stage, correction, background, floor, policy, ..
+        } = config;
+        let threads = match config.threads {
+            0 => thread::available_parallelism().map_or(1, usize::from),
+            threads => threads,
+        };
+        let prepared = Background::new(&correction, background.mean())
+            .map_err(|error| PipelineError::Spawn { name: "dots", source: error.into() })?;
+        let (input, frames) = Input::new(config.queue_frames, policy);
+        let shop = Arc::new(Shop {
+            source: Mutex::new(Source { frames, next: 0 }),
+            backgrounds: Backgrounds::new(u64::from(scan.dots), Arc::new(prepared)),
+            spare: Mutex::default(),
+            scan: scan.clone(),
+            format,
+            saturation_dn,
+            floor,
+        });
+        let is_blind = Arc::new(AtomicBool::new(false));
+        let (done, looked) = sync_channel::<Numbered>(config.queue_frames + threads);
+        let mut gatherer = Gatherer::new(scan, format, background, sink);
+        let gatherer = spawn("dots".into(), {
+            let shop = shop.clone();
+            let is_blind = is_blind.clone();
+            move || {
+                let _closing = Closing(&shop.backgrounds);
+                let error = gather(&mut gatherer, &shop, &correction, &looked, &is_blind).err();
+                let Gatherer { sink, background, .. } = gatherer;
+                Gathered { sink, background, error }
+            }
+        })?;
+        let workers = (0..threads).map(|index| {
+            let (shop, done, mut worker) = (shop.clone(), done.clone(), stage.worker());
+            spawn(format!("dots-{index}"), move || shop.work(&mut *worker, &done))
+        });
+        let workers = workers.collect::<Result<_, _>>()?;
+        Ok((Self { workers, gatherer, is_blind }, input))
+    }
+
+    /// Set when the trailing dot is not seen where it should be: what still comes is counted and thrown away.
+    pub fn is_blind(&self) -> Arc<AtomicBool> {
+        self.is_blind.clone()
+    }
+
+    /// Waits for the end of everything sent.
+    ///
+    /// # Errors
+    /// When a thread panicked.
+    pub fn join(self) -> Result<Gathered<S>, PipelineError> {
+        let worked = self.workers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
+        let gathered = self.gatherer.join().map_err(|_panic| PipelineError::Panicked("dots"))?;
+        if worked > 0 { Err(PipelineError::Panicked("dots worker")) } else { Ok(gathered) }
+    }
+}
+
+/// Lets workers that wait for a background go, also when the gatherer panics.
+struct Closing<'a>(&'a Backgrounds);
+
+impl Drop for Closing<'_> {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+fn spawn<T: Send + 'static>(
+    name: String,
+    body: impl FnOnce() -> T + Send + 'static,
+) -> Result<JoinHandle<T>, PipelineError> {
+    let spawned = thread::Builder::new().name(name).spawn(body);
+    spawned.map_err(|source| PipelineError::Spawn { name: "dots", source: source.into() })
+}
+
+impl Shop {
+    /// Takes frames in turn until there are no more.
+    fn work(&self, worker: &mut dyn ColumnWorker, done: &SyncSender<Numbered>) {
+        let mut unpacked = Vec::new();
+        let mut background: Option<(u64, Arc<Background>)> = None;
+        loop {
+            let (number, Arrival { frame, lost_before }) = {
+                let mut source = self.source.lock().unwrap_or_else(PoisonError::into_inner);
+                let Ok(arrival) = source.frames.recv() else { return };
+                source.next += 1;
+                (source.next - 1, arrival)
+            };
+            let epoch = self.backgrounds.epoch_of(number);
+            if background.as_ref().is_none_or(|(of, _)| *of != epoch) {
+                background = self.backgrounds.of(epoch).map(|background| (epoch, background));
+            }
+            let Some((_, background)) = &background else { return };
+            let (seen, column) = self.look(worker, &frame, &mut unpacked, background);
+            if done.send((number, Looked { seen, column, frame, lost_before })).is_err() {
+                return;
+            }
+        }
+    }
+
+    fn look(
+        &self,
+        worker: &mut dyn ColumnWorker,
+        frame: &Frame,
+        unpacked: &mut Vec<u16>,
+        background: &Background,
+    ) -> (Observation, Result<SparseColumn, String>) {
+        // Of a frame that cannot be read nothing is seen.
+        let unseen = Observation { id: frame.stamp.seq, energy: 0, saturated: true };
+        let counts = match counts_of(frame, self.format, unpacked, self.scan.shape.values()) {
+            Ok(counts) => counts,
+            Err(problem) => return (unseen, Err(problem)),
+        };
+        let Scan { shape, trailing_region, .. } = &self.scan;
+        let seen = Observation::new(frame.stamp.seq, counts, *shape, trailing_region, self.saturation_dn);
+        let mut column = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        let made =
+            catch_unwind(AssertUnwindSafe(|| worker.column(counts, background, self.floor, &mut column)));
+        let made = match made {
+            Ok(Ok(())) => Ok(column),
+            Ok(Err(error)) => Err(error.to_string()),
+            Err(panic) => Err(format!("panicked: {}", message_of(&*panic))),
+        };
+        (seen.unwrap_or(unseen), made)
+    }
+}
+
+/// A frame's counts: as they lie there where they are 16 bits wide already.
+fn counts_of<'a>(
+    frame: &'a Frame,
+    format: PixelFormat,
+    unpacked: &'a mut Vec<u16>,
+    values: usize,
+) -> Result<&'a [u16], String> {
+    let is_wide = cfg!(target_endian = "little") && format.bits() > 8 && format.frame_bytes(4) == 8;
+    if is_wide
+        && let Ok(counts) = bytemuck::try_cast_slice::<u8, u16>(&frame.data)
+        && counts.len() == values
+    {
+        return Ok(counts);
+    }
+    unpacked.resize(values, 0);
+    format.unpack_into(&frame.data, unpacked).map_err(|error| error.to_string())?;
+    Ok(unpacked)
+}
+
+/// Puts what the workers send back into the order of the frames.
+fn gather<S: CutSink>(
+    gatherer: &mut Gatherer<S>,
+    shop: &Shop,
+    correction: &Correction,
+    looked: &Receiver<Numbered>,
+    is_blind: &AtomicBool,
+) -> Result<(), DotsError> {
+    let mut early: VecDeque<Option<Looked>> = VecDeque::new();
+    let mut next = 0;
+    let mut spare = |column| shop.spare.lock().unwrap_or_else(PoisonError::into_inner).push(column);
+    let mut cut = Ok(());
+    for (number, frame) in looked {
+        let place = (number - next) as usize;
+        if early.len() <= place {
+            early.resize_with(place + 1, || None);
+        }
+        early[place] = Some(frame);
+        while let Some(frame) = early.front_mut().and_then(Option::take) {
+            early.pop_front();
+            if let Err(error) = gatherer.take(frame, &mut spare) {
+                is_blind.store(true, Ordering::Relaxed);
+                cut = Err(error);
+            }
+            shop.backgrounds.decided(next, || {
+                let mean = gatherer.changed_background()?;
+                Background::new(correction, mean).map(Arc::new).ok()
+            });
+            next += 1;
+        }
+    }
+    let finished = gatherer.finish(&mut spare);
+    cut.and(finished)
+}

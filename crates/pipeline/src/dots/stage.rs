@@ -1,0 +1,274 @@
+//! Stages that make a column of a frame, by the names that plans use.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use raysweep_transport::dots::{
+    Background, Correction, DenoiseSettings, Denoiser, DotsError, NoiseFloor, Region, Scratch, SparseColumn,
+    StopRule, reference,
+};
+use serde::Deserialize;
+use serde_json::Value;
+
+use crate::registry::RegistryError;
+
+/// Makes sparse columns of raw frames.
+pub trait ColumnStage: Send + Sync {
+    /// What one thread works with, from frame to frame.
+    fn worker(&self) -> Box<dyn ColumnWorker>;
+}
+
+/// One thread's part of a [`ColumnStage`].
+pub trait ColumnWorker: Send {
+    /// Makes the column of a raw frame `[height, width]` in counts.
+    ///
+    /// # Errors
+    /// When the frame cannot be processed; its dot is then lost, with the cause.
+    fn column(
+        &mut self,
+        frame: &[u16],
+        background: &Background,
+        floor: NoiseFloor,
+        column: &mut SparseColumn,
+    ) -> Result<(), DotsError>;
+}
+
+/// Options of `denoise` and `denoise-reference`.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DenoiseOptions {
+    /// Radius of the discs, as large as the dot; left out: 20 of 1024 pixels of the frame's width.
+    pub radius_px: Option<f64>,
+    /// When to stop.
+    pub stop: Stop,
+    /// False discs a frame without light, of the rule `false-alarms`.
+    pub false_alarms: f64,
+    /// Background patch of the rule `printed`: first and last row, first and last column; the last ones are left out.
+    pub patch: [usize; 4],
+    /// Standard deviations of the patch within which the rule `printed` takes what is left for background.
+    pub tolerance: f64,
+    /// Most discs a frame; frames that end here are counted.
+    pub max_discs: u32,
+    /// Whether the light outside of the discs is kept as means of blocks.
+    pub residual: bool,
+}
+
+/// Names of [`StopRule`] in plans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Stop {
+    /// When what is left can be noise.
+    FalseAlarms,
+    /// As the paper prints it.
+    Printed,
+}
+
+impl Default for DenoiseOptions {
+    fn default() -> Self {
+        Self {
+            radius_px: None,
+            stop: Stop::FalseAlarms,
+            false_alarms: 0.05,
+            patch: [0, 32, 0, 32],
+            tolerance: 0.05,
+            max_discs: 64,
+            residual: true,
+        }
+    }
+}
+
+impl DenoiseOptions {
+    fn settings(&self, width_px: usize) -> DenoiseSettings {
+        let [top, bottom, left, right] = self.patch;
+        DenoiseSettings {
+            // A disc that holds the paper's dot of 32 pixels wherever noise puts its brightest one.
+            radius_px: self.radius_px.unwrap_or(20.0 * width_px as f64 / 1024.0),
+            stop: match self.stop {
+                Stop::FalseAlarms => StopRule::FalseAlarms { per_frame: self.false_alarms },
+                Stop::Printed => StopRule::Printed {
+                    patch: Region { rows: top..bottom, columns: left..right },
+                    tolerance: self.tolerance,
+                },
+            },
+            max_discs: self.max_discs,
+        }
+    }
+}
+
+/// The fused pass over a frame.
+struct Fused {
+    denoiser: Arc<Denoiser>,
+    residual: bool,
+}
+
+struct FusedWorker {
+    denoiser: Arc<Denoiser>,
+    scratch: Scratch,
+    residual: bool,
+}
+
+impl ColumnStage for Fused {
+    fn worker(&self) -> Box<dyn ColumnWorker> {
+        let (denoiser, residual) = (self.denoiser.clone(), self.residual);
+        Box::new(FusedWorker { scratch: denoiser.scratch(), denoiser, residual })
+    }
+}
+
+impl ColumnWorker for FusedWorker {
+    fn column(
+        &mut self,
+        frame: &[u16],
+        background: &Background,
+        floor: NoiseFloor,
+        column: &mut SparseColumn,
+    ) -> Result<(), DotsError> {
+        self.denoiser.column(frame, background, floor, &mut self.scratch, column)?;
+        if !self.residual {
+            column.residual.fill(0.0);
+        }
+        Ok(())
+    }
+}
+
+/// The plain reference, which the fused pass must equal.
+#[derive(Clone)]
+struct Plain {
+    correction: Arc<Correction>,
+    settings: DenoiseSettings,
+    residual: bool,
+}
+
+impl ColumnStage for Plain {
+    fn worker(&self) -> Box<dyn ColumnWorker> {
+        Box::new(self.clone())
+    }
+}
+
+impl ColumnWorker for Plain {
+    fn column(
+        &mut self,
+        frame: &[u16],
+        background: &Background,
+        floor: NoiseFloor,
+        column: &mut SparseColumn,
+    ) -> Result<(), DotsError> {
+        *column = reference::column(frame, &self.correction, background, floor, &self.settings)?;
+        if !self.residual {
+            column.residual.fill(0.0);
+        }
+        Ok(())
+    }
+}
+
+type Make = Box<dyn Fn(Value, &Correction) -> Result<Box<dyn ColumnStage>, RegistryError> + Send + Sync>;
+
+/// All column stages that plans may name.
+pub struct DotStages {
+    makers: BTreeMap<&'static str, Make>,
+}
+
+impl Default for DotStages {
+    fn default() -> Self {
+        let mut stages = Self { makers: BTreeMap::new() };
+        stages.register("denoise", |options, correction| {
+            let options: DenoiseOptions = parse("denoise", options)?;
+            let denoiser = denoiser("denoise", &options, correction)?;
+            Ok(Box::new(Fused { denoiser: Arc::new(denoiser), residual: options.residual }))
+        });
+        stages.register("denoise-reference", |options, correction| {
+            let options: DenoiseOptions = parse("denoise-reference", options)?;
+            // The same settings are refused.
+            denoiser("denoise-reference", &options, correction)?;
+            let settings = options.settings(correction.shape().width());
+            let correction = Arc::new(correction.clone());
+            Ok(Box::new(Plain { correction, settings, residual: options.residual }))
+        });
+        stages
+    }
+}
+
+fn parse(name: &str, options: Value) -> Result<DenoiseOptions, RegistryError> {
+    serde_json::from_value(options).map_err(|source| RegistryError::Options { name: name.into(), source })
+}
+
+fn denoiser(
+    name: &str,
+    options: &DenoiseOptions,
+    correction: &Correction,
+) -> Result<Denoiser, RegistryError> {
+    let settings = options.settings(correction.shape().width());
+    Denoiser::new(correction.clone(), settings)
+        .map_err(|error| RegistryError::Invalid { name: name.into(), what: error.to_string() })
+}
+
+impl DotStages {
+    /// Adds a name, or replaces what it stood for.
+    pub fn register(
+        &mut self,
+        name: &'static str,
+        make: impl Fn(Value, &Correction) -> Result<Box<dyn ColumnStage>, RegistryError> + Send + Sync + 'static,
+    ) {
+        self.makers.insert(name, Box::new(make));
+    }
+
+    /// Makes what a plan names.
+    ///
+    /// # Errors
+    /// For unknown names, and options that the stage does not take.
+    pub fn make(
+        &self,
+        name: &str,
+        options: Value,
+        correction: &Correction,
+    ) -> Result<Box<dyn ColumnStage>, RegistryError> {
+        let make = self.makers.get(name).ok_or_else(|| RegistryError::Unknown {
+            name: name.into(),
+            known: self.makers.keys().copied().collect::<Vec<_>>().join(", "),
+        })?;
+        make(options, correction)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_transport::dots::FrameShape;
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn both_stages_make_the_same_column_and_leave_out_the_residual_when_asked() {
+        let shape = FrameShape::new(64, 64, 1).unwrap();
+        let correction = Correction::none(shape);
+        let background = Background::new(&correction, &vec![100.0; shape.pixels()]).unwrap();
+        let floor = NoiseFloor { mean: 0.0, sigma: 3.0 };
+        let mut frame = vec![102; shape.pixels()];
+        (0..5).for_each(|at| frame[64 * 30 + 20 + at] = 900);
+        let column = |name: &str, residual: bool| {
+            let options = json!({ "radius_px": 6.0, "residual": residual });
+            let stage = DotStages::default().make(name, options, &correction).unwrap();
+            let mut column = SparseColumn::default();
+            stage.worker().column(&frame, &background, floor, &mut column).unwrap();
+            column
+        };
+        let fused = column("denoise", true);
+        assert!(!fused.words.is_empty() && fused.residual.iter().all(|&light| light == 2.0));
+        assert_eq!(fused, column("denoise-reference", true));
+        assert!(column("denoise", false).residual.iter().all(|&light| light == 0.0));
+    }
+
+    #[test]
+    fn what_no_stage_takes_is_refused_by_name() {
+        let correction = Correction::none(FrameShape::new(64, 64, 1).unwrap());
+        let refused = |name: &str, options: Value| {
+            DotStages::default().make(name, options, &correction).err().unwrap().to_string()
+        };
+        assert!(refused("demux", json!({})).contains("known are denoise, denoise-reference"));
+        assert!(refused("denoise", json!({ "radius": 3 })).contains("radius"));
+        assert!(refused("denoise", json!({ "radius_px": -1.0 })).contains("radius_px"));
+        assert!(
+            refused("denoise-reference", json!({ "stop": "printed", "patch": [0, 99, 0, 8] }))
+                .contains("rows")
+        );
+    }
+}

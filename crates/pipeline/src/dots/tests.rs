@@ -1,0 +1,252 @@
+use std::sync::Arc;
+
+use raysweep_core::{Counts, Frame, FramePool, FrameStamp, LossCause, PixelFormat};
+use raysweep_transport::dots::{
+    Background, DotsError, FrameShape, NoiseFloor, Region, Sampling, SparseColumn,
+};
+use serde_json::json;
+
+use super::*;
+use crate::queue::Policy;
+
+const DOTS: u32 = 12;
+const WIDTH: usize = 64;
+const HEIGHT: usize = 48;
+const BACKGROUND: u32 = 3;
+const TRAILING: u32 = DOTS - 1;
+
+fn shape() -> FrameShape {
+    FrameShape::new(HEIGHT, WIDTH, 1).unwrap()
+}
+
+fn scan(batches: u32) -> Scan {
+    Scan {
+        shape: shape(),
+        dots: DOTS,
+        trailing_index: TRAILING,
+        trailing_region: Region { rows: 0..8, columns: 56..64 },
+        background_indices: vec![BACKGROUND],
+        batches,
+    }
+}
+
+/// Counts of the frame of a step of the scan: dots wander over the frame, the trailing one lands in its corner.
+fn counts(step: u64) -> Vec<u16> {
+    let mut state = step.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+    let mut counts: Vec<u16> = (0..HEIGHT * WIDTH)
+        .map(|_| {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            100 + (state >> 61) as u16
+        })
+        .collect();
+    let index = (step % u64::from(DOTS)) as usize;
+    let centre = match index as u32 {
+        TRAILING => Some((3, 60)),
+        BACKGROUND => None,
+        _ => Some((12 + 2 * index, 4 + 4 * index)),
+    };
+    for (row, column) in centre.iter().flat_map(|&(row, column)| {
+        (row - 2..row + 3).flat_map(move |row| (column - 2..column + 3).map(move |column| (row, column)))
+    }) {
+        // The scene brightens from batch to batch.
+        counts[row * WIDTH + column] += 500 + 10 * (step / u64::from(DOTS)) as u16;
+    }
+    counts
+}
+
+fn frame(pool: &FramePool, format: PixelFormat, step: u64) -> Frame {
+    let mut data = pool.take();
+    format.pack_into(&counts(step), &mut data).unwrap();
+    let at_ns = step as i64 * 1000;
+    let stamp = FrameStamp {
+        seq: step,
+        device_ns: at_ns,
+        exposure_start_ns: at_ns,
+        host_ns: at_ns + 900,
+        exposure_us: None,
+    };
+    Frame { data, format, stamp }
+}
+
+fn sensor(format: PixelFormat) -> Sensor {
+    let pool = FramePool::new(1, format.frame_bytes(shape().pixels()));
+    let mut run = DarkRun::new(shape(), 4000, 64, 16).unwrap();
+    let mut unpacked = vec![0; shape().pixels()];
+    for number in 0..64 {
+        // The steps of the beam dump are dark.
+        let dark = frame(&pool, format, number * u64::from(DOTS) + u64::from(BACKGROUND));
+        format.unpack_into(&dark.data, &mut unpacked).unwrap();
+        run.push(&unpacked).unwrap();
+    }
+    run.finish(8.0, None, Sampling::Full).unwrap()
+}
+
+#[derive(Default)]
+struct Kept {
+    cuts: Vec<Cut>,
+    outside: Counts,
+    fates: Vec<(u64, Option<(u32, u32)>)>,
+}
+
+impl CutSink for Kept {
+    fn take(&mut self, cut: Cut) {
+        self.cuts.push(cut);
+    }
+
+    fn outside(&mut self, counts: Counts) {
+        self.outside.add(&counts);
+    }
+
+    fn fate(&mut self, _: u64, id: u64, place: Option<(u32, u32)>) {
+        self.fates.push((id, place));
+    }
+}
+
+impl Kept {
+    fn counts(&self) -> Counts {
+        let mut all = self.outside.clone();
+        self.cuts.iter().for_each(|cut| all.add(&cut.counts));
+        all
+    }
+}
+
+/// Sends the frames of these steps through a flow, with what was lost before each.
+fn cut(
+    format: PixelFormat,
+    stage: Arc<dyn ColumnStage>,
+    threads: usize,
+    batches: u32,
+    steps: impl IntoIterator<Item = (u64, Vec<Loss>)>,
+) -> Gathered<Kept> {
+    let Sensor { correction, background, floor } = sensor(format);
+    let config = DotsFlowConfig {
+        scan: scan(batches),
+        format,
+        saturation_dn: 4000,
+        stage,
+        correction,
+        background,
+        floor,
+        threads,
+        queue_frames: 4,
+        policy: Policy::Wait,
+    };
+    let (flow, input) = DotsFlow::start(config, Kept::default()).unwrap();
+    let pool = FramePool::new(40, format.frame_bytes(shape().pixels()));
+    for (step, lost_before) in steps {
+        let arrival = Arrival { frame: frame(&pool, format, step), lost_before };
+        assert!(input.send(arrival).is_ok());
+    }
+    drop(input);
+    flow.join().unwrap()
+}
+
+fn denoise(format: PixelFormat) -> Arc<dyn ColumnStage> {
+    let correction = sensor(format).correction;
+    DotStages::default().make("denoise", json!({ "radius_px": 5.0 }), &correction).unwrap().into()
+}
+
+fn whole(steps: std::ops::Range<u64>) -> impl Iterator<Item = (u64, Vec<Loss>)> {
+    steps.map(|step| (step, Vec::new()))
+}
+
+#[test]
+fn every_frame_becomes_the_column_of_its_dot_whatever_the_threads_and_the_packing() {
+    let format = PixelFormat::Mono12;
+    let kept = cut(format, denoise(format), 1, 8, whole(5..DOTS.into()).chain(whole(12..9 * 12 + 5)));
+    assert!(kept.error.is_none());
+    let Kept { cuts, fates, .. } = &kept.sink;
+    assert_eq!(cuts.iter().map(|cut| cut.batch).collect::<Vec<_>>(), (0..8).collect::<Vec<_>>());
+    for (id, place) in fates.iter().filter_map(|(id, place)| Some((id, place.as_ref()?))) {
+        assert_eq!((u64::from(place.0) + 1) * 12 + u64::from(place.1), *id);
+    }
+    for cut in cuts {
+        let scene: Vec<bool> = (0..DOTS).map(|index| scan(8).is_scene(index)).collect();
+        assert_eq!((&cut.seen, cut.counts.averaged), (&scene, 12));
+        let words = &cut.columns.word_offsets;
+        for (index, is_scene) in scene.into_iter().enumerate() {
+            assert_eq!(words[index + 1] > words[index], is_scene, "dot {index}");
+        }
+    }
+    // From the first trailing dot on every dump is mixed in, as soon as where it comes is known.
+    assert!(kept.background.seen() > 56 + 5, "{}", kept.background.seen());
+    let counts = kept.sink.counts();
+    assert!(counts.balanced() && counts.averaged == 96 && counts.lost.is_empty(), "{counts:?}");
+    assert_eq!((counts.settling, counts.cancelled), (7, 5));
+
+    for (threads, format) in [(3, PixelFormat::Mono12), (2, PixelFormat::Mono12p)] {
+        let again = cut(format, denoise(format), threads, 8, whole(5..12).chain(whole(12..9 * 12 + 5)));
+        assert!(again.sink.cuts == *cuts, "{threads} threads, {format}");
+    }
+}
+
+#[test]
+fn lost_frames_leave_dots_without_light_and_are_told_by_cause() {
+    let format = PixelFormat::Mono12;
+    let gap = |frames, cause| vec![Loss { frames, cause }];
+    let steps = whole(0..40)
+        .chain([(42, gap(2, LossCause::PoolEmpty)), (42, Vec::new()), (43, Vec::new())])
+        .chain(whole(44..60));
+    let kept = cut(format, denoise(format), 2, 4, steps).sink;
+    let counts = kept.counts();
+    assert!(counts.balanced(), "{counts:?}");
+    assert_eq!(counts.lost, [(LossCause::PoolEmpty, 2)].into());
+    let hit = &kept.cuts[2];
+    assert_eq!((hit.counts.averaged, hit.counts.expected, hit.duplicates), (10, 12, 1));
+    let missing: Vec<usize> = (0..12).filter(|&dot| scan(4).is_scene(dot as u32) && !hit.seen[dot]).collect();
+    assert_eq!(missing, [4, 5]);
+    assert_eq!(hit.columns.discs.len(), 12);
+}
+
+/// Fails for one dot, panics for another.
+struct Fragile(Arc<dyn ColumnStage>);
+
+struct FragileWorker(Box<dyn ColumnWorker>);
+
+impl ColumnStage for Fragile {
+    fn worker(&self) -> Box<dyn ColumnWorker> {
+        Box::new(FragileWorker(self.0.worker()))
+    }
+}
+
+impl ColumnWorker for FragileWorker {
+    fn column(
+        &mut self,
+        frame: &[u16],
+        background: &Background,
+        floor: NoiseFloor,
+        column: &mut SparseColumn,
+    ) -> Result<(), DotsError> {
+        let lit = |index: usize| frame[(12 + 2 * index) * WIDTH + 4 + 4 * index] > 400;
+        assert!(!lit(5), "dot 5 is too much");
+        if lit(7) {
+            return Err(DotsError::TooFew { what: "sevens", given: 0, needed: 1 });
+        }
+        self.0.column(frame, background, floor, column)
+    }
+}
+
+#[test]
+fn a_stage_that_fails_or_panics_costs_its_dot_and_nothing_else() {
+    let format = PixelFormat::Mono12;
+    let kept = cut(format, Arc::new(Fragile(denoise(format))), 2, 2, whole(0..40)).sink;
+    assert_eq!(kept.cuts.len(), 2);
+    for cut in &kept.cuts {
+        assert_eq!(cut.counts.lost, [(LossCause::StageFailed, 2)].into());
+        assert!(!cut.seen[5] && !cut.seen[7] && cut.seen[6]);
+        assert!(cut.problem.as_ref().unwrap().contains("dot 5 is too much"), "{:?}", cut.problem);
+    }
+    assert!(kept.counts().balanced());
+}
+
+#[test]
+fn without_a_trailing_dot_the_stream_ends_with_a_word_and_an_account() {
+    let format = PixelFormat::Mono12;
+    let dumps = (0..60).map(|number| (number * 12 + u64::from(BACKGROUND), Vec::new()));
+    let gathered = cut(format, denoise(format), 2, 2, dumps);
+    assert!(gathered.error.unwrap().to_string().contains("trailing dot"));
+    let counts = gathered.sink.counts();
+    assert!(counts.balanced() && counts.cancelled == 60, "{counts:?}");
+}

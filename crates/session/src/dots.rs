@@ -1,0 +1,461 @@
+//! `dots.zarr`: the sparse columns of a flying dot, a Zarr v3 group with one group `bNNNN` a batch.
+//!
+//! | array | type | axes | what |
+//! | --- | --- | --- | --- |
+//! | `word_offsets` | uint64 | `[dot + 1]` | where each dot's words begin |
+//! | `words` | uint32 | `[word]` | pixel / 32 of 32 pixels in a row of the frame, ascending in each dot |
+//! | `masks` | uint32 | `[word]` | which of them the dot has: bit `b` is pixel `32 word + b` |
+//! | `values` | float32 | `[pixel]` | their light, in the order of dots, words and bits |
+//! | `residual` | float32 | `[dot, block row, block column]` | mean light of the other pixels of each 32 x 32 block |
+//! | `discs` | uint32 | `[dot]` | discs that the denoising took; 0: nothing stood out of the background |
+//! | `capped` | bool | `[dot]` | whether it ended at the cap on discs |
+//! | `seen` | bool | `[dot]` | whether the dot has a frame that shows the scene; the others have no light |
+//!
+//! Light is in camera counts above the background, times the flat field's gain; signed. A pixel is `row * width + column`.
+//! A batch appears as a whole: its folder is written beside, synced, and renamed. One without a line in the ledger is not
+//! stored.
+
+use std::fs::{self, File};
+use std::io::{BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+use zarrs::array::{ArrayBuilder, DataType, Element, ElementOwned, FillValue, data_type};
+
+use crate::durable::{self, DraftDir};
+use crate::stack::StackShape;
+use crate::zarr::{self, DurableStore};
+use crate::{Error, Result};
+
+/// Side of a residual's block in pixels.
+const BLOCK_PX: usize = 32;
+
+/// The columns of one batch; the fields are the arrays of its group.
+#[derive(Debug, Clone, Default, PartialEq)]
+#[allow(missing_docs, reason = "the table at the head of the module says what each is")]
+pub struct BatchColumns {
+    pub word_offsets: Vec<u64>,
+    pub words: Vec<u32>,
+    pub masks: Vec<u32>,
+    pub values: Vec<f32>,
+    pub residual: Vec<f32>,
+    pub discs: Vec<u32>,
+    pub capped: Vec<bool>,
+    pub seen: Vec<bool>,
+}
+
+impl BatchColumns {
+    /// CRC-32 (the one of zip and PNG) of all arrays, little-endian, in the order of the fields.
+    pub fn crc32(&self) -> u32 {
+        let mut hasher = crc32fast::Hasher::new();
+        self.word_offsets.iter().for_each(|value| hasher.update(&value.to_le_bytes()));
+        for values in [&self.words, &self.masks] {
+            values.iter().for_each(|value| hasher.update(&value.to_le_bytes()));
+        }
+        for values in [&self.values, &self.residual] {
+            values.iter().for_each(|value| hasher.update(&value.to_le_bytes()));
+        }
+        self.discs.iter().for_each(|value| hasher.update(&value.to_le_bytes()));
+        for flags in [&self.capped, &self.seen] {
+            flags.iter().for_each(|&flag| hasher.update(&[u8::from(flag)]));
+        }
+        hasher.finalize()
+    }
+}
+
+/// A stored batch, as the ledger says it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BatchEntry {
+    /// Its index in `dots.zarr`.
+    pub batch: usize,
+    /// The calibration plane that it shows, from 0; none: the scene.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plane: Option<usize>,
+    /// Start of its first exposure, in seconds after that of the run's first batch.
+    pub start_s: f64,
+    /// Dots of the scene that have no frame.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub missing: Vec<usize>,
+    /// Dots of the scene in whose frames nothing stood out of the background.
+    pub empty: usize,
+    /// Dots whose frames ended at the cap on discs.
+    pub capped: usize,
+    /// Frames that came twice.
+    pub duplicates: u64,
+    /// Where its triggers went.
+    pub counts: raysweep_core::Counts,
+    /// See [`BatchColumns::crc32`].
+    pub crc32: u32,
+}
+
+/// `dots.zarr` of a session.
+pub struct Dots {
+    dir: PathBuf,
+    /// Frames of a batch.
+    dots: usize,
+    /// Rows and columns of blocks.
+    blocks: [usize; 2],
+}
+
+impl Dots {
+    /// Makes the group without any batch at `dir`.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] where the file system refuses.
+    pub fn create(dir: &Path, shape: &StackShape) -> Result<Self> {
+        let attributes = json!({
+            "height": shape.rows,
+            "width": shape.columns,
+            "dots": shape.dots,
+            "block_px": BLOCK_PX,
+            "units": "camera counts (DN) above the background, times the flat field's gain",
+        });
+        zarr::create_group(&DurableStore::new(dir)?, into_map(attributes))?;
+        Ok(Self::open(dir, shape))
+    }
+
+    /// The group at `dir`.
+    pub fn open(dir: &Path, shape: &StackShape) -> Self {
+        let blocks = [shape.rows.div_ceil(BLOCK_PX), shape.columns.div_ceil(BLOCK_PX)];
+        Self { dir: dir.to_owned(), dots: shape.dots, blocks }
+    }
+
+    fn path_of(&self, batch: usize) -> PathBuf {
+        self.dir.join(format!("b{batch:04}"))
+    }
+
+    /// Writes a batch, replacing what was there; when this returns, it is durable. `attributes` become its group's.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for arrays that are not those of so many dots and blocks; [`Error::Io`] or [`Error::Zarr`] where
+    /// the file system refuses.
+    pub fn write(&self, batch: usize, columns: &BatchColumns, attributes: Map<String, Value>) -> Result<()> {
+        let (dots, [rows, across]) = (self.dots, self.blocks);
+        let lengths = [
+            ("word_offsets", columns.word_offsets.len(), dots + 1),
+            ("masks", columns.masks.len(), columns.words.len()),
+            ("residual", columns.residual.len(), dots * rows * across),
+            ("discs", columns.discs.len(), dots),
+            ("capped", columns.capped.len(), dots),
+            ("seen", columns.seen.len(), dots),
+        ];
+        if let Some((name, found, allowed)) = lengths.into_iter().find(|(_, found, allowed)| found != allowed)
+        {
+            let what = format!("{name} of batch {batch}");
+            return Err(Error::Shape { what, found: vec![found], allowed: format!("[{allowed}]") });
+        }
+        let draft = DraftDir::create(&self.path_of(batch))?;
+        let store = DurableStore::draft(draft.path())?;
+        zarr::create_group(&store, attributes)?;
+        let put = Put { store: &store };
+        let words = columns.words.len();
+        put.array(
+            "word_offsets",
+            &[dots + 1],
+            &["dot"],
+            data_type::uint64(),
+            0u64.into(),
+            &columns.word_offsets,
+        )?;
+        put.array("words", &[words], &["word"], data_type::uint32(), 0u32.into(), &columns.words)?;
+        put.array("masks", &[words], &["word"], data_type::uint32(), 0u32.into(), &columns.masks)?;
+        let pixels = columns.values.len();
+        put.array("values", &[pixels], &["pixel"], data_type::float32(), 0f32.into(), &columns.values)?;
+        let (shape, axes) = ([dots, rows, across], ["dot", "block_row", "block_column"]);
+        put.array("residual", &shape, &axes, data_type::float32(), 0f32.into(), &columns.residual)?;
+        put.array("discs", &[dots], &["dot"], data_type::uint32(), 0u32.into(), &columns.discs)?;
+        put.array("capped", &[dots], &["dot"], data_type::bool(), false.into(), &columns.capped)?;
+        put.array("seen", &[dots], &["dot"], data_type::bool(), false.into(), &columns.seen)?;
+        sync_all(draft.path())?;
+        draft.commit()
+    }
+
+    /// Reads a batch; that its arrays fit each other is for the reader to check.
+    ///
+    /// # Errors
+    /// [`Error::Zarr`] where there is none or it is damaged.
+    pub fn read(&self, batch: usize) -> Result<BatchColumns> {
+        let path = self.path_of(batch);
+        if !path.is_dir() {
+            let missing = std::io::Error::from(std::io::ErrorKind::NotFound);
+            return Err(Error::io("read", &path)(missing));
+        }
+        let get = Get { store: DurableStore::new(&path)? };
+        Ok(BatchColumns {
+            word_offsets: get.array("word_offsets", 1)?,
+            words: get.array("words", 1)?,
+            masks: get.array("masks", 1)?,
+            values: get.array("values", 1)?,
+            residual: get.array("residual", 3)?,
+            discs: get.array("discs", 1)?,
+            capped: get.array("capped", 1)?,
+            seen: get.array("seen", 1)?,
+        })
+    }
+}
+
+/// `raw.npy` and `raw.csv`: the raw frames of a flying dot in the order in which they came, uint16 `[frame, t, s]`, and
+/// a line for each with its number in the file, the camera's id, and its batch and dot, both empty where it has none.
+/// Lines come when that is certain, so not quite in order. A file that a crash cut short says that it has no frames; its
+/// length tells how many there are.
+pub struct RawFrames {
+    path: PathBuf,
+    frames: BufWriter<File>,
+    lines: BufWriter<File>,
+    size: [usize; 2],
+    count: u64,
+}
+
+/// Bytes of the header of `raw.npy`, whatever the number of frames.
+const HEADER_BYTES: usize = 128;
+
+impl RawFrames {
+    /// Makes both files, without frames; `path` is that of `raw.npy`.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses.
+    pub fn create(path: &Path, rows: usize, columns: usize) -> Result<Self> {
+        let make = |path: &Path| File::create(path).map(BufWriter::new).map_err(Error::io("create", path));
+        let table = path.with_extension("csv");
+        let (mut frames, mut lines) = (make(path)?, make(&table)?);
+        let size = [rows, columns];
+        frames.write_all(&header(0, size)).map_err(Error::io("write", path))?;
+        lines.write_all(b"frame,id,batch,dot\n").map_err(Error::io("write", &table))?;
+        Ok(Self { path: path.to_owned(), frames, lines, size, count: 0 })
+    }
+
+    /// Frames so far.
+    pub fn len(&self) -> u64 {
+        self.count
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// Appends a frame, row by row.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for a frame of another size, [`Error::Io`] where the file system refuses.
+    pub fn push(&mut self, frame: &[u16]) -> Result<()> {
+        let [rows, columns] = self.size;
+        if frame.len() != rows * columns {
+            let what = "a raw frame".to_owned();
+            return Err(Error::Shape {
+                what,
+                found: vec![frame.len()],
+                allowed: format!("[{}]", rows * columns),
+            });
+        }
+        let mut written = Ok(());
+        for row in frame.chunks(columns) {
+            let bytes: Vec<u8> = row.iter().flat_map(|counts| counts.to_le_bytes()).collect();
+            written = written.and_then(|()| self.frames.write_all(&bytes));
+        }
+        self.count += 1;
+        written.map_err(Error::io("write", &self.path))
+    }
+
+    /// Notes which dot of which batch a frame shows.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses.
+    pub fn note(&mut self, frame: u64, id: u64, place: Option<(usize, usize)>) -> Result<()> {
+        let written = match place {
+            Some((batch, dot)) => writeln!(self.lines, "{frame},{id},{batch},{dot}"),
+            None => writeln!(self.lines, "{frame},{id},,"),
+        };
+        written.map_err(Error::io("write", &self.path.with_extension("csv")))
+    }
+
+    /// Ends the files; when this returns, they are durable.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where the file system refuses.
+    pub fn finish(self) -> Result<()> {
+        let Self { path, frames, lines, size, count } = self;
+        for (file, header) in [(frames, Some(header(count, size))), (lines, None)] {
+            let mut file =
+                file.into_inner().map_err(|error| Error::io("write", &path)(error.into_error()))?;
+            let written = match header {
+                Some(header) => file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(&header)),
+                None => Ok(()),
+            };
+            written.and_then(|()| file.sync_all()).map_err(Error::io("write", &path))?;
+        }
+        path.parent().map_or(Ok(()), durable::sync_dir)
+    }
+}
+
+/// The header of an NPY file, version 1.0.
+fn header(count: u64, [rows, columns]: [usize; 2]) -> [u8; HEADER_BYTES] {
+    let text = format!("{{'descr': '<u2', 'fortran_order': False, 'shape': ({count}, {rows}, {columns}), }}");
+    let mut header = [b' '; HEADER_BYTES];
+    header[..10].copy_from_slice(b"\x93NUMPY\x01\x00\x76\x00");
+    // At most 20 digits a length: it always fits.
+    header[10..10 + text.len()].copy_from_slice(text.as_bytes());
+    header[HEADER_BYTES - 1] = b'\n';
+    header
+}
+
+struct Put<'a> {
+    store: &'a Arc<DurableStore>,
+}
+
+impl Put<'_> {
+    /// One array of one chunk.
+    fn array<T: Element>(
+        &self,
+        name: &str,
+        shape: &[usize],
+        axes: &[&str],
+        data_type: DataType,
+        fill: FillValue,
+        values: &[T],
+    ) -> Result<()> {
+        let lengths = |least: usize| shape.iter().map(|&len| len.max(least) as u64).collect::<Vec<_>>();
+        let mut builder = ArrayBuilder::new(lengths(0), lengths(1), data_type, fill);
+        zarr::with_codecs(&mut builder).dimension_names(Some(axes.iter().copied()));
+        let array = zarr::create_array(self.store, name, &builder)?;
+        if values.is_empty() {
+            return Ok(());
+        }
+        let path = self.store.root().join(name);
+        // One thread: batches are written while frames of the next arrive, and they need the others.
+        let options = zarr::codec_options().with_concurrent_target(1);
+        array.store_chunk_opt(&vec![0; shape.len()], values, &options).map_err(Error::zarr("write", &path))
+    }
+}
+
+struct Get {
+    store: Arc<DurableStore>,
+}
+
+impl Get {
+    fn array<T: ElementOwned>(&self, name: &str, axes: usize) -> Result<Vec<T>> {
+        let array = zarr::open_array(&self.store, name, axes)?;
+        if zarr::shape_of(&array).contains(&0) {
+            return Ok(Vec::new());
+        }
+        let path = self.store.root().join(name);
+        array
+            .retrieve_array_subset_opt(&array.subset_all(), &zarr::codec_options())
+            .map_err(Error::zarr("read", &path))
+    }
+}
+
+/// Makes files and folders of a folder durable, all at once.
+fn sync_all(dir: &Path) -> Result<()> {
+    for entry in fs::read_dir(dir).map_err(Error::io("list", dir))? {
+        let path = entry.map_err(Error::io("list", dir))?.path();
+        match path.is_dir() {
+            true => sync_all(&path)?,
+            false => File::open(&path).and_then(|file| file.sync_all()).map_err(Error::io("sync", &path))?,
+        }
+    }
+    durable::sync_dir(dir)
+}
+
+fn into_map(value: Value) -> Map<String, Value> {
+    match value {
+        Value::Object(map) => map,
+        _ => Map::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shape() -> StackShape {
+        StackShape { points: 4, exposures: 0, rows: 40, columns: 64, settings: 0, dots: 3 }
+    }
+
+    fn columns(seed: u32) -> BatchColumns {
+        BatchColumns {
+            word_offsets: vec![0, 2, 2, 3],
+            words: vec![seed, seed + 4, 7],
+            masks: vec![1, u32::MAX, 1 << 31],
+            values: (0..34).map(|value| value as f32 - 3.5).collect(),
+            residual: (0..12).map(|block| block as f32 / 8.0).collect(),
+            discs: vec![2, 0, 1],
+            capped: vec![true, false, false],
+            seen: vec![true, false, true],
+        }
+    }
+
+    #[test]
+    fn batches_read_back_and_replace_what_was_there() {
+        let dir = tempfile::tempdir().unwrap();
+        let dots = Dots::create(dir.path(), &shape()).unwrap();
+        dots.write(1, &columns(5), Map::new()).unwrap();
+        dots.write(1, &columns(0), Map::new()).unwrap();
+        let dots = Dots::open(dir.path(), &shape());
+        let read = dots.read(1).unwrap();
+        assert_eq!((&read, read.crc32()), (&columns(0), columns(0).crc32()));
+        assert!(read.crc32() != columns(5).crc32());
+        assert!(dots.read(0).is_err());
+        let names = fs::read_dir(dir.path()).unwrap().map(|entry| entry.unwrap().file_name());
+        let mut names: Vec<_> = names.map(|name| name.into_string().unwrap()).collect();
+        names.sort();
+        assert_eq!(names, ["b0001", "zarr.json"], "nothing else is left");
+    }
+
+    #[test]
+    fn a_batch_without_any_light_is_stored_too() {
+        let dir = tempfile::tempdir().unwrap();
+        let dots = Dots::create(dir.path(), &shape()).unwrap();
+        let dark = BatchColumns {
+            word_offsets: vec![0; 4],
+            words: Vec::new(),
+            masks: Vec::new(),
+            values: Vec::new(),
+            residual: vec![0.0; 12],
+            discs: vec![0; 3],
+            capped: vec![false; 3],
+            seen: vec![false; 3],
+        };
+        dots.write(0, &dark, Map::new()).unwrap();
+        assert_eq!(dots.read(0).unwrap(), dark);
+    }
+
+    #[test]
+    fn raw_frames_are_a_file_that_numpy_reads() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("raw.npy");
+        let mut raw = RawFrames::create(&path, 3, 5).unwrap();
+        let frame = |seed: u16| (0..15).map(|pixel| seed * 1000 + pixel).collect::<Vec<u16>>();
+        raw.push(&frame(1)).unwrap();
+        raw.push(&frame(2)).unwrap();
+        raw.note(0, 17, Some((3, 4))).unwrap();
+        raw.note(1, 18, None).unwrap();
+        assert!(raw.push(&[0; 14]).is_err());
+        raw.finish().unwrap();
+        let read: ndarray::Array3<u16> = ndarray_npy::read_npy(&path).unwrap();
+        assert_eq!(
+            (read.dim(), read.into_raw_vec_and_offset().0),
+            ((2, 3, 5), [frame(1), frame(2)].concat())
+        );
+        let table = fs::read_to_string(path.with_extension("csv")).unwrap();
+        assert_eq!(table, "frame,id,batch,dot\n0,17,3,4\n1,18,,\n");
+    }
+
+    #[test]
+    fn arrays_that_do_not_fit_are_refused_and_damage_is_noticed() {
+        let dir = tempfile::tempdir().unwrap();
+        let dots = Dots::create(dir.path(), &shape()).unwrap();
+        let torn = BatchColumns { seen: vec![true; 2], ..columns(0) };
+        let error = dots.write(0, &torn, Map::new()).unwrap_err().to_string();
+        assert!(error.contains("seen of batch 0") && error.contains("[3]"), "{error}");
+        dots.write(0, &columns(0), Map::new()).unwrap();
+        let chunk = dir.path().join("b0000/values/c.0");
+        let mut bytes = fs::read(&chunk).unwrap();
+        let middle = bytes.len() / 2;
+        bytes[middle] ^= 0x40;
+        fs::write(&chunk, bytes).unwrap();
+        assert!(dots.read(0).is_err() || dots.read(0).unwrap().crc32() != columns(0).crc32());
+    }
+}

@@ -1,0 +1,174 @@
+//! A video: images of one size in time, written one after the other.
+
+use std::io;
+use std::os::unix::fs::FileExt;
+use std::path::PathBuf;
+
+use ndarray::{ArrayView3, Axis};
+use ndarray_npy::write_zeroed_npy;
+use serde_json::{Map, Value};
+
+use super::{Products, sidecar};
+use crate::durable::{self, DraftDir, DraftFile};
+use crate::report::{Picture, ToneMap};
+use crate::{Error, Result, exr_file};
+
+/// Percentile of the first image's pixels that its picture does not overexpose, and room above it for the others.
+const PERCENTILE: f64 = 99.5;
+const HEADROOM: f32 = 1.25;
+
+/// Writes a video `NAME`: `NAME.npy` (float32 `[k, t, s]`, or `[k, t, s, 3]`), the folder `NAME` with `0000.exr` (linear)
+/// and `0000.png` (all on one scale, with the transfer function of sRGB) and so on, and `NAME.json`. Nothing is seen of it
+/// before [`VideoWriter::commit`], and nothing stays of it without.
+pub struct VideoWriter {
+    npy: DraftFile,
+    frames: DraftDir,
+    sidecar: PathBuf,
+    name: String,
+    metadata: Map<String, Value>,
+    /// `[images, rows, columns, channels]`.
+    shape: [usize; 4],
+    header_bytes: u64,
+    next: usize,
+    tone_map: Option<ToneMap>,
+}
+
+impl Products {
+    /// Begins a video of so many images of this size `[t, s, channels]`, with one channel or three.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for other channels or no image; otherwise as [`Products::image`].
+    pub fn video(
+        &self,
+        name: &str,
+        images: usize,
+        size: [usize; 3],
+        metadata: &Map<String, Value>,
+    ) -> Result<VideoWriter> {
+        let [rows, columns, channels] = size;
+        if ![1, 3].contains(&channels) || images * rows * columns == 0 {
+            return Err(Error::Shape {
+                what: format!("video `{name}`"),
+                found: vec![images, rows, columns, channels],
+                allowed: "[k, t, s, 1] or [k, t, s, 3], none empty".into(),
+            });
+        }
+        let (path, sidecar) = (self.path(name, "npy")?, self.path(name, "json")?);
+        durable::create_dir_all(self.dir())?;
+        let npy = DraftFile::create(&path)?;
+        let zeroed = match channels {
+            1 => write_zeroed_npy::<f32, _>(npy.file(), (images, rows, columns)),
+            _ => write_zeroed_npy::<f32, _>(npy.file(), (images, rows, columns, channels)),
+        };
+        zeroed.map_err(io::Error::other).map_err(npy.failed())?;
+        let file_bytes = npy.file().metadata().map_err(npy.failed())?.len();
+        let header_bytes = file_bytes - (images * rows * columns * channels * size_of::<f32>()) as u64;
+        Ok(VideoWriter {
+            npy,
+            frames: DraftDir::create(&self.dir().join(name))?,
+            sidecar,
+            name: name.to_owned(),
+            metadata: metadata.clone(),
+            shape: [images, rows, columns, channels],
+            header_bytes,
+            next: 0,
+            tone_map: None,
+        })
+    }
+}
+
+impl VideoWriter {
+    /// Writes the next image; returns its picture's scale.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] for one of another size, or too many; [`Error::Io`].
+    pub fn append(&mut self, image: ArrayView3<f32>) -> Result<ToneMap> {
+        let [images, rows, columns, channels] = self.shape;
+        if image.dim() != (rows, columns, channels) || self.next == images {
+            let mut found = vec![self.next];
+            found.extend(image.shape());
+            let what = format!("an image of video `{}`", self.name);
+            return Err(Error::Shape { what, found, allowed: format!("{:?}", self.shape) });
+        }
+        let bytes: Vec<u8> = image.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let at = self.header_bytes + (self.next * bytes.len()) as u64;
+        self.npy.file().write_all_at(&bytes, at).map_err(self.npy.failed())?;
+        let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
+        let tone_map = *self.tone_map.get_or_insert_with(|| {
+            let ToneMap { white } = ToneMap::percentile(&planes, PERCENTILE);
+            ToneMap { white: white * HEADROOM }
+        });
+        let names: &[&str] = if channels == 1 { &["Y"] } else { &["R", "G", "B"] };
+        let exr: Vec<_> = names.iter().copied().zip(planes.iter().map(|plane| plane.view())).collect();
+        let picture = match channels {
+            1 => Picture::grey(planes[0], tone_map),
+            _ => Picture::rgb(image, tone_map),
+        };
+        let path = |extension: &str| self.frames.path().join(format!("{:04}.{extension}", self.next));
+        durable::write(&path("exr"), &exr_file::encode(&exr, &self.metadata)?)?;
+        durable::write(&path("png"), &picture.to_png()?)?;
+        self.next += 1;
+        Ok(tone_map)
+    }
+
+    /// Puts the video in its place.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] while images are lacking; [`Error::Io`].
+    pub fn commit(self) -> Result<()> {
+        let [images, ..] = self.shape;
+        if self.next < images {
+            let what = format!("video `{}`", self.name);
+            return Err(Error::Shape { what, found: vec![self.next], allowed: format!("[{images}]") });
+        }
+        self.npy.commit()?;
+        self.frames.commit()?;
+        let mut metadata = self.metadata;
+        metadata.insert("png_white".into(), self.tone_map.map_or(Value::Null, |map| map.white.into()));
+        durable::write(&self.sidecar, &sidecar(&self.name, &metadata)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::{Array3, Array4};
+
+    use super::*;
+
+    fn image(channels: usize, seed: f32) -> Array3<f32> {
+        Array3::from_shape_fn((4, 6, channels), |(t, s, c)| seed + (t * 18 + s * 3 + c) as f32)
+    }
+
+    #[test]
+    fn a_video_is_there_when_it_is_whole_as_npy_exr_and_png() {
+        let dir = tempfile::tempdir().unwrap();
+        let products = Products::new(dir.path());
+        let mut video = products.video("relit", 2, [4, 6, 3], &Map::new()).unwrap();
+        video.append(image(3, 1.0).view()).unwrap();
+        assert!(video.append(image(1, 0.0).view()).is_err());
+        assert!(!dir.path().join("relit.npy").exists());
+        video.append(image(3, 9.0).view()).unwrap();
+        assert!(video.append(image(3, 9.0).view()).is_err(), "there are two");
+        video.commit().unwrap();
+        let read: Array4<f32> = ndarray_npy::read_npy(dir.path().join("relit.npy")).unwrap();
+        assert_eq!(read.index_axis(Axis(0), 1), image(3, 9.0));
+        for name in ["relit/0000.exr", "relit/0001.png", "relit.json"] {
+            assert!(dir.path().join(name).exists(), "{name}");
+        }
+        let decoder = png::Decoder::new(io::BufReader::new(
+            std::fs::File::open(dir.path().join("relit/0001.png")).unwrap(),
+        ));
+        assert_eq!(decoder.read_info().unwrap().info().size(), (6, 4));
+    }
+
+    #[test]
+    fn a_video_that_is_not_finished_leaves_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let products = Products::new(dir.path());
+        let mut video = products.video("grey", 2, [4, 6, 1], &Map::new()).unwrap();
+        video.append(image(1, 1.0).view()).unwrap();
+        assert!(video.commit().is_err());
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+        assert!(products.video("grey", 2, [4, 6, 2], &Map::new()).is_err());
+    }
+}

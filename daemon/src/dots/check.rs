@@ -1,0 +1,86 @@
+//! What a plan of batches would do, before anything moves.
+
+use std::path::Path;
+
+use raysweep_core::CameraCapabilities;
+use raysweep_pipeline::Registry;
+use raysweep_proto::{BatchesCheck, CheckReport};
+use raysweep_transport::dots::Correction;
+
+use super::{DotTask, allows, free_bytes};
+use crate::config::{BatchesPlan, ConfigError};
+use crate::memory::available_bytes;
+use crate::run::FRAMES_UNDER_WAY;
+
+/// Bytes of a dot's column on the disk, beside its residual: measured on rendered scenes with dots of 32 pixels.
+const COLUMN_BYTES: u64 = 4600;
+/// Batches that the memory holds at once: two that wait for their indices, one under construction, some being written.
+const BATCHES_IN_MEMORY: u64 = 8;
+/// Report, calibration and everything else.
+const OTHER_BYTES: u64 = 20_000_000;
+
+/// Foresees a task whose session will lie in `data`; `text` is its plan's.
+///
+/// # Errors
+/// For what the camera, or a stage, cannot do.
+pub(crate) fn check(
+    task: &DotTask,
+    text: &str,
+    registry: &Registry,
+    camera: &CameraCapabilities,
+    data: &Path,
+    memory_limit_bytes: Option<u64>,
+) -> Result<CheckReport, ConfigError> {
+    allows(task, camera, text)?;
+    task.stage(registry, &Correction::none(task.shape), text)?;
+    let plan = task.batches();
+    let planes: Vec<u32> = plan.calibration.iter().map(|plane| plane.batches).collect();
+    let passes = planes.iter().copied().chain([plan.count]);
+    let rounds: u32 = plan.dark_rounds() + passes.map(BatchesPlan::rounds).sum::<u32>();
+    let batch_s = plan.path.duration_s();
+    let dots = u64::from(plan.dots);
+    let frame_bytes = task.format.frame_bytes(task.shape.pixels()) as u64;
+    let residual_bytes = 4 * task.shape.blocks() as u64;
+    let batch_bytes = dots * (COLUMN_BYTES.min(5 * task.shape.pixels() as u64) + residual_bytes);
+    let total = plan.total() as u64;
+    let raw_bytes = if plan.keep_raw { u64::from(rounds) * dots * 2 * task.shape.pixels() as u64 } else { 0 };
+    let image_bytes = 4 * task.shape.pixels() as u64;
+    let mut warnings = Vec::new();
+    if plan.calibration.is_empty() {
+        warnings.push("no calibration plane: there will be no relit, separated or dual images; add [[batches.calibration]]".into());
+    } else if plan.calibration.len() == 1 {
+        warnings.push(
+            "one calibration plane: an epipolar mask needs two depths; add a second [[batches.calibration]]"
+                .into(),
+        );
+    }
+    Ok(CheckReport {
+        points: plan.total(),
+        extra_points: 0,
+        frames: u64::from(rounds) * dots,
+        light_s: f64::from(rounds) * batch_s,
+        memory_bytes: FRAMES_UNDER_WAY as u64 * frame_bytes
+            + BATCHES_IN_MEMORY * batch_bytes
+            + 16 * image_bytes,
+        memory_free_bytes: available_bytes(memory_limit_bytes),
+        disk_bytes: total * (batch_bytes + 4 * 8 * image_bytes) + raw_bytes + OTHER_BYTES,
+        disk_free_bytes: free_bytes(data),
+        reach_rows: (0, 0),
+        condition: 1.0,
+        advice: None,
+        film: None,
+        batches: Some(BatchesCheck {
+            scene: plan.count,
+            planes,
+            dots: plan.dots,
+            camera_rate_hz: plan.camera_rate_hz(),
+            batch_s,
+            dark_frames: plan.dark_frames,
+            samples: task.path.points().len(),
+            rate_hz: task.path.rate_hz(),
+            raw_bytes_per_s: (plan.camera_rate_hz() * frame_bytes as f64) as u64,
+            disk_bytes_per_batch: batch_bytes,
+        }),
+        warnings,
+    })
+}

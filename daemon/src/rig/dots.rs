@@ -1,0 +1,270 @@
+//! From the file of a dot rig to its open devices.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror};
+use raysweep_drivers::camera::replay::{ReplayCamera, ReplayConfig, ReplayPace};
+use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
+use raysweep_drivers::mirror::{
+    LightGuard, Mti, MtiConfig, Optotune, OptotuneConfig, PlayzerX, PlayzerXConfig, RtsLaser,
+};
+use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, Subject, SubjectSwitch};
+
+use super::{Pace, RigError};
+use crate::config::{ConfigError, DotCameraDriver, DotRigFile, MirrorDriver, MirrorSection};
+use crate::mirror;
+
+/// A dot rig whose devices can be opened, one run at a time.
+pub struct DotRig {
+    /// What its file says.
+    pub file: DotRigFile,
+    /// The file's text, as sessions keep it.
+    pub text: String,
+    sim: Option<Arc<DotsRig>>,
+    /// The file's folder, from which its paths go.
+    folder: PathBuf,
+}
+
+/// The open devices of a dot rig.
+pub struct DotDevices {
+    /// The camera, one dot a frame.
+    pub camera: Box<dyn Camera>,
+    /// The mirror and its light; none where frames come from a recording.
+    pub mirror: Option<Box<dyn Mirror>>,
+    /// Who puts planes and scene before the camera.
+    pub stand: Stand,
+    /// The clock that the camera's stamps are on.
+    pub clock: Clock,
+    /// Whether the camera waits for the pipeline or frames come as they come.
+    pub pace: Pace,
+    /// What really happens, of a simulated camera: for tests alone.
+    pub truth: Option<DotsTruth>,
+}
+
+/// Who puts planes and scene before the camera.
+#[derive(Clone)]
+pub enum Stand {
+    /// The simulator, at a word.
+    Simulated(SubjectSwitch),
+    /// An operator: the run must wait for one.
+    Operator,
+    /// Nobody: it was done when the frames were recorded, in the plan's order.
+    Recorded,
+}
+
+impl Stand {
+    /// Puts it there, where that needs nobody; `false` if an operator must do it.
+    ///
+    /// # Errors
+    /// `OutOfRange` for a plane that the rig does not have.
+    pub fn place(&self, subject: Subject) -> Result<bool, DeviceError> {
+        match self {
+            Self::Simulated(switch) => switch.place(subject).map(|()| true),
+            Self::Recorded => Ok(true),
+            Self::Operator => Ok(false),
+        }
+    }
+}
+
+impl DotRig {
+    /// Reads a rig file and builds what can be built before devices are opened.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+        let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
+        let file = DotRigFile::parse(&text).map_err(shown)?;
+        let folder = path.parent().unwrap_or(Path::new(".")).to_owned();
+        let setup = DotsSetup {
+            format: file.camera.pixel_format,
+            white_dn: file.camera.white_dn(),
+            white_exposure_us: file.camera.white_exposure_us,
+            black_dn: file.camera.black_dn(),
+            incidence: file.incidence(),
+            limits: file.limits(),
+        };
+        let sim = match file.camera.driver {
+            DotCameraDriver::Sim => {
+                let sim = DotsRig::new(file.sim.dots.clone(), setup, &folder).map_err(|error| {
+                    let path: Vec<&str> = ["sim", "dots"].into_iter().chain(error.key().split('.')).collect();
+                    shown(ConfigError::at(&text, &path, error.to_string()))
+                })?;
+                Some(Arc::new(sim))
+            }
+            _ => None,
+        };
+        Ok(Self { file, text, sim, folder })
+    }
+
+    /// The simulated rig, where its camera is simulated.
+    pub fn simulated(&self) -> Option<&DotsRig> {
+        self.sim.as_deref()
+    }
+
+    /// Opens all devices; the mirror's driver keeps its state in the daemon's data folder. A camera that sets its own
+    /// pace makes `frame_rate_hz` frames a second.
+    ///
+    /// # Errors
+    /// The first device that does not open.
+    pub fn open(&self, data: &Path, frame_rate_hz: f64) -> Result<DotDevices, RigError> {
+        let mirror = match &self.file.mirror {
+            Some(section) => self.open_mirror(section, data)?,
+            None => None,
+        };
+        if let Some(sim) = &self.sim {
+            let pace =
+                if self.file.sim.dots.realtime || mirror.is_some() { Pace::Devices } else { Pace::Pipeline };
+            let DotsDevices { camera, mirror, subject, clock, truth } = sim.open(frame_rate_hz, mirror);
+            return Ok(DotDevices {
+                camera,
+                mirror: Some(mirror),
+                stand: Stand::Simulated(subject),
+                clock,
+                pace,
+                truth: Some(truth),
+            });
+        }
+        let (camera, pace, stand): (Box<dyn Camera>, _, _) = match self.file.camera.driver {
+            DotCameraDriver::Replay => {
+                let Some(replay) = &self.file.camera.replay else {
+                    return Err(RigError::Config("[camera.replay] is missing".into()));
+                };
+                let pace = match replay.pace {
+                    ReplayPace::Pipeline => Pace::Pipeline,
+                    ReplayPace::Recorded => Pace::Devices,
+                };
+                let config = ReplayConfig { path: self.folder.join(&replay.path), ..replay.clone() };
+                let format = self.file.camera.pixel_format;
+                (Box::new(ReplayCamera::open(&config, format, frame_rate_hz)?), pace, Stand::Recorded)
+            }
+            DotCameraDriver::Aravis => (self.open_aravis(frame_rate_hz)?, Pace::Devices, Stand::Operator),
+            _ => (self.open_v4l2(frame_rate_hz)?, Pace::Devices, Stand::Operator),
+        };
+        Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace, truth: None })
+    }
+
+    /// Opens a mirror that has a driver of its own.
+    fn open_mirror(&self, section: &MirrorSection, data: &Path) -> Result<Option<Box<dyn Mirror>>, RigError> {
+        let (state, light) = (mirror::state_file(data), self.light_guard(data));
+        let full_scale = MechanicalDeg(section.full_scale_deg);
+        let limits = section.limits;
+        let port = section.port.clone().unwrap_or_default();
+        Ok(Some(match section.driver {
+            MirrorDriver::Sim => return Ok(None),
+            MirrorDriver::PlayzerX => {
+                let link = section.link();
+                Box::new(PlayzerX::open(PlayzerXConfig { port, link, full_scale, limits, state, light })?)
+            }
+            MirrorDriver::Mti => {
+                let (drive, most) = (section.drive(), section.max_drive());
+                Box::new(Mti::open(MtiConfig { port, drive, most, full_scale, limits, state, light })?)
+            }
+            MirrorDriver::Optotune => {
+                let laser_port = section.laser_port.clone();
+                let laser = Box::new(RtsLaser::open(laser_port.as_deref().unwrap_or(Path::new("")))?);
+                Box::new(Optotune::open(OptotuneConfig { port, laser_port, limits, state, light }, laser)?)
+            }
+        }))
+    }
+
+    /// Who permits light on this rig.
+    pub fn light_guard(&self, data: &Path) -> LightGuard {
+        mirror::light_guard(data, self.file.mirror.as_ref().and_then(|mirror| mirror.interlock.clone()))
+    }
+
+    /// Whether a real mirror moves real light.
+    pub fn has_real_mirror(&self) -> bool {
+        self.file.mirror.as_ref().is_some_and(|mirror| mirror.driver != MirrorDriver::Sim)
+    }
+
+    fn open_v4l2(&self, frame_rate_hz: f64) -> Result<Box<dyn Camera>, RigError> {
+        let camera = &self.file.camera;
+        let Some(config) = camera.v4l2.clone() else {
+            return Err(RigError::Config("[camera.v4l2] is missing".into()));
+        };
+        let setup = V4l2Setup {
+            config,
+            format: camera.pixel_format,
+            row_time_us: 0.0,
+            trigger_period_us: 1e6 / frame_rate_hz,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(v4l2::open(setup)?))
+    }
+
+    #[cfg(feature = "aravis")]
+    fn open_aravis(&self, frame_rate_hz: f64) -> Result<Box<dyn Camera>, RigError> {
+        use raysweep_drivers::camera::aravis::{AravisCamera, RigFacts};
+
+        let camera = &self.file.camera;
+        let period_us = 1e6 / frame_rate_hz;
+        let facts = RigFacts {
+            format: camera.pixel_format,
+            row_time_us: 0.0,
+            trigger_period_us: period_us,
+            trigger_margin_us: period_us / 8.0,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
+    }
+
+    #[cfg(not(feature = "aravis"))]
+    fn open_aravis(&self, _: f64) -> Result<Box<dyn Camera>, RigError> {
+        Err(super::built_without_aravis())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use raysweep_core::{DeviceState, FramePool};
+
+    use super::*;
+    use crate::rig::AnyRig;
+
+    fn load(folder: &Path, text: &str) -> Result<DotRig, RigError> {
+        let path = folder.join("rig.toml");
+        std::fs::write(&path, text).unwrap();
+        match AnyRig::load(&path)? {
+            AnyRig::Dots(rig) => Ok(rig),
+            AnyRig::Plane(_) => panic!("its kind is another"),
+        }
+    }
+
+    #[test]
+    fn a_simulated_rig_opens_with_camera_mirror_and_stand() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n[sim.dots]\nrows = 16\n";
+        let rig = load(folder.path(), text).unwrap();
+        let devices = rig.open(folder.path(), 13_500.0).unwrap();
+        assert_eq!((devices.camera.capabilities().height, devices.pace), (32, Pace::Pipeline));
+        assert!(devices.mirror.is_some() && devices.truth.is_some() && !rig.has_real_mirror());
+        assert!(devices.stand.place(Subject::Plane(1)).unwrap());
+        assert!(devices.stand.place(Subject::Plane(2)).is_err());
+        let refused = load(folder.path(), &text.replace("rows = 16", "scene = \"teapot\"")).err().unwrap();
+        let refused = refused.to_string();
+        assert!(refused.contains("line 7") && refused.contains("teapot"), "{refused}");
+    }
+
+    #[test]
+    fn a_recording_beside_the_rig_file_is_its_camera_and_needs_no_mirror() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("frames.raw"), [7_u8; 3 * 2 * 4 * 8]).unwrap();
+        let text = "kind = \"dots\"\n[camera]\ndriver = \"replay\"\n\
+                    [camera.replay]\npath = \"frames.raw\"\nwidth = 8\nheight = 4\n";
+        let rig = load(folder.path(), text).unwrap();
+        let DotDevices { mut camera, mirror, stand, pace, .. } = rig.open(folder.path(), 1000.0).unwrap();
+        assert!(mirror.is_none() && matches!(stand, Stand::Recorded) && pace == Pace::Pipeline);
+        camera.arm().unwrap();
+        let mut buffer = FramePool::new(1, 64).take();
+        for _ in 0..3 {
+            assert_eq!(camera.state(), DeviceState::Streaming);
+            camera.next_frame(&mut buffer, Duration::ZERO).unwrap().unwrap();
+            assert!(buffer.iter().all(|byte| *byte == 7));
+        }
+        assert_eq!(camera.state(), DeviceState::Ready);
+    }
+}

@@ -1,0 +1,352 @@
+//! A run of a dot rig: dark frames, calibration planes, then the scene.
+
+mod camera;
+mod motion;
+mod storage;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+
+use raysweep_core::{Camera, Clock, Counts, FramePool, MirrorPath, SettingsId};
+use raysweep_pipeline::dots::{Arrival, DarkRun, DotsFlow, DotsFlowConfig, Gathered, Loss, Sensor};
+use raysweep_pipeline::{PipelineError, Policy, Registry, message_of};
+use raysweep_proto::{Event, RunState};
+use raysweep_session::Session;
+use raysweep_session::dots::RawFrames;
+use raysweep_session::ledger::{Entry, Ledger};
+use raysweep_sim::dots::Subject;
+
+use self::camera::{Refused, Source, Wanted};
+use self::motion::Motion;
+use self::storage::{RawSink, Storage, Stored, Writing};
+use super::board::Board;
+use super::engine::RunError;
+use super::orders::{Order, Orders};
+use crate::config::BatchesPlan;
+use crate::dots::DotTask;
+use crate::live::Outlet;
+use crate::rig::{DotDevices, DotRig, Pace, Stand};
+
+/// Frames that may wait for the workers.
+const QUEUE_FRAMES: usize = 24;
+/// Buffers of the pool: those that wait, those under work, and those of the beam dump that wait for their index.
+pub(crate) const FRAMES_UNDER_WAY: usize = 64;
+
+/// Everything that one run needs.
+pub struct DotRun {
+    /// The rig.
+    pub rig: Arc<DotRig>,
+    /// The plan on it.
+    pub task: Arc<DotTask>,
+    /// The plan's text.
+    pub plan_text: String,
+    /// Its stages by name.
+    pub registry: Arc<Registry>,
+    /// Its session.
+    pub session: Session,
+    /// Its ledger, locked for this run.
+    pub ledger: Ledger,
+    /// The daemon's data folder, where the mirror's state is kept.
+    pub data: PathBuf,
+    /// What it is told.
+    pub orders: Arc<Orders>,
+    /// What it tells.
+    pub board: Arc<Board>,
+    /// Where floodlit images are shown, if anywhere.
+    pub live: Option<Outlet>,
+}
+
+/// What acquisition leaves behind.
+pub struct Acquired {
+    /// The session.
+    pub session: Session,
+    /// Its ledger, still locked.
+    pub ledger: Ledger,
+    /// What single dots and batches met.
+    pub problems: Vec<String>,
+    /// Why acquisition ended early, if a fault ended it.
+    pub fault: Option<RunError>,
+}
+
+impl DotRun {
+    /// Acquires all batches.
+    ///
+    /// # Errors
+    /// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
+    pub fn acquire(mut self) -> Result<Acquired, RunError> {
+        self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: false })?;
+        let rate_hz = self.task.batches().camera_rate_hz();
+        let DotDevices { mut camera, mirror, stand, clock, pace, .. } = self.rig.open(&self.data, rate_hz)?;
+        let mut motion = Motion::new(mirror);
+        let shape = self.task.shape;
+        let found = (camera.capabilities().height, camera.capabilities().width);
+        if found != (shape.height(), shape.width()) {
+            return Err(RunError::OtherCamera { found, expected: (shape.height(), shape.width()) });
+        }
+        if let Some(Err(error)) = self.live.as_ref().map(|outlet| outlet.file.clear()) {
+            tracing::warn!(%error, "the live file still shows the run before");
+        }
+        camera.configure(SettingsId { point: 0, attempt: 0 }, &self.task.camera_settings())?;
+        let storage = Storage::start(Writing {
+            task: self.task.clone(),
+            dots: self.session.dots()?,
+            ledger: self.ledger,
+            board: self.board.clone(),
+            orders: self.orders.clone(),
+            live: self.live,
+        })?;
+        camera.arm()?;
+        let _ = self.board.go(RunState::Armed);
+        let _ = self.board.go(RunState::Running);
+        let mut passes = Passes {
+            task: &self.task,
+            plan_text: &self.plan_text,
+            registry: &self.registry,
+            session: &self.session,
+            orders: &self.orders,
+            board: &self.board,
+            storage: &storage,
+            motion: &mut motion,
+            camera: &mut *camera,
+            pool: FramePool::new(FRAMES_UNDER_WAY, self.task.format.frame_bytes(shape.pixels())),
+            stand,
+            clock,
+            pace,
+        };
+        let passed = passes.all();
+        let _ = self.board.go(RunState::Draining);
+        // Light off before anything else ends.
+        drop(motion);
+        if let Err(error) = camera.disarm() {
+            tracing::warn!(%error, "camera not disarmed");
+        }
+        let Stored { ledger, problems, error } = storage.finish()?;
+        let fault = error.map(RunError::from).or(passed.err());
+        Ok(Acquired { session: self.session, ledger, problems, fault })
+    }
+}
+
+struct Passes<'a> {
+    task: &'a DotTask,
+    plan_text: &'a str,
+    registry: &'a Registry,
+    session: &'a Session,
+    orders: &'a Orders,
+    board: &'a Board,
+    storage: &'a Storage,
+    motion: &'a mut Motion,
+    camera: &'a mut dyn Camera,
+    pool: FramePool,
+    stand: Stand,
+    clock: Clock,
+    pace: Pace,
+}
+
+impl Passes<'_> {
+    /// Dark frames, planes, scene.
+    fn all(&mut self) -> Result<(), RunError> {
+        let plan = self.task.batches();
+        let Some(mut sensor) = self.dark()? else { return Ok(()) };
+        let mut raw = match plan.keep_raw {
+            true => {
+                let (rows, columns) = (self.task.shape.height(), self.task.shape.width());
+                let frames = RawFrames::create(&self.session.raw_path(), rows, columns)?;
+                Some(RawSink::new(frames, self.task.format, self.task.shape.values()))
+            }
+            false => None,
+        };
+        let mut first_batch = 0;
+        let planes = plan.calibration.iter().enumerate().map(|(index, plane)| (Some(index), plane.batches));
+        for (plane, batches) in planes.chain([(None, plan.count)]) {
+            self.place(plane)?;
+            if !self.orders.go_on() {
+                break;
+            }
+            (sensor, raw) = self.pass(sensor, raw, first_batch, plane, batches)?;
+            first_batch += batches as usize;
+        }
+        match raw {
+            Some(raw) => Ok(raw.finish()?),
+            None => Ok(()),
+        }
+    }
+
+    /// Puts a plane, or the scene, before the camera; waits for the operator where that takes one.
+    fn place(&self, plane: Option<usize>) -> Result<(), RunError> {
+        self.orders.wait_while_paused();
+        if !self.stand.place(plane.map_or(Subject::Scene, Subject::Plane))? {
+            let text = match plane {
+                Some(plane) => format!(
+                    "put calibration plane {} of {} before the camera",
+                    plane + 1,
+                    self.task.batches().calibration.len()
+                ),
+                None => "put the scene before the camera, and the calibration plane away".into(),
+            };
+            self.orders.give(Order::Pause);
+            if self.board.go(RunState::Paused).is_ok() {
+                self.board.publish(Event::Ask { text: format!("{text}, then `raysweep continue`") });
+                self.orders.wait_while_paused();
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes the dark frames; nothing if the run was told to end.
+    fn dark(&mut self) -> Result<Option<Sensor>, RunError> {
+        let (task, plan) = (self.task, self.task.batches());
+        let options = &task.correct;
+        let mut run =
+            DarkRun::new(task.shape, task.saturation_dn(), plan.dark_frames, options.background_batches)?;
+        let path = task.path.clone().with_light(|_| 0);
+        let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
+        let has_enough = AtomicBool::new(false);
+        let lost =
+            self.play(&path, plan.dark_rounds(), plan.dark_frames.into(), &has_enough, &mut |arrival| {
+                // Whoever waits for the camera's last frame sees some more.
+                if !has_enough.load(Ordering::Relaxed) {
+                    let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
+                    let pushed = match unpacked {
+                        Ok(()) => run.push(&counts).map_err(RunError::from),
+                        Err(error) => Err(RunError::Frame(error.to_string())),
+                    };
+                    match pushed {
+                        Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
+                        Err(error) => {
+                            failed = Some(error);
+                            return Err(Refused::Closed);
+                        }
+                    }
+                }
+                frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
+                Ok(())
+            })?;
+        frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
+        // No batch waits for any of them.
+        self.storage.outside(Counts { expected: frames, settling: frames, ..Counts::default() });
+        if let Some(failed) = failed {
+            return Err(failed);
+        }
+        if !self.orders.go_on() {
+            return Ok(None);
+        }
+        Ok(Some(run.finish(options.hot_sigmas, None, task.sampling())?))
+    }
+
+    /// Takes the batches of one plane or of the scene.
+    fn pass(
+        &mut self,
+        sensor: Sensor,
+        raw: Option<RawSink>,
+        first_batch: usize,
+        plane: Option<usize>,
+        batches: u32,
+    ) -> Result<(Sensor, Option<RawSink>), RunError> {
+        let (task, plan) = (self.task, self.task.batches());
+        let Sensor { correction, background, floor } = sensor;
+        let stage = task.stage(self.registry, &correction, self.plan_text)?;
+        let config = DotsFlowConfig {
+            scan: plan.scan(task.shape, batches),
+            format: task.format,
+            saturation_dn: task.saturation_dn(),
+            stage: stage.into(),
+            correction: correction.clone(),
+            background,
+            floor,
+            threads: 0,
+            queue_frames: QUEUE_FRAMES,
+            policy: match self.pace {
+                Pace::Pipeline => Policy::Wait,
+                Pace::Devices => Policy::Fail,
+            },
+        };
+        let (flow, input) = DotsFlow::start(config, self.storage.sink(first_batch, plane, raw))?;
+        let blind = flow.is_blind();
+        let rounds = BatchesPlan::rounds(batches);
+        let frames = u64::from(rounds) * u64::from(plan.dots);
+        let played = self.play(&task.path, rounds, frames, &blind, &mut |arrival| Ok(input.offer(arrival)?));
+        drop(input);
+        let Gathered { sink, background, error } = flow.join()?;
+        let mut rest = Counts::default();
+        for Loss { frames, cause } in played? {
+            rest.expected += frames;
+            rest.lose(cause, frames);
+        }
+        self.storage.outside(rest);
+        if let Some(error) = error.filter(|_| self.orders.go_on()) {
+            return Err(error.into());
+        }
+        Ok((Sensor { correction, background, floor }, sink.into_raw()))
+    }
+
+    /// Plays a path `rounds` times while the camera takes its frames: until the path is over, or, without a mirror,
+    /// until `frames` have come; sooner if `enough` is set or the run is told to end.
+    fn play(
+        &mut self,
+        path: &MirrorPath,
+        rounds: u32,
+        frames: u64,
+        enough: &AtomicBool,
+        deliver: &mut (dyn FnMut(Arrival) -> Result<(), Refused> + Send),
+    ) -> Result<Vec<Loss>, RunError> {
+        let orders = self.orders;
+        let (path_over, camera_over) = (AtomicBool::new(false), AtomicBool::new(false));
+        let is_driven = self.motion.is_driven();
+        self.motion.start(path, rounds)?;
+        let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
+        let taken = AtomicU64::new(0);
+        let wanted = || {
+            let is_over = match is_driven {
+                true => path_over.load(Ordering::Relaxed),
+                // The next frame of a recording is another pass'.
+                false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
+            };
+            match (orders.go_on(), is_over) {
+                (true, false) => Wanted::Frames,
+                (true, true) if is_driven => Wanted::Rest,
+                _ => Wanted::Nothing,
+            }
+        };
+        let mut deliver = |arrival| {
+            taken.fetch_add(1, Ordering::Relaxed);
+            deliver(arrival)
+        };
+        let clock = self.clock.clone();
+        let (fed, taken) = thread::scope(|scope| -> Result<_, PipelineError> {
+            let camera = thread::Builder::new()
+                .name("camera".into())
+                .spawn_scoped(scope, || {
+                    let _over = SetOnDrop(&camera_over);
+                    source.take(&wanted, &mut deliver)
+                })
+                .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
+            let fed = {
+                let _over = SetOnDrop(&path_over);
+                let go_on = || {
+                    orders.go_on() && !enough.load(Ordering::Relaxed) && !camera_over.load(Ordering::Relaxed)
+                };
+                self.motion.play(&clock, &go_on)
+            };
+            if fed.is_err() {
+                orders.give(Order::Fault);
+            }
+            Ok((fed, camera.join()))
+        })?;
+        fed?;
+        match taken {
+            Ok(taken) => Ok(taken?),
+            Err(panic) => Err(RunError::Panicked(message_of(&*panic).to_owned())),
+        }
+    }
+}
+
+/// Tells the other thread that this one is over, also where it panics.
+struct SetOnDrop<'a>(&'a AtomicBool);
+
+impl Drop for SetOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}

@@ -1,0 +1,68 @@
+//! The mirror's part: the one place from which it is driven, and parked on every way out.
+
+use std::time::Duration;
+
+use raysweep_core::{Clock, DeviceError, DeviceErrorKind, Mirror, MirrorPath, ns_from_us};
+
+/// Between two looks at a mirror that plays a path.
+const FEED: Duration = Duration::from_millis(4);
+
+/// Share of the path's rate by which the controller's own may differ: drivers measure it while the mirror goes to the
+/// path's beginning, no better than this. Every batch is synchronised anew.
+const RATE_TOLERANCE: f64 = 0.03;
+
+/// A mirror in a run, if the rig has one: parked with the light off when it goes out of scope, on every way out.
+pub struct Motion(Option<Box<dyn Mirror>>);
+
+impl Motion {
+    /// Takes a mirror that is at rest.
+    pub fn new(mirror: Option<Box<dyn Mirror>>) -> Self {
+        Self(mirror)
+    }
+
+    /// Whether there is a mirror at all.
+    pub fn is_driven(&self) -> bool {
+        self.0.is_some()
+    }
+
+    /// Takes the mirror to the path's first point and begins to play it.
+    ///
+    /// # Errors
+    /// What the mirror's driver said, or a rate that the frames would not fit.
+    pub fn start(&mut self, path: &MirrorPath, rounds: u32) -> Result<(), DeviceError> {
+        let Some(mirror) = &mut self.0 else { return Ok(()) };
+        let rate_hz = mirror.load(path)?;
+        let wanted_hz = path.rate_hz();
+        if (rate_hz - wanted_hz).abs() > RATE_TOLERANCE * wanted_hz {
+            let what = format!(
+                "the controller plays {rate_hz} samples a second, the plan's batches.path.rate_hz is {wanted_hz}: plan with the controller's rate"
+            );
+            return Err(DeviceError::new("mirror", DeviceErrorKind::OutOfRange, what));
+        }
+        mirror.start(rounds)
+    }
+
+    /// Feeds the mirror until its path is over, or parks it as soon as `go_on` says no.
+    ///
+    /// # Errors
+    /// What the mirror's driver said.
+    pub fn play(&mut self, clock: &Clock, go_on: &dyn Fn() -> bool) -> Result<(), DeviceError> {
+        let Some(mirror) = &mut self.0 else { return Ok(()) };
+        let clock = clock.register();
+        while go_on() {
+            if mirror.feed()?.parked {
+                return Ok(());
+            }
+            clock.sleep_until(clock.now_ns() + ns_from_us(FEED.as_secs_f64() * 1e6));
+        }
+        mirror.park()
+    }
+}
+
+impl Drop for Motion {
+    fn drop(&mut self) {
+        if let Some(Err(error)) = self.0.as_mut().map(|mirror| mirror.park()) {
+            tracing::error!(%error, "mirror not parked");
+        }
+    }
+}

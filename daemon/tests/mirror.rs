@@ -1,0 +1,357 @@
+//! A run on a rig whose mirror hangs on a serial line: the path reaches the mirror bit for bit, and every way out of the
+//! daemon leaves the mirror parked with the light off. How long that took is printed.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use raysweep::config::{DotRigFile, Plan};
+use raysweep::control::Control;
+use raysweep::mirror::state_file;
+use raysweep::rig::AnyRig;
+use raysweep::run::Runner;
+use raysweep_core::{Clock, MirrorLimits};
+use raysweep_drivers::mirror::playzerx::protocol::Sample;
+use raysweep_drivers::mirror::{Parked, park};
+use raysweep_pipeline::Registry;
+use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
+use raysweep_proto::{Client, Event, RunParams, RunState};
+use raysweep_sim::mirror::{Held, Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
+use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
+use tempfile::TempDir;
+
+/// 6500 samples and 50 dots a batch: few enough frames for any machine.
+fn plan(count: u32) -> String {
+    format!(
+        "kind = \"batches\"\nname = \"mirror\"\n[batches]\ncount = {count}\ndots = 50\nexposure_us = 70\n\
+         trailing_region = [16, 32, 0, 32]\ndark_frames = 50\ncalibration = []\n\
+         [batches.path]\namplitude_deg = [2.3, 1.3]\nlines = 40\n"
+    )
+}
+
+struct Lab {
+    pty: MirrorPty,
+    folder: TempDir,
+}
+
+struct Daemon(Child);
+
+impl Drop for Daemon {
+    /// SIGKILL, also where a test fails: a daemon left behind would hold the test's output open.
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+impl Daemon {
+    fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.0.id().try_into().unwrap()), signal).unwrap();
+    }
+}
+
+impl Lab {
+    fn new() -> Self {
+        let controller = PlayzerXController::new(PlayzerXConfig::default());
+        let pty = MirrorPty::plug(controller, Link::VirtualCom, WireFaults::default()).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let rig = format!(
+            "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"playzerx\"\nport = \"{}\"\n\
+             interlock = \"{}\"\n[sim.dots]\nrows = 16\ncolumns = 32\n",
+            pty.path().display(),
+            folder.path().join("interlock").display()
+        );
+        fs::write(folder.path().join("interlock"), "1\n").unwrap();
+        fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        Self { pty, folder }
+    }
+
+    fn data(&self) -> PathBuf {
+        self.folder.path().join("data")
+    }
+
+    fn socket(&self) -> PathBuf {
+        self.folder.path().join("socket")
+    }
+
+    fn daemon(&self) -> Daemon {
+        let daemon = Command::new(env!("CARGO_BIN_EXE_raysweepd"))
+            .arg("--rig")
+            .arg(self.folder.path().join("rig.toml"))
+            .arg("--socket")
+            .arg(self.socket())
+            .arg("--data")
+            .arg(self.data())
+            .stderr(fs::File::create(self.folder.path().join("log")).map_or(Stdio::null(), Stdio::from))
+            .spawn()
+            .unwrap();
+        Daemon(daemon)
+    }
+
+    fn log(&self) -> String {
+        fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
+    }
+
+    fn client(&self) -> Client {
+        let began = Instant::now();
+        loop {
+            match Client::connect(self.socket()) {
+                Ok(client) => return client,
+                Err(error) => assert!(began.elapsed() < Duration::from_secs(60), "{error}\n{}", self.log()),
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// Begins a run and waits until the mirror has played so many samples with light.
+    fn play(&self, count: u32, samples: usize) -> Daemon {
+        let daemon = self.daemon();
+        let params = RunParams { plan: plan(count), ..RunParams::default() };
+        self.client().run(&params).unwrap();
+        let began = Instant::now();
+        while self.lit() < samples {
+            assert!(began.elapsed() < Duration::from_secs(60), "no light after a minute\n{}", self.log());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        daemon
+    }
+
+    fn lit(&self) -> usize {
+        self.pty.look(|truth| truth.held.iter().filter(|held| held.light > 0).count())
+    }
+
+    /// Waits until the run has ended, and says how.
+    fn ended(&self) -> (RunState, Option<String>) {
+        let mut client = self.client();
+        let began = Instant::now();
+        loop {
+            let status = client.status().unwrap();
+            if matches!(status.state, RunState::Idle | RunState::Faulted) {
+                return (status.state, status.error);
+            }
+            assert!(began.elapsed() < Duration::from_secs(60), "{status:?}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    /// Waits until the mirror is parked, with the light off before, and without a step on the way; prints when.
+    fn assert_parked(&self, way: &str, since_ns: i64) {
+        let began = Instant::now();
+        let (dark_ns, parked_ns) = loop {
+            let parked = self.pty.look(|truth| truth.dark_since_ns.zip(truth.parked_since_ns));
+            if let Some(parked) = parked {
+                break parked;
+            }
+            assert!(began.elapsed() < Duration::from_secs(20), "{way}: not parked\n{}", self.log());
+            std::thread::sleep(Duration::from_millis(2));
+        };
+        assert!(dark_ns <= parked_ns);
+        let truth = self.pty.truth();
+        let steps = truth
+            .held
+            .windows(2)
+            .map(|pair| (pair[1].x - pair[0].x).abs().max((pair[1].y - pair[0].y).abs()));
+        let step = steps.fold(0.0, f64::max);
+        let allowed = MirrorLimits::A7B2_3_3600AL.max_step.0 / 6.5 * 2047.0 + 2.0;
+        assert!(step <= allowed, "{way}: a step of {step} codes, {allowed} are allowed");
+        let ms = |ns: i64| (ns - since_ns) as f64 / 1e6;
+        println!("{way}: light off after {:.1} ms, mirror parked after {:.1} ms", ms(dark_ns), ms(parked_ns));
+    }
+
+    /// Waits until whoever had the mirror has noted that it is parked.
+    fn assert_noted(&self) {
+        let began = Instant::now();
+        loop {
+            match park(&state_file(&self.data())) {
+                Ok(parked) => {
+                    return assert_eq!(parked, Parked::Already, "somebody else has parked it before");
+                }
+                Err(error) => assert!(began.elapsed() < Duration::from_secs(10), "{error}"),
+            }
+        }
+    }
+}
+
+fn now_ns() -> i64 {
+    Clock::real().now_ns()
+}
+
+#[test]
+fn sixty_batches_reach_the_mirror_bit_for_bit() {
+    let lab = Lab::new();
+    let _daemon = lab.daemon();
+    let events = lab.client().subscribe().unwrap();
+    // Two batches more are played than are wanted: the first has no beginning.
+    let text = plan(58);
+    lab.client().run(&RunParams { plan: text.clone(), ..RunParams::default() }).unwrap();
+    let finished = events.into_iter().find_map(|event| match event.unwrap() {
+        Event::Finished { state, error, .. } => Some((state, error)),
+        _ => None,
+    });
+    assert_eq!(finished, Some(("complete".into(), None)), "{}", lab.log());
+    let truth = lab.pty.truth();
+    assert_eq!((truth.underruns, truth.overfills), (0, 0));
+    let rig = DotRigFile::parse(&fs::read_to_string(lab.folder.path().join("rig.toml")).unwrap()).unwrap();
+    let path = Plan::parse(&text).unwrap().batches.mirror_path(&rig.limits()).unwrap();
+    assert_eq!(path.points().len(), 6500);
+    let codes: Vec<Held> = path
+        .points()
+        .iter()
+        .map(|point| Sample::of(*point, MirrorLimits::A7B2_3_3600AL.max_tilt))
+        .map(|Sample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
+        .collect();
+    let first = codes.iter().position(|held| held.light > 0).unwrap();
+    let begin = truth.held.iter().position(|held| held.light > 0).unwrap() - first;
+    assert!(truth.held.len() >= begin + 390_000);
+    for (batch, held) in truth.held[begin..begin + 390_000].chunks(6500).enumerate() {
+        assert!(held == codes, "batch {batch} differs");
+    }
+    lab.assert_noted();
+}
+
+#[test]
+fn cancel() {
+    let lab = Lab::new();
+    let _daemon = lab.play(1000, 20_000);
+    let status = lab.client().status().unwrap().mirror.unwrap();
+    assert!(status.laser && !status.parked, "{status:?}");
+    assert_eq!(status.light, "interlock_closed");
+    let since_ns = now_ns();
+    lab.client().cancel().unwrap();
+    lab.assert_parked("cancel", since_ns);
+    assert_eq!(lab.ended().0, RunState::Idle);
+    let status = lab.client().status().unwrap().mirror.unwrap();
+    assert!(!status.laser && status.parked, "{status:?}");
+}
+
+#[test]
+fn interlock() {
+    let lab = Lab::new();
+    let _daemon = lab.play(1000, 20_000);
+    let since_ns = now_ns();
+    fs::write(lab.folder.path().join("interlock"), "0\n").unwrap();
+    lab.assert_parked("interlock opened", since_ns);
+    let (state, error) = lab.ended();
+    assert_eq!(state, RunState::Faulted);
+    assert!(error.unwrap().contains("interlock"));
+    let status = lab.client().status().unwrap().mirror.unwrap();
+    assert_eq!((status.light.as_str(), status.parked), ("interlock_open", true));
+}
+
+/// A host that is too slow: the daemon stands still for longer than the controller's 125,000 samples last.
+#[test]
+fn underrun() {
+    let lab = Lab::new();
+    let daemon = lab.play(1000, 20_000);
+    daemon.signal(Signal::SIGSTOP);
+    let began = Instant::now();
+    while lab.pty.look(|truth| truth.underruns == 0) {
+        assert!(began.elapsed() < Duration::from_secs(20), "the FIFO does not run dry");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let since_ns = now_ns();
+    daemon.signal(Signal::SIGCONT);
+    lab.assert_parked("underrun, from when the daemon goes on", since_ns);
+    let (state, error) = lab.ended();
+    assert_eq!(state, RunState::Faulted);
+    assert!(error.unwrap().contains("ran out of samples"));
+}
+
+#[test]
+fn unplug() {
+    let mut lab = Lab::new();
+    let _daemon = lab.play(1000, 20_000);
+    let since_ns = now_ns();
+    // The power goes with the plug: the light is off and the mirror springs back.
+    lab.pty.unplug();
+    let (state, error) = lab.ended();
+    assert_eq!(state, RunState::Faulted);
+    assert!(error.unwrap().contains("the controller is gone"));
+    println!("unplug: the run had ended after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
+    let status = lab.client().status().unwrap().mirror.unwrap();
+    assert!(!status.parked, "nobody takes it for parked: {status:?}");
+}
+
+#[test]
+fn sigterm() {
+    let lab = Lab::new();
+    let mut daemon = lab.play(1000, 20_000);
+    let since_ns = now_ns();
+    daemon.signal(Signal::SIGTERM);
+    lab.assert_parked("SIGTERM", since_ns);
+    assert!(daemon.0.wait().unwrap().success(), "{}", lab.log());
+    println!("SIGTERM: the daemon had ended after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
+    lab.assert_noted();
+}
+
+#[test]
+fn sigkill() {
+    let lab = Lab::new();
+    let mut daemon = lab.play(1000, 20_000);
+    let since_ns = now_ns();
+    daemon.signal(Signal::SIGKILL);
+    daemon.0.wait().unwrap();
+    lab.assert_parked("SIGKILL, by the guardian", since_ns);
+    lab.assert_noted();
+}
+
+/// A stage that panics on every frame.
+struct Panicking;
+
+impl ColumnStage for Panicking {
+    fn worker(&self) -> Box<dyn ColumnWorker> {
+        Box::new(Self)
+    }
+}
+
+impl ColumnWorker for Panicking {
+    fn column(
+        &mut self,
+        _: &[u16],
+        _: &Background,
+        _: NoiseFloor,
+        _: &mut SparseColumn,
+    ) -> Result<(), DotsError> {
+        panic!("as planned");
+    }
+}
+
+/// It costs its frames and nothing else: the run goes on, and at its end the mirror is parked.
+#[test]
+fn panic_in_a_stage() {
+    let lab = Lab::new();
+    let mut registry = Registry::default();
+    registry.dots.register("denoise", |_, _| Ok(Box::new(Panicking)));
+    let rig = AnyRig::load(&lab.folder.path().join("rig.toml")).unwrap();
+    fs::create_dir(lab.data()).unwrap();
+    let runner = Runner::new(rig, lab.data(), registry).unwrap();
+    runner.run(RunParams { plan: plan(3), ..RunParams::default() }).unwrap();
+    let began = Instant::now();
+    while !matches!(runner.status().state, RunState::Idle | RunState::Faulted) {
+        assert!(began.elapsed() < Duration::from_secs(60), "{:?}", runner.status());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let ended_ns = now_ns();
+    assert!(lab.lit() > 0);
+    let dark_ns = lab.pty.look(|truth| truth.dark_since_ns).unwrap();
+    lab.assert_parked("panic in a stage, after the last light", dark_ns);
+    assert!(lab.pty.look(|truth| truth.parked_since_ns).unwrap() <= ended_ns, "before the run ends");
+    lab.assert_noted();
+}
+
+#[test]
+fn no_light_without_a_word() {
+    let lab = Lab::new();
+    fs::write(lab.folder.path().join("interlock"), "0\n").unwrap();
+    let _daemon = lab.daemon();
+    lab.client().run(&RunParams { plan: plan(2), ..RunParams::default() }).unwrap();
+    let (state, error) = lab.ended();
+    assert_eq!(state, RunState::Faulted);
+    assert!(error.unwrap().contains("close the enclosure"));
+    assert_eq!(lab.lit(), 0);
+}

@@ -1,0 +1,203 @@
+//! The simulated dot rig and what it takes to build it.
+
+use std::ops::Range;
+use std::path::Path;
+use std::sync::Arc;
+
+use raysweep_core::{Camera, Clock, MechanicalDeg, Mirror, MirrorLimits, PixelFormat, ns_from_us};
+
+use super::beam::Beam;
+use super::camera::DotCamera;
+use super::config::DotsConfig;
+use super::mirror::{DotMirror, WatchedMirror};
+use super::scene::{DotSceneError, Scene};
+use super::world::{DotsTruth, SubjectSwitch, World};
+use crate::sensor::{Scale, Sensor};
+
+/// Why a simulated dot rig cannot be built.
+#[derive(Debug, thiserror::Error)]
+pub enum DotsError {
+    /// The scene cannot be read or made.
+    #[error("sim.dots.scene: {0}")]
+    Scene(#[from] DotSceneError),
+    /// A key of `[sim.dots]` outside its range.
+    #[error("sim.dots.{key} = {value}: allowed is {allowed}")]
+    Range {
+        /// The key below `[sim.dots]`.
+        key: &'static str,
+        /// Its value.
+        value: f64,
+        /// What it may be.
+        allowed: &'static str,
+    },
+}
+
+impl DotsError {
+    /// The key below `[sim.dots]` that it is about.
+    pub fn key(&self) -> &'static str {
+        match self {
+            Self::Scene(_) => "scene",
+            Self::Range { key, .. } => key,
+        }
+    }
+}
+
+/// What the rest of the rig file says that the simulation needs.
+#[derive(Debug, Clone)]
+pub struct DotsSetup {
+    /// How frames are packed.
+    pub format: PixelFormat,
+    /// Counts, above black, of a white plane in the dot's middle in an exposure of `white_exposure_us`.
+    pub white_dn: f64,
+    /// The exposure that `white_dn` is for.
+    pub white_exposure_us: f64,
+    /// Counts without light.
+    pub black_dn: f64,
+    /// Angle between the beam and the mirror's normal at rest.
+    pub incidence: MechanicalDeg,
+    /// What the mirror survives.
+    pub limits: MirrorLimits,
+}
+
+/// A simulated dot rig whose devices can be opened again and again.
+pub struct DotsRig {
+    bench: Arc<Bench>,
+}
+
+/// Everything about the rig that does not change while it runs.
+pub(super) struct Bench {
+    pub config: DotsConfig,
+    pub setup: DotsSetup,
+    pub scene: Scene,
+    pub beam: Beam,
+    pub sensor: Sensor,
+    /// Camera rows and columns, the margin included.
+    pub size: (usize, usize),
+}
+
+/// The devices of one dot rig, all on one clock.
+pub struct DotsDevices {
+    /// The camera, one dot a frame.
+    pub camera: Box<dyn Camera>,
+    /// The mirror and its light.
+    pub mirror: Box<dyn Mirror>,
+    /// Puts planes before the camera.
+    pub subject: SubjectSwitch,
+    /// The clock that they live by.
+    pub clock: Clock,
+    /// What really happens. A real rig has no such thing: it is for tests alone.
+    pub truth: DotsTruth,
+}
+
+impl DotsRig {
+    /// Builds the rig; a scene file is looked up relative to `folder`.
+    ///
+    /// # Errors
+    /// When the scene cannot be read or a key is out of range; the message names the key.
+    pub fn new(config: DotsConfig, setup: DotsSetup, folder: &Path) -> Result<Self, DotsError> {
+        check_ranges(&config)?;
+        let half = config.fov_deg.map(|fov| (fov / 2.0).to_radians().tan());
+        let scene = Scene::new(&config, half, setup.format.mosaic, folder)?;
+        let (rows, columns) = scene.view().size;
+        let size = (rows + config.margin_rows, columns);
+        let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
+        let sensor = Sensor::new(&config.sensor.emva(), size, scale, config.seed);
+        let beam = Beam::new(&config.dot, half);
+        Ok(Self { bench: Arc::new(Bench { config, setup, scene, beam, sensor, size }) })
+    }
+
+    /// Camera rows (those of the scene above, the margin with the trailing dot below them) and columns.
+    pub fn size(&self) -> (usize, usize) {
+        self.bench.size
+    }
+
+    /// Rows of the scene: the margin begins below them.
+    pub fn scene_rows(&self) -> usize {
+        self.bench.scene.view().size.0
+    }
+
+    /// Camera rows and columns in which the trailing dot shows, and nothing else: it fills less than half of them.
+    pub fn trailing_region(&self) -> (Range<usize>, Range<usize>) {
+        let (rows, columns) = self.bench.size;
+        let (middle, margin) = (columns / 2, self.bench.config.margin_rows);
+        (self.scene_rows()..rows, middle.saturating_sub(margin)..(middle + margin).min(columns))
+    }
+
+    /// Opens the devices, with a camera that makes `frame_rate_hz` frames a second. With a mirror that is driven by its
+    /// own driver the rig is paced by the host's clock, and its camera runs beside the mirror's clock.
+    pub fn open(&self, frame_rate_hz: f64, mirror: Option<Box<dyn Mirror>>) -> DotsDevices {
+        let by_the_clock = self.bench.config.realtime || mirror.is_some();
+        let clock = if by_the_clock { Clock::real() } else { Clock::simulated() };
+        let world = World::new(self.bench.clone(), frame_rate_hz, clock.clone(), by_the_clock);
+        let mirror: Box<dyn Mirror> = match mirror {
+            Some(mirror) => Box::new(WatchedMirror::new(mirror, world.clone())),
+            None => Box::new(DotMirror::new(world.clone())),
+        };
+        DotsDevices {
+            camera: Box::new(DotCamera::new(world.clone(), clock.register())),
+            mirror,
+            subject: SubjectSwitch::new(world.clone()),
+            truth: DotsTruth::new(world),
+            clock,
+        }
+    }
+}
+
+impl Bench {
+    /// Light of one moment's white plane, in the sensor's units of a white plane in its exposure.
+    pub fn exposed(&self, exposure_us: f64) -> f64 {
+        exposure_us / self.setup.white_exposure_us
+    }
+
+    /// Shortest time between two frames.
+    pub fn frame_ns(frame_rate_hz: f64) -> i64 {
+        ns_from_us(1e6 / frame_rate_hz).max(1)
+    }
+}
+
+fn check_ranges(config: &DotsConfig) -> Result<(), DotsError> {
+    let share = (0.0..=1.0, "0 to 1");
+    let not_negative = (0.0..=f64::MAX, "0 or more");
+    let positive = (f64::MIN_POSITIVE..=f64::MAX, "more than 0");
+    let side = (8.0..=4096.0, "8 to 4096");
+    let DotsConfig { dot, mirror, camera, sensor, .. } = config;
+    let [fov_x, fov_y] = config.fov_deg;
+    let mut rules = vec![
+        ("rows", config.rows as f64, side.clone()),
+        ("columns", config.columns as f64, side),
+        ("margin_rows", config.margin_rows as f64, (4.0..=512.0, "4 to 512")),
+        ("motion_period_s", config.motion_period_s, (0.1..=1e6, "0.1 to 1e6")),
+        ("fov_deg", fov_x.min(fov_y), (0.1..=90.0, "0.1 to 90")),
+        ("fov_deg", fov_x.max(fov_y), (0.1..=90.0, "0.1 to 90")),
+        ("dot.fwhm_deg", dot.fwhm_deg, (0.01..=10.0, "0.01 to 10")),
+        ("dot.uneven", dot.uneven, share.clone()),
+        ("dot.ghost", dot.ghost, share.clone()),
+        ("mirror.f0_hz", mirror.f0_hz[0].min(mirror.f0_hz[1]), positive.clone()),
+        ("mirror.q", mirror.q[0].min(mirror.q[1]), positive.clone()),
+        ("mirror.filter_hz", mirror.filter_hz, positive.clone()),
+        ("mirror.coupling", mirror.coupling.abs(), share.clone()),
+        ("mirror.repeat_deg", mirror.repeat_deg, not_negative.clone()),
+        ("camera.clock_error", camera.clock_error, (-0.01..=0.01, "-0.01 to 0.01")),
+        ("camera.dropped", camera.dropped, share.clone()),
+        ("camera.duplicated", camera.duplicated, share.clone()),
+        ("camera.saturated", camera.saturated, share.clone()),
+        ("sensor.hot_pixels", sensor.hot_pixels, share),
+        ("sensor.electrons_per_dn", sensor.electrons_per_dn, positive.clone()),
+        ("sensor.full_well_e", sensor.full_well_e, positive),
+        ("sensor.read_noise_e", sensor.read_noise_e, not_negative.clone()),
+        ("sensor.dsnu_e", sensor.dsnu_e, not_negative.clone()),
+        ("sensor.column_e", sensor.column_e, not_negative.clone()),
+        ("sensor.prnu_percent", sensor.prnu_percent, not_negative.clone()),
+        ("sensor.hot_pixel_e_per_s", sensor.hot_pixel_e_per_s, not_negative),
+        ("sensor.vignetting_percent", sensor.vignetting_percent, (0.0..=100.0, "0 to 100")),
+    ];
+    rules.extend(
+        config.plane_depths.iter().map(|&depth| ("plane_depths", depth, (0.5..=2.0, "0.5 to 2, each"))),
+    );
+    for (key, value, (range, allowed)) in rules {
+        if !range.contains(&value) {
+            return Err(DotsError::Range { key, value, allowed });
+        }
+    }
+    Ok(())
+}

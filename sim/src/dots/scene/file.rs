@@ -1,0 +1,210 @@
+//! Scenes from files: the image under each of N dots.
+//!
+//! `.npz`: `T` float32 (or float64, converted) `[N, H, W]` or `[N, H, W, 3]`, and `uv` `[N, 2]`, the dots' centres in the field of view,
+//! 0..1 from left to right and from top to bottom. `.npy`: `T` alone, its dots on a square grid, row by row from the
+//! top. Between dots the images are interpolated.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use ndarray::{Array2, ArrayD, Axis, Ix2, IxDyn, OwnedRepr};
+use ndarray_npy::{NpzReader, ReadNpyError, ReadNpyExt, ReadNpzError};
+use raysweep_core::Mosaic;
+
+use super::{DotSceneError, Still, seen};
+use crate::dots::beam::Spot;
+use crate::dots::view::View;
+
+/// Dots around a place that make its image where they lie on no grid.
+const NEIGHBOURS: usize = 4;
+
+/// A scene that is known by its dots.
+pub struct FileScene {
+    /// `[dots, pixels]`, as the sensor's pixels see it.
+    images: Array2<f32>,
+    uv: Vec<[f64; 2]>,
+    /// Columns and rows of the grid that the dots lie on, row by row, if they do.
+    grid: Option<[usize; 2]>,
+    view: View,
+}
+
+impl FileScene {
+    /// Reads it.
+    pub fn load(path: &Path, half: [f64; 2], mosaic: Mosaic) -> Result<Self, DotSceneError> {
+        let unreadable = |reason: String| DotSceneError::Unreadable { path: path.into(), reason };
+        let file = || File::open(path).map(BufReader::new).map_err(|error| unreadable(error.to_string()));
+        let (transport, uv) = if path.extension().is_some_and(|extension| extension == "npy") {
+            let transport = match ArrayD::<f32>::read_npy(file()?) {
+                Err(ReadNpyError::WrongDescriptor(_)) => {
+                    ArrayD::<f64>::read_npy(file()?).map(|wide| wide.mapv(|value| value as f32))
+                }
+                read => read,
+            };
+            (transport.map_err(|error| unreadable(error.to_string()))?, None)
+        } else {
+            let mut npz = NpzReader::new(file()?).map_err(|error| unreadable(error.to_string()))?;
+            let names = npz.names().map_err(|error| unreadable(error.to_string()))?;
+            if !["T", "uv"].iter().all(|wanted| names.iter().any(|name| name == wanted)) {
+                return Err(DotSceneError::Layout {
+                    path: path.into(),
+                    found: format!("it holds [{}]", names.join(", ")),
+                    expected: "T [N, H, W] or [N, H, W, 3] and uv [N, 2]".into(),
+                });
+            }
+            let mut read = |name| array(&mut npz, name).map_err(|error| unreadable(error.to_string()));
+            (read("T")?, Some(read("uv")?))
+        };
+        Self::new(path, transport, uv, half, mosaic)
+    }
+
+    fn new(
+        path: &Path,
+        transport: ArrayD<f32>,
+        uv: Option<ArrayD<f32>>,
+        half: [f64; 2],
+        mosaic: Mosaic,
+    ) -> Result<Self, DotSceneError> {
+        let shape = transport.shape().to_vec();
+        let layout = |found: String, expected: &str| DotSceneError::Layout {
+            path: path.into(),
+            found,
+            expected: expected.into(),
+        };
+        let (&[dots, rows, columns] | &[dots, rows, columns, 3]) = shape.as_slice() else {
+            return Err(layout(format!("T has the shape {shape:?}"), "[N, H, W] or [N, H, W, 3]"));
+        };
+        if transport.is_empty() {
+            return Err(layout(format!("T has the shape {shape:?}"), "no length 0"));
+        }
+        let pixels = rows * columns;
+        let channels = transport.len() / dots / pixels;
+        for (dot, image) in transport.axis_iter(Axis(0)).enumerate() {
+            let bad = image.iter().enumerate().find(|&(_, &value)| !(value.is_finite() && value >= 0.0));
+            if let Some((index, &value)) = bad {
+                return Err(DotSceneError::Value { path: path.into(), dot, index, value });
+            }
+        }
+        let uv: Vec<[f64; 2]> = match uv {
+            Some(uv) => {
+                let shape = uv.shape().to_vec();
+                let expected = format!("[{dots}, 2]: one centre for each dot of T");
+                let uv = uv.into_dimensionality::<Ix2>().ok().filter(|uv| uv.dim() == (dots, 2));
+                let uv = uv.ok_or_else(|| layout(format!("uv has the shape {shape:?}"), &expected))?;
+                uv.rows().into_iter().map(|uv| [uv[0], uv[1]].map(f64::from)).collect()
+            }
+            None => {
+                let side = dots.isqrt();
+                if side * side != dots {
+                    let expected = "a square number of them, or an .npz with uv";
+                    return Err(layout(format!("T has {dots} dots"), expected));
+                }
+                let middle = |index: usize| (index as f64 + 0.5) / side as f64;
+                (0..dots).map(|dot| [middle(dot % side), middle(dot / side)]).collect()
+            }
+        };
+        if let Some(dot) = uv.iter().position(|uv| !uv.iter().all(|part| (-1.0..=2.0).contains(part))) {
+            return Err(layout(format!("uv[{dot}] = {:?}", uv[dot]), "0 to 1 in the field of view"));
+        }
+        let values = transport.as_standard_layout();
+        let values = values.as_slice().unwrap_or_default();
+        let images = Array2::from_shape_fn((dots, pixels), |(dot, pixel)| {
+            let first = (dot * pixels + pixel) * channels;
+            match values[first..first + channels] {
+                [red, green, blue] => seen(mosaic, pixel / columns, pixel % columns, [red, green, blue]),
+                _ => values[first],
+            }
+        });
+        let grid = grid_of(&uv);
+        Ok(Self { images, uv, grid, view: View { size: (rows, columns), half } })
+    }
+
+    /// Rows and columns of its images.
+    pub fn size(&self) -> (usize, usize) {
+        self.view.size
+    }
+
+    /// The dots whose images make that of a spot, with their weights; none beside the field of view.
+    fn neighbours(&self, uv: [f64; 2]) -> Vec<(usize, f64)> {
+        if let Some([columns, rows]) = self.grid {
+            let (first, last) = (self.uv[0], self.uv[self.uv.len() - 1]);
+            let mut between = [(0, 0.0); 2];
+            for (axis, count) in [(0, columns), (1, rows)] {
+                let pitch = (last[axis] - first[axis]) / (count - 1) as f64;
+                let place = (uv[axis] - first[axis]) / pitch;
+                if !(-1.0..=count as f64).contains(&place) {
+                    return Vec::new();
+                }
+                let place = place.clamp(0.0, (count - 1) as f64);
+                let below = (place as usize).min(count - 2);
+                between[axis] = (below, place - below as f64);
+            }
+            let [(column, right), (row, down)] = between;
+            let dot = |row: usize, column: usize| row * columns + column;
+            return vec![
+                (dot(row, column), (1.0 - right) * (1.0 - down)),
+                (dot(row, column + 1), right * (1.0 - down)),
+                (dot(row + 1, column), (1.0 - right) * down),
+                (dot(row + 1, column + 1), right * down),
+            ];
+        }
+        let mut nearest: Vec<(usize, f64)> = Vec::with_capacity(NEIGHBOURS + 1);
+        for (dot, centre) in self.uv.iter().enumerate() {
+            let square = (uv[0] - centre[0]).powi(2) + (uv[1] - centre[1]).powi(2);
+            let place = nearest.partition_point(|&(_, other)| other <= square);
+            nearest.insert(place, (dot, square));
+            nearest.truncate(NEIGHBOURS);
+        }
+        let pitch_square = 1.0 / self.uv.len() as f64;
+        match nearest.first() {
+            Some(&(dot, square)) if square < 1e-6 * pitch_square => vec![(dot, 1.0)],
+            Some(&(_, square)) if square > pitch_square => Vec::new(),
+            _ => {
+                let total: f64 = nearest.iter().map(|(_, square)| square.recip()).sum();
+                nearest.into_iter().map(|(dot, square)| (dot, square.recip() / total)).collect()
+            }
+        }
+    }
+}
+
+impl Still for FileScene {
+    fn add_direct(&self, spot: &Spot, image: &mut [f32]) {
+        for (dot, weight) in self.neighbours(self.view.uv(spot.centre)) {
+            let weight = (weight * spot.light) as f32;
+            if weight > 0.0 {
+                image.iter_mut().zip(self.images.row(dot)).for_each(|(sum, value)| *sum += weight * value);
+            }
+        }
+    }
+
+    fn add_global(&self, _: &Spot, _: &mut [f32]) {}
+}
+
+/// Columns and rows of the grid on which the dots lie, row by row, if they do.
+fn grid_of(uv: &[[f64; 2]]) -> Option<[usize; 2]> {
+    let columns = uv.windows(2).position(|pair| pair[1][0] <= pair[0][0])? + 1;
+    let rows = uv.len() / columns;
+    if rows * columns != uv.len() || rows < 2 || columns < 2 {
+        return None;
+    }
+    let (first, last) = (uv[0], uv[uv.len() - 1]);
+    let counts = [columns, rows];
+    let pitch = [0, 1].map(|axis| (last[axis] - first[axis]) / (counts[axis] - 1) as f64);
+    let on_grid = uv.iter().enumerate().all(|(dot, uv)| {
+        let place = [dot % columns, dot / columns];
+        (0..2).all(|axis| {
+            (uv[axis] - first[axis] - place[axis] as f64 * pitch[axis]).abs() < 1e-3 * pitch[axis].abs()
+        })
+    });
+    on_grid.then_some(counts)
+}
+
+/// Reads float32, or float64 by conversion.
+fn array(npz: &mut NpzReader<BufReader<File>>, name: &str) -> Result<ArrayD<f32>, ReadNpzError> {
+    match npz.by_name::<OwnedRepr<f32>, IxDyn>(name) {
+        Err(ReadNpzError::Npy(ReadNpyError::WrongDescriptor(_))) => {
+            Ok(npz.by_name::<OwnedRepr<f64>, IxDyn>(name)?.mapv(|value| value as f32))
+        }
+        other => other,
+    }
+}

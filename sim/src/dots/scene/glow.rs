@@ -1,0 +1,121 @@
+//! Light after its first reflection or refraction, in models that are simple and of the right kind: none is measured.
+
+use std::f64::consts::PI;
+
+use super::model::{Coarse, Model, Place};
+use crate::dots::beam::Spot;
+use crate::dots::view::View;
+
+/// What a scene's light does.
+pub enum Glow {
+    /// Nothing more.
+    None,
+    /// It bounces once from wall to wall.
+    Bounce,
+    /// It is refracted by a ball, and a caustic gathers it.
+    Caustic { centre: [f64; 2], radius: f64 },
+    /// It wanders in wax and comes out around where it went in.
+    Wax { centre: f64, radius: f64, top: f64 },
+    /// It is scattered along the beam and around it.
+    Fog { density: Box<dyn Fn([f64; 2]) -> f64 + Send + Sync> },
+}
+
+/// Widths of the wax's glow, in parts of the field's height, and the share of the light in each.
+const WAX: [(f64, f64); 2] = [(0.10, 0.30), (0.30, 0.25)];
+/// Distances at which the beam's light is scattered in the fog.
+const FOG_DEPTHS: [f64; 6] = [0.90, 0.92, 0.94, 0.96, 0.98, 1.00];
+/// Light scattered towards the camera at each of them, of a beam through the thickest fog.
+const FOG_STREAK: f64 = 0.02;
+/// The same that comes out after several scatterings, and how wide.
+const FOG_HALO: (f64, f64) = (0.012, 0.5);
+
+/// The light at a coarse pixel, from its number, its direction and its place.
+type LightAt<'a> = Box<dyn Fn(usize, [f64; 2], &Place) -> f64 + 'a>;
+
+impl Glow {
+    /// Whether it falls on the surface, whose albedo then counts; else it comes from what is before it.
+    pub fn is_of_surface(&self) -> bool {
+        !matches!(self, Self::Fog { .. })
+    }
+
+    /// The light at the coarse pixels, of what has no fine detail.
+    pub fn coarse(&self, spot: &Spot, model: &Model, view: &View, coarse: &Coarse) -> Option<Vec<f32>> {
+        let light: LightAt = match self {
+            Self::None | Self::Caustic { .. } => return None,
+            Self::Bounce => {
+                let from = model.place(spot.centre);
+                let flux = spot.flux() * model.mean_albedo(spot.centre);
+                let blur = spot.sigma().powi(2);
+                Box::new(move |_, _, to| flux * exchange(&from, to, blur))
+            }
+            &Self::Wax { centre, radius, top } => {
+                let within = move |[x, y]: [f64; 2]| (x - centre).abs() < radius && y > top;
+                if !within(spot.centre) {
+                    return None;
+                }
+                let (spot, height) = (*spot, 2.0 * view.half[1]);
+                Box::new(move |_, m, _| if within(m) { wandered(&spot, m, height) } else { 0.0 })
+            }
+            Self::Fog { density } => {
+                let thick = density(spot.centre);
+                let blobs: Vec<([f64; 2], f64, f64)> = FOG_DEPTHS
+                    .iter()
+                    .map(|&depth| (view.pixel(spot.centre, depth), 1.5 * spot.sigma(), FOG_STREAK * thick))
+                    .chain([(view.pixel(spot.centre, 1.0), FOG_HALO.1 * view.half[1], FOG_HALO.0 * thick)])
+                    .collect();
+                let px_per_tangent = view.size.1 as f64 / (2.0 * view.half[0]);
+                let light = spot.light;
+                let pixel_of = |node: usize| coarse.pixel(node);
+                Box::new(move |node, _, _| {
+                    let [row, column] = pixel_of(node);
+                    blobs
+                        .iter()
+                        .map(|([y, x], sigma, share)| {
+                            let sigma_px = sigma * px_per_tangent;
+                            let square = (row - y).powi(2) + (column - x).powi(2);
+                            light * share * (-0.5 * square / (sigma_px * sigma_px)).exp()
+                        })
+                        .sum()
+                })
+            }
+        };
+        Some(coarse.seen.iter().enumerate().map(|(node, (m, place))| light(node, *m, place) as f32).collect())
+    }
+}
+
+/// Irradiance at `to` of a unit of flux that a small diffuse patch at `from` sends out.
+fn exchange(from: &Place, to: &Place, blur: f64) -> f64 {
+    let way = [0, 1, 2].map(|axis| to.point[axis] - from.point[axis]);
+    let square: f64 = way.iter().map(|part| part * part).sum();
+    let dot = |normal: [f64; 3]| (0..3).map(|axis| normal[axis] * way[axis]).sum::<f64>();
+    let (out, into) = (dot(from.normal).max(0.0), (-dot(to.normal)).max(0.0));
+    // Near the edge the patch is no point.
+    out * into / (PI * square.max(1e-12) * (square + blur))
+}
+
+/// Light that went into the wax under a spot and comes out elsewhere.
+fn wandered(spot: &Spot, m: [f64; 2], height: f64) -> f64 {
+    let square = (m[0] - spot.centre[0]).powi(2) + (m[1] - spot.centre[1]).powi(2);
+    let gaussians = WAX.iter().map(|(width, share)| {
+        let variance = (width * height).powi(2) + spot.sigma().powi(2);
+        share * spot.flux() / (2.0 * PI * variance) * (-0.5 * square / variance).exp()
+    });
+    gaussians.sum()
+}
+
+/// The spots behind a ball of glass of a spot on it. Those from near its rim and from nearer its middle meet, so that
+/// light gathers in a ring.
+pub fn caustic(centre: [f64; 2], radius: f64, spot: &Spot) -> Option<Spot> {
+    let from_centre = [0, 1].map(|axis| (spot.centre[axis] - centre[axis]) / radius);
+    let rho = from_centre[0].hypot(from_centre[1]);
+    if rho >= 1.0 {
+        return None;
+    }
+    let stretch = 1.6 * rho * rho - 2.4;
+    Some(
+        spot.refracted(
+            [0, 1].map(|axis| centre[axis] + stretch * radius * from_centre[axis]),
+            1.0 - rho * rho,
+        ),
+    )
+}

@@ -1,0 +1,122 @@
+//! What stands before the camera of the dot rig, and how it looks under one spot of light.
+
+mod error;
+mod file;
+mod glow;
+mod model;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use raysweep_core::Mosaic;
+
+pub use self::error::DotSceneError;
+use self::file::FileScene;
+use self::model::{Model, Surface};
+use super::beam::Spot;
+use super::config::DotsConfig;
+use super::view::View;
+
+/// Names of the built-in scenes.
+pub const BUILTIN_NAMES: [&str; 4] = ["v-groove", "glass", "candle", "fog"];
+
+/// Images of one spot, `[row, column]` row-major, in parts of a white plane's under the full beam.
+#[derive(Debug, Clone)]
+pub struct Light {
+    /// Light straight from the mirror; of a scene from a file, all light.
+    pub direct: Vec<f32>,
+    /// All other light.
+    pub global: Vec<f32>,
+}
+
+/// A scene at rest.
+pub trait Still: Send + Sync {
+    /// Adds the light of a spot that comes straight from the mirror; of a scene from a file, all light.
+    fn add_direct(&self, spot: &Spot, image: &mut [f32]);
+
+    /// Adds all other light of a spot.
+    fn add_global(&self, spot: &Spot, image: &mut [f32]);
+}
+
+/// A scene that may move, and the planes that can stand in its place.
+pub struct Scene {
+    kind: Kind,
+    planes: Vec<Arc<dyn Still>>,
+    view: View,
+    mosaic: Mosaic,
+    seed: u64,
+}
+
+enum Kind {
+    File(Arc<dyn Still>),
+    Builtin(&'static str),
+}
+
+impl Scene {
+    /// Reads or makes it; files are looked up relative to `folder`.
+    ///
+    /// # Errors
+    /// When it cannot be read, or there is none of that name or size.
+    pub fn new(
+        config: &DotsConfig,
+        half: [f64; 2],
+        mosaic: Mosaic,
+        folder: &Path,
+    ) -> Result<Self, DotSceneError> {
+        let extension = config.scene.extension().and_then(|extension| extension.to_str());
+        let (kind, size): (Kind, _) = if let Some("npz" | "npy") = extension {
+            let scene = FileScene::load(&folder.join(&config.scene), half, mosaic)?;
+            let size = scene.size();
+            (Kind::File(Arc::new(scene)), size)
+        } else {
+            let name = config.scene.to_string_lossy();
+            let name = BUILTIN_NAMES.into_iter().find(|known| *known == name);
+            let name = name.ok_or_else(|| DotSceneError::UnknownName {
+                name: config.scene.to_string_lossy().into_owned(),
+            })?;
+            (Kind::Builtin(name), (config.rows, config.columns))
+        };
+        let view = View { size, half };
+        let planes = config
+            .plane_depths
+            .iter()
+            .map(|&depth| Arc::new(Surface::trace(Model::plane(depth), view, mosaic)) as Arc<dyn Still>)
+            .collect();
+        Ok(Self { kind, planes, view, mosaic, seed: config.seed })
+    }
+
+    /// Rows and columns.
+    pub fn view(&self) -> View {
+        self.view
+    }
+
+    /// How many planes there are.
+    pub fn planes(&self) -> usize {
+        self.planes.len()
+    }
+
+    /// One of the planes.
+    pub fn plane(&self, number: usize) -> Option<Arc<dyn Still>> {
+        self.planes.get(number).cloned()
+    }
+
+    /// The scene at a place of its swing, -1..=1.
+    pub fn at(&self, swing: f64) -> Arc<dyn Still> {
+        match &self.kind {
+            Kind::File(still) => still.clone(),
+            Kind::Builtin(name) => {
+                let model = Model::builtin(name, self.view.half, swing, self.seed);
+                Arc::new(Surface::trace(model, self.view, self.mosaic))
+            }
+        }
+    }
+}
+
+/// What a pixel of a mosaic sees of a colour; a monochrome one the mean.
+fn seen(mosaic: Mosaic, row: usize, column: usize, colour: [f32; 3]) -> f32 {
+    let Some((red_column, red_row)) = mosaic.red() else {
+        return colour.iter().sum::<f32>() / 3.0;
+    };
+    // Blue lies diagonally from red, green beside both.
+    colour[usize::from(row % 2 != red_row) + usize::from(column % 2 != red_column)]
+}

@@ -1,0 +1,392 @@
+//! What camera and mirror share: the path that is played, what stands before the camera, and which frame is next.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use raysweep_core::{Clock, DeviceError, DeviceErrorKind, MirrorPath, ns_from_us};
+
+use super::rig::Bench;
+use super::scan::{Lit, Scan};
+use super::scene::{Light, Still};
+use crate::keyed::{Purpose, keyed, uniform};
+
+/// Frames that a camera by the host's clock keeps for a host that is late.
+const CAMERA_BUFFERS: u64 = 64;
+
+/// What stands before the camera.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Subject {
+    /// The scene.
+    Scene,
+    /// One of the Lambertian planes, by its number in the rig file.
+    Plane(usize),
+}
+
+/// Puts planes before the camera, as an operator would.
+#[derive(Clone)]
+pub struct SubjectSwitch(Arc<World>);
+
+impl SubjectSwitch {
+    pub(super) fn new(world: Arc<World>) -> Self {
+        Self(world)
+    }
+
+    /// Puts it there. What is before the camera when a path begins stays there until its end.
+    ///
+    /// # Errors
+    /// `OutOfRange` for a plane that the rig does not have.
+    pub fn place(&self, subject: Subject) -> Result<(), DeviceError> {
+        let planes = self.0.bench.scene.planes();
+        if let Subject::Plane(number) = subject
+            && number >= planes
+        {
+            let what = format!("plane {number}: sim.dots.plane_depths has {planes}, counted from 0");
+            return Err(DeviceError::new("subject", DeviceErrorKind::OutOfRange, what));
+        }
+        self.0.lock().subject = subject;
+        Ok(())
+    }
+}
+
+/// What became of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameFate {
+    /// It came once.
+    Delivered,
+    /// It was exposed and never came.
+    Dropped,
+    /// It came twice.
+    Duplicated,
+    /// It came once, overexposed everywhere.
+    Saturated,
+}
+
+/// What a frame really was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FrameTruth {
+    /// How many paths were started before the one that it belongs to.
+    pub scan: u64,
+    /// Its batch in that path, from 0.
+    pub batch: u64,
+    /// Its index in the batch, from 0.
+    pub index: u64,
+    /// What stood before the camera.
+    pub subject: Subject,
+    /// What became of it.
+    pub fate: FrameFate,
+}
+
+/// Looks behind the devices, for tests alone.
+#[derive(Clone)]
+pub struct DotsTruth(Arc<World>);
+
+impl DotsTruth {
+    pub(super) fn new(world: Arc<World>) -> Self {
+        Self(world)
+    }
+
+    /// The frame with this id; none that was not triggered yet.
+    pub fn frame(&self, seq: u64) -> Option<FrameTruth> {
+        let state = self.0.lock();
+        let (record, frame) = state.record_of(seq)?;
+        let (batch, index) = record.scan.dot_of(frame);
+        let fate = self.0.fate(record.number, frame);
+        Some(FrameTruth { scan: record.number, batch, index, subject: record.subject, fate })
+    }
+
+    /// The frame's light without noise, in an exposure of `exposure_us`, `[row, column]` row-major without the margin, in
+    /// parts of a white plane's in `camera.white_exposure_us`: straight from the mirror, and all other. Of scenes from
+    /// files the first is all light.
+    pub fn light(&self, seq: u64, exposure_us: f64) -> Option<(Vec<f32>, Vec<f32>)> {
+        let (mut scan, still, frame) = {
+            let state = self.0.lock();
+            let (record, frame) = state.record_of(seq)?;
+            let (batch, _) = record.scan.dot_of(frame);
+            (
+                record.scan.clone(),
+                self.0.still(record.subject, record.scan.rate_hz(), &record.scan, batch),
+                frame,
+            )
+        };
+        let lit = scan.exposure(frame, exposure_us);
+        let mut light = self.0.dark();
+        self.0.render(&lit, exposure_us, &*still, &mut light);
+        Some((light.direct, light.global))
+    }
+
+    /// Ids given so far.
+    pub fn frames(&self) -> u64 {
+        self.0.lock().next_seq
+    }
+}
+
+/// The rig in motion.
+pub struct World {
+    pub bench: Arc<Bench>,
+    pub frame_rate_hz: f64,
+    pub clock: Clock,
+    by_the_clock: bool,
+    state: Mutex<State>,
+}
+
+struct State {
+    subject: Subject,
+    /// The path that is played or was played last, and all before it.
+    records: Vec<Record>,
+    armed: bool,
+    next_seq: u64,
+    /// The next frame of the last path.
+    next_frame: u64,
+}
+
+/// A path that was started.
+struct Record {
+    number: u64,
+    scan: Scan,
+    subject: Subject,
+    /// When its first sample is played; none before the mirror's driver knows.
+    start_ns: Option<i64>,
+    /// Where it was broken off, in samples.
+    end: f64,
+    /// Id and number of the first frame that the camera took of it.
+    first: Option<(u64, u64)>,
+}
+
+/// What a camera has next.
+pub enum Next {
+    /// This frame.
+    Frame(Due),
+    /// One at this time.
+    At(i64),
+    /// None, as long as no other path is started.
+    Nothing,
+}
+
+/// A frame that is exposed.
+pub struct Due {
+    pub seq: u64,
+    pub start_ns: i64,
+    pub done_ns: i64,
+    /// Of the path and of the frame in it: what its noise is keyed by.
+    pub key: [u64; 2],
+    pub batch: u64,
+    pub lit: Vec<Lit>,
+    pub fate: FrameFate,
+    pub subject: Subject,
+}
+
+impl State {
+    fn record_of(&self, seq: u64) -> Option<(&Record, u64)> {
+        let (record, (first_seq, first_frame)) = self
+            .records
+            .iter()
+            .rev()
+            .find_map(|record| Some((record, record.first.filter(|first| first.0 <= seq)?)))?;
+        let frame = first_frame + (seq - first_seq);
+        (seq < self.next_seq).then_some((record, frame))
+    }
+}
+
+impl Record {
+    fn time_ns(&self, start_ns: i64, moment: f64) -> i64 {
+        start_ns + (moment / self.scan.rate_hz() * 1e9).round() as i64
+    }
+}
+
+impl World {
+    pub fn new(bench: Arc<Bench>, frame_rate_hz: f64, clock: Clock, by_the_clock: bool) -> Arc<Self> {
+        let state =
+            State { subject: Subject::Scene, records: Vec::new(), armed: false, next_seq: 0, next_frame: 0 };
+        Arc::new(Self { bench, frame_rate_hz, clock, by_the_clock, state: Mutex::new(state) })
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // A device that panicked has ended its own thread; the state is never left half changed.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A path begins; its first sample is played at `start_ns`, if that is known already.
+    pub fn start(&self, path: MirrorPath, batches: u32, start_ns: Option<i64>) {
+        let scan =
+            Scan::new(path, batches, self.frame_rate_hz, self.bench.setup.incidence, &self.bench.config);
+        let mut state = self.lock();
+        let (number, subject) = (state.records.len() as u64, state.subject);
+        let end = scan.samples() as f64;
+        state.records.push(Record { number, scan, subject, start_ns, end, first: None });
+        state.next_frame = u64::from(self.bench.config.camera.late_frames);
+    }
+
+    /// The first sample of the path was played at `start_ns`.
+    pub fn started(&self, start_ns: i64) {
+        if let Some(record) = self.lock().records.last_mut() {
+            record.start_ns.get_or_insert(start_ns);
+        }
+    }
+
+    /// Samples per second of the path.
+    pub fn rate_hz(&self) -> f64 {
+        self.lock().records.last().map_or(1.0, |record| record.scan.rate_hz())
+    }
+
+    /// The id of the next frame.
+    pub fn next_seq(&self) -> u64 {
+        self.lock().next_seq
+    }
+
+    /// The light goes off and the triggers end.
+    pub fn stop(&self) {
+        let now_ns = self.clock.now_ns();
+        if let Some(record) = self.lock().records.last_mut() {
+            let played = record
+                .start_ns
+                .map_or(0.0, |start_ns| (now_ns - start_ns) as f64 * 1e-9 * record.scan.rate_hz());
+            record.end = record.end.min(played.max(0.0));
+        }
+    }
+
+    /// Samples played, and samples of the whole path.
+    pub fn played(&self) -> (u64, u64) {
+        let now_ns = self.clock.now_ns();
+        let state = self.lock();
+        let Some(record) = state.records.last() else { return (0, 0) };
+        let total = record.scan.samples();
+        let start_ns = record.start_ns.unwrap_or(now_ns);
+        let played = (now_ns - start_ns) as f64 * 1e-9 * record.scan.rate_hz();
+        ((played.max(0.0) as u64).min(total), total)
+    }
+
+    pub fn is_armed(&self) -> bool {
+        self.lock().armed
+    }
+
+    /// From now on triggers are answered, or no longer.
+    pub fn set_armed(&self, armed: bool) {
+        let now_ns = self.clock.now_ns();
+        let mut state = self.lock();
+        if armed && !state.armed {
+            // Triggers that came before are over.
+            let gone = state.records.last().and_then(|record| {
+                let moment = (now_ns - record.start_ns?) as f64 * 1e-9 * record.scan.rate_hz();
+                Some((moment / record.scan.trigger(1)).ceil().max(0.0) as u64)
+            });
+            state.next_frame = state.next_frame.max(gone.unwrap_or(0));
+        }
+        state.armed = armed;
+    }
+
+    /// The camera's next frame.
+    pub fn next(&self, now_ns: i64, exposure_us: f64) -> Next {
+        let mut state = self.lock();
+        let State { records, next_seq, next_frame, .. } = &mut *state;
+        let Some(record) = records.last_mut() else { return Next::Nothing };
+        let Some(start_ns) = record.start_ns else { return Next::Nothing };
+        let done_ns = |record: &Record, frame| {
+            record.time_ns(start_ns, record.scan.trigger(frame)) + ns_from_us(exposure_us)
+        };
+        let last = record.scan.frames();
+        if self.by_the_clock {
+            let frame_ns = Bench::frame_ns(self.frame_rate_hz);
+            let late = (now_ns - done_ns(record, *next_frame)) / frame_ns;
+            let lost = u64::try_from(late).unwrap_or(0).saturating_sub(CAMERA_BUFFERS);
+            let lost = lost.min(last.saturating_sub(*next_frame));
+            record.first.get_or_insert((*next_seq, *next_frame));
+            *next_frame += lost;
+            *next_seq += lost;
+        }
+        loop {
+            let frame = *next_frame;
+            if frame >= last || record.scan.trigger(frame) >= record.end {
+                return Next::Nothing;
+            }
+            let done_ns = done_ns(record, frame);
+            if done_ns > now_ns {
+                return Next::At(done_ns);
+            }
+            record.first.get_or_insert((*next_seq, frame));
+            let seq = *next_seq;
+            *next_seq += 1;
+            *next_frame += 1;
+            let fate = self.fate(record.number, frame);
+            if fate != FrameFate::Dropped {
+                return Next::Frame(Due {
+                    seq,
+                    start_ns: record.time_ns(start_ns, record.scan.trigger(frame)),
+                    done_ns,
+                    key: [record.number, frame],
+                    batch: record.scan.dot_of(frame).0,
+                    lit: record.scan.exposure(frame, exposure_us),
+                    fate,
+                    subject: record.subject,
+                });
+            }
+        }
+    }
+
+    fn fate(&self, scan: u64, frame: u64) -> FrameFate {
+        let camera = &self.bench.config.camera;
+        let mut random = keyed(self.bench.config.seed, Purpose::DotFrame, &[scan, frame]);
+        if uniform(&mut random) < camera.dropped {
+            FrameFate::Dropped
+        } else if uniform(&mut random) < camera.duplicated {
+            FrameFate::Duplicated
+        } else if uniform(&mut random) < camera.saturated {
+            FrameFate::Saturated
+        } else {
+            FrameFate::Delivered
+        }
+    }
+
+    /// What stands before the camera in a batch of the path that is played.
+    pub fn still_in(&self, subject: Subject, batch: u64) -> Option<Arc<dyn Still>> {
+        let state = self.lock();
+        let record = state.records.last()?;
+        Some(self.still(subject, record.scan.rate_hz(), &record.scan, batch))
+    }
+
+    fn still(&self, subject: Subject, rate_hz: f64, scan: &Scan, batch: u64) -> Arc<dyn Still> {
+        let plane = match subject {
+            Subject::Plane(number) => self.bench.scene.plane(number),
+            Subject::Scene => None,
+        };
+        plane.unwrap_or_else(|| {
+            let seconds = (batch * scan.samples_per_batch()) as f64 / rate_hz;
+            let phase = seconds / self.bench.config.motion_period_s;
+            self.bench.scene.at((std::f64::consts::TAU * phase).sin())
+        })
+    }
+
+    /// Images without light, of the scene's size.
+    pub fn dark(&self) -> Light {
+        let (rows, columns) = self.bench.scene.view().size;
+        Light { direct: vec![0.0; rows * columns], global: vec![0.0; rows * columns] }
+    }
+
+    /// Adds the light of an exposure; how much went onto the trailing dot's plane. Light that has no fine detail is that
+    /// of the exposure's middle.
+    pub fn render(&self, lit: &[Lit], exposure_us: f64, still: &dyn Still, light: &mut Light) -> f64 {
+        let dot = &self.bench.config.dot;
+        let share = self.bench.exposed(exposure_us) / lit.len() as f64;
+        let (mut trailing, mut on_scene, mut middle) = (0.0, 0.0, [0.0; 2]);
+        for lit in lit {
+            match *lit {
+                Lit::Nowhere => {}
+                Lit::Trailing(part) => trailing += part * share,
+                Lit::Scene(centre, part) => {
+                    let part = part * share;
+                    still.add_direct(&self.bench.beam.spot(centre, part), &mut light.direct);
+                    on_scene += part;
+                    (0..2).for_each(|axis| middle[axis] += part * centre[axis]);
+                }
+            }
+        }
+        if on_scene > 0.0 {
+            let middle = middle.map(|sum| sum / on_scene);
+            still.add_global(&self.bench.beam.spot(middle, on_scene), &mut light.global);
+            if dot.ghost > 0.0 {
+                let beside = [0, 1].map(|axis| middle[axis] + dot.ghost_deg[axis].to_radians().tan());
+                let ghost = self.bench.beam.spot(beside, on_scene * dot.ghost);
+                still.add_direct(&ghost, &mut light.global);
+            }
+        }
+        trailing
+    }
+}
