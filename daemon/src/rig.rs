@@ -13,9 +13,7 @@ use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
-use crate::config::{
-    CameraDriver, ConfigError, DrmSection, ProjectorDriver, RigFile, RigKind, VsyncDriver,
-};
+use crate::config::{CameraDriver, ConfigError, DrmSection, ProjectorDriver, RigFile, RigKind, VsyncDriver};
 
 pub use self::dots::{DotDevices, DotRig, Stand};
 

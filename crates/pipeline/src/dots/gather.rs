@@ -167,11 +167,7 @@ impl<S: CutSink> Gatherer<S> {
     ///
     /// # Errors
     /// When the trailing dot is not seen where it should be.
-    pub fn take(
-        &mut self,
-        looked: Looked,
-        spare: &mut dyn FnMut(SparseColumn),
-    ) -> Result<(), DotsError> {
+    pub fn take(&mut self, looked: Looked, spare: &mut dyn FnMut(SparseColumn)) -> Result<(), DotsError> {
         let Looked { seen, column, frame, lost_before } = looked;
         if let Cutter::Blind = self.cutter {
             // Taken in so that it is accounted for.
@@ -272,13 +268,7 @@ impl<S: CutSink> Gatherer<S> {
         self.decided = decided;
     }
 
-    fn settle(
-        &mut self,
-        arrival: u64,
-        waiting: Waiting,
-        fate: Fate,
-        spare: &mut dyn FnMut(SparseColumn),
-    ) {
+    fn settle(&mut self, arrival: u64, waiting: Waiting, fate: Fate, spare: &mut dyn FnMut(SparseColumn)) {
         let Waiting { id, column, frame, lost_before, start_ns, end_ns } = waiting;
         let mut place = None;
         match fate {

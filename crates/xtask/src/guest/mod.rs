@@ -44,13 +44,7 @@ const TESTS: &[GuestTest] = &[
         pipes: &[],
         environment: &[("RAYSWEEP_DRM_CARD", "/dev/dri/card0")],
     },
-    GuestTest {
-        name: "guest_fx2lafw",
-        modules: &["vhci-hcd"],
-        devices: &[],
-        pipes: &[],
-        environment: &[],
-    },
+    GuestTest { name: "guest_fx2lafw", modules: &["vhci-hcd"], devices: &[], pipes: &[], environment: &[] },
     GuestTest {
         name: "guest_modemline",
         modules: &["vhci-hcd", "ftdi_sio", "pps-ldisc"],

@@ -44,6 +44,8 @@ pub struct Stream {
     asked: Instant,
     /// Samples sent before the question that was answered last, and how many of them were left.
     answer: (u64, u64),
+    /// When that question was asked.
+    answer_asked: Instant,
     played: u64,
     moved: Instant,
     began: Option<Instant>,
@@ -67,6 +69,7 @@ impl Stream {
             question: None,
             asked: now,
             answer: (0, 0),
+            answer_asked: now,
             played: 0,
             moved: now,
             began: None,
@@ -99,14 +102,19 @@ impl Stream {
         self.written = 0;
         let (asked_after, left) = self.answer;
         let held_at_most = left + (self.next - asked_after);
-        let room = (u64::from(FIFO_SAMPLES) - SPARE_SAMPLES).saturating_sub(held_at_most);
+        // What is sent to a FIFO that ran dry would hide that it did.
+        let is_in_doubt = self.may_have_run_dry();
+        let room = match is_in_doubt {
+            true => 0,
+            false => (u64::from(FIFO_SAMPLES) - SPARE_SAMPLES).saturating_sub(held_at_most),
+        };
         let samples = room.min(WRITE_SAMPLES).min(self.sequence.len() - self.next);
         for index in self.next..self.next + samples {
             let sample = Sample::of(self.sequence.at(index), self.full_scale);
             Command::Sample(sample).to_bytes(&mut self.out);
         }
         self.next += samples;
-        if self.question.is_none() && self.asked.elapsed() >= ASK_EVERY {
+        if self.question.is_none() && (is_in_doubt || self.asked.elapsed() >= ASK_EVERY) {
             Command::SamplesLeft.to_bytes(&mut self.out);
         }
         !self.out.is_empty()
@@ -150,7 +158,7 @@ impl Stream {
             return Ok(());
         };
         self.question = None;
-        self.answer = (sent, left);
+        (self.answer, self.answer_asked) = ((sent, left), asked);
         if played > self.played {
             self.moved = Instant::now();
         }
@@ -160,8 +168,7 @@ impl Stream {
             let seconds = (asked.duration_since(began) + asked.elapsed() / 2).as_secs_f64();
             self.rate.push(seconds, played as f64);
         }
-        let lead = self.sequence.lead_len();
-        if left == 0 && self.sequence.path_len() > 0 && sent > lead && sent < self.sequence.len() {
+        if left == 0 && self.is_within_path(sent) {
             return Err(fault(
                 DeviceErrorKind::Protocol,
                 format!(
@@ -172,6 +179,19 @@ impl Stream {
         Ok(())
     }
 
+    /// Whether more samples must follow the first `sent` without a gap.
+    fn is_within_path(&self, sent: u64) -> bool {
+        self.sequence.path_len() > 0 && sent > self.sequence.lead_len() && sent < self.sequence.len()
+    }
+
+    /// Whether the FIFO may have drained since the last answer, by the clock: the host stood still for that long.
+    fn may_have_run_dry(&self) -> bool {
+        let (asked_after, left) = self.answer;
+        let held = left + (self.next - asked_after);
+        let since = self.began.map_or(Duration::ZERO, |began| self.answer_asked.max(began).elapsed());
+        self.is_within_path(self.next) && since.as_secs_f64() * self.asked_rate_hz * 1.1 >= held as f64
+    }
+
     /// A controller that does not answer, or whose FIFO does not drain, does not move the mirror.
     fn check_life(&self) -> Result<(), DeviceError> {
         if self.question.is_some_and(|(asked, _)| asked.elapsed() > REPLY_WAIT) {
@@ -180,7 +200,7 @@ impl Stream {
                 "the controller no longer answers: check its cable, or switch it off and on",
             ));
         }
-        let waiting = self.began.is_some() && self.played < self.certain;
+        let waiting = self.began.is_some() && self.played < self.certain && !self.may_have_run_dry();
         if waiting && self.moved.elapsed() > REPLY_WAIT {
             return Err(fault(
                 DeviceErrorKind::Timeout,
