@@ -37,6 +37,7 @@ pub fn bench(arguments: &[&str]) -> Done {
             bench.args(["bench", "--package", "raysweep-pipeline", "--bench", "dots", "--"]);
             run(bench.args(options))
         }
+        ["dots", "--live", unknown, ..] => Err(format!("`dots --live` has no option `{unknown}`\n{BENCHES}")),
         ["dots", options @ ..] => {
             transport("dots", "python-peers-dots", "peers-dots-requirements.txt", options)
         }

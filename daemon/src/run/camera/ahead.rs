@@ -33,6 +33,8 @@ pub struct Line {
     pub max_jitter_us: f64,
     /// Whether a frame's delay tells each settings of the plan from all others of the same exposure.
     pub distinct: bool,
+    /// Whether all have the same exposure.
+    pub has_one_exposure: bool,
 }
 
 impl Line {
@@ -53,7 +55,8 @@ impl Line {
             let mut steps = settings.windows(2).map(|pair| phase_us(pair[1]) - phase_us(pair[0]));
             wraps && steps.all(|step_us| step_us > max_jitter_us)
         });
-        Self { period_us, max_jitter_us, distinct }
+        let has_one_exposure = sorted.chunk_by(|a, b| same_exposure(a, b)).count() <= 1;
+        Self { period_us, max_jitter_us, distinct, has_one_exposure }
     }
 }
 
@@ -320,7 +323,11 @@ impl Ahead {
     /// Notes settings that were written between two moments. Without `work` they only lead to others.
     pub fn push(&mut self, applied: Applied, written_ns: (i64, i64), work: Option<Wanted>) {
         self.camera_is_exact = matches!(applied.first_frame, FirstFrame::Exactly(_));
-        let by_stamps = work.is_none() || self.line.distinct;
+        // Where latencies vary, stamps tell of all points alike or of none: which frames of a point count must not hang on
+        // the point before it, which a resumed run may not have taken.
+        let tell_alike =
+            self.frames_carry_exposure || self.line.has_one_exposure || self.constant_latency().is_some();
+        let by_stamps = work.is_none() || self.line.distinct && tell_alike;
         // Where frames do not tell their exposure, the probe found out when delays act and no more than that.
         let late_frames = self.constant_latency().filter(|_| work.is_some());
         let certain = applied.first_frame.certain();
