@@ -263,7 +263,8 @@ impl WithSimd for Pivoting<'_> {
                     }
                     let least = match self.aim {
                         Aim::NonNegative => {
-                            pixel.exchange(simd, &y, self.free.of_mut(pixel.number), &mut exchanged);
+                            let costs = pixel.side == Side::Free && narrow.is_none();
+                            pixel.exchange(simd, &y, costs, self.free.of_mut(pixel.number), &mut exchanged);
                             0.0
                         }
                         Aim::Free => {
@@ -305,9 +306,17 @@ impl Pixel {
         }
     }
 
-    /// Looks for slots with the wrong sign in a step's `y`, and has them change sides.
+    /// Looks for slots with the wrong sign in a step's `y`, and has them change sides; `free_costs`: a step costs the more, the
+    /// more slots are free.
     #[inline(always)]
-    fn exchange<S: Simd>(&mut self, simd: S, y: &[f64], free: &mut [f64], exchanged: &mut [f64]) {
+    fn exchange<S: Simd>(
+        &mut self,
+        simd: S,
+        y: &[f64],
+        free_costs: bool,
+        free: &mut [f64],
+        exchanged: &mut [f64],
+    ) {
         let zero = simd.splat_f64s(0.0);
         let one = simd.splat_f64s(1.0);
         let (mut largest_x, mut sum, mut wrong) = (zero, zero, zero);
@@ -334,30 +343,30 @@ impl Pixel {
             self.state = State::Minimum;
         } else if wrong < self.fewest {
             (self.fewest, self.patience) = (wrong, PATIENCE);
-            self.exchange_most(y, free, exchanged);
+            exchange_most(y, free_costs, free, exchanged);
         } else if self.patience > 0 {
             self.patience -= 1;
-            self.exchange_most(y, free, exchanged);
+            exchange_most(y, free_costs, free, exchanged);
         } else if let Some(last) = (0..free.len()).rev().find(|&slot| free[slot] != exchanged[slot]) {
             // Exchanging only the last row cannot cycle (Murty), so the count falls below `fewest` at last.
             free[last] = exchanged[last];
         }
     }
+}
 
-    /// Exchanges all slots, but where free ones are what a step costs, of neighbours that are to become free only those
-    /// that gain most: they are mostly enough, and the others would have to go again.
-    #[inline(always)]
-    fn exchange_most(&self, y: &[f64], free: &mut [f64], exchanged: &mut [f64]) {
-        if self.side == Side::Free {
-            let neighbourhoods = y.windows(3).zip(free.windows(3));
-            for ((y, free), exchanged) in neighbourhoods.zip(&mut exchanged[1..]) {
-                let is_outdone_by = |other: usize| (free[other] == 0.0) & (y[other] < y[1]);
-                let stays = (free[1] == 0.0) & (is_outdone_by(0) | is_outdone_by(2));
-                *exchanged = if stays { 0.0 } else { *exchanged };
-            }
+/// Exchanges all slots; where free ones are what a step costs, of neighbours that are to become free only those that gain
+/// most: they are mostly enough, and the others would have to go again.
+#[inline(always)]
+fn exchange_most(y: &[f64], free_costs: bool, free: &mut [f64], exchanged: &mut [f64]) {
+    if free_costs {
+        let neighbourhoods = y.windows(3).zip(free.windows(3));
+        for ((y, free), exchanged) in neighbourhoods.zip(&mut exchanged[1..]) {
+            let is_outdone_by = |other: usize| (free[other] == 0.0) & (y[other] < y[1]);
+            let stays = (free[1] == 0.0) & (is_outdone_by(0) | is_outdone_by(2));
+            *exchanged = if stays { 0.0 } else { *exchanged };
         }
-        free.copy_from_slice(exchanged);
     }
+    free.copy_from_slice(exchanged);
 }
 
 #[cfg(test)]

@@ -112,7 +112,7 @@ impl Sample {
             valid.is_none_or(|valid| valid.slice(s![.., at, *column]).iter().all(|v| *v))
         };
         let unspread = timing.clone().with_beam(Beam::Ideal)?;
-        let rows: Vec<SampledClass> = Self::rows_of(height)
+        let rows: Vec<(RowModel, SampledClass)> = Self::rows_of(height)
             .enumerate()
             .collect::<Vec<_>>()
             .into_par_iter()
@@ -135,22 +135,24 @@ impl Sample {
                 {
                     return Err(PlaneError::NotFinite { setting, row: t, column: columns[pixel] });
                 }
+                let model = RowModel::new(&unspread, &settings, &reach, t);
                 let slots = RowModel::new(&timing, &settings, &reach, t).slots;
                 let ideal = settings.iter().flat_map(|setting| unspread.weights(t, setting)).collect();
                 let ideal = Array2::from_shape_vec((settings.len(), timing.projector_rows()), ideal)
                     .unwrap_or_default();
                 let own_row = timing.camera().own_row(t);
                 let pixels = columns.into_iter().map(|column| (t, column)).collect();
-                Ok(SampledClass { pixels, intensities, slots, ideal, own_row })
+                Ok((model, SampledClass { pixels, intensities, slots, ideal, own_row }))
             })
             .collect::<Result<_, _>>()?;
-        let mut classes: Vec<SampledClass> = Vec::new();
-        for row in rows.into_iter().filter(|row| !row.pixels.is_empty()) {
+        let mut classes: Vec<(RowModel, SampledClass)> = Vec::new();
+        for (model, row) in rows.into_iter().filter(|(_, row)| !row.pixels.is_empty()) {
             match classes.last_mut() {
-                Some(class) if class.has_model_of(&row) => class.append(row),
-                _ => classes.push(row),
+                Some((same, class)) if *same == model && class.slots == row.slots => class.append(row),
+                _ => classes.push((model, row)),
             }
         }
+        let classes: Vec<SampledClass> = classes.into_iter().map(|(_, class)| class).collect();
         if classes.is_empty() {
             return Err(CalibrateError::NoPixels);
         }
@@ -187,10 +189,6 @@ impl Sample {
 }
 
 impl SampledClass {
-    fn has_model_of(&self, row: &Self) -> bool {
-        self.slots == row.slots && self.weights(0.0) == row.weights(0.0)
-    }
-
     fn append(&mut self, row: Self) {
         self.pixels.extend(row.pixels);
         self.intensities = concatenate![Axis(0), self.intensities, row.intensities];
