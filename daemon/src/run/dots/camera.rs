@@ -1,6 +1,6 @@
 //! The camera's part: frames off the camera and into the pipeline, and every exposure that comes to nothing.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use raysweep_core::{Camera, DeviceError, DeviceErrorKind, Frame, FramePool, LossCause};
 use raysweep_pipeline::QueueError;
@@ -10,8 +10,9 @@ use crate::rig::Pace;
 
 /// One wait for a frame.
 const POLL: Duration = Duration::from_millis(100);
-/// Waits without a frame after which the camera has lost its trigger.
-const PATIENCE_POLLS: u32 = 50;
+/// A camera without frames for so long has lost its trigger; by the host's time, since a virtual clock runs on while another
+/// thread is about to start the mirror.
+const PATIENCE: Duration = Duration::from_secs(5);
 /// Frames that are taken after the last trigger, at most: a camera that runs freely gives some for ever.
 const MOST_REST_FRAMES: u32 = 1024;
 /// Ids that may be asked after one by one where many are missing at once.
@@ -69,7 +70,8 @@ impl Source<'_> {
         let mut spare = None;
         let mut last: Option<u64> = None;
         let mut lost = Vec::new();
-        let (mut idle_polls, mut rest_frames) = (0, 0);
+        let mut waiting_since: Option<Instant> = None;
+        let mut rest_frames = 0;
         loop {
             let before = wanted();
             rest_frames += u32::from(before == Wanted::Rest);
@@ -89,14 +91,13 @@ impl Source<'_> {
                 if before == Wanted::Rest {
                     return Ok(lost);
                 }
-                idle_polls += 1;
-                if idle_polls > PATIENCE_POLLS {
+                if waiting_since.get_or_insert_with(Instant::now).elapsed() > PATIENCE {
                     let what = "no frame came for 5 s while the mirror plays its path: is the camera triggered by the mirror's sample clock?";
                     return Err(DeviceError::new("camera", DeviceErrorKind::Timeout, what));
                 }
                 continue;
             };
-            idle_polls = 0;
+            waiting_since = None;
             if let Some(last) = last.filter(|last| stamp.seq > last + 1) {
                 self.note_gap(last + 1, stamp.seq, &mut lost);
             }
