@@ -11,7 +11,7 @@ use raysweep_sim::dots::DotsConfig;
 use serde::Deserialize;
 
 use super::ConfigError;
-use super::rig::{RigKind, default_pixel_format, default_reopen_s};
+use super::rig::{RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn};
 
 /// A dot rig.
 #[derive(Debug, Clone, Deserialize)]
@@ -81,16 +81,12 @@ pub struct DotCameraSection {
 impl DotCameraSection {
     /// Counts, above black, of a white plane in the dot's middle.
     pub fn white_dn(&self) -> f64 {
-        self.white_dn.unwrap_or(2500.0 / 4096.0 * self.full_scale_dn())
+        self.white_dn.unwrap_or_else(|| default_white_dn(self.pixel_format))
     }
 
     /// Counts without light.
     pub fn black_dn(&self) -> f64 {
-        self.black_dn.unwrap_or(64.0 / 4096.0 * self.full_scale_dn())
-    }
-
-    fn full_scale_dn(&self) -> f64 {
-        f64::from(self.pixel_format.max_value()) + 1.0
+        self.black_dn.unwrap_or_else(|| default_black_dn(self.pixel_format))
     }
 }
 

@@ -134,16 +134,12 @@ pub struct CameraSection {
 impl CameraSection {
     /// Counts, above black, of a white pixel in the time of one projector row.
     pub fn white_dn(&self) -> f64 {
-        self.white_dn.unwrap_or(2500.0 / 4096.0 * self.full_scale_dn())
+        self.white_dn.unwrap_or_else(|| default_white_dn(self.pixel_format))
     }
 
     /// Counts without light.
     pub fn black_dn(&self) -> f64 {
-        self.black_dn.unwrap_or(64.0 / 4096.0 * self.full_scale_dn())
-    }
-
-    fn full_scale_dn(&self) -> f64 {
-        f64::from(self.pixel_format.max_value()) + 1.0
+        self.black_dn.unwrap_or_else(|| default_black_dn(self.pixel_format))
     }
 }
 
@@ -215,6 +211,20 @@ pub(super) fn default_reopen_s() -> f64 {
     60.0
 }
 /// Rectified rows of the same height.
+/// 2500 of the 4096 counts of 12 bit, in a format's own counts.
+pub(super) fn default_white_dn(format: PixelFormat) -> f64 {
+    2500.0 / 4096.0 * full_scale_dn(format)
+}
+
+/// 64 of the 4096 counts of 12 bit.
+pub(super) fn default_black_dn(format: PixelFormat) -> f64 {
+    64.0 / 4096.0 * full_scale_dn(format)
+}
+
+fn full_scale_dn(format: PixelFormat) -> f64 {
+    f64::from(format.max_value()) + 1.0
+}
+
 fn default_row_pitch() -> f64 {
     1.0
 }
@@ -279,13 +289,13 @@ impl RigFile {
         let (camera, sensor) = (&self.camera, &self.sim.sensor);
         let unstated = if camera.driver != CameraDriver::Sim {
             CameraNoise {
-                electrons_per_dn: TYPICAL_FULL_SCALE_E / camera.full_scale_dn(),
+                electrons_per_dn: TYPICAL_FULL_SCALE_E / full_scale_dn(camera.pixel_format),
                 read_noise_e: TYPICAL_READ_NOISE_E,
                 source: NoiseSource::Assumed,
             }
         } else if sensor.noise {
             // The simulator counts its electrons on a scale of 12 bit.
-            let electrons_per_dn = sensor.electrons_per_dn * 4096.0 / camera.full_scale_dn();
+            let electrons_per_dn = sensor.electrons_per_dn * 4096.0 / full_scale_dn(camera.pixel_format);
             CameraNoise {
                 electrons_per_dn,
                 read_noise_e: sensor.read_noise_e,

@@ -202,7 +202,7 @@ impl Run {
         let (pipeline, input) = Pipeline::start(config, assembler, stages, storage)?;
 
         let board = self.board.clone();
-        let vsync = VsyncThread::start(vsync, vsync_line, board, input.clone(), self.orders.clone())?;
+        let vsync = VsyncThread::start(vsync, vsync_line, pace, board, input.clone(), self.orders.clone())?;
         let line = line_of(&self.task, trigger_latency_us);
         let camera = CameraThread::start(camera, Drive { clock, pace, line }, input, self.orders.clone())?;
         let _ = self.board.go(RunState::Armed);

@@ -12,6 +12,7 @@ use raysweep_proto::Event as Told;
 use super::board::Board;
 use super::orders::{Order, Orders};
 use super::priority;
+use crate::rig::Pace;
 
 const POLL: Duration = Duration::from_millis(100);
 /// How often the line is shown.
@@ -77,6 +78,7 @@ impl VsyncThread {
     pub fn start(
         mut vsync: Box<dyn Vsync>,
         line: Line,
+        pace: Pace,
         board: Arc<Board>,
         input: Input<Event>,
         orders: Arc<Orders>,
@@ -87,7 +89,9 @@ impl VsyncThread {
             .spawn({
                 let stop = stop.clone();
                 move || {
-                    priority::for_device("vsync");
+                    if pace == Pace::Devices {
+                        priority::for_device("vsync");
+                    }
                     let mut alarm = Alarm { orders, armed: true };
                     let mut meter = Meter::new(line, board);
                     while !stop.load(Ordering::Relaxed) {
