@@ -22,7 +22,16 @@ pub const TEMPORARY_SUFFIX: &str = ".raysweep-tmp";
 /// # Errors
 /// [`Error::Io`] where the file system refuses; the file at `path` is then as before.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    write_with(path, |file| file.write_all(bytes))
+    write_with(path, |file| write_in_pieces(file, bytes))
+}
+
+/// A kernel without preemption (common in virtual machines) runs nothing else on the core while it takes one write,
+/// and needs 5 ms for 2 MiB of fresh pages: a camera's settings would come too late for their trigger.
+const PIECE_BYTES: usize = 128 << 10;
+
+/// Writes all bytes, and leaves the core to real-time threads in between.
+pub(crate) fn write_in_pieces(file: &mut File, bytes: &[u8]) -> io::Result<()> {
+    bytes.chunks(PIECE_BYTES).try_for_each(|piece| file.write_all(piece))
 }
 
 /// As [`write`], with what `fill` writes into the temporary file.

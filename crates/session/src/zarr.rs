@@ -1,5 +1,6 @@
 //! What `stack.zarr` and `transport.zarr` share: a durable store, and chunks at the edge of an array.
 
+use std::fs::File;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -74,7 +75,9 @@ impl WritableStorageTraits for DurableStore {
         let path = self.files.key_to_fspath(key);
         let parent = path.parent().unwrap_or(&self.root);
         if self.draft {
-            let written = std::fs::create_dir_all(parent).and_then(|()| std::fs::write(&path, &value));
+            let written = std::fs::create_dir_all(parent)
+                .and_then(|()| File::create(&path))
+                .and_then(|mut file| durable::write_in_pieces(&mut file, &value));
             return written.map_err(StorageError::from);
         }
         durable::create_dir_all(parent)
