@@ -3,6 +3,7 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use ndarray::Array2;
 use raysweep_core::{
@@ -56,6 +57,8 @@ pub enum Event {
     End,
     /// Nobody takes frames for a while: those that pass are nobody's loss.
     Idle,
+    /// To be raised when everything before it is decided.
+    Settle(Arc<AtomicBool>),
     /// No further frame of this pass comes: decide everything.
     Flush,
 }
@@ -121,6 +124,7 @@ enum Waiting {
     Lost(u64, Option<LossCause>),
     End,
     Idle,
+    Settle(Arc<AtomicBool>),
     Flush,
 }
 
@@ -183,6 +187,7 @@ impl Assembler {
             Event::Lost(seq, cause) => self.waiting.push_back(Waiting::Lost(seq, cause)),
             Event::End => self.waiting.push_back(Waiting::End),
             Event::Idle => self.waiting.push_back(Waiting::Idle),
+            Event::Settle(decided) => self.waiting.push_back(Waiting::Settle(decided)),
             Event::Flush => self.waiting.push_back(Waiting::Flush),
         }
         while let Some(next) = self.waiting.pop_front() {
@@ -230,6 +235,7 @@ impl Assembler {
                 }
             }
             Waiting::Idle => self.idle = true,
+            Waiting::Settle(decided) => decided.store(true, Ordering::Release),
             Waiting::Flush => {
                 self.idle = true;
                 // A device that failed may have left its attempt open.

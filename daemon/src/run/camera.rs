@@ -60,7 +60,8 @@ const POOL_BUFFERS: usize = 40;
 const POLL: Duration = Duration::from_millis(100);
 /// A camera without frames for so long, beyond the time that they take, has lost its trigger.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Frames that pass before a run's first point and after a pass's last, so that the line is known around each frame.
+/// Frames that pass before a run's first point, and at most after a pass's last, so that the line is known around each
+/// frame.
 const MARGIN_FRAMES: u32 = 6;
 
 /// How a pass ended.

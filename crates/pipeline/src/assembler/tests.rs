@@ -187,6 +187,24 @@ fn a_line_that_has_died_does_not_hold_frames_for_ever() {
 }
 
 #[test]
+fn whoever_waits_for_decisions_is_told_of_the_last_one() {
+    let mut feed = Feed::new();
+    feed.edges(0, 3);
+    feed.begin(1, 700.0, 0);
+    feed.frame(2, 9);
+    feed.push(Event::End);
+    let decided = Arc::new(AtomicBool::new(false));
+    feed.push(Event::Settle(decided.clone()));
+    assert!(
+        !decided.load(Ordering::Acquire) && feed.decisions.is_empty(),
+        "the edge after the frame is to come"
+    );
+    feed.edges(3, 4);
+    assert!(decided.load(Ordering::Acquire));
+    assert!(matches!(&feed.decisions[..], [Decision::Unit(_)]));
+}
+
+#[test]
 fn a_flush_decides_what_waits() {
     let mut feed = Feed::new();
     feed.edges(0, 3);

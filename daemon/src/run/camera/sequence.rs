@@ -1,6 +1,8 @@
 //! Sweeps and films: points one after the other while frames keep coming. The settings of each are written while frames
 //! of those before are still under way, so that no trigger goes by for want of them.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use raysweep_core::{Applied, CameraSettings, DeviceError, DeviceState, SettingsId};
@@ -8,10 +10,13 @@ use raysweep_pipeline::{Event, Job, Label, Point, Role, Shot};
 
 use super::ahead::Wanted;
 use super::{Attempt, MARGIN_FRAMES, POLL, Pass, Received, Sequencer, Taken, Watchdog, closed};
+use crate::rig::Pace;
 use crate::run::orders::Order;
 
 /// Settings that lead to others differ from them by so much delay: more than any jitter. [A]
 const LEAD_IN_US: f64 = 2_000.0;
+/// How often it is looked whether the last frames are decided.
+const SETTLE_POLL: Duration = Duration::from_millis(2);
 
 /// A film to take under one picture of the projector.
 #[derive(Debug, Clone)]
@@ -124,7 +129,29 @@ impl Sequencer {
                 None => watchdog.missed(timeout, self.longest_frame_us, self.camera.state())?,
             }
         }
-        self.pass_frames(MARGIN_FRAMES, i64::MIN)
+        self.settle()
+    }
+
+    /// Lets frames go by until all points are decided.
+    fn settle(&mut self) -> Result<(), DeviceError> {
+        if self.pace == Pace::Pipeline {
+            // Always as many, so that runs are equal to the bit.
+            return self.pass_frames(MARGIN_FRAMES, i64::MIN);
+        }
+        let decided = Arc::new(AtomicBool::new(false));
+        self.input.send(Event::Settle(decided.clone())).map_err(closed)?;
+        let mut left = MARGIN_FRAMES;
+        let mut watchdog = Watchdog::default();
+        while left > 0 && !decided.load(Ordering::Acquire) && self.orders.go_on() {
+            match self.receive(SETTLE_POLL)? {
+                Some(received) => {
+                    self.pass(received)?;
+                    left -= 1;
+                }
+                None => watchdog.missed(SETTLE_POLL, self.longest_frame_us, self.camera.state())?,
+            }
+        }
+        Ok(())
     }
 
     /// Sets the camera to what stamps tell from `settings`, at the same exposure.

@@ -180,11 +180,12 @@ fn best_coarse(score: impl Fn(f64) -> Result<f64, PlaneError> + Sync) -> Result<
 fn golden_section(
     mut from: f64,
     mut to: f64,
-    f: impl Fn(f64) -> Result<f64, PlaneError>,
+    f: impl Fn(f64) -> Result<f64, PlaneError> + Sync,
 ) -> Result<f64, PlaneError> {
     let mut low = to - GOLDEN_RATIO * (to - from);
     let mut high = from + GOLDEN_RATIO * (to - from);
-    let (mut f_low, mut f_high) = (f(low)?, f(high)?);
+    let (f_first, f_second) = rayon::join(|| f(low), || f(high));
+    let (mut f_low, mut f_high) = (f_first?, f_second?);
     for _ in 0..GOLDEN_STEPS - 1 {
         if f_low < f_high {
             (to, high, f_high) = (high, low, f_low);

@@ -1,4 +1,5 @@
-use ndarray::{Array1, Array2, ArrayView2, Axis};
+use ndarray::{Array1, Array2, ArrayView2, Axis, s};
+use rayon::prelude::*;
 
 use super::super::pivot::{RUN_PX, Start, minimise};
 use super::super::quadratic::Quadratic;
@@ -39,12 +40,18 @@ impl RowProblem {
     /// Minimisers of several pixels, shape `[pixels, slots]`, from `samples`, `[pixels, settings]`, started from the
     /// free slots of `near`, minimisers of like problems.
     pub fn minimise(&self, samples: ArrayView2<f64>, near: Option<&Array2<f64>>) -> Array2<f64> {
-        let linear = self.quadratic.linear(self.weights.view(), samples);
-        let runs: Vec<usize> =
-            (0..linear.nrows()).step_by(RUN_PX).map(|px| RUN_PX.min(linear.nrows() - px)).collect();
-        let free = near.map(|near| near.mapv(|x| x > 0.0));
-        let start = free.as_ref().map_or(Start::Runs(&runs), |free| Start::Free(free.view()));
-        minimise(SimdLevel::best(), &self.quadratic, linear, &start)
+        let mut pixels = self.quadratic.linear(self.weights.view(), samples);
+        // A sample has few classes, which alone would leave processors without work.
+        pixels.axis_chunks_iter_mut(Axis(0), RUN_PX).into_par_iter().enumerate().for_each(
+            |(run, mut pixels)| {
+                let (first, lengths) = (run * RUN_PX, [pixels.nrows()]);
+                let free = near.map(|near| near.slice(s![first..first + lengths[0], ..]).mapv(|x| x > 0.0));
+                let start = free.as_ref().map_or(Start::Runs(&lengths), |free| Start::Free(free.view()));
+                let minima = minimise(SimdLevel::best(), &self.quadratic, pixels.to_owned(), &start);
+                pixels.assign(&minima);
+            },
+        );
+        pixels
     }
 
     /// Value of `||A x - I||^2 + alpha ||D x||^2 + beta sum(x)` for each pixel at its minimiser.
