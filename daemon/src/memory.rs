@@ -2,7 +2,7 @@
 
 use raysweep_pipeline::{ProductSpec, Role, rows_to_choose_by};
 use raysweep_session::STRIP_ROWS;
-use raysweep_transport::plane::{PlaneError, Setting, reach};
+use raysweep_transport::plane::{PlaneError, Setting, objectives_bytes, reach};
 
 use crate::processing::Task;
 
@@ -28,9 +28,11 @@ impl MemoryNeed {
             sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
         let reach_rows = reach(&geometry.timing()?, &settings)?.count() as u64;
         let pixels = (geometry.height * geometry.width) as u64;
+        let threads = std::thread::available_parallelism().map_or(1, |threads| threads.get() as u64);
+        let solver_bytes = objectives_bytes(reach_rows, threads);
         if task.is_film() {
             // Frames and images of the cycles under way, a stack and its mask, the transport and its copies to the disk.
-            let bytes = pixels * (80 * settings.len() as u64 + 16 * reach_rows);
+            let bytes = pixels * (80 * settings.len() as u64 + 16 * reach_rows) + solver_bytes;
             return Ok(Self { whole_bytes: bytes, strips_bytes: bytes });
         }
         let strip_px = (geometry.height.min(STRIP_ROWS) * geometry.width) as u64;
@@ -47,10 +49,13 @@ impl MemoryNeed {
         // Sums of the transport for the report, and single images on their way from the disk through the stages.
         let shown_bytes = 4 * pixels * (5 + 5);
         Ok(Self {
-            whole_bytes: pixels * (stack_bytes_per_px + transport_bytes_per_px) + product_bytes,
+            whole_bytes: pixels * (stack_bytes_per_px + transport_bytes_per_px)
+                + product_bytes
+                + solver_bytes,
             strips_bytes: chosen_by_px * stack_bytes_per_px
                 + strip_px * transport_bytes_per_px
                 + product_bytes
+                + solver_bytes
                 + shown_bytes,
         })
     }

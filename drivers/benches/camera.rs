@@ -58,6 +58,9 @@ impl Streamed {
     }
 }
 
+/// The camera has noted by then that a frame has left, and the next has not: less than a period.
+const NOTED_WITHIN: Duration = Duration::from_millis(2);
+
 /// A simulated camera of test pictures in a process of its own.
 struct Simulated(Child);
 
@@ -178,11 +181,16 @@ impl Case {
         let mut buf = pool.take();
         let clock = Clock::real();
         let mut latencies_us = Vec::with_capacity(TIMED_FRAMES);
-        let mut first_seq = None;
+        // The first frame's id, and how many had left by then.
+        let mut first = None;
         while latencies_us.len() < TIMED_FRAMES {
             let Some(stamp) = camera.next_frame(&mut buf, Duration::from_secs(1))? else { continue };
             let taken_ns = clock.now_ns();
-            let number = stamp.seq - *first_seq.get_or_insert(stamp.seq) + 1;
+            let (first_seq, left) = *first.get_or_insert_with(|| {
+                std::thread::sleep(NOTED_WITHIN);
+                (stamp.seq, device.truth().frames)
+            });
+            let number = stamp.seq - first_seq + left;
             // The camera notes a frame when all of it has left.
             let truth = loop {
                 let truth = device.truth();

@@ -16,7 +16,7 @@ benchmarks: cargo xtask bench <name> [options]
           --peers  beside NumPy, SciPy and OpenCV on the same frames and columns
           --json   JSON lines instead of tables: bench, case, stage, method, seconds, times_read, ratio
           --live   frames of 1024x1024 pixels from memory through pool, queue and stages, as fast as they are taken and for a
-                   minute at 0.95 of that, beside the same kernels in a plain loop; with --json one line
+                   minute at 0.8 of that, beside the same kernels in a plain loop; with --json one line
   camera  the driver aravis on the simulated GigE camera: frames a second, processor time of a frame beside
           arv-camera-test-0.8 in the same run, and from a frame's last packet until it is in the pool; best as root
           --sweep  instead, the paper's sweep over the wire in real time, with late settings, lost packets and a

@@ -52,6 +52,7 @@ pub use profile::DelayProfile;
 pub use relight::{relight, relight_rows};
 pub use setting::{Setting, delay_us, offset_us};
 pub use simd::SimdLevel;
+pub use tiles::objectives_bytes;
 pub use timing::{CameraRows, RowTiming};
 pub use transport::Transport;
 pub use uncertainty::{Samples, Uncertainty};

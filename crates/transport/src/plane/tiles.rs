@@ -20,6 +20,13 @@ const PROBLEMS: usize = 16;
 /// Steps, per projector row, of the place of direct light: pixels within one step share an objective.
 const SPIKE_STEPS: f32 = 64.0;
 
+/// Bytes of the objectives that solving on `threads` threads holds at a time, of pixels that see `reach_rows` projector rows:
+/// of each its matrix, the inverse, and the settings' weights or what both were made of.
+pub fn objectives_bytes(reach_rows: u64, threads: u64) -> u64 {
+    let matrix_bytes = 8 * reach_rows.pow(2);
+    3 * matrix_bytes * PROBLEMS as u64 * threads
+}
+
 /// What the objectives of all pixels are made of.
 #[derive(Clone, Copy)]
 pub(super) struct Objectives<'a> {

@@ -1,9 +1,12 @@
-use ndarray::{Array2, Array3};
+use ndarray::{Array2, Array3, Axis};
 use rayon::prelude::*;
 
 use crate::dots::calibrate::Centroids;
 use crate::dots::error::{check_range, check_shape};
 use crate::dots::{Batch, DotsError};
+
+/// Pixels of a rim that are filled together.
+const RIM_PX: usize = 4096;
 
 /// The scene as the mirror would see it, lit from the camera.
 #[derive(Debug, Clone, PartialEq)]
@@ -94,24 +97,32 @@ pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     let at_rim = |&pixel: &usize| {
         is_open[pixel] && neighbours(pixel).iter().any(|near| !values[near * channels].is_nan())
     };
+    let mean_near = |pixel: usize, channel: usize, values: &[f32]| {
+        let (mut sum, mut count) = (0.0, 0.0);
+        for near in neighbours(pixel) {
+            let value = values[near * channels + channel];
+            let is_filled = !value.is_nan();
+            sum += if is_filled { value } else { 0.0 };
+            count += if is_filled { 1.0 } else { 0.0 };
+        }
+        sum / count
+    };
     // In each step only the rim of what is filled: every pixel is reached once.
-    let mut rim: Vec<usize> = (0..height).flat_map(row_of).filter(at_rim).collect();
+    let rows = (0..height).into_par_iter();
+    let mut rim: Vec<usize> = rows.flat_map_iter(|row| row_of(row).filter(at_rim)).collect();
     rim.iter().for_each(|&pixel| is_open[pixel] = false);
     let (mut next, mut means) = (Vec::new(), Vec::new());
     while !rim.is_empty() {
-        means.clear();
-        for &pixel in &rim {
-            means.extend((0..channels).map(|channel| {
-                let (mut sum, mut count) = (0.0, 0.0);
-                for near in neighbours(pixel) {
-                    let value = values[near * channels + channel];
-                    let is_filled = !value.is_nan();
-                    sum += if is_filled { value } else { 0.0 };
-                    count += if is_filled { 1.0 } else { 0.0 };
-                }
-                sum / count
-            }));
-        }
+        means.resize(rim.len() * channels, 0.0);
+        let parts = means.par_chunks_mut(RIM_PX * channels).zip(rim.par_chunks(RIM_PX));
+        parts.for_each(|(means, rim)| {
+            for (means, &pixel) in means.chunks_exact_mut(channels).zip(rim) {
+                means
+                    .iter_mut()
+                    .enumerate()
+                    .for_each(|(channel, mean)| *mean = mean_near(pixel, channel, &values));
+            }
+        });
         next.clear();
         for (&pixel, means) in rim.iter().zip(means.chunks_exact(channels)) {
             values[pixel * channels..][..channels].copy_from_slice(means);
@@ -121,9 +132,9 @@ pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     }
     // Where nothing is known, nothing was filled.
     if known.iter().any(|&known| known) {
-        for (row, mut pixels) in image.outer_iter_mut().enumerate() {
+        image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(row, mut pixels)| {
             let values = &values[row_of(row).start * channels..row_of(row).end * channels];
             pixels.iter_mut().zip(values).for_each(|(pixel, &value)| *pixel = value);
-        }
+        });
     }
 }
