@@ -134,8 +134,7 @@ impl Control {
         match command {
             Command::Discovery => reply.extend_from_slice(self.registers.discovery()),
             Command::ReadRegisters(addresses) => {
-                let active_set = self.controls.active_set().unwrap_or(0);
-                self.registers.set_number(Id::SequencerSetActive, active_set as u32);
+                self.note_active_set();
                 for address in addresses.as_chunks::<4>().0 {
                     let address = u32::from_be_bytes(*address);
                     self.may_read(from)?;
@@ -143,6 +142,7 @@ impl Control {
                 }
             }
             Command::ReadMemory(address, bytes) => {
+                self.note_active_set();
                 self.may_read(from)?;
                 reply.extend_from_slice(&address.to_be_bytes());
                 reply.extend_from_slice(self.registers.read(address, bytes)?);
@@ -169,6 +169,12 @@ impl Control {
             }
         }
         Ok(())
+    }
+
+    /// The set that frames are at changes by itself.
+    fn note_active_set(&mut self) {
+        let set = self.controls.active_set().unwrap_or(0);
+        self.registers.set_number(Id::SequencerSetActive, set as u32);
     }
 
     /// Everybody may look, unless a client wants to be alone.

@@ -17,9 +17,11 @@ use crate::run::orders::Order;
 
 /// Frames further apart are not compared: the line's period is not known that well. [A]
 const COMPARED_NS: i64 = 1_000_000_000;
+/// Cycles in which the phase must be found; the camera does something else otherwise.
+const PATIENCE_CYCLES: usize = 8;
 
 impl Sequencer {
-    /// Takes slots of a film by the camera's own sequencer: all of them, or none where it cannot be used.
+    /// Takes slots of a film by the camera's own sequencer, as far as that can be used.
     pub(super) fn take_by_sets(
         &mut self,
         film: &FilmPass,
@@ -40,9 +42,15 @@ impl Sequencer {
             let taken = self.take_frames(slots, Phase::new(sets, self.line));
             // What the stamps of its frames seemed to say, by the settings written before.
             self.ahead.lose_track();
-            taken?;
+            let is_followed = taken?;
             // Ends the sequence.
             self.pass_through(&settings[0])?;
+            if !is_followed {
+                tracing::warn!(
+                    "frames do not show the settings of the camera's sequencer one after the other: settings are written instead"
+                );
+                return Ok(());
+            }
             if slots.peek().is_some() && self.orders.go_on() {
                 self.input.send(Event::Idle).map_err(closed)?;
                 self.orders.wait_while_paused();
@@ -52,12 +60,13 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Takes frames until every slot has its own, or a pause comes between two cycles.
+    /// Takes frames until every slot has its own, or a pause comes between two cycles; `false`: the camera does not go
+    /// through its sets.
     fn take_frames(
         &mut self,
         slots: &mut Peekable<impl Iterator<Item = Slot>>,
         mut phase: Phase,
-    ) -> Result<(), DeviceError> {
+    ) -> Result<bool, DeviceError> {
         let mut watchdog = Watchdog::default();
         let mut next_seq = None;
         let mut slot_before: Option<u64> = None;
@@ -88,6 +97,10 @@ impl Sequencer {
             }
             next_seq = Some(stamp.seq + 1);
             phase.see(&stamp);
+            if phase.is_hopeless() {
+                self.hand_on(received, Label::Settling)?;
+                return Ok(false);
+            }
             let Some(slot) = slots.next_if(|slot| phase.set_of(stamp.seq) == Some(slot.place)) else {
                 self.hand_on(received, Label::Settling)?;
                 continue;
@@ -101,7 +114,7 @@ impl Sequencer {
                 self.note_exposure(&stamp, &job.applied.actual, is_lit);
             }
         }
-        Ok(())
+        Ok(true)
     }
 }
 
@@ -115,11 +128,13 @@ struct Phase {
     /// For each phase, how many frames in a row have agreed with it, each with the one before.
     agreeing: Vec<usize>,
     newest: Option<FrameStamp>,
+    /// Frames that have been looked at without result.
+    in_vain: usize,
 }
 
 impl Phase {
     fn new(sets: Vec<CameraSettings>, line: Line) -> Self {
-        Self { known: None, agreeing: vec![0; sets.len()], newest: None, sets, line }
+        Self { known: None, agreeing: vec![0; sets.len()], newest: None, in_vain: 0, sets, line }
     }
 
     /// Whether stamps tell each phase of a cycle of settings from all others, and each frame's settings from all others
@@ -161,6 +176,11 @@ impl Phase {
         if let (Some(phase), None) = (certain.next(), certain.next()) {
             self.known = Some(phase);
         }
+        self.in_vain = if self.known.is_some() { 0 } else { self.in_vain + 1 };
+    }
+
+    fn is_hopeless(&self) -> bool {
+        self.in_vain > PATIENCE_CYCLES * self.sets.len()
     }
 
     /// Whether by a phase two frames were triggered whole periods apart and have the exposures that they say.

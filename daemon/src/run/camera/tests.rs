@@ -31,6 +31,8 @@ struct Script {
     sets: usize,
     /// Frames of a sequence that have the set of the frame before once more.
     stutters: &'static [u64],
+    /// Whether its sequencer stays with the first set.
+    stuck: bool,
 }
 
 const EXACT: Script = Script {
@@ -42,6 +44,7 @@ const EXACT: Script = Script {
     held_up: &[],
     sets: 0,
     stutters: &[],
+    stuck: false,
 };
 
 /// A camera whose every trigger is answered, and whose frames are on the host 18 ms after their exposure.
@@ -71,7 +74,8 @@ impl Scripted {
             && seq >= *first_seq
         {
             let stutters = self.script.stutters.iter().filter(|stutter| **stutter <= seq).count();
-            return sets[((seq - first_seq) as usize - stutters) % sets.len()];
+            let place = ((seq - first_seq) as usize - stutters) % sets.len();
+            return sets[if self.script.stuck { 0 } else { place }];
         }
         let written = self.written.iter().rev().find(|(first_seq, _)| *first_seq <= seq);
         written.map_or(settings(0.0, 100.0), |(_, settings)| *settings)
@@ -557,6 +561,9 @@ fn a_pause_stops_the_sequence_and_a_cycle_is_whole_before_it() {
 fn a_film_that_the_sequencer_cannot_take_is_written_ahead() {
     let one_set_short = Script { sets: 7, ..EXACT };
     let film = play_plan(&film_plan(), one_set_short, 1, Some(3), None);
+    film.assert_true(&film_plan());
+    assert_eq!((film.counted.len(), film.frames()), (24, 24));
+    let film = play_plan(&film_plan(), Script { sets: 8, stuck: true, ..EXACT }, 1, Some(3), None);
     film.assert_true(&film_plan());
     assert_eq!((film.counted.len(), film.frames()), (24, 24));
     // Delays all round a period in equal steps: any set might be the first.
