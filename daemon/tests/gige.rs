@@ -70,6 +70,12 @@ fn a_film_by_the_cameras_sequencer_is_what_the_scene_gives() {
 }
 
 #[test]
+fn a_film_of_more_settings_than_the_camera_has_sets_is_written_ahead() {
+    let plan = "cycles = 16\ndelay_us = { start = -800, stop = 800, count = 17 }\nexposure_us = 400\n";
+    Sweep { plan, ..FILM }.run();
+}
+
+#[test]
 fn frames_of_a_film_that_are_lost_take_their_sets_with_them() {
     let faults = &["packet_loss=0.01", "resend=false", "reordering=0.02"];
     let counts = Sweep { faults, ..FILM }.run().counts;

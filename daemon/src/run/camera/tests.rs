@@ -548,7 +548,7 @@ fn a_pause_stops_the_sequence_and_a_cycle_is_whole_before_it() {
     assert_eq!((film.counted.len(), film.short.len()), (96, 0));
     let gaps: Vec<usize> =
         (1..96).filter(|&place| film.counted[place].1 != film.counted[place - 1].1 + 1).collect();
-    assert!(gaps.len() == 1 && gaps[0] % 8 == 0, "{gaps:?}");
+    assert!(gaps.len() == 1 && gaps[0].is_multiple_of(8), "{gaps:?}");
     let (before, after) = (film.counted[gaps[0] - 1].1, film.counted[gaps[0]].1);
     assert_eq!(
         film.told.iter().filter(|told| (before..after).contains(*told)).count(),
