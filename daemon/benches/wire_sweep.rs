@@ -11,6 +11,7 @@ use wire::{Sweep, Swept};
 
 const SWEEP: Sweep = Sweep {
     side_px: 128,
+    kind: "sweep",
     plan: "average = 8\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
            exposure_us = { start = 600, stop = 1200, count = 5 }\n",
     camera: "",

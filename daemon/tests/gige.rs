@@ -10,10 +10,18 @@ use wire::Sweep;
 
 const SWEEP: Sweep = Sweep {
     side_px: 32,
+    kind: "sweep",
     plan: "average = 4\ndelay_us = { start = -300, stop = 300, count = 7 }\nexposure_us = [400, 600]\n",
     camera: "",
     faults: &[],
     dies_after: None,
+};
+
+/// By the camera's sequencer, which [`wire`] makes sure of.
+const FILM: Sweep = Sweep {
+    kind: "film",
+    plan: "cycles = 40\ndelay_us = [-300, -200, -100, 0, 120, 200, 350]\nexposure_us = 400\n",
+    ..SWEEP
 };
 
 #[test]
@@ -52,5 +60,31 @@ fn settings_that_act_three_frames_late_mislabel_nothing() {
 #[test]
 fn a_camera_that_dies_in_the_middle_costs_the_frames_of_its_absence() {
     let counts = Sweep { dies_after: Some(3), ..SWEEP }.run().counts;
+    assert!(counts.lost[&LossCause::CameraLost] > 0, "{counts:?}");
+}
+
+#[test]
+fn a_film_by_the_cameras_sequencer_is_what_the_scene_gives() {
+    let filmed = FILM.run();
+    assert!(!filmed.counts.lost.contains_key(&LossCause::CameraLost), "{:?}", filmed.counts);
+}
+
+#[test]
+fn a_film_of_more_settings_than_the_camera_has_sets_is_written_ahead() {
+    let plan = "cycles = 16\ndelay_us = { start = -800, stop = 800, count = 17 }\nexposure_us = 400\n";
+    Sweep { plan, ..FILM }.run();
+}
+
+#[test]
+fn frames_of_a_film_that_are_lost_take_their_sets_with_them() {
+    let faults = &["packet_loss=0.01", "resend=false", "reordering=0.02"];
+    let counts = Sweep { faults, ..FILM }.run().counts;
+    assert!(counts.lost[&LossCause::PacketsLost] > 0, "{counts:?}");
+    assert!(!counts.lost.contains_key(&LossCause::Jitter), "{counts:?}");
+}
+
+#[test]
+fn a_camera_that_dies_within_a_film_has_its_sets_again_when_it_is_back() {
+    let counts = Sweep { dies_after: Some(10), ..FILM }.run().counts;
     assert!(counts.lost[&LossCause::CameraLost] > 0, "{counts:?}");
 }

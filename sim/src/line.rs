@@ -127,8 +127,20 @@ struct CameraLine {
     frames: u64,
     /// Settings on their way into the sensor, in the order of their first frames.
     written: VecDeque<Written>,
+    sequence: Option<Sequence>,
     seq: u64,
     exposures: VecDeque<Exposure>,
+}
+
+/// Settings of the camera's own sequencer, each with the number of those that the frame after has.
+pub type Sets = Vec<(CameraSettings, usize)>;
+
+/// The camera's own sequencer while it runs.
+struct Sequence {
+    sets: Sets,
+    /// Which one the next frame has.
+    next: usize,
+    frames: u32,
 }
 
 /// Settings, and the first frame that has them.
@@ -150,6 +162,15 @@ impl CameraLine {
     fn key(&self) -> [u64; 3] {
         let (Written { id, .. }, frames) = self.due();
         [u64::from(id.point), u64::from(id.attempt), frames]
+    }
+
+    /// Where the sequencer runs, the next frame has its next set.
+    fn take_next_set(&mut self) {
+        let Some(Sequence { sets, next, frames }) = &mut self.sequence else { return };
+        let Some(&(settings, after)) = sets.get(*next) else { return };
+        let id = SettingsId { point: *next as u32, attempt: *frames };
+        self.written.push_back(Written { first_seq: self.seq, id, settings });
+        (*next, *frames) = (after, *frames + 1);
     }
 
     /// When the camera triggers itself, where it does.
@@ -217,6 +238,7 @@ impl Line {
                 in_force: idle,
                 frames: 0,
                 written: VecDeque::new(),
+                sequence: None,
                 seq: 0,
                 exposures: VecDeque::new(),
             },
@@ -369,14 +391,16 @@ impl Line {
         camera.exposures.push_back(Exposure { seq: camera.seq, key, settings, start_ns, done_ns, delivered });
         camera.seq += 1;
         camera.frames += 1;
+        camera.take_next_set();
         self.truth.exposures += 1;
         self.truth.dropped_frames += u64::from(!delivered);
         true
     }
 
-    /// Writes camera settings at `now_ns`; returns the id of the next frame to be triggered.
+    /// Writes camera settings at `now_ns`, which ends a sequence; returns the id of the next frame to be triggered.
     pub fn configure(&mut self, now_ns: i64, id: SettingsId, settings: CameraSettings) -> u64 {
         self.advance(now_ns);
+        self.camera.sequence = None;
         let config = &self.config;
         let late = if config.camera.late_frames_min < config.camera.late_frames_max {
             let span = config.camera.late_frames_max - config.camera.late_frames_min + 1;
@@ -392,6 +416,22 @@ impl Line {
         self.camera.written.push_back(Written { first_seq, id, settings });
         self.redraw(now_ns);
         self.camera.seq
+    }
+
+    /// Has each frame from the next one on, which begins with the set `first`, take the set after that of the frame before.
+    pub fn set_sequence(&mut self, now_ns: i64, sets: Sets, first: usize) {
+        self.advance(now_ns);
+        self.camera.written.clear();
+        self.camera.sequence = Some(Sequence { sets, next: first, frames: 0 });
+        self.camera.take_next_set();
+        self.redraw(now_ns);
+    }
+
+    /// The set of the newest frame, while a sequence runs and has had one.
+    pub fn active_set(&mut self, now_ns: i64) -> Option<usize> {
+        self.advance(now_ns);
+        let CameraLine { sequence, in_force, .. } = &self.camera;
+        sequence.as_ref().filter(|sequence| sequence.frames > 1).map(|_| in_force.id.point as usize)
     }
 
     /// What lies ahead was drawn for the settings before: draws it again for the new ones.

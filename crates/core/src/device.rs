@@ -198,6 +198,18 @@ pub trait Camera: Send {
     /// [`DeviceState::Lost`]: write them again when it is back.
     fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError>;
 
+    /// Has the camera's own sequencer take it through these settings, which all have one exposure and one shutter: a frame
+    /// under each, in order and round again, while nothing is written, until [`Camera::configure`] or
+    /// [`Camera::disarm`]. Returns them as the hardware took them; `None`, and nothing is changed, where the camera has no
+    /// sequencer or one that is too small. Frames that were exposed before may still come. Each frame *exposed* takes
+    /// the next settings, lost or not, so ids tell which; from where on they count, the frames' stamps must tell.
+    ///
+    /// # Errors
+    /// As [`Camera::configure`].
+    fn sequence(&mut self, _settings: &[CameraSettings]) -> Result<Option<Vec<CameraSettings>>, DeviceError> {
+        Ok(None)
+    }
+
     /// From now on triggers are answered.
     ///
     /// # Errors

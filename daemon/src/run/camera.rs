@@ -3,6 +3,7 @@
 mod ahead;
 mod probe;
 mod sequence;
+mod sets;
 mod triggers;
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -193,7 +194,7 @@ struct Sequencer {
     warmed_up: bool,
     /// The longest that a frame has taken so far, from its edge to its last row.
     longest_frame_us: f64,
-    period_us: f64,
+    line: Line,
     ahead: Ahead,
     /// Up to this frame the assembler knows what became of each; nothing after a pause, whose frames are nobody's.
     told_seq: Option<u64>,
@@ -236,7 +237,7 @@ impl Sequencer {
             orders,
             warmed_up: false,
             longest_frame_us: 0.0,
-            period_us: line.period_us,
+            line,
             told_seq: None,
             lead_ins: 0,
             exposures: Exposures::default(),
@@ -297,8 +298,8 @@ impl Sequencer {
     }
 
     fn frame_us(&self, settings: &CameraSettings) -> f64 {
-        let periods = self.camera.capabilities().periods_per_frame(settings, self.period_us);
-        f64::from(periods) * self.period_us
+        let periods = self.camera.capabilities().periods_per_frame(settings, self.line.period_us);
+        f64::from(periods) * self.line.period_us
     }
 
     /// Notes a frame that a point waited for, which has just come.

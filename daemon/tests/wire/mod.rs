@@ -11,21 +11,24 @@ use std::time::{Duration, Instant};
 
 use ndarray::Axis;
 use nix::sched::{CloneFlags, unshare};
+use raysweep::config::Plan;
 use raysweep::rig::Rig;
 use raysweep_core::{CameraSettings, Counts, FramePool, Pattern, SettingsId, Shutter, ns_from_us};
 use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
-use raysweep_session::ledger::{EndEntry, PointEntry};
+use raysweep_session::ledger::EndEntry;
 use raysweep_session::stack::ArrayName;
 use raysweep_sim::bench::BenchProbe;
 use raysweep_sim::gige::{Faults, WireTruth};
 use raysweep_sim::{Devices, PlaneRig};
 
-/// A sweep and what happens to it.
+/// A sweep or a film and what happens to it.
 pub struct Sweep<'a> {
     /// Rows and columns of the scene, and rows of the projector.
     pub side_px: usize,
-    /// The plan's `[sweep]`.
+    /// The plan's kind: `sweep`, or `film`, which the camera's sequencer must then take if it has the sets.
+    pub kind: &'a str,
+    /// The plan's `[sweep]` or `[film]`.
     pub plan: &'a str,
     /// Lines of `[sim.camera]`.
     pub camera: &'a str,
@@ -60,7 +63,12 @@ impl Sweep<'_> {
         let bench = folder.path().join("bench.sock");
         let mut probe = wait_for("the camera does not start", || BenchProbe::open(&bench).ok());
         let session = self.run_daemon(folder.path(), &mut probe);
-        assert_images_of_the_scene(&session, &Rig::load(&rig).unwrap());
+        let rig = Rig::load(&rig).unwrap();
+        if self.kind == "film" {
+            assert_frames_of_the_scene(&session, &rig, &Plan::parse(&self.plan()).unwrap());
+        } else {
+            assert_images_of_the_scene(&session, &rig);
+        }
         let state = session.state().unwrap();
         assert!(state.counts.balanced(), "{:?}", state.counts);
         Swept { counts: state.counts, wire: probe.truth().unwrap().wire, end: state.end.unwrap() }
@@ -78,6 +86,16 @@ impl Sweep<'_> {
         )
     }
 
+    /// Whether the simulated camera has as many sets as a film has settings.
+    fn has_sets(&self) -> bool {
+        Plan::parse(&self.plan()).unwrap().film.delay_us.values().len() <= 16
+    }
+
+    fn plan(&self) -> String {
+        let Self { kind, plan, .. } = self;
+        format!("kind = \"{kind}\"\nname = \"wire\"\n[{kind}]\n{plan}")
+    }
+
     fn run_daemon(&self, folder: &Path, probe: &mut BenchProbe) -> Session {
         let (rig, socket, data) = (folder.join("rig.toml"), folder.join("socket"), folder.join("sessions"));
         let arguments = [("--rig", &rig), ("--socket", &socket), ("--data", &data)];
@@ -85,9 +103,10 @@ impl Sweep<'_> {
         let _daemon = Process::start(env!("CARGO_BIN_EXE_raysweepd"), &arguments.collect::<Vec<_>>());
         let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
         let events = Client::connect(&socket).unwrap().subscribe().unwrap();
-        let plan = format!("kind = \"sweep\"\nname = \"wire\"\n[sweep]\n{}", self.plan);
-        client.run(&RunParams { plan, ..RunParams::default() }).unwrap();
+        client.run(&RunParams { plan: self.plan(), ..RunParams::default() }).unwrap();
         let mut dies_after = self.dies_after;
+        // How often settings had been written when a cycle of a film was stored.
+        let mut written = Vec::new();
         for event in events {
             match event.unwrap() {
                 Event::Progress(progress)
@@ -98,9 +117,25 @@ impl Sweep<'_> {
                     thread::sleep(Duration::from_secs(2));
                     probe.set_faults(Faults::default()).unwrap();
                 }
+                // Well before the film's end, which this may hear of late.
+                Event::Progress(progress)
+                    if self.kind == "film"
+                        && (4..progress.points_planned / 2).contains(&progress.points_stored) =>
+                {
+                    written.push(probe.truth().unwrap().wire.settings_written);
+                }
                 Event::Finished { session, state, missing, error, .. } => {
-                    assert_eq!((state.as_str(), missing), ("complete", 0), "{error:?}");
+                    assert_eq!(state, "complete", "{error:?}");
+                    assert!(missing == 0 || self.kind == "film", "{missing} points");
                     assert_eq!(dies_after, None, "the camera did not die");
+                    if self.kind == "film" && self.dies_after.is_none() {
+                        assert!(written.len() >= 2, "{written:?}");
+                        assert_eq!(
+                            written.windows(2).all(|pair| pair[0] == pair[1]),
+                            self.has_sets(),
+                            "{written:?}"
+                        );
+                    }
                     return Session::open(&session).unwrap();
                 }
                 _ => {}
@@ -148,7 +183,7 @@ fn assert_images_of_the_scene(session: &Session, rig: &Rig) {
         assert_eq!(state.stored(array).count(), stored.len_of(Axis(0)));
         for entry in state.stored(array) {
             let found = stored.index_axis(Axis(0), entry.index);
-            let counts = scene_counts(rig, &pattern, entry);
+            let counts = scene_counts(rig, &pattern, entry.delay_us, entry.exposure_us);
             let expected = counts.iter().map(|count| count * entry.frames);
             let wrong = found.iter().zip(expected).filter(|(found, expected)| **found != *expected).count();
             assert_eq!(wrong, 0, "pixels of {array:?} {}, attempt {}", entry.index, entry.attempt);
@@ -156,20 +191,36 @@ fn assert_images_of_the_scene(session: &Session, rig: &Rig) {
     }
 }
 
-/// One frame of the simulated camera itself, without wire or daemon, under an entry's settings.
-fn scene_counts(rig: &Rig, pattern: &Pattern, entry: &PointEntry) -> Vec<u32> {
+/// Each frame of a stored cycle is what the scene gives under its setting.
+fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &Plan) {
+    let settings = plan.film.delay_us.values();
+    let expected: Vec<Vec<u32>> = settings
+        .iter()
+        .map(|&delay_us| scene_counts(rig, &Pattern::White, delay_us, plan.film.exposure_us))
+        .collect();
+    let (film, state) = (session.film().unwrap(), session.state().unwrap());
+    assert!(2 * state.cycles().count() > plan.film.cycles as usize, "too few cycles to prove anything");
+    for cycle in state.cycles() {
+        let frames = film.read(cycle.cycle).unwrap().unwrap();
+        for (setting, (frame, expected)) in frames.outer_iter().zip(&expected).enumerate() {
+            let wrong =
+                frame.iter().zip(expected).filter(|(found, expected)| u32::from(**found) != **expected);
+            assert_eq!(wrong.count(), 0, "pixels of setting {setting} in cycle {}", cycle.cycle);
+        }
+    }
+}
+
+/// One frame of the simulated camera itself, without wire or daemon.
+fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -> Vec<u32> {
     let scene: &PlaneRig = rig.simulated();
     let Devices { mut camera, mut projector, vsync, .. } = scene.open();
     // Time waits for every device.
     drop(vsync);
     let (raster, format) = (rig.file.raster(), camera.capabilities().format);
     let latency_us = camera.capabilities().trigger_latency_us;
-    let trigger = raster.trigger(scene.first_row(), entry.delay_us, entry.exposure_us, latency_us);
-    let settings = CameraSettings {
-        shutter: Shutter::Rolling,
-        exposure_us: entry.exposure_us,
-        trigger_delay_us: trigger.trigger_delay_us,
-    };
+    let trigger = raster.trigger(scene.first_row(), delay_us, exposure_us, latency_us);
+    let settings =
+        CameraSettings { shutter: Shutter::Rolling, exposure_us, trigger_delay_us: trigger.trigger_delay_us };
     let applied = camera.configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
     let shown = projector.show(pattern).unwrap();
     camera.arm().unwrap();

@@ -12,6 +12,7 @@ use super::gvcp::{Command, Request, Status, seal, u32_at};
 use super::gvsp::{MAX_PACKET_BYTES, MIN_PACKET_BYTES, View};
 use super::lock;
 use super::registers::{Registers, Write};
+use super::sequencer::Sequencer;
 use super::source::{Controls, TriggeredBy};
 use super::stream::{Order, Stream};
 use super::wire::{Route, Wire};
@@ -40,6 +41,7 @@ pub struct Control {
     owner: Option<Owner>,
     factory_set: Vec<u8>,
     user_set: Vec<u8>,
+    sequencer: Sequencer,
     /// What the sensor has.
     settings: CameraSettings,
     selector_written: bool,
@@ -60,6 +62,7 @@ impl Control {
             owner: None,
             factory_set: set.clone(),
             user_set: set,
+            sequencer: Sequencer::new(settings),
             settings,
             selector_written: false,
             acquisitions: 0,
@@ -80,6 +83,7 @@ impl Control {
         self.factory_set = factory_set;
         self.selector_written = false;
         self.apply_all();
+        self.sequencer = Sequencer::new(self.settings);
     }
 
     /// Takes note of faults that clients can see in registers.
@@ -130,6 +134,7 @@ impl Control {
         match command {
             Command::Discovery => reply.extend_from_slice(self.registers.discovery()),
             Command::ReadRegisters(addresses) => {
+                self.note_active_set();
                 for address in addresses.as_chunks::<4>().0 {
                     let address = u32::from_be_bytes(*address);
                     self.may_read(from)?;
@@ -137,6 +142,7 @@ impl Control {
                 }
             }
             Command::ReadMemory(address, bytes) => {
+                self.note_active_set();
                 self.may_read(from)?;
                 reply.extend_from_slice(&address.to_be_bytes());
                 reply.extend_from_slice(self.registers.read(address, bytes)?);
@@ -165,6 +171,12 @@ impl Control {
         Ok(())
     }
 
+    /// The set that frames are at changes by itself.
+    fn note_active_set(&mut self) {
+        let set = self.controls.active_set().unwrap_or(0);
+        self.registers.set_number(Id::SequencerSetActive, set as u32);
+    }
+
     /// Everybody may look, unless a client wants to be alone.
     fn may_read(&self, from: SocketAddr) -> Result<(), Status> {
         let exclusive = self.registers.number(Id::GevCCP) & EXCLUSIVE != 0;
@@ -188,10 +200,12 @@ impl Control {
             return Err(Status::AccessDenied);
         }
         self.check_trigger_order(write.id)?;
+        Sequencer::check(&self.registers, write.id)?;
         match write.id {
             Id::GevSCPS => return self.set_packet_size(write),
             Id::ExposureTime | Id::TriggerDelay | Id::SensorShutterMode => {
                 self.registers.commit(write);
+                lock(&self.stream.truth).settings_written += 1;
                 return self.apply_settings();
             }
             _ => self.registers.commit(write),
@@ -235,6 +249,18 @@ impl Control {
                 return Err(Status::WriteProtect);
             }
             Id::UserSetSave => self.user_set = self.registers.snapshot(),
+            Id::SequencerMode if Sequencer::runs(&self.registers) => {
+                let mut sets = self.sequencer.sequence(&self.registers, self.settings);
+                sets.iter_mut().for_each(|(settings, _)| *settings = self.sensor_settings(*settings));
+                self.controls.set_sequence(sets, number(Id::SequencerSetStart) as usize);
+            }
+            Id::SequencerMode => self.apply_settings()?,
+            Id::SequencerSetSelector => self.sequencer.show(&mut self.registers),
+            Id::SequencerSetSave => self.sequencer.save(&self.registers, self.settings),
+            Id::SequencerSetLoad => {
+                self.sequencer.load(&mut self.registers);
+                self.apply_settings()?;
+            }
             Id::Width | Id::Height | Id::OffsetX | Id::OffsetY | Id::PixelFormat => self.update_derived(),
             Id::ChunkModeActive | Id::ChunkEnable => self.update_derived(),
             _ => {}
@@ -278,12 +304,10 @@ impl Control {
     /// The settings in the registers go to the sensor, and what it made of them back.
     fn apply_settings(&mut self) -> Result<(), Status> {
         let wanted = settings_of(&self.registers);
-        let triggered = self.registers.number(Id::TriggerMode) == 1;
-        // A camera that triggers itself delays nothing.
-        let delay_us = if triggered { wanted.trigger_delay_us } else { 0.0 };
-        let applied = self.controls.configure(&CameraSettings { trigger_delay_us: delay_us, ..wanted });
+        let applied = self.controls.configure(&self.sensor_settings(wanted));
         if let Ok(actual) = applied {
-            let delay_us = if triggered { actual.trigger_delay_us } else { wanted.trigger_delay_us };
+            let delay_us =
+                if self.is_triggered() { actual.trigger_delay_us } else { wanted.trigger_delay_us };
             self.settings = CameraSettings { trigger_delay_us: delay_us, ..actual };
         }
         let CameraSettings { shutter, exposure_us, trigger_delay_us } = self.settings;
@@ -292,6 +316,16 @@ impl Control {
         self.registers.set_float(Id::ExposureTime, exposure_us);
         self.registers.set_float(Id::TriggerDelay, trigger_delay_us);
         if applied.is_ok() { Ok(()) } else { Err(Status::InvalidParameter) }
+    }
+
+    fn is_triggered(&self) -> bool {
+        self.registers.number(Id::TriggerMode) == 1
+    }
+
+    /// A camera that triggers itself delays nothing.
+    fn sensor_settings(&self, settings: CameraSettings) -> CameraSettings {
+        let delay_us = if self.is_triggered() { settings.trigger_delay_us } else { 0.0 };
+        CameraSettings { trigger_delay_us: delay_us, ..settings }
     }
 
     fn apply_all(&mut self) {

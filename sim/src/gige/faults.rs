@@ -84,4 +84,6 @@ pub struct WireTruth {
     pub packets_unavailable: u64,
     /// Packets that the host's network did not take.
     pub packets_refused: u64,
+    /// Writes of exposure, delay or shutter that were taken.
+    pub settings_written: u64,
 }

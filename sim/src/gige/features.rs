@@ -58,6 +58,18 @@ pub enum Id {
     UserSetSelector,
     UserSetLoad,
     UserSetSave,
+    SequencerMode,
+    SequencerConfigurationMode,
+    SequencerFeatureSelector,
+    SequencerFeatureEnable,
+    SequencerSetSelector,
+    SequencerSetSave,
+    SequencerSetLoad,
+    SequencerSetStart,
+    SequencerPathSelector,
+    SequencerSetNext,
+    SequencerTriggerSource,
+    SequencerSetActive,
 }
 
 /// Who may change a register.
@@ -164,6 +176,12 @@ pub const SINGLE_FRAME: u32 = 1;
 pub const SOFTWARE: u32 = 1;
 /// Values of `SensorShutterMode`.
 pub const GLOBAL_SHUTTER: u32 = 1;
+/// Sets of the sequencer.
+pub const SEQUENCER_SETS: usize = 16;
+/// Values of `SequencerTriggerSource`.
+pub const FRAME_START: u32 = 1;
+/// Entries of `SequencerFeatureSelector`.
+pub const SEQUENCED: [&str; 2] = ["ExposureTime", "TriggerDelay"];
 /// Entries of `ChunkSelector`, which are also what `ChunkEnable` is told apart by.
 pub const CHUNKS: [&str; 3] = ["ExposureTime", "Timestamp", "FrameID"];
 
@@ -192,6 +210,8 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
     let acquisition = Some("AcquisitionControl");
     let chunks = Some("ChunkDataControl");
     let user_sets = Some("UserSetControl");
+    let sequencer = Some("SequencerControl");
+    let set = whole(0, SEQUENCER_SETS as u32 - 1, 1, None);
     let standard =
         |id, address, category, access, kind| Feature { id, category, address, access, kind, initial: 0 };
     let maker = |id, category, access, kind, initial| {
@@ -270,6 +290,24 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
         maker(Id::UserSetSelector, user_sets, ReadWrite, one_of(&["Default", "UserSet1"]), 0),
         maker(Id::UserSetLoad, user_sets, Command, Kind::any(), 0),
         maker(Id::UserSetSave, user_sets, Command, Kind::any(), 0),
+        maker(Id::SequencerMode, sequencer, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(Id::SequencerConfigurationMode, sequencer, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(Id::SequencerFeatureSelector, sequencer, ReadWrite, one_of(&SEQUENCED), 0),
+        maker(
+            Id::SequencerFeatureEnable,
+            sequencer,
+            ReadWrite,
+            Kind::BooleanFor(Id::SequencerFeatureSelector),
+            0,
+        ),
+        maker(Id::SequencerSetSelector, sequencer, ReadWrite, set.clone(), 0),
+        maker(Id::SequencerSetSave, sequencer, Command, Kind::any(), 0),
+        maker(Id::SequencerSetLoad, sequencer, Command, Kind::any(), 0),
+        maker(Id::SequencerSetStart, sequencer, ReadWrite, set.clone(), 0),
+        maker(Id::SequencerPathSelector, sequencer, ReadWrite, whole(0, 0, 1, None), 0),
+        maker(Id::SequencerSetNext, sequencer, ReadWrite, set, 0),
+        maker(Id::SequencerTriggerSource, sequencer, ReadWrite, one_of(&["Off", "FrameStart"]), 0),
+        maker(Id::SequencerSetActive, sequencer, ReadOnly, Kind::any(), 0),
     ]
 }
 

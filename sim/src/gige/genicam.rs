@@ -116,9 +116,15 @@ fn node(xml: &mut String, feature: &Feature) {
         Kind::Boolean | Kind::BooleanFor(_) => xml.push_str("<OnValue>1</OnValue><OffValue>0</OffValue>"),
         _ => {}
     }
-    if *id == Id::ChunkSelector {
-        element(xml, "pSelected", "ChunkEnable");
-    }
+    let selected: &[&str] = match id {
+        Id::ChunkSelector => &["ChunkEnable"],
+        Id::SequencerFeatureSelector => &["SequencerFeatureEnable"],
+        Id::SequencerSetSelector | Id::SequencerPathSelector => {
+            &["SequencerSetNext", "SequencerTriggerSource"]
+        }
+        _ => &[],
+    };
+    selected.iter().for_each(|name| element(xml, "pSelected", name));
     let _ = writeln!(xml, "</{tag}>");
 }
 

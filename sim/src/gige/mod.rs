@@ -9,6 +9,7 @@ mod genicam;
 mod gvcp;
 mod gvsp;
 mod registers;
+mod sequencer;
 mod source;
 mod stream;
 #[cfg(test)]

@@ -13,7 +13,7 @@ use super::gvsp::{Block, View};
 use super::lock;
 use crate::devices::SimCamera;
 use crate::line::Line;
-pub use crate::line::TriggeredBy;
+pub use crate::line::{Sets, TriggeredBy};
 
 /// Pictures that are kept for clients that miss packets; test pictures repeat after as many.
 pub const BLOCKS: usize = 16;
@@ -27,6 +27,10 @@ pub trait Controls: Send + Sync {
     /// # Errors
     /// `OutOfRange`; the old settings then stay.
     fn configure(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError>;
+    /// Takes frames through settings from the set `first` on, until [`Controls::configure`].
+    fn set_sequence(&self, sets: Sets, first: usize);
+    /// The set of the newest frame, while frames go through some.
+    fn active_set(&self) -> Option<usize>;
     /// Chooses what starts exposures.
     fn set_triggered_by(&self, triggered_by: TriggeredBy);
     /// Triggers are answered from now on; returns the number of the next exposure.
@@ -94,6 +98,14 @@ impl Controls for SceneControls {
         let attempt = self.written.fetch_add(1, Ordering::Relaxed);
         let applied = lock(&self.camera).configure(SettingsId { point: 0, attempt }, settings)?;
         Ok(applied.actual)
+    }
+
+    fn set_sequence(&self, sets: Sets, first: usize) {
+        self.with_line(|line, now_ns| line.set_sequence(now_ns, sets, first));
+    }
+
+    fn active_set(&self) -> Option<usize> {
+        self.with_line(|line, now_ns| line.active_set(now_ns))
     }
 
     fn set_triggered_by(&self, triggered_by: TriggeredBy) {
@@ -227,6 +239,14 @@ impl Controls for Pattern {
     fn configure(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError> {
         lock(&self.state).settings = *settings;
         Ok(*settings)
+    }
+
+    fn set_sequence(&self, _: Sets, _: usize) {
+        // A test picture shows no settings, whichever set they are of.
+    }
+
+    fn active_set(&self) -> Option<usize> {
+        None
     }
 
     fn set_triggered_by(&self, triggered_by: TriggeredBy) {

@@ -249,6 +249,40 @@ fn user_sets_bring_settings_back() {
 }
 
 #[test]
+fn sets_of_the_sequencer_are_made_in_configuration_mode_and_kept_while_it_runs() {
+    const DENIED: u16 = 0x8006;
+    let mut bench = Bench::new();
+    bench.write(0, CCP, 2);
+    assert_eq!(bench.set(Id::SequencerSetSelector, 1), DENIED, "not yet configured");
+    assert_eq!(bench.set(Id::SequencerConfigurationMode, 1), SUCCESS);
+    for (set, exposure_us, next) in [(0, 300.0, 1), (1, 400.0, 0)] {
+        assert_eq!(bench.set(Id::SequencerSetSelector, set), SUCCESS);
+        assert_eq!(bench.set_float(Id::ExposureTime, exposure_us), SUCCESS);
+        assert_eq!(bench.set(Id::SequencerSetNext, next), SUCCESS);
+        assert_eq!(bench.set(Id::SequencerTriggerSource, 1), SUCCESS);
+        assert_eq!(bench.set(Id::SequencerSetSave, 1), SUCCESS);
+    }
+    assert_eq!(bench.set(Id::SequencerSetSelector, 0), SUCCESS);
+    assert_eq!(bench.get(Id::SequencerSetNext), 1);
+    assert_eq!(bench.get_float(Id::ExposureTime), 400.0, "not before it is loaded");
+    assert_eq!(bench.set(Id::SequencerSetLoad, 1), SUCCESS);
+    assert_eq!(bench.get_float(Id::ExposureTime), 300.0);
+    assert_eq!(bench.set(Id::SequencerMode, 1), DENIED, "still configured");
+    assert_eq!(bench.set(Id::SequencerConfigurationMode, 0), SUCCESS);
+    assert_eq!(bench.set(Id::SequencerMode, 1), SUCCESS);
+    let written = lock(&bench.stream.truth).settings_written;
+    assert_eq!(written, 2);
+    for id in [Id::SequencerConfigurationMode, Id::SequencerSetSave, Id::UserSetLoad, Id::SequencerSetStart] {
+        assert_eq!(bench.set(id, 1), DENIED, "{id:?}");
+    }
+    assert_eq!(bench.set_float(Id::ExposureTime, 500.0), DENIED);
+    assert_eq!(bench.set_float(Id::TriggerDelay, 500.0), DENIED);
+    assert_eq!(lock(&bench.stream.truth).settings_written, written);
+    assert_eq!(bench.set(Id::SequencerMode, 0), SUCCESS);
+    assert_eq!(bench.set_float(Id::ExposureTime, 500.0), SUCCESS);
+}
+
+#[test]
 fn some_cameras_want_their_trigger_set_in_one_order() {
     let mut bench = Bench::new();
     bench.write(0, CCP, 2);
@@ -308,7 +342,7 @@ proptest! {
                     prop_oneof![Just(2_u16), Just(0x40), Just(0x80), Just(0x82), Just(0x84), Just(0x86), any::<u16>()],
                     any::<u8>(),
                     prop::collection::vec(
-                        prop_oneof![any::<u32>(), 0_u32..0x1000, 0x1_0000_u32..0x1_0340, Just(0x10_0000), 0_u32..600],
+                        prop_oneof![any::<u32>(), 0_u32..0x1000, 0x1_0000_u32..0x1_0400, Just(0x10_0000), 0_u32..600],
                         0..140,
                     ),
                 )

@@ -210,6 +210,46 @@ fn settings_can_be_late_and_chunks_later_still() {
 }
 
 #[test]
+fn the_sequencer_takes_a_set_with_every_frame() {
+    let (camera, mut client, _vsync) = lit(8, &rig(|_| {}), Faults::default());
+    client.set("TriggerSource", 1);
+    client.set("ChunkModeActive", 1);
+    client.set_entry("ChunkEnable", 0, 1);
+    let load = |client: &mut Client, enabled: u32, sets: &[(u32, f64, u32)]| {
+        client.set("SequencerMode", 0);
+        client.set("SequencerConfigurationMode", 1);
+        client.set_entry("SequencerFeatureEnable", 0, enabled);
+        for &(set, exposure_us, next) in sets {
+            client.set("SequencerSetSelector", set);
+            client.set_float("ExposureTime", exposure_us);
+            client.set("SequencerSetNext", next);
+            client.set("SequencerTriggerSource", 1);
+            client.set("SequencerSetSave", 1);
+        }
+        client.set("SequencerSetStart", sets[0].0);
+        client.set("SequencerConfigurationMode", 0);
+        client.set("SequencerMode", 1);
+    };
+    let exposures = |client: &mut Client, frames: u32| -> Vec<f64> {
+        let mut told_us = |_| {
+            client.set("TriggerSoftware", 1);
+            f64::from_bits(client.frame().unwrap().chunk(0x1000))
+        };
+        (0..frames).map(&mut told_us).collect()
+    };
+    client.set("AcquisitionStart", 1);
+    load(&mut client, 1, &[(3, 300.0, 5), (5, 500.0, 9), (9, 900.0, 3)]);
+    let written = camera.truth().settings_written;
+    assert_eq!(exposures(&mut client, 5), [300.0, 500.0, 900.0, 300.0, 500.0]);
+    assert_eq!(client.number("SequencerSetActive"), 5);
+    assert_eq!(camera.truth().settings_written, written);
+    client.set("SequencerMode", 0);
+    assert_eq!(exposures(&mut client, 2), [900.0; 2], "what the registers have");
+    load(&mut client, 0, &[(0, 310.0, 1), (1, 320.0, 0)]);
+    assert_eq!(exposures(&mut client, 2), [320.0; 2], "a feature that is no part of the sets stays");
+}
+
+#[test]
 fn what_is_lost_doubled_and_overtaken_on_the_way_arrives_in_the_end() {
     let faults =
         Faults { packet_loss: 0.05, duplication: 0.05, reordering: 0.05, seed: 3, ..Faults::default() };

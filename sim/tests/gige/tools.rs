@@ -81,6 +81,29 @@ fn arv_tool_reads_and_writes_features() {
         ] {
             assert!(got.contains(line), "{line}: {got}");
         }
+        let set = arv_tool(
+            test,
+            &[
+                "control",
+                "SequencerConfigurationMode=On",
+                "SequencerFeatureSelector=TriggerDelay",
+                "SequencerFeatureEnable=true",
+                "SequencerSetSelector=3",
+                "TriggerDelay=800",
+                "SequencerPathSelector=0",
+                "SequencerSetNext=4",
+                "SequencerTriggerSource=FrameStart",
+                "SequencerSetSave",
+                "SequencerSetStart=3",
+                "SequencerConfigurationMode=Off",
+                "SequencerMode=On",
+            ],
+        );
+        assert!(!set.to_lowercase().contains("error"), "{set}");
+        let got = arv_tool(test, &["control", "SequencerMode", "SequencerSetNext", "SequencerSetStart"]);
+        for line in ["SequencerMode = On", "SequencerSetNext = 4", "SequencerSetStart = 3"] {
+            assert!(got.contains(line), "{line}: {got}");
+        }
         let refused = arv_tool(test, &["control", "PixelFormat=Mono9", "PixelFormat"]);
         assert!(refused.contains("PixelFormat = Mono12p"), "{refused}");
         // Every feature can be read: register and description agree.

@@ -58,6 +58,12 @@ impl Line {
         let has_one_exposure = sorted.chunk_by(|a, b| same_exposure(a, b)).count() <= 1;
         Self { period_us, max_jitter_us, distinct, has_one_exposure }
     }
+
+    /// How far a time is from a whole number of periods.
+    pub fn off_us(&self, time_us: f64) -> f64 {
+        let since_us = time_us.rem_euclid(self.period_us);
+        since_us.min(self.period_us - since_us)
+    }
 }
 
 /// Settings that the camera has been given.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use raysweep_core::{Applied, CameraSettings, DeviceError, DeviceState, SettingsId};
+use raysweep_core::{Applied, Camera, CameraSettings, DeviceError, DeviceState, SettingsId};
 use raysweep_pipeline::{Event, Job, Label, Point, Role, Shot};
 
 use super::ahead::Wanted;
@@ -43,11 +43,13 @@ pub struct FilmSetting {
 }
 
 /// A place in the sequence.
-struct Slot {
-    attempt: Attempt,
-    periods_from_last: Option<u32>,
+pub(super) struct Slot {
+    pub attempt: Attempt,
+    pub periods_from_last: Option<u32>,
+    /// Place in a film's cycle.
+    pub place: usize,
     /// Whether a pause may come before it.
-    may_hold: bool,
+    pub may_hold: bool,
 }
 
 impl FilmPass {
@@ -59,6 +61,7 @@ impl FilmPass {
                 Slot {
                     attempt: Attempt { id, point, shot },
                     periods_from_last: Some(periods_from_last),
+                    place,
                     may_hold: place == 0,
                 }
             })
@@ -70,14 +73,16 @@ impl Sequencer {
     /// Takes points. Each ends in a unit or a failure, in order.
     pub(super) fn sweep(&mut self, pass: Pass) -> Result<(), DeviceError> {
         self.warm_up(pass.not_before_ns)?;
-        let slots = pass.attempts.into_iter();
-        self.sequence(slots.map(|attempt| Slot { attempt, periods_from_last: None, may_hold: true }))
+        let slot = |attempt| Slot { attempt, periods_from_last: None, place: 0, may_hold: true };
+        self.sequence(pass.attempts.into_iter().map(slot))
     }
 
-    /// Takes a film: a sweep of one frame a point, again and again.
+    /// Takes a film: a sweep of one frame a point, again and again. What the camera does not by itself is written ahead.
     pub(super) fn film(&mut self, film: &FilmPass) -> Result<(), DeviceError> {
         self.warm_up(film.not_before_ns)?;
-        self.sequence(film.slots())
+        let mut slots = film.slots().peekable();
+        self.take_by_sets(film, &mut slots)?;
+        self.sequence(slots)
     }
 
     fn sequence(&mut self, slots: impl Iterator<Item = Slot>) -> Result<(), DeviceError> {
@@ -204,30 +209,39 @@ impl Sequencer {
         })
     }
 
-    /// Writes settings. A camera that is being opened again is waited for.
+    /// Writes settings.
     fn configure(
         &mut self,
         id: SettingsId,
         settings: &CameraSettings,
         work: impl FnOnce(Applied) -> Option<Wanted>,
     ) -> Result<(), DeviceError> {
-        let (before_ns, applied) = loop {
-            let before_ns = self.clock.now_ns();
-            match self.camera.configure(id, settings) {
+        let clock = self.clock.clone();
+        let written = self.when_there(|camera| Ok((clock.now_ns(), camera.configure(id, settings)?)))?;
+        let Some((before_ns, applied)) = written else { return Ok(()) };
+        self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
+        self.ahead.push(applied, (before_ns, self.clock.now_ns()), work(applied));
+        Ok(())
+    }
+
+    /// Has the camera do something, which waits for one that is being opened again; nothing where the run ends meanwhile.
+    pub(super) fn when_there<T>(
+        &mut self,
+        mut act: impl FnMut(&mut dyn Camera) -> Result<T, DeviceError>,
+    ) -> Result<Option<T>, DeviceError> {
+        loop {
+            match act(&mut *self.camera) {
                 Err(_) if self.camera.state() == DeviceState::Lost => {
                     if !self.orders.go_on() {
-                        return Ok(());
+                        return Ok(None);
                     }
                     if let Some(received) = self.receive(POLL)? {
                         self.deliver(received)?;
                     }
                 }
-                applied => break (before_ns, applied?),
+                done => return done.map(Some),
             }
-        };
-        self.longest_frame_us = self.longest_frame_us.max(self.frame_us(&applied.actual));
-        self.ahead.push(applied, (before_ns, self.clock.now_ns()), work(applied));
-        Ok(())
+        }
     }
 
     /// Hands a frame on as that of the settings that it was exposed with; those before, whose frames never came, are

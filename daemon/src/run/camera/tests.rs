@@ -7,6 +7,7 @@ use raysweep_core::{Applied, CameraCapabilities, ClockHandle, FirstFrame, PixelF
 use raysweep_pipeline::{Policy, Role};
 
 use super::*;
+use crate::run::orders::Order;
 
 const PERIOD_NS: i64 = 16_666_667;
 const LATENCY_US: f64 = 8.0;
@@ -26,10 +27,25 @@ struct Script {
     lost: &'static [u64],
     /// Frames that are held up on their way to the host, as resends do, by so many ms; those behind them wait.
     held_up: &'static [(u64, i64)],
+    /// How many sets its sequencer has.
+    sets: usize,
+    /// Frames of a sequence that have the set of the frame before once more.
+    stutters: &'static [u64],
+    /// Whether its sequencer stays with the first set.
+    stuck: bool,
 }
 
-const EXACT: Script =
-    Script { late: &[0], promise: None, chunk: true, oversleep_ms: &[0], lost: &[], held_up: &[] };
+const EXACT: Script = Script {
+    late: &[0],
+    promise: None,
+    chunk: true,
+    oversleep_ms: &[0],
+    lost: &[],
+    held_up: &[],
+    sets: 0,
+    stutters: &[],
+    stuck: false,
+};
 
 /// A camera whose every trigger is answered, and whose frames are on the host 18 ms after their exposure.
 struct Scripted {
@@ -37,7 +53,11 @@ struct Scripted {
     clock: ClockHandle,
     capabilities: CameraCapabilities,
     written: Vec<(u64, CameraSettings)>,
+    /// From which frame on its sequencer goes through what.
+    sequence: Option<(u64, Vec<CameraSettings>)>,
     changes: usize,
+    /// The frames at which settings were written or a sequence was begun.
+    told: Arc<Mutex<Vec<u64>>>,
     sleeps: usize,
     next_seq: u64,
     /// The settings of each frame, in truth.
@@ -45,7 +65,18 @@ struct Scripted {
 }
 
 impl Scripted {
+    fn next_trigger(&self) -> u64 {
+        self.clock.now_ns().unsigned_abs().div_ceil(PERIOD_NS.unsigned_abs())
+    }
+
     fn settings(&self, seq: u64) -> CameraSettings {
+        if let Some((first_seq, sets)) = &self.sequence
+            && seq >= *first_seq
+        {
+            let stutters = self.script.stutters.iter().filter(|stutter| **stutter <= seq).count();
+            let place = ((seq - first_seq) as usize - stutters) % sets.len();
+            return sets[if self.script.stuck { 0 } else { place }];
+        }
         let written = self.written.iter().rev().find(|(first_seq, _)| *first_seq <= seq);
         written.map_or(settings(0.0, 100.0), |(_, settings)| *settings)
     }
@@ -61,9 +92,16 @@ impl Camera for Scripted {
     }
 
     fn configure(&mut self, _: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
-        let next_seq = self.clock.now_ns().unsigned_abs().div_ceil(PERIOD_NS.unsigned_abs());
+        let next_seq = self.next_trigger();
         let first_seq = next_seq + self.script.late[self.changes % self.script.late.len()];
         self.changes += 1;
+        self.told.lock().unwrap().push(next_seq);
+        if self.sequence.is_some() {
+            // What is on its way has its sets.
+            let under_way: Vec<_> = (self.next_seq..first_seq).map(|seq| (seq, self.settings(seq))).collect();
+            self.written.extend(under_way);
+            self.sequence = None;
+        }
         self.written.retain(|(earlier_seq, _)| *earlier_seq < first_seq);
         self.written.push((first_seq, *settings));
         let first_frame = match self.script.promise {
@@ -72,6 +110,17 @@ impl Camera for Scripted {
             Some(late) => FirstFrame::Within { earliest: self.next_seq, certain: next_seq + late },
         };
         Ok(Applied { actual: *settings, first_frame })
+    }
+
+    fn sequence(&mut self, all: &[CameraSettings]) -> Result<Option<Vec<CameraSettings>>, DeviceError> {
+        if all.len() > self.script.sets {
+            return Ok(None);
+        }
+        // It keeps the settings before for some frames, as with any others.
+        let first_seq = self.next_trigger() + self.script.late[0];
+        self.told.lock().unwrap().push(first_seq);
+        self.sequence = Some((first_seq, all.to_vec()));
+        Ok(Some(all.to_vec()))
     }
 
     fn arm(&mut self) -> Result<(), DeviceError> {
@@ -145,6 +194,8 @@ struct Played {
     /// Points that ended without all their frames.
     short: Vec<u32>,
     truth: Vec<CameraSettings>,
+    /// The frames at which settings were written or a sequence was begun.
+    told: Vec<u64>,
 }
 
 impl Played {
@@ -167,6 +218,19 @@ impl Played {
 
 /// Takes the plan as a sweep of `frames` a point or, in `cycles`, as a film.
 fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
+    play_plan(&plan(), script, frames, cycles, None)
+}
+
+/// Takes a plan, with a pause after so many frames that counted.
+fn play_plan(
+    plan: &[CameraSettings],
+    script: Script,
+    frames: u32,
+    cycles: Option<u32>,
+    pause_after: Option<usize>,
+) -> Played {
+    let told = Arc::new(Mutex::new(Vec::new()));
+    let orders = Arc::new(Orders::default());
     let clock = Clock::simulated();
     let truth = Arc::new(Mutex::new(Vec::new()));
     let camera = Scripted {
@@ -174,16 +238,20 @@ fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
         clock: clock.register(),
         capabilities: capabilities(),
         written: Vec::new(),
+        sequence: None,
         changes: 0,
+        told: told.clone(),
         sleeps: 0,
         next_seq: 0,
         truth: truth.clone(),
     };
-    let plan = plan();
-    let drive = Drive { clock, pace: Pace::Pipeline, line: Line::new(PERIOD_NS as f64 * 1e-3, 50.0, &plan) };
+    let drive = Drive { clock, pace: Pace::Pipeline, line: Line::new(PERIOD_NS as f64 * 1e-3, 50.0, plan) };
     let (input, events) = Input::new(64, Policy::Wait);
-    let follower = std::thread::spawn(move || follow(&events, frames));
-    let mut sequencer = Sequencer::new(Box::new(camera), drive, input, Arc::default());
+    let follower = std::thread::spawn({
+        let orders = orders.clone();
+        move || follow(&events, frames, pause_after, &orders)
+    });
+    let mut sequencer = Sequencer::new(Box::new(camera), drive, input, orders);
     let latency = OnceLock::new();
     let ended = sequencer.work(Work::Probe(plan[0]), &latency);
     assert!(matches!(ended, Ended::Flushed(Ok(()))));
@@ -197,7 +265,7 @@ fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
     let work = match cycles {
         None => Work::Pass(Pass {
             attempts: (0..)
-                .zip(&plan)
+                .zip(plan)
                 .map(|(index, &settings)| Attempt {
                     id: SettingsId { point: index, attempt: 0 },
                     point: point(index, settings),
@@ -208,7 +276,7 @@ fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
         }),
         Some(cycles) => Work::Film(FilmPass {
             settings: (0..)
-                .zip(&plan)
+                .zip(plan)
                 .map(|(index, &settings)| FilmSetting {
                     ordinal: index,
                     point: point(index, settings),
@@ -223,11 +291,16 @@ fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
     assert!(matches!(sequencer.work(work, &latency), Ended::Flushed(Ok(()))));
     drop(sequencer);
     let (counted, short) = follower.join().unwrap();
-    let truth = truth.lock().unwrap().clone();
-    Played { latency: latency.get().copied(), counted, short, truth }
+    let (truth, told) = (truth.lock().unwrap().clone(), told.lock().unwrap().clone());
+    Played { latency: latency.get().copied(), counted, short, truth, told }
 }
 
-fn follow(events: &Receiver<Event>, frames: u32) -> (Vec<(u32, u64)>, Vec<u32>) {
+fn follow(
+    events: &Receiver<Event>,
+    frames: u32,
+    pause_after: Option<usize>,
+    orders: &Orders,
+) -> (Vec<(u32, u64)>, Vec<u32>) {
     let (mut counted, mut short) = (Vec::new(), Vec::new());
     let mut open: Option<(u32, u32)> = None;
     for event in events.iter() {
@@ -240,7 +313,11 @@ fn follow(events: &Receiver<Event>, frames: u32) -> (Vec<(u32, u64)>, Vec<u32>) 
                 let (point, passed) = open.as_mut().expect("a job");
                 *passed += 1;
                 counted.push((*point, frame.stamp.seq));
+                if Some(counted.len()) == pause_after {
+                    orders.give(Order::Pause);
+                }
             }
+            Event::Idle => orders.give(Order::Go),
             Event::End => {
                 let (point, passed) = open.take().expect("a job");
                 if passed < frames {
@@ -406,4 +483,93 @@ fn a_frame_whose_stamps_leave_a_doubt_is_nobodys() {
         (Some(1), None),
         "who knows how long"
     );
+}
+
+/// Eight delays at one exposure: a film.
+fn film_plan() -> Vec<CameraSettings> {
+    [0.0, 60.0, 200.0, 400.0, 700.0, 500.0, 300.0, 120.0]
+        .iter()
+        .map(|us| settings(3_000.0 + us, 600.0))
+        .collect()
+}
+
+fn sequencers() -> Vec<Script> {
+    all_late().into_iter().map(|script| Script { sets: 8, ..script }).collect()
+}
+
+#[test]
+fn a_film_by_the_sequencer_is_told_nothing_while_it_runs() {
+    for script in sequencers() {
+        // A host that is this late would cost a film that is written ahead frames.
+        let script = Script { oversleep_ms: &[0, 40, 3, 0, 0, 18, 1, 0, 25, 16, 2], ..script };
+        let film = play_plan(&film_plan(), script, 1, Some(5), None);
+        film.assert_true(&film_plan());
+        assert_eq!((film.counted.len(), film.short.len(), film.frames()), (40, 0, 40), "{:?}", script.late);
+        let ids: Vec<u64> = film.counted.iter().map(|(_, seq)| *seq).collect();
+        assert!(!film.told.iter().any(|told| (ids[0]..=ids[39]).contains(told)), "{:?}", film.told);
+        // Two cycles at the most until its place in the sequence is known and its cycle begins.
+        let begun = film.told.iter().filter(|told| **told < ids[0]).max().unwrap();
+        assert!(ids[0] - begun <= 2 * 8 + 6, "{begun} {ids:?}");
+        assert!(film.told.last().unwrap() > &ids[39], "it is stopped");
+    }
+}
+
+#[test]
+fn a_lost_frame_of_a_sequence_takes_its_set_with_it() {
+    for script in sequencers() {
+        let script = Script { lost: &[75, 76, 82, 86, 88, 98], ..script };
+        let film = play_plan(&film_plan(), script, 1, Some(6), None);
+        film.assert_true(&film_plan());
+        assert_eq!(film.short.len() + film.counted.len(), 48);
+        let (first, last) = (film.counted[0].1, film.counted.last().unwrap().1);
+        let lost = script.lost.iter().filter(|lost| (first..=last).contains(*lost)).count();
+        assert!(lost >= 2, "{first} to {last}");
+        assert_eq!(film.short.len(), lost);
+    }
+}
+
+#[test]
+fn a_sequence_that_stutters_is_found_again() {
+    let film = play_plan(&film_plan(), Script { sets: 8, stutters: &[120], ..EXACT }, 1, Some(20), None);
+    let plan = film_plan();
+    let is_true = |&(point, seq): &(u32, u64)| film.truth[seq as usize] == plan[point as usize];
+    // What is wrong, the assembler sees by its delay: for less than two cycles.
+    let wrong: Vec<u64> = film.counted.iter().filter(|frame| !is_true(frame)).map(|(_, seq)| *seq).collect();
+    assert!((1..=16).contains(&wrong.len()) && wrong[0] == 120, "{wrong:?}");
+    assert_eq!(film.counted.len(), 160);
+}
+
+#[test]
+fn a_pause_stops_the_sequence_and_a_cycle_is_whole_before_it() {
+    let script = Script { sets: 8, ..EXACT };
+    // The order comes by the events, of which 64 may lie ahead.
+    let film = play_plan(&film_plan(), script, 1, Some(12), Some(11));
+    film.assert_true(&film_plan());
+    assert_eq!((film.counted.len(), film.short.len()), (96, 0));
+    let gaps: Vec<usize> =
+        (1..96).filter(|&place| film.counted[place].1 != film.counted[place - 1].1 + 1).collect();
+    assert!(gaps.len() == 1 && gaps[0].is_multiple_of(8), "{gaps:?}");
+    let (before, after) = (film.counted[gaps[0] - 1].1, film.counted[gaps[0]].1);
+    assert_eq!(
+        film.told.iter().filter(|told| (before..after).contains(*told)).count(),
+        2,
+        "stopped and begun"
+    );
+}
+
+#[test]
+fn a_film_that_the_sequencer_cannot_take_is_written_ahead() {
+    let one_set_short = Script { sets: 7, ..EXACT };
+    let film = play_plan(&film_plan(), one_set_short, 1, Some(3), None);
+    film.assert_true(&film_plan());
+    assert_eq!((film.counted.len(), film.frames()), (24, 24));
+    let film = play_plan(&film_plan(), Script { sets: 8, stuck: true, ..EXACT }, 1, Some(3), None);
+    film.assert_true(&film_plan());
+    assert_eq!((film.counted.len(), film.frames()), (24, 24));
+    // Delays all round a period in equal steps: any set might be the first.
+    let round: Vec<_> = (0..6).map(|k| settings(f64::from(k) * PERIOD_NS as f64 / 6e3, 600.0)).collect();
+    let film = play_plan(&round, Script { sets: 8, ..EXACT }, 1, Some(3), None);
+    film.assert_true(&round);
+    assert_eq!(film.counted.len(), 18);
+    assert!(film.told.len() > 18, "{:?}", film.told);
 }

@@ -10,7 +10,8 @@ use aravis::prelude::*;
 use aravis::{Buffer, BufferStatus, ChunkParser, Stream};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
-    DeviceState, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us, us_from_ns,
+    DeviceState, FirstFrame, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us,
+    us_from_ns,
 };
 
 use super::buffer;
@@ -110,6 +111,7 @@ impl AravisCamera {
             replies: answers,
             armed: false,
             settings: None,
+            sequence: None,
         };
         let thread = thread::Builder::new()
             .name("camera-owner".into())
@@ -371,7 +373,7 @@ impl Camera for AravisCamera {
     fn configure(&mut self, _: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
         self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         let triggers = self.triggers();
-        let Done { written_ns, actual, restarted } = self.ask(Command::Configure(*settings))?;
+        let Done { written_ns, actual, restarted, .. } = self.ask(Command::Configure(*settings))?;
         let actual = actual.unwrap_or(*settings);
         if restarted {
             self.ids.restart(0);
@@ -381,6 +383,25 @@ impl Camera for AravisCamera {
         let first_frame = first_frame(triggers, written_ns, latency);
         self.promises.push(first_frame, actual);
         Ok(Applied { actual, first_frame })
+    }
+
+    fn sequence(&mut self, settings: &[CameraSettings]) -> Result<Option<Vec<CameraSettings>>, DeviceError> {
+        for settings in settings {
+            self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
+        }
+        let Done { sequence, restarted, .. } = self.ask(Command::Sequence(settings.to_vec()))?;
+        if restarted {
+            self.drain();
+            self.ids.restart(0);
+        }
+        // What was triggered when is told from the longest delay that a frame may have.
+        let by_delay =
+            |a: &&CameraSettings, b: &&CameraSettings| a.trigger_delay_us.total_cmp(&b.trigger_delay_us);
+        if let Some(longest) = sequence.iter().flatten().max_by(by_delay) {
+            let next_seq = self.ids.next();
+            self.promises.push(FirstFrame::Within { earliest: next_seq, certain: next_seq }, *longest);
+        }
+        Ok(sequence)
     }
 
     fn arm(&mut self) -> Result<(), DeviceError> {

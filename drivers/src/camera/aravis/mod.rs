@@ -32,6 +32,8 @@ mod owner;
 #[cfg(feature = "aravis")]
 mod promise;
 #[cfg(feature = "aravis")]
+mod sequencer;
+#[cfg(feature = "aravis")]
 mod settings;
 #[cfg(feature = "aravis")]
 mod setup;

@@ -10,9 +10,10 @@ use raysweep_core::{CameraCapabilities, CameraSettings, Clock, ClockModel, Devic
 
 use super::config::AravisConfig;
 use super::driver::RigFacts;
-use super::features::Features;
+use super::features::{FeatureError, Features};
 use super::library::{Device, DeviceClock, Health, device_error};
 use super::network::{self, SocketBuffer};
+use super::sequencer;
 use super::settings::Writer;
 use super::setup::set_up;
 
@@ -36,6 +37,8 @@ pub enum Command {
     Disarm,
     /// Write settings.
     Configure(CameraSettings),
+    /// Have the camera's sequencer go through settings.
+    Sequence(Vec<CameraSettings>),
     /// The camera is given up: dispose of its stream and open it again.
     Reopen(Stream),
     /// The same for good; the channel's end says so, too.
@@ -62,6 +65,8 @@ pub struct Done {
     pub written_ns: i64,
     /// The settings that the camera has, where some were written.
     pub actual: Option<CameraSettings>,
+    /// The settings of its sequencer, where that was started.
+    pub sequence: Option<Vec<CameraSettings>>,
     /// Whether it had to stop for them, so that it counts its frames anew.
     pub restarted: bool,
 }
@@ -106,6 +111,8 @@ pub struct Owner {
     pub replies: SyncSender<Reply>,
     pub armed: bool,
     pub settings: Option<CameraSettings>,
+    /// What the camera's sequencer goes through, in the place of `settings`.
+    pub sequence: Option<Vec<CameraSettings>>,
 }
 
 struct Connection {
@@ -227,6 +234,10 @@ impl Owner {
         if let Some(settings) = &self.settings {
             writer.write(&device, settings)?;
         }
+        if let Some(sequence) = &self.sequence {
+            sequencer::start(&device, writer.names(), sequence)?;
+            writer.forget();
+        }
         let armed_ns = self.armed.then(|| self.shared.clock.now_ns());
         if self.armed {
             device.execute("AcquisitionStart")?;
@@ -245,6 +256,10 @@ impl Owner {
                 }
                 Ok(Order { command: Command::Close(stream), .. }) => {
                     let _ = connection.device.execute("AcquisitionStop");
+                    if self.sequence.is_some() {
+                        // A camera that is gone is not left with it; one that is there takes it.
+                        let _ = sequencer::stop(&connection.device);
+                    }
                     drop(stream);
                     return Ended::Closed;
                 }
@@ -281,7 +296,7 @@ impl Owner {
 
     fn obey(&mut self, connection: &mut Connection, command: Command) -> Result<Done, DeviceError> {
         let Connection { device, writer, .. } = connection;
-        let mut done = Done { written_ns: 0, actual: None, restarted: false };
+        let mut done = Done { written_ns: 0, actual: None, sequence: None, restarted: false };
         match command {
             Command::Arm => {
                 device.execute("AcquisitionStart")?;
@@ -290,13 +305,20 @@ impl Owner {
             Command::Disarm => {
                 self.armed = false;
                 device.execute("AcquisitionStop")?;
+                if self.sequence.take().is_some() {
+                    sequencer::stop(device)?;
+                }
             }
             Command::Configure(settings) => {
                 self.settings = Some(settings);
-                // Shutter modes are locked while a camera streams.
-                done.restarted = self.armed && writer.changes_shutter(&settings);
+                let sequenced = self.sequence.take().is_some();
+                // Shutter modes are locked while a camera streams, and so may be its sequencer.
+                done.restarted = self.armed && (sequenced || writer.changes_shutter(&settings));
                 if done.restarted {
                     device.execute("AcquisitionStop")?;
+                }
+                if sequenced {
+                    sequencer::stop(device)?;
                 }
                 let written = writer.write(device, &settings);
                 if done.restarted {
@@ -304,9 +326,36 @@ impl Owner {
                 }
                 done.actual = Some(written?);
             }
-            Command::Reopen(_) | Command::Close(_) => {}
+            Command::Sequence(settings) if sequencer::is_offered(device) => {
+                done.restarted = self.armed;
+                if done.restarted {
+                    device.execute("AcquisitionStop")?;
+                }
+                let started = sequencer::start(device, writer.names(), &settings);
+                writer.forget();
+                if done.restarted {
+                    device.execute("AcquisitionStart")?;
+                }
+                match started {
+                    Ok(actual) => {
+                        (self.sequence, done.sequence) = (Some(settings), Some(actual));
+                    }
+                    Err(error) if is_gone(&error) => return Err(error.into()),
+                    Err(error) => {
+                        tracing::warn!(
+                            camera = device.model(),
+                            "the camera's sequencer is not used, settings are written instead: {error}"
+                        );
+                    }
+                }
+            }
+            Command::Sequence(_) | Command::Reopen(_) | Command::Close(_) => {}
         }
         done.written_ns = self.shared.clock.now_ns();
         Ok(done)
     }
+}
+
+fn is_gone(error: &FeatureError) -> bool {
+    matches!(error.kind, DeviceErrorKind::Timeout | DeviceErrorKind::Disconnected)
 }

@@ -53,6 +53,16 @@ impl Writer {
         Self { names, last: None }
     }
 
+    /// The names that it writes to.
+    pub fn names(&self) -> &Names {
+        &self.names
+    }
+
+    /// It is no longer known what the camera has.
+    pub fn forget(&mut self) {
+        self.last = None;
+    }
+
     /// Whether these settings need another shutter than the camera has.
     pub fn changes_shutter(&self, settings: &CameraSettings) -> bool {
         self.names.shutter.is_some() && self.last.is_none_or(|(asked, _)| asked.shutter != settings.shutter)

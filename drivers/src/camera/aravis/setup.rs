@@ -5,6 +5,7 @@ use raysweep_core::{DeviceErrorKind, PixelFormat};
 
 use super::config::{AravisConfig, Region};
 use super::features::{FeatureError, Features, Result, first_present, put_boolean, put_integer, put_text};
+use super::sequencer;
 use super::settings::Names;
 
 /// What came of setting a camera up.
@@ -30,6 +31,8 @@ pub struct SetUp {
 /// A feature that sweeps cannot do without, or a value that the camera does not take.
 pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelFormat) -> Result<SetUp> {
     let mut lacks = Vec::new();
+    // While it runs, cameras take no settings.
+    sequencer::stop(features)?;
     for line in &config.features {
         features.set_line(line)?;
     }

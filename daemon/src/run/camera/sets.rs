@@ -1,0 +1,208 @@
+//! Films by the camera's own sequencer: it goes through the cycle's settings by itself, so that no frame hangs on a write
+//! that must come between two triggers.
+//!
+//! Each frame exposed has the set after that of the frame before, whether it arrives or not. So one number, the phase, says
+//! of every id which set it has. The camera does not promise it; it is believed when a whole cycle of frames agrees with it
+//! and with no other, and given up for another that does. The assembler holds each frame's delay against its edge
+//! all the same.
+
+use std::iter::Peekable;
+
+use raysweep_core::{Applied, CameraSettings, DeviceError, FirstFrame, FrameStamp, LossCause, us_from_ns};
+use raysweep_pipeline::{EXPOSURE_TOLERANCE_US, Event, Job, Label, Role};
+
+use super::sequence::{FilmPass, Slot};
+use super::{Line, POLL, Sequencer, Taken, Watchdog, closed};
+use crate::run::orders::Order;
+
+/// Frames further apart are not compared: the line's period is not known that well. [A]
+const COMPARED_NS: i64 = 1_000_000_000;
+/// Cycles in which the phase must be found; the camera does something else otherwise.
+const PATIENCE_CYCLES: usize = 8;
+
+impl Sequencer {
+    /// Takes slots of a film by the camera's own sequencer, as far as that can be used.
+    pub(super) fn take_by_sets(
+        &mut self,
+        film: &FilmPass,
+        slots: &mut Peekable<impl Iterator<Item = Slot>>,
+    ) -> Result<(), DeviceError> {
+        let settings: Vec<CameraSettings> =
+            film.settings.iter().map(|setting| setting.shot.settings).collect();
+        if !Phase::tells(&settings, &self.line) {
+            return Ok(());
+        }
+        while slots.peek().is_some() && self.orders.go_on() {
+            let Some(sets) = self.when_there(|camera| camera.sequence(&settings))?.flatten() else {
+                return Ok(());
+            };
+            tracing::info!(sets = sets.len(), "the film is taken by the camera's own sequencer");
+            let longest_us = sets.iter().map(|settings| self.frame_us(settings)).fold(0.0, f64::max);
+            self.longest_frame_us = self.longest_frame_us.max(longest_us);
+            let taken = self.take_frames(slots, Phase::new(sets, self.line));
+            // What the stamps of its frames seemed to say, by the settings written before.
+            self.ahead.lose_track();
+            let is_followed = taken?;
+            // Ends the sequence.
+            self.pass_through(&settings[0])?;
+            if !is_followed {
+                tracing::warn!(
+                    "frames do not show the settings of the camera's sequencer one after the other: settings are written instead"
+                );
+                return Ok(());
+            }
+            if slots.peek().is_some() && self.orders.go_on() {
+                self.input.send(Event::Idle).map_err(closed)?;
+                self.orders.wait_while_paused();
+                self.told_seq = None;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes frames until every slot has its own, or a pause comes between two cycles; `false`: the camera does not go
+    /// through its sets.
+    fn take_frames(
+        &mut self,
+        slots: &mut Peekable<impl Iterator<Item = Slot>>,
+        mut phase: Phase,
+    ) -> Result<bool, DeviceError> {
+        let mut watchdog = Watchdog::default();
+        let mut next_seq = None;
+        let mut slot_before: Option<u64> = None;
+        while let Some(slot) = slots.peek() {
+            if !self.orders.go_on() || slot.may_hold && self.orders.now() == Order::Pause {
+                break;
+            }
+            let Some(received) = self.receive(POLL)? else {
+                watchdog.missed(POLL, self.longest_frame_us, self.camera.state())?;
+                continue;
+            };
+            watchdog.feed();
+            let stamp = received.stamp;
+            for lost_seq in next_seq.unwrap_or(stamp.seq)..stamp.seq {
+                let cause = self.camera.loss_of(lost_seq);
+                if let Some(slot) = slots.next_if(|slot| phase.set_of(lost_seq) == Some(slot.place)) {
+                    let job = phase.job(&slot, lost_seq, slot_before.replace(lost_seq));
+                    self.input.send(Event::Begin(job)).map_err(closed)?;
+                    self.input.send(Event::Lost(lost_seq, Some(cause))).map_err(closed)?;
+                    self.input.send(Event::End).map_err(closed)?;
+                    self.told_seq = Some(lost_seq);
+                }
+                if cause == LossCause::CameraLost {
+                    // Its ids were made up, and its sequencer has begun anew.
+                    phase.forget();
+                    break;
+                }
+            }
+            next_seq = Some(stamp.seq + 1);
+            phase.see(&stamp);
+            if phase.is_hopeless() {
+                self.hand_on(received, Label::Settling)?;
+                return Ok(false);
+            }
+            let Some(slot) = slots.next_if(|slot| phase.set_of(stamp.seq) == Some(slot.place)) else {
+                self.hand_on(received, Label::Settling)?;
+                continue;
+            };
+            let job = phase.job(&slot, stamp.seq, slot_before.replace(stamp.seq));
+            self.input.send(Event::Begin(job)).map_err(closed)?;
+            let taken = self.hand_on(received, Label::Counted)?;
+            self.input.send(Event::End).map_err(closed)?;
+            if let Taken::Passed = taken {
+                let is_lit = !matches!(slot.attempt.point.role, Role::Dark(_));
+                self.note_exposure(&stamp, &job.applied.actual, is_lit);
+            }
+        }
+        Ok(true)
+    }
+}
+
+/// Which set each frame has.
+struct Phase {
+    /// The sets' settings, as the camera took them.
+    sets: Vec<CameraSettings>,
+    line: Line,
+    /// The frame 0 has, or would have, the set of this number.
+    known: Option<usize>,
+    /// For each phase, how many frames in a row have agreed with it, each with the one before.
+    agreeing: Vec<usize>,
+    newest: Option<FrameStamp>,
+    /// Frames that have been looked at without result.
+    in_vain: usize,
+}
+
+impl Phase {
+    fn new(sets: Vec<CameraSettings>, line: Line) -> Self {
+        Self { known: None, agreeing: vec![0; sets.len()], newest: None, in_vain: 0, sets, line }
+    }
+
+    /// Whether stamps tell each phase of a cycle of settings from all others, and each frame's settings from all others
+    /// once its edge is known.
+    fn tells(settings: &[CameraSettings], line: &Line) -> bool {
+        let delay_us = |place: usize| settings[place % settings.len()].trigger_delay_us;
+        let step_us = |place: usize| delay_us(place + 1) - delay_us(place);
+        // Edges may be off by the jitter that is allowed, and so may what is asked of the frames.
+        let differs = |shift: usize| {
+            (0..settings.len())
+                .any(|place| line.off_us(step_us(place + shift) - step_us(place)) > 2.0 * line.max_jitter_us)
+        };
+        line.distinct && line.has_one_exposure && (1..settings.len()).all(differs)
+    }
+
+    fn set_of(&self, seq: u64) -> Option<usize> {
+        self.known.map(|phase| self.set_by(phase, seq))
+    }
+
+    fn set_by(&self, phase: usize, seq: u64) -> usize {
+        let sets = self.sets.len();
+        ((seq % sets as u64) as usize + phase) % sets
+    }
+
+    /// Nothing that was seen counts any more.
+    fn forget(&mut self) {
+        *self = Self::new(std::mem::take(&mut self.sets), self.line);
+    }
+
+    /// Looks at a frame.
+    fn see(&mut self, stamp: &FrameStamp) {
+        let before = self.newest.replace(*stamp);
+        let before = before.filter(|before| stamp.exposure_start_ns - before.exposure_start_ns < COMPARED_NS);
+        for phase in 0..self.sets.len() {
+            let agrees = before.is_some_and(|before| self.agrees(phase, &before, stamp));
+            self.agreeing[phase] = if agrees { self.agreeing[phase] + 1 } else { 0 };
+        }
+        let mut certain = (0..self.sets.len()).filter(|&phase| self.agreeing[phase] >= self.sets.len());
+        if let (Some(phase), None) = (certain.next(), certain.next()) {
+            self.known = Some(phase);
+        }
+        self.in_vain = if self.known.is_some() { 0 } else { self.in_vain + 1 };
+    }
+
+    fn is_hopeless(&self) -> bool {
+        self.in_vain > PATIENCE_CYCLES * self.sets.len()
+    }
+
+    /// Whether by a phase two frames were triggered whole periods apart and have the exposures that they say.
+    fn agrees(&self, phase: usize, before: &FrameStamp, stamp: &FrameStamp) -> bool {
+        let [first, second] = [before, stamp].map(|stamp| self.sets[self.set_by(phase, stamp.seq)]);
+        let exposure_us = stamp.exposure_us.unwrap_or(second.exposure_us);
+        let starts_us = us_from_ns(stamp.exposure_start_ns - before.exposure_start_ns);
+        let triggers_us = starts_us - (second.trigger_delay_us - first.trigger_delay_us);
+        self.line.off_us(triggers_us) <= self.line.max_jitter_us
+            && (exposure_us - second.exposure_us).abs() <= EXPOSURE_TOLERANCE_US
+    }
+
+    /// What the assembler is told of the frame `seq`, which has a slot's set; `before` is the frame of the slot before.
+    fn job(&self, slot: &Slot, seq: u64, before: Option<u64>) -> Job {
+        let runs_on = before.is_some_and(|before| before + 1 == seq);
+        Job {
+            id: slot.attempt.id,
+            frames: slot.attempt.point.frames,
+            applied: Applied { actual: self.sets[slot.place], first_frame: FirstFrame::Exactly(seq) },
+            delay_us: slot.attempt.point.delay_us,
+            light_edges_later: slot.attempt.shot.light_edges_later,
+            periods_from_last: slot.periods_from_last.filter(|_| runs_on),
+        }
+    }
+}

@@ -1,0 +1,124 @@
+//! The camera's own sequencer after the SFNC 2.7, chapter "Sequencer Control": sets of settings that frames go through, one
+//! a frame, without a word from the client.
+
+use raysweep_core::CameraSettings;
+
+use super::features::{FRAME_START, Id, SEQUENCER_SETS};
+use super::gvcp::Status;
+use super::registers::Registers;
+use super::source::Sets;
+
+/// Values of `SequencerMode` and `SequencerConfigurationMode`.
+const ON: u32 = 1;
+/// Places in `SequencerFeatureEnable`, as in [`super::features::SEQUENCED`].
+const EXPOSURE_TIME: u32 = 0;
+const TRIGGER_DELAY: u32 = 1;
+
+/// The saved sets.
+pub struct Sequencer {
+    sets: [Set; SEQUENCER_SETS],
+}
+
+/// One set.
+#[derive(Clone, Copy)]
+struct Set {
+    settings: CameraSettings,
+    /// `SequencerSetNext`.
+    next: u32,
+    /// `SequencerTriggerSource`.
+    source: u32,
+}
+
+impl Sequencer {
+    /// Sets that all have these settings and lead nowhere.
+    pub fn new(settings: CameraSettings) -> Self {
+        Self { sets: [Set { settings, next: 0, source: 0 }; SEQUENCER_SETS] }
+    }
+
+    /// Whether a register may be written now: sets are changed in configuration mode alone, and while the sequencer runs
+    /// neither they nor what it sets.
+    ///
+    /// # Errors
+    /// `AccessDenied`.
+    pub fn check(registers: &Registers, id: Id) -> Result<(), Status> {
+        let runs = registers.number(Id::SequencerMode) == ON;
+        let configures = registers.number(Id::SequencerConfigurationMode) == ON;
+        let allowed = match id {
+            Id::SequencerMode => !configures,
+            Id::SequencerConfigurationMode
+            | Id::ExposureTime
+            | Id::TriggerDelay
+            | Id::SensorShutterMode
+            | Id::UserSetLoad
+            | Id::UserSetSave => !runs,
+            Id::SequencerFeatureSelector
+            | Id::SequencerFeatureEnable
+            | Id::SequencerSetSelector
+            | Id::SequencerSetSave
+            | Id::SequencerSetLoad
+            | Id::SequencerSetStart
+            | Id::SequencerPathSelector
+            | Id::SequencerSetNext
+            | Id::SequencerTriggerSource => configures,
+            _ => true,
+        };
+        if allowed { Ok(()) } else { Err(Status::AccessDenied) }
+    }
+
+    /// Whether it is switched on.
+    pub fn runs(registers: &Registers) -> bool {
+        registers.number(Id::SequencerMode) == ON
+    }
+
+    fn selected(registers: &Registers) -> usize {
+        registers.number(Id::SequencerSetSelector) as usize
+    }
+
+    /// Keeps what the camera has as the selected set.
+    pub fn save(&mut self, registers: &Registers, settings: CameraSettings) {
+        if let Some(set) = self.sets.get_mut(Self::selected(registers)) {
+            let number = |id| registers.number(id);
+            *set = Set {
+                settings,
+                next: number(Id::SequencerSetNext),
+                source: number(Id::SequencerTriggerSource),
+            };
+        }
+    }
+
+    /// Shows where the selected set leads.
+    pub fn show(&self, registers: &mut Registers) {
+        if let Some(set) = self.sets.get(Self::selected(registers)) {
+            registers.set_number(Id::SequencerSetNext, set.next);
+            registers.set_number(Id::SequencerTriggerSource, set.source);
+        }
+    }
+
+    /// Puts the selected set into the registers.
+    pub fn load(&self, registers: &mut Registers) {
+        self.show(registers);
+        if let Some(Set { settings, .. }) = self.sets.get(Self::selected(registers)) {
+            registers.set_float(Id::ExposureTime, settings.exposure_us);
+            registers.set_float(Id::TriggerDelay, settings.trigger_delay_us);
+        }
+    }
+
+    /// What frames go through; what is not enabled stays as `settings` have it.
+    pub fn sequence(&self, registers: &Registers, settings: CameraSettings) -> Sets {
+        let enabled = |feature| registers.number_for(Id::SequencerFeatureEnable, feature) == ON;
+        let (exposure, delay) = (enabled(EXPOSURE_TIME), enabled(TRIGGER_DELAY));
+        let sets = self.sets.iter().enumerate().map(|(place, set)| {
+            let of_set = CameraSettings {
+                shutter: settings.shutter,
+                exposure_us: if exposure { set.settings.exposure_us } else { settings.exposure_us },
+                trigger_delay_us: if delay {
+                    set.settings.trigger_delay_us
+                } else {
+                    settings.trigger_delay_us
+                },
+            };
+            (of_set, if set.source == FRAME_START { set.next as usize } else { place })
+        });
+        sets.collect()
+    }
+}
