@@ -154,8 +154,11 @@ impl Drop for Lit {
         if let Some(operator) = &self.operator {
             operator.dismiss();
         }
-        if let Err(error) = self.projector.blank() {
-            tracing::error!(%error, "projector not blanked");
+        match self.projector.blank() {
+            Ok(_) => {}
+            // As with every run: the operator has been told.
+            Err(error) if self.operator.is_some() => tracing::warn!(%error, "projector not known to be dark"),
+            Err(error) => tracing::error!(%error, "projector not blanked"),
         }
     }
 }
