@@ -5,11 +5,13 @@ mod vsync;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::mpsc::Receiver;
 use std::time::Duration;
 
 use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
+use raysweep_drivers::projector::external::{External, Request};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 
@@ -90,6 +92,8 @@ pub struct Devices {
     pub vsync: Box<dyn Vsync>,
     /// The projector.
     pub projector: Box<dyn Projector>,
+    /// What the projector asks of its operator, where one works it.
+    pub questions: Option<Receiver<Request>>,
     /// The clock that their stamps are on.
     pub clock: Clock,
     /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
@@ -183,11 +187,17 @@ impl Rig {
             (None, Some(bench)) => Box::new(RemoteVsync::open(bench)?),
             (None, None) => sim.vsync,
         };
-        let projector: Box<dyn Projector> = match (self.file.projector.driver, &self.file.sim.bench) {
-            (ProjectorDriver::Drm, _) => Box::new(self.open_drm()?),
-            (ProjectorDriver::Sim, Some(bench)) => Box::new(RemoteProjector::open(bench)?),
-            (ProjectorDriver::Sim, None) => sim.projector,
-        };
+        let (projector, questions): (Box<dyn Projector>, _) =
+            match (self.file.projector.driver, &self.file.sim.bench) {
+                (ProjectorDriver::Drm, _) => (Box::new(self.open_drm()?), None),
+                (ProjectorDriver::External, _) => {
+                    // A run that waits for its operator can be cancelled, so no patience ends before the operator's.
+                    let (projector, questions) = External::new(Duration::MAX);
+                    (Box::new(projector), Some(questions))
+                }
+                (ProjectorDriver::Sim, Some(bench)) => (Box::new(RemoteProjector::open(bench)?), None),
+                (ProjectorDriver::Sim, None) => (sim.projector, None),
+            };
         let camera = match self.file.camera.driver {
             CameraDriver::Sim => sim.camera,
             CameraDriver::Aravis => self.open_aravis()?,
@@ -198,7 +208,7 @@ impl Rig {
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
         // Real devices know no time but the machine's, also where others of the rig are simulated.
         let clock = if self.file.camera.driver == CameraDriver::Sim { sim.clock } else { Clock::real() };
-        Ok(Devices { camera, vsync, projector, clock, pace })
+        Ok(Devices { camera, vsync, projector, questions, clock, pace })
     }
 
     /// Real devices know no time but the machine's, so a simulated camera beside them must keep to it.

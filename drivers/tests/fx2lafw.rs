@@ -55,6 +55,11 @@ fn signal() -> Signal {
     }
 }
 
+fn script(sample_rate_hz: u32, seconds: u64) -> Scripted {
+    let step_ns = 1e9 / f64::from(sample_rate_hz) * (1.0 + RATE_PPM * 1e-6);
+    Scripted { signal: signal(), step_ns, taken: 0, transfers: 0, last: seconds * 250 }
+}
+
 fn analyser(sample_rate_hz: u32, seconds: u64) -> (Fx2Lafw<Scripted>, Fx2LafwConfig) {
     let config = Fx2LafwConfig {
         sample_rate_hz,
@@ -62,9 +67,7 @@ fn analyser(sample_rate_hz: u32, seconds: u64) -> (Fx2Lafw<Scripted>, Fx2LafwCon
         latency_us: LATENCY_NS as f64 / 1e3,
         ..Fx2LafwConfig::default()
     };
-    let step_ns = 1e9 / f64::from(sample_rate_hz) * (1.0 + RATE_PPM * 1e-6);
-    let link = Scripted { signal: signal(), step_ns, taken: 0, transfers: 0, last: seconds * 250 };
-    (Fx2Lafw::new(link, &config).unwrap(), config)
+    (Fx2Lafw::new(script(sample_rate_hz, seconds), &config).unwrap(), config)
 }
 
 /// Every edge that the line has in this time.
@@ -105,6 +108,42 @@ fn every_edge_is_seen_once_when_it_was() {
     }
     let clock = analyser.clock().unwrap();
     assert!((clock.rate_ppm - RATE_PPM).abs() < 3.0, "{clock:?}");
+}
+
+#[test]
+fn at_24_mhz_changes_are_those_of_one_sample_after_the_other() {
+    let (mut analyser, config) = analyser(24_000_000, 1);
+    let seen = changes(&mut analyser);
+    // The plain reference: every sample by itself, each change of an input counted if the input was quiet before.
+    let mut link = script(24_000_000, 1);
+    let step_ns = link.step_ns;
+    let mut samples = Vec::new();
+    while link.receive(Duration::ZERO, &mut |transfer, _| samples.extend_from_slice(transfer)).is_ok() {}
+    let quiet = (config.quiet_us * 24.0) as usize;
+    let mut expected = Vec::new();
+    for (channel, input) in [(0, 1), (1, 0)] {
+        let (mut changed, mut counts) = (None, [0; 2]);
+        for (index, pair) in samples.windows(2).enumerate() {
+            let level = pair[1] >> input & 1;
+            if level == pair[0] >> input & 1 {
+                continue;
+            }
+            if changed.replace(index).is_none_or(|before| index - before >= quiet) {
+                let slope = if level == 1 { Slope::Rising } else { Slope::Falling };
+                counts[slope as usize] += 1;
+                expected.push((index + 1, channel, slope, counts[slope as usize]));
+            }
+        }
+    }
+    expected.sort_unstable_by_key(|(index, channel, ..)| (*index, *channel));
+    // Those before the clock is known are numbered and not told.
+    let untold = expected.len() - seen.len();
+    assert!(seen.len() > 200 && untold < 20, "{} of {}", seen.len(), expected.len());
+    for (change, (index, channel, slope, seq)) in seen.iter().zip(&expected[untold..]) {
+        assert_eq!((change.channel, change.slope, change.seq), (*channel, *slope, *seq));
+        let off_ns = change.host_ns - START_NS - (*index as f64 * step_ns) as i64;
+        assert!((-5_000..12_000).contains(&off_ns), "sample {index}: {off_ns} ns");
+    }
 }
 
 #[test]

@@ -1,17 +1,21 @@
 //! What every driver of a trait must do, whatever is behind it: the simulated rig, a simulated device on its real wire, and with
-//! `RAYSWEEP_HIL=rig.toml` the hardware of a lab, whose camera must be triggered and whose projector may light up.
+//! `RAYSWEEP_HIL=rig.toml` the hardware of a lab: of a plane rig, whose camera must be triggered and whose projector may light up;
+//! of a dot rig the mirror, which moves by a quarter of what it may and stays dark.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+#[path = "../../drivers/tests/suite/mirror.rs"]
+mod suite;
 
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use raysweep::rig::{Devices, Rig};
+use raysweep::rig::{AnyRig, Devices, DotRig, Rig};
 use raysweep_core::{
     Camera, CameraSettings, Clock, DeviceErrorKind, DeviceState, FramePool, Pattern, Projector, SettingsId,
     Shutter, Vsync,
 };
-use raysweep_sim::mirror::{Link, WireFaults};
+use raysweep_sim::mirror::{Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use raysweep_tests::rig_text;
 
@@ -100,7 +104,21 @@ fn projector_conforms(projector: &mut dyn Projector, clock: &Clock) {
 }
 
 fn rig_conforms(path: &Path) {
-    let rig = Rig::load(path).unwrap();
+    match AnyRig::load(path).unwrap() {
+        AnyRig::Plane(rig) => plane_rig_conforms(&rig),
+        AnyRig::Dots(rig) => mirror_conforms(&rig),
+    }
+}
+
+/// The mirror that a dot rig's file names, by a daemon in whose data folder nobody has armed the light.
+fn mirror_conforms(rig: &DotRig) {
+    let data = tempfile::tempdir().unwrap();
+    let mirror = rig.open_mirror(data.path()).unwrap();
+    let mut mirror = mirror.expect("[mirror] names the driver of a mirror that is there, not \"sim\"");
+    suite::mirror_conforms(&mut *mirror);
+}
+
+fn plane_rig_conforms(rig: &Rig) {
     let Devices { mut camera, mut vsync, mut projector, clock, .. } = rig.open().unwrap();
     vsync_conforms(&mut *vsync, &clock, rig.file.vsync.period_us);
     projector_conforms(&mut *projector, &clock);
@@ -131,6 +149,20 @@ fn a_triggerbox_on_its_wire() {
         format!("driver = \"triggerbox\"\ntriggerbox = {{ port = {:?}, link = \"usb\" }}", pty.path());
     let (_folder, path) = rig_file(&vsync, "realtime = true");
     rig_conforms(&path);
+}
+
+#[test]
+fn a_mirror_by_its_rig_file() {
+    let controller = PlayzerXController::new(PlayzerXConfig::default());
+    let pty = MirrorPty::plug(controller, Link::VirtualCom, WireFaults::default()).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("rig.toml");
+    let mirror = format!("[mirror]\ndriver = \"playzerx\"\nport = {:?}\n", pty.path());
+    std::fs::write(&path, format!("kind = \"dots\"\n[camera]\ndriver = \"sim\"\n{mirror}")).unwrap();
+    rig_conforms(&path);
+    let truth = pty.truth();
+    assert!(truth.parked_since_ns.is_some() && truth.held.len() > 1000);
+    assert!(truth.held.iter().all(|held| held.light == 0));
 }
 
 #[test]

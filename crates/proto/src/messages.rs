@@ -406,7 +406,7 @@ pub enum Event {
     Film(FilmEstimate),
     /// A batch of a flying dot was stored.
     Batch(BatchStored),
-    /// The run waits for an operator, who is to do this.
+    /// The run waits for an operator, who is to do this; where the run is over, nobody waits.
     Ask {
         /// What to do.
         text: String,

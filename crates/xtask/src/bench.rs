@@ -22,6 +22,7 @@ benchmarks: cargo xtask bench <name> [options]
           --sweep  instead, the paper's sweep over the wire in real time, with late settings, lost packets and a
                    camera that dies: seconds of light and frames lost, each image held against the scene; as root
           --json   JSON lines
+  edges   the logic analyser's edge scan on one core: samples a second against its 24 MHz, quiet to worst
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
 
 /// Runs the benchmark that the first argument names with the options that follow; without a name, lists all.
@@ -43,6 +44,8 @@ pub fn bench(arguments: &[&str]) -> Done {
         }
         ["unpack"] => run(cargo().args(["bench", "--package", "raysweep-core", "--bench", "unpack"])),
         ["unpack", option, ..] => Err(format!("`unpack` has no option `{option}`\n{BENCHES}")),
+        ["edges"] => run(cargo().args(["bench", "--package", "raysweep-drivers", "--bench", "edges"])),
+        ["edges", option, ..] => Err(format!("`edges` has no option `{option}`\n{BENCHES}")),
         ["camera", options @ ..] => camera(options),
         ["live"] => live::live(live::Print::Text),
         ["live", "--json"] => live::live(live::Print::JsonLines),
@@ -102,12 +105,13 @@ mod tests {
 
     #[test]
     fn unknown_names_and_options_are_told_what_there_is() {
-        let unknown: [&[&str]; 6] = [
+        let unknown: [&[&str]; 7] = [
             &["demuxx"],
             &["demux", "--fast"],
             &["dots", "--live", "--fast"],
             &["live", "--fast"],
             &["unpack", "--json"],
+            &["edges", "--json"],
             &["camera", "--peers"],
         ];
         for arguments in unknown {

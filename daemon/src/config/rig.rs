@@ -75,6 +75,8 @@ pub enum ProjectorDriver {
     Sim,
     /// A display output of this machine.
     Drm,
+    /// The operator, asked through the daemon's clients.
+    External,
 }
 
 /// `[projector.drm]`
@@ -458,6 +460,14 @@ mod tests {
         assert_eq!(noise("read_noise_e = 3", ""), is(1.66, 3.0, NoiseSource::Simulated));
         assert_eq!(noise("", "noise = false"), is(f64::INFINITY, 0.0, NoiseSource::Simulated));
         assert_eq!(noise("electrons_per_dn = 2\nread_noise_e = 3", ""), is(2.0, 3.0, NoiseSource::Stated));
+    }
+
+    #[test]
+    fn an_operator_may_work_the_projector() {
+        let text = MINIMAL.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\"");
+        assert_eq!(RigFile::parse(&text).unwrap().projector.driver, ProjectorDriver::External);
+        let error = RigFile::parse(&text.replace("external", "nobody")).unwrap_err();
+        assert!(error.message.contains("external"), "{}", error.message);
     }
 
     #[test]

@@ -13,7 +13,7 @@ use raysweep_drivers::mirror::{
 use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, Subject, SubjectSwitch};
 
 use super::{Pace, RigError};
-use crate::config::{ConfigError, DotCameraDriver, DotRigFile, MirrorDriver, MirrorSection};
+use crate::config::{ConfigError, DotCameraDriver, DotRigFile, MirrorDriver};
 use crate::mirror;
 
 /// A dot rig whose devices can be opened, one run at a time.
@@ -111,10 +111,7 @@ impl DotRig {
     /// # Errors
     /// The first device that does not open.
     pub fn open(&self, data: &Path, frame_rate_hz: f64) -> Result<DotDevices, RigError> {
-        let mirror = match &self.file.mirror {
-            Some(section) => self.open_mirror(section, data)?,
-            None => None,
-        };
+        let mirror = self.open_mirror(data)?;
         if let Some(sim) = &self.sim {
             let pace =
                 if self.file.sim.dots.realtime || mirror.is_some() { Pace::Devices } else { Pace::Pipeline };
@@ -147,8 +144,12 @@ impl DotRig {
         Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace, truth: None })
     }
 
-    /// Opens a mirror that has a driver of its own.
-    fn open_mirror(&self, section: &MirrorSection, data: &Path) -> Result<Option<Box<dyn Mirror>>, RigError> {
+    /// Opens the mirror alone, if it has a driver of its own, which keeps its state in the daemon's data folder.
+    ///
+    /// # Errors
+    /// When it does not open.
+    pub fn open_mirror(&self, data: &Path) -> Result<Option<Box<dyn Mirror>>, RigError> {
+        let Some(section) = &self.file.mirror else { return Ok(None) };
         let (state, light) = (mirror::state_file(data), self.light_guard(data));
         let full_scale = MechanicalDeg(section.full_scale_deg);
         let limits = section.limits;

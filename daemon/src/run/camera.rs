@@ -246,6 +246,8 @@ impl Sequencer {
 
     /// Always ends with a flush, so that nothing stays undecided.
     fn work(&mut self, work: Work, latency: &OnceLock<SettingsLatency>) -> Ended {
+        // Frames since the last work are nobody's: an operator may have taken minutes to change the picture.
+        self.told_seq = None;
         let acquired = match work {
             Work::Probe(settings) => self.probe(&settings).map(|found| {
                 if let Some(found) = found {

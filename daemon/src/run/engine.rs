@@ -17,6 +17,7 @@ use raysweep_session::ledger::{Entry, Ledger, State};
 use super::board::Board;
 use super::camera::{Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Line, Pass, Work};
 use super::film::{Account, CycleTiming, FilmSink, Solving, Worker};
+use super::operator::Operator;
 use super::orders::Orders;
 use super::storage::{PaceMeter, Storage, Verdict};
 use super::vsync::VsyncThread;
@@ -128,12 +129,36 @@ pub struct Acquired {
 }
 
 /// Turns the light off when it goes out of scope, on every way out.
-struct Lit(Box<dyn Projector>);
+struct Lit {
+    projector: Box<dyn Projector>,
+    /// Who works the projector, if it is a person; ends after it.
+    operator: Option<Operator>,
+}
+
+impl Lit {
+    /// Shows a pattern, or nothing; `None` where the run was ended while its operator was to do it.
+    fn show(&mut self, pattern: Option<&Pattern>, orders: &Orders) -> Result<Option<Shown>, DeviceError> {
+        let shown = match pattern {
+            Some(pattern) => self.projector.show(pattern),
+            None => self.projector.blank(),
+        };
+        match shown {
+            Err(_) if self.operator.is_some() && !orders.go_on() => Ok(None),
+            shown => shown.map(Some),
+        }
+    }
+}
 
 impl Drop for Lit {
     fn drop(&mut self) {
-        if let Err(error) = self.0.blank() {
-            tracing::error!(%error, "projector not blanked");
+        if let Some(operator) = &self.operator {
+            operator.dismiss();
+        }
+        match self.projector.blank() {
+            Ok(_) => {}
+            // As with every run: the operator has been told.
+            Err(error) if self.operator.is_some() => tracing::warn!(%error, "projector not known to be dark"),
+            Err(error) => tracing::error!(%error, "projector not blanked"),
         }
     }
 }
@@ -145,8 +170,11 @@ impl Run {
     /// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
     pub fn acquire(mut self) -> Result<Acquired, RunError> {
         self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: self.resumed })?;
-        let Devices { camera, vsync, projector, clock, pace } = self.rig.open()?;
-        let projector = Lit(projector);
+        let Devices { camera, vsync, projector, questions, clock, pace } = self.rig.open()?;
+        let operator = questions
+            .map(|questions| Operator::start(questions, self.orders.clone(), self.board.clone()))
+            .transpose()?;
+        let projector = Lit { projector, operator };
         let assembler = self.assembler_config(camera.capabilities())?;
         let stack = self.session.stack()?;
         let state = self.ledger.state().clone();
@@ -363,11 +391,12 @@ impl Passes<'_> {
                 todo.iter().partition(|id| matches!(self.point(**id).role, Role::Dark(_)));
             todo = Vec::new();
             if !dark.is_empty() {
-                let shown = self.projector.0.blank()?;
+                let Some(shown) = self.projector.show(None, self.orders)? else { return Ok(()) };
                 todo.extend(self.pass(&dark, shown)?);
             }
             if !lit.is_empty() && self.orders.go_on() {
-                let shown = self.projector.0.show(&Pattern::White)?;
+                let white = self.projector.show(Some(&Pattern::White), self.orders)?;
+                let Some(shown) = white else { return Ok(()) };
                 todo.extend(self.pass(&lit, shown)?);
             }
             if todo.is_empty() || !self.orders.go_on() {
@@ -379,7 +408,8 @@ impl Passes<'_> {
 
     /// Takes the film; what became of its cycles, the ledger says.
     fn film(&mut self, cycle_plan: &CyclePlan) -> Result<(), RunError> {
-        let shown = self.projector.0.show(&Pattern::White)?;
+        let white = self.projector.show(Some(&Pattern::White), self.orders)?;
+        let Some(shown) = white else { return Ok(()) };
         let points: Vec<(u32, Point)> =
             self.task.settings().map(|(ordinal, point)| (ordinal, *point)).collect();
         let CycleOrder { settings, periods } = &cycle_plan.order;

@@ -6,6 +6,7 @@ mod conclude;
 mod dots;
 mod engine;
 mod film;
+mod operator;
 mod orders;
 pub(crate) mod priority;
 mod storage;

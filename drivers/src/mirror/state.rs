@@ -7,7 +7,7 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
-use std::os::unix::fs::FileExt;
+use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -62,9 +62,20 @@ impl StateError {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "driver", rename_all = "lowercase", deny_unknown_fields)]
 pub(super) enum Reach {
-    PlayzerX { port: PathBuf, full_scale: MechanicalDeg },
-    Mti { port: PathBuf, full_scale: MechanicalDeg },
-    Optotune { port: PathBuf, laser_port: Option<PathBuf> },
+    PlayzerX {
+        port: PathBuf,
+        /// [`node_of`] the port while it was open.
+        node: Option<u64>,
+        full_scale: MechanicalDeg,
+    },
+    Mti {
+        port: PathBuf,
+        full_scale: MechanicalDeg,
+    },
+    Optotune {
+        port: PathBuf,
+        laser_port: Option<PathBuf>,
+    },
 }
 
 /// What `NAME` holds.
@@ -230,6 +241,11 @@ impl MirrorState {
     pub fn is_of_this_boot(&self) -> bool {
         boot_id().is_ok_and(|boot_id| boot_id == self.boot_id)
     }
+}
+
+/// Which device node a port's name leads to: the kernel makes a new one whenever a cable is plugged in.
+pub(super) fn node_of(port: &Path) -> Option<u64> {
+    fs::metadata(port).ok().map(|node| node.ino())
 }
 
 /// As an error of the mirror.

@@ -2,8 +2,12 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod conformance;
 mod parsers;
 mod points;
 mod rig;
+mod scripts;
 mod stream;
+#[path = "../suite/mirror.rs"]
+mod suite;
 mod ways_out;

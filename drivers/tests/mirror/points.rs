@@ -40,7 +40,7 @@ fn rounded(value: f64) -> f64 {
     (value * 1e5).round() / 1e5
 }
 
-fn assert_points(held: &[Held], path: &MirrorPath, batches: usize, of: impl Fn(f64) -> f64, lit: u8) {
+pub fn assert_points(held: &[Held], path: &MirrorPath, batches: usize, of: impl Fn(f64) -> f64, lit: u8) {
     let points: Vec<Held> = path
         .points()
         .iter()
@@ -81,11 +81,25 @@ fn mti_refuses_what_would_destroy_the_mirror() {
 }
 
 #[derive(Clone, Default)]
-struct Lamp(Arc<AtomicBool>);
+pub struct Lamp {
+    lit: Arc<AtomicBool>,
+    was_lit: Arc<AtomicBool>,
+}
+
+impl Lamp {
+    pub fn was_lit(&self) -> bool {
+        self.was_lit.load(Ordering::Relaxed)
+    }
+
+    fn is_lit(&self) -> bool {
+        self.lit.load(Ordering::Relaxed)
+    }
+}
 
 impl Laser for Lamp {
     fn switch(&mut self, on: bool) -> Result<(), DeviceError> {
-        self.0.store(on, Ordering::Relaxed);
+        self.lit.store(on, Ordering::Relaxed);
+        self.was_lit.fetch_or(on, Ordering::Relaxed);
         Ok(())
     }
 }
@@ -111,14 +125,14 @@ fn optotune_plays_a_path_with_a_light_of_its_own() {
     let path = circle(60).with_light(|_| 1);
     let mut mirror = Optotune::open(config.clone(), Box::new(lamp.clone())).unwrap();
     mirror.load(&path).unwrap();
-    assert!(!lamp.0.load(Ordering::Relaxed));
+    assert!(!lamp.is_lit());
     mirror.start(2).unwrap();
     let mut seen = false;
     while !mirror.feed().unwrap().parked {
-        seen |= lamp.0.load(Ordering::Relaxed);
+        seen |= lamp.is_lit();
         std::thread::sleep(Duration::from_millis(1));
     }
-    assert!(seen && !lamp.0.load(Ordering::Relaxed));
+    assert!(seen && !lamp.is_lit());
     let coordinate = |deg: f64| (2.0 * deg).to_radians().tan() / 50.0_f64.to_radians().tan();
     assert_points(&rig.pty.truth().held, &path, 2, coordinate, 0);
     mirror.load(&path).unwrap();
@@ -126,8 +140,8 @@ fn optotune_plays_a_path_with_a_light_of_its_own() {
     while mirror.feed().unwrap().played < 30 {
         std::thread::sleep(Duration::from_millis(1));
     }
-    assert!(lamp.0.load(Ordering::Relaxed));
+    assert!(lamp.is_lit());
     drop(mirror);
-    assert!(!lamp.0.load(Ordering::Relaxed));
+    assert!(!lamp.is_lit());
     rig.assert_parked();
 }

@@ -118,6 +118,31 @@ fn unplug_and_plug_in_again() {
     assert!(matches!(park(&rig.state()), Err(ParkError::Device(_))));
 }
 
+#[test]
+fn a_controller_that_was_plugged_in_again_is_not_taken_for_the_one_that_was_left() {
+    let mut rig = Rig::good();
+    let name = rig.folder.path().join("by-id");
+    std::os::unix::fs::symlink(rig.pty.path(), &name).unwrap();
+    let config = mirror::PlayzerXConfig { port: name.clone(), ..rig.config() };
+    let mut mirror = PlayzerX::open(config).unwrap();
+    mirror.load(&batch()).unwrap();
+    mirror.start(1000).unwrap();
+    for _ in 0..300 {
+        mirror.feed().unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    // With the power back it is at rest: told to be where it was left, it would jump.
+    let again = Rig::playzerx(PlayzerXConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
+    rig.pty.unplug();
+    while mirror.feed().is_ok() {}
+    drop(mirror);
+    std::fs::remove_file(&name).unwrap();
+    std::os::unix::fs::symlink(again.pty.path(), &name).unwrap();
+    assert_eq!(park(&rig.state()).unwrap(), Parked::ByReset);
+    let held = again.assert_parked();
+    assert_eq!(held.largest_step, 0.0);
+}
+
 /// The process that the tests below end: plays until it is told otherwise.
 #[test]
 #[ignore = "run by the other tests, as a process of its own"]

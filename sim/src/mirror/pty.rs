@@ -1,4 +1,5 @@
-//! A controller, of a mirror or of anything else, at the far end of a pseudo-terminal, with the faults of its wire.
+//! A controller, of a mirror or of anything else, at the far end of a pseudo-terminal or of another line, with the faults of its
+//! wire.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -60,7 +61,7 @@ impl Default for WireFaults {
 /// What a device does with what comes over its wire: [`Controller::run`].
 pub type Run = Box<dyn FnMut(&[u8], i64, &mut Vec<u8>) + Send>;
 
-/// A device on a pseudo-terminal. Dropping it unplugs it.
+/// A device on a pseudo-terminal or another line. Dropping it unplugs it.
 pub struct Pty {
     path: PathBuf,
     unplugged: Arc<AtomicBool>,
@@ -79,9 +80,17 @@ impl Pty {
         grantpt(&master)?;
         unlockpt(&master)?;
         let path = ptsname_r(&master)?.into();
+        Self::attach(File::from(OwnedFd::from(master)), path, run, link, faults)
+    }
+
+    /// Plugs a device in at one end of a line, opened without blocking, whose other end a driver opens at `path`.
+    ///
+    /// # Errors
+    /// When there is no thread.
+    pub fn attach(end: File, path: PathBuf, run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
         let unplugged = Arc::new(AtomicBool::new(false));
         let mut wire = Wire {
-            master: File::from(OwnedFd::from(master)),
+            end,
             device: run,
             link,
             faults,
@@ -114,7 +123,7 @@ impl Drop for Pty {
     }
 }
 
-/// A mirror's controller on a pseudo-terminal. Dropping it unplugs it.
+/// A mirror's controller on a pseudo-terminal or another line. Dropping it unplugs it.
 pub struct MirrorPty {
     pty: Pty,
     truth: Arc<Mutex<MirrorTruth>>,
@@ -125,10 +134,20 @@ impl MirrorPty {
     ///
     /// # Errors
     /// When there is no pseudo-terminal or no thread.
-    pub fn plug(mut controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
+    pub fn plug(controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
         let truth = controller.truth();
-        let run = move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| controller.run(bytes, now_ns, replies);
-        Ok(Self { pty: Pty::plug(Box::new(run), link, faults)?, truth })
+        Ok(Self { pty: Pty::plug(run_of(controller), link, faults)?, truth })
+    }
+
+    /// Plugs a controller in at one end of a line without faults, opened without blocking, whose other end a driver opens at
+    /// `path`.
+    ///
+    /// # Errors
+    /// When there is no thread.
+    pub fn attach(end: File, path: PathBuf, controller: impl Controller) -> io::Result<Self> {
+        let truth = controller.truth();
+        let faults = WireFaults::default();
+        Ok(Self { pty: Pty::attach(end, path, run_of(controller), Link::VirtualCom, faults)?, truth })
     }
 
     /// The port that a driver opens.
@@ -152,8 +171,12 @@ impl MirrorPty {
     }
 }
 
+fn run_of(mut controller: impl Controller) -> Run {
+    Box::new(move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| controller.run(bytes, now_ns, replies))
+}
+
 struct Wire {
-    master: File,
+    end: File,
     device: Run,
     link: Link,
     faults: WireFaults,
@@ -191,7 +214,7 @@ impl Wire {
             let read = match room {
                 0 => 0,
                 // EIO: nobody has the port open. Either way there is nothing to take.
-                _ => self.master.read(&mut buffer[..room]).unwrap_or(0),
+                _ => self.end.read(&mut buffer[..room]).unwrap_or(0),
             };
             taken += read as u64;
             (self.device)(&buffer[..read], self.clock.now_ns(), &mut replies);
@@ -204,7 +227,7 @@ impl Wire {
 
     /// Until something comes, a millisecond at most, and never at full speed on a port that nobody has open.
     fn wait(&self) {
-        let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::POLLIN)];
+        let mut fds = [PollFd::new(self.end.as_fd(), PollFlags::POLLIN)];
         let ready = poll(&mut fds, PollTimeout::from(1_u8)).unwrap_or(0);
         let closed = fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP));
         if closed || (ready > 0 && self.link != Link::VirtualCom) {
@@ -220,7 +243,7 @@ impl Wire {
             replies.splice(0..0, garbage);
         }
         // A host that reads nothing loses replies, as on a real port.
-        let _ = self.master.write(replies);
+        let _ = self.end.write(replies);
         replies.clear();
     }
 

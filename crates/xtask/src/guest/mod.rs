@@ -46,6 +46,13 @@ const TESTS: &[GuestTest] = &[
     },
     GuestTest { name: "guest_fx2lafw", modules: &["vhci-hcd"], devices: &[], pipes: &[], environment: &[] },
     GuestTest {
+        name: "guest_mirror",
+        modules: &["xhci_pci", "ftdi_sio"],
+        devices: &[],
+        pipes: &["serial"],
+        environment: &[],
+    },
+    GuestTest {
         name: "guest_modemline",
         modules: &["vhci-hcd", "ftdi_sio", "pps-ldisc"],
         devices: &[],

@@ -23,7 +23,7 @@ use super::park::park_left;
 use super::port::{Port, fault};
 use super::rules;
 use super::sequence::Sequence;
-use super::state::{MirrorState, Reach, Sent, StateFile, of_state};
+use super::state::{MirrorState, Reach, Sent, StateFile, node_of, of_state};
 
 /// The controller's baud rate; a virtual serial port ignores it.
 const BAUD: u32 = 921_600;
@@ -31,6 +31,8 @@ const BAUD: u32 = 921_600;
 const RATE_HZ: RangeInclusive<f64> = 50.0..=50_000.0;
 /// How long an answer may take.
 const REPLY_WAIT: Duration = Duration::from_millis(300);
+/// How long the controller is deaf after a reset.
+const RESET_WAIT: Duration = Duration::from_millis(2500);
 /// How often the light's permission is looked at.
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
 /// Longest time to wait for whoever drives the mirror to let go of it.
@@ -67,6 +69,7 @@ pub struct PlayzerXConfig {
 /// A PlayzerX.
 pub struct PlayzerX {
     port: Port,
+    node: Option<u64>,
     config: PlayzerXConfig,
     capabilities: MirrorCapabilities,
     state: StateFile,
@@ -93,6 +96,7 @@ impl PlayzerX {
         let state = StateFile::open(&config.state, LOCK_WAIT).map_err(of_state)?;
         park_left(&state).map_err(|error| fault(DeviceErrorKind::NotReady, error.to_string()))?;
         let mut port = Port::open(&config.port, BAUD)?;
+        let node = node_of(&config.port);
         let device = hello(&mut port)?;
         let left = samples_left(&mut port, REPLY_WAIT)?;
         if left != Some(0) {
@@ -114,7 +118,7 @@ impl PlayzerX {
             rate_hz: *RATE_HZ.start()..=top_hz,
             fifo_samples: FIFO_SAMPLES,
         };
-        Ok(Self { port, config, capabilities, state, phase: Phase::Parked })
+        Ok(Self { port, node, config, capabilities, state, phase: Phase::Parked })
     }
 
     /// Bytes from the controller so far that made no reply: a measure of the wire's health.
@@ -124,7 +128,7 @@ impl PlayzerX {
 
     fn state(&self, rate_hz: f64, playing: Option<Sequence>) -> Result<MirrorState, DeviceError> {
         let PlayzerXConfig { port, full_scale, limits, .. } = &self.config;
-        let reach = Reach::PlayzerX { port: port.clone(), full_scale: *full_scale };
+        let reach = Reach::PlayzerX { port: port.clone(), node: self.node, full_scale: *full_scale };
         MirrorState::new(reach, *limits, rate_hz, playing).map_err(of_state)
     }
 
@@ -335,16 +339,20 @@ pub(super) fn recover(
     state: &MirrorState,
     sent: Sent,
 ) -> Result<Option<Tilt>, DeviceError> {
-    let (Reach::PlayzerX { port, full_scale }, Some(sequence)) = (&state.reach, &state.playing) else {
+    let (Reach::PlayzerX { port: name, node, full_scale }, Some(sequence)) = (&state.reach, &state.playing)
+    else {
         return Ok(None);
     };
-    let mut port = Port::open(port, BAUD)?;
-    let left = if state.is_of_this_boot() { stream::halt(&mut port, 0)? } else { None };
+    let mut port = Port::open(name, BAUD)?;
+    // A cable that was pulled out takes samples with it that had left the process, and perhaps the controller's power.
+    let is_same_line = state.is_of_this_boot() && node.is_some() && *node == node_of(name);
+    let left = if is_same_line { stream::halt(&mut port, 0)? } else { None };
     let Some(left) = left else {
         // The light and the drive go off with the controller; the mirror springs back through the drive's own filter.
         let mut bytes = PADDING.to_vec();
         Command::Reset.to_bytes(&mut bytes);
         port.send(&bytes)?;
+        std::thread::sleep(RESET_WAIT);
         return Ok(None);
     };
     // Where the process died within a write, the middle of what may have left is within a write of the truth.

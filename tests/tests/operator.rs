@@ -1,0 +1,72 @@
+//! A projector that an operator works, on the simulated line: what is asked holds the run, and nothing is taken before the answer.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+use raysweep::control::Control;
+use raysweep_proto::{Event, RunParams, RunState};
+use raysweep_session::stack::ArrayName;
+use raysweep_tests::{Bench, Ended, end_of, rig_text};
+
+const PLAN: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = [-300, 0, 300]\nexposure_us = [500]\naverage = 2\n";
+
+fn bench() -> Bench {
+    let sim = "realtime = true\nscene = \"slab\"\nscene_rows = 16\nscene_columns = 8";
+    let rig = rig_text(16, sim, "[sim.vsync]\njitter_us = 0\n");
+    Bench::new(&rig.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\""))
+}
+
+/// Runs the plan with an operator who does what is asked after `answer` has looked at it; what was asked, and how it ended.
+fn run(bench: &Bench, answer: impl Fn(usize, &Bench)) -> (Vec<String>, Ended) {
+    let mut events = bench.runner.events();
+    let mut told = bench.runner.events();
+    bench.runner.run(RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
+    let mut asked = Vec::new();
+    loop {
+        match events.blocking_recv().unwrap() {
+            Event::Ask { text } => {
+                if text.contains("`raysweep continue`") {
+                    assert_eq!(bench.runner.status().state, RunState::Paused);
+                    answer(asked.len(), bench);
+                }
+                asked.push(text);
+            }
+            Event::Finished { .. } => return (asked, end_of(&mut told)),
+            _ => {}
+        }
+    }
+}
+
+fn stored(bench: &Bench) -> usize {
+    bench.runner.status().progress.map_or(0, |progress| progress.points_stored)
+}
+
+#[test]
+fn points_wait_for_the_picture_that_they_need() {
+    let bench = bench();
+    let (asked, ended) = run(&bench, |questions_before, bench| {
+        // Long enough for several frames, were they taken for points.
+        std::thread::sleep(std::time::Duration::from_millis(300));
+        // Nothing before the light is off; before there is light the dark images alone, the sweep's and the regular image's.
+        assert_eq!(stored(bench), [0, 2][questions_before]);
+        bench.runner.go_on().unwrap();
+    });
+    assert_eq!(ended.state, "complete", "{:?}", ended.error);
+    assert_eq!(asked.len(), 3, "{asked:?}");
+    assert!(asked[0].contains("light off") && asked[1].contains("white"), "{asked:?}");
+    assert!(asked[2].contains("light off") && asked[2].contains("over"), "{asked:?}");
+    let (_, state) = ended.open();
+    assert!(state.counts.balanced() && state.counts.lost.is_empty(), "{:?}", state.counts);
+}
+
+#[test]
+fn a_run_that_waits_for_its_operator_can_be_cancelled_and_resumed() {
+    let bench = bench();
+    let (asked, ended) = run(&bench, |questions_before, bench| match questions_before {
+        0 => bench.runner.go_on().unwrap(),
+        _ => bench.runner.cancel().unwrap(),
+    });
+    assert_eq!((ended.state.as_str(), &ended.error), ("cancelled", &None), "{asked:?}");
+    let (_, state) = ended.open();
+    assert_eq!(state.stored(ArrayName::Sum).count(), 0, "nothing was taken in a light that nobody confirmed");
+    assert!(state.point(ArrayName::Dark, 0).is_some());
+}
