@@ -183,7 +183,7 @@ pub const FRAME_START: u32 = 1;
 /// Entries of `SequencerFeatureSelector`.
 pub const SEQUENCED: [&str; 2] = ["ExposureTime", "TriggerDelay"];
 /// Entries of `ChunkSelector`, which are also what `ChunkEnable` is told apart by.
-pub const CHUNKS: [&str; 3] = ["ExposureTime", "Timestamp", "FrameID"];
+pub const CHUNKS: [&str; 4] = ["ExposureTime", "Timestamp", "FrameID", "SequencerSetActive"];
 
 /// The table for a camera with these capabilities.
 pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {

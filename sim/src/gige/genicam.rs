@@ -203,7 +203,9 @@ fn chunks(xml: &mut String) {
         let (name, id) = (chunk.feature(), chunk.id());
         let (tag, register, sign) = match chunk {
             Chunk::ExposureTime => ("Float", "FloatReg", ""),
-            Chunk::Timestamp | Chunk::FrameId => ("Integer", "IntReg", "<Sign>Unsigned</Sign>"),
+            Chunk::Timestamp | Chunk::FrameId | Chunk::SequencerSetActive => {
+                ("Integer", "IntReg", "<Sign>Unsigned</Sign>")
+            }
         };
         let _ = writeln!(
             xml,

@@ -36,11 +36,13 @@ pub enum Chunk {
     Timestamp,
     /// The frame's number, which does not wrap.
     FrameId,
+    /// The sequencer's set; 0 while it is off.
+    SequencerSetActive,
 }
 
 impl Chunk {
     /// All, in the order of `ChunkSelector`.
-    pub const ALL: [Self; 3] = [Self::ExposureTime, Self::Timestamp, Self::FrameId];
+    pub const ALL: [Self; 4] = [Self::ExposureTime, Self::Timestamp, Self::FrameId, Self::SequencerSetActive];
 
     /// Its id in the payload.
     pub fn id(self) -> u32 {
@@ -53,6 +55,7 @@ impl Chunk {
             Self::ExposureTime => "ChunkExposureTime",
             Self::Timestamp => "ChunkTimestamp",
             Self::FrameId => "ChunkFrameID",
+            Self::SequencerSetActive => "ChunkSequencerSetActive",
         }
     }
 }
@@ -71,7 +74,7 @@ pub struct View {
     /// Rows.
     pub height: usize,
     /// The chunks sent, in the order of [`Chunk::ALL`]; `None`: the plain image.
-    pub chunks: Option<[bool; 3]>,
+    pub chunks: Option<[bool; Chunk::ALL.len()]>,
 }
 
 impl View {
@@ -106,6 +109,8 @@ pub struct Stamp {
     pub ticks: u64,
     /// The exposure, as the chunk tells it.
     pub exposure_us: f64,
+    /// The sequencer's set.
+    pub set: u64,
 }
 
 /// A frame as it is sent, kept for clients that miss packets of it.
@@ -147,6 +152,7 @@ impl Block {
                 Chunk::ExposureTime => self.stamp.exposure_us.to_bits(),
                 Chunk::Timestamp => self.stamp.ticks,
                 Chunk::FrameId => self.stamp.seq,
+                Chunk::SequencerSetActive => self.stamp.set,
             };
             put(&mut self.payload, &mut at, &value.to_be_bytes());
             put(&mut self.payload, &mut at, &chunk.id().to_be_bytes());

@@ -52,6 +52,8 @@ pub struct Exposed {
     pub start_ns: i64,
     /// How long each row was exposed.
     pub exposure_us: f64,
+    /// The sequencer's set; 0 while it is off.
+    pub set: u64,
 }
 
 /// Pictures, from the thread that sends them.
@@ -136,7 +138,9 @@ impl Pictures for ScenePictures {
     fn wait(&mut self, view: &View, timeout: Duration) -> Option<Exposed> {
         let exposure = self.camera.next_exposure(view.y, timeout)?;
         let (seq, start_ns) = (exposure.seq, exposure.start_ns);
-        Some(Exposed { seq, start_ns, exposure_us: exposure.settings.exposure_us })
+        // Sets are keyed by their number, other settings as point 0.
+        let [set, ..] = exposure.key;
+        Some(Exposed { seq, start_ns, exposure_us: exposure.settings.exposure_us, set })
     }
 
     fn write(&mut self, _: &Exposed, block: &mut Block) {
@@ -315,7 +319,7 @@ impl Pictures for PatternPictures {
         state.fired = state.fired.saturating_sub(1);
         let seq = state.next_seq;
         state.next_seq += 1;
-        Some(Exposed { seq, start_ns: due_ns, exposure_us: state.settings.exposure_us })
+        Some(Exposed { seq, start_ns: due_ns, exposure_us: state.settings.exposure_us, set: 0 })
     }
 
     fn write(&mut self, exposed: &Exposed, block: &mut Block) {

@@ -126,7 +126,7 @@ impl Stream {
                 block.view = order.view;
                 block.packet_bytes = order.packet_bytes.max(MIN_PACKET_BYTES);
                 let ticks = lock(&self.clock).ticks(exposed.start_ns);
-                block.stamp = Stamp { seq: exposed.seq, ticks, exposure_us: told_us };
+                block.stamp = Stamp { seq: exposed.seq, ticks, exposure_us: told_us, set: exposed.set };
                 pictures.write(&exposed, &mut block);
                 block.write_chunks();
             }

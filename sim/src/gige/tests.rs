@@ -377,7 +377,7 @@ proptest! {
         width in 1_usize..80,
         height in 1_usize..60,
         packet_bytes in 576_usize..4000,
-        chunks in prop::option::of(any::<[bool; 3]>()),
+        chunks in prop::option::of(any::<[bool; 4]>()),
     ) {
         let view = View { format: PixelFormat::Mono12p, x: 3, y: 4, width, height, chunks };
         let mut block = Block::with_room(view, 80 * 60);

@@ -237,11 +237,14 @@ fn the_sequencer_takes_a_set_with_every_frame() {
         };
         (0..frames).map(&mut told_us).collect()
     };
+    client.set_entry("ChunkEnable", 3, 1);
     client.set("AcquisitionStart", 1);
     load(&mut client, 1, &[(3, 300.0, 5), (5, 500.0, 9), (9, 900.0, 3)]);
     let written = camera.truth().settings_written;
     assert_eq!(exposures(&mut client, 5), [300.0, 500.0, 900.0, 300.0, 500.0]);
     assert_eq!(client.number("SequencerSetActive"), 5);
+    client.set("TriggerSoftware", 1);
+    assert_eq!(client.frame().unwrap().chunk(0x1003), 9);
     assert_eq!(camera.truth().settings_written, written);
     client.set("SequencerMode", 0);
     assert_eq!(exposures(&mut client, 2), [900.0; 2], "what the registers have");

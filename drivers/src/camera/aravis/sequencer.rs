@@ -15,10 +15,13 @@ pub fn is_offered(features: &impl Features) -> bool {
     features.has("SequencerMode")
 }
 
-/// Switches the sequencer off, where there is one: it may be left over from another program.
+/// Switches the sequencer off, where there is one: it may be left over from another program, running or half configured.
 pub fn stop(features: &impl Features) -> Result<()> {
-    if is_offered(features) {
-        put_text(features, "SequencerMode", "Off")?;
+    for mode in ["SequencerMode", "SequencerConfigurationMode"] {
+        // While one is on, the other may not be written at all.
+        if features.has(mode) && features.text(mode)? != "Off" {
+            put_text(features, mode, "Off")?;
+        }
     }
     Ok(())
 }
@@ -143,7 +146,6 @@ mod tests {
         assert_eq!(started(&camera, &[50.0]).unwrap(), [settings(50.0)]);
         let written = camera.take_written();
         let expected = [
-            "SequencerMode=Off",
             "SequencerConfigurationMode=On",
             "SequencerSetSelector=0",
             "TriggerDelay=50",
@@ -158,6 +160,18 @@ mod tests {
             "SequencerMode=On",
         ];
         assert_eq!(written, expected);
+    }
+
+    #[test]
+    fn what_another_program_left_on_is_switched_off() {
+        let left = camera(4);
+        stop(&left).unwrap();
+        assert!(left.take_written().is_empty());
+        for mode in ["SequencerMode", "SequencerConfigurationMode"] {
+            let left = camera(4).with(mode, Value::Text("On".into(), vec!["Off", "On"]));
+            stop(&left).unwrap();
+            assert_eq!(left.take_written(), [format!("{mode}=Off")]);
+        }
     }
 
     #[test]
