@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Vsync};
+use raysweep_drivers::vsync::fx2lafw::scan::Scanner;
 use raysweep_drivers::vsync::fx2lafw::{Change, Fx2Lafw, Fx2LafwConfig, Link, Slope};
 use raysweep_sim::usb::Signal;
 
@@ -117,8 +118,16 @@ fn at_24_mhz_changes_are_those_of_one_sample_after_the_other() {
     // The plain reference: every sample by itself, each change of an input counted if the input was quiet before.
     let mut link = script(24_000_000, 1);
     let step_ns = link.step_ns;
-    let mut samples = Vec::new();
-    while link.receive(Duration::ZERO, &mut |transfer, _| samples.extend_from_slice(transfer)).is_ok() {}
+    let (mut samples, mut scanned) = (Vec::new(), Vec::new());
+    let mut scanner = Scanner::new(3);
+    let mut take = |transfer: &[u8], _| {
+        samples.extend_from_slice(transfer);
+        scanner.scan(transfer, |sample, levels, changed| scanned.push((sample, levels, changed)));
+    };
+    while link.receive(Duration::ZERO, &mut take).is_ok() {}
+    let pairs = samples.windows(2).zip(1..).filter(|(pair, _)| pair[0] != pair[1]);
+    let plain: Vec<_> = pairs.map(|(pair, sample)| (sample, pair[1], pair[0] ^ pair[1])).collect();
+    assert_eq!(scanned, plain);
     let quiet = (config.quiet_us * 24.0) as usize;
     let mut expected = Vec::new();
     for (channel, input) in [(0, 1), (1, 0)] {

@@ -10,7 +10,7 @@ pub enum Guest {
     Skip,
 }
 
-/// Installs what is missing, then format, lints, tests, doc tests, tests in the kernel guest.
+/// Installs what is missing, then format, lints, the fuzz targets' check, tests, doc tests, tests in the kernel guest.
 pub fn test(wanted: Guest) -> Done {
     packages::install()?;
     // Packages that read our files in real life.
@@ -18,6 +18,8 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["fmt", "--all", "--check"]))?;
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--", "-D", "warnings"]))?;
     run(cargo().args(["clippy", "--workspace", "--all-targets", "--all-features", "--", "-D", "warnings"]))?;
+    // A workspace of its own, which nothing else compiles.
+    run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml"]))?;
     run(cargo().args(["test", "--workspace", "--all-features"]).env("RAYSWEEP_PYTHON", python))?;
     match wanted {
         Guest::Run => guest::guest(&[]),
