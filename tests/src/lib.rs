@@ -1,6 +1,8 @@
 //! What the tests of the whole have in common: a rig and a plan in a folder of their own, run through the daemon's
 //! core, and the session that comes out.
 
+pub mod dots;
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -13,26 +13,9 @@ use raysweep::rig::DotRig;
 use raysweep_core::{CameraSettings, FramePool, LossCause, SettingsId, Shutter};
 use raysweep_session::dots::BatchEntry;
 use raysweep_sim::dots::Subject;
+use raysweep_tests::dots::{plan, rig};
 use raysweep_tests::{Bench, Ended, data};
 use raysweep_transport::quality::snr_db;
-
-/// A moving V-groove of 112 x 128 pixels with 16 rows for the trailing dot below it.
-fn rig(more: &str) -> String {
-    format!(
-        "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n\
-         [sim.dots]\nscene = \"v-groove\"\nrows = 112\ncolumns = 128\nmargin_rows = 16\nseed = 5\n{more}"
-    )
-}
-
-/// 300 dots a batch, 20 batches a second.
-fn plan(more: &str, batches: u32) -> String {
-    format!(
-        "kind = \"batches\"\n{more}\n[batches]\ncount = {batches}\ndots = 300\nexposure_us = 100\ndark_frames = 64\n\
-         trailing_region = [112, 128, 48, 80]\nbackground_indices = [0]\n\
-         [batches.path]\nshape = \"lissajous\"\ncycles = [7, 1]\namplitude_deg = [2.3, 1.3]\nsamples = 1500\nrate_hz = 30000\n\
-         [[batches.calibration]]\nbatches = 2\n[[batches.calibration]]\nbatches = 2\n"
-    )
-}
 
 fn entries(ended: &Ended) -> Vec<BatchEntry> {
     ended.open().1.batches().cloned().collect()

@@ -12,8 +12,10 @@
 //! | `seen` | bool | `[dot]` | whether the dot has a frame that shows the scene; the others have no light |
 //!
 //! Light is in camera counts above the background, times the flat field's gain; signed. A pixel is `row * width + column`.
-//! A batch appears as a whole: its folder is written beside, synced, and renamed. One without a line in the ledger is not
+//! Where the run knew a flat field, `flat` has it: `gain`, float32, and `repaired`, bool, `[t, s]`. A batch appears as a whole: its folder is written beside, synced, and renamed. One without a line in the ledger is not
 //! stored.
+
+mod flat;
 
 use std::fs::{self, File};
 use std::io::{BufWriter, Seek, SeekFrom, Write};
@@ -28,6 +30,8 @@ use crate::durable::{self, DraftDir};
 use crate::stack::StackShape;
 use crate::zarr::{self, DurableStore};
 use crate::{Error, Result};
+
+pub use self::flat::FlatArrays;
 
 /// Side of a residual's block in pixels.
 const BLOCK_PX: usize = 32;

@@ -27,6 +27,8 @@ pub struct BatchesPlan {
     pub background_indices: Vec<u32>,
     /// Frames without light before the first batch: what is known of the sensor.
     pub dark_frames: u32,
+    /// Frames of even light after them, for the flat field; 0: none.
+    pub flat_frames: u32,
     /// Whether the raw frames are kept, 16 bits a pixel.
     pub keep_raw: bool,
     /// `[batches.path]`
@@ -95,6 +97,7 @@ impl Default for BatchesPlan {
             trailing_region: [0, 32, 0, 32],
             background_indices: vec![0],
             dark_frames: 256,
+            flat_frames: 0,
             keep_raw: false,
             path: PathPlan::default(),
             calibration: vec![PlanePlan { batches: 2, depth_mm: None }],
@@ -177,6 +180,13 @@ impl BatchesPlan {
         if !(16..=1 << 20).contains(&self.dark_frames) {
             let message = format!("batches.dark_frames = {}: 16 to 1048576 are allowed", self.dark_frames);
             return refused("dark_frames", message);
+        }
+        if self.flat_frames != 0 && !(16..=1 << 20).contains(&self.flat_frames) {
+            let message = format!(
+                "batches.flat_frames = {}: 16 to 1048576 are allowed, or 0 for no flat field",
+                self.flat_frames
+            );
+            return refused("flat_frames", message);
         }
         self.path.check(text)?;
         let camera_rate_hz = self.camera_rate_hz();
@@ -261,9 +271,9 @@ impl BatchesPlan {
         batches + SPARE_BATCHES
     }
 
-    /// Times that the path is played, dark, for the dark frames.
-    pub fn dark_rounds(&self) -> u32 {
-        self.dark_frames.div_ceil(self.dots) + 1
+    /// Times that the path is played, without light, for so many frames of the sensor's calibration.
+    pub fn dark_rounds(&self, frames: u32) -> u32 {
+        if frames == 0 { 0 } else { frames.div_ceil(self.dots) + 1 }
     }
 
     /// The path of one batch, with the light off where it goes to the beam dump.
@@ -378,6 +388,7 @@ mod tests {
             ("[batches]\nexposure_us = nan", "greater than 0"),
             ("[batches]\nexposure_us = 80", "longer than the 74.07 us"),
             ("[batches]\ndark_frames = 3", "16 to"),
+            ("[batches]\nflat_frames = 3", "or 0 for no flat field"),
             ("[batches]\ncamera_rate_hz = 13000", "13500.000 Hz would do"),
             ("[batches]\ncount = 3\n[[batches.calibration]]\nbatches = 0", "1 to 129600"),
             ("[batches.path]\nsamples = 0", "samples is empty"),

@@ -36,7 +36,8 @@ pub(crate) fn check(
     let plan = task.batches();
     let planes: Vec<u32> = plan.calibration.iter().map(|plane| plane.batches).collect();
     let passes = planes.iter().copied().chain([plan.count]);
-    let rounds: u32 = plan.dark_rounds() + passes.map(BatchesPlan::rounds).sum::<u32>();
+    let still: u32 = [plan.dark_frames, plan.flat_frames].map(|frames| plan.dark_rounds(frames)).iter().sum();
+    let rounds: u32 = still + passes.map(BatchesPlan::rounds).sum::<u32>();
     let batch_s = plan.path.duration_s();
     let dots = u64::from(plan.dots);
     let frame_bytes = task.format.frame_bytes(task.shape.pixels()) as u64;

@@ -2,11 +2,12 @@
 
 mod calibration;
 pub(crate) mod check;
+pub(crate) mod flat;
 mod product;
 mod report;
 mod results;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use raysweep_core::{CameraCapabilities, CameraSettings, MirrorPath, PathError, PixelFormat, Shutter};
 use raysweep_pipeline::Registry;
@@ -48,6 +49,8 @@ struct NoOptions {}
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CorrectOptions {
+    /// An earlier session whose flat field serves.
+    pub flat_field: Option<PathBuf>,
     /// Pixels whose dark level or noise lies so many standard deviations beyond the others' are hot.
     pub hot_sigmas: f64,
     /// Batches that the rolling background is worth.
@@ -56,7 +59,7 @@ pub struct CorrectOptions {
 
 impl Default for CorrectOptions {
     fn default() -> Self {
-        Self { hot_sigmas: 8.0, background_batches: 64 }
+        Self { flat_field: None, hot_sigmas: 8.0, background_batches: 64 }
     }
 }
 
@@ -166,7 +169,7 @@ fn stages(plan: &Plan, text: &str) -> Result<(CorrectOptions, StageTable), Confi
         if stage.name == "correct" {
             correct = serde_json::from_value(Value::Object(stage.options.clone()))
                 .map_err(|error| refused(format!("stage correct: {error}")))?;
-            let CorrectOptions { hot_sigmas, background_batches } = correct;
+            let CorrectOptions { hot_sigmas, background_batches, .. } = correct;
             if !(hot_sigmas > 0.0 && hot_sigmas.is_finite()) {
                 return Err(refused(format!(
                     "stage correct: hot_sigmas = {hot_sigmas}: give more than 0, as 8"
@@ -175,6 +178,11 @@ fn stages(plan: &Plan, text: &str) -> Result<(CorrectOptions, StageTable), Confi
             if background_batches == 0 {
                 return Err(refused(
                     "stage correct: background_batches = 0: give at least 1; 64 is usual".into(),
+                ));
+            }
+            if correct.flat_field.is_some() && plan.batches.flat_frames > 0 {
+                return Err(refused(
+                    "stage correct: flat_field beside batches.flat_frames: take a flat field, or use an earlier session's".into(),
                 ));
             }
         } else if denoise.replace(stage.clone()).is_some() {

@@ -1,6 +1,7 @@
 //! The report of a dot rig's session.
 
 use ndarray::{Array3, Axis};
+use raysweep_session::dots::FlatArrays;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{
     Block, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table, ToneMap,
@@ -45,7 +46,7 @@ pub(super) fn make(
     Ok(Report {
         title: state.session.name.clone(),
         subtitle: subtitle(state, session),
-        facts: facts(state, task),
+        facts: facts(state, task).into_iter().chain(flat_field(session, task)?).collect(),
         sections,
     })
 }
@@ -62,6 +63,19 @@ fn facts(state: &State, task: &DotTask) -> Vec<(String, String)> {
     ]
     .map(|(key, value)| (key.to_owned(), value))
     .to_vec()
+}
+
+/// How uneven the sensor was found, if the run knew.
+fn flat_field(session: &Session, task: &DotTask) -> Result<Option<(String, String)>> {
+    let dots = session.dots()?;
+    if !dots.has_flat() {
+        return Ok(None);
+    }
+    let FlatArrays { gain, repaired } = dots.read_flat([task.shape.height(), task.shape.width()])?;
+    let (mean, sigma) = (gain.mean().unwrap_or(1.0), gain.std(0.0));
+    let repaired = repaired.iter().filter(|repaired| **repaired).count();
+    let text = format!("gains spread by {:.2} %, {repaired} pixels repaired", 100.0 * sigma / mean);
+    Ok(Some(("flat field".into(), text)))
 }
 
 fn video(strip: &Strip) -> Section {

@@ -103,6 +103,9 @@ impl DotCamera {
             .zip(direct.iter().zip(global))
             .for_each(|(sum, (direct, global))| *sum = direct + global);
         margin.iter_mut().zip(&self.trailing).for_each(|(sum, light)| *sum = light * trailing as f32);
+        if let Some(even) = due.subject.even_light() {
+            self.sensor_light.fill(even);
+        }
         if due.fate == FrameFate::Saturated {
             self.sensor_light.fill(FLASH);
         }

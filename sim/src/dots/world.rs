@@ -19,6 +19,18 @@ pub enum Subject {
     Scene,
     /// One of the Lambertian planes, by its number in the rig file.
     Plane(usize),
+    /// An evenly lit diffuser right before the lens.
+    Diffuser,
+}
+
+/// What a pixel sees of the diffuser, in parts of a white plane: its lamp is dimmed until the exposure suits.
+const DIFFUSER_LIGHT: f32 = 0.6;
+
+impl Subject {
+    /// Light that is the same in every pixel, whatever the mirror does.
+    pub(super) fn even_light(self) -> Option<f32> {
+        matches!(self, Self::Diffuser).then_some(DIFFUSER_LIGHT)
+    }
 }
 
 /// Puts planes before the camera, as an operator would.
@@ -100,6 +112,11 @@ impl DotsTruth {
         let (mut scan, still, frame) = {
             let state = self.0.lock();
             let (record, frame) = state.record_of(seq)?;
+            if let Some(even) = record.subject.even_light() {
+                let Light { direct, mut global } = self.0.dark();
+                global.fill(even);
+                return Some((direct, global));
+            }
             let (batch, _) = record.scan.dot_of(frame);
             (
                 record.scan.clone(),
@@ -345,7 +362,7 @@ impl World {
     fn still(&self, subject: Subject, rate_hz: f64, scan: &Scan, batch: u64) -> Arc<dyn Still> {
         let plane = match subject {
             Subject::Plane(number) => self.bench.scene.plane(number),
-            Subject::Scene => None,
+            Subject::Scene | Subject::Diffuser => None,
         };
         plane.unwrap_or_else(|| {
             let seconds = (batch * scan.samples_per_batch()) as f64 / rate_hz;

@@ -1,9 +1,9 @@
-//! What frames without light tell of the sensor.
+//! What frames without light, and of even light, tell of the sensor.
 
-use ndarray::ArrayView3;
+use ndarray::Array3;
 use raysweep_transport::dots::{
-    Background, BackgroundMean, Correction, DotsError, FrameShape, NoiseFloor, Observation, Region,
-    RunStatistics, Sampling,
+    Background, BackgroundMean, Correction, DotsError, FlatField, FrameShape, NoiseFloor, Observation,
+    Region, RunStatistics, Sampling,
 };
 
 /// Frames in which the noise is measured; they are not in the mean that is subtracted from them.
@@ -63,9 +63,7 @@ impl DarkRun {
     /// # Errors
     /// [`DotsError::Shape`] if it is not of the frames' size.
     pub fn push(&mut self, frame: &[u16]) -> Result<bool, DotsError> {
-        let whole = Region::whole(self.shape);
-        let is_flash = Observation::new(0, frame, self.shape, &whole, self.saturation_dn)?.saturated;
-        if self.taken < self.wanted && !is_flash {
+        if self.taken < self.wanted && !is_flash(self.shape, frame, self.saturation_dn)? {
             self.taken += 1;
             self.statistics.push(frame)?;
             match self.noisy.len() < NOISE_FRAMES {
@@ -77,15 +75,15 @@ impl DarkRun {
     }
 
     /// The sensor as these frames show it: pixels whose level or noise lies `hot_sigmas` beyond the others' are hot;
-    /// `gain` is the flat field `[height, width, 1]`, left out where the sensor is even.
+    /// `flat` is the flat field, left out where the sensor is even; its dead pixels are repaired as hot ones are.
     ///
     /// # Errors
-    /// [`DotsError::TooFew`] while frames are lacking; [`DotsError::Shape`] and [`DotsError::OutOfRange`] for a gain that
-    /// is none.
+    /// [`DotsError::TooFew`] while frames are lacking; [`DotsError::Shape`] and [`DotsError::OutOfRange`] for a flat field
+    /// that is none.
     pub fn finish(
         self,
         hot_sigmas: f64,
-        gain: Option<ArrayView3<f32>>,
+        flat: Option<&FlatField>,
         sampling: Sampling,
     ) -> Result<Sensor, DotsError> {
         if self.taken < self.wanted {
@@ -93,14 +91,66 @@ impl DarkRun {
             let what = "dark frames: the camera was stopped before it had taken them";
             return Err(DotsError::TooFew { what, given, needed });
         }
-        let hot = self.statistics.hot_pixels(hot_sigmas)?;
-        let even = ndarray::Array3::ones((self.shape.height(), self.shape.width(), self.shape.channels()));
-        let correction = Correction::new(self.shape, gain.unwrap_or(even.view()), &hot, sampling)?;
+        let mut repaired = self.statistics.hot_pixels(hot_sigmas)?;
+        repaired.extend(flat.iter().flat_map(|flat| &flat.dead));
+        let even = Array3::ones((self.shape.height(), self.shape.width(), self.shape.channels()));
+        let gain = flat.map_or(even.view(), |flat| flat.gain.view());
+        let correction = Correction::new(self.shape, gain, &repaired, sampling)?;
         let background = Background::new(&correction, self.mean.mean())?;
         let frames = self.noisy.iter().map(Vec::as_slice);
         let floor = NoiseFloor::measured(frames, &correction, &background, &Region::whole(self.shape))?;
         Ok(Sensor { correction, background: self.mean, floor })
     }
+}
+
+/// Frames of even light on their way to a [`FlatField`].
+pub struct FlatRun {
+    shape: FrameShape,
+    saturation_dn: u16,
+    wanted: u32,
+    statistics: RunStatistics,
+}
+
+impl FlatRun {
+    /// A run of `frames` frames. Those in which most pixels have `saturation_dn` or more are left out.
+    pub fn new(shape: FrameShape, saturation_dn: u16, frames: u32) -> Self {
+        Self { shape, saturation_dn, wanted: frames, statistics: RunStatistics::new(shape) }
+    }
+
+    fn wants_more(&self) -> bool {
+        self.statistics.frames() < self.wanted.into()
+    }
+
+    /// Takes a frame; whether more are wanted.
+    ///
+    /// # Errors
+    /// [`DotsError::Shape`] if it is not of the frames' size.
+    pub fn push(&mut self, frame: &[u16]) -> Result<bool, DotsError> {
+        if self.wants_more() && !is_flash(self.shape, frame, self.saturation_dn)? {
+            self.statistics.push(frame)?;
+        }
+        Ok(self.wants_more())
+    }
+
+    /// The flat field; pixels that `dark` shows to be hot, as in [`DarkRun::finish`], have no part in it.
+    ///
+    /// # Errors
+    /// [`DotsError::TooFew`] while frames are lacking; else as [`FlatField::measured`].
+    pub fn finish(self, dark: &DarkRun, hot_sigmas: f64, sampling: Sampling) -> Result<FlatField, DotsError> {
+        if self.wants_more() {
+            let (given, needed) = (self.statistics.frames() as usize, self.wanted as usize);
+            let what = "frames of even light that are not overexposed: dim the light, or take a shorter batches.exposure_us";
+            return Err(DotsError::TooFew { what, given, needed });
+        }
+        let hot = dark.statistics.hot_pixels(hot_sigmas)?;
+        let Self { shape, statistics, saturation_dn, .. } = self;
+        FlatField::measured(shape, &statistics, &dark.statistics, &hot, sampling, saturation_dn)
+    }
+}
+
+/// Whether most of a frame is overexposed: no frame of a calibration.
+fn is_flash(shape: FrameShape, frame: &[u16], saturation_dn: u16) -> Result<bool, DotsError> {
+    Ok(Observation::new(0, frame, shape, &Region::whole(shape), saturation_dn)?.saturated)
 }
 
 #[cfg(test)]
@@ -128,6 +178,31 @@ mod tests {
         // Uniform over 0 to 7: sigma is the root of 63/12.
         assert!((sensor.floor.sigma - 2.29).abs() < 0.2, "{:?}", sensor.floor);
         assert!(sensor.floor.mean.abs() < 0.3, "{:?}", sensor.floor);
+    }
+
+    #[test]
+    fn dead_pixels_are_repaired_and_flashes_are_no_even_light() {
+        let shape = FrameShape::new(32, 64, 1).unwrap();
+        let frame = |level: u16| (0..2048).map(move |pixel| if pixel == 9 { 101 } else { level + pixel % 2 });
+        let frame = |level: u16| frame(level).collect::<Vec<u16>>();
+        let mut dark = DarkRun::new(shape, 4000, 16, 64).unwrap();
+        for number in 0..16 {
+            assert_eq!(dark.push(&frame(100)).unwrap(), number < 15);
+        }
+        let mut flat = FlatRun::new(shape, 4000, 16);
+        assert!(flat.push(&vec![4095; 2048]).unwrap(), "a flash is no frame of even light");
+        for number in 0..15 {
+            assert!(flat.push(&frame(1000)).unwrap(), "{number}");
+        }
+        assert!(!flat.push(&frame(1000)).unwrap());
+        let field = flat.finish(&dark, 8.0, Sampling::Full).unwrap();
+        let sensor = dark.finish(8.0, Some(&field), Sampling::Full).unwrap();
+        assert_eq!(sensor.correction.hot(), [9]);
+        assert!(sensor.correction.gain().iter().all(|gain| (gain - 1.0).abs() < 1e-6));
+
+        let dark = DarkRun::new(shape, 4000, 16, 64).unwrap();
+        let error = FlatRun::new(shape, 4000, 16).finish(&dark, 8.0, Sampling::Full).unwrap_err();
+        assert!(error.to_string().contains("dim the light"), "{error}");
     }
 
     #[test]

@@ -11,7 +11,7 @@ mod flow;
 mod gather;
 mod stage;
 
-pub use dark::{DarkRun, Sensor};
+pub use dark::{DarkRun, FlatRun, Sensor};
 pub use flow::{Arrival, DotsFlow, DotsFlowConfig, Gathered, Loss};
 pub use gather::{Cut, CutSink, Scan};
 pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, DotStages};

@@ -57,8 +57,12 @@ fn counts(step: u64) -> Vec<u16> {
 }
 
 fn frame(pool: &FramePool, format: PixelFormat, step: u64) -> Frame {
+    frame_of(pool, format, step, &counts(step))
+}
+
+fn frame_of(pool: &FramePool, format: PixelFormat, step: u64, counts: &[u16]) -> Frame {
     let mut data = pool.take();
-    format.pack_into(&counts(step), &mut data).unwrap();
+    format.pack_into(counts, &mut data).unwrap();
     let at_ns = step as i64 * 1000;
     let stamp = FrameStamp {
         seq: step,
@@ -120,6 +124,23 @@ fn cut(
     batches: u32,
     steps: impl IntoIterator<Item = (u64, Vec<Loss>)>,
 ) -> Gathered<Kept> {
+    cut_frames(
+        format,
+        stage,
+        threads,
+        batches,
+        steps.into_iter().map(|(step, lost)| (step, counts(step), lost)),
+    )
+}
+
+/// As [`cut`], with the counts of each frame.
+fn cut_frames(
+    format: PixelFormat,
+    stage: Arc<dyn ColumnStage>,
+    threads: usize,
+    batches: u32,
+    frames: impl IntoIterator<Item = (u64, Vec<u16>, Vec<Loss>)>,
+) -> Gathered<Kept> {
     let Sensor { correction, background, floor } = sensor(format);
     let config = DotsFlowConfig {
         scan: scan(batches),
@@ -135,8 +156,8 @@ fn cut(
     };
     let (flow, input) = DotsFlow::start(config, Kept::default()).unwrap();
     let pool = FramePool::new(40, format.frame_bytes(shape().pixels()));
-    for (step, lost_before) in steps {
-        let arrival = Arrival { frame: frame(&pool, format, step), lost_before };
+    for (step, counts, lost_before) in frames {
+        let arrival = Arrival { frame: frame_of(&pool, format, step, &counts), lost_before };
         assert!(input.send(arrival).is_ok());
     }
     drop(input);
@@ -198,6 +219,37 @@ fn lost_frames_leave_dots_without_light_and_are_told_by_cause() {
     let missing: Vec<usize> = (0..12).filter(|&dot| scan(4).is_scene(dot as u32) && !hit.seen[dot]).collect();
     assert_eq!(missing, [4, 5]);
     assert_eq!(hit.columns.discs.len(), 12);
+}
+
+#[test]
+fn the_background_follows_a_change_of_the_room_by_its_weight() {
+    const CHANGE_DN: u16 = 4;
+    /// The dumps of 16 batches make the mean: each leaves 15 of 17 parts of what was before.
+    const KEPT: f64 = 15.0 / 17.0;
+    let format = PixelFormat::Mono12;
+    let brighter_from = 6 * u64::from(DOTS);
+    let frames = (0..32 * u64::from(DOTS)).map(|step| {
+        let change = if step < brighter_from { 0 } else { CHANGE_DN };
+        (step, counts(step).iter().map(|counts| counts + change).collect(), Vec::new())
+    });
+    let kept = cut_frames(format, denoise(format), 2, 30, frames).sink;
+    // Light beyond the dots, the mean of the scene's dots; the first round is no batch.
+    let beyond = |batch: usize| {
+        let cut = &kept.cuts[batch - 1];
+        let residual = cut.columns.residual.chunks_exact(cut.columns.residual.len() / DOTS as usize);
+        let scene = residual.zip(&cut.seen).filter(|(_, seen)| **seen).flat_map(|(blocks, _)| blocks);
+        let light: Vec<f64> = scene.map(|&light| f64::from(light)).collect();
+        light.iter().sum::<f64>() / light.len() as f64
+    };
+    assert!(beyond(5).abs() < 0.2, "{}", beyond(5));
+    // Frames of two rounds are denoised with what was known before.
+    for batch in [6, 7] {
+        assert!((beyond(batch) - beyond(5) - f64::from(CHANGE_DN)).abs() < 0.2, "{batch}: {}", beyond(batch));
+    }
+    for batch in [10, 15, 25] {
+        let expected = f64::from(CHANGE_DN) * KEPT.powi(batch as i32 - 7);
+        assert!((beyond(batch) - expected).abs() < 0.2, "{batch}: {}, expected {expected}", beyond(batch));
+    }
 }
 
 /// Fails for one dot, panics for another.

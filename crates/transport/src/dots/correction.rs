@@ -25,7 +25,8 @@ const MAX_REPAIR_RINGS: isize = 8;
 pub struct Correction {
     shape: FrameShape,
     gain: Vec<f32>,
-    /// Mean gain of each block's sound pixels, `[blocks, channels]`.
+    /// Gain of the mean of each block's sound pixels, `[blocks, channels]`: one over the mean of one over the gains, which is
+    /// what even light over the block is multiplied by; the mean of the gains would be too much by their variance.
     block_gain: Vec<f32>,
     /// Hot pixels in each word.
     hot_masks: Vec<u32>,
@@ -101,12 +102,14 @@ impl Correction {
             for bit in bits(!hot) {
                 let of_pixel = &gain[(word * BLOCK_PX + bit) * channels..][..channels];
                 for (sum, &gain) in sums[block * channels..].iter_mut().zip(of_pixel) {
-                    *sum += f64::from(gain);
+                    *sum += f64::from(gain).recip();
                 }
             }
         }
-        let block_gain =
-            sums.iter().enumerate().map(|(at, sum)| (sum / f64::from(counts[at / channels].max(1))) as f32);
+        let block_gain = sums.iter().enumerate().map(|(at, &sum)| match counts[at / channels] {
+            0 => 1.0,
+            count => (f64::from(count) / sum) as f32,
+        });
         let block_gain = block_gain.collect();
         Self { shape, gain, block_gain, hot_masks, hot: hot.to_vec(), source_offsets, sources }
     }
@@ -117,7 +120,7 @@ impl Correction {
     }
 
     /// Gain of each value, `[height, width, channels]`.
-    pub(crate) fn gain(&self) -> &[f32] {
+    pub fn gain(&self) -> &[f32] {
         &self.gain
     }
 
@@ -215,6 +218,20 @@ mod tests {
         let frame: Vec<u16> =
             (0..256).map(|at| if at / 32 % 2 == 0 && at % 2 == 0 { 10 } else { 1000 }).collect();
         assert_eq!(correction.value(&frame, &[0.0; 256], 4 * 32 + 4, 0), 10.0);
+    }
+
+    #[test]
+    fn a_blocks_gain_gives_even_light_its_energy() {
+        let shape = FrameShape::new(32, 64, 1).unwrap();
+        // Pixels that answer half as much and one and a half times as much; the second block is hot.
+        let response = |pixel: usize| if pixel.is_multiple_of(2) { 0.5 } else { 1.5 };
+        let gain = Array3::from_shape_fn((32, 64, 1), |(row, column, _)| 1.0 / response(row * 64 + column));
+        let hot: Vec<(usize, usize)> =
+            (0..32).flat_map(|row| (32..64).map(move |column| (row, column))).collect();
+        let correction = Correction::new(shape, gain.view(), &hot, Sampling::Full).unwrap();
+        let counts: f32 = (0..32).map(|column| 100.0 * response(column)).sum::<f32>() / 32.0;
+        assert_eq!(counts * correction.block_gain()[0], 100.0);
+        assert_eq!(correction.block_gain()[1], 1.0);
     }
 
     #[test]

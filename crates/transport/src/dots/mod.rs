@@ -10,6 +10,7 @@ mod column;
 mod correction;
 mod denoise;
 mod error;
+mod flat;
 pub mod product;
 mod sensor;
 mod shape;
@@ -21,6 +22,7 @@ pub use column::{Outcome, SparseColumn};
 pub use correction::{Correction, Sampling};
 pub use denoise::{DenoiseSettings, Denoiser, Scratch, StopRule, false_alarm_sigmas, reference};
 pub use error::DotsError;
+pub use flat::FlatField;
 pub use sensor::RunStatistics;
 pub use shape::{BLOCK_PX, FrameShape, Region};
 pub use synchronise::{

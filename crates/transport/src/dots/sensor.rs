@@ -1,12 +1,9 @@
-//! Calibration of the sensor from runs of frames: dark level, hot pixels, flat field.
+//! Calibration of the sensor from runs of frames: dark level and hot pixels.
 
 use ndarray::Array3;
 
 use super::error::{check_range, check_shape};
 use super::{DotsError, FrameShape};
-
-/// Pixels with less than this share of the plane's median light are taken for unlit, and their gain left at 1.
-const UNLIT: f64 = 0.1;
 
 /// Scales a median absolute deviation to the standard deviation of normal noise.
 const MAD_TO_SIGMA: f64 = 1.4826;
@@ -57,15 +54,9 @@ impl RunStatistics {
     /// # Errors
     /// [`DotsError::TooFew`] below eight frames, [`DotsError::OutOfRange`] for `sigmas` that are not above 0.
     pub fn hot_pixels(&self, sigmas: f64) -> Result<Vec<(usize, usize)>, DotsError> {
-        self.needs(8)?;
         check_range("sigmas", sigmas, sigmas > 0.0, "above 0, as 8")?;
-        let frames = self.frames as f64;
-        let mean: Vec<f64> = self.sums.iter().map(|&sum| sum as f64 / frames).collect();
-        let spread = self.squares.iter().zip(&mean).map(|(&square, mean)| {
-            let variance = (square as f64 / frames - mean * mean).max(0.0) * frames / (frames - 1.0);
-            variance.sqrt()
-        });
-        let spread: Vec<f64> = spread.collect();
+        let spread = self.spread()?;
+        let mean: Vec<f64> = self.sums.iter().map(|&sum| sum as f64 / self.frames as f64).collect();
         let (mean_limit, spread_limit) = (limit(&mean, sigmas), limit(&spread, sigmas));
         let channels = self.shape.channels();
         let is_hot = |pixel: usize| {
@@ -76,25 +67,21 @@ impl RunStatistics {
         Ok(hot.map(|pixel| (pixel / self.shape.width(), pixel % self.shape.width())).collect())
     }
 
-    /// Gain that makes a Lambertian plane's image even, `[height, width, channels]`: the median of each channel over
-    /// the plane's light above `dark`. The plane must be lit evenly: by all dots of a dense scan, summed up, or by
-    /// another lamp. Pixels with less than a tenth of the median are unlit, their gain is 1.
-    ///
-    /// # Errors
-    /// [`DotsError::TooFew`] without frames, [`DotsError::Shape`] if `dark` is not of the frames' shape.
-    pub fn flat_gain(&self, dark: &Array3<f32>) -> Result<Array3<f32>, DotsError> {
-        let plane = self.mean()?;
-        check_shape("dark", "[height, width, channels]", dark.shape(), plane.shape())?;
-        let mut gain = plane - dark;
-        for mut channel in gain.axis_iter_mut(ndarray::Axis(2)) {
-            let mut light: Vec<f64> = channel.iter().map(|&light| f64::from(light)).collect();
-            let middle = median(&mut light);
-            channel.mapv_inplace(|light| match f64::from(light) >= UNLIT * middle && light > 0.0 {
-                true => (middle / f64::from(light)) as f32,
-                false => 1.0,
-            });
-        }
-        Ok(gain)
+    /// Frames so far.
+    pub fn frames(&self) -> u64 {
+        self.frames
+    }
+
+    /// Standard deviation of each value over the frames, in counts.
+    pub(crate) fn spread(&self) -> Result<Vec<f64>, DotsError> {
+        self.needs(8)?;
+        let frames = self.frames as f64;
+        let spread = self.sums.iter().zip(&self.squares).map(|(&sum, &square)| {
+            let mean = sum as f64 / frames;
+            let variance = (square as f64 / frames - mean * mean).max(0.0) * frames / (frames - 1.0);
+            variance.sqrt()
+        });
+        Ok(spread.collect())
     }
 
     fn needs(&self, needed: usize) -> Result<(), DotsError> {
@@ -157,20 +144,6 @@ mod tests {
         assert_eq!(dark.hot_pixels(8.0).unwrap(), [(0, 7), (1, 36), (31, 16)]);
         let mean = dark.mean().unwrap();
         assert!((mean[[10, 10, 0]] - 64.0).abs() < 2.0 && (mean[[0, 7, 0]] - 400.0).abs() < 2.0);
-    }
-
-    #[test]
-    fn the_flat_field_makes_the_plane_even_and_leaves_unlit_pixels() {
-        let shape = FrameShape::new(64, 64, 1).unwrap();
-        let shading = |at: usize| if at % 64 < 4 { 0.0 } else { 1.0 + 0.3 * ((at / 64) as f64 / 64.0) };
-        let dark = run(shape, usize::MAX, |_| 64.0).mean().unwrap();
-        let gain = run(shape, usize::MAX, |at| 64.0 + 1000.0 * shading(at)).flat_gain(&dark).unwrap();
-        let even = |row: usize| f64::from(gain[[row, 30, 0]]) * shading(row * 64 + 30);
-        let level = even(32);
-        for row in 0..64 {
-            assert!((even(row) / level - 1.0).abs() < 0.01, "row {row}");
-            assert_eq!(gain[[row, 1, 0]], 1.0);
-        }
     }
 
     #[test]

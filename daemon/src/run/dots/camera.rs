@@ -57,6 +57,12 @@ impl From<QueueError<Arrival>> for Refused {
 }
 
 impl Source<'_> {
+    /// Reads the camera for nothing until `is_over`, or until it fails.
+    pub fn idle(&mut self, is_over: &dyn Fn() -> bool) {
+        let mut data = self.pool.spare();
+        while !is_over() && self.camera.next_frame(&mut data, POLL).is_ok() {}
+    }
+
     /// Takes frames as long as `wanted` says and hands them to `deliver`; returns what was lost after the last.
     ///
     /// # Errors

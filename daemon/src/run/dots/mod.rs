@@ -1,4 +1,4 @@
-//! A run of a dot rig: dark frames, calibration planes, then the scene.
+//! A run of a dot rig: dark frames, flat field, calibration planes, then the scene.
 
 mod camera;
 mod motion;
@@ -10,13 +10,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
 use raysweep_core::{Camera, Clock, Counts, FramePool, MirrorPath, SettingsId};
-use raysweep_pipeline::dots::{Arrival, DarkRun, DotsFlow, DotsFlowConfig, Gathered, Loss, Sensor};
+use raysweep_pipeline::dots::{Arrival, DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
 use raysweep_pipeline::{PipelineError, Policy, Registry, message_of};
 use raysweep_proto::{Event, RunState};
 use raysweep_session::Session;
 use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::{Entry, Ledger};
 use raysweep_sim::dots::Subject;
+use raysweep_transport::dots::{DotsError, FlatField};
 
 use self::camera::{Refused, Source, Wanted};
 use self::motion::Motion;
@@ -25,7 +26,7 @@ use super::board::Board;
 use super::engine::RunError;
 use super::orders::{Order, Orders};
 use crate::config::BatchesPlan;
-use crate::dots::DotTask;
+use crate::dots::{CorrectOptions, DotTask, flat};
 use crate::live::Outlet;
 use crate::rig::{DotDevices, DotRig, Pace, Stand};
 
@@ -77,6 +78,7 @@ impl DotRun {
     /// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
     pub fn acquire(mut self) -> Result<Acquired, RunError> {
         self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: false })?;
+        let earlier = self.task.earlier_flat_field()?;
         let rate_hz = self.task.batches().camera_rate_hz();
         let DotDevices { mut camera, mirror, stand, clock, pace, .. } = self.rig.open(&self.data, rate_hz)?;
         let mut motion = Motion::new(mirror);
@@ -105,6 +107,7 @@ impl DotRun {
             plan_text: &self.plan_text,
             registry: &self.registry,
             session: &self.session,
+            earlier,
             orders: &self.orders,
             board: &self.board,
             storage: &storage,
@@ -133,6 +136,8 @@ struct Passes<'a> {
     plan_text: &'a str,
     registry: &'a Registry,
     session: &'a Session,
+    /// The flat field of an earlier session, if the plan names one.
+    earlier: Option<FlatField>,
     orders: &'a Orders,
     board: &'a Board,
     storage: &'a Storage,
@@ -145,10 +150,10 @@ struct Passes<'a> {
 }
 
 impl Passes<'_> {
-    /// Dark frames, planes, scene.
+    /// Dark frames, flat field, planes, scene.
     fn all(&mut self) -> Result<(), RunError> {
         let plan = self.task.batches();
-        let Some(mut sensor) = self.dark()? else { return Ok(()) };
+        let Some(mut sensor) = self.sensor()? else { return Ok(()) };
         let mut raw = match plan.keep_raw {
             true => {
                 let (rows, columns) = (self.task.shape.height(), self.task.shape.width());
@@ -160,7 +165,7 @@ impl Passes<'_> {
         let mut first_batch = 0;
         let planes = plan.calibration.iter().enumerate().map(|(index, plane)| (Some(index), plane.batches));
         for (plane, batches) in planes.chain([(None, plan.count)]) {
-            self.place(plane)?;
+            self.place(plane.map_or(Subject::Scene, Subject::Plane))?;
             if !self.orders.go_on() {
                 break;
             }
@@ -173,17 +178,18 @@ impl Passes<'_> {
         }
     }
 
-    /// Puts a plane, or the scene, before the camera; waits for the operator where that takes one.
-    fn place(&self, plane: Option<usize>) -> Result<(), RunError> {
+    /// Puts a subject before the camera; waits for the operator where that takes one.
+    fn place(&self, subject: Subject) -> Result<(), RunError> {
         self.orders.wait_while_paused();
-        if !self.stand.place(plane.map_or(Subject::Scene, Subject::Plane))? {
-            let text = match plane {
-                Some(plane) => format!(
+        if !self.stand.place(subject)? {
+            let text = match subject {
+                Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
+                Subject::Plane(plane) => format!(
                     "put calibration plane {} of {} before the camera",
                     plane + 1,
                     self.task.batches().calibration.len()
                 ),
-                None => "put the scene before the camera, and the calibration plane away".into(),
+                Subject::Scene => "put the scene before the camera, and all else away".into(),
             };
             self.orders.give(Order::Pause);
             if self.board.go(RunState::Paused).is_ok() {
@@ -194,45 +200,70 @@ impl Passes<'_> {
         Ok(())
     }
 
-    /// Takes the dark frames; nothing if the run was told to end.
-    fn dark(&mut self) -> Result<Option<Sensor>, RunError> {
+    /// What is known of the sensor before the first dot; nothing if the run was told to end.
+    fn sensor(&mut self) -> Result<Option<Sensor>, RunError> {
         let (task, plan) = (self.task, self.task.batches());
-        let options = &task.correct;
-        let mut run =
-            DarkRun::new(task.shape, task.saturation_dn(), plan.dark_frames, options.background_batches)?;
+        let CorrectOptions { hot_sigmas, background_batches, .. } = task.correct;
+        let (shape, saturation_dn) = (task.shape, task.saturation_dn());
+        let mut dark = DarkRun::new(shape, saturation_dn, plan.dark_frames, background_batches)?;
+        if !self.without_light(plan.dark_frames, &mut |frame| dark.push(frame))? {
+            return Ok(None);
+        }
+        let field = match plan.flat_frames {
+            0 => self.earlier.take(),
+            frames => {
+                self.place(Subject::Diffuser)?;
+                let mut run = FlatRun::new(shape, saturation_dn, frames);
+                if !self.orders.go_on() || !self.without_light(frames, &mut |frame| run.push(frame))? {
+                    return Ok(None);
+                }
+                Some(run.finish(&dark, hot_sigmas, task.sampling())?)
+            }
+        };
+        let sensor = dark.finish(hot_sigmas, field.as_ref(), task.sampling())?;
+        if field.is_some() {
+            flat::keep(self.session, &sensor.correction)?;
+        }
+        Ok(Some(sensor))
+    }
+
+    /// Takes frames while the mirror's light is off, until `push` wants no more; whether the run goes on.
+    fn without_light(
+        &mut self,
+        wanted: u32,
+        push: &mut (dyn FnMut(&[u16]) -> Result<bool, DotsError> + Send),
+    ) -> Result<bool, RunError> {
+        let task = self.task;
         let path = task.path.clone().with_light(|_| 0);
         let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
         let has_enough = AtomicBool::new(false);
-        let lost =
-            self.play(&path, plan.dark_rounds(), plan.dark_frames.into(), &has_enough, &mut |arrival| {
-                // Whoever waits for the camera's last frame sees some more.
-                if !has_enough.load(Ordering::Relaxed) {
-                    let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
-                    let pushed = match unpacked {
-                        Ok(()) => run.push(&counts).map_err(RunError::from),
-                        Err(error) => Err(RunError::Frame(error.to_string())),
-                    };
-                    match pushed {
-                        Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
-                        Err(error) => {
-                            failed = Some(error);
-                            return Err(Refused::Closed);
-                        }
+        let rounds = task.batches().dark_rounds(wanted);
+        let lost = self.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+            // Whoever waits for the camera's last frame sees some more.
+            if !has_enough.load(Ordering::Relaxed) {
+                let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
+                let pushed = match unpacked {
+                    Ok(()) => push(&counts).map_err(RunError::from),
+                    Err(error) => Err(RunError::Frame(error.to_string())),
+                };
+                match pushed {
+                    Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
+                    Err(error) => {
+                        failed = Some(error);
+                        return Err(Refused::Closed);
                     }
                 }
-                frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
-                Ok(())
-            })?;
+            }
+            frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
+            Ok(())
+        })?;
         frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
         // No batch waits for any of them.
         self.storage.outside(Counts { expected: frames, settling: frames, ..Counts::default() });
-        if let Some(failed) = failed {
-            return Err(failed);
+        match failed {
+            Some(failed) => Err(failed),
+            None => Ok(self.orders.go_on()),
         }
-        if !self.orders.go_on() {
-            return Ok(None);
-        }
-        Ok(Some(run.finish(options.hot_sigmas, None, task.sampling())?))
     }
 
     /// Takes the batches of one plane or of the scene.
@@ -318,8 +349,12 @@ impl Passes<'_> {
             let camera = thread::Builder::new()
                 .name("camera".into())
                 .spawn_scoped(scope, || {
-                    let _over = SetOnDrop(&camera_over);
-                    source.take(&wanted, &mut deliver)
+                    let over = SetOnDrop(&camera_over);
+                    let taken = source.take(&wanted, &mut deliver);
+                    drop(over);
+                    // A virtual clock stands still with a camera that nobody asks, and the mirror must come to rest.
+                    source.idle(&|| path_over.load(Ordering::Relaxed));
+                    taken
                 })
                 .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
             let fed = {
