@@ -26,7 +26,7 @@ use tempfile::TempDir;
 const PIPE: &str = "serial";
 const PORT: &str = "/dev/ttyUSB0";
 const LIMITS: MirrorLimits = MirrorLimits::A7B2_3_3600AL;
-/// What software emulation of the bus carries with room to spare.
+/// What the simulated controller, in software emulation itself, keeps up with; the line carries sixteen times as much.
 const RATE_HZ: f64 = 5_000.0;
 const SAMPLES: usize = 650;
 
