@@ -180,7 +180,7 @@ mod tests {
 
     #[test]
     fn a_mosaic_keeps_the_colour_of_the_lamp() {
-        let warm = |at: usize| if at / 64 % 2 == 0 && at % 2 == 0 { 2.0 } else { 1.0 };
+        let warm = |at: usize| if (at / 64).is_multiple_of(2) && at.is_multiple_of(2) { 2.0 } else { 1.0 };
         let flat = run(3, |at| 64.0 + 1000.0 * warm(at) * response(at));
         let mosaic = measured(&flat, &[(1, 13)], Sampling::Bayer).unwrap().gain;
         let level = |red: bool| {

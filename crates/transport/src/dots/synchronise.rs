@@ -479,6 +479,15 @@ mod tests {
     }
 
     #[test]
+    fn a_trailing_dot_right_after_a_gap_is_one_of_its_own() {
+        // All that lay between two of them is lost, so they follow each other.
+        let stream: Vec<_> = (0..100).chain(149..301).map(|step| at(step, step, 49)).collect();
+        let (fates, counts) = fates(&stream, 49);
+        assert_eq!((counts.bridged, counts.drifted), (0, 0));
+        assert!(errors(&stream, &fates).iter().all(|(_, error)| *error == 0));
+    }
+
+    #[test]
     fn a_flash_is_no_trailing_dot() {
         let (stream, fates, counts) = ten_scans(|stream| {
             for flash in [220, 248] {
