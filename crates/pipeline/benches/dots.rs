@@ -25,9 +25,9 @@ const FORMAT: PixelFormat = PixelFormat::Mono12;
 const DISTINCT: usize = 128;
 /// Frames without light.
 const DARK: usize = 32;
-/// A host that stands still for a tenth of a second, as virtual machines do, loses nothing.
+/// A host that stands still for a fifth of a second, as virtual machines do, loses nothing.
 const POOL_FRAMES: usize = QUEUE_FRAMES + 16;
-const QUEUE_FRAMES: usize = 320;
+const QUEUE_FRAMES: usize = 640;
 /// How long the rates are measured, and how long the paced run is.
 const MEASURED: Duration = Duration::from_secs(10);
 const PACED: Duration = Duration::from_secs(60);
