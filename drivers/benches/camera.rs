@@ -58,6 +58,9 @@ impl Streamed {
     }
 }
 
+/// Frames before those that are timed.
+const WARM_UP_FRAMES: usize = 10;
+
 /// The camera has noted by then that a frame has left, and the next has not: less than a period.
 const NOTED_WITHIN: Duration = Duration::from_millis(2);
 
@@ -181,7 +184,11 @@ impl Case {
         let mut buf = pool.take();
         let clock = Clock::real();
         let mut latencies_us = Vec::with_capacity(TIMED_FRAMES);
-        // The first frame's id, and how many had left by then.
+        // The first frames may come late.
+        for _ in 0..WARM_UP_FRAMES {
+            camera.next_frame(&mut buf, Duration::from_secs(1))?;
+        }
+        // A frame's id, and how many had left by then.
         let mut first = None;
         while latencies_us.len() < TIMED_FRAMES {
             let Some(stamp) = camera.next_frame(&mut buf, Duration::from_secs(1))? else { continue };
