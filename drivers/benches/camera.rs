@@ -58,8 +58,8 @@ impl Streamed {
     }
 }
 
-/// Frames before those that are timed.
-const WARM_UP_FRAMES: usize = 10;
+/// Frames before those that are timed: more than wait in buffers while the camera is opened.
+const WARM_UP_FRAMES: usize = 100;
 
 /// The camera has noted by then that a frame has left, and the next has not: less than a period.
 const NOTED_WITHIN: Duration = Duration::from_millis(2);
