@@ -5,6 +5,7 @@ pub mod dots;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use ndarray::Array2;
 use raysweep::control::Control;
@@ -20,6 +21,18 @@ use tempfile::TempDir;
 /// The folder of the tests' data.
 pub fn data(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(file)
+}
+
+/// Waits for something that comes soon.
+///
+/// # Panics
+/// If it has not come after a minute.
+pub fn wait_until(mut holds: impl FnMut() -> bool) {
+    let began = Instant::now();
+    while !holds() {
+        assert!(began.elapsed() < Duration::from_secs(60), "waited in vain");
+        std::thread::sleep(Duration::from_millis(5));
+    }
 }
 
 /// A rig file for the simulated plane rig; `more` is appended, `sim` stands at the head of `[sim]`.

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use ndarray::{Array2, Array3, Array4, Axis, Zip, s};
 use raysweep::control::Control;
@@ -19,7 +19,7 @@ use raysweep_pipeline::dots::{ColumnStage, ColumnWorker, DotStages};
 use raysweep_proto::{RunParams, RunState};
 use raysweep_session::dots::BatchEntry;
 use raysweep_tests::dots::{plan, rig};
-use raysweep_tests::{Bench, Ended, end_of};
+use raysweep_tests::{Bench, Ended, end_of, wait_until};
 use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
 use serde_json::json;
 
@@ -289,14 +289,6 @@ fn trapped(rig: &str, frame: usize, spring: fn(&Runner)) -> Bench {
 }
 
 const TRAP: &str = "[[stage]]\nname = \"trap\"\n";
-
-fn wait_until(mut holds: impl FnMut() -> bool) {
-    let began = Instant::now();
-    while !holds() {
-        assert!(began.elapsed() < Duration::from_secs(60), "waited in vain");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-}
 
 #[test]
 fn a_pause_in_mid_run_holds_before_the_next_pass_and_costs_nothing() {

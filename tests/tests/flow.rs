@@ -6,7 +6,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
-use std::time::{Duration, Instant};
 
 use ndarray::Array2;
 use raysweep::control::Control;
@@ -15,7 +14,7 @@ use raysweep_core::LossCause;
 use raysweep_pipeline::{Entry, HotPixels, Registry, Stage, StageError, Unit};
 use raysweep_proto::{ErrorCode, Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
-use raysweep_tests::{Bench, PRODUCTS, data, end_of, rig_text, with_products};
+use raysweep_tests::{Bench, PRODUCTS, data, end_of, rig_text, wait_until, with_products};
 
 const PLAN: &str = "kind = \"sweep\"\nname = \"flow\"\n[sweep]\naverage = 3\n\
                     delay_us = { start = -200, stop = 200, count = 5 }\nexposure_us = [100, 250]\n";
@@ -209,14 +208,6 @@ fn a_cancelled_run_keeps_what_it_has_and_resumes() {
     let (_, state) = resumed.open();
     assert!(state.counts.balanced(), "{:?}", state.counts);
     assert_eq!(state.missing(ArrayName::Sum).count(), 0);
-}
-
-fn wait_until(mut holds: impl FnMut() -> bool) {
-    let began = Instant::now();
-    while !holds() {
-        assert!(began.elapsed() < Duration::from_secs(60), "waited in vain");
-        std::thread::sleep(Duration::from_millis(5));
-    }
 }
 
 #[test]
