@@ -61,7 +61,8 @@ pub struct FramePool {
 impl FramePool {
     /// `buffers` buffers of `buffer_bytes` bytes each.
     pub fn new(buffers: usize, buffer_bytes: usize) -> Self {
-        let free = (0..buffers).map(|_| vec![0; buffer_bytes].into_boxed_slice()).collect();
+        // Not zeros, which the system hands out as pages yet to be made: the first frames would pay for them.
+        let free = (0..buffers).map(|_| vec![u8::MAX; buffer_bytes].into_boxed_slice()).collect();
         Self { shelf: Arc::new(Shelf { free: Mutex::new(free), returned: Condvar::new() }), buffer_bytes }
     }
 

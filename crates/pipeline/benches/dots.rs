@@ -4,8 +4,8 @@
 //! `cargo xtask bench dots --live [--json]`
 
 use std::error::Error;
-use std::sync::Arc;
-use std::sync::mpsc::sync_channel;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
@@ -162,7 +162,7 @@ fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran
         policy: if rate_hz.is_some() { Policy::Fail } else { Policy::Wait },
     };
     let sink = Watched { shape: memory.shape, batches: 0, counts: Counts::default() };
-    let (flow, input) = DotsFlow::start(config, sink)?;
+    let (flow, mut input) = DotsFlow::start(config, sink)?;
     let pool = FramePool::new(POOL_FRAMES, FORMAT.frame_bytes(memory.shape.pixels()));
     let (mut seq, mut refused) = (0, Counts::default());
     let began = Instant::now();
@@ -202,51 +202,60 @@ fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran
     }
 }
 
-/// The same kernels over the same frames, frames a second: as they lie in memory, or copied first.
-fn plain(memory: &Memory, is_copied: bool) -> Result<f64, Box<dyn Error>> {
+/// Whose copy the frames of a plain loop are.
+#[derive(Clone, Copy)]
+enum Copying {
+    /// Nobody's: they are worked on where they lie.
+    No,
+    /// Each thread copies its own, all at once.
+    ByEach,
+    /// One source copies them, one after the other, as a device's driver does.
+    ByOneSource,
+}
+
+/// The same kernels over the same frames without queues and batches, frames a second.
+fn plain(memory: &Memory, copying: Copying) -> Result<f64, Box<dyn Error>> {
     let Sensor { correction, background, floor } = memory.sensor()?;
-    let stage: Arc<_> = DotStages::default().make("denoise", serde_json::json!({}), &correction)?.into();
-    let stage: Arc<dyn raysweep_pipeline::dots::ColumnStage> = stage;
+    let stage = DotStages::default().make("denoise", serde_json::json!({}), &correction)?;
     let background = Background::new(&correction, background.mean())?;
-    let (told, rates) = sync_channel(64);
     let threads = std::thread::available_parallelism()?.get();
+    let (source, next) = (Mutex::new(()), AtomicU64::new(0));
+    let began = Instant::now();
     std::thread::scope(|scope| {
-        for thread in 0..threads as u64 {
-            let (told, stage, background) = (told.clone(), stage.clone(), &background);
-            scope.spawn(move || {
+        for _ in 0..threads {
+            scope.spawn(|| {
                 let (mut worker, mut column) = (stage.worker(), SparseColumn::default());
                 let mut copy = vec![0; memory.shape.pixels()];
-                let (began, mut frames) = (Instant::now(), 0_u64);
                 while began.elapsed() < MEASURED {
-                    let mut frame = memory.frame(frames * threads as u64 + thread);
-                    if is_copied {
+                    let turn = matches!(copying, Copying::ByOneSource).then(|| source.lock());
+                    let mut frame = memory.frame(next.fetch_add(1, Ordering::Relaxed));
+                    if !matches!(copying, Copying::No) {
                         copy.copy_from_slice(frame);
                         frame = &copy;
                     }
-                    std::hint::black_box(worker.column(frame, background, floor, &mut column).is_ok());
-                    frames += 1;
+                    drop(turn);
+                    std::hint::black_box(worker.column(frame, &background, floor, &mut column).is_ok());
                 }
-                let _ = told.send(frames as f64 / began.elapsed().as_secs_f64());
             });
         }
-        drop(told);
-        Ok(rates.iter().sum())
-    })
+    });
+    Ok(next.into_inner() as f64 / began.elapsed().as_secs_f64())
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
     let is_json = std::env::args().any(|argument| argument == "--json");
     let memory = Memory::new()?;
-    let bare_hz = plain(&memory, false)?;
-    let copied_hz = plain(&memory, true)?;
+    let bare_hz = plain(&memory, Copying::No)?;
+    let copied_hz = plain(&memory, Copying::ByEach)?;
+    let source_hz = plain(&memory, Copying::ByOneSource)?;
     let free = flow(&memory, MEASURED, None)?;
     let paced = flow(&memory, PACED, Some(PACE * free.rate_hz()))?;
-    let (ratio, of_bare) = (free.rate_hz() / copied_hz, free.rate_hz() / bare_hz);
-    let paced_ratio = paced.rate_hz() / copied_hz;
+    let ratio = free.rate_hz() / source_hz;
+    let [of_copied, of_bare] = [copied_hz, bare_hz].map(|hz| free.rate_hz() / hz);
     let case = format!("{SIDE_PX}x{SIDE_PX}, {DOTS} dots");
     if is_json {
         println!(
-            "{{\"bench\":\"dots-live\",\"case\":\"{case}\",\"plain_hz\":{bare_hz:.1},\"copied_hz\":{copied_hz:.1},\"pipeline_hz\":{:.1},\"ratio\":{ratio:.3},\"paced_hz\":{:.1},\"paced_seconds\":{:.1},\"paced_frames\":{},\"paced_lost\":{},\"paced_batches\":{}}}",
+            "{{\"bench\":\"dots-live\",\"case\":\"{case}\",\"plain_hz\":{bare_hz:.1},\"copied_hz\":{copied_hz:.1},\"one_source_hz\":{source_hz:.1},\"pipeline_hz\":{:.1},\"ratio\":{ratio:.3},\"paced_hz\":{:.1},\"paced_seconds\":{:.1},\"paced_frames\":{},\"paced_lost\":{},\"paced_batches\":{}}}",
             free.rate_hz(),
             paced.rate_hz(),
             paced.seconds,
@@ -257,14 +266,15 @@ fn main() -> Result<(), Box<dyn Error>> {
         return Ok(());
     }
     println!("{case}: frames a second");
-    println!("  kernels in a plain loop           {bare_hz:8.0}");
-    println!("  the same, frames copied first     {copied_hz:8.0}");
+    println!("  kernels in a plain loop                 {bare_hz:8.0}");
+    println!("  the same, each thread copies its frames {copied_hz:8.0}");
+    println!("  the same, one source copies them        {source_hz:8.0}");
     println!(
-        "  pool, queue, workers, batches     {:8.0}   {ratio:.2} of the plain loop with its copy, {of_bare:.2} without",
+        "  pool, queue, workers, batches           {:8.0}   {ratio:.2} of the plain loop with one source, {of_copied:.2} of that with copies by each thread, {of_bare:.2} of that without",
         free.rate_hz()
     );
     println!(
-        "  the same, paced, for {:.0} s        {:8.0}   {paced_ratio:.2} of the plain loop with its copy; {} frames, {} lost, {} batches",
+        "  the same, paced, for {:.0} s              {:8.0}   {} frames, {} lost, {} batches",
         paced.seconds,
         paced.rate_hz(),
         paced.frames,

@@ -26,7 +26,7 @@ pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
 pub use products::{Assembly, NotMade, ProductError, ProductSpec, Profile, SweepStack};
-pub use queue::{Input, Policy, QueueError};
+pub use queue::{Input, Policy, QueueError, Receiver};
 pub use registry::{Entry, Registry, RegistryError};
 pub use schedule::{Point, Role, Scan, Schedule, Shot, Spot, SweepGeometry};
 pub use stage::{Fold, FoldError, HotPixels, Product, Snapshot, Stage, StageError};

@@ -4,9 +4,9 @@ use std::any::Any;
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::{self, JoinHandle};
 
+use crossbeam_channel::{Receiver, Sender, bounded};
 use ndarray::Array2;
 use raysweep_core::{Counts, SettingsId, VsyncStats};
 
@@ -90,8 +90,8 @@ impl<S: Sink + 'static> Pipeline<S> {
         let (input, events) = Input::new(config.queue_events, config.policy);
         let under_way = config.units_under_way.max(1);
         // Every item under way holds a permit, so the channel to the sink never fills and no worker waits in it.
-        let (done, items) = sync_channel::<Numbered>(under_way);
-        let (give_back, permits) = sync_channel::<()>(under_way);
+        let (done, items) = bounded::<Numbered>(under_way);
+        let (give_back, permits) = bounded::<()>(under_way);
         for _ in 0..under_way {
             let _ = give_back.send(());
         }
@@ -128,7 +128,7 @@ fn spawn<T: Send + 'static>(
 struct Dispatch {
     workers: rayon::ThreadPool,
     stages: Arc<[Box<dyn Stage>]>,
-    done: SyncSender<Numbered>,
+    done: Sender<Numbered>,
     permits: Receiver<()>,
 }
 
@@ -184,7 +184,7 @@ pub fn message_of(panic: &(dyn Any + Send)) -> &str {
 }
 
 /// Puts what the workers finish back into the order in which it was assembled.
-fn run_sink<S: Sink>(mut sink: S, items: &Receiver<Numbered>, give_back: &SyncSender<()>) -> S {
+fn run_sink<S: Sink>(mut sink: S, items: &Receiver<Numbered>, give_back: &Sender<()>) -> S {
     let mut next = 0;
     let mut early = BTreeMap::new();
     for (seq, item) in items {

@@ -1,6 +1,7 @@
 //! The bounded queue between the device threads and the assembler.
 
-use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
+pub use crossbeam_channel::Receiver;
+use crossbeam_channel::{Sender, TrySendError, bounded};
 
 /// What happens to an item that finds the queue full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -9,8 +10,6 @@ pub enum Policy {
     Wait,
     /// The item is handed back and counted by its owner: science on a real camera, where the point is repeated.
     Fail,
-    /// The item is dropped and nobody minds: views for people.
-    DropNewest,
 }
 
 /// Why an item did not enter the queue.
@@ -26,7 +25,7 @@ pub enum QueueError<T> {
 
 /// The sending side. Cloning gives another sender into the same queue.
 pub struct Input<T> {
-    sender: SyncSender<T>,
+    sender: Sender<T>,
     policy: Policy,
 }
 
@@ -39,7 +38,7 @@ impl<T> Clone for Input<T> {
 impl<T> Input<T> {
     /// A queue of at most `capacity` items.
     pub fn new(capacity: usize, policy: Policy) -> (Self, Receiver<T>) {
-        let (sender, receiver) = mpsc::sync_channel(capacity);
+        let (sender, receiver) = bounded(capacity);
         (Self { sender, policy }, receiver)
     }
 
@@ -53,8 +52,7 @@ impl<T> Input<T> {
         }
         match self.sender.try_send(item) {
             Ok(()) => Ok(()),
-            Err(TrySendError::Full(item)) if self.policy == Policy::Fail => Err(QueueError::Full(item)),
-            Err(TrySendError::Full(_)) => Ok(()),
+            Err(TrySendError::Full(item)) => Err(QueueError::Full(item)),
             Err(TrySendError::Disconnected(_)) => Err(QueueError::Closed),
         }
     }
@@ -64,7 +62,7 @@ impl<T> Input<T> {
     /// # Errors
     /// `Closed` when the receiver is gone.
     pub fn send(&self, item: T) -> Result<(), QueueError<T>> {
-        self.sender.send(item).map_err(|mpsc::SendError(_)| QueueError::Closed)
+        self.sender.send(item).map_err(|_closed| QueueError::Closed)
     }
 }
 
@@ -79,12 +77,6 @@ mod tests {
         assert!(matches!(input.offer(2), Err(QueueError::Full(2))));
         drop(receiver);
         assert!(matches!(input.offer(3), Err(QueueError::Closed)));
-
-        let (input, receiver) = Input::new(1, Policy::DropNewest);
-        input.offer(1).unwrap();
-        input.offer(2).unwrap();
-        drop(input);
-        assert_eq!(receiver.iter().collect::<Vec<_>>(), [1]);
 
         let (input, receiver) = Input::new(1, Policy::Wait);
         let sender = std::thread::spawn(move || (0..100).for_each(|i| input.offer(i).unwrap()));

@@ -3,10 +3,10 @@
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
+use crossbeam_channel::{Receiver, Sender, bounded};
 use raysweep_core::{Frame, LossCause, PixelFormat};
 use raysweep_transport::dots::{
     Background, BackgroundMean, Correction, DotsError, NoiseFloor, Observation, SparseColumn,
@@ -16,7 +16,7 @@ use super::background::Backgrounds;
 use super::gather::{CutSink, Gatherer, Looked, Scan};
 use super::stage::{ColumnStage, ColumnWorker};
 use crate::pipeline::{PipelineError, message_of};
-use crate::queue::{Input, Policy};
+use crate::queue::{Input, Policy, QueueError};
 
 /// Exposures in a row of which no frame came.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,7 +59,29 @@ pub struct DotsFlowConfig {
     pub policy: Policy,
 }
 
-/// Frames on their way to batches. It ends when every clone of its [`Input`] is dropped.
+/// Where a flow's frames enter, in the order of their exposure. The flow ends when it is dropped.
+pub struct DotsInput {
+    queue: Input<(u64, Arrival)>,
+    /// The number of the next frame.
+    next: u64,
+}
+
+impl DotsInput {
+    /// Sends a frame that may be refused, by the flow's policy.
+    ///
+    /// # Errors
+    /// As [`Input::offer`].
+    pub fn offer(&mut self, arrival: Arrival) -> Result<(), QueueError<Arrival>> {
+        self.queue.offer((self.next, arrival)).map_err(|error| match error {
+            QueueError::Full((_, arrival)) => QueueError::Full(arrival),
+            QueueError::Closed => QueueError::Closed,
+        })?;
+        self.next += 1;
+        Ok(())
+    }
+}
+
+/// Frames on their way to batches. It ends when its [`DotsInput`] is dropped.
 pub struct DotsFlow<S> {
     workers: Vec<JoinHandle<()>>,
     gatherer: JoinHandle<Gathered<S>>,
@@ -76,15 +98,9 @@ pub struct Gathered<S> {
     pub error: Option<DotsError>,
 }
 
-/// The frames' queue, and the number of the next.
-struct Source {
-    frames: Receiver<Arrival>,
-    next: u64,
-}
-
 /// What the workers share.
 struct Shop {
-    source: Mutex<Source>,
+    frames: Receiver<(u64, Arrival)>,
     backgrounds: Backgrounds,
     /// Columns whose memory is free.
     spare: Mutex<Vec<SparseColumn>>,
@@ -101,7 +117,7 @@ impl<S: CutSink + 'static> DotsFlow<S> {
     ///
     /// # Errors
     /// When the system gives no thread, or the background does not fit the frames.
-    pub fn start(config: DotsFlowConfig, sink: S) -> Result<(Self, Input<Arrival>), PipelineError> {
+    pub fn start(config: DotsFlowConfig, sink: S) -> Result<(Self, DotsInput), PipelineError> {
         let DotsFlowConfig {
             scan, format, saturation_dn, stage, correction, background, floor, policy, ..
         } = config;
@@ -111,9 +127,9 @@ impl<S: CutSink + 'static> DotsFlow<S> {
         };
         let prepared = Background::new(&correction, background.mean())
             .map_err(|error| PipelineError::Spawn { name: "dots", source: error.into() })?;
-        let (input, frames) = Input::new(config.queue_frames, policy);
+        let (queue, frames) = Input::new(config.queue_frames, policy);
         let shop = Arc::new(Shop {
-            source: Mutex::new(Source { frames, next: 0 }),
+            frames,
             backgrounds: Backgrounds::new(u64::from(scan.dots), Arc::new(prepared)),
             spare: Mutex::default(),
             scan: scan.clone(),
@@ -122,7 +138,7 @@ impl<S: CutSink + 'static> DotsFlow<S> {
             floor,
         });
         let is_blind = Arc::new(AtomicBool::new(false));
-        let (done, looked) = sync_channel::<Numbered>(config.queue_frames + threads);
+        let (done, looked) = bounded::<Numbered>(config.queue_frames + threads);
         let mut gatherer = Gatherer::new(scan, format, background, sink);
         let gatherer = spawn("dots".into(), {
             let shop = shop.clone();
@@ -139,7 +155,7 @@ impl<S: CutSink + 'static> DotsFlow<S> {
             spawn(format!("dots-{index}"), move || shop.work(&mut *worker, &done))
         });
         let workers = workers.collect::<Result<_, _>>()?;
-        Ok((Self { workers, gatherer, is_blind }, input))
+        Ok((Self { workers, gatherer, is_blind }, DotsInput { queue, next: 0 }))
     }
 
     /// Set when the trailing dot is not seen where it should be: what still comes is counted and thrown away.
@@ -177,16 +193,10 @@ fn spawn<T: Send + 'static>(
 
 impl Shop {
     /// Takes frames in turn until there are no more.
-    fn work(&self, worker: &mut dyn ColumnWorker, done: &SyncSender<Numbered>) {
+    fn work(&self, worker: &mut dyn ColumnWorker, done: &Sender<Numbered>) {
         let mut unpacked = Vec::new();
         let mut background: Option<(u64, Arc<Background>)> = None;
-        loop {
-            let (number, Arrival { frame, lost_before }) = {
-                let mut source = self.source.lock().unwrap_or_else(PoisonError::into_inner);
-                let Ok(arrival) = source.frames.recv() else { return };
-                source.next += 1;
-                (source.next - 1, arrival)
-            };
+        for (number, Arrival { frame, lost_before }) in &self.frames {
             let epoch = self.backgrounds.epoch_of(number);
             if background.as_ref().is_none_or(|(of, _)| *of != epoch) {
                 background = self.backgrounds.of(epoch).map(|background| (epoch, background));

@@ -12,7 +12,7 @@ mod gather;
 mod stage;
 
 pub use dark::{DarkRun, FlatRun, Sensor};
-pub use flow::{Arrival, DotsFlow, DotsFlowConfig, Gathered, Loss};
+pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered, Loss};
 pub use gather::{Cut, CutSink, Scan};
 pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, DotStages};
 

@@ -1,7 +1,6 @@
 //! The sequencer on a camera that is played by a script, on a virtual clock.
 
 use std::sync::Mutex;
-use std::sync::mpsc::Receiver;
 
 use raysweep_core::{Applied, CameraCapabilities, ClockHandle, FirstFrame, PixelFormat, Readout, Shutter};
 use raysweep_pipeline::{Policy, Role};

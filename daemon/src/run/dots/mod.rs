@@ -293,7 +293,7 @@ impl Passes<'_> {
                 Pace::Devices => Policy::Fail,
             },
         };
-        let (flow, input) = DotsFlow::start(config, self.storage.sink(first_batch, plane, raw))?;
+        let (flow, mut input) = DotsFlow::start(config, self.storage.sink(first_batch, plane, raw))?;
         let blind = flow.is_blind();
         let rounds = BatchesPlan::rounds(batches);
         let frames = u64::from(rounds) * u64::from(plan.dots);
