@@ -269,28 +269,37 @@ impl<'a> Column<'a> {
     }
 
     /// All light of the column, those outside the mask by their blocks' means: one sum a channel.
-    ///
-    /// `of_block` must have a place for each block; it is overwritten.
-    pub(crate) fn energy(&self, of_block: &mut [u32]) -> [f64; 3] {
-        /// A multiple of all numbers of channels.
-        const LANES: usize = 12;
-        let (shape, mut energy) = (self.batch.shape, [0.0; 3]);
+    pub(crate) fn energy(&self) -> [f64; 3] {
+        let shape = self.batch.shape;
         let channels = shape.channels();
-        of_block.fill(0);
+        let mut energy = sum_of_channels(self.values(), channels);
+        // As if the means were of whole blocks, then without the pixels that have values of their own.
+        for (row, means) in self.residual.chunks_exact(shape.block_columns() * channels).enumerate() {
+            let pixels = shape.pixels_of_block(row * shape.block_columns()) as f64;
+            let sums = sum_of_channels(means, channels);
+            energy.iter_mut().zip(sums).for_each(|(energy, sum)| *energy += pixels * sum);
+        }
         let range = self.words.clone();
         let words = self.batch.arrays.words[range.clone()].iter().zip(&self.batch.arrays.masks[range]);
-        words.for_each(|(&word, mask)| of_block[shape.block_of_word(word as usize)] += mask.count_ones());
-        let values = self.values();
-        // Side by side: one sum after another would wait for each.
-        let mut partial = [0.0; LANES];
-        let (whole, rest) = values.as_chunks::<LANES>();
-        whole.iter().for_each(|lanes| (0..LANES).for_each(|lane| partial[lane] += f64::from(lanes[lane])));
-        rest.iter().zip(&mut partial).for_each(|(&value, partial)| *partial += f64::from(value));
-        partial.iter().enumerate().for_each(|(lane, partial)| energy[lane % channels] += partial);
-        for (block, (means, &masked)) in self.residual.chunks_exact(channels).zip(&*of_block).enumerate() {
-            let outside = shape.pixels_of_block(block) as f64 - f64::from(masked);
-            energy.iter_mut().zip(means).for_each(|(energy, &mean)| *energy += outside * f64::from(mean));
+        for (&word, mask) in words {
+            let means = &self.residual[shape.block_of_word(word as usize) * channels..][..channels];
+            let pixels = f64::from(mask.count_ones());
+            energy.iter_mut().zip(means).for_each(|(energy, &mean)| *energy -= pixels * f64::from(mean));
         }
         energy
     }
+}
+
+/// Sums of values whose channels lie side by side.
+fn sum_of_channels(values: &[f32], channels: usize) -> [f64; 3] {
+    /// A multiple of all numbers of channels.
+    const LANES: usize = 12;
+    // Side by side: one sum after another would wait for each.
+    let mut partial = [0.0; LANES];
+    let (whole, rest) = values.as_chunks::<LANES>();
+    whole.iter().for_each(|lanes| (0..LANES).for_each(|lane| partial[lane] += f64::from(lanes[lane])));
+    rest.iter().zip(&mut partial).for_each(|(&value, partial)| *partial += f64::from(value));
+    let mut sums = [0.0; 3];
+    partial.iter().enumerate().for_each(|(lane, partial)| sums[lane % channels] += partial);
+    sums
 }

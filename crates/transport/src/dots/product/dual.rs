@@ -1,12 +1,10 @@
-use ndarray::{Array2, Array3, Axis};
+use ndarray::{Array2, Array3};
 use rayon::prelude::*;
 
+use super::holes::fill_holes;
 use crate::dots::calibrate::Centroids;
 use crate::dots::error::{check_range, check_shape};
 use crate::dots::{Batch, DotsError};
-
-/// Pixels of a rim that are filled together.
-const RIM_PX: usize = 4096;
 
 /// The scene as the mirror would see it, lit from the camera.
 #[derive(Debug, Clone, PartialEq)]
@@ -25,9 +23,7 @@ pub fn column_energies(batch: &Batch) -> Vec<f64> {
 }
 
 fn energies_of_channels(batch: &Batch) -> Vec<[f64; 3]> {
-    let of_block = || vec![0; batch.shape().blocks()];
-    let dots = (0..batch.dots()).into_par_iter();
-    dots.map_init(of_block, |of_block, dot| batch.column(dot).energy(of_block)).collect()
+    (0..batch.dots()).into_par_iter().map(|dot| batch.column(dot).energy()).collect()
 }
 
 /// Dual image by Helmholtz reciprocity: each dot's place on the calibration plane has the light of its whole column,
@@ -70,71 +66,4 @@ pub fn dual(
     let known = counts.mapv(|count| count > 0);
     fill_holes(&mut image, &known);
     Ok(DualImage { image, known })
-}
-
-/// Fills the pixels of an image `[height, width, channels]` that are not known, from the known ones outwards: each has
-/// the mean of its horizontal and vertical neighbours that were known or filled a step before. Without any known pixel
-/// the image stays as it is.
-///
-/// # Panics
-/// If `known` is not of the image's height and width.
-pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
-    let (height, width, channels) = image.dim();
-    assert_eq!(known.dim(), (height, width), "known must be as large as the image");
-    // With a border that is never filled, so that every pixel has four neighbours. What is not filled is NaN.
-    let stride = width + 2;
-    let row_of = |row: usize| (row + 1) * stride + 1..(row + 1) * stride + 1 + width;
-    let mut values = vec![f32::NAN; (height + 2) * stride * channels];
-    let mut is_open = vec![false; (height + 2) * stride];
-    for (row, (known, pixels)) in known.outer_iter().zip(image.outer_iter()).enumerate() {
-        is_open[row_of(row)].iter_mut().zip(known).for_each(|(is_open, known)| *is_open = !known);
-        let values = values[row_of(row).start * channels..].chunks_exact_mut(channels);
-        for ((values, pixel), _) in values.zip(pixels.outer_iter()).zip(known).filter(|(_, known)| **known) {
-            values.iter_mut().zip(pixel).for_each(|(value, &light)| *value = light);
-        }
-    }
-    let neighbours = |pixel: usize| [pixel - 1, pixel + 1, pixel - stride, pixel + stride];
-    let at_rim = |&pixel: &usize| {
-        is_open[pixel] && neighbours(pixel).iter().any(|near| !values[near * channels].is_nan())
-    };
-    let mean_near = |pixel: usize, channel: usize, values: &[f32]| {
-        let (mut sum, mut count) = (0.0, 0.0);
-        for near in neighbours(pixel) {
-            let value = values[near * channels + channel];
-            let is_filled = !value.is_nan();
-            sum += if is_filled { value } else { 0.0 };
-            count += if is_filled { 1.0 } else { 0.0 };
-        }
-        sum / count
-    };
-    // In each step only the rim of what is filled: every pixel is reached once.
-    let rows = (0..height).into_par_iter();
-    let mut rim: Vec<usize> = rows.flat_map_iter(|row| row_of(row).filter(at_rim)).collect();
-    rim.iter().for_each(|&pixel| is_open[pixel] = false);
-    let (mut next, mut means) = (Vec::new(), Vec::new());
-    while !rim.is_empty() {
-        means.resize(rim.len() * channels, 0.0);
-        let parts = means.par_chunks_mut(RIM_PX * channels).zip(rim.par_chunks(RIM_PX));
-        parts.for_each(|(means, rim)| {
-            for (means, &pixel) in means.chunks_exact_mut(channels).zip(rim) {
-                means
-                    .iter_mut()
-                    .enumerate()
-                    .for_each(|(channel, mean)| *mean = mean_near(pixel, channel, &values));
-            }
-        });
-        next.clear();
-        for (&pixel, means) in rim.iter().zip(means.chunks_exact(channels)) {
-            values[pixel * channels..][..channels].copy_from_slice(means);
-            next.extend(neighbours(pixel).into_iter().filter(|&near| std::mem::take(&mut is_open[near])));
-        }
-        std::mem::swap(&mut rim, &mut next);
-    }
-    // Where nothing is known, nothing was filled.
-    if known.iter().any(|&known| known) {
-        image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(row, mut pixels)| {
-            let values = &values[row_of(row).start * channels..row_of(row).end * channels];
-            pixels.iter_mut().zip(values).for_each(|(pixel, &value)| *pixel = value);
-        });
-    }
 }

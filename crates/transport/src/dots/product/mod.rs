@@ -5,6 +5,7 @@
 
 mod dual;
 mod epipolar;
+mod holes;
 mod overlap;
 mod relight;
 mod shadow;
@@ -15,8 +16,9 @@ use ndarray::Array3;
 use super::error::check_shape;
 use super::{Batch, DotsError};
 
-pub use dual::{DualImage, column_energies, dual, fill_holes};
+pub use dual::{DualImage, column_energies, dual};
 pub use epipolar::{EpipolarMask, MaskRule, epipolar};
+pub use holes::fill_holes;
 pub use overlap::{compensate, coverage};
 pub use relight::{floodlit, pattern_weights, relight, relight_sequence};
 pub use shadow::{shadow_dot, shadow_neighbours};
