@@ -74,7 +74,8 @@ fn a_flat_field_takes_away_the_fixed_pattern_and_keeps_the_energy() {
     assert!((energy - 1.0).abs() < 0.005, "{energy}");
 
     // A later plan has the same from the session, without another lamp.
-    let stage = format!("[[stage]]\nname = \"correct\"\nflat_field = {:?}\n", corrected.session);
+    let name = corrected.session.file_name().unwrap();
+    let stage = format!("[[stage]]\nname = \"correct\"\nflat_field = {name:?}\n");
     let later = completed(&bench, &(plan.clone() + &stage));
     assert!(pattern(&floodlit(&later)) < before / 4.0);
     let gains = |ended: &Ended| ended.open().0.dots().unwrap().read_flat([128, 128]).unwrap();
@@ -93,11 +94,10 @@ fn a_flat_field_that_cannot_be_used_ends_the_run_with_what_to_do() {
     assert!(ended.error.as_ref().unwrap().contains("diffuser"), "{:?}", ended.error);
     assert!(entries(&ended).is_empty());
     let bench = Bench::dots(&rig(""));
-    let none = bench.run(
-        &(plan.replace("flat_frames = 64", "flat_frames = 0")
-            + "[[stage]]\nname = \"correct\"\nflat_field = \"nowhere\"\n"),
-    );
-    assert!(none.error.as_ref().unwrap().contains("nowhere"), "{:?}", none.error);
+    let plan = plan.replace("flat_frames = 64", "flat_frames = 0")
+        + "[[stage]]\nname = \"correct\"\nflat_field = \"nowhere\"\n";
+    let refused = bench.runner.check(&plan).unwrap_err().message;
+    assert!(refused.contains("flat_field") && refused.contains("nowhere"), "{refused}");
 }
 
 #[test]

@@ -7,7 +7,7 @@ use raysweep_pipeline::Registry;
 use raysweep_proto::{BatchesCheck, CheckReport};
 use raysweep_transport::dots::Correction;
 
-use super::{DotTask, allows, free_bytes};
+use super::{DotTask, allows, free_bytes, place_of};
 use crate::config::{BatchesPlan, ConfigError};
 use crate::memory::available_bytes;
 use crate::run::FRAMES_UNDER_WAY;
@@ -22,7 +22,7 @@ const OTHER_BYTES: u64 = 20_000_000;
 /// Foresees a task whose session will lie in `data`; `text` is its plan's.
 ///
 /// # Errors
-/// For what the camera, or a stage, cannot do.
+/// For what the camera, or a stage, cannot do, and a flat field that cannot be read.
 pub(crate) fn check(
     task: &DotTask,
     text: &str,
@@ -33,6 +33,10 @@ pub(crate) fn check(
 ) -> Result<CheckReport, ConfigError> {
     allows(task, camera, text)?;
     task.stage(registry, &Correction::none(task.shape), text)?;
+    task.earlier_flat_field(data).map_err(|error| {
+        let place = ["stage", &place_of(&task.plan, "correct"), "flat_field"];
+        ConfigError::at(text, &place, format!("stage correct: flat_field: {error}"))
+    })?;
     let plan = task.batches();
     let planes: Vec<u32> = plan.calibration.iter().map(|plane| plane.batches).collect();
     let passes = planes.iter().copied().chain([plan.count]);

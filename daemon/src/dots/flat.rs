@@ -1,5 +1,7 @@
 //! The flat field between a run, its session, and later runs.
 
+use std::path::Path;
+
 use ndarray::{Array2, Axis};
 use raysweep_session::dots::FlatArrays;
 use raysweep_session::{Result, Session};
@@ -23,14 +25,14 @@ pub(crate) fn keep(session: &Session, correction: &Correction) -> Result<()> {
 }
 
 impl DotTask {
-    /// The flat field of the earlier session that the plan names, if it names one.
+    /// The flat field of the earlier session that the plan names, if it names one; sessions lie in `data`.
     ///
     /// # Errors
     /// When that session has none, or one of another size.
-    pub(crate) fn earlier_flat_field(&self) -> Result<Option<FlatField>> {
+    pub(crate) fn earlier_flat_field(&self, data: &Path) -> Result<Option<FlatField>> {
         let Some(dir) = &self.correct.flat_field else { return Ok(None) };
         let size = [self.shape.height(), self.shape.width()];
-        let FlatArrays { gain, repaired } = Session::open(dir)?.dots()?.read_flat(size)?;
+        let FlatArrays { gain, repaired } = Session::open(&data.join(dir))?.dots()?.read_flat(size)?;
         let dead =
             repaired.indexed_iter().filter(|(_, repaired)| **repaired).map(|(pixel, _)| pixel).collect();
         Ok(Some(FlatField { gain: gain.insert_axis(Axis(2)), dead }))

@@ -40,6 +40,11 @@ pub struct DotTask {
     denoise: StageTable,
 }
 
+/// Which of a plan's stages has this name.
+fn place_of(plan: &Plan, name: &str) -> String {
+    plan.stage.iter().position(|stage| stage.name == name).unwrap_or(0).to_string()
+}
+
 /// What has no options.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -49,7 +54,7 @@ struct NoOptions {}
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CorrectOptions {
-    /// An earlier session whose flat field serves.
+    /// An earlier session whose flat field serves: its folder, or its name within the daemon's data folder.
     pub flat_field: Option<PathBuf>,
     /// Pixels whose dark level or noise lies so many standard deviations beyond the others' are hot.
     pub hot_sigmas: f64,
@@ -152,7 +157,7 @@ impl DotTask {
         text: &str,
     ) -> Result<Box<dyn ColumnStage>, ConfigError> {
         let StageTable { name, options } = &self.denoise;
-        let index = self.plan.stage.iter().position(|stage| stage.name == *name).unwrap_or(0).to_string();
+        let index = place_of(&self.plan, name);
         registry
             .dots
             .make(name, Value::Object(options.clone()), correction)

@@ -78,7 +78,7 @@ impl DotRun {
     /// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
     pub fn acquire(mut self) -> Result<Acquired, RunError> {
         self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: false })?;
-        let earlier = self.task.earlier_flat_field()?;
+        let earlier = self.task.earlier_flat_field(&self.data)?;
         let rate_hz = self.task.batches().camera_rate_hz();
         let DotDevices { mut camera, mirror, stand, clock, pace, .. } = self.rig.open(&self.data, rate_hz)?;
         let mut motion = Motion::new(mirror);
