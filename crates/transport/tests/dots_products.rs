@@ -355,6 +355,8 @@ fn a_mask_of_the_dots_own_width_keeps_the_planes_light_and_the_printed_one_a_fif
     };
     assert!(share(MaskRule::Plateau) >= 0.98, "{}", share(MaskRule::Plateau));
     assert!((share(MaskRule::Printed) - 0.2).abs() < 0.05, "{}", share(MaskRule::Printed));
+    let radius_px = PointSpreads::new(&batch).unwrap().radius_px().unwrap();
+    assert!((7.5..=9.5).contains(&radius_px), "{radius_px}");
 }
 
 #[test]

@@ -30,6 +30,8 @@ pub(super) struct Calibration {
     pub fundamental: std::result::Result<Fundamental, String>,
     /// Root mean square distance of the second plane's dots from their lines.
     pub epipolar_px: Option<f64>,
+    /// Radius of a dot on the plane, if any can be told from its surroundings.
+    pub radius_px: Option<f64>,
     /// Dots whose spread is not one piece.
     pub not_unimodal: usize,
     /// From the first batch of the first plane to its others.
@@ -98,6 +100,7 @@ impl Calibration {
             centroids,
             fundamental,
             epipolar_px,
+            radius_px: spreads.radius_px(),
             not_unimodal,
             drifts,
         })

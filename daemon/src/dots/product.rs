@@ -6,8 +6,8 @@ use ndarray::{Array3, Array4, ArrayView3, Axis};
 use raysweep_session::pattern;
 use raysweep_transport::dots::Batch;
 use raysweep_transport::dots::product::{
-    EpipolarMask, MaskRule, compensate, dual, epipolar, floodlit, pattern_weights, relight, shadow_dot,
-    shadow_neighbours,
+    EpipolarMask, MaskRule, REFERENCE_WIDTH_PX, compensate, dual, epipolar, floodlit, pattern_weights,
+    relight, shadow_dot, shadow_neighbours,
 };
 use serde::Deserialize;
 use serde_json::Value;
@@ -64,8 +64,8 @@ enum Pattern {
 #[serde(deny_unknown_fields, default)]
 struct Separation {
     method: Method,
-    /// Of `epipolar`: the paper's d_thresh, in pixels of a frame that is 1024 wide.
-    distance_px: f64,
+    /// Of `epipolar`: the paper's d_thresh, in pixels of a frame that is 1024 wide; left out: a dot's radius.
+    distance_px: Option<f64>,
     /// Of `epipolar`: softness beyond it, in the same pixels.
     sigma_px: f64,
     /// Of `epipolar`: the mask as the paper prints it.
@@ -78,7 +78,7 @@ impl Default for Separation {
     fn default() -> Self {
         Self {
             method: Method::Neighbours,
-            distance_px: 19.0,
+            distance_px: None,
             sigma_px: 2.0,
             printed: false,
             compensate: false,
@@ -197,7 +197,8 @@ impl DotSpec {
             "direct-global" => {
                 let separation: Separation = read(kind_name, options)?;
                 let Separation { distance_px, sigma_px, .. } = separation;
-                for (key, value) in [("distance_px", distance_px), ("sigma_px", sigma_px)] {
+                let lengths = [("distance_px", distance_px.unwrap_or(0.0)), ("sigma_px", sigma_px)];
+                for (key, value) in lengths {
                     if !(0.0..=1024.0).contains(&value) {
                         return Err(format!(
                             "product {kind_name}: {key} = {value}: 0 to 1024 pixels are allowed"
@@ -306,6 +307,13 @@ impl DotSpec {
                         let fundamental = calibration.fundamental.as_ref().map_err(Clone::clone)?;
                         let rule = if options.printed { MaskRule::Printed } else { MaskRule::Plateau };
                         let Separation { distance_px, sigma_px, .. } = *options;
+                        let measured_px = || {
+                            let radius_px = calibration
+                                .radius_px
+                                .ok_or("no dot of the plane is one piece: give distance_px")?;
+                            Ok::<_, String>(radius_px * REFERENCE_WIDTH_PX / batch.shape().width() as f64)
+                        };
+                        let distance_px = distance_px.map_or_else(measured_px, Ok)?;
                         let mask = EpipolarMask { distance_px, sigma_px, rule };
                         epipolar(batch, scene.light, fundamental, &calibration.centroids.xy, &mask)
                     }

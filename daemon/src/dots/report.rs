@@ -108,6 +108,9 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
         ),
         ("dots that are not one piece", calibration.not_unimodal.to_string()),
     ];
+    if let Some(px) = calibration.radius_px {
+        entries.push(("radius of a dot", format!("{px:.1} px")));
+    }
     for (plane, depth_mm) in
         task.batches().calibration.iter().enumerate().filter_map(|(plane, of)| Some((plane, of.depth_mm?)))
     {

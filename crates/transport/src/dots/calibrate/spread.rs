@@ -1,8 +1,10 @@
 use std::collections::VecDeque;
+use std::f64::consts::PI;
 
 use rayon::prelude::*;
 
 use super::footprint::luminance;
+use crate::dots::sensor::median;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, BatchArrays, DotsError, FrameShape, SparseColumn};
 
@@ -43,6 +45,15 @@ impl PointSpreads {
         spreads.iter().for_each(|(column, _)| arrays.push(column));
         let unimodal = spreads.iter().map(|(_, unimodal)| *unimodal).collect();
         Ok(Self { columns: Batch::new(shape, arrays)?, unimodal })
+    }
+
+    /// Radius of a dot down to a fiftieth of its peak: that of a disc as large, the median over the dots with an estimate of
+    /// their own; none if there is no such dot.
+    pub fn radius_px(&self) -> Option<f64> {
+        let own = self.unimodal.iter().enumerate().filter(|(_, unimodal)| **unimodal).map(|(dot, _)| dot);
+        let mut radii: Vec<f64> =
+            own.map(|dot| (self.columns.column(dot).pixels().count() as f64 / PI).sqrt()).collect();
+        (!radii.is_empty()).then(|| median(&mut radii))
     }
 }
 

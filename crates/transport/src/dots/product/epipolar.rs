@@ -12,7 +12,7 @@ use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError, FrameShape};
 
 /// Width of the frames that distances of masks are given for, in pixels.
-const REFERENCE_WIDTH_PX: f64 = 1024.0;
+pub const REFERENCE_WIDTH_PX: f64 = 1024.0;
 
 /// A block's share of the mask is the mean over this many points a side.
 const POINTS: usize = 4;

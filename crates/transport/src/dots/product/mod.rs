@@ -17,7 +17,7 @@ use super::error::check_shape;
 use super::{Batch, DotsError};
 
 pub use dual::{DualImage, column_energies, dual};
-pub use epipolar::{EpipolarMask, MaskRule, epipolar};
+pub use epipolar::{EpipolarMask, MaskRule, REFERENCE_WIDTH_PX, epipolar};
 pub use holes::fill_holes;
 pub use overlap::{compensate, coverage};
 pub use relight::{floodlit, pattern_weights, relight, relight_sequence};
