@@ -531,6 +531,19 @@ fn products_are_the_same_for_any_number_of_threads() {
 }
 
 #[test]
+fn the_light_of_a_column_is_that_of_its_image_in_a_cut_last_row_of_blocks_too() {
+    for channels in [1, 3] {
+        let shape = FrameShape::new(75, 64, channels).unwrap();
+        let images = random_images(shape, 4, 5);
+        let energies = column_energies(&batch(shape, &images, 0.61));
+        for (energy, image) in energies.iter().zip(&images) {
+            let expected = image.mapv(f64::from).sum() / channels as f64;
+            assert!((energy / expected - 1.0).abs() < 1e-5, "{energy} {expected}");
+        }
+    }
+}
+
+#[test]
 fn damaged_columns_are_refused() {
     let shape = FrameShape::new(64, 64, 1).unwrap();
     let sound = batch(shape, &random_images(shape, 3, 7), 0.61).arrays().clone();
