@@ -154,11 +154,11 @@ fn cut_frames(
         queue_frames: 4,
         policy: Policy::Wait,
     };
-    let (flow, input) = DotsFlow::start(config, Kept::default()).unwrap();
+    let (flow, mut input) = DotsFlow::start(config, Kept::default()).unwrap();
     let pool = FramePool::new(40, format.frame_bytes(shape().pixels()));
     for (step, counts, lost_before) in frames {
         let arrival = Arrival { frame: frame_of(&pool, format, step, &counts), lost_before };
-        assert!(input.send(arrival).is_ok());
+        assert!(input.offer(arrival).is_ok());
     }
     drop(input);
     flow.join().unwrap()

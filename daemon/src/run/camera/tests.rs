@@ -295,7 +295,7 @@ fn play_plan(
 }
 
 fn follow(
-    events: &Receiver<Event>,
+    events: &raysweep_pipeline::Receiver<Event>,
     frames: u32,
     pause_after: Option<usize>,
     orders: &Orders,
