@@ -132,7 +132,7 @@ fn distance_px(found: &[Option<[f64; 2]>], wanted: &[Option<[f64; 2]>]) -> f64 {
 
 #[test]
 fn paths_distorted_by_what_was_identified_are_followed_closer() {
-    // 23 lines: x swings at 230 Hz, half its resonance.
+    // x swings at 180 Hz, a third of its resonance.
     let raster = plan("product = [{ kind = \"floodlit\" }]", 2).replace(
         "shape = \"lissajous\"\ncycles = [7, 1]\namplitude_deg = [2.3, 1.3]",
         "shape = \"raster\"\nlines = 18\namplitude_deg = [1.6, 1.1]\nflyback = 0.15",
@@ -216,7 +216,7 @@ fn a_plan_says_what_it_would_do_and_where_it_cannot() {
             assert!(error.message.contains(expected), "{}", error.message);
         }
     }
-    let plane = Bench::new(&raysweep_tests::rig_text(32, "scene = \"corner\"", ""));
+    let plane = Bench::new(&raysweep_tests::rig_text(128, "scene = \"v-groove\"", ""));
     let error = plane.runner.check(&chirps("")).unwrap_err();
     assert!(error.message.contains("a plane rig runs"), "{}", error.message);
 }
