@@ -124,6 +124,7 @@ pub fn check(
         advice: None,
         film,
         batches: None,
+        response: None,
         warnings,
     })
 }

@@ -13,6 +13,7 @@ pub mod mirror;
 pub mod process;
 pub mod processing;
 mod report;
+mod response;
 mod results;
 pub mod rig;
 pub mod run;

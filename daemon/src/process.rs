@@ -12,6 +12,7 @@ use crate::dots::{self, DotSpec, DotTask};
 use crate::film;
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::processing::Task;
+use crate::response::{Findings, ResponseTask};
 use crate::results::{self, Results};
 
 /// Why a session cannot be processed.
@@ -97,11 +98,15 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     let (rig_path, rig_text) = read(session.rig_path())?;
     let plan = Plan::parse(&plan_text)
         .map_err(|error| ProcessError::Config(error.render(&plan_path.display().to_string(), &plan_text)))?;
-    if plan.kind == PlanKind::Batches {
+    if matches!(plan.kind, PlanKind::Batches | PlanKind::Response) {
         let rig = DotRigFile::parse(&rig_text).map_err(|error| {
             ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text))
         })?;
-        return process_batches(&session, ledger.state(), (plan, &plan_text), &rig, asked);
+        let of = (plan, plan_text.as_str());
+        return match of.0.kind {
+            PlanKind::Response => process_response(&session, ledger.state(), of, &rig, asked),
+            _ => process_batches(&session, ledger.state(), of, &rig, asked),
+        };
     }
     let rig = RigFile::parse(&rig_text)
         .map_err(|error| ProcessError::Config(error.render(&rig_path.display().to_string(), &rig_text)))?;
@@ -168,7 +173,7 @@ fn process_batches(
 ) -> Result<Processed, ProcessError> {
     let shape = state.session.shape;
     let size = (shape.rows, shape.columns);
-    let task = DotTask::new(plan, plan_text, rig, rig.camera.pixel_format, size)
+    let task = DotTask::new(plan, plan_text, rig, rig.camera.pixel_format, size, session.dir())
         .map_err(|error| ProcessError::Config(error.to_string()))?;
     let mut specs = if asked.only { Vec::new() } else { task.specs.clone() };
     for argument in &asked.products {
@@ -182,6 +187,32 @@ fn process_batches(
         stored: state.stored_points(),
         points: shape.points,
         problems: made.problems,
+    })
+}
+
+/// What the records of a mirror's chirps show. The rig's own file is left alone: it is the newest run's.
+fn process_response(
+    session: &Session,
+    state: &State,
+    (plan, plan_text): (Plan, &str),
+    rig: &DotRigFile,
+    asked: &Asked,
+) -> Result<Processed, ProcessError> {
+    if !asked.products.is_empty() {
+        let message = "a session of kind \"response\" has no products to ask for: leave --product out";
+        return Err(ProcessError::Product(message.into()));
+    }
+    let size = (state.session.shape.rows, state.session.shape.columns);
+    let task = ResponseTask::new(plan, plan_text, rig, rig.camera.pixel_format, size)
+        .map_err(|error| ProcessError::Config(error.to_string()))?;
+    let findings = Findings::of(session, state, &task)?;
+    findings.keep(session, state, None)?;
+    findings.write(session, state, &task, rig)?;
+    Ok(Processed {
+        report: session.report_path(),
+        stored: state.stored_points(),
+        points: state.session.shape.points,
+        problems: findings.refusal().map(ToString::to_string).into_iter().collect(),
     })
 }
 

@@ -198,6 +198,10 @@ impl Ended {
             assert!(state.batches().all(|batch| batch.counts.balanced()));
             return self;
         }
+        if state.session.shape.is_axes() {
+            assert!(state.axes().all(|axis| axis.counts.balanced()));
+            return self;
+        }
         if state.session.shape.is_film() {
             assert!(state.cycles().all(|cycle| cycle.counts.balanced()));
             return self;

@@ -231,6 +231,29 @@ pub struct BatchesCheck {
     pub disk_bytes_per_batch: u64,
 }
 
+/// What `check` says of a plan of a mirror's chirps, one of each axis.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ResponseCheck {
+    /// Where a chirp begins and ends.
+    pub band_hz: [f64; 2],
+    /// Its amplitude, of the mirror.
+    pub amplitude_deg: f64,
+    /// Seconds of a chirp.
+    pub chirp_s: f64,
+    /// Seconds after it.
+    pub rest_s: f64,
+    /// Frames of each axis.
+    pub frames: usize,
+    /// Frames a second.
+    pub camera_rate_hz: f64,
+    /// Frames without light before the first chirp.
+    pub dark_frames: u32,
+    /// Samples of the mirror's path.
+    pub samples: usize,
+    /// Samples a second.
+    pub rate_hz: f64,
+}
+
 /// `status`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Status {
@@ -321,6 +344,9 @@ pub struct CheckReport {
     /// Where the plan is one of batches; reach and condition then mean nothing.
     #[serde(default)]
     pub batches: Option<BatchesCheck>,
+    /// Where the plan is one of a mirror's chirps; reach and condition then mean nothing.
+    #[serde(default)]
+    pub response: Option<ResponseCheck>,
     /// What an operator should know; none of it stops the run.
     pub warnings: Vec<String>,
 }

@@ -25,7 +25,7 @@ pub struct Session {
 
 impl Session {
     /// Makes the folder of a new session in `root` (made where it is missing), with `plan.toml` and `rig.toml` as
-    /// given, an empty stack and the ledger's first line, which comes last: without it there is no session.
+    /// given, an empty stack (of a dot rig none) and the ledger's first line, which comes last: without it there is no session.
     ///
     /// The folder is named `YYYYMMDD-HHMMSS_name` after `session.created` in UTC. Of the name, letters and digits of
     /// any script, `-`, `_` and `.` stay, every run of anything else becomes one `-`, `-` and `.` at the ends go, and
@@ -43,9 +43,10 @@ impl Session {
         durable::write(&created.plan_path(), plan.as_bytes())?;
         durable::write(&created.rig_path(), rig.as_bytes())?;
         durable::create_dir(&created.products_path())?;
-        match session.shape.is_batches() {
-            true => drop(Dots::create(&created.dots_path(), &session.shape)?),
-            false => drop(Stack::create(&created.stack_path(), &session.shape, &session.kind)?),
+        if session.shape.is_batches() {
+            Dots::create(&created.dots_path(), &session.shape)?;
+        } else if !session.shape.is_axes() {
+            Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
         }
         if session.shape.is_film() {
             Film::create(&created.film_path(), &session.shape)?;
@@ -175,6 +176,11 @@ impl Session {
         self.dir.join("patterns").join(format!("{product}.npy"))
     }
 
+    /// `mirror-response.json`: how a mirror was found to answer, or which such finding its path was distorted by.
+    pub fn mirror_response_path(&self) -> PathBuf {
+        self.dir.join("mirror-response.json")
+    }
+
     /// `products`, see [`crate::products`].
     pub fn products_path(&self) -> PathBuf {
         self.dir.join("products")
@@ -202,7 +208,7 @@ pub struct SessionSummary {
     pub kind: String,
     /// UTC.
     pub created: Timestamp,
-    /// Points of the sweep, cycles of the film, or batches that are planned.
+    /// Points of the sweep, cycles of the film, batches, or axes of a mirror that are planned.
     pub points: usize,
     /// Those of them that are stored.
     pub stored: usize,

@@ -78,6 +78,8 @@ pub enum Entry {
         /// What became of its frames.
         counts: Counts,
     },
+    /// The record of a mirror's axis under its chirp is durable in `products`.
+    Axis(AxisEntry),
     /// A film is over; its cycles have lines of their own.
     Film(FilmSummary),
     /// Frames outside any point: drained, in a pause, after a cancel.
@@ -152,6 +154,21 @@ impl PointEntry {
     }
 }
 
+/// The stored record of a mirror's axis.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AxisEntry {
+    /// 0: x, 1: y.
+    pub axis: usize,
+    /// Frames of the record: those of its chirp.
+    pub frames: usize,
+    /// Those of them that never came.
+    pub lost: usize,
+    /// Those of them that came and show no dot.
+    pub empty: usize,
+    /// Where its triggers went.
+    pub counts: Counts,
+}
+
 /// How an acquisition run ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EndEntry {
@@ -206,6 +223,7 @@ pub struct State {
     stored: BTreeMap<(ArrayName, usize), PointEntry>,
     cycles: BTreeMap<usize, CycleEntry>,
     batches: BTreeMap<usize, BatchEntry>,
+    axes: BTreeMap<usize, AxisEntry>,
     next_attempts: BTreeMap<(ArrayName, usize), u32>,
 }
 
@@ -227,6 +245,7 @@ impl State {
             stored: BTreeMap::new(),
             cycles: BTreeMap::new(),
             batches: BTreeMap::new(),
+            axes: BTreeMap::new(),
             next_attempts: BTreeMap::new(),
         };
         for (entry, line) in rest.iter().zip(1..) {
@@ -250,9 +269,15 @@ impl State {
         self.batches.values()
     }
 
-    /// How many of the plan's points are stored: of a sweep's points, of a film's cycles, or of a flying dot's batches.
+    /// The stored records of a mirror's axes, x first.
+    pub fn axes(&self) -> impl Iterator<Item = &AxisEntry> {
+        self.axes.values()
+    }
+
+    /// How many of the plan's points are stored: of a sweep's points, of a film's cycles, of a flying dot's batches, or
+    /// of a mirror's axes.
     pub fn stored_points(&self) -> usize {
-        self.stored(ArrayName::Sum).count() + self.cycles.len() + self.batches.len()
+        self.stored(ArrayName::Sum).count() + self.cycles.len() + self.batches.len() + self.axes.len()
     }
 
     /// A stored point.
@@ -303,6 +328,14 @@ impl State {
                     Err(format!("batch {batch} is outside of the plan, which has {batches} batches"))
                 }
             }
+            Entry::Axis(AxisEntry { axis, .. }) => {
+                let axes = self.session.shape.points * usize::from(self.session.shape.is_axes());
+                if *axis < axes {
+                    Ok(())
+                } else {
+                    Err(format!("axis {axis} is outside of the plan, which has {axes} axes"))
+                }
+            }
             Entry::Run { .. } | Entry::Film(_) | Entry::Outside { .. } | Entry::End(_) => Ok(()),
         }
     }
@@ -331,6 +364,10 @@ impl State {
             Entry::Batch(batch) => {
                 self.counts.add(&batch.counts);
                 self.batches.insert(batch.batch, batch.clone());
+            }
+            Entry::Axis(axis) => {
+                self.counts.add(&axis.counts);
+                self.axes.insert(axis.axis, axis.clone());
             }
             Entry::CycleLost { counts, .. } | Entry::BatchLost { counts, .. } => self.counts.add(counts),
             Entry::Film(film) => self.film = Some(film.clone()),

@@ -63,9 +63,9 @@ impl ArrayName {
 /// The shapes of the stack's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StackShape {
-    /// Planned points of the sweep; of a film, its cycles; of a flying dot, its batches.
+    /// Planned points of the sweep; of a film, its cycles; of a flying dot, its batches; of a mirror, its axes.
     pub points: usize,
-    /// Exposures, each with a dark frame.
+    /// Exposures, each with a dark frame; none of a dot rig.
     pub exposures: usize,
     /// Camera rows, axis t.
     pub rows: usize,
@@ -103,8 +103,13 @@ impl StackShape {
         self.dots > 0
     }
 
+    /// Whether the points are axes of a mirror, whose records are products; there is no stack then.
+    pub fn is_axes(&self) -> bool {
+        self.exposures == 0 && !self.is_film() && !self.is_batches()
+    }
+
     fn is_sweep(&self) -> bool {
-        !self.is_film() && !self.is_batches()
+        !self.is_film() && !self.is_batches() && !self.is_axes()
     }
 
     /// The arrays of the stack.
@@ -114,7 +119,7 @@ impl StackShape {
 
     pub(crate) fn check(&self) -> Result<()> {
         let found = vec![self.points, self.exposures, self.rows, self.columns];
-        let has_stack = !self.is_batches();
+        let has_stack = !self.is_batches() && !self.is_axes();
         if found.iter().enumerate().any(|(axis, &len)| len == 0 && (axis != 1 || has_stack)) {
             return Err(Error::Shape {
                 what: "the stack [points, exposures, rows, columns]".into(),

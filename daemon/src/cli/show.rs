@@ -145,6 +145,23 @@ pub(super) fn check(report: &CheckReport) -> String {
         rows.insert(2, ("dark", format!("{} frames before the first batch", batches.dark_frames)));
         rows.push(("a batch", format!("about {} on disk", BinaryBytes(batches.disk_bytes_per_batch))));
     }
+    if let Some(response) = &report.response {
+        rows.truncate(5);
+        let [low_hz, high_hz] = response.band_hz;
+        rows[0] = (
+            "chirps",
+            format!(
+                "x, then y: {low_hz} to {high_hz} Hz in {} s, {} degrees to either side, then {} s at rest",
+                response.chirp_s, response.amplitude_deg, response.rest_s
+            ),
+        );
+        let pace = format!(
+            "{} frames an axis, {:.0} frames/s; mirror: {} samples at {:.0} Hz",
+            response.frames, response.camera_rate_hz, response.samples, response.rate_hz
+        );
+        rows.insert(1, ("pace", pace));
+        rows.insert(2, ("dark", format!("{} frames before the first chirp", response.dark_frames)));
+    }
     rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
     better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.sweep.trim_end()))

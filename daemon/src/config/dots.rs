@@ -142,12 +142,33 @@ pub struct MirrorSection {
     /// The most that the mirror takes of it, from its data sheet.
     #[serde(default)]
     max_drive: DriveTable,
-    /// The axes' responses, x and y, as identified; paths are then distorted beforehand so that the mirror follows them.
-    pub response: Option<[SecondOrder; 2]>,
+    /// How the axes answer; paths are then distorted beforehand so that the mirror follows them.
+    pub response: Option<ResponseKey>,
     /// A file that begins with `1` while the interlock is closed, such as a GPIO's value; left out: the operator's word.
     pub interlock: Option<PathBuf>,
     /// The port whose RTS line enables the laser, for the driver `optotune`.
     pub laser_port: Option<PathBuf>,
+}
+
+/// `mirror.response`
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "\"identified\", or [{ f0_hz = .., q = .. }, { f0_hz = .., q = .. }] of x and y"
+)]
+pub enum ResponseKey {
+    /// As a plan of kind `response` has found it.
+    Found(Identified),
+    /// As stated here, x and y.
+    Stated([SecondOrder; 2]),
+}
+
+/// The word `identified`.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Identified {
+    /// It has no other.
+    Identified,
 }
 
 #[derive(Debug, Clone, Copy, Default, Deserialize)]
@@ -255,9 +276,11 @@ impl DotRigFile {
                 (&["mirror", "limits", "bandwidth_hz"], limits.bandwidth_hz, 1.0, 1e5),
                 (&["mirror", "limits", "out_of_band"], limits.out_of_band.0, 0.0, limits.max_tilt.0),
             ]);
-            for SecondOrder { f0_hz, q } in mirror.response.iter().flatten() {
-                rules.push((&["mirror", "response"], *f0_hz, 1.0, 1e6));
-                rules.push((&["mirror", "response"], *q, 0.1, 1e5));
+            if let Some(ResponseKey::Stated(axes)) = &mirror.response {
+                for SecondOrder { f0_hz, q } in axes {
+                    rules.push((&["mirror", "response"], *f0_hz, 1.0, 1e6));
+                    rules.push((&["mirror", "response"], *q, 0.1, 1e5));
+                }
             }
         }
         for (path, value, low, high) in rules {
@@ -369,6 +392,14 @@ mod tests {
             (
                 MINIMAL.replace("[camera]\n", "[camera]\nwhite_exposure_us = 0\n"),
                 "camera.white_exposure_us = 0",
+            ),
+            (MINIMAL.replace("[mirror]\n", "[mirror]\nresponse = \"measured\"\n"), "\"identified\", or ["),
+            (
+                MINIMAL.replace(
+                    "[mirror]\n",
+                    "[mirror]\nresponse = [{ f0_hz = 0, q = 9 }, { f0_hz = 9, q = 9 }]\n",
+                ),
+                "mirror.response = 0",
             ),
             (format!("{MINIMAL}[sim.dots]\nscenes = 3\n"), "scenes"),
             (format!("{MINIMAL}[sim.dots.camera]\nlate = 3\n"), "late"),

@@ -5,6 +5,7 @@ mod dots;
 mod film;
 mod plan;
 mod product;
+mod response;
 mod rig;
 mod vsync;
 
@@ -13,10 +14,13 @@ use std::ops::Range;
 use toml::de::DeValue;
 
 pub use batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
-pub use dots::{DotCameraDriver, DotCameraSection, DotRigFile, DotSimSection, MirrorDriver, MirrorSection};
+pub use dots::{
+    DotCameraDriver, DotCameraSection, DotRigFile, DotSimSection, MirrorDriver, MirrorSection, ResponseKey,
+};
 pub use film::FilmPlan;
 pub use plan::{Axis, Plan, PlanKind, StageTable, Sweep};
 pub use product::{ProductTable, append_argument};
+pub use response::ResponsePlan;
 pub use rig::{
     CameraDriver, CameraNoise, CameraSection, DrmSection, ProjectorDriver, ProjectorSection, RigFile, RigKind,
 };

@@ -4,7 +4,7 @@ use raysweep_pipeline::{Point, Role, Schedule};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use super::{BatchesPlan, ConfigError, FilmPlan, ProductTable, span_of};
+use super::{BatchesPlan, ConfigError, FilmPlan, ProductTable, ResponsePlan, span_of};
 
 /// A plan.
 #[derive(Debug, Clone, Deserialize)]
@@ -24,6 +24,9 @@ pub struct Plan {
     /// `[batches]`, where it is a flying dot's.
     #[serde(default)]
     pub batches: BatchesPlan,
+    /// `[response]`, where it is a mirror's.
+    #[serde(default)]
+    pub response: ResponsePlan,
     /// `[[stage]]`: stages in order, then folds; none: `demux`.
     #[serde(default = "default_stages")]
     pub stage: Vec<StageTable>,
@@ -41,10 +44,12 @@ pub enum PlanKind {
     Film,
     /// Batches of frames of a flying dot.
     Batches,
+    /// Chirps of a mirror, from which its resonances are identified.
+    Response,
 }
 
 impl PlanKind {
-    const ALL: [Self; 3] = [Self::Sweep, Self::Film, Self::Batches];
+    const ALL: [Self; 4] = [Self::Sweep, Self::Film, Self::Batches, Self::Response];
 
     /// Its name in plans, which is also that of its table.
     pub fn name(self) -> &'static str {
@@ -52,6 +57,7 @@ impl PlanKind {
             Self::Sweep => "sweep",
             Self::Film => "film",
             Self::Batches => "batches",
+            Self::Response => "response",
         }
     }
 }
@@ -173,7 +179,7 @@ impl Plan {
             PlanKind::Sweep => self.sweep.max_jitter_us,
             PlanKind::Film => self.film.max_jitter_us,
             // A flying dot has no line to be late for.
-            PlanKind::Batches => f64::INFINITY,
+            PlanKind::Batches | PlanKind::Response => f64::INFINITY,
         }
     }
 
@@ -191,8 +197,14 @@ impl Plan {
                 return Err(ConfigError::at(text, &[other], message));
             }
         }
+        let unused = ["stage", "product"].into_iter().find(|key| span_of(text, &[*key]).is_some());
+        if let (PlanKind::Response, Some(key)) = (self.kind, unused) {
+            let message = format!("kind = \"response\" has no [[{key}]]: leave it out");
+            return Err(ConfigError::at(text, &[key], message));
+        }
         self.film.check(text)?;
         self.batches.check(text)?;
+        self.response.check(text)?;
         if self.name.trim().is_empty() {
             return Err(ConfigError::at(text, &["name"], "name is empty: give the session a name"));
         }

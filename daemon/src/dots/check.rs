@@ -86,6 +86,7 @@ pub(crate) fn check(
             raw_bytes_per_s: (plan.camera_rate_hz() * frame_bytes as f64) as u64,
             disk_bytes_per_batch: batch_bytes,
         }),
+        response: None,
         warnings,
     })
 }

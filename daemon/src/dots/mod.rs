@@ -22,6 +22,7 @@ pub(crate) use self::product::DotSpec;
 pub(crate) use self::results::{keep_patterns, make};
 use crate::config::{BatchesPlan, ConfigError, DotRigFile, Plan, PlanKind, StageTable};
 use crate::processing::SATURATION;
+use crate::response::Predistortion;
 
 /// A plan of batches on a dot rig: everything that acquisition and processing have in common.
 pub struct DotTask {
@@ -33,6 +34,8 @@ pub struct DotTask {
     pub format: PixelFormat,
     /// What the mirror is told to do in a batch.
     pub path: MirrorPath,
+    /// By what that was distorted beforehand.
+    pub predistortion: Option<Predistortion>,
     /// What is made of the batches.
     pub specs: Vec<DotSpec>,
     /// What is known and done of single pixels.
@@ -69,7 +72,8 @@ impl Default for CorrectOptions {
 }
 
 impl DotTask {
-    /// A plan on a rig with a camera of this size (rows, columns); `text` is the plan's.
+    /// A plan on a rig with a camera of this size (rows, columns); `text` is the plan's. `folder` has what was identified
+    /// of the rig's mirror, if the rig file wants that: the daemon's data, or the session.
     ///
     /// # Errors
     /// With the place in the plan's text, for what this rig cannot do.
@@ -79,10 +83,12 @@ impl DotTask {
         rig: &DotRigFile,
         format: PixelFormat,
         size: (usize, usize),
+        folder: &Path,
     ) -> Result<Self, ConfigError> {
         if plan.kind != PlanKind::Batches {
             let name = plan.kind.name();
-            let message = format!("kind = \"{name}\": a dot rig runs plans of kind \"batches\"");
+            let message =
+                format!("kind = \"{name}\": a dot rig runs plans of kind \"batches\" and \"response\"");
             return Err(ConfigError::at(text, &["kind"], message));
         }
         let refused = |path: &[&str], message: String| ConfigError::at(text, path, message);
@@ -96,13 +102,16 @@ impl DotTask {
         let broken = |error: PathError| refused(&["batches", "path"], format!("batches.path: {error}"));
         let limits = rig.limits();
         let wanted = plan.batches.mirror_path(&limits).map_err(broken)?;
-        let path = match rig.mirror.as_ref().and_then(|mirror| mirror.response) {
-            Some(responses) => wanted.predistorted(responses, &limits).map_err(broken)?,
+        let predistortion = Predistortion::of(rig, folder)?;
+        let path = match &predistortion {
+            Some(Predistortion { responses, .. }) => {
+                wanted.predistorted(*responses, &limits).map_err(broken)?
+            }
             None => wanted,
         };
         let specs = DotSpec::all(&plan, text)?;
         let (correct, denoise) = stages(&plan, text)?;
-        Ok(Self { plan, shape, format, path, specs, correct, denoise })
+        Ok(Self { plan, shape, format, path, predistortion, specs, correct, denoise })
     }
 
     /// The plan's own table.
@@ -140,10 +149,7 @@ impl DotTask {
 
     /// How the sensor samples colour.
     pub fn sampling(&self) -> Sampling {
-        match self.format.mosaic.red() {
-            None => Sampling::Full,
-            Some(_) => Sampling::Bayer,
-        }
+        sampling(self.format)
     }
 
     /// What makes columns of frames.
@@ -162,6 +168,14 @@ impl DotTask {
             .dots
             .make(name, Value::Object(options.clone()), correction)
             .map_err(|error| ConfigError::at(text, &["stage", &index, "name"], error.to_string()))
+    }
+}
+
+/// How a sensor with this format samples colour.
+pub(crate) fn sampling(format: PixelFormat) -> Sampling {
+    match format.mosaic.red() {
+        None => Sampling::Full,
+        Some(_) => Sampling::Bayer,
     }
 }
 

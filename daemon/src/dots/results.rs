@@ -18,6 +18,7 @@ use super::calibration::{Calibration, read_batch};
 use super::product::{DotSpec, Scene, light_of, read_pattern};
 use super::report::{self, Strip};
 use crate::config::DotRigFile;
+use crate::response::Predistortion;
 
 /// What was made of a session, and what was not.
 pub struct Made {
@@ -231,6 +232,7 @@ fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRig
         "background_indices": plan.background_indices,
         "samples": task.path.points().len(),
         "rate_hz": task.path.rate_hz(),
+        "mirror_response": task.predistortion.as_ref().map(Predistortion::to_json),
     });
     let settings = settings.as_object().cloned().unwrap_or_default();
     manifest::write(session, state, software, settings)?;

@@ -10,12 +10,13 @@ use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
 
 use super::board::Board;
-use super::dots::{self, DotRun};
+use super::dots::{self, DotRun, Recorded, ResponseRun};
 use super::engine::{self, Acquired, Run, RunError};
 use super::orders::{Order, Orders};
 use crate::dots as dot_rig;
 use crate::live::Outlet;
 use crate::processing::Task;
+use crate::response::Findings;
 use crate::results::{self, Results};
 use crate::rig::Rig;
 use crate::strips::Overview;
@@ -65,6 +66,38 @@ pub fn conduct_batches(run: DotRun, orders: &Orders, board: &Board, dir: &Path) 
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
     finish(ended, task.batches().total(), board, dir);
+}
+
+/// The run's thread where a mirror's response is identified; see [`conduct`].
+pub fn conduct_response(run: ResponseRun, board: &Board, dir: &Path) {
+    let (task, rig, data) = (run.task.clone(), run.rig.clone(), run.data.clone());
+    let points = task.stack_shape().points;
+    tracing::info!(session = %dir.display(), "run begins");
+    let ended = catch_unwind(AssertUnwindSafe(|| -> Result<(EndEntry, Vec<String>), RunError> {
+        let Recorded { session, mut ledger, mut fault } = run.acquire()?;
+        let stored = ledger.state().stored_points();
+        let is_whole = fault.is_none() && stored == points;
+        let findings = is_whole.then(|| Findings::of(&session, ledger.state(), &task)).transpose()?;
+        if let Some(findings) = &findings {
+            fault = findings.refusal().cloned().map(RunError::from);
+            // Before the ledger says that the run is complete.
+            findings.keep(&session, ledger.state(), Some(&data))?;
+        }
+        let state = match (&fault, is_whole) {
+            (Some(_), _) => EndState::Faulted,
+            (None, true) => EndState::Complete,
+            (None, false) => EndState::Cancelled,
+        };
+        let error = fault.map(|fault| fault.to_string());
+        let end = EndEntry { error, ..end_entry(state, stored, points - stored) };
+        ledger.append(&Entry::End(end.clone()))?;
+        if let Some(findings) = findings {
+            findings.write(&session, ledger.state(), &task, &rig.file)?;
+        }
+        Ok((end, Vec::new()))
+    }))
+    .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
+    finish(ended, points, board, dir);
 }
 
 /// Says how a run of so many points ended.

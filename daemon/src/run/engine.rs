@@ -25,6 +25,7 @@ use crate::config::ConfigError;
 use crate::film::{self, CyclePlan};
 use crate::live::{LiveEstimate, Outlet};
 use crate::processing::{Processing, Task, place};
+use crate::response::ResponseError;
 use crate::rig::{Devices, Pace, Rig, RigError};
 
 /// Attempts at a point before it stays missing.
@@ -64,6 +65,9 @@ pub enum RunError {
     /// The frames, or the calibration, of a dot rig cannot be used.
     #[error(transparent)]
     Dots(#[from] raysweep_transport::dots::DotsError),
+    /// The mirror's response is not known.
+    #[error(transparent)]
+    Response(#[from] ResponseError),
     /// A frame cannot be read.
     #[error("{0}")]
     Frame(String),

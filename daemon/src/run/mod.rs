@@ -29,9 +29,9 @@ use tokio::sync::broadcast;
 
 pub(crate) use self::board::Board;
 use self::board::WrongState;
-use self::conclude::{conduct, conduct_batches};
-use self::dots::DotRun;
+use self::conclude::{conduct, conduct_batches, conduct_response};
 pub(crate) use self::dots::FRAMES_UNDER_WAY;
+use self::dots::{DotRun, ResponseRun};
 use self::engine::Run;
 use self::orders::{Order, Orders};
 use crate::advice;
@@ -43,6 +43,7 @@ use crate::live::{LiveFile, Outlet};
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::mirror;
 use crate::processing::Task;
+use crate::response::{self, ResponseTask};
 use crate::results;
 use crate::rig::{AnyRig, DotRig, Rig, RigError};
 
@@ -141,11 +142,9 @@ impl Runner {
     fn foresee_batches(&self, rig: &DotRig, plan: &str) -> Result<(DotTask, CheckReport), RpcError> {
         let foreseen = || {
             let size = (self.camera.height, self.camera.width);
-            let task = DotTask::new(Plan::parse(plan)?, plan, &rig.file, self.camera.format, size)?;
-            let camera = CameraCapabilities {
-                exposure_us: *self.camera.exposure_us.start()..=1e6 / task.batches().camera_rate_hz(),
-                ..self.camera.clone()
-            };
+            let parsed = Plan::parse(plan)?;
+            let task = DotTask::new(parsed, plan, &rig.file, self.camera.format, size, &self.data)?;
+            let camera = self.camera_at(task.batches().camera_rate_hz());
             let limit_bytes = self.memory_limit_bytes;
             let report =
                 dot_rig::check::check(&task, plan, &self.registry, &camera, &self.data, limit_bytes)?;
@@ -154,11 +153,30 @@ impl Runner {
         foreseen().map_err(|error| invalid_plan(&error))
     }
 
+    /// A plan of a mirror's chirps on this rig, and what it would do.
+    fn foresee_response(&self, rig: &DotRig, plan: &str) -> Result<(ResponseTask, CheckReport), RpcError> {
+        let foreseen = || {
+            let size = (self.camera.height, self.camera.width);
+            let task = ResponseTask::new(Plan::parse(plan)?, plan, &rig.file, self.camera.format, size)?;
+            let camera = self.camera_at(task.response().camera_rate_hz);
+            let report = response::check::check(&task, plan, &camera, &self.data, self.memory_limit_bytes)?;
+            Ok((task, report))
+        };
+        foreseen().map_err(|error| invalid_plan(&error))
+    }
+
+    /// The rig's camera when it makes so many frames a second.
+    fn camera_at(&self, rate_hz: f64) -> CameraCapabilities {
+        let exposure_us = *self.camera.exposure_us.start()..=1e6 / rate_hz;
+        CameraCapabilities { exposure_us, ..self.camera.clone() }
+    }
+
     /// A plan on this rig, and what it would do.
     fn foresee(&self, rig: &Rig, plan: &str) -> Result<(Task, CheckReport), RpcError> {
         let parsed = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
-        if parsed.kind == PlanKind::Batches {
-            let message = "kind = \"batches\": a plane rig runs plans of kind \"sweep\" and \"film\"";
+        if matches!(parsed.kind, PlanKind::Batches | PlanKind::Response) {
+            let kind = parsed.kind.name();
+            let message = format!("kind = \"{kind}\": a plane rig runs plans of kind \"sweep\" and \"film\"");
             return Err(invalid_plan(&ConfigError::at(plan, &["kind"], message)));
         }
         let size = (self.camera.height, self.camera.width);
@@ -239,6 +257,9 @@ impl Runner {
         let task = Arc::new(task);
         let patterns = dot_rig::keep_patterns(&session, &task);
         patterns.map_err(|error| RpcError::new(ErrorCode::InvalidPlan, error))?;
+        if let Some(predistortion) = &task.predistortion {
+            predistortion.keep(&session).map_err(|error| storage(&error))?;
+        }
         self.board.set_session(dir.clone());
         let orders = Arc::new(Orders::default());
         let run = DotRun {
@@ -257,6 +278,33 @@ impl Runner {
         let thread = spawn_run({
             let (orders, dir) = (orders.clone(), dir.clone());
             move || conduct_batches(run, &orders, &board, &dir)
+        })?;
+        Ok((Started { session: dir }, Current { orders, thread }))
+    }
+
+    /// Prepares a run of a mirror's chirps and starts its thread.
+    fn begin_response(&self, rig: &Arc<DotRig>, params: &RunParams) -> Result<(Started, Current), RpcError> {
+        let (task, report) = self.foresee_response(rig, &params.plan)?;
+        self.check_room(&report, "take smaller frames")?;
+        let (name, shape) = (task.plan.name.clone(), task.stack_shape());
+        let (session, ledger) =
+            self.create_session(params, PlanKind::Response, &name, shape, 0, &rig.text)?;
+        let dir = session.dir().to_owned();
+        self.board.set_session(dir.clone());
+        let orders = Arc::new(Orders::default());
+        let run = ResponseRun {
+            rig: rig.clone(),
+            task: Arc::new(task),
+            session,
+            ledger,
+            data: self.data.clone(),
+            orders: orders.clone(),
+            board: self.board.clone(),
+        };
+        let board = self.board.clone();
+        let thread = spawn_run({
+            let dir = dir.clone();
+            move || conduct_response(run, &board, &dir)
         })?;
         Ok((Started { session: dir }, Current { orders, thread }))
     }
@@ -416,6 +464,7 @@ impl Control for Runner {
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
         let rig = match &self.rig {
             Bench::Plane(rig) => rig,
+            Bench::Dots(rig) if is_response(plan)? => return Ok(self.foresee_response(rig, plan)?.1),
             Bench::Dots(rig) => return Ok(self.foresee_batches(rig, plan)?.1),
         };
         let (task, mut report) = self.foresee(rig, plan)?;
@@ -431,6 +480,7 @@ impl Control for Runner {
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
         self.start(|| match &self.rig {
             Bench::Plane(rig) => self.spawn(rig, self.prepare_new(rig, &params)?),
+            Bench::Dots(rig) if is_response(&params.plan)? => self.begin_response(rig, &params),
             Bench::Dots(rig) => self.begin_batches(rig, &params),
         })
     }
@@ -487,6 +537,12 @@ impl Control for Runner {
     fn events(&self) -> broadcast::Receiver<Event> {
         self.board.subscribe()
     }
+}
+
+/// Whether a plan is one of a mirror's chirps.
+fn is_response(plan: &str) -> Result<bool, RpcError> {
+    let plan = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
+    Ok(plan.kind == PlanKind::Response)
 }
 
 fn invalid_plan(error: &ConfigError) -> RpcError {

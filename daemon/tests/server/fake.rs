@@ -140,6 +140,7 @@ pub fn report() -> CheckReport {
         }),
         film: None,
         batches: None,
+        response: None,
         warnings: vec!["few points".into()],
     }
 }

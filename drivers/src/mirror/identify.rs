@@ -2,6 +2,8 @@
 //!
 //! Per axis: the ratio of the two spectra is fitted with `g exp(-i 2 pi f delay) / (1 - r^2 + i r / Q)`, r = f / f0. The
 //! start comes from a straight problem, `1 / |H|^2 = (1 + (1/Q^2 - 2) r^2 + r^4) / g^2`; Gauss-Newton does the rest.
+//! A controller's low-pass bends the response over a wide band; where the whole band is refused, the neighbourhood of
+//! the largest movement is tried, in which the low-pass is little more than a gain and a delay.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::RangeInclusive;
@@ -15,18 +17,49 @@ const FREQUENCIES: usize = 400;
 const STEPS: usize = 30;
 /// Share of the measured movement that the model may leave unexplained.
 const LARGEST_RESIDUAL: f64 = 0.2;
+/// By how many half periods of the resonance the delay is tried to be another than the phases' slope says.
+const HALF_PERIODS: [i32; 5] = [0, -1, 1, -2, 2];
+/// Parts of its frequency to either side of the largest movement that are tried after the whole band.
+const NEIGHBOURHOODS: [f64; 3] = [0.4, 0.2, 0.1];
 
 /// What an axis answers to its command.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Identified {
     /// Its resonance.
     pub response: SecondOrder,
-    /// Measured angle over commanded angle at rest.
+    /// Measured angle over commanded angle at rest, as the band shows it; negative where they run against each other.
     pub gain: f64,
     /// How late it answers: the controller's filter, and the measurement.
     pub delay_s: f64,
     /// Share of the measured movement, in the band and by amplitude, that this does not explain.
     pub residual: f64,
+    /// The band in which it holds, lower and upper end.
+    pub band_hz: [f64; 2],
+}
+
+impl Identified {
+    /// What it makes of a command of this frequency.
+    pub fn at(&self, hz: f64) -> Transfer {
+        let Self { response: SecondOrder { f0_hz, q }, gain, delay_s, .. } = *self;
+        Transfer::new(hz, Model { gain, f0_hz, q, delay_s }.at(hz))
+    }
+}
+
+/// What becomes of a command of one frequency.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Transfer {
+    /// The frequency.
+    pub hz: f64,
+    /// Measured amplitude over commanded amplitude.
+    pub amplitude: f64,
+    /// By how much the measured angle is ahead, -pi to pi.
+    pub phase_rad: f64,
+}
+
+impl Transfer {
+    fn new(hz: f64, ratio: Complex64) -> Self {
+        Self { hz, amplitude: ratio.norm(), phase_rad: ratio.arg() }
+    }
 }
 
 /// Why nothing could be identified.
@@ -55,6 +88,16 @@ pub enum IdentifyError {
         "nothing moves between {low_hz} and {high_hz} Hz: command a chirp over that band and measure its angles"
     )]
     Still {
+        /// The band's lower end.
+        low_hz: f64,
+        /// The band's upper end.
+        high_hz: f64,
+    },
+    /// It resonates elsewhere, or not at all.
+    #[error(
+        "no resonance between {low_hz} and {high_hz} Hz: command a chirp over a band in which it lies, and see that the controller's filter lets it through"
+    )]
+    NoResonance {
         /// The band's lower end.
         low_hz: f64,
         /// The band's upper end.
@@ -90,7 +133,8 @@ pub fn chirp(
     sweep.chain(std::iter::repeat_n(0.0, rest)).collect()
 }
 
-/// Fits one axis. `commanded` and `measured` are degrees of the same kind, sample by sample, at rest at both ends.
+/// Fits one axis. `commanded` and `measured` are degrees of the same kind, sample by sample, at rest at both ends and
+/// 0 there; of another unit, the gain is by so much another.
 ///
 /// # Errors
 /// When the records, the band or the movement make no resonator.
@@ -100,6 +144,67 @@ pub fn identify(
     rate_hz: f64,
     band: &RangeInclusive<f64>,
 ) -> Result<Identified, IdentifyError> {
+    let points = points(commanded, measured, rate_hz, band)?;
+    let refused = match fit(&points, band) {
+        Ok(found) => return Ok(found),
+        Err(refused) => refused,
+    };
+    let Some(peak) = points.iter().max_by(|a, b| a.energy().total_cmp(&b.energy())) else {
+        return Err(refused);
+    };
+    for share in NEIGHBOURHOODS {
+        let near = peak.hz * (1.0 - share)..=peak.hz * (1.0 + share);
+        // A movement that is largest at the band's end is no resonance within it.
+        if band.contains(near.start())
+            && band.contains(near.end())
+            && let Ok(found) = fit(&self::points(commanded, measured, rate_hz, &near)?, &near)
+        {
+            return Ok(found);
+        }
+    }
+    Err(refused)
+}
+
+/// What the records say of frequencies over the band, evenly spaced, without a model.
+///
+/// # Errors
+/// When the records or the band make no spectra.
+pub fn transfer(
+    commanded: &[f64],
+    measured: &[f64],
+    rate_hz: f64,
+    band: &RangeInclusive<f64>,
+) -> Result<Vec<Transfer>, IdentifyError> {
+    let points = points(commanded, measured, rate_hz, band)?;
+    Ok(points.iter().map(|point| Transfer::new(point.hz, point.ratio)).collect())
+}
+
+/// The direction in which a track in a plane moves most within the band, as a unit vector. What is slower, as drift,
+/// has no say.
+pub fn direction(track: [&[f64]; 2], rate_hz: f64, band: &RangeInclusive<f64>) -> [f64; 2] {
+    let mut moments = [0.0; 3];
+    for hz in frequencies(band) {
+        let [a, b] = track.map(|values| spectrum_at(values, hz / rate_hz));
+        let products = [a.norm_sqr(), b.norm_sqr(), (a * b.conj()).re];
+        moments.iter_mut().zip(products).for_each(|(moment, product)| *moment += product);
+    }
+    let [aa, bb, ab] = moments;
+    let (sin, cos) = (0.5 * (2.0 * ab).atan2(aa - bb)).sin_cos();
+    [cos, sin]
+}
+
+fn frequencies(band: &RangeInclusive<f64>) -> impl Iterator<Item = f64> + use<> {
+    let (low_hz, high_hz) = (*band.start(), *band.end());
+    (0..FREQUENCIES).map(move |k| low_hz + (high_hz - low_hz) * k as f64 / (FREQUENCIES - 1) as f64)
+}
+
+/// The spectra over the band, where there are any.
+fn points(
+    commanded: &[f64],
+    measured: &[f64],
+    rate_hz: f64,
+    band: &RangeInclusive<f64>,
+) -> Result<Vec<Point>, IdentifyError> {
     if commanded.len() != measured.len() || commanded.len() < 100 {
         return Err(IdentifyError::Lengths { commanded: commanded.len(), measured: measured.len() });
     }
@@ -107,25 +212,38 @@ pub fn identify(
     if !(low_hz > 0.0 && low_hz < high_hz && high_hz <= rate_hz / 2.0) {
         return Err(IdentifyError::Band { low_hz, high_hz });
     }
-    let frequencies: Vec<f64> =
-        (0..FREQUENCIES).map(|k| low_hz + (high_hz - low_hz) * k as f64 / (FREQUENCIES - 1) as f64).collect();
-    let points: Vec<Point> = frequencies
-        .into_iter()
-        .map(|hz| {
-            let [command, answer] = [commanded, measured].map(|values| spectrum_at(values, hz / rate_hz));
-            Point { hz, command: command.norm(), ratio: answer / command }
-        })
-        .filter(|point| point.ratio.is_finite() && point.ratio.norm() > 0.0)
-        .collect();
-    let still = IdentifyError::Still { low_hz, high_hz };
-    let start = Model::start(&points).ok_or(still)?;
-    let model = start.refined(&points);
-    let residual = (model.error(&points) / points.iter().map(Point::energy).sum::<f64>()).sqrt();
-    if !(residual <= LARGEST_RESIDUAL && model.q > 0.0 && model.f0_hz > 0.0) {
+    let points = frequencies(band).map(|hz| {
+        let [command, answer] = [commanded, measured].map(|values| spectrum_at(values, hz / rate_hz));
+        Point { hz, command: command.norm(), ratio: answer / command }
+    });
+    let points: Vec<Point> =
+        points.filter(|point| point.ratio.is_finite() && point.ratio.norm() > 0.0).collect();
+    match points.len() {
+        0..2 => Err(IdentifyError::Still { low_hz, high_hz }),
+        _ => Ok(points),
+    }
+}
+
+fn fit(points: &[Point], band: &RangeInclusive<f64>) -> Result<Identified, IdentifyError> {
+    let [low_hz, high_hz] = [*band.start(), *band.end()];
+    let elsewhere = IdentifyError::NoResonance { low_hz, high_hz };
+    let Some(start) = Model::start(points) else { return Err(elsewhere) };
+    // A low-pass turns the phase by a line that misses 0: the delay may lack half periods of the resonance.
+    let refined = HALF_PERIODS.map(|halves| start.late_by(halves).refined(points));
+    let [first, others @ ..] = refined;
+    let better = |a: Model, b: Model| if b.error(points) < a.error(points) { b } else { a };
+    let model = others.into_iter().fold(first, better);
+    let residual = (model.error(points) / points.iter().map(Point::energy).sum::<f64>()).sqrt();
+    // Also for NaN.
+    if !(residual <= LARGEST_RESIDUAL) {
         return Err(IdentifyError::NoResonator { residual });
     }
+    if !(model.q > 0.0 && band.contains(&model.f0_hz)) {
+        return Err(elsewhere);
+    }
     let response = SecondOrder { f0_hz: model.f0_hz, q: model.q };
-    Ok(Identified { response, gain: model.gain, delay_s: model.delay_s, residual })
+    let Model { gain, delay_s, .. } = model;
+    Ok(Identified { response, gain, delay_s, residual, band_hz: [low_hz, high_hz] })
 }
 
 /// The spectra at one frequency.
@@ -186,7 +304,18 @@ impl Model {
             .sum();
         let spacing_hz = points.get(1)?.hz - points.first()?.hz;
         model.delay_s = -turns.arg() / (TAU * spacing_hz);
+        let agreement: f64 =
+            points.iter().map(|point| point.energy() * (point.ratio / model.at(point.hz)).re).sum();
+        if agreement < 0.0 {
+            model.gain = -model.gain;
+        }
         Some(model)
+    }
+
+    /// The same near the resonance, by half periods of it later.
+    fn late_by(self, halves: i32) -> Self {
+        let gain = if halves % 2 == 0 { self.gain } else { -self.gain };
+        Self { gain, delay_s: self.delay_s + f64::from(halves) / (2.0 * self.f0_hz), ..self }
     }
 
     fn denominator(&self, hz: f64) -> Complex64 {
@@ -325,6 +454,40 @@ mod tests {
     }
 
     #[test]
+    fn a_low_filter_hides_no_resonance_and_a_mirrored_axis_has_a_negative_gain() {
+        // The filter takes nine tenths of the movement at the resonance, and bends the rest of the band.
+        let config = MechanicsConfig { filter_hz: 200.0, q: [30.0, 20.0], ..Default::default() };
+        let (commanded, measured) = measure(config, 0.002);
+        for (axis, measured) in measured.iter().enumerate() {
+            let mirrored: Vec<f64> = measured.iter().map(|deg| -deg).collect();
+            let found = identify(&commanded, &mirrored, RATE_HZ, &BAND).unwrap();
+            let (f0, q) = (found.response.f0_hz / config.f0_hz[axis], found.response.q / config.q[axis]);
+            assert!((f0 - 1.0).abs() < 0.01 && (q - 1.0).abs() < 0.05, "axis {axis}: {found:?}");
+            let [low_hz, high_hz] = found.band_hz;
+            assert!(high_hz - low_hz < 0.5 * found.response.f0_hz, "not the whole band: {found:?}");
+        }
+        let config = MechanicsConfig { filter_hz: 5000.0, ..Default::default() };
+        let (commanded, [x, _]) = measure(config, 0.0);
+        let mirrored: Vec<f64> = x.iter().map(|deg| -2.0 * deg).collect();
+        let found = identify(&commanded, &mirrored, RATE_HZ, &BAND).unwrap();
+        assert!((found.gain / -2.0 - 1.0).abs() < 0.01 && found.delay_s < 0.001, "{found:?}");
+        for Transfer { hz, amplitude, .. } in transfer(&commanded, &mirrored, RATE_HZ, &BAND).unwrap() {
+            let fitted = found.at(hz).amplitude;
+            assert!((amplitude / fitted - 1.0).abs() < 0.1, "{amplitude}, fitted {fitted} at {hz} Hz");
+        }
+    }
+
+    #[test]
+    fn a_track_moves_along_its_line_whatever_drifts() {
+        let (_, [x, _]) = measure(MechanicsConfig { filter_hz: 5000.0, ..Default::default() }, 0.0);
+        let (sin, cos) = 0.3_f64.sin_cos();
+        let a: Vec<f64> = x.iter().map(|x| cos * x).collect();
+        let b: Vec<f64> = x.iter().enumerate().map(|(n, x)| sin * x + 1e-5 * n as f64).collect();
+        let [along_a, along_b] = direction([&a, &b], RATE_HZ, &BAND);
+        assert!((along_b / along_a - sin / cos).abs() < 0.02, "{along_a} {along_b}");
+    }
+
+    #[test]
     fn what_is_no_resonator_is_refused() {
         let (commanded, _) = measure(MechanicsConfig::default(), 0.0);
         let still = vec![0.0; commanded.len()];
@@ -336,6 +499,13 @@ mod tests {
         ));
         let wrong = 900.0..=100.0;
         assert!(matches!(identify(&commanded, &commanded, RATE_HZ, &wrong), Err(IdentifyError::Band { .. })));
+        // A mirror that is where it is commanded to be, and one whose resonance lies above the band.
+        let exact = identify(&commanded, &commanded, RATE_HZ, &BAND);
+        assert!(matches!(exact, Err(IdentifyError::NoResonance { .. })), "{exact:?}");
+        let config = MechanicsConfig { filter_hz: 5000.0, f0_hz: [1500.0, 1500.0], ..Default::default() };
+        let (commanded, [x, _]) = measure(config, 0.0);
+        let above = identify(&commanded, &x, RATE_HZ, &BAND);
+        assert!(matches!(above, Err(IdentifyError::NoResonance { .. })), "{above:?}");
         let nonsense: Vec<f64> =
             (0..commanded.len()).map(|n| ((n * n * 7919) % 1013) as f64 / 1013.0).collect();
         assert!(identify(&commanded, &nonsense, RATE_HZ, &BAND).is_err());

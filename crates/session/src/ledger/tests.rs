@@ -250,3 +250,25 @@ fn the_mean_delay_is_that_of_the_frames() {
     entry.delays_us.clear();
     assert_eq!(entry.mean_delay_us(), None);
 }
+
+#[test]
+fn records_of_a_mirrors_axes_are_points_of_their_own() {
+    let axis = |axis| Entry::Axis(AxisEntry { axis, frames: 8, lost: 3, empty: 0, counts: counts() });
+    let (_dir, path) = ledger_with(&[]);
+    assert!(
+        matches!(Ledger::open(&path).unwrap().append(&axis(0)), Err(Error::Entry { .. })),
+        "a sweep has none"
+    );
+    let dir = tempfile::tempdir().unwrap();
+    let shape = StackShape { points: 2, exposures: 0, rows: 3, columns: 5, settings: 0, dots: 0 };
+    let session = SessionEntry { kind: "response".into(), shape, ..session() };
+    let (session, mut ledger) = crate::Session::create(dir.path(), session, "plan", "rig").unwrap();
+    assert!(!session.stack_path().exists() && !session.dots_path().exists(), "records are products");
+    for entry in [axis(1), axis(0)] {
+        ledger.append(&entry).unwrap();
+    }
+    assert!(matches!(ledger.append(&axis(2)), Err(Error::Entry { .. })));
+    let state = session.state().unwrap();
+    assert_eq!(state.axes().map(|axis| axis.axis).collect::<Vec<_>>(), [0, 1]);
+    assert_eq!((state.stored_points(), state.counts.expected), (2, 24));
+}

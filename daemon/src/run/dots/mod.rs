@@ -2,33 +2,36 @@
 
 mod camera;
 mod motion;
+mod play;
+mod response;
 mod storage;
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::thread;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use raysweep_core::{Camera, Clock, Counts, FramePool, MirrorPath, SettingsId};
-use raysweep_pipeline::dots::{Arrival, DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
-use raysweep_pipeline::{PipelineError, Policy, Registry, message_of};
-use raysweep_proto::{Event, RunState};
+use raysweep_core::{Counts, FramePool, SettingsId};
+use raysweep_pipeline::dots::{DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
+use raysweep_pipeline::{Policy, Registry};
+use raysweep_proto::RunState;
 use raysweep_session::Session;
 use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::{Entry, Ledger};
 use raysweep_sim::dots::Subject;
 use raysweep_transport::dots::{DotsError, FlatField};
 
-use self::camera::{Refused, Source, Wanted};
+use self::camera::Refused;
 use self::motion::Motion;
+use self::play::Player;
+pub use self::response::{Recorded, ResponseRun};
 use self::storage::{RawSink, Storage, Stored, Writing};
 use super::board::Board;
 use super::engine::RunError;
-use super::orders::{Order, Orders};
+use super::orders::Orders;
 use crate::config::BatchesPlan;
 use crate::dots::{CorrectOptions, DotTask, flat};
 use crate::live::Outlet;
-use crate::rig::{DotDevices, DotRig, Pace, Stand};
+use crate::rig::{DotDevices, DotRig, Pace};
 
 /// Frames that may wait for the workers.
 const QUEUE_FRAMES: usize = 24;
@@ -109,14 +112,17 @@ impl DotRun {
             session: &self.session,
             earlier,
             orders: &self.orders,
-            board: &self.board,
             storage: &storage,
-            motion: &mut motion,
-            camera: &mut *camera,
-            pool: FramePool::new(FRAMES_UNDER_WAY, self.task.format.frame_bytes(shape.pixels())),
-            stand,
-            clock,
-            pace,
+            player: Player {
+                orders: &self.orders,
+                board: &self.board,
+                motion: &mut motion,
+                camera: &mut *camera,
+                pool: FramePool::new(FRAMES_UNDER_WAY, self.task.format.frame_bytes(shape.pixels())),
+                stand,
+                clock,
+                pace,
+            },
         };
         let passed = passes.all();
         let _ = self.board.go(RunState::Draining);
@@ -139,14 +145,8 @@ struct Passes<'a> {
     /// The flat field of an earlier session, if the plan names one.
     earlier: Option<FlatField>,
     orders: &'a Orders,
-    board: &'a Board,
     storage: &'a Storage,
-    motion: &'a mut Motion,
-    camera: &'a mut dyn Camera,
-    pool: FramePool,
-    stand: Stand,
-    clock: Clock,
-    pace: Pace,
+    player: Player<'a>,
 }
 
 impl Passes<'_> {
@@ -165,7 +165,7 @@ impl Passes<'_> {
         let mut first_batch = 0;
         let planes = plan.calibration.iter().enumerate().map(|(index, plane)| (Some(index), plane.batches));
         for (plane, batches) in planes.chain([(None, plan.count)]) {
-            self.place(plane.map_or(Subject::Scene, Subject::Plane))?;
+            self.player.place(plane.map_or(Subject::Scene, Subject::Plane), plan.calibration.len())?;
             if !self.orders.go_on() {
                 break;
             }
@@ -176,28 +176,6 @@ impl Passes<'_> {
             Some(raw) => Ok(raw.finish()?),
             None => Ok(()),
         }
-    }
-
-    /// Puts a subject before the camera; waits for the operator where that takes one.
-    fn place(&self, subject: Subject) -> Result<(), RunError> {
-        self.orders.wait_while_paused();
-        if !self.stand.place(subject)? {
-            let text = match subject {
-                Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
-                Subject::Plane(plane) => format!(
-                    "put calibration plane {} of {} before the camera",
-                    plane + 1,
-                    self.task.batches().calibration.len()
-                ),
-                Subject::Scene => "put the scene before the camera, and all else away".into(),
-            };
-            self.orders.give(Order::Pause);
-            if self.board.go(RunState::Paused).is_ok() {
-                self.board.publish(Event::Ask { text: format!("{text}, then `raysweep continue`") });
-                self.orders.wait_while_paused();
-            }
-        }
-        Ok(())
     }
 
     /// What is known of the sensor before the first dot; nothing if the run was told to end.
@@ -212,7 +190,7 @@ impl Passes<'_> {
         let field = match plan.flat_frames {
             0 => self.earlier.take(),
             frames => {
-                self.place(Subject::Diffuser)?;
+                self.player.place(Subject::Diffuser, plan.calibration.len())?;
                 let mut run = FlatRun::new(shape, saturation_dn, frames);
                 if !self.orders.go_on() || !self.without_light(frames, &mut |frame| run.push(frame))? {
                     return Ok(None);
@@ -238,7 +216,7 @@ impl Passes<'_> {
         let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
         let has_enough = AtomicBool::new(false);
         let rounds = task.batches().dark_rounds(wanted);
-        let lost = self.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+        let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
             // Whoever waits for the camera's last frame sees some more.
             if !has_enough.load(Ordering::Relaxed) {
                 let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
@@ -288,7 +266,7 @@ impl Passes<'_> {
             floor,
             threads: 0,
             queue_frames: QUEUE_FRAMES,
-            policy: match self.pace {
+            policy: match self.player.pace {
                 Pace::Pipeline => Policy::Wait,
                 Pace::Devices => Policy::Fail,
             },
@@ -297,7 +275,8 @@ impl Passes<'_> {
         let blind = flow.is_blind();
         let rounds = BatchesPlan::rounds(batches);
         let frames = u64::from(rounds) * u64::from(plan.dots);
-        let played = self.play(&task.path, rounds, frames, &blind, &mut |arrival| Ok(input.offer(arrival)?));
+        let played =
+            self.player.play(&task.path, rounds, frames, &blind, &mut |arrival| Ok(input.offer(arrival)?));
         drop(input);
         let Gathered { sink, background, error } = flow.join()?;
         let mut rest = Counts::default();
@@ -310,78 +289,5 @@ impl Passes<'_> {
             return Err(error.into());
         }
         Ok((Sensor { correction, background, floor }, sink.into_raw()))
-    }
-
-    /// Plays a path `rounds` times while the camera takes its frames: until the path is over, or, without a mirror,
-    /// until `frames` have come; sooner if `enough` is set or the run is told to end.
-    fn play(
-        &mut self,
-        path: &MirrorPath,
-        rounds: u32,
-        frames: u64,
-        enough: &AtomicBool,
-        deliver: &mut (dyn FnMut(Arrival) -> Result<(), Refused> + Send),
-    ) -> Result<Vec<Loss>, RunError> {
-        let orders = self.orders;
-        let (path_over, camera_over) = (AtomicBool::new(false), AtomicBool::new(false));
-        let is_driven = self.motion.is_driven();
-        self.motion.start(path, rounds)?;
-        let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
-        let taken = AtomicU64::new(0);
-        let wanted = || {
-            let is_over = match is_driven {
-                true => path_over.load(Ordering::Relaxed),
-                // The next frame of a recording is another pass'.
-                false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
-            };
-            match (orders.go_on(), is_over) {
-                (true, false) => Wanted::Frames,
-                (true, true) if is_driven => Wanted::Rest,
-                _ => Wanted::Nothing,
-            }
-        };
-        let mut deliver = |arrival| {
-            taken.fetch_add(1, Ordering::Relaxed);
-            deliver(arrival)
-        };
-        let clock = self.clock.clone();
-        let (fed, taken) = thread::scope(|scope| -> Result<_, PipelineError> {
-            let camera = thread::Builder::new()
-                .name("camera".into())
-                .spawn_scoped(scope, || {
-                    let over = SetOnDrop(&camera_over);
-                    let taken = source.take(&wanted, &mut deliver);
-                    drop(over);
-                    // A virtual clock stands still with a camera that nobody asks, and the mirror must come to rest.
-                    source.idle(&|| path_over.load(Ordering::Relaxed));
-                    taken
-                })
-                .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
-            let fed = {
-                let _over = SetOnDrop(&path_over);
-                let go_on = || {
-                    orders.go_on() && !enough.load(Ordering::Relaxed) && !camera_over.load(Ordering::Relaxed)
-                };
-                self.motion.play(&clock, &go_on)
-            };
-            if fed.is_err() {
-                orders.give(Order::Fault);
-            }
-            Ok((fed, camera.join()))
-        })?;
-        fed?;
-        match taken {
-            Ok(taken) => Ok(taken?),
-            Err(panic) => Err(RunError::Panicked(message_of(&*panic).to_owned())),
-        }
-    }
-}
-
-/// Tells the other thread that this one is over, also where it panics.
-struct SetOnDrop<'a>(&'a AtomicBool);
-
-impl Drop for SetOnDrop<'_> {
-    fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
     }
 }

@@ -1,0 +1,249 @@
+//! A run that finds out how a mirror answers: dark frames, then a chirp of each axis, on a plane.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use raysweep_core::{Counts, FramePool, SettingsId};
+use raysweep_pipeline::dots::{Arrival, DarkRun, Loss, Sensor};
+use raysweep_proto::{Event, RunState};
+use raysweep_session::Session;
+use raysweep_session::ledger::{AxisEntry, Entry, Ledger};
+use raysweep_sim::dots::Subject;
+
+use super::FRAMES_UNDER_WAY;
+use super::camera::Refused;
+use super::motion::Motion;
+use super::play::Player;
+use crate::dots::sampling;
+use crate::response::{AXES, DotFinder, Record, ResponseTask};
+use crate::rig::{DotDevices, DotRig};
+use crate::run::board::Board;
+use crate::run::engine::RunError;
+use crate::run::orders::Orders;
+use crate::run::storage::PaceMeter;
+
+/// Standard deviations beyond the others' from which on a pixel is hot.
+const HOT_SIGMAS: f64 = 8.0;
+/// Batches of dark frames that their mean is worth.
+const BACKGROUND_BATCHES: u32 = 64;
+
+/// Everything that one run needs.
+pub struct ResponseRun {
+    /// The rig.
+    pub rig: Arc<DotRig>,
+    /// The plan on it.
+    pub task: Arc<ResponseTask>,
+    /// Its session.
+    pub session: Session,
+    /// Its ledger, locked for this run.
+    pub ledger: Ledger,
+    /// The daemon's data folder, where the mirror's state is kept, and its response will be.
+    pub data: PathBuf,
+    /// What it is told.
+    pub orders: Arc<Orders>,
+    /// What it tells.
+    pub board: Arc<Board>,
+}
+
+/// What acquisition leaves behind.
+pub struct Recorded {
+    /// The session.
+    pub session: Session,
+    /// Its ledger, still locked.
+    pub ledger: Ledger,
+    /// Why acquisition ended early, if a fault ended it.
+    pub fault: Option<RunError>,
+}
+
+impl ResponseRun {
+    /// Records both axes.
+    ///
+    /// # Errors
+    /// When the run could not begin. A fault on the way is in [`Recorded::fault`]: what was recorded is kept.
+    pub fn acquire(mut self) -> Result<Recorded, RunError> {
+        self.ledger.append(&Entry::Run { started: jiff::Timestamp::now(), resumed: false })?;
+        let task = self.task.clone();
+        let rate_hz = task.response().camera_rate_hz;
+        let DotDevices { mut camera, mirror, stand, clock, pace, .. } = self.rig.open(&self.data, rate_hz)?;
+        let mut motion = Motion::new(mirror);
+        let found = (camera.capabilities().height, camera.capabilities().width);
+        let expected = (task.shape.height(), task.shape.width());
+        if found != expected {
+            return Err(RunError::OtherCamera { found, expected });
+        }
+        camera.configure(SettingsId { point: 0, attempt: 0 }, &task.camera_settings())?;
+        camera.arm()?;
+        let _ = self.board.go(RunState::Armed);
+        let _ = self.board.go(RunState::Running);
+        let (orders, board) = (self.orders.clone(), self.board.clone());
+        let mut player = Player {
+            orders: &orders,
+            board: &board,
+            motion: &mut motion,
+            camera: &mut *camera,
+            pool: FramePool::new(FRAMES_UNDER_WAY, task.format.frame_bytes(task.shape.pixels())),
+            stand,
+            clock,
+            pace,
+        };
+        let passed = self.passes(&mut player);
+        let _ = board.go(RunState::Draining);
+        // Light off before anything else ends.
+        drop(motion);
+        if let Err(error) = camera.disarm() {
+            tracing::warn!(%error, "camera not disarmed");
+        }
+        Ok(Recorded { session: self.session, ledger: self.ledger, fault: passed.err() })
+    }
+
+    fn passes(&mut self, player: &mut Player<'_>) -> Result<(), RunError> {
+        let mut pace = PaceMeter::new(0, AXES.len());
+        player.place(Subject::Plane(0), 1)?;
+        if !self.orders.go_on() {
+            return Ok(());
+        }
+        let sensor = self.sensor(player, &mut pace)?;
+        let Some(sensor) = sensor.filter(|_| self.orders.go_on()) else { return Ok(()) };
+        let finder = DotFinder::new(self.task.shape, self.task.region.clone(), &sensor);
+        for axis in 0..AXES.len() {
+            self.orders.wait_while_paused();
+            if !self.orders.go_on() {
+                break;
+            }
+            self.axis(axis, player, &finder, &mut pace)?;
+        }
+        Ok(())
+    }
+
+    /// What is known of the sensor in the dark; nothing if the run was told to end.
+    fn sensor(&mut self, player: &mut Player<'_>, pace: &mut PaceMeter) -> Result<Option<Sensor>, RunError> {
+        let (task, orders) = (self.task.clone(), self.orders.clone());
+        let wanted = task.response().dark_frames;
+        let mut dark = DarkRun::new(task.shape, task.saturation_dn(), wanted, BACKGROUND_BATCHES)?;
+        let path = task.paths[0].clone().with_light(|_| 0);
+        let rounds = wanted.div_ceil(task.frames() as u32) + 1;
+        let has_enough = AtomicBool::new(false);
+        let mut arrivals = Arrivals::new(&task);
+        let after = player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+            arrivals.take(&arrival, |_, counts| {
+                if !has_enough.load(Ordering::Relaxed) {
+                    has_enough.store(!dark.push(counts)?, Ordering::Relaxed);
+                }
+                Ok(())
+            })
+        })?;
+        let counts = arrivals.account(&after, 0)?;
+        // No record waits for any of them.
+        let settling = Counts { settling: counts.cancelled, cancelled: 0, ..counts };
+        self.append(&Entry::Outside { counts: settling.clone() }, settling, pace)?;
+        match orders.go_on() {
+            true => Ok(Some(dark.finish(HOT_SIGMAS, None, sampling(task.format))?)),
+            false => Ok(None),
+        }
+    }
+
+    /// Records the chirp of one axis.
+    fn axis(
+        &mut self,
+        axis: usize,
+        player: &mut Player<'_>,
+        finder: &DotFinder,
+        pace: &mut PaceMeter,
+    ) -> Result<(), RunError> {
+        let task = self.task.clone();
+        let mut record = Record::new(task.commanded_deg(axis));
+        let frames = record.commanded_deg.len();
+        let (mut came, mut shown) = (0, 0);
+        let mut arrivals = Arrivals::new(&task);
+        let never = AtomicBool::new(false);
+        let after = player.play(&task.paths[axis], 1, frames as u64, &never, &mut |arrival| {
+            arrivals.take(&arrival, |frame, counts| {
+                if frame < frames {
+                    came += 1;
+                    if let Some(place) = finder.find(counts) {
+                        record.note(frame, place);
+                        shown += 1;
+                    }
+                }
+                Ok(())
+            })
+        })?;
+        let counts = arrivals.account(&after, shown)?;
+        if !self.orders.go_on() {
+            // A record that was cut short is none.
+            let counts = Counts { cancelled: counts.cancelled + counts.averaged, averaged: 0, ..counts };
+            return self.append(&Entry::Outside { counts: counts.clone() }, counts, pace);
+        }
+        record.write(&self.session, axis, &task)?;
+        pace.stored += 1;
+        let empty = came - shown as usize;
+        let entry = AxisEntry { axis, frames, lost: frames - came, empty, counts: counts.clone() };
+        self.append(&Entry::Axis(entry), counts, pace)
+    }
+
+    fn append(&mut self, entry: &Entry, counts: Counts, pace: &mut PaceMeter) -> Result<(), RunError> {
+        self.ledger.append(entry)?;
+        pace.counts.add(&counts);
+        self.board.publish(Event::Progress(pace.progress()));
+        Ok(())
+    }
+}
+
+/// The frames of a path by their ids, unpacked into one buffer, and where its triggers went.
+struct Arrivals<'a> {
+    task: &'a ResponseTask,
+    pixels: Vec<u16>,
+    /// Ids of the first and of the newest frame.
+    ids: Option<(u64, u64)>,
+    counts: Counts,
+    failed: Option<RunError>,
+}
+
+impl<'a> Arrivals<'a> {
+    fn new(task: &'a ResponseTask) -> Self {
+        let pixels = vec![0; task.shape.values()];
+        Self { task, pixels, ids: None, counts: Counts::default(), failed: None }
+    }
+
+    /// Unpacks a frame that is new and hands it on with its number, counted from the first that came.
+    fn take(
+        &mut self,
+        arrival: &Arrival,
+        each: impl FnOnce(usize, &[u16]) -> Result<(), RunError>,
+    ) -> Result<(), Refused> {
+        self.lose(&arrival.lost_before);
+        let seq = arrival.frame.stamp.seq;
+        if self.ids.is_some_and(|(_, newest)| seq <= newest) {
+            return Ok(());
+        }
+        let first = self.ids.map_or(seq, |(first, _)| first);
+        self.ids = Some((first, seq));
+        self.counts.expected += 1;
+        self.counts.cancelled += 1;
+        let unpacked = self.task.format.unpack_into(&arrival.frame.data, &mut self.pixels);
+        let done = unpacked
+            .map_err(|error| RunError::Frame(error.to_string()))
+            .and_then(|()| each((seq - first) as usize, &self.pixels));
+        done.map_err(|error| {
+            self.failed = Some(error);
+            Refused::Closed
+        })
+    }
+
+    fn lose(&mut self, losses: &[Loss]) {
+        for loss in losses {
+            self.counts.expected += loss.frames;
+            self.counts.lose(loss.cause, loss.frames);
+        }
+    }
+
+    /// Where the triggers went: `used` of the frames into a record, the others nowhere.
+    fn account(mut self, after: &[Loss], used: u64) -> Result<Counts, RunError> {
+        self.lose(after);
+        let Self { mut counts, failed, .. } = self;
+        counts.cancelled -= used;
+        counts.averaged += used;
+        failed.map_or(Ok(counts), Err)
+    }
+}
