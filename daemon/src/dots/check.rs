@@ -10,7 +10,8 @@ use raysweep_transport::dots::Correction;
 use super::{DotTask, allows, free_bytes, place_of};
 use crate::config::{BatchesPlan, ConfigError};
 use crate::memory::available_bytes;
-use crate::run::FRAMES_UNDER_WAY;
+use crate::rig::Pace;
+use crate::run::{FRAMES_AT_WORK, frames_waiting};
 
 /// Bytes of a dot's column on the disk, beside its residual: measured on rendered scenes with dots of 32 pixels.
 const COLUMN_BYTES: u64 = 4600;
@@ -28,6 +29,7 @@ pub(crate) fn check(
     text: &str,
     registry: &Registry,
     camera: &CameraCapabilities,
+    pace: Pace,
     data: &Path,
     memory_limit_bytes: Option<u64>,
 ) -> Result<CheckReport, ConfigError> {
@@ -45,6 +47,7 @@ pub(crate) fn check(
     let batch_s = plan.path.duration_s();
     let dots = u64::from(plan.dots);
     let frame_bytes = task.format.frame_bytes(task.shape.pixels()) as u64;
+    let frames = frames_waiting(pace, plan.camera_rate_hz(), frame_bytes as usize) + FRAMES_AT_WORK;
     let residual_bytes = 4 * task.shape.blocks() as u64;
     let batch_bytes = dots * (COLUMN_BYTES.min(5 * task.shape.pixels() as u64) + residual_bytes);
     let total = plan.total() as u64;
@@ -64,9 +67,7 @@ pub(crate) fn check(
         extra_points: 0,
         frames: u64::from(rounds) * dots,
         light_s: f64::from(rounds) * batch_s,
-        memory_bytes: FRAMES_UNDER_WAY as u64 * frame_bytes
-            + BATCHES_IN_MEMORY * batch_bytes
-            + 16 * image_bytes,
+        memory_bytes: frames as u64 * frame_bytes + BATCHES_IN_MEMORY * batch_bytes + 16 * image_bytes,
         memory_free_bytes: available_bytes(memory_limit_bytes),
         disk_bytes: total * (batch_bytes + 4 * 8 * image_bytes) + raw_bytes + OTHER_BYTES,
         disk_free_bytes: free_bytes(data),

@@ -9,7 +9,7 @@ use super::{AXES, ResponseTask};
 use crate::config::ConfigError;
 use crate::dots::free_bytes;
 use crate::memory::available_bytes;
-use crate::run::FRAMES_UNDER_WAY;
+use crate::run::FRAMES_AT_WORK;
 
 /// Bytes of a frame's line in the records: three numbers, as text and as floats.
 const LINE_BYTES: u64 = 96;
@@ -40,7 +40,7 @@ pub(crate) fn check(
         extra_points: 0,
         frames: frames * axes as u64 + u64::from(plan.dark_frames),
         light_s: axes as f64 * plan.duration_s(),
-        memory_bytes: FRAMES_UNDER_WAY as u64 * frame_bytes + DARK_BYTES * task.shape.pixels() as u64,
+        memory_bytes: FRAMES_AT_WORK as u64 * frame_bytes + DARK_BYTES * task.shape.pixels() as u64,
         memory_free_bytes: available_bytes(memory_limit_bytes),
         disk_bytes: frames * axes as u64 * LINE_BYTES + OTHER_BYTES,
         disk_free_bytes: free_bytes(data),

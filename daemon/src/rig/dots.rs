@@ -105,6 +105,20 @@ impl DotRig {
         self.sim.as_deref()
     }
 
+    /// Who sets the pace of a run.
+    pub fn pace(&self) -> Pace {
+        let has_own_mirror =
+            self.file.mirror.as_ref().is_some_and(|mirror| mirror.driver != MirrorDriver::Sim);
+        let waits = match self.file.camera.driver {
+            DotCameraDriver::Sim => !self.file.sim.dots.realtime && !has_own_mirror,
+            DotCameraDriver::Replay => {
+                self.file.camera.replay.as_ref().is_none_or(|replay| replay.pace == ReplayPace::Pipeline)
+            }
+            _ => false,
+        };
+        if waits { Pace::Pipeline } else { Pace::Devices }
+    }
+
     /// Opens all devices; the mirror's driver keeps its state in the daemon's data folder. A camera that sets its own
     /// pace makes `frame_rate_hz` frames a second.
     ///
@@ -113,35 +127,29 @@ impl DotRig {
     pub fn open(&self, data: &Path, frame_rate_hz: f64) -> Result<DotDevices, RigError> {
         let mirror = self.open_mirror(data)?;
         if let Some(sim) = &self.sim {
-            let pace =
-                if self.file.sim.dots.realtime || mirror.is_some() { Pace::Devices } else { Pace::Pipeline };
             let DotsDevices { camera, mirror, subject, clock, truth } = sim.open(frame_rate_hz, mirror);
             return Ok(DotDevices {
                 camera,
                 mirror: Some(mirror),
                 stand: Stand::Simulated(subject),
                 clock,
-                pace,
+                pace: self.pace(),
                 truth: Some(truth),
             });
         }
-        let (camera, pace, stand): (Box<dyn Camera>, _, _) = match self.file.camera.driver {
+        let (camera, stand): (Box<dyn Camera>, _) = match self.file.camera.driver {
             DotCameraDriver::Replay => {
                 let Some(replay) = &self.file.camera.replay else {
                     return Err(RigError::Config("[camera.replay] is missing".into()));
                 };
-                let pace = match replay.pace {
-                    ReplayPace::Pipeline => Pace::Pipeline,
-                    ReplayPace::Recorded => Pace::Devices,
-                };
                 let config = ReplayConfig { path: self.folder.join(&replay.path), ..replay.clone() };
                 let format = self.file.camera.pixel_format;
-                (Box::new(ReplayCamera::open(&config, format, frame_rate_hz)?), pace, Stand::Recorded)
+                (Box::new(ReplayCamera::open(&config, format, frame_rate_hz)?), Stand::Recorded)
             }
-            DotCameraDriver::Aravis => (self.open_aravis(frame_rate_hz)?, Pace::Devices, Stand::Operator),
-            _ => (self.open_v4l2(frame_rate_hz)?, Pace::Devices, Stand::Operator),
+            DotCameraDriver::Aravis => (self.open_aravis(frame_rate_hz)?, Stand::Operator),
+            _ => (self.open_v4l2(frame_rate_hz)?, Stand::Operator),
         };
-        Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace, truth: None })
+        Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace: self.pace(), truth: None })
     }
 
     /// Opens the mirror alone, if it has a driver of its own, which keeps its state in the daemon's data folder.

@@ -30,8 +30,8 @@ use tokio::sync::broadcast;
 pub(crate) use self::board::Board;
 use self::board::WrongState;
 use self::conclude::{conduct, conduct_batches, conduct_response};
-pub(crate) use self::dots::FRAMES_UNDER_WAY;
 use self::dots::{DotRun, ResponseRun};
+pub(crate) use self::dots::{FRAMES_AT_WORK, frames_waiting};
 use self::engine::Run;
 use self::orders::{Order, Orders};
 use crate::advice;
@@ -146,8 +146,15 @@ impl Runner {
             let task = DotTask::new(parsed, plan, &rig.file, self.camera.format, size, &self.data)?;
             let camera = self.camera_at(task.batches().camera_rate_hz());
             let limit_bytes = self.memory_limit_bytes;
-            let report =
-                dot_rig::check::check(&task, plan, &self.registry, &camera, &self.data, limit_bytes)?;
+            let report = dot_rig::check::check(
+                &task,
+                plan,
+                &self.registry,
+                &camera,
+                rig.pace(),
+                &self.data,
+                limit_bytes,
+            )?;
             Ok((task, report))
         };
         foreseen().map_err(|error| invalid_plan(&error))

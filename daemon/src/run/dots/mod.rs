@@ -33,10 +33,25 @@ use crate::dots::{CorrectOptions, DotTask, flat};
 use crate::live::Outlet;
 use crate::rig::{DotDevices, DotRig, Pace};
 
-/// Frames that may wait for the workers.
-const QUEUE_FRAMES: usize = 24;
-/// Buffers of the pool: those that wait, those under work, and those of the beam dump that wait for their index.
-pub(crate) const FRAMES_UNDER_WAY: usize = 64;
+/// Frames that may wait for the workers where the source waits for room.
+const FEWEST_WAITING: usize = 24;
+/// How long a host may stand still, as virtual machines do, without loss of a frame; as far as memory goes.
+const STANDSTILL_S: f64 = 0.2;
+/// Most memory for frames that wait.
+const MOST_WAITING_BYTES: usize = 1 << 30;
+/// Buffers of the frames under work, and of those of the beam dump that wait for their index.
+pub(crate) const FRAMES_AT_WORK: usize = 40;
+
+/// Frames of a camera that may wait for the workers.
+pub(crate) fn frames_waiting(pace: Pace, rate_hz: f64, frame_bytes: usize) -> usize {
+    match pace {
+        Pace::Pipeline => FEWEST_WAITING,
+        Pace::Devices => {
+            let of_standstill = (STANDSTILL_S * rate_hz).ceil() as usize;
+            of_standstill.min(MOST_WAITING_BYTES / frame_bytes).max(FEWEST_WAITING)
+        }
+    }
+}
 
 /// Everything that one run needs.
 pub struct DotRun {
@@ -102,6 +117,8 @@ impl DotRun {
             orders: self.orders.clone(),
             live: self.live,
         })?;
+        let frame_bytes = self.task.format.frame_bytes(shape.pixels());
+        let waiting = frames_waiting(pace, rate_hz, frame_bytes);
         camera.arm()?;
         let _ = self.board.go(RunState::Armed);
         let _ = self.board.go(RunState::Running);
@@ -113,12 +130,13 @@ impl DotRun {
             earlier,
             orders: &self.orders,
             storage: &storage,
+            waiting,
             player: Player {
                 orders: &self.orders,
                 board: &self.board,
                 motion: &mut motion,
                 camera: &mut *camera,
-                pool: FramePool::new(FRAMES_UNDER_WAY, self.task.format.frame_bytes(shape.pixels())),
+                pool: FramePool::new(waiting + FRAMES_AT_WORK, frame_bytes),
                 stand,
                 clock,
                 pace,
@@ -146,6 +164,8 @@ struct Passes<'a> {
     earlier: Option<FlatField>,
     orders: &'a Orders,
     storage: &'a Storage,
+    /// Frames that may wait for the workers.
+    waiting: usize,
     player: Player<'a>,
 }
 
@@ -265,7 +285,7 @@ impl Passes<'_> {
             background,
             floor,
             threads: 0,
-            queue_frames: QUEUE_FRAMES,
+            queue_frames: self.waiting,
             policy: match self.player.pace {
                 Pace::Pipeline => Policy::Wait,
                 Pace::Devices => Policy::Fail,
@@ -289,5 +309,18 @@ impl Passes<'_> {
             return Err(error.into());
         }
         Ok((Sensor { correction, background, floor }, sink.into_raw()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_of_a_fifth_of_a_second_may_wait_where_the_camera_does_not_as_far_as_memory_goes() {
+        assert_eq!(frames_waiting(Pace::Pipeline, 13_500.0, 1 << 15), 24);
+        assert_eq!(frames_waiting(Pace::Devices, 13_500.0, 1 << 15), 2700);
+        assert_eq!(frames_waiting(Pace::Devices, 13_500.0, 1 << 21), 512);
+        assert_eq!(frames_waiting(Pace::Devices, 60.0, 1 << 21), 24);
     }
 }

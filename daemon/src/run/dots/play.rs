@@ -15,6 +15,7 @@ use crate::rig::{Pace, Stand};
 use crate::run::board::Board;
 use crate::run::engine::RunError;
 use crate::run::orders::{Order, Orders};
+use crate::run::priority;
 
 /// The devices of a run, and who is told and tells.
 pub struct Player<'a> {
@@ -71,6 +72,7 @@ impl Player<'_> {
         let is_driven = self.motion.is_driven();
         self.motion.start(path, rounds)?;
         let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
+        let (pace, is_simulated) = (self.pace, matches!(self.stand, Stand::Simulated(_)));
         let taken = AtomicU64::new(0);
         let wanted = || {
             let is_over = match is_driven {
@@ -93,6 +95,10 @@ impl Player<'_> {
             let camera = thread::Builder::new()
                 .name("camera".into())
                 .spawn_scoped(scope, || {
+                    // A simulated camera computes its frames here, which must give way to the workers.
+                    if pace == Pace::Devices && !is_simulated {
+                        priority::for_device("camera");
+                    }
                     let over = SetOnDrop(&camera_over);
                     let taken = source.take(&wanted, &mut deliver);
                     drop(over);

@@ -11,7 +11,7 @@ use raysweep_session::Session;
 use raysweep_session::ledger::{AxisEntry, Entry, Ledger};
 use raysweep_sim::dots::Subject;
 
-use super::FRAMES_UNDER_WAY;
+use super::FRAMES_AT_WORK;
 use super::camera::Refused;
 use super::motion::Motion;
 use super::play::Player;
@@ -82,7 +82,7 @@ impl ResponseRun {
             board: &board,
             motion: &mut motion,
             camera: &mut *camera,
-            pool: FramePool::new(FRAMES_UNDER_WAY, task.format.frame_bytes(task.shape.pixels())),
+            pool: FramePool::new(FRAMES_AT_WORK, task.format.frame_bytes(task.shape.pixels())),
             stand,
             clock,
             pace,
