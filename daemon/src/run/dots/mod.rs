@@ -12,7 +12,7 @@ use std::thread;
 use raysweep_core::{Camera, Clock, Counts, FramePool, MirrorPath, SettingsId};
 use raysweep_pipeline::dots::{Arrival, DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
 use raysweep_pipeline::{PipelineError, Policy, Registry, message_of};
-use raysweep_proto::{Event, RunState};
+use raysweep_proto::RunState;
 use raysweep_session::Session;
 use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::{Entry, Ledger};
@@ -192,10 +192,8 @@ impl Passes<'_> {
                 Subject::Scene => "put the scene before the camera, and all else away".into(),
             };
             self.orders.give(Order::Pause);
-            if self.board.go(RunState::Paused).is_ok() {
-                self.board.publish(Event::Ask { text: format!("{text}, then `raysweep continue`") });
-                self.orders.wait_while_paused();
-            }
+            self.board.ask(&text);
+            self.orders.wait_while_paused();
         }
         Ok(())
     }
