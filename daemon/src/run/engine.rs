@@ -238,6 +238,7 @@ impl Run {
         let mut passes = Passes {
             task: &self.task,
             camera: &camera,
+            vsync: &vsync,
             projector,
             results: &results,
             orders: &self.orders,
@@ -365,6 +366,7 @@ pub fn missing(task: &Task, state: &State) -> Vec<SettingsId> {
 struct Passes<'a> {
     task: &'a Task,
     camera: &'a CameraThread,
+    vsync: &'a VsyncThread,
     projector: Lit,
     results: &'a Receiver<Verdict>,
     orders: &'a Orders,
@@ -386,7 +388,9 @@ impl Passes<'_> {
 
     fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
         let mut todo = missing;
-        for _ in 0..MAX_ATTEMPTS {
+        let mut losses = self.vsync.losses(self.orders);
+        let mut attempts = 0;
+        while attempts < MAX_ATTEMPTS {
             let (dark, lit): (Vec<_>, Vec<_>) =
                 todo.iter().partition(|id| matches!(self.point(**id).role, Role::Dark(_)));
             todo = Vec::new();
@@ -402,6 +406,9 @@ impl Passes<'_> {
             if todo.is_empty() || !self.orders.go_on() {
                 return Ok(());
             }
+            let losses_before = std::mem::replace(&mut losses, self.vsync.losses(self.orders));
+            // Points that failed while nobody watched the line have had no chance.
+            attempts += u32::from(losses == losses_before);
         }
         Err(RunError::Hopeless { points: todo.len() })
     }
