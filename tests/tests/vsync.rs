@@ -36,7 +36,7 @@ fn plan(delays: usize, average: u32) -> String {
 
 #[test]
 fn a_sweep_with_a_triggerbox_is_complete() {
-    let pty = plug(WireFaults { seed: 2, garbage: 0.1, ..WireFaults::default() });
+    let pty = plug(WireFaults { seed: 2, garbage: 0.1, stalls: 0.002, stall_ms: 30 });
     let bench = bench(pty.path(), 60.0);
     let ended = bench.run(&plan(3, 4));
     assert_eq!(ended.state, "complete", "{:?}", ended.error);

@@ -388,9 +388,7 @@ impl Passes<'_> {
 
     fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
         let mut todo = missing;
-        let mut losses = self.vsync.losses(self.orders);
-        let mut attempts = 0;
-        while attempts < MAX_ATTEMPTS {
+        for _ in 0..MAX_ATTEMPTS {
             let (dark, lit): (Vec<_>, Vec<_>) =
                 todo.iter().partition(|id| matches!(self.point(**id).role, Role::Dark(_)));
             todo = Vec::new();
@@ -406,9 +404,8 @@ impl Passes<'_> {
             if todo.is_empty() || !self.orders.go_on() {
                 return Ok(());
             }
-            let losses_before = std::mem::replace(&mut losses, self.vsync.losses(self.orders));
-            // Points that failed while nobody watched the line have had no chance.
-            attempts += u32::from(losses == losses_before);
+            // As long as nobody watches the line, no point has a chance.
+            self.vsync.await_watcher(self.orders);
         }
         Err(RunError::Hopeless { points: todo.len() })
     }

@@ -103,63 +103,81 @@ mod tests {
 
     use super::*;
 
-    /// A run under way, and a projector whose operator is asked by it.
-    fn run() -> (Arc<Board>, Arc<Orders>, External, Operator) {
+    /// A run under way, and the operator that its projector asks.
+    struct Run {
+        board: Arc<Board>,
+        orders: Arc<Orders>,
+        operator: Operator,
+    }
+
+    impl Drop for Run {
+        /// Lets nobody wait for ever where a test fails.
+        fn drop(&mut self) {
+            self.orders.give(Order::Cancel);
+        }
+    }
+
+    fn run() -> (Run, External) {
         let (board, orders) = (Arc::new(Board::new("plane")), Arc::new(Orders::default()));
         for state in [RunState::Preparing, RunState::Armed, RunState::Running] {
             board.go(state).unwrap();
         }
         let (projector, questions) = External::new(Duration::MAX);
         let operator = Operator::start(questions, orders.clone(), board.clone()).unwrap();
-        (board, orders, projector, operator)
+        (Run { board, orders, operator }, projector)
     }
 
-    /// What the socket's `continue` does.
-    fn go_on(board: &Board, orders: &Orders) {
-        board.go(RunState::Running).unwrap();
-        orders.give(Order::Go);
-    }
+    impl Run {
+        /// What the socket's `continue` does.
+        fn go_on(&self) {
+            self.board.go(RunState::Running).unwrap();
+            self.orders.give(Order::Go);
+        }
 
-    fn await_question(board: &Board) {
-        while board.status().question.is_none() {
-            thread::sleep(Duration::from_millis(1));
+        fn await_question(&self) {
+            for _ in 0..10_000 {
+                if self.board.status().question.is_some() {
+                    return;
+                }
+                thread::sleep(Duration::from_millis(1));
+            }
+            panic!("nothing was asked");
         }
     }
 
     #[test]
     fn who_lets_a_held_run_go_on_answers_no_question_that_was_not_asked() {
-        let (board, orders, mut projector, operator) = run();
-        orders.give(Order::Pause);
-        board.go(RunState::Paused).unwrap();
+        let (run, mut projector) = run();
+        run.orders.give(Order::Pause);
+        run.board.go(RunState::Paused).unwrap();
         let shown = thread::spawn(move || projector.show(&Pattern::White));
         // Long enough for a question, were it not to wait.
         thread::sleep(Duration::from_millis(100));
-        assert_eq!(board.status().question, None, "it is asked once the run goes on");
-        go_on(&board, &orders);
-        await_question(&board);
+        assert_eq!(run.board.status().question, None, "it is asked once the run goes on");
+        run.go_on();
+        run.await_question();
         thread::sleep(Duration::from_millis(100));
         assert!(!shown.is_finished(), "nobody has answered");
-        go_on(&board, &orders);
+        run.go_on();
         shown.join().unwrap().unwrap();
-        assert_eq!(board.status().question, None);
-        drop(operator);
+        assert_eq!(run.board.status().question, None);
     }
 
     #[test]
     fn a_run_that_is_ended_meanwhile_is_no_answer() {
-        let (board, orders, mut projector, operator) = run();
+        let (run, mut projector) = run();
         let shown = thread::spawn(move || (projector.show(&Pattern::White), projector));
-        await_question(&board);
-        orders.give(Order::Cancel);
+        run.await_question();
+        run.orders.give(Order::Cancel);
         let (shown, mut projector) = shown.join().unwrap();
         assert!(shown.unwrap_err().to_string().contains("ended before"));
         // Nobody is asked for more, and told only of the light that is left.
-        let mut events = board.subscribe();
+        let mut events = run.board.subscribe();
         assert!(projector.show(&Pattern::White).is_err());
         assert!(events.try_recv().is_err());
-        operator.dismiss();
+        run.operator.dismiss();
         assert!(projector.blank().is_err());
         assert!(matches!(events.try_recv(), Ok(Event::Ask { text }) if text.contains("is over")));
-        drop((projector, operator));
+        drop(projector);
     }
 }

@@ -1,7 +1,7 @@
 //! The VSYNC watcher's thread: hands edges on and shows once a second what the line is like.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -21,7 +21,8 @@ const SHOWN_EVERY: Duration = Duration::from_secs(1);
 /// The watcher's thread as the run sees it.
 pub struct VsyncThread {
     stop: Arc<AtomicBool>,
-    presence: Arc<Presence>,
+    /// Whether the watcher's device is being opened again.
+    is_lost: Arc<AtomicBool>,
     thread: Option<JoinHandle<Result<(), DeviceError>>>,
 }
 
@@ -32,23 +33,6 @@ impl Drop for VsyncThread {
             // Whoever wants to know how it ended has joined it.
             let _ = thread.join();
         }
-    }
-}
-
-/// Whether the watcher's device is there.
-#[derive(Default)]
-struct Presence {
-    is_lost: AtomicBool,
-    losses: AtomicU64,
-}
-
-impl Presence {
-    fn note(&self, state: DeviceState) {
-        let is_lost = state == DeviceState::Lost;
-        if is_lost && !self.is_lost.load(Ordering::Relaxed) {
-            self.losses.fetch_add(1, Ordering::Relaxed);
-        }
-        self.is_lost.store(is_lost, Ordering::Relaxed);
     }
 }
 
@@ -102,11 +86,11 @@ impl VsyncThread {
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         let stop = Arc::new(AtomicBool::new(false));
-        let presence = Arc::new(Presence::default());
+        let is_lost = Arc::new(AtomicBool::new(false));
         let thread = thread::Builder::new()
             .name("vsync".into())
             .spawn({
-                let (stop, presence) = (stop.clone(), presence.clone());
+                let (stop, is_lost) = (stop.clone(), is_lost.clone());
                 move || {
                     if pace == Pace::Devices {
                         priority::for_device("vsync");
@@ -124,7 +108,7 @@ impl VsyncThread {
                             Ok(None) => {}
                             Err(error) => return Err(error),
                         }
-                        presence.note(vsync.state());
+                        is_lost.store(vsync.state() == DeviceState::Lost, Ordering::Relaxed);
                         meter.show(&*vsync);
                     }
                     alarm.armed = false;
@@ -132,16 +116,14 @@ impl VsyncThread {
                 }
             })
             .map_err(|error| DeviceError::new("vsync", DeviceErrorKind::NotReady, error))?;
-        Ok(Self { stop, presence, thread: Some(thread) })
+        Ok(Self { stop, is_lost, thread: Some(thread) })
     }
 
-    /// How often the watcher's device was lost so far; waits until it is there, or `orders` end the run.
-    pub fn losses(&self, orders: &Orders) -> u64 {
-        // A watcher that stays away ends the run itself.
-        while self.presence.is_lost.load(Ordering::Relaxed) && orders.go_on() {
+    /// Waits while the watcher's device is being opened again, unless the run ends. One that stays away ends it.
+    pub fn await_watcher(&self, orders: &Orders) {
+        while self.is_lost.load(Ordering::Relaxed) && orders.go_on() {
             thread::sleep(POLL);
         }
-        self.presence.losses.load(Ordering::Relaxed)
     }
 
     /// Ends the thread.
