@@ -211,6 +211,7 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
     for (batch, held) in truth.held[begin..begin + 390_000].chunks(6500).enumerate() {
         assert!(held == codes, "batch {batch} differs");
     }
+    lab.assert_parked("the run's end, after the last light", truth.dark_since_ns.unwrap());
     lab.assert_noted();
 }
 

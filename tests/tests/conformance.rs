@@ -1,13 +1,19 @@
 //! What every driver of a trait must do, whatever is behind it: the simulated rig, a simulated device on its real wire, and with
 //! `RAYSWEEP_HIL=rig.toml` the hardware of a lab: of a plane rig, whose camera must be triggered and whose projector may light up;
-//! of a dot rig the mirror, which moves by a quarter of what it may and stays dark.
+//! of a dot rig the mirror, which moves by a quarter of what it may and stays dark. A projector that an operator works
+//! (`driver = "external"`) is asked for on the terminal.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 #[path = "../../drivers/tests/suite/mirror.rs"]
 mod suite;
 
+use std::fs::File;
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::sync::mpsc::Receiver;
+use std::thread;
 use std::time::{Duration, Instant};
 
 use raysweep::rig::{AnyRig, Devices, DotRig, Rig};
@@ -15,6 +21,7 @@ use raysweep_core::{
     Camera, CameraSettings, Clock, DeviceErrorKind, DeviceState, FramePool, Pattern, Projector, SettingsId,
     Shutter, Vsync,
 };
+use raysweep_drivers::projector::external::Request;
 use raysweep_sim::mirror::{Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use raysweep_tests::rig_text;
@@ -103,9 +110,31 @@ fn projector_conforms(projector: &mut dyn Projector, clock: &Clock) {
     assert!(projector.blank().unwrap().not_before_ns >= dark.not_before_ns);
 }
 
+/// Where an operator is asked and answers by a line.
+struct Terminal {
+    say: Box<dyn Write + Send>,
+    hear: Box<dyn BufRead + Send>,
+}
+
+/// Puts the questions of a projector to an operator, until it is dropped.
+fn ask(questions: Receiver<Request>, terminal: &mut Terminal) {
+    for question in questions {
+        writeln!(terminal.say, "projector: show {:?}, then press Enter", question.wanted).unwrap();
+        match terminal.hear.read_line(&mut String::new()) {
+            Ok(1..) => question.done(),
+            answer => question.refuse(format!("no answer: {answer:?}")),
+        }
+    }
+}
+
+/// A simulated rig has no operator, and needs none.
 fn rig_conforms(path: &Path) {
+    rig_conforms_with(path, None);
+}
+
+fn rig_conforms_with(path: &Path, terminal: Option<Terminal>) {
     match AnyRig::load(path).unwrap() {
-        AnyRig::Plane(rig) => plane_rig_conforms(&rig),
+        AnyRig::Plane(rig) => plane_rig_conforms(&rig, terminal),
         AnyRig::Dots(rig) => mirror_conforms(&rig),
     }
 }
@@ -118,10 +147,22 @@ fn mirror_conforms(rig: &DotRig) {
     suite::mirror_conforms(&mut *mirror);
 }
 
-fn plane_rig_conforms(rig: &Rig) {
-    let Devices { mut camera, mut vsync, mut projector, clock, .. } = rig.open().unwrap();
+fn plane_rig_conforms(rig: &Rig, terminal: Option<Terminal>) {
+    let Devices { mut camera, mut vsync, mut projector, questions, clock, .. } = rig.open().unwrap();
     vsync_conforms(&mut *vsync, &clock, rig.file.vsync.period_us);
-    projector_conforms(&mut *projector, &clock);
+    match (questions, terminal) {
+        (None, _) => projector_conforms(&mut *projector, &clock),
+        (Some(questions), Some(mut terminal)) => thread::scope(|scope| {
+            scope.spawn(|| ask(questions, &mut terminal));
+            projector_conforms(&mut *projector, &clock);
+            drop(projector);
+        }),
+        (Some(_), None) => {
+            println!(
+                "projector: SKIPPED: an operator works it (driver = \"external\"), and there is no terminal to ask on"
+            );
+        }
+    }
     // The watcher lives on its own thread, as in a run: in virtual time, nobody's time goes on without it.
     drop(vsync);
     camera_conforms(&mut *camera);
@@ -139,6 +180,24 @@ fn rig_file(vsync: &str, sim: &str) -> (tempfile::TempDir, std::path::PathBuf) {
 #[test]
 fn the_simulated_rig_in_the_host_s_time() {
     let (_folder, path) = rig_file("driver = \"sim\"", "realtime = true");
+    rig_conforms(&path);
+}
+
+#[test]
+fn a_projector_that_an_operator_works() {
+    let (_folder, path) = rig_file("driver = \"sim\"", "realtime = true");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let external = text.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\"");
+    assert_ne!(text, external);
+    std::fs::write(&path, external).unwrap();
+    let (terminal, mut operator) = UnixStream::pair().unwrap();
+    let hear = Box::new(BufReader::new(terminal.try_clone().unwrap()));
+    operator.write_all(b"\n\n").unwrap();
+    rig_conforms_with(&path, Some(Terminal { say: Box::new(terminal), hear }));
+    let asked: Vec<String> = BufReader::new(operator).lines().map(Result::unwrap).collect();
+    assert_eq!(asked.len(), 2, "{asked:?}");
+    assert!(asked[0].contains("White") && asked[1].contains("Dark"), "{asked:?}");
+    // Without anybody to ask it is left out; the rest of the rig is not.
     rig_conforms(&path);
 }
 
@@ -169,5 +228,11 @@ fn a_mirror_by_its_rig_file() {
 #[ignore = "needs hardware: RAYSWEEP_HIL=rig.toml cargo test -p raysweep-tests --test conformance -- --ignored"]
 fn the_hardware_of_a_lab() {
     let path = std::env::var_os("RAYSWEEP_HIL").expect("RAYSWEEP_HIL names the lab's rig file");
-    rig_conforms(Path::new(&path));
+    // Not standard input: what tests print there is kept back.
+    let terminal = File::options().read(true).write(true).open("/dev/tty").ok();
+    let terminal = terminal.map(|terminal| {
+        let hear = Box::new(BufReader::new(terminal.try_clone().unwrap()));
+        Terminal { say: Box::new(terminal), hear }
+    });
+    rig_conforms_with(Path::new(&path), terminal);
 }

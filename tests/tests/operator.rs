@@ -25,12 +25,16 @@ fn run(bench: &Bench, answer: impl Fn(usize, &Bench)) -> (Vec<String>, Ended) {
         match events.blocking_recv().unwrap() {
             Event::Ask { text } => {
                 if text.contains("`raysweep continue`") {
-                    assert_eq!(bench.runner.status().state, RunState::Paused);
+                    let status = bench.runner.status();
+                    assert_eq!((status.state, status.question.as_ref()), (RunState::Paused, Some(&text)));
                     answer(asked.len(), bench);
                 }
                 asked.push(text);
             }
-            Event::Finished { .. } => return (asked, end_of(&mut told)),
+            Event::Finished { .. } => {
+                assert_eq!(bench.runner.status().question, None);
+                return (asked, end_of(&mut told));
+            }
             _ => {}
         }
     }

@@ -74,6 +74,12 @@ impl ClockModel {
         self.capacity
     }
 
+    /// Forgets all round trips.
+    pub fn clear(&mut self) {
+        self.trips.clear();
+        self.fit = None;
+    }
+
     /// Takes a round trip into account; one that ends before it begins is none.
     pub fn add(&mut self, trip: RoundTrip) {
         if trip.duration_ns() < 0 {

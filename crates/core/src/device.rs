@@ -247,6 +247,11 @@ pub trait Vsync: Send {
     /// `Disconnected` when the device is gone.
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError>;
 
+    /// [`DeviceState::Lost`] while its driver tries to open it again.
+    fn state(&self) -> DeviceState {
+        DeviceState::Streaming
+    }
+
     /// How well the device's own clock is known; nothing where edges are stamped by the host's.
     fn clock(&self) -> Option<ClockQuality> {
         None

@@ -263,6 +263,9 @@ pub struct Status {
     pub rig: String,
     /// What the daemon is doing.
     pub state: RunState,
+    /// What an operator is to do before `continue`, where the run is held for that.
+    #[serde(default)]
+    pub question: Option<String>,
     /// The session of the present or the last run.
     pub session: Option<PathBuf>,
     /// How far that run is, or was.

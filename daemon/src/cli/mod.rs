@@ -16,7 +16,7 @@ use std::process::ExitCode;
 use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
 use raysweep_drivers::mirror;
-use raysweep_proto::{Client, ClientError, Empty, ErrorCode, RpcError, RunParams, RunState, Started};
+use raysweep_proto::{Client, ClientError, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started};
 use serde::Serialize;
 use serde_json::json;
 
@@ -287,7 +287,12 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, Failure> {
         let message = "no run is under way; `raysweep sessions` lists those that were";
         return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
     };
-    follow(events, &session, interrupts, View::new(printer.json), OnInterrupt::Leave)
+    let mut view = View::new(printer.json);
+    if let Some(text) = status.question {
+        // Asked before anybody watched.
+        view.show(&Event::Ask { text }).map_err(Failure::Output)?;
+    }
+    follow(events, &session, interrupts, view, OnInterrupt::Leave)
 }
 
 /// Prints results for people or for programs.

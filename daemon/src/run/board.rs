@@ -27,6 +27,7 @@ impl Board {
             version: env!("CARGO_PKG_VERSION").into(),
             rig: rig.into(),
             state: RunState::Idle,
+            question: None,
             session: None,
             progress: None,
             vsync: None,
@@ -64,6 +65,8 @@ impl Board {
             return Err(WrongState(status.state));
         }
         status.state = next;
+        // Whatever comes after it has answered it, or needs no answer.
+        status.question = None;
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
             (status.film, status.settings_latency, status.vsync_clock) = (None, None, None);
@@ -72,6 +75,21 @@ impl Board {
         // Sent under the lock, so that subscribers see states in their true order.
         let _ = self.events.send(event);
         Ok(())
+    }
+
+    /// Holds the run for an operator who is to do something, unless it is about to end.
+    pub fn ask(&self, task: &str) {
+        let mut status = self.lock();
+        if status.state.may_become(RunState::Paused) {
+            status.state = RunState::Paused;
+            let session = status.session.clone();
+            let _ = self.events.send(Event::State { state: RunState::Paused, session });
+        }
+        if status.state == RunState::Paused {
+            let text = format!("{task}, then `raysweep continue`");
+            status.question = Some(text.clone());
+            let _ = self.events.send(Event::Ask { text });
+        }
     }
 
     /// Names the session of the run that is being prepared.

@@ -242,6 +242,7 @@ impl Run {
         let mut passes = Passes {
             task: &self.task,
             camera: &camera,
+            vsync: &vsync,
             projector,
             results: &results,
             orders: &self.orders,
@@ -369,6 +370,7 @@ pub fn missing(task: &Task, state: &State) -> Vec<SettingsId> {
 struct Passes<'a> {
     task: &'a Task,
     camera: &'a CameraThread,
+    vsync: &'a VsyncThread,
     projector: Lit,
     results: &'a Receiver<Verdict>,
     orders: &'a Orders,
@@ -406,6 +408,8 @@ impl Passes<'_> {
             if todo.is_empty() || !self.orders.go_on() {
                 return Ok(());
             }
+            // As long as nobody watches the line, no point has a chance.
+            self.vsync.await_watcher(self.orders);
         }
         Err(RunError::Hopeless { points: todo.len() })
     }

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use raysweep_core::{DeviceError, DeviceErrorKind, Vsync};
+use raysweep_core::{DeviceError, DeviceErrorKind, DeviceState, Vsync};
 use raysweep_pipeline::{EdgeTracker, Event, Input, Line};
 use raysweep_proto::Event as Told;
 
@@ -21,6 +21,8 @@ const SHOWN_EVERY: Duration = Duration::from_secs(1);
 /// The watcher's thread as the run sees it.
 pub struct VsyncThread {
     stop: Arc<AtomicBool>,
+    /// Whether the watcher's device is being opened again.
+    is_lost: Arc<AtomicBool>,
     thread: Option<JoinHandle<Result<(), DeviceError>>>,
 }
 
@@ -84,10 +86,11 @@ impl VsyncThread {
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         let stop = Arc::new(AtomicBool::new(false));
+        let is_lost = Arc::new(AtomicBool::new(false));
         let thread = thread::Builder::new()
             .name("vsync".into())
             .spawn({
-                let stop = stop.clone();
+                let (stop, is_lost) = (stop.clone(), is_lost.clone());
                 move || {
                     if pace == Pace::Devices {
                         priority::for_device("vsync");
@@ -105,6 +108,7 @@ impl VsyncThread {
                             Ok(None) => {}
                             Err(error) => return Err(error),
                         }
+                        is_lost.store(vsync.state() == DeviceState::Lost, Ordering::Relaxed);
                         meter.show(&*vsync);
                     }
                     alarm.armed = false;
@@ -112,7 +116,14 @@ impl VsyncThread {
                 }
             })
             .map_err(|error| DeviceError::new("vsync", DeviceErrorKind::NotReady, error))?;
-        Ok(Self { stop, thread: Some(thread) })
+        Ok(Self { stop, is_lost, thread: Some(thread) })
+    }
+
+    /// Waits while the watcher's device is being opened again, unless the run ends. One that stays away ends it.
+    pub fn await_watcher(&self, orders: &Orders) {
+        while self.is_lost.load(Ordering::Relaxed) && orders.go_on() {
+            thread::sleep(POLL);
+        }
     }
 
     /// Ends the thread.

@@ -97,6 +97,7 @@ fn every_other_command_prints_for_people_and_for_programs() {
         (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),
         (vec!["run", &plan, "--detach"], "/data/20260101-000000_fake", ""),
         (vec!["pause"], "held", ""),
+        (vec!["status"], "to do      cover the lens", "/question"),
         (vec!["continue"], "goes on", ""),
         (vec!["cancel"], "kept", ""),
         (vec!["resume", "old", "--detach"], "/data/20260101-000000_fake", ""),
@@ -235,6 +236,19 @@ fn watch_follows_anothers_run_and_ctrl_c_does_not_touch_it() {
     run(&daemon, &["cancel"]);
     assert!(lines.last().unwrap().unwrap().contains("cancelled"));
     assert_eq!(stays.wait().unwrap().code(), Some(3));
+}
+
+#[test]
+fn watch_begins_with_what_an_operator_was_asked_before() {
+    let daemon = Daemon::start();
+    run(&daemon, &["run", &plan(&daemon, "hang"), "--detach"]);
+    run(&daemon, &["pause"]);
+    let mut child = command(&daemon, &["watch", "--json"]).stdout(Stdio::piped()).spawn().unwrap();
+    let first = BufReader::new(child.stdout.take().unwrap()).lines().next().unwrap().unwrap();
+    let asked = &json_lines(&first)[0];
+    assert_eq!((&asked["event"], &asked["text"]), (&"ask".into(), &"cover the lens".into()));
+    kill(Pid::from_raw(child.id() as i32), Signal::SIGINT).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(0));
 }
 
 /// Begins to watch, and waits until events arrive there.

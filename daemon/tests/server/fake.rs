@@ -166,10 +166,12 @@ pub fn bad_plan() -> RpcError {
 
 impl Control for Fake {
     fn status(&self) -> Status {
+        let state = *self.state.lock().unwrap();
         Status {
             version: "1".into(),
             rig: "plane".into(),
-            state: *self.state.lock().unwrap(),
+            state,
+            question: (state == RunState::Paused).then(|| "cover the lens".into()),
             session: Some(session()),
             progress: Some(progress()),
             vsync: Some(VsyncStats { edges: 10, period_us: 16_666.7, ..VsyncStats::default() }),

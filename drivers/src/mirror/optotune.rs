@@ -10,7 +10,7 @@ use raysweep_core::{DeviceError, DeviceErrorKind, MirrorLimits, MirrorPoint, Til
 use super::light::LightGuard;
 use super::points::{self, PointController, PointMirror};
 use super::port::{Port, fault};
-use super::state::{MirrorState, Reach, Sent};
+use super::state::{MirrorState, Reach, Sent, node_of};
 use super::wire::{Parsed, line};
 
 const BAUD: u32 = 256_000;
@@ -200,7 +200,7 @@ impl PointMirror<OptotuneLine> {
     /// `Busy`, `Disconnected`, `Timeout`, `Protocol`.
     pub fn open(config: OptotuneConfig, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
         let OptotuneConfig { port, laser_port, limits, state, light } = config;
-        let reach = Reach::Optotune { port: port.clone(), laser_port };
+        let reach = Reach::Optotune { port: port.clone(), node: node_of(&port), laser_port };
         PointMirror::open_with(&state, limits, light, reach, || {
             let mut line = OptotuneLine::open(&port, laser)?;
             line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
@@ -218,14 +218,20 @@ impl Laser for NoLaser {
     }
 }
 
-/// Parks a mirror that a process has left behind.
+/// Parks a mirror that a process has left behind. `None`: nobody knew whether it was where it was left.
 pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
-    let Reach::Optotune { port, laser_port } = &state.reach else { return Ok(None) };
+    let Reach::Optotune { port, node, laser_port } = &state.reach else { return Ok(None) };
     let laser: Box<dyn Laser> = match laser_port {
         Some(port) => Box::new(RtsLaser::open(port)?),
         None => Box::new(NoLaser),
     };
-    points::recover(&mut OptotuneLine::open(port, laser)?, state, sent)
+    let mut line = OptotuneLine::open(port, laser)?;
+    if !state.is_plugged_in_since(port, *node) {
+        // Without power it has sprung back; with it, its own loop brings it back as it takes any step.
+        line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
+        return Ok(None);
+    }
+    points::recover(&mut line, state, sent)
 }
 
 #[cfg(test)]

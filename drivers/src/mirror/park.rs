@@ -29,7 +29,8 @@ pub enum Parked {
     Already,
     /// It was found there, and taken to the origin with the light off.
     From(Tilt),
-    /// Nobody could say where it was, so its controller was started anew, which takes light and drive away.
+    /// Nobody could say where it was, so its controller was started anew, which takes light and drive away, or told to be at the
+    /// origin.
     ByReset,
 }
 

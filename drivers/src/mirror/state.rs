@@ -74,6 +74,8 @@ pub(super) enum Reach {
     },
     Optotune {
         port: PathBuf,
+        /// As of a PlayzerX.
+        node: Option<u64>,
         laser_port: Option<PathBuf>,
     },
 }
@@ -238,8 +240,14 @@ impl MirrorState {
     }
 
     /// Whether what was noted without fsync is still true.
-    pub fn is_of_this_boot(&self) -> bool {
+    fn is_of_this_boot(&self) -> bool {
         boot_id().is_ok_and(|boot_id| boot_id == self.boot_id)
+    }
+
+    /// Whether the cable at `port` has been in its place since `node` was noted, and with it what was sent and perhaps
+    /// the controller's power.
+    pub fn is_plugged_in_since(&self, port: &Path, node: Option<u64>) -> bool {
+        self.is_of_this_boot() && node.is_some() && node == node_of(port)
     }
 }
 

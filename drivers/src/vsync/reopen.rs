@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use raysweep_core::{ClockQuality, DeviceError, DeviceErrorKind, Edge, Vsync};
+use raysweep_core::{ClockQuality, DeviceError, DeviceErrorKind, DeviceState, Edge, Vsync};
 
 /// How often is looked whether the device is back.
 const LOOK: Duration = Duration::from_millis(250);
@@ -15,27 +15,29 @@ pub type Opener<V> = Box<dyn FnMut() -> Result<V, DeviceError> + Send>;
 pub struct Reopened<V> {
     open: Opener<V>,
     patience: Duration,
-    device: Result<V, Lost>,
+    device: Option<V>,
+    /// From when it was lost until it tells an edge again.
+    lost: Option<Lost>,
     /// What is added to the device's own numbers.
     base: u64,
     last_seq: u64,
 }
 
+#[derive(Clone, Copy)]
 struct Lost {
     since: Instant,
     looked: Instant,
-    error: DeviceError,
 }
 
 impl<V: Vsync> Reopened<V> {
     /// Watches by `device`, which `open` opens again when it is lost, for up to `patience`.
     pub fn new(device: V, open: Opener<V>, patience: Duration) -> Self {
-        Self { open, patience, device: Ok(device), base: 0, last_seq: 0 }
+        Self { open, patience, device: Some(device), lost: None, base: 0, last_seq: 0 }
     }
 
     /// Looks whether the device is back.
     fn look(&mut self, timeout: Duration) -> Result<(), DeviceError> {
-        let Err(lost) = &mut self.device else { return Ok(()) };
+        let Some(lost) = &mut self.lost else { return Ok(()) };
         std::thread::sleep(timeout.min(LOOK.saturating_sub(lost.looked.elapsed())));
         if lost.looked.elapsed() < LOOK {
             return Ok(());
@@ -44,7 +46,7 @@ impl<V: Vsync> Reopened<V> {
         match (self.open)() {
             Ok(device) => {
                 tracing::info!("the VSYNC line's watcher is back");
-                self.device = Ok(device);
+                self.device = Some(device);
                 self.base = self.last_seq + 1;
                 Ok(())
             }
@@ -52,38 +54,49 @@ impl<V: Vsync> Reopened<V> {
             Err(error) => Err(error),
         }
     }
+
+    /// Lets the device go after an error that opening it again may mend; gives the error back when patience is at its end.
+    fn lose(&mut self, error: DeviceError) -> Result<(), DeviceError> {
+        let now = Instant::now();
+        // A device that can be opened and then tells nothing is as lost as before.
+        let since = self.lost.map_or(now, |lost| lost.since);
+        let passing = matches!(
+            error.kind,
+            DeviceErrorKind::Disconnected | DeviceErrorKind::Timeout | DeviceErrorKind::Protocol
+        );
+        if !passing || now - since > self.patience {
+            return Err(error);
+        }
+        tracing::warn!(%error, "the VSYNC line's watcher is lost");
+        self.device = None;
+        self.lost = Some(Lost { since, looked: now });
+        Ok(())
+    }
 }
 
 impl<V: Vsync> Vsync for Reopened<V> {
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
-        let device = match &mut self.device {
-            Ok(device) => device,
-            Err(lost) if lost.since.elapsed() > self.patience => {
-                let DeviceError { device, kind, source } = &lost.error;
-                return Err(DeviceError::new(device, *kind, source.to_string()));
-            }
-            Err(_) => {
-                self.look(timeout)?;
-                return Ok(None);
-            }
+        let Some(device) = &mut self.device else {
+            self.look(timeout)?;
+            return Ok(None);
         };
         match device.next_edge(timeout) {
-            Ok(edge) => Ok(edge.map(|edge| {
+            Ok(Some(edge)) => {
+                self.lost = None;
                 self.last_seq = self.base + edge.seq;
-                Edge { seq: self.last_seq, ..edge }
-            })),
-            Err(error) if matches!(error.kind, DeviceErrorKind::Disconnected | DeviceErrorKind::Timeout) => {
-                tracing::warn!(%error, "the VSYNC line's watcher is lost");
-                let now = Instant::now();
-                self.device = Err(Lost { since: now, looked: now, error });
-                Ok(None)
+                Ok(Some(Edge { seq: self.last_seq, ..edge }))
             }
-            Err(error) => Err(error),
+            Ok(None) => Ok(None),
+            Err(error) => self.lose(error).map(|()| None),
         }
     }
 
+    fn state(&self) -> DeviceState {
+        if self.lost.is_some() { DeviceState::Lost } else { DeviceState::Streaming }
+    }
+
     fn clock(&self) -> Option<ClockQuality> {
-        self.device.as_ref().ok().and_then(Vsync::clock)
+        self.device.as_ref().and_then(Vsync::clock)
     }
 }
 
@@ -123,10 +136,13 @@ mod tests {
         };
         let mut vsync = Reopened::new(Brief(0), opener, Duration::from_secs(60));
         let mut seen = Vec::new();
+        let mut was_lost = false;
         while seen.len() < 6 {
             seen.extend(vsync.next_edge(Duration::from_millis(50)).unwrap().map(|edge| edge.seq));
+            was_lost |= vsync.state() == DeviceState::Lost;
         }
         assert_eq!(seen, [1, 2, 3, 5, 6, 7]);
+        assert!(was_lost && vsync.state() == DeviceState::Streaming);
         assert_eq!(looks.load(Ordering::Relaxed), 3);
     }
 
@@ -140,5 +156,18 @@ mod tests {
             }
         };
         assert_eq!(error.kind, DeviceErrorKind::Disconnected);
+    }
+
+    #[test]
+    fn a_device_that_opens_and_fails_before_its_first_edge_is_given_up() {
+        let mut vsync = Reopened::new(Brief(9), Box::new(|| Ok(Brief(9))), 2 * LOOK);
+        let began = Instant::now();
+        let error = loop {
+            if let Err(error) = vsync.next_edge(LOOK) {
+                break error;
+            }
+        };
+        assert_eq!(error.kind, DeviceErrorKind::Disconnected);
+        assert!(began.elapsed() > 2 * LOOK, "it was opened again meanwhile");
     }
 }

@@ -4,6 +4,7 @@
 
 mod conformance;
 mod parsers;
+mod playzerx_script;
 mod points;
 mod rig;
 mod scripts;

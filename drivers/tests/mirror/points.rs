@@ -6,7 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Mirror, MirrorPath, Tilt};
-use raysweep_drivers::mirror::{Laser, LightGuard, Mti, MtiConfig, MtiDrive, Optotune, OptotuneConfig};
+use raysweep_drivers::mirror::{
+    Laser, LightGuard, Mti, MtiConfig, MtiDrive, Optotune, OptotuneConfig, Parked, park,
+};
 use raysweep_sim::mirror::{
     Held, Link, MechanicsConfig, MirrorPty, MtiController, OptotuneController, WireFaults,
 };
@@ -104,16 +106,15 @@ impl Laser for Lamp {
     }
 }
 
+fn optotune_rig(faults: WireFaults) -> Rig {
+    let mechanics = MechanicsConfig { max_tilt: raysweep_core::MechanicalDeg(25.0), ..Default::default() };
+    let link = Link::Uart { baud: 256_000 };
+    rig(MirrorPty::plug(OptotuneController::new(mechanics), link, faults).unwrap())
+}
+
 #[test]
 fn optotune_plays_a_path_with_a_light_of_its_own() {
-    let mechanics = MechanicsConfig { max_tilt: raysweep_core::MechanicalDeg(25.0), ..Default::default() };
-    let pty = MirrorPty::plug(
-        OptotuneController::new(mechanics),
-        Link::Uart { baud: 256_000 },
-        WireFaults { garbage: 0.05, ..WireFaults::default() },
-    )
-    .unwrap();
-    let rig = rig(pty);
+    let rig = optotune_rig(WireFaults { garbage: 0.05, ..WireFaults::default() });
     let config = OptotuneConfig {
         port: rig.pty.path().to_owned(),
         laser_port: None,
@@ -144,4 +145,37 @@ fn optotune_plays_a_path_with_a_light_of_its_own() {
     drop(mirror);
     assert!(!lamp.is_lit());
     rig.assert_parked();
+}
+
+#[test]
+fn an_optotune_that_was_plugged_in_again_is_not_told_to_be_where_it_was_left() {
+    let mut rig = optotune_rig(WireFaults::default());
+    let name = rig.folder.path().join("by-id");
+    std::os::unix::fs::symlink(rig.pty.path(), &name).unwrap();
+    let config = OptotuneConfig {
+        port: name.clone(),
+        laser_port: None,
+        limits: LIMITS,
+        state: rig.state(),
+        light: rig.armed(),
+    };
+    let mut mirror = Optotune::open(config, Box::new(Lamp::default())).unwrap();
+    mirror.load(&circle(60)).unwrap();
+    mirror.start(2).unwrap();
+    while mirror.feed().unwrap().played < 15 {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    // With the power back it is at rest: told to be where it was left, it would jump.
+    let again = optotune_rig(WireFaults::default());
+    rig.pty.unplug();
+    while mirror.feed().is_ok() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    drop(mirror);
+    std::fs::remove_file(&name).unwrap();
+    std::os::unix::fs::symlink(again.pty.path(), &name).unwrap();
+    assert_eq!(park(&rig.state()).unwrap(), Parked::ByReset);
+    let origin = Held { x: 0.0, y: 0.0, light: 0 };
+    assert_eq!(again.pty.truth().held, [origin]);
+    assert_eq!(park(&rig.state()).unwrap(), Parked::Already);
 }

@@ -11,9 +11,9 @@ use tempfile::TempDir;
 use crate::points::{Lamp, mti_config};
 use crate::rig::LIMITS;
 
-/// A port on which every message that begins with one of these gets the answer beside it.
-struct Script {
-    pty: Pty,
+/// A port whose every message is answered by rules.
+pub struct Script {
+    pub pty: Pty,
     heard: Arc<Mutex<Vec<u8>>>,
     folder: TempDir,
 }
@@ -21,29 +21,40 @@ struct Script {
 type Answers = &'static [(&'static [u8], &'static [u8])];
 
 impl Script {
-    /// `message` says how long the message is that bytes begin with, if it is whole.
+    /// Every message that begins with one of these gets the answer beside it. `message` says how long the message is that
+    /// bytes begin with, if it is whole.
     fn new(answers: Answers, message: fn(&[u8]) -> Option<usize>) -> Self {
+        Self::with(message, move |message, _| {
+            let answer = answers.iter().find(|(begins, _)| message.starts_with(begins));
+            answer.map(|(_, answer)| answer.to_vec()).unwrap_or_default()
+        })
+    }
+
+    /// Every message gets the answer that `answer` has for it at that time.
+    pub fn with(
+        message: fn(&[u8]) -> Option<usize>,
+        mut answer: impl FnMut(&[u8], i64) -> Vec<u8> + Send + 'static,
+    ) -> Self {
         let heard = Arc::new(Mutex::new(Vec::new()));
         let record = heard.clone();
         let mut waiting = Vec::new();
-        let run = move |bytes: &[u8], _: i64, replies: &mut Vec<u8>| {
+        let run = move |bytes: &[u8], now_ns: i64, replies: &mut Vec<u8>| {
             record.lock().unwrap().extend_from_slice(bytes);
             waiting.extend_from_slice(bytes);
             while let Some(length) = message(&waiting) {
                 let message: Vec<u8> = waiting.drain(..length).collect();
-                let answer = answers.iter().find(|(begins, _)| message.starts_with(begins));
-                replies.extend(answer.into_iter().flat_map(|(_, answer)| *answer));
+                replies.extend(answer(&message, now_ns));
             }
         };
         let pty = Pty::plug(Box::new(run), Link::VirtualCom, WireFaults::default()).unwrap();
         Self { pty, heard, folder: tempfile::tempdir().unwrap() }
     }
 
-    fn light(&self) -> LightGuard {
+    pub fn light(&self) -> LightGuard {
         LightGuard { armed_file: self.folder.path().join("nobody"), interlock: None }
     }
 
-    fn state(&self) -> std::path::PathBuf {
+    pub fn state(&self) -> std::path::PathBuf {
         self.folder.path().join("mirror.json")
     }
 
@@ -63,7 +74,7 @@ fn line(bytes: &[u8]) -> Option<usize> {
 }
 
 /// Two places a step from the origin, dark.
-fn play(mirror: &mut dyn Mirror) {
+pub fn play(mirror: &mut dyn Mirror) {
     let places = [Tilt::new(0.13, 0.0), Tilt::new(0.13, -0.26)];
     let points = places.map(|tilt| raysweep_core::MirrorPoint { tilt, light: 0 });
     mirror.load(&MirrorPath::new(points.into(), 100.0, &LIMITS).unwrap()).unwrap();
@@ -130,8 +141,28 @@ fn optotune_says_what_the_maker_documents() {
     assert_eq!(lines.last().unwrap(), "XY=0.00000;0.00000");
 }
 
+#[test]
+fn an_optotune_that_refuses_or_falls_silent_is_quoted() {
+    let refused = |answers: Answers| {
+        let script = Script::new(answers, line);
+        let (state, light) = (script.state(), script.light());
+        let port = script.pty.path().to_owned();
+        let config = OptotuneConfig { port, laser_port: None, limits: LIMITS, state, light };
+        Optotune::open(config, Box::new(Lamp::default())).err().unwrap()
+    };
+    for (answer, says) in [(b"NO\r\n", "No"), (b"OL\r\n", "TooLow"), (b"OU\r\n", "TooHigh")] {
+        let answers: [(&[u8], &[u8]); 2] = [(b"START", b"OK\r\n"), (b"XY=", answer)];
+        let error = refused(Box::leak(Box::new(answers)));
+        assert!(error.kind == DeviceErrorKind::Protocol && error.to_string().contains(says), "{error}");
+    }
+    let error = refused(&[(b"START", b"OK\r\n")]);
+    assert!(error.kind == DeviceErrorKind::Timeout && error.to_string().contains("GoTo"), "{error}");
+    let error = refused(&[(b"XY=", b"OK\r\n")]);
+    assert!(error.kind == DeviceErrorKind::Timeout && error.to_string().contains("Start"), "{error}");
+}
+
 /// The frames of a PlayzerX: 'p', 'l', command, length; zeros end what a broken-off write has left.
-fn frame(bytes: &[u8]) -> Option<usize> {
+pub fn frame(bytes: &[u8]) -> Option<usize> {
     match bytes {
         [0, ..] => Some(1),
         [_, _, _, length, ..] => Some(usize::from(*length)).filter(|length| bytes.len() >= *length),

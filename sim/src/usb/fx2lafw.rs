@@ -85,13 +85,19 @@ struct Sampling {
 #[derive(Clone, Default)]
 pub struct Fx2Faults {
     stalled: Arc<AtomicBool>,
+    overrun: Arc<AtomicBool>,
     starts: Arc<AtomicU64>,
 }
 
 impl Fx2Faults {
-    /// The samples' endpoint halts from now on.
+    /// The samples' endpoint halts until the host clears it.
     pub fn stall(&self) {
         self.stalled.store(true, Ordering::Relaxed);
+    }
+
+    /// The analyser stops sampling, as one does whose host was too slow, until it is started again.
+    pub fn overrun(&self) {
+        self.overrun.store(true, Ordering::Relaxed);
     }
 
     /// How often sampling was started.
@@ -141,6 +147,9 @@ impl UsbDevice for Fx2Lafw {
         if self.faults.stalled.load(Ordering::Relaxed) {
             return Some(Err(Stall));
         }
+        if self.faults.overrun.swap(false, Ordering::Relaxed) {
+            self.running = None;
+        }
         let sampling = self.running.as_mut()?;
         let first_ns = sampling.start_ns as f64 + sampling.taken as f64 * sampling.step_ns;
         if first_ns + room as f64 * sampling.step_ns > self.clock.now_ns() as f64 {
@@ -150,6 +159,10 @@ impl UsbDevice for Fx2Lafw {
         self.signal.samples(first_ns, sampling.step_ns, &mut samples);
         sampling.taken += room as u64;
         Some(Ok(samples))
+    }
+
+    fn clear_halt(&mut self, _: u8) {
+        self.faults.stalled.store(false, Ordering::Relaxed);
     }
 
     fn bulk_out(&mut self, _: u8, _: &[u8]) -> Result<(), Stall> {

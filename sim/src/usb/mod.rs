@@ -59,6 +59,9 @@ pub trait UsbDevice: Send {
     /// # Errors
     /// If the endpoint has halted.
     fn bulk_out(&mut self, endpoint: u8, data: &[u8]) -> Result<(), Stall>;
+
+    /// The host has cleared an endpoint that may have halted.
+    fn clear_halt(&mut self, _endpoint: u8) {}
 }
 
 /// How fast a device is, as Linux numbers it.

@@ -152,6 +152,11 @@ fn control(device: &mut dyn UsbDevice, setup: &Request, data: &[u8]) -> Result<V
         (0x80..=0x82, 0) => Ok(vec![0, 0]),
         (0x80, 8) => Ok(vec![1]),
         (0x81, 10) => Ok(vec![0]),
+        // CLEAR_FEATURE of an endpoint, whose one feature is that it has halted.
+        (0x02, 1) => {
+            device.clear_halt(setup.index as u8);
+            Ok(Vec::new())
+        }
         // CLEAR_FEATURE, SET_CONFIGURATION, SET_INTERFACE: there is but one of each.
         (0x00..=0x02, 1 | 9 | 11) => Ok(Vec::new()),
         (kind, _) if kind & 0x60 == 0 => Err(Stall),

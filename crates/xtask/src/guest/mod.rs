@@ -1,6 +1,6 @@
 //! `cargo xtask guest`: the drivers' hardware tests against real kernel drivers, in a small QEMU guest.
 //!
-//! The tests are ordinary integration tests of the crate `drivers`, marked `#[ignore]` since they need devices. The guest
+//! The tests are ordinary integration tests, most of the crate `drivers`, marked `#[ignore]` since they need devices. The guest
 //! runs a stock Debian kernel in software emulation, mounts the host's `/usr` read-only, and so runs the very
 //! executables that cargo built. A test has QEMU's monitor (QMP) at `/dev/virtio-ports/qmp`, with which it plugs and
 //! unplugs devices and takes screen dumps; these land in `/share`, which the host keeps in `guest/run` of its
@@ -12,7 +12,6 @@ mod qemu;
 mod report;
 mod script;
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::Stdio;
 use std::time::Instant;
@@ -21,10 +20,12 @@ use crate::packages;
 use crate::run::{Done, cargo, target};
 use kernel::Kernel;
 
-/// One integration test of `drivers` and the guest that it needs.
+/// One integration test and the guest that it needs.
 pub struct GuestTest {
-    /// The file in `drivers/tests`, without `.rs`.
+    /// The file in a crate's `tests`, without `.rs`.
     name: &'static str,
+    /// Programs of that crate that the test starts; they lie beside it.
+    programs: &'static [&'static str],
     /// Kernel modules with their parameters, loaded right before the test.
     modules: &'static [&'static str],
     /// Devices of the guest that QEMU must have from the start; others are plugged in by the test, through QMP.
@@ -38,15 +39,32 @@ pub struct GuestTest {
 /// Adding a test is adding its line here, and its modules' folder in `kernel.rs` if it has a new one.
 const TESTS: &[GuestTest] = &[
     GuestTest {
+        name: "guest_daemon",
+        programs: &["raysweepd"],
+        modules: &["vhci-hcd"],
+        devices: &[],
+        pipes: &[],
+        environment: &[],
+    },
+    GuestTest {
         name: "guest_drm",
+        programs: &[],
         modules: &["virtio-gpu"],
         devices: &["virtio-gpu-pci"],
         pipes: &[],
         environment: &[("RAYSWEEP_DRM_CARD", "/dev/dri/card0")],
     },
-    GuestTest { name: "guest_fx2lafw", modules: &["vhci-hcd"], devices: &[], pipes: &[], environment: &[] },
+    GuestTest {
+        name: "guest_fx2lafw",
+        programs: &[],
+        modules: &["vhci-hcd"],
+        devices: &[],
+        pipes: &[],
+        environment: &[],
+    },
     GuestTest {
         name: "guest_mirror",
+        programs: &[],
         modules: &["xhci_pci", "ftdi_sio"],
         devices: &[],
         pipes: &["serial"],
@@ -54,6 +72,7 @@ const TESTS: &[GuestTest] = &[
     },
     GuestTest {
         name: "guest_modemline",
+        programs: &[],
         modules: &["vhci-hcd", "ftdi_sio", "pps-ldisc"],
         devices: &[],
         pipes: &[],
@@ -61,6 +80,7 @@ const TESTS: &[GuestTest] = &[
     },
     GuestTest {
         name: "guest_serial",
+        programs: &[],
         modules: &["xhci_pci", "ftdi_sio"],
         devices: &[],
         pipes: &["serial"],
@@ -68,6 +88,7 @@ const TESTS: &[GuestTest] = &[
     },
     GuestTest {
         name: "v4l2_vivid",
+        programs: &[],
         modules: &["vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=3"],
         devices: &[],
         pipes: &[],
@@ -85,13 +106,10 @@ pub fn guest(names: &[&str]) -> Done {
     let began = Instant::now();
     let run = folder.join("run");
     let _ = std::fs::remove_dir_all(&run);
-    let place = |name: &str, executable: &PathBuf| {
-        let folder = run.join(name);
-        std::fs::create_dir_all(&folder)?;
-        std::fs::copy(executable, folder.join("test"))
-    };
-    for (name, executable) in &executables {
-        place(name, executable).map_err(|error| format!("{}: {error}", run.join(name).display()))?;
+    for Executable { test, name, path } in &executables {
+        let folder = run.join(test);
+        let placed = std::fs::create_dir_all(&folder).and_then(|()| std::fs::copy(path, folder.join(name)));
+        placed.map_err(|error| format!("{}: {error}", folder.join(name).display()))?;
     }
     let script = run.join("run.sh");
     std::fs::write(&script, script::script(&tests))
@@ -118,8 +136,15 @@ fn chosen(names: &[&str]) -> Done<Vec<&'static GuestTest>> {
     Ok(TESTS.iter().filter(|test| names.is_empty() || names.contains(&test.name)).collect())
 }
 
+/// What the guest runs in a test's folder.
+struct Executable {
+    test: &'static str,
+    name: &'static str,
+    path: PathBuf,
+}
+
 /// Builds the tests with the very features that `cargo xtask test` uses, so that both share what is built.
-fn build(tests: &[&GuestTest]) -> Done<BTreeMap<&'static str, PathBuf>> {
+fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
     let mut build = cargo();
     build.args([
         "test",
@@ -138,24 +163,38 @@ fn build(tests: &[&GuestTest]) -> Done<BTreeMap<&'static str, PathBuf>> {
         return Err("the guest's tests do not build; the compiler's messages stand above".to_owned());
     }
     let messages = String::from_utf8_lossy(&output.stdout);
-    tests
-        .iter()
-        .map(|test| {
-            let executable = executable(&messages, test.name);
-            executable
-                .map(|path| (test.name, path))
-                .ok_or_else(|| format!("cargo built no test {}", test.name))
-        })
-        .collect()
+    let built = |test, name, path: Option<PathBuf>, what: &str| {
+        path.map(|path| Executable { test, name, path }).ok_or_else(|| format!("cargo built no {what}"))
+    };
+    let mut all = Vec::new();
+    for GuestTest { name: test, programs, .. } in tests {
+        all.push(built(test, "test", test_executable(&messages, test), &format!("test {test}"))?);
+        for name in *programs {
+            all.push(built(test, name, program(&messages, name), &format!("program {name}"))?);
+        }
+    }
+    Ok(all)
 }
 
-/// The executable of a test in cargo's JSON messages: a file named after the test, a dash and a hash.
-fn executable(messages: &str, name: &str) -> Option<PathBuf> {
-    let paths = messages.lines().filter_map(|line| line.split_once("\"executable\":\"")?.1.split_once('"'));
-    paths.map(|(path, _)| PathBuf::from(path)).find(|path| {
+/// The executables in cargo's JSON messages.
+fn executables(messages: &str) -> impl Iterator<Item = PathBuf> {
+    messages
+        .lines()
+        .filter_map(|line| line.split_once("\"executable\":\"")?.1.split_once('"'))
+        .map(|(path, _)| PathBuf::from(path))
+}
+
+/// The executable of a test: a file named after the test, a dash and a hash.
+fn test_executable(messages: &str, name: &str) -> Option<PathBuf> {
+    executables(messages).find(|path| {
         let file = path.file_name().map(|file| file.to_string_lossy().into_owned()).unwrap_or_default();
         file.rsplit_once('-').is_some_and(|(stem, _)| stem == name)
     })
+}
+
+/// The executable of a program, which cargo builds with the tests of its crate: a file of its name.
+fn program(messages: &str, name: &str) -> Option<PathBuf> {
+    executables(messages).find(|path| path.file_name().is_some_and(|file| file == name))
 }
 
 #[cfg(test)]
@@ -166,9 +205,12 @@ mod tests {
     fn executables_are_found_by_their_names() {
         let messages = r#"{"reason":"compiler-artifact","executable":null}
 {"reason":"compiler-artifact","executable":"/a/deps/guest_drm_more-0123","fresh":true}
-{"reason":"compiler-artifact","executable":"/a/deps/guest_drm-4567","fresh":true}"#;
-        assert_eq!(executable(messages, "guest_drm"), Some(PathBuf::from("/a/deps/guest_drm-4567")));
-        assert_eq!(executable(messages, "guest"), None);
+{"reason":"compiler-artifact","executable":"/a/deps/guest_drm-4567","fresh":true}
+{"reason":"compiler-artifact","executable":"/a/guest","fresh":true}"#;
+        assert_eq!(test_executable(messages, "guest_drm"), Some(PathBuf::from("/a/deps/guest_drm-4567")));
+        assert_eq!(test_executable(messages, "guest"), None);
+        assert_eq!(program(messages, "guest"), Some(PathBuf::from("/a/guest")));
+        assert_eq!(program(messages, "guest_drm"), None);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use super::GuestTest;
 
 /// A test that takes longer hangs.
-pub const TEST_LIMIT_S: u32 = 90;
+pub const TEST_LIMIT_S: u32 = 120;
 
 const PREFACE: &str = "\
 modprobe virtio_console

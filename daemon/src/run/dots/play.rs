@@ -6,7 +6,6 @@ use std::thread;
 use raysweep_core::{Camera, Clock, FramePool, MirrorPath};
 use raysweep_pipeline::dots::{Arrival, Loss};
 use raysweep_pipeline::{PipelineError, message_of};
-use raysweep_proto::{Event, RunState};
 use raysweep_sim::dots::Subject;
 
 use super::camera::{Refused, Source, Wanted};
@@ -45,10 +44,8 @@ impl Player<'_> {
                 Subject::Scene => "put the scene before the camera, and all else away".into(),
             };
             self.orders.give(Order::Pause);
-            if self.board.go(RunState::Paused).is_ok() {
-                self.board.publish(Event::Ask { text: format!("{text}, then `raysweep continue`") });
-                self.orders.wait_while_paused();
-            }
+            self.board.ask(&text);
+            self.orders.wait_while_paused();
         }
         Ok(())
     }

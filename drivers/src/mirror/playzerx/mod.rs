@@ -344,9 +344,7 @@ pub(super) fn recover(
         return Ok(None);
     };
     let mut port = Port::open(name, BAUD)?;
-    // A cable that was pulled out takes samples with it that had left the process, and perhaps the controller's power.
-    let is_same_line = state.is_of_this_boot() && node.is_some() && *node == node_of(name);
-    let left = if is_same_line { stream::halt(&mut port, 0)? } else { None };
+    let left = if state.is_plugged_in_since(name, *node) { stream::halt(&mut port, 0)? } else { None };
     let Some(left) = left else {
         // The light and the drive go off with the controller; the mirror springs back through the drive's own filter.
         let mut bytes = PADDING.to_vec();

@@ -2,7 +2,10 @@
 //!
 //! The analyser cannot be asked for its time; samples come in transfers, and a transfer is complete a little after its last sample
 //! was taken: by the bus's own latency at best, by much more where the host was busy. So of each quarter of a second the transfer
-//! that was least late counts, as a round trip that ends where its last sample was taken.
+//! that was least late counts, as a round trip that ends where its last sample was taken. Where the host was busy all that time, the
+//! other quarters show by how much even that one was late: so much longer is its round trip, and so much less it says.
+
+use std::collections::VecDeque;
 
 use raysweep_core::{ClockModel, ClockQuality, RoundTrip};
 
@@ -13,12 +16,32 @@ const SHORT_WINDOWS: usize = 8;
 const UNCERTAINTY_NS: i64 = 5_000;
 /// Windows of the fit.
 const WINDOWS: usize = 100;
+/// How far two crystals may drift apart [A].
+const MOST_DRIFT: f64 = 100e-6;
 
 /// The relation of samples to the host's clock.
 pub struct SampleClock {
     latency_ns: i64,
+    /// The least late transfers of the newest windows.
+    best: VecDeque<Arrival>,
     model: ClockModel,
     window: Option<Window>,
+}
+
+/// Until when the device had sampled, and when the host had that, less the bus's latency.
+#[derive(Clone, Copy)]
+struct Arrival {
+    device_ns: i64,
+    taken_ns: i64,
+}
+
+impl Arrival {
+    /// By how much it was later than another one at least, however the clocks drift.
+    fn later_than_ns(&self, other: &Self) -> i64 {
+        let apart_ns = self.device_ns - other.device_ns;
+        let drift_ns = (apart_ns.abs() as f64 * MOST_DRIFT) as i64;
+        self.taken_ns - other.taken_ns - apart_ns - drift_ns
+    }
 }
 
 struct Window {
@@ -30,7 +53,8 @@ struct Window {
 impl SampleClock {
     /// A clock whose transfers arrive `latency_ns` after their last sample when nothing delays them.
     pub fn new(latency_ns: i64) -> Self {
-        Self { latency_ns, model: ClockModel::new(WINDOWS), window: None }
+        let (best, model) = (VecDeque::with_capacity(WINDOWS), ClockModel::new(WINDOWS));
+        Self { latency_ns, best, model, window: None }
     }
 
     /// Notes that the samples up to `device_ns` had arrived at `host_ns`.
@@ -45,10 +69,24 @@ impl SampleClock {
         let windows = self.model.quality().map_or(0, |quality| quality.round_trips);
         if host_ns - window.began_ns >= WINDOW_NS[usize::from(windows >= SHORT_WINDOWS)] {
             let (device_ns, arrived_ns) = window.best;
-            let taken_ns = arrived_ns - self.latency_ns;
-            let (request_ns, receive_ns) = (taken_ns - UNCERTAINTY_NS, taken_ns + UNCERTAINTY_NS);
-            self.model.add(RoundTrip { request_ns, device_ns, receive_ns });
+            if self.best.len() == WINDOWS {
+                self.best.pop_front();
+            }
+            self.best.push_back(Arrival { device_ns, taken_ns: arrived_ns - self.latency_ns });
+            self.fit();
             self.window = None;
+        }
+    }
+
+    /// How late each window's best was shows by all of them, so each new one makes the fit anew.
+    fn fit(&mut self) {
+        self.model.clear();
+        for arrival in &self.best {
+            let late_ns =
+                self.best.iter().map(|other| arrival.later_than_ns(other)).max().unwrap_or(0).max(0);
+            let Arrival { device_ns, taken_ns } = *arrival;
+            let (request_ns, receive_ns) = (taken_ns - late_ns - UNCERTAINTY_NS, taken_ns + UNCERTAINTY_NS);
+            self.model.add(RoundTrip { request_ns, device_ns, receive_ns });
         }
     }
 
@@ -91,5 +129,17 @@ mod tests {
         assert!(worst_ns < 5_000, "{worst_ns} ns");
         let quality = clock.quality().unwrap();
         assert!((quality.rate_ppm - 30.0).abs() < 0.5 && quality.residual_us < 2.0, "{quality:?}");
+    }
+
+    /// As when a run begins and opens its devices: for whole windows no transfer is on time.
+    #[test]
+    fn a_host_that_was_busy_for_a_second_knows_the_time_two_seconds_later() {
+        let mut clock = SampleClock::new(100_000);
+        for k in 1..=750_i64 {
+            let late_ns = if k <= 250 { 1_000_000 + k * 7919 % 5_000_000 } else { k * 7919 % 400_000 };
+            clock.arrived(k * 4_000_000, 7_000_000_000_000 + k * 4_000_000 + 100_000 + late_ns);
+        }
+        let off_ns = clock.host_ns(3_000_000_000).unwrap() - 7_003_000_000_000;
+        assert!(off_ns.abs() < 30_000, "{off_ns} ns");
     }
 }

@@ -104,6 +104,8 @@ impl Usb {
         let mut endpoint = interface
             .endpoint::<Bulk, In>(SAMPLES)
             .map_err(|source| UsbError::System { call: "samples", source })?;
+        // An endpoint that halted stays so also for whoever opens it next, unless it is told.
+        endpoint.clear_halt().wait().map_err(|source| UsbError::System { call: "clear", source })?;
         let packet = endpoint.max_packet_size().max(1);
         let bytes = (rate.hz() as usize * TRANSFER_MS as usize / 1000).next_multiple_of(packet);
         // Under way before the first sample is taken: the analyser stops at once where nobody takes it.

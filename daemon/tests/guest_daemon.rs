@@ -1,0 +1,216 @@
+//! The daemon with a logic analyser on its VSYNC line, behind the kernel's USB stack (`vhci-hcd`): every frame that counts is
+//! tied to an edge that the analyser saw, whatever befalls the line and the analyser meanwhile. The camera is the simulated one,
+//! in a process of its own with the daemon, and both live by the guest's clock, on whose multiples of the period the line's edges stand.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+#[path = "../../drivers/tests/guest/mod.rs"]
+mod guest;
+
+use std::fs::File;
+use std::path::PathBuf;
+use std::process::{Child, Command};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+use guest::wait_for;
+use raysweep_core::{Edge, LossCause, Vsync};
+use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig};
+use raysweep_proto::{Client, Event, RunParams};
+use raysweep_session::Session;
+use raysweep_session::ledger::State;
+use raysweep_session::stack::ArrayName;
+use raysweep_sim::usb::{Fx2Faults, Fx2Lafw as Analyser, Plugged, Signal};
+use tempfile::TempDir;
+use thread_priority::{
+    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
+};
+
+/// A line and a sample rate that software emulation keeps up with, also on a busy host.
+const PERIOD_NS: i64 = 50_000_000;
+const SAMPLE_RATE_HZ: u32 = 100_000;
+const POINTS: usize = 8;
+const FRAMES: u32 = 2;
+/// Frames are tied to edges within 200 us.
+const MAX_JITTER_US: f64 = 180.0;
+
+fn plan() -> String {
+    format!(
+        "kind = \"sweep\"\n[sweep]\naverage = {FRAMES}\nmax_jitter_us = {MAX_JITTER_US}\n\
+         delay_us = {{ start = -750, stop = 750, count = {POINTS} }}\nexposure_us = [500]\n"
+    )
+}
+
+/// The line as the analyser sees it: the simulated camera's own, but for edges that it misses and false ones.
+fn signal(missing: f64, false_edges: f64) -> Signal {
+    Signal {
+        seed: 3,
+        period_ns: PERIOD_NS,
+        pulse_ns: 2_000_000,
+        jitter_ns: 0.0,
+        missing,
+        false_edges,
+        exposure_after_ns: 3_000_000,
+        exposure_ns: 1_000_000,
+    }
+}
+
+/// Plugs an analyser in whose own thread, as it is a device, goes before all that the guest computes.
+fn plug(signal: Signal) -> (Plugged, Fx2Faults) {
+    let (analyser, faults) = Analyser::new(signal, 20.0);
+    let plugged = std::thread::spawn(|| {
+        let priority = ThreadPriorityValue::try_from(80).map(ThreadPriority::Crossplatform).unwrap();
+        let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+        set_thread_priority_and_policy(thread_native_id(), priority, policy).unwrap();
+        // Its thread inherits the priority.
+        Plugged::new(analyser).unwrap()
+    });
+    (plugged.join().unwrap(), faults)
+}
+
+/// How late the driver's stamps are here: emulation takes its time over every transfer. A lab measures its own.
+fn lateness_us() -> f64 {
+    static MEASURED: OnceLock<f64> = OnceLock::new();
+    *MEASURED.get_or_init(|| {
+        let (_plugged, _) = plug(signal(0.0, 0.0));
+        let config =
+            Fx2LafwConfig { sample_rate_hz: SAMPLE_RATE_HZ, latency_us: 0.0, ..Fx2LafwConfig::default() };
+        let mut vsync = wait_for("the analyser", || Fx2Lafw::open(&config).ok());
+        let late_ns = |edge: Edge| (edge.host_ns + PERIOD_NS / 2).rem_euclid(PERIOD_NS) - PERIOD_NS / 2;
+        let mut late: Vec<i64> = Vec::new();
+        while late.len() < 120 {
+            late.extend(vsync.next_edge(Duration::from_millis(100)).unwrap().map(late_ns));
+        }
+        println!("{:?}", vsync.clock());
+        // The first seconds are spent on the fit of the clock.
+        let late = &mut late[80..];
+        late.sort_unstable();
+        println!("stamps are late by {} to {} ns", late[0], late[late.len() - 1]);
+        (late[late.len() / 2] as f64 / 1e3).max(0.0)
+    })
+}
+
+/// A daemon with its analyser, in a folder of its own.
+struct Lab {
+    folder: TempDir,
+    daemon: Child,
+}
+
+impl Drop for Lab {
+    fn drop(&mut self) {
+        let _ = self.daemon.kill();
+        let _ = self.daemon.wait();
+    }
+}
+
+impl Lab {
+    /// Starts the daemon. The analyser must be plugged in.
+    fn new(latency_us: f64) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let rig = format!(
+            "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\nrows = 8\nrow_time_us = 22.22\n\
+             [vsync]\ndriver = \"fx2lafw\"\nperiod_us = 50000\nreopen_s = 30\n\
+             fx2lafw = {{ sample_rate_hz = {SAMPLE_RATE_HZ}, latency_us = {latency_us} }}\n\
+             [sim]\nrealtime = true\nscene = \"slab\"\nscene_rows = 8\nscene_columns = 8\n[sim.vsync]\njitter_us = 0\n"
+        );
+        std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        let program = std::env::current_exe().unwrap().with_file_name("raysweepd");
+        let path = |name: &str| folder.path().join(name);
+        let daemon = Command::new(program)
+            .arg("--rig")
+            .arg(path("rig.toml"))
+            .arg("--socket")
+            .arg(path("socket"))
+            .arg("--data")
+            .arg(path("sessions"))
+            .stderr(File::create(path("log")).unwrap())
+            .spawn()
+            .unwrap();
+        Self { folder, daemon }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Runs the plan to its end, which is complete; `meanwhile` is told how many points are stored.
+    fn sweep(&self, mut meanwhile: impl FnMut(usize)) -> State {
+        let client = || wait_for("the daemon", || Client::connect(self.path("socket")).ok());
+        let events = client().subscribe().unwrap();
+        let began = Instant::now();
+        client().run(&RunParams { plan: plan(), ..RunParams::default() }).unwrap();
+        for event in events {
+            match event.unwrap() {
+                Event::Progress(progress) => meanwhile(progress.points_stored),
+                Event::Finished { session, state, error, missing, .. } => {
+                    println!("{}", std::fs::read_to_string(self.path("log")).unwrap());
+                    println!("{state} after {:?}", began.elapsed());
+                    assert_eq!((state.as_str(), error, missing), ("complete", None, 0));
+                    return Session::open(&session).unwrap().state().unwrap();
+                }
+                _ => {}
+            }
+        }
+        panic!("the daemon ended before the run");
+    }
+}
+
+/// Every frame of every point was tied to an edge, and measured by it has the delay that its point asks for.
+fn assert_tied(state: &State) {
+    let delays: Vec<f64> = (0..POINTS).map(|k| -750.0 + 1500.0 * k as f64 / (POINTS - 1) as f64).collect();
+    let mut worst_us = 0.0_f64;
+    for (point, delay_us) in state.stored(ArrayName::Sum).zip(delays) {
+        assert!((point.delay_us - delay_us).abs() < 1e-6, "{point:?}");
+        assert_eq!(point.delays_us.len(), FRAMES as usize, "{point:?}");
+        for measured_us in &point.delays_us {
+            worst_us = worst_us.max((measured_us - delay_us).abs());
+        }
+    }
+    println!("{:?}: delays are off by up to {worst_us:.0} us", state.counts);
+    assert_eq!(state.stored(ArrayName::Sum).count(), POINTS);
+    assert!(worst_us <= MAX_JITTER_US);
+    assert!(state.counts.balanced());
+}
+
+#[test]
+#[ignore = "needs the kernel guest: cargo xtask guest"]
+fn edges_that_the_analyser_misses_and_false_ones_tie_no_frame_wrongly() {
+    let latency_us = lateness_us();
+    let (_plugged, _) = plug(signal(0.05, 0.1));
+    let state = Lab::new(latency_us).sweep(|_| {});
+    assert_tied(&state);
+    let vsync = state.end.unwrap().vsync.unwrap();
+    println!("{vsync:?}");
+    assert!(vsync.missed > 0 && vsync.false_edges > 0, "{vsync:?}");
+}
+
+#[test]
+#[ignore = "needs the kernel guest: cargo xtask guest"]
+fn an_analyser_that_halts_stops_or_is_unplugged_within_a_sweep_costs_the_frames_of_its_absence() {
+    let latency_us = lateness_us();
+    let (first, faults) = plug(signal(0.0, 0.0));
+    let mut plugged = Some(first);
+    // How often it had been started before each of them.
+    let mut starts = Vec::new();
+    let state = Lab::new(latency_us).sweep(|stored| match starts.len() {
+        0 if stored >= 3 => {
+            starts.push(faults.starts());
+            faults.stall();
+        }
+        1 if stored >= 5 => {
+            starts.push(faults.starts());
+            faults.overrun();
+        }
+        2 if stored >= 7 => {
+            starts.push(faults.starts());
+            plugged = None;
+            std::thread::sleep(Duration::from_secs(3));
+            plugged = Some(plug(signal(0.0, 0.0)).0);
+        }
+        _ => {}
+    });
+    assert!(starts.len() == 3 && starts.is_sorted_by(|a, b| a < b), "{starts:?}");
+    assert_tied(&state);
+    assert!(state.counts.lost[&LossCause::EdgeMissing] > 0, "{:?}", state.counts);
+}

@@ -1,0 +1,301 @@
+//! A PlayzerX's stream, frame by frame as the maker documents it, against a FIFO of a few lines: streaming, the count of samples
+//! left, parking, health. Nothing of the driver's or the simulator's encoding is used here.
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use raysweep_core::{DeviceErrorKind, Mirror, MirrorPath, Tilt};
+use raysweep_drivers::mirror::{self, PlayzerX};
+
+use crate::rig::LIMITS;
+use crate::scripts::{Script, frame, play};
+
+/// The controller's words: what it is, and what it says to a ping.
+const INFO: &[u8] = b"pl-info\nPX1\nPLX-2.1.0.0\nXYM\n";
+const ALIVE: &[u8] = b"pl-ok\n";
+/// Samples that a monochrome controller holds.
+const FIFO_SAMPLES: u64 = 125_000;
+
+/// The origin, dark: X = Y = 2048.
+const AT_ORIGIN: &[u8] = b"pld\x09\x00\x80\x80\x00\n";
+const LEFT: &[u8] = b"plg\x05\n";
+const CLEAR: &[u8] = b"plc\x05\n";
+const PING: &[u8] = b"plp\x05\n";
+
+/// How the controller takes its samples out of the FIFO.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Drain {
+    /// So many a second.
+    ByClock(f64),
+    /// One between any two questions.
+    ByQuestion,
+    /// None, and the last so many are left.
+    Holds(u64),
+}
+
+/// What the script remembers.
+struct Desk {
+    drain: Drain,
+    frames: Vec<Vec<u8>>,
+    sent: u64,
+    /// Samples played when the FIFO was empty last, and when the next came.
+    base: u64,
+    began_ns: i64,
+    asked: u64,
+    most_held: u64,
+    /// Said before each answer.
+    noise: &'static [u8],
+}
+
+impl Desk {
+    fn left(&mut self, now_ns: i64) -> u64 {
+        match self.drain {
+            Drain::Holds(left) => left,
+            Drain::ByQuestion => {
+                self.asked += 1;
+                let left = self.sent - self.base - self.asked.min(self.sent - self.base);
+                self.most_held = self.most_held.max(left + 1);
+                left
+            }
+            Drain::ByClock(rate_hz) => {
+                let played = ((now_ns - self.began_ns) as f64 * 1e-9 * rate_hz) as u64;
+                (self.sent - self.base).saturating_sub(played)
+            }
+        }
+    }
+
+    fn answer(&mut self, message: &[u8], now_ns: i64) -> Vec<u8> {
+        if message == [0] {
+            return Vec::new();
+        }
+        self.frames.push(message.to_vec());
+        let answer = match message[2] {
+            b'd' => {
+                if matches!(self.drain, Drain::ByClock(_)) && self.left(now_ns) == 0 {
+                    (self.base, self.began_ns) = (self.sent, now_ns);
+                }
+                self.sent += 1;
+                return Vec::new();
+            }
+            b'c' => {
+                (self.base, self.asked) = (self.sent, 0);
+                return Vec::new();
+            }
+            b'n' => INFO.to_vec(),
+            b'p' => ALIVE.to_vec(),
+            b'g' => {
+                let [low, middle, high, ..] = self.left(now_ns).to_le_bytes();
+                [b"pl-", &[low, middle, high][..]].concat()
+            }
+            _ => return Vec::new(),
+        };
+        [self.noise, &answer].concat()
+    }
+}
+
+struct Lab {
+    script: Script,
+    desk: Arc<Mutex<Desk>>,
+}
+
+impl Lab {
+    fn new(rate_hz: f64) -> Self {
+        let desk = Arc::new(Mutex::new(Desk {
+            drain: Drain::ByClock(rate_hz),
+            frames: Vec::new(),
+            sent: 0,
+            base: 0,
+            began_ns: 0,
+            asked: 0,
+            most_held: 0,
+            noise: b"",
+        }));
+        let answering = desk.clone();
+        let answer = move |message: &[u8], now_ns| answering.lock().unwrap().answer(message, now_ns);
+        Self { script: Script::with(frame, answer), desk }
+    }
+
+    fn open(&self) -> PlayzerX {
+        let config = mirror::PlayzerXConfig {
+            port: self.script.pty.path().to_owned(),
+            link: mirror::Link::VirtualCom,
+            full_scale: LIMITS.max_tilt,
+            limits: LIMITS,
+            state: self.script.state(),
+            light: self.script.light(),
+        };
+        PlayzerX::open(config).unwrap()
+    }
+
+    fn frames(&self) -> Vec<Vec<u8>> {
+        self.desk.lock().unwrap().frames.clone()
+    }
+
+    fn drain(&self, drain: Drain) {
+        self.desk.lock().unwrap().drain = drain;
+    }
+}
+
+fn is_sample(frame: &[u8]) -> bool {
+    frame.starts_with(b"pld\x09")
+}
+
+/// A dark turn that takes seconds.
+fn turn(samples: usize, rate_hz: f64) -> MirrorPath {
+    let path = MirrorPath::lissajous(Tilt::new(1.0, 0.5), [1, 1], samples, rate_hz, &LIMITS).unwrap();
+    path.with_light(|_| 0)
+}
+
+#[test]
+fn a_stream_is_the_documented_frames_in_order() {
+    let lab = Lab::new(100.0);
+    let mut mirror = lab.open();
+    play(&mut mirror);
+    drop(mirror);
+    let frames = lab.frames();
+    let begin = frames.iter().position(|frame| is_sample(frame)).unwrap();
+    // Reports off, description, nothing left to play; then 100 samples/s, little endian.
+    let heard: Vec<&[u8]> = frames[..begin].iter().map(Vec::as_slice).collect();
+    assert_eq!(heard, [b"plu\x07\x00\x00\n", b"pln\x05\n" as &[u8], LEFT, b"plr\x08\x64\x00\x00\n"]);
+    // 0.13 degrees of 6.5 are 41 codes of 2047, -0.26 are -82: X = 0x829, Y = 0x800 and 0x7AE.
+    let samples: Vec<&[u8]> = frames.iter().map(Vec::as_slice).filter(|frame| is_sample(frame)).collect();
+    let places: [&[u8]; 2] = [b"pld\x09\x29\x80\x80\x00\n", b"pld\x09\x29\x8E\x7A\x00\n"];
+    assert!(samples.windows(2).any(|pair| pair == places), "{samples:x?}");
+    assert_eq!((samples[0], samples[samples.len() - 1]), (AT_ORIGIN, AT_ORIGIN));
+    assert!(frames[begin..].iter().all(|frame| is_sample(frame) || frame == LEFT), "nothing else is said");
+}
+
+#[test]
+fn the_fifo_is_filled_and_never_overfilled_by_the_controllers_own_count() {
+    let lab = Lab::new(39_000.0);
+    let mut mirror = lab.open();
+    mirror.load(&turn(6500, 39_000.0)).unwrap();
+    {
+        let mut desk = lab.desk.lock().unwrap();
+        (desk.drain, desk.base) = (Drain::ByQuestion, desk.sent);
+    }
+    mirror.start(100).unwrap();
+    let most = |lab: &Lab| lab.desk.lock().unwrap().most_held;
+    let began = Instant::now();
+    let mut full = None;
+    // Some time beyond, in which it would be overfilled.
+    while full.is_none_or(|full: Instant| full.elapsed() < Duration::from_millis(300)) {
+        mirror.feed().unwrap();
+        if most(&lab) > FIFO_SAMPLES - 2000 {
+            full.get_or_insert_with(Instant::now);
+        }
+        assert!(began.elapsed() < Duration::from_secs(60), "{} samples", most(&lab));
+        std::thread::sleep(Duration::from_micros(100));
+    }
+    assert!(most(&lab) <= FIFO_SAMPLES, "{} samples", most(&lab));
+    lab.drain(Drain::ByClock(39_000.0));
+    mirror.park().unwrap();
+}
+
+#[test]
+fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
+    let lab = Lab::new(1000.0);
+    let mut mirror = lab.open();
+    mirror.load(&turn(2000, 1000.0)).unwrap();
+    mirror.start(2).unwrap();
+    let began = Instant::now();
+    while mirror.feed().unwrap().played < 700 {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    // It stops where 3000 samples are left.
+    lab.drain(Drain::Holds(3000));
+    let parking = std::thread::spawn(move || mirror.park().map(|()| mirror));
+    let began = Instant::now();
+    let clearing = loop {
+        if let Some(at) = lab.frames().iter().position(|frame| frame == CLEAR) {
+            break at;
+        }
+        assert!(began.elapsed() < Duration::from_secs(60));
+    };
+    {
+        let mut desk = lab.desk.lock().unwrap();
+        (desk.drain, desk.base) = (Drain::ByClock(1000.0), desk.sent);
+    }
+    parking.join().unwrap().unwrap();
+    let frames = lab.frames();
+    // The count is asked for thrice, since an answer may be lost; the ping tells that all of it has arrived.
+    assert_eq!(frames[clearing - 3..clearing], [LEFT, LEFT, LEFT]);
+    assert_eq!(frames[clearing + 1], PING);
+    let samples = |frames: &[Vec<u8>]| -> Vec<Vec<u8>> {
+        frames.iter().filter(|frame| is_sample(frame)).cloned().collect()
+    };
+    let (before, after) = (samples(&frames[..clearing]), samples(&frames[clearing..]));
+    let place = &before[before.len() - 3000 - 1];
+    assert_ne!(place, AT_ORIGIN);
+    assert_eq!(&after[0], place, "dark where it stands");
+    assert_eq!(after.last().unwrap(), AT_ORIGIN);
+    let code = |frame: &[u8]| {
+        let high = u16::from(frame[5]);
+        [u16::from(frame[4]) | (high & 0xF0) << 4, high & 0x0F | u16::from(frame[6]) << 4].map(i32::from)
+    };
+    for pair in after.windows(2) {
+        let (a, b) = (code(&pair[0]), code(&pair[1]));
+        // What the mirror survives, and the rounding of both ends.
+        let allowed = (LIMITS.max_step.0 / 6.5 * 2047.0) as i32 + 2;
+        assert!((0..2).all(|axis| (a[axis] - b[axis]).abs() <= allowed), "{a:?} then {b:?}");
+    }
+}
+
+#[test]
+fn a_controller_that_plays_nothing_is_told_by_its_count() {
+    let lab = Lab::new(1000.0);
+    let mut mirror = lab.open();
+    mirror.load(&turn(2000, 1000.0)).unwrap();
+    mirror.start(2).unwrap();
+    mirror.feed().unwrap();
+    // Of about 4000 samples as many stay, whenever it is asked.
+    let began = Instant::now();
+    while mirror.feed().unwrap().played < 100 {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let left = {
+        let mut desk = lab.desk.lock().unwrap();
+        let now_ns = raysweep_core::Clock::real().now_ns();
+        let left = desk.left(now_ns);
+        desk.drain = Drain::Holds(left);
+        left
+    };
+    assert!(left > 1000);
+    let halted = std::thread::spawn(move || {
+        let error = loop {
+            if let Err(error) = mirror.feed() {
+                break error;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        };
+        (error, mirror)
+    });
+    // Parking after the error finds it alive again.
+    while !lab.frames().iter().any(|frame| frame == CLEAR) {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    {
+        let mut desk = lab.desk.lock().unwrap();
+        (desk.drain, desk.base) = (Drain::ByClock(1000.0), desk.sent);
+    }
+    let (error, _mirror) = halted.join().unwrap();
+    assert!(error.kind == DeviceErrorKind::Timeout && error.to_string().contains("no motion"), "{error}");
+}
+
+#[test]
+fn noise_before_each_answer_is_counted_and_costs_nothing() {
+    let lab = Lab::new(100.0);
+    // The beginning of an answer that is none, and half a word.
+    lab.desk.lock().unwrap().noise = b"pl-ixpl";
+    let mut mirror = lab.open();
+    play(&mut mirror);
+    let questions =
+        lab.frames().iter().filter(|frame| [LEFT, b"pln\x05\n" as &[u8]].contains(&frame.as_slice())).count();
+    assert!(questions > 3);
+    // An answer that is under way when the path is over has not been read.
+    let unread = questions as u64 * 7 - mirror.garbage_bytes();
+    assert!(unread <= 7, "{unread} of {questions} times 7 bytes were not counted");
+}
