@@ -1,11 +1,9 @@
-//! What libaravis has of a frame, without the copies and allocations of its Rust bindings.
+//! A frame's image where libaravis has it, without the copies of its Rust bindings.
 
-#![allow(unsafe_code, reason = "the bindings copy each image twice and allocate for each chunk")]
+#![allow(unsafe_code, reason = "the bindings copy each image twice")]
 
-use std::ffi::CStr;
-
+use aravis::Buffer;
 use aravis::glib::translate::ToGlibPtr;
-use aravis::{Buffer, ChunkParser};
 
 /// The image of a frame, where it lies.
 ///
@@ -18,26 +16,4 @@ pub fn image_data(buffer: &Buffer) -> &[u8] {
         let data = aravis_sys::arv_buffer_get_image_data(buffer.to_glib_none().0, &mut size);
         if data.is_null() { &[] } else { std::slice::from_raw_parts(data, size) }
     }
-}
-
-/// A number of a frame's chunk data, where it has it.
-///
-/// Benefit: `ChunkParser::float_value` of the bindings allocates the name anew for each frame.
-pub fn chunk_float(parser: &ChunkParser, buffer: &Buffer, name: &CStr) -> Option<f64> {
-    let mut error = std::ptr::null_mut();
-    // SAFETY: parser, buffer and name live through the call, which keeps none of them; the error, if there is one, is
-    // ours to free.
-    unsafe {
-        let value = aravis_sys::arv_chunk_parser_get_float_value(
-            parser.to_glib_none().0,
-            buffer.to_glib_none().0,
-            name.as_ptr(),
-            &mut error,
-        );
-        if error.is_null() {
-            return Some(value);
-        }
-        drop::<aravis::glib::Error>(aravis::glib::translate::from_glib_full(error));
-    }
-    None
 }

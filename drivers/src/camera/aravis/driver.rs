@@ -1,13 +1,12 @@
 //! The camera as the traits of `raysweep-core` have it: the side that takes frames.
 
-use std::ffi::CStr;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use aravis::prelude::*;
-use aravis::{Buffer, BufferStatus, ChunkParser, Stream};
+use aravis::{Buffer, BufferStatus, Stream};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
     DeviceState, FirstFrame, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us,
@@ -15,12 +14,14 @@ use raysweep_core::{
 };
 
 use super::buffer;
+use super::chunks::Chunks;
 use super::config::{AravisConfig, TimestampAt};
 use super::ids::FrameIds;
 use super::library::Health;
 use super::losses::Losses;
 use super::owner::{BUFFERS, Command, Done, Opened, Order, Owner, Reply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
+use super::sequencer::Sequence;
 
 /// What the driver must know of the rig that its camera is part of.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,7 +46,6 @@ const ROUND_TRIPS: usize = 100;
 const LOOK: Duration = Duration::from_millis(50);
 /// An owner whose camera is dead may be blocked for longer; it then ends by itself.
 const FAREWELL: Duration = Duration::from_secs(3);
-const CHUNK_EXPOSURE: &CStr = c"ChunkExposureTime";
 
 /// A GenICam camera.
 pub struct AravisCamera {
@@ -63,10 +63,12 @@ pub struct AravisCamera {
     losses: Losses,
     promises: Promises<CameraSettings>,
     newest: Option<Newest>,
+    /// The number of the first set of the camera's sequencer, while that runs.
+    first_set: Option<i64>,
 }
 
 enum Link {
-    Up { stream: Stream, chunks: Option<ChunkParser>, tells_time: bool },
+    Up { stream: Stream, chunks: Option<Chunks>, tells_time: bool },
     Lost { since: Instant },
 }
 
@@ -76,6 +78,8 @@ struct Newest {
     seq: u64,
     exposure_start_ns: i64,
     host_ns: i64,
+    /// The sequencer's set, counted from its first, where the frame says it.
+    set: Option<usize>,
 }
 
 fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
@@ -141,6 +145,7 @@ impl AravisCamera {
             losses: Losses::new(),
             promises: Promises::new(),
             newest: None,
+            first_set: None,
         })
     }
 
@@ -275,8 +280,11 @@ impl AravisCamera {
         };
         buf.copy_from_slice(image);
         let Link::Up { chunks, tells_time, .. } = &self.link else { return Ok(None) };
-        let exposure_us =
-            chunks.as_ref().and_then(|parser| buffer::chunk_float(parser, from, CHUNK_EXPOSURE));
+        let exposure_us = chunks.as_ref().and_then(|chunks| chunks.exposure_us(from));
+        let set = self.first_set.zip(chunks.as_ref()).and_then(|(first_set, chunks)| {
+            let set = chunks.sequencer_set(from)?;
+            usize::try_from(set - first_set).ok()
+        });
         let set_us =
             exposure_us.or(self.promises.newest().map(|settings| settings.exposure_us)).unwrap_or(0.0);
         let stamped_ns = i64::try_from(from.timestamp()).unwrap_or(i64::MAX);
@@ -293,7 +301,7 @@ impl AravisCamera {
         });
         let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
         self.losses.whole(seq);
-        self.newest = Some(Newest { seq, exposure_start_ns, host_ns });
+        self.newest = Some(Newest { seq, exposure_start_ns, host_ns, set });
         Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
     }
 
@@ -374,6 +382,7 @@ impl Camera for AravisCamera {
         self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         let triggers = self.triggers();
         let Done { written_ns, actual, restarted, .. } = self.ask(Command::Configure(*settings))?;
+        self.first_set = None;
         let actual = actual.unwrap_or(*settings);
         if restarted {
             self.ids.restart(0);
@@ -390,6 +399,8 @@ impl Camera for AravisCamera {
             self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         }
         let Done { sequence, restarted, .. } = self.ask(Command::Sequence(settings.to_vec()))?;
+        self.first_set = sequence.as_ref().map(|sequence| sequence.first_set);
+        let sequence = sequence.map(|Sequence { settings, .. }| settings);
         if restarted {
             self.drain();
             self.ids.restart(0);
@@ -402,6 +413,10 @@ impl Camera for AravisCamera {
             self.promises.push(FirstFrame::Within { earliest: next_seq, certain: next_seq }, *longest);
         }
         Ok(sequence)
+    }
+
+    fn active_set(&self) -> Option<usize> {
+        self.newest.and_then(|newest| newest.set)
     }
 
     fn arm(&mut self) -> Result<(), DeviceError> {

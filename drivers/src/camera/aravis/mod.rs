@@ -14,6 +14,8 @@ pub use config::{AravisConfig, ConfigFault, Region, TimestampAt};
 #[cfg(feature = "aravis")]
 mod buffer;
 #[cfg(feature = "aravis")]
+mod chunks;
+#[cfg(feature = "aravis")]
 mod driver;
 #[cfg(feature = "aravis")]
 mod features;

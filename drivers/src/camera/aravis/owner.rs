@@ -5,15 +5,16 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use aravis::prelude::*;
-use aravis::{Buffer, ChunkParser, Stream};
+use aravis::{Buffer, Stream};
 use raysweep_core::{CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind};
 
+use super::chunks::Chunks;
 use super::config::AravisConfig;
 use super::driver::RigFacts;
 use super::features::{FeatureError, Features};
 use super::library::{Device, DeviceClock, Health, device_error};
 use super::network::{self, SocketBuffer};
-use super::sequencer;
+use super::sequencer::{self, Sequence};
 use super::settings::Writer;
 use super::setup::set_up;
 
@@ -65,8 +66,8 @@ pub struct Done {
     pub written_ns: i64,
     /// The settings that the camera has, where some were written.
     pub actual: Option<CameraSettings>,
-    /// The settings of its sequencer, where that was started.
-    pub sequence: Option<Vec<CameraSettings>>,
+    /// What its sequencer goes through, where that was started.
+    pub sequence: Option<Sequence>,
     /// Whether it had to stop for them, so that it counts its frames anew.
     pub restarted: bool,
 }
@@ -74,7 +75,7 @@ pub struct Done {
 /// An open camera, as far as whoever takes its frames needs it.
 pub struct Opened {
     pub stream: Stream,
-    pub chunks: Option<ChunkParser>,
+    pub chunks: Option<Chunks>,
     pub capabilities: CameraCapabilities,
     /// Whether its clock can be asked.
     pub tells_time: bool,
@@ -229,7 +230,8 @@ impl Owner {
             exposure_us: device.float_range(set_up.names.exposure)?,
             trigger_delay_us: delay_us,
         };
-        let chunks = if set_up.chunk_exposure { device.camera.create_chunk_parser() } else { None };
+        let parser = device.camera.create_chunk_parser();
+        let chunks = parser.map(|parser| Chunks::new(parser, set_up.chunks));
         let mut writer = Writer::new(set_up.names);
         if let Some(settings) = &self.settings {
             writer.write(&device, settings)?;
@@ -256,10 +258,8 @@ impl Owner {
                 }
                 Ok(Order { command: Command::Close(stream), .. }) => {
                     let _ = connection.device.execute("AcquisitionStop");
-                    if self.sequence.is_some() {
-                        // A camera that is gone is not left with it; one that is there takes it.
-                        let _ = sequencer::stop(&connection.device);
-                    }
+                    // A camera that is gone is not left with it; one that is there takes it.
+                    let _ = self.end_sequence(&mut connection);
                     drop(stream);
                     return Ended::Closed;
                 }
@@ -294,6 +294,20 @@ impl Owner {
         }
     }
 
+    /// Switches the camera's sequencer off, where it runs, and writes the settings that the camera had before.
+    fn end_sequence(
+        &mut self,
+        Connection { device, writer, .. }: &mut Connection,
+    ) -> Result<(), FeatureError> {
+        if self.sequence.take().is_some() {
+            sequencer::stop(device)?;
+            if let Some(settings) = &self.settings {
+                writer.write(device, settings)?;
+            }
+        }
+        Ok(())
+    }
+
     fn obey(&mut self, connection: &mut Connection, command: Command) -> Result<Done, DeviceError> {
         let Connection { device, writer, .. } = connection;
         let mut done = Done { written_ns: 0, actual: None, sequence: None, restarted: false };
@@ -305,9 +319,7 @@ impl Owner {
             Command::Disarm => {
                 self.armed = false;
                 device.execute("AcquisitionStop")?;
-                if self.sequence.take().is_some() {
-                    sequencer::stop(device)?;
-                }
+                self.end_sequence(connection)?;
             }
             Command::Configure(settings) => {
                 self.settings = Some(settings);
@@ -337,8 +349,8 @@ impl Owner {
                     device.execute("AcquisitionStart")?;
                 }
                 match started {
-                    Ok(actual) => {
-                        (self.sequence, done.sequence) = (Some(settings), Some(actual));
+                    Ok(sequence) => {
+                        (self.sequence, done.sequence) = (Some(settings), Some(sequence));
                     }
                     Err(error) if is_gone(&error) => return Err(error.into()),
                     Err(error) => {
