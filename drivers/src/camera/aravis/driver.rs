@@ -5,21 +5,20 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use aravis::prelude::*;
-use aravis::{Buffer, BufferStatus, Stream};
+use aravis::{Buffer, BufferStatus};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
     DeviceState, FirstFrame, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us,
     us_from_ns,
 };
 
-use super::buffer;
 use super::chunks::Chunks;
 use super::config::{AravisConfig, TimestampAt};
+use super::frames::{Frames, image_data};
 use super::ids::FrameIds;
 use super::library::Health;
 use super::losses::Losses;
-use super::owner::{BUFFERS, Command, Done, Opened, Order, Owner, Reply, Shared};
+use super::owner::{Command, Done, Opened, Order, Owner, Reply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
 use super::sequencer::Sequence;
 
@@ -68,7 +67,7 @@ pub struct AravisCamera {
 }
 
 enum Link {
-    Up { stream: Stream, chunks: Option<Chunks>, tells_time: bool },
+    Up { frames: Frames, chunks: Option<Chunks>, tells_time: bool },
     Lost { since: Instant },
 }
 
@@ -127,7 +126,7 @@ impl AravisCamera {
                 return Err(error(DeviceErrorKind::NotReady, "its thread ended; the log has its message"));
             }
         };
-        let Opened { stream, chunks, capabilities, tells_time, .. } = opened;
+        let Opened { frames, chunks, capabilities, tells_time, .. } = opened;
         let mut ids = FrameIds::default();
         ids.restart(1);
         Ok(Self {
@@ -139,7 +138,7 @@ impl AravisCamera {
             replies,
             owner: Some(thread),
             ticket: 0,
-            link: Link::Up { stream, chunks, tells_time },
+            link: Link::Up { frames, chunks, tells_time },
             armed_ns: None,
             ids,
             losses: Losses::new(),
@@ -209,11 +208,11 @@ impl AravisCamera {
     /// Gives the camera up and has it opened again.
     fn lose(&mut self) {
         let link = std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() });
-        if let (Link::Up { stream, .. }, Some(orders)) = (link, &self.orders) {
+        if let (Link::Up { frames, .. }, Some(orders)) = (link, &self.orders) {
             tracing::warn!(camera = self.capabilities.model, "camera lost; opening it again");
             self.ticket += 1;
             // The channel has room for this and for what was asked before.
-            let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(stream) });
+            let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(frames) });
         }
     }
 
@@ -231,9 +230,9 @@ impl AravisCamera {
                         );
                         return Err(error(DeviceErrorKind::Protocol, what));
                     }
-                    let Opened { stream, chunks, tells_time, armed_ns, .. } = opened;
+                    let Opened { frames, chunks, tells_time, armed_ns, .. } = opened;
                     tracing::warn!(camera = self.capabilities.model, away = ?since.elapsed(), "camera back");
-                    self.link = Link::Up { stream, chunks, tells_time };
+                    self.link = Link::Up { frames, chunks, tells_time };
                     self.armed_ns = self.armed_ns.and(armed_ns);
                     self.resume_ids();
                     return Ok(());
@@ -257,8 +256,8 @@ impl AravisCamera {
         }
     }
 
-    /// Looks at a buffer that the stream gave: a whole frame is copied into `buf`.
-    fn take(&mut self, from: &Buffer, buf: &mut FrameBuf) -> Result<Option<FrameStamp>, DeviceError> {
+    /// Looks at a frame that came, of which `bytes` are wanted; nothing where it is not whole.
+    fn look_at(&mut self, from: &Buffer, bytes: usize) -> Result<Option<FrameStamp>, DeviceError> {
         match from.status() {
             BufferStatus::Success => {}
             // Left over from before a stop.
@@ -269,16 +268,13 @@ impl AravisCamera {
             }
         }
         let host_ns = self.shared.clock.now_ns();
-        let image = buffer::image_data(from);
-        let Some(image) = image.get(..buf.len()) else {
+        let image_bytes = image_data(from).len();
+        if image_bytes < bytes {
             let what = format!(
-                "a frame has {} bytes instead of {}: its region or format was changed",
-                image.len(),
-                buf.len()
+                "a frame has {image_bytes} bytes instead of {bytes}: its region or format was changed"
             );
             return Err(error(DeviceErrorKind::Protocol, what));
-        };
-        buf.copy_from_slice(image);
+        }
         let Link::Up { chunks, tells_time, .. } = &self.link else { return Ok(None) };
         let exposure_us = chunks.as_ref().and_then(|chunks| chunks.exposure_us(from));
         let set = self.first_set.zip(chunks.as_ref()).and_then(|(first_set, chunks)| {
@@ -357,10 +353,8 @@ impl AravisCamera {
 
     /// Throws away what has come of frames that nobody asked for.
     fn drain(&self) {
-        if let Link::Up { stream, .. } = &self.link {
-            while let Some(buffer) = stream.try_pop_buffer() {
-                stream.push_buffer(buffer);
-            }
+        if let Link::Up { frames, .. } = &self.link {
+            frames.drain();
         }
     }
 }
@@ -442,16 +436,16 @@ impl Camera for AravisCamera {
         let until = Instant::now() + timeout;
         loop {
             let left = until.saturating_duration_since(Instant::now());
-            let stream = match &self.link {
+            let frames = match &self.link {
                 Link::Lost { since } => {
                     let since = *since;
                     self.wait_for_return(since, left)?;
                     return Ok(None);
                 }
-                Link::Up { stream, .. } => stream,
+                Link::Up { frames, .. } => frames,
             };
             let wait_us = left.min(LOOK).as_micros().try_into().unwrap_or(u64::MAX);
-            let popped = stream.timeout_pop_buffer(wait_us);
+            let popped = frames.pop(wait_us);
             let Some(buffer) = popped else {
                 let alive_ns = self.newest.map_or(armed_ns, |newest| newest.host_ns.max(armed_ns));
                 if self.silent_since(alive_ns) {
@@ -461,15 +455,21 @@ impl Camera for AravisCamera {
                 }
                 continue;
             };
-            if stream.n_buffers().0 == 0 {
-                self.losses.full(self.ids.next() + BUFFERS);
+            if frames.is_full() {
+                self.losses.full(self.ids.next() + frames.buffers() as u64);
             }
-            let taken = self.take(&buffer, buf);
-            if let Link::Up { stream, .. } = &self.link {
-                stream.push_buffer(buffer);
-            }
-            if let Some(stamp) = taken? {
-                return Ok(Some(stamp));
+            let seen = self.look_at(&buffer, buf.len());
+            let Link::Up { frames, .. } = &mut self.link else { return Ok(None) };
+            match seen {
+                Ok(Some(stamp)) => {
+                    frames.take(buffer, buf);
+                    return Ok(Some(stamp));
+                }
+                Ok(None) => frames.give_back(buffer),
+                Err(error) => {
+                    frames.give_back(buffer);
+                    return Err(error);
+                }
             }
         }
     }
@@ -490,10 +490,10 @@ impl Camera for AravisCamera {
 impl Drop for AravisCamera {
     fn drop(&mut self) {
         let Some(orders) = self.orders.take() else { return };
-        if let Link::Up { stream, .. } =
+        if let Link::Up { frames, .. } =
             std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() })
         {
-            let _ = orders.try_send(Order { ticket: 0, command: Command::Close(stream) });
+            let _ = orders.try_send(Order { ticket: 0, command: Command::Close(frames) });
         }
         drop(orders);
         // The owner of a dead camera may be blocked in the library: it is waited for, but not for ever.

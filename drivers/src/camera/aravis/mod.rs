@@ -12,8 +12,6 @@ mod config;
 pub use config::{AravisConfig, ConfigFault, Region, TimestampAt};
 
 #[cfg(feature = "aravis")]
-mod buffer;
-#[cfg(feature = "aravis")]
 mod chunks;
 #[cfg(feature = "aravis")]
 mod driver;
@@ -21,6 +19,8 @@ mod driver;
 mod features;
 #[cfg(feature = "aravis")]
 mod file;
+#[cfg(feature = "aravis")]
+mod frames;
 #[cfg(feature = "aravis")]
 mod ids;
 #[cfg(feature = "aravis")]
