@@ -7,7 +7,7 @@
 #[path = "../tests/wire/mod.rs"]
 mod wire;
 
-use wire::{Sweep, Swept};
+use wire::{Sweep, Swept, Then};
 
 const SWEEP: Sweep = Sweep {
     side_px: 128,
@@ -16,7 +16,7 @@ const SWEEP: Sweep = Sweep {
            exposure_us = { start = 600, stop = 1200, count = 5 }\n",
     camera: "",
     faults: &[],
-    dies_after: None,
+    then: None,
 };
 
 fn main() {
@@ -36,7 +36,7 @@ fn main() {
             "1 % of packets lost, none sent again",
             Sweep { faults: &["packet_loss=0.01", "resend=false"], ..SWEEP },
         ),
-        ("the camera dies for 2 s", Sweep { dies_after: Some(30), ..SWEEP }),
+        ("the camera dies for 2 s", Sweep { then: Some((30, Then::Dies)), ..SWEEP }),
     ];
     for (case, sweep) in cases {
         let Swept { counts, wire, end } = sweep.run();

@@ -6,7 +6,7 @@ mod wire;
 
 use raysweep_core::LossCause;
 
-use wire::Sweep;
+use wire::{Sweep, Then};
 
 const SWEEP: Sweep = Sweep {
     side_px: 32,
@@ -14,7 +14,7 @@ const SWEEP: Sweep = Sweep {
     plan: "average = 4\ndelay_us = { start = -300, stop = 300, count = 7 }\nexposure_us = [400, 600]\n",
     camera: "",
     faults: &[],
-    dies_after: None,
+    then: None,
 };
 
 /// By the camera's sequencer, which [`wire`] makes sure of.
@@ -60,7 +60,7 @@ fn settings_that_act_three_frames_late_mislabel_nothing() {
 #[test]
 fn a_camera_that_dies_in_the_middle_costs_the_frames_of_its_absence() {
     // While points wait for frames: between two passes nobody does.
-    let counts = Sweep { dies_after: Some(8), ..SWEEP }.run().counts;
+    let counts = Sweep { then: Some((8, Then::Dies)), ..SWEEP }.run().counts;
     assert!(counts.lost[&LossCause::CameraLost] > 0, "{counts:?}");
 }
 
@@ -86,6 +86,25 @@ fn frames_of_a_film_that_are_lost_take_their_sets_with_them() {
 
 #[test]
 fn a_camera_that_dies_within_a_film_has_its_sets_again_when_it_is_back() {
-    let counts = Sweep { dies_after: Some(10), ..FILM }.run().counts;
+    let counts = Sweep { then: Some((10, Then::Dies)), ..FILM }.run().counts;
     assert!(counts.lost[&LossCause::CameraLost] > 0, "{counts:?}");
+}
+
+#[test]
+fn a_film_whose_sets_stamps_cannot_tell_goes_by_what_frames_say_of_them() {
+    // Half a period apart: either set might be the first.
+    let plan = "cycles = 60\ndelay_us = [-500, 7833]\nexposure_us = 400\n";
+    Sweep { plan, ..FILM }.run();
+}
+
+#[test]
+fn a_pause_stops_the_cameras_sequencer_and_costs_no_frame() {
+    let filmed = Sweep { then: Some((10, Then::IsHeld)), ..FILM }.run();
+    assert!(!filmed.counts.lost.contains_key(&LossCause::Jitter), "{:?}", filmed.counts);
+}
+
+#[test]
+fn a_film_that_is_cancelled_leaves_the_camera_without_its_sequencer() {
+    let filmed = Sweep { then: Some((10, Then::IsCancelled)), ..FILM }.run();
+    assert!(!filmed.counts.lost.contains_key(&LossCause::Jitter), "{:?}", filmed.counts);
 }

@@ -5,11 +5,13 @@
 mod support;
 
 use std::error::Error;
+use std::fmt;
+use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use nix::sys::resource::{UsageWho, getrusage};
-use nix::sys::time::TimeVal;
+use nix::time::{ClockId, clock_getcpuclockid};
+use nix::unistd::Pid;
 use raysweep_core::{Camera, CameraSettings, Clock, FramePool, PixelFormat, SettingsId, Shutter};
 use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, RigFacts};
 use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look};
@@ -24,9 +26,10 @@ const CASES: [(usize, usize, &str, u32); 3] =
 const PACKET_BYTES: [u32; 2] = [1_500, 9_000];
 /// More than any client takes.
 const FLAT_OUT_HZ: u32 = 10_000;
-const DURATION: Duration = Duration::from_secs(3);
-/// Each is measured as often, in turn, and its best taken: whatever else the machine does only adds.
-const REPEATS: usize = 3;
+/// Seconds that are measured one by one in each turn, after the first, in which the client starts.
+const SECONDS: usize = 4;
+/// Turns of the driver and of the peer.
+const TURNS: usize = 3;
 /// Frames whose way is timed.
 const TIMED_FRAMES: usize = 600;
 
@@ -40,21 +43,47 @@ struct Case {
     packet_bytes: u32,
 }
 
-/// What streaming cost and gave.
-#[derive(Clone, Copy)]
+/// What streaming cost and gave, second by second.
+#[derive(Default)]
 struct Streamed {
-    cpu_us_per_frame: f64,
-    frames_per_s: f64,
+    cpu_us_per_frame: Vec<f64>,
+    frames_per_s: Vec<f64>,
 }
 
 impl Streamed {
-    const NOTHING: Self = Self { cpu_us_per_frame: f64::INFINITY, frames_per_s: 0.0 };
+    fn note(&mut self, frames: f64, cpu_us: f64, elapsed: Duration) {
+        self.cpu_us_per_frame.push(cpu_us / frames);
+        self.frames_per_s.push(frames / elapsed.as_secs_f64());
+    }
 
-    fn best(self, other: Self) -> Self {
-        Self {
-            cpu_us_per_frame: self.cpu_us_per_frame.min(other.cpu_us_per_frame),
-            frames_per_s: self.frames_per_s.max(other.frames_per_s),
-        }
+    fn cpu_us(&self) -> Spread {
+        Spread::of(&self.cpu_us_per_frame)
+    }
+
+    fn rate_hz(&self) -> Spread {
+        Spread::of(&self.frames_per_s)
+    }
+}
+
+/// The median of some seconds, and how far they lie apart.
+struct Spread {
+    lowest: f64,
+    median: f64,
+    highest: f64,
+}
+
+impl Spread {
+    fn of(values: &[f64]) -> Self {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let at = |place: usize| sorted.get(place).copied().unwrap_or(f64::NAN);
+        Self { lowest: at(0), median: at(sorted.len() / 2), highest: at(sorted.len().saturating_sub(1)) }
+    }
+}
+
+impl fmt::Display for Spread {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:.0} ({:.0} to {:.0})", self.median, self.lowest, self.highest)
     }
 }
 
@@ -87,10 +116,9 @@ impl Drop for Simulated {
     }
 }
 
-fn cpu_us(who: UsageWho) -> Done<f64> {
-    let usage = getrusage(who)?;
-    let us = |time: TimeVal| time.tv_sec() as f64 * 1e6 + time.tv_usec() as f64;
-    Ok(us(usage.user_time()) + us(usage.system_time()))
+/// What a process has taken of the processors.
+fn cpu_us(clock: ClockId) -> Done<f64> {
+    Ok(Duration::from(clock.now()?).as_secs_f64() * 1e6)
 }
 
 impl Case {
@@ -124,49 +152,63 @@ impl Case {
         Ok((camera, FramePool::new(1, format.frame_bytes(self.width * self.height))))
     }
 
+    fn name(self) -> String {
+        format!("{}x{} {}, packets of {}", self.width, self.height, self.format, self.packet_bytes)
+    }
+
     /// Streams for a while with the driver.
-    fn ours(self) -> Done<Streamed> {
+    fn ours(self, streamed: &mut Streamed) -> Done<()> {
         let (mut camera, pool) = self.open()?;
         let mut buf = pool.take();
-        camera.next_frame(&mut buf, Duration::from_secs(1))?;
-        let (begun, begun_us, mut frames) = (Instant::now(), cpu_us(UsageWho::RUSAGE_SELF)?, 0_u32);
-        while begun.elapsed() < DURATION {
-            frames += u32::from(camera.next_frame(&mut buf, Duration::from_secs(1))?.is_some());
+        let clock = ClockId::CLOCK_PROCESS_CPUTIME_ID;
+        for second in 0..=SECONDS {
+            let (begun, begun_us, mut frames) = (Instant::now(), cpu_us(clock)?, 0_u32);
+            while begun.elapsed() < Duration::from_secs(1) {
+                frames += u32::from(camera.next_frame(&mut buf, Duration::from_secs(1))?.is_some());
+            }
+            if second > 0 {
+                streamed.note(frames.into(), cpu_us(clock)? - begun_us, begun.elapsed());
+            }
         }
-        let frames = f64::from(frames);
-        Ok(Streamed {
-            cpu_us_per_frame: (cpu_us(UsageWho::RUSAGE_SELF)? - begun_us) / frames,
-            frames_per_s: frames / begun.elapsed().as_secs_f64(),
-        })
+        Ok(())
     }
 
-    /// Processor time and frames of the library's own client, on the same kind of socket.
-    fn client(self, seconds: u64) -> Done<(f64, f64)> {
-        let before_us = cpu_us(UsageWho::RUSAGE_CHILDREN)?;
+    /// The same with the library's own client, on the same kind of socket. It says each second how many frames it had.
+    fn theirs(self, streamed: &mut Streamed) -> Done<()> {
         let features = format!("PixelFormat={} AcquisitionFrameRate={}", self.format, self.rate_hz);
         let (width, height) = (self.width.to_string(), self.height.to_string());
-        let output = Command::new("arv-camera-test-0.8")
-            .args(["-n", ADDRESS, "--auto", "--no-packet-socket", "-w", &width, "-h", &height])
-            .args(["--features", &features, "-j", "never", "-i", &self.packet_bytes.to_string()])
-            .args(["--duration", &seconds.to_string()])
-            .output()
-            .map_err(|error| format!("arv-camera-test-0.8 (Debian: aravis-tools): {error}"))?;
-        let text = String::from_utf8(output.stdout)?;
-        let line = text.lines().find(|line| line.starts_with("n_completed_buffers"));
-        let line = line.ok_or_else(|| format!("arv-camera-test-0.8 had no frames:\n{text}"))?;
-        let frames = line.rsplit(' ').next().unwrap_or_default().parse()?;
-        Ok((cpu_us(UsageWho::RUSAGE_CHILDREN)? - before_us, frames))
-    }
-
-    /// The same with the library's own client, beyond its start.
-    fn theirs(self) -> Done<Streamed> {
-        let (short_us, short_frames) = self.client(1)?;
-        let (long_us, long_frames) = self.client(1 + DURATION.as_secs())?;
-        let frames = long_frames - short_frames;
-        Ok(Streamed {
-            cpu_us_per_frame: (long_us - short_us) / frames,
-            frames_per_s: frames / DURATION.as_secs_f64(),
-        })
+        // The first second is its start, in the last it ends.
+        let duration_s = (SECONDS + 2).to_string();
+        let mut client = Command::new("stdbuf")
+            .args(["-oL", "arv-camera-test-0.8", "-n", ADDRESS, "--auto", "--no-packet-socket"])
+            .args(["-w", &width, "-h", &height, "--features", &features])
+            .args(["-j", "never", "-i", &self.packet_bytes.to_string(), "--duration", &duration_s])
+            .stdout(Stdio::piped())
+            .spawn()
+            .map_err(|error| {
+                format!("stdbuf arv-camera-test-0.8 (Debian: coreutils, aravis-tools): {error}")
+            })?;
+        let clock = clock_getcpuclockid(Pid::from_raw(client.id().try_into()?))?;
+        let (mut said, mut seconds, mut before) = (String::new(), 0, None);
+        for line in BufReader::new(client.stdout.take().ok_or("no output")?).lines() {
+            let line = line?;
+            let frames = line.split_once(" frame").and_then(|(frames, _)| frames.trim().parse().ok());
+            if let Some(frames) = frames.filter(|_| seconds < SECONDS) {
+                let now = (Instant::now(), cpu_us(clock)?);
+                if let Some((begun, begun_us)) = before.replace(now) {
+                    streamed.note(frames, now.1 - begun_us, now.0 - begun);
+                    seconds += 1;
+                }
+            }
+            said += &line;
+            said.push('\n');
+        }
+        client.wait()?;
+        if seconds == SECONDS {
+            Ok(())
+        } else {
+            Err(format!("arv-camera-test-0.8 had no frames:\n{said}").into())
+        }
     }
 
     /// From the moment when a frame's last packet leaves until the frame is in the pool, in us, in rising order. The
@@ -218,75 +260,85 @@ impl Case {
 /// What the command line asks for.
 struct Arguments {
     camera: String,
+    /// A part of the names of the cases to measure.
+    only: String,
     json: bool,
 }
 
 fn arguments() -> Done<Arguments> {
-    let (mut camera, mut json) = (None, false);
+    let (mut camera, mut only, mut json) = (None, String::new(), false);
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         match word.as_str() {
             "--camera" => camera = words.next(),
+            "--only" => only = words.next().ok_or("--only takes a part of a case's name")?,
             "--json" => json = true,
             // Cargo's own.
             "--bench" => {}
-            unknown => return Err(format!("no option `{unknown}`: there are --camera and --json").into()),
+            unknown => {
+                let what = format!("no option `{unknown}`: there are --camera, --only and --json");
+                return Err(what.into());
+            }
         }
     }
     let camera =
         camera.ok_or("--camera names the program raysweep-sim-camera: `cargo xtask bench camera`")?;
-    Ok(Arguments { camera, json })
+    Ok(Arguments { camera, only, json })
 }
 
 fn main() -> Done<()> {
-    let Arguments { camera, json } = arguments()?;
+    let Arguments { camera, only, json } = arguments()?;
     if nix::unistd::geteuid().is_root() {
         own_network();
     }
-    for (width, height, format, rate_hz) in CASES {
-        for packet_bytes in PACKET_BYTES {
-            let case = Case { width, height, format, rate_hz, packet_bytes };
-            let flat_out = Case { rate_hz: FLAT_OUT_HZ, ..case };
-            let (mut ours, mut theirs) = (Streamed::NOTHING, Streamed::NOTHING);
-            let (mut ours_flat_out, mut theirs_flat_out) = (Streamed::NOTHING, Streamed::NOTHING);
-            {
-                let _device = Simulated::start(&camera, case)?;
-                for _ in 0..REPEATS {
-                    ours = ours.best(case.ours()?);
-                    theirs = theirs.best(case.theirs()?);
-                }
-                ours_flat_out = ours_flat_out.best(flat_out.ours()?);
-                theirs_flat_out = theirs_flat_out.best(flat_out.theirs()?);
-            }
-            let latencies_us = case.latencies_us()?;
-            let percentile = |percent: usize| latencies_us[latencies_us.len() * percent / 100];
-            let (p50_us, p99_us) = (percentile(50), percentile(99));
-            let ratio = ours.cpu_us_per_frame / theirs.cpu_us_per_frame;
-            let name = format!("{width}x{height} {format}, packets of {packet_bytes}");
-            if json {
-                println!(
-                    "{{\"bench\":\"camera\",\"case\":\"{name}\",\"rate_hz\":{rate_hz},\"frames_per_s\":{:.1},\
-                     \"flat_out_frames_per_s\":{:.1},\"peer_flat_out_frames_per_s\":{:.1},\"cpu_us\":{:.1},\
-                     \"peer_cpu_us\":{:.1},\"ratio\":{ratio:.3},\"p50_us\":{p50_us:.0},\"p99_us\":{p99_us:.0}}}",
-                    ours.frames_per_s,
-                    ours_flat_out.frames_per_s,
-                    theirs_flat_out.frames_per_s,
-                    ours.cpu_us_per_frame,
-                    theirs.cpu_us_per_frame,
-                );
-            } else {
-                println!(
-                    "{name}: {:.1} of {rate_hz} frames/s, flat out {:.0} (arv-camera-test-0.8 {:.0}); a frame costs {:.0} us of \
-                     processor time (arv-camera-test-0.8 {:.0}): {ratio:.2} times; in the pool {p50_us:.0} us after its last \
-                     packet left (p99 {p99_us:.0})",
-                    ours.frames_per_s,
-                    ours_flat_out.frames_per_s,
-                    theirs_flat_out.frames_per_s,
-                    ours.cpu_us_per_frame,
-                    theirs.cpu_us_per_frame,
-                );
-            }
+    let cases = CASES.into_iter().flat_map(|(width, height, format, rate_hz)| {
+        PACKET_BYTES.map(|packet_bytes| Case { width, height, format, rate_hz, packet_bytes })
+    });
+    for case in cases.filter(|case| case.name().contains(&only)) {
+        measure(case, &camera, json)?;
+    }
+    Ok(())
+}
+
+/// Measures one case and prints what it gave.
+fn measure(case: Case, camera: &str, json: bool) -> Done<()> {
+    let flat_out = Case { rate_hz: FLAT_OUT_HZ, ..case };
+    let (mut ours, mut theirs) = (Streamed::default(), Streamed::default());
+    let (mut ours_flat_out, mut theirs_flat_out) = (Streamed::default(), Streamed::default());
+    {
+        let _device = Simulated::start(camera, case)?;
+        for _ in 0..TURNS {
+            case.ours(&mut ours)?;
+            case.theirs(&mut theirs)?;
         }
+        flat_out.ours(&mut ours_flat_out)?;
+        flat_out.theirs(&mut theirs_flat_out)?;
+    }
+    let latencies_us = case.latencies_us()?;
+    let percentile = |percent: usize| latencies_us[latencies_us.len() * percent / 100];
+    let (p50_us, p99_us) = (percentile(50), percentile(99));
+    let (cpu_us, peer_cpu_us) = (ours.cpu_us(), theirs.cpu_us());
+    let ratio = cpu_us.median / peer_cpu_us.median;
+    let frames_per_s = ours.rate_hz().median;
+    let (rate_hz, name) = (case.rate_hz, case.name());
+    if json {
+        println!(
+            "{{\"bench\":\"camera\",\"case\":\"{name}\",\"rate_hz\":{rate_hz},\"frames_per_s\":{frames_per_s:.1},\
+             \"flat_out_frames_per_s\":{:.1},\"peer_flat_out_frames_per_s\":{:.1},\"cpu_us\":{:.1},\
+             \"peer_cpu_us\":{:.1},\"ratio\":{ratio:.3},\"p50_us\":{p50_us:.0},\"p99_us\":{p99_us:.0}}}",
+            ours_flat_out.rate_hz().median,
+            theirs_flat_out.rate_hz().median,
+            cpu_us.median,
+            peer_cpu_us.median,
+        );
+    } else {
+        println!(
+            "{name}: {frames_per_s:.1} of {rate_hz} frames/s, flat out {} (arv-camera-test-0.8 {}); a frame costs \
+             {cpu_us} us of processor time (arv-camera-test-0.8 {peer_cpu_us}): {ratio:.2} times; in the pool \
+             {p50_us:.0} us after its last packet left (p99 {p99_us:.0})",
+            ours_flat_out.rate_hz(),
+            theirs_flat_out.rate_hz(),
+        );
     }
     Ok(())
 }

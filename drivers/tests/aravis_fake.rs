@@ -92,6 +92,43 @@ fn frames_come_whole_and_in_order_with_their_times() {
 }
 
 #[test]
+fn frames_are_not_copied_and_stay_as_they_came_while_they_are_kept() {
+    own_network();
+    let _device = FakeCamera::start(&[]);
+    let mut camera = AravisCamera::open(&config(2_000, 256), FACTS).unwrap();
+    camera.configure(ID, &SETTINGS).unwrap();
+    camera.arm().unwrap();
+    let pool = FramePool::new(8, 256 * 256);
+    let mut take = |pool: &FramePool| loop {
+        let mut buf = pool.take();
+        let own = buf.as_ptr();
+        if camera.next_frame(&mut buf, Duration::from_secs(2)).unwrap().is_some() {
+            let is_own = buf.as_ptr() == own;
+            return (buf, is_own);
+        }
+    };
+    let mut kept = Vec::new();
+    for _ in 0..8 {
+        let (buf, is_own) = take(&pool);
+        assert!(!is_own, "the frame lies where it was received");
+        kept.push((buf.to_vec(), buf));
+    }
+    kept.truncate(4);
+    // The others go to and fro, more often than the driver has buffers.
+    for _ in 0..300 {
+        take(&pool);
+    }
+    let (short, is_own) = take(&FramePool::new(1, 256 * 256 - 1));
+    assert!(is_own, "memory of another length is not the driver's");
+    let slope = short.iter().zip(&short[1..]).filter(|(a, b)| (u16::from(**a) + 1) % 255 == u16::from(**b));
+    assert!(slope.count() > 256 * 254);
+    drop((camera, pool));
+    for (came, buf) in kept {
+        assert!(came == buf[..], "it is written to by nobody");
+    }
+}
+
+#[test]
 fn what_it_lacks_or_does_not_take_is_refused_by_name() {
     own_network();
     let _device = FakeCamera::start(&[]);

@@ -202,12 +202,19 @@ pub trait Camera: Send {
     /// under each, in order and round again, while nothing is written, until [`Camera::configure`] or
     /// [`Camera::disarm`]. Returns them as the hardware took them; `None`, and nothing is changed, where the camera has no
     /// sequencer or one that is too small. Frames that were exposed before may still come. Each frame *exposed* takes
-    /// the next settings, lost or not, so ids tell which; from where on they count, the frames' stamps must tell.
+    /// the next settings, lost or not, so ids tell which; from where on they count, [`Camera::active_set`] or the frames'
+    /// stamps must tell.
     ///
     /// # Errors
     /// As [`Camera::configure`].
     fn sequence(&mut self, _settings: &[CameraSettings]) -> Result<Option<Vec<CameraSettings>>, DeviceError> {
         Ok(None)
+    }
+
+    /// Which of the settings of [`Camera::sequence`] the newest frame of [`Camera::next_frame`] had, counted from 0, by its
+    /// own word; `None` where it does not say.
+    fn active_set(&self) -> Option<usize> {
+        None
     }
 
     /// From now on triggers are answered.

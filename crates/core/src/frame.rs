@@ -39,6 +39,9 @@ pub struct Frame {
     pub stamp: FrameStamp,
 }
 
+/// Room in each buffer behind the frame, for what cameras send there: chunk data, padding.
+const TAIL_BYTES: usize = 4096;
+
 struct Shelf {
     free: Mutex<Vec<Box<[u8]>>>,
     returned: Condvar,
@@ -61,15 +64,14 @@ pub struct FramePool {
 impl FramePool {
     /// `buffers` buffers of `buffer_bytes` bytes each.
     pub fn new(buffers: usize, buffer_bytes: usize) -> Self {
-        // Not zeros, which the system hands out as pages yet to be made: the first frames would pay for them.
-        let free = (0..buffers).map(|_| vec![u8::MAX; buffer_bytes].into_boxed_slice()).collect();
+        let free = (0..buffers).map(|_| memory(buffer_bytes)).collect();
         Self { shelf: Arc::new(Shelf { free: Mutex::new(free), returned: Condvar::new() }), buffer_bytes }
     }
 
     /// A buffer if one is free.
     pub fn try_take(&self) -> Option<FrameBuf> {
         let data = self.shelf.lock().pop()?;
-        Some(FrameBuf { data, home: Some(self.shelf.clone()) })
+        Some(self.lend(data))
     }
 
     /// A buffer as soon as one is free.
@@ -77,7 +79,7 @@ impl FramePool {
         let mut free = self.shelf.lock();
         loop {
             if let Some(data) = free.pop() {
-                return FrameBuf { data, home: Some(self.shelf.clone()) };
+                return self.lend(data);
             }
             free = self.shelf.returned.wait(free).unwrap_or_else(PoisonError::into_inner);
         }
@@ -85,26 +87,58 @@ impl FramePool {
 
     /// A buffer of the pool's size that belongs to no pool: where a frame goes that there is no room for.
     pub fn spare(&self) -> FrameBuf {
-        FrameBuf { data: vec![0; self.buffer_bytes].into_boxed_slice(), home: None }
+        FrameBuf { data: memory(self.buffer_bytes), bytes: self.buffer_bytes, home: None }
     }
+
+    fn lend(&self, data: Box<[u8]>) -> FrameBuf {
+        FrameBuf { data, bytes: self.buffer_bytes, home: Some(self.shelf.clone()) }
+    }
+}
+
+fn memory(buffer_bytes: usize) -> Box<[u8]> {
+    // Not zeros, which the system hands out as pages yet to be made: the first frames would pay for them.
+    vec![u8::MAX; FrameBuf::memory_bytes(buffer_bytes)].into()
 }
 
 /// A buffer on loan from a [`FramePool`]; dropping it gives it back.
 pub struct FrameBuf {
+    /// The frame and its tail.
     data: Box<[u8]>,
+    /// Bytes of the frame.
+    bytes: usize,
     home: Option<Arc<Shelf>>,
+}
+
+impl FrameBuf {
+    /// Bytes of memory that a buffer for a frame of so many bytes has.
+    pub fn memory_bytes(frame_bytes: usize) -> usize {
+        frame_bytes + TAIL_BYTES
+    }
+
+    /// Puts other memory in the place of the buffer's own, which it returns: for a device that has written its frame, from
+    /// the start of the memory on, without knowing of the pool.
+    ///
+    /// # Errors
+    /// The memory that was given, where it is not as long as the buffer's own.
+    pub fn exchange(&mut self, memory: Box<[u8]>) -> Result<Box<[u8]>, Box<[u8]>> {
+        if memory.len() == self.data.len() {
+            Ok(std::mem::replace(&mut self.data, memory))
+        } else {
+            Err(memory)
+        }
+    }
 }
 
 impl Deref for FrameBuf {
     type Target = [u8];
     fn deref(&self) -> &[u8] {
-        &self.data
+        &self.data[..self.bytes]
     }
 }
 
 impl DerefMut for FrameBuf {
     fn deref_mut(&mut self) -> &mut [u8] {
-        &mut self.data
+        &mut self.data[..self.bytes]
     }
 }
 
@@ -131,6 +165,19 @@ mod tests {
         assert_eq!(pool.take().as_ptr(), address, "the same memory, not a new allocation");
         drop((b, pool.spare()));
         assert_eq!(pool.shelf.lock().len(), 2, "a spare buffer never joins the pool");
+    }
+
+    #[test]
+    fn memory_of_the_same_length_takes_the_place_of_a_buffers_own() {
+        let pool = FramePool::new(1, 16);
+        let mut lent = pool.take();
+        let foreign: Box<[u8]> = (0..FrameBuf::memory_bytes(16)).map(|at| at as u8).collect();
+        let own = lent.exchange(foreign).unwrap();
+        assert!(own.iter().all(|byte| *byte == u8::MAX) && own.len() == FrameBuf::memory_bytes(16));
+        assert!(lent.iter().copied().eq(0..16));
+        assert_eq!(lent.exchange(vec![1; 16].into()), Err(vec![1; 16].into()), "shorter");
+        drop(lent);
+        assert!(pool.take().iter().copied().eq(0..16), "it is the pool's now");
     }
 
     #[test]

@@ -21,6 +21,7 @@ benchmarks: cargo xtask bench <name> [options]
           arv-camera-test-0.8 in the same run, and from a frame's last packet until it is in the pool; best as root
           --sweep  instead, the paper's sweep over the wire in real time, with late settings, lost packets and a
                    camera that dies: seconds of light and frames lost, each image held against the scene; as root
+          --only CASE  the cases alone whose names have this in them: 512x512, \"packets of 9000\"
           --json   JSON lines
   edges   the logic analyser's edge scan on one core: samples a second against its 24 MHz, quiet to worst
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
@@ -73,11 +74,21 @@ fn transport(name: &str, environment: &str, requirements: &str, options: &[&str]
 
 /// The camera's driver, alone or under a whole sweep.
 fn camera(options: &[&str]) -> Done {
-    if let Some(unknown) = options.iter().find(|option| !["--json", "--sweep"].contains(option)) {
-        return Err(format!("`camera` has no option `{unknown}`\n{BENCHES}"));
+    let (mut is_sweep, mut passed_on) = (false, Vec::new());
+    let mut words = options.iter().copied();
+    while let Some(word) = words.next() {
+        match (word, is_sweep) {
+            ("--sweep", _) => is_sweep = true,
+            ("--json", _) => passed_on.push(word),
+            ("--only", false) => {
+                let case = words.next().ok_or_else(|| format!("`--only` takes a case\n{BENCHES}"))?;
+                passed_on.extend([word, case]);
+            }
+            (unknown, _) => return Err(format!("`camera` has no option `{unknown}`\n{BENCHES}")),
+        }
     }
     let mut bench = cargo();
-    if options.contains(&"--sweep") {
+    if is_sweep {
         bench.args(["bench", "--package", "raysweep", "--features", "aravis", "--bench", "wire_sweep", "--"]);
     } else {
         run(cargo().args(["build", "--package", "raysweep", "--bin", "raysweep-sim-camera", "--release"]))?;
@@ -93,10 +104,7 @@ fn camera(options: &[&str]) -> Done {
         ]);
         bench.arg("--camera").arg(target().join("release/raysweep-sim-camera"));
     }
-    if options.contains(&"--json") {
-        bench.arg("--json");
-    }
-    run(&mut bench)
+    run(bench.args(passed_on))
 }
 
 #[cfg(test)]
@@ -105,7 +113,7 @@ mod tests {
 
     #[test]
     fn unknown_names_and_options_are_told_what_there_is() {
-        let unknown: [&[&str]; 7] = [
+        let unknown: [&[&str]; 8] = [
             &["demuxx"],
             &["demux", "--fast"],
             &["dots", "--live", "--fast"],
@@ -113,6 +121,7 @@ mod tests {
             &["unpack", "--json"],
             &["edges", "--json"],
             &["camera", "--peers"],
+            &["camera", "--only"],
         ];
         for arguments in unknown {
             let message = bench(arguments).unwrap_err();

@@ -91,7 +91,12 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
         let read = transports.as_ref().and_then(|film| film.read(entry.cycle).ok().flatten());
         let own_row = transports.as_ref().and_then(|film| film.attributes().get("u_min")?.as_i64());
         if let (Some(transport), Some(u_min)) = (read, own_row) {
-            let epipolar = transport.slice(s![-u_min as usize, .., ..]).to_owned();
+            // Delays that are all long reach no pixel's own row.
+            let own_row = usize::try_from(-u_min).ok().filter(|&own_row| own_row < transport.len_of(Axis(0)));
+            let epipolar = match own_row {
+                Some(own_row) => transport.slice(s![own_row, .., ..]).to_owned(),
+                None => Array2::zeros((transport.len_of(Axis(1)), transport.len_of(Axis(2)))),
+            };
             let indirect = transport.sum_axis(Axis(0)) - &epipolar;
             labels.push(format!("{} ({:.2} s)", entry.cycle, entry.start_s));
             images.push([epipolar, indirect]);

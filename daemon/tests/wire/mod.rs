@@ -22,6 +22,9 @@ use raysweep_sim::bench::BenchProbe;
 use raysweep_sim::gige::{Faults, WireTruth};
 use raysweep_sim::{Devices, PlaneRig};
 
+/// From the simulated camera's trigger to its exposure, at no delay.
+const LATENCY_US: f64 = 8.0;
+
 /// A sweep or a film and what happens to it.
 pub struct Sweep<'a> {
     /// Rows and columns of the scene, and rows of the projector.
@@ -34,8 +37,20 @@ pub struct Sweep<'a> {
     pub camera: &'a str,
     /// What goes wrong on the wire from the start, each as `key=value`.
     pub faults: &'a [&'a str],
-    /// After so many points the camera loses its power for two seconds.
-    pub dies_after: Option<usize>,
+    /// What happens once so many points or cycles are stored.
+    pub then: Option<(usize, Then)>,
+}
+
+/// What happens in the middle of a run.
+#[allow(dead_code, reason = "the benchmark needs not all of it")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Then {
+    /// The camera loses its power for two seconds.
+    Dies,
+    /// A film is held and goes on.
+    IsHeld,
+    /// A film is cancelled.
+    IsCancelled,
 }
 
 /// What came of it.
@@ -64,8 +79,16 @@ impl Sweep<'_> {
         let mut probe = wait_for("the camera does not start", || BenchProbe::open(&bench).ok());
         let session = self.run_daemon(folder.path(), &mut probe);
         let rig = Rig::load(&rig).unwrap();
+        if self.is_cancelled() {
+            assert_camera_is_left_as_set(&rig, &self.parsed());
+        }
         if self.kind == "film" {
-            assert_frames_of_the_scene(&session, &rig, &Plan::parse(&self.plan()).unwrap());
+            let (stored, plan) = (session.state().unwrap().cycles().count(), self.parsed());
+            assert!(
+                2 * stored > plan.film.cycles as usize || self.is_cancelled(),
+                "too few to prove anything"
+            );
+            assert_frames_of_the_scene(&session, &rig, &plan);
         } else {
             assert_images_of_the_scene(&session, &rig);
         }
@@ -78,7 +101,7 @@ impl Sweep<'_> {
         let Self { side_px, camera, .. } = self;
         format!(
             "kind = \"plane\"\n[camera]\npixel_format = \"Mono12p\"\ndriver = \"aravis\"\n\
-             aravis.address = \"127.0.0.1\"\naravis.trigger_latency_us = 8\n[vsync]\ndriver = \"sim\"\n\
+             aravis.address = \"127.0.0.1\"\naravis.trigger_latency_us = {LATENCY_US}\n[vsync]\ndriver = \"sim\"\n\
              [projector]\ndriver = \"sim\"\nrows = {side_px}\nrow_time_us = 22.22\nfirst_row_us = 2200\n\
              [sim]\nbench = \"bench.sock\"\nscene = \"v-groove\"\nscene_rows = {side_px}\n\
              scene_columns = {side_px}\n[sim.sensor]\nnoise = false\n[sim.vsync]\njitter_us = 0\n\
@@ -88,7 +111,15 @@ impl Sweep<'_> {
 
     /// Whether the simulated camera has as many sets as a film has settings.
     fn has_sets(&self) -> bool {
-        Plan::parse(&self.plan()).unwrap().film.delay_us.values().len() <= 16
+        self.parsed().film.delay_us.values().len() <= 16
+    }
+
+    fn is_cancelled(&self) -> bool {
+        matches!(self.then, Some((_, Then::IsCancelled)))
+    }
+
+    fn parsed(&self) -> Plan {
+        Plan::parse(&self.plan()).unwrap()
     }
 
     fn plan(&self) -> String {
@@ -104,18 +135,23 @@ impl Sweep<'_> {
         let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
         let events = Client::connect(&socket).unwrap().subscribe().unwrap();
         client.run(&RunParams { plan: self.plan(), ..RunParams::default() }).unwrap();
-        let mut dies_after = self.dies_after;
+        let mut then = self.then;
         // How often settings had been written when a cycle of a film was stored.
         let mut written = Vec::new();
         for event in events {
             match event.unwrap() {
                 Event::Progress(progress)
-                    if dies_after.is_some_and(|points| progress.points_stored >= points) =>
+                    if then.is_some_and(|(points, _)| progress.points_stored >= points) =>
                 {
-                    dies_after = None;
-                    probe.set_faults(Faults { dead: true, ..Faults::default() }).unwrap();
-                    thread::sleep(Duration::from_secs(2));
-                    probe.set_faults(Faults::default()).unwrap();
+                    match then.take() {
+                        Some((_, Then::Dies)) => {
+                            probe.set_faults(Faults { dead: true, ..Faults::default() }).unwrap();
+                            thread::sleep(Duration::from_secs(2));
+                            probe.set_faults(Faults::default()).unwrap();
+                        }
+                        Some((_, Then::IsHeld)) => hold(&mut client),
+                        _ => client.cancel().unwrap(),
+                    }
                 }
                 // Well before the film's end, which this may hear of late.
                 Event::Progress(progress)
@@ -125,10 +161,11 @@ impl Sweep<'_> {
                     written.push(probe.truth().unwrap().wire.settings_written);
                 }
                 Event::Finished { session, state, missing, error, .. } => {
-                    assert_eq!(state, "complete", "{error:?}");
+                    let expected = if self.is_cancelled() { "cancelled" } else { "complete" };
+                    assert_eq!(state, expected, "{error:?}");
                     assert!(missing == 0 || self.kind == "film", "{missing} points");
-                    assert_eq!(dies_after, None, "the camera did not die");
-                    if self.kind == "film" && self.dies_after.is_none() {
+                    assert_eq!(then, None, "it did not happen");
+                    if self.kind == "film" && self.then.is_none() {
                         assert!(written.len() >= 2, "{written:?}");
                         assert_eq!(
                             written.windows(2).all(|pair| pair[0] == pair[1]),
@@ -143,6 +180,51 @@ impl Sweep<'_> {
         }
         panic!("the daemon ended before the run");
     }
+}
+
+/// What a client that others wrote reads of the camera's features.
+fn camera_says(features: &[&str]) -> String {
+    let arguments = [&["-a", "127.0.0.1", "control"], features].concat();
+    let output = Command::new("arv-tool-0.8").args(arguments).output().expect("aravis-tools is installed");
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Holds a film that the camera's sequencer takes, and lets it go on.
+fn hold(client: &mut Client) {
+    let wait_for_sequencer = |mode: &str| {
+        wait_for("the sequencer is not told", || {
+            camera_says(&["SequencerMode"]).contains(&format!("SequencerMode = {mode}")).then_some(())
+        });
+    };
+    wait_for_sequencer("On");
+    client.pause().unwrap();
+    wait_for_sequencer("Off");
+    let cycles = |client: &mut Client| client.status().unwrap().film.unwrap().cycles_stored;
+    // What was exposed before is stored meanwhile.
+    thread::sleep(Duration::from_millis(500));
+    let held = cycles(client);
+    thread::sleep(Duration::from_millis(500));
+    assert_eq!(cycles(client), held, "nothing is taken during a pause");
+    client.go_on().unwrap();
+    wait_for_sequencer("On");
+}
+
+/// The camera's sequencer is off, and it has the settings that were written last: those of the cycle's first place, which
+/// are not those of the last set that was saved. They can be written anew.
+fn assert_camera_is_left_as_set(rig: &Rig, plan: &Plan) {
+    let exposure_us = plan.film.exposure_us;
+    let trigger_delay_us = trigger_delay_us(rig, plan.film.delay_us.values()[6], exposure_us);
+    let lines = [
+        "SequencerMode = Off".to_owned(),
+        "SequencerConfigurationMode = Off".to_owned(),
+        format!("ExposureTime = {exposure_us} us"),
+        format!("TriggerDelay = {trigger_delay_us:.2} us"),
+        "ExposureTime = 765.25 us".to_owned(),
+    ];
+    let features = ["SequencerMode", "SequencerConfigurationMode", "ExposureTime", "TriggerDelay"];
+    let features = [&features[..], &["ExposureTime=765.25", "ExposureTime"]].concat();
+    let found = camera_says(&features);
+    assert!(lines.iter().all(|line| found.contains(line)), "{lines:?}: {found}");
 }
 
 /// Ended with the test.
@@ -199,7 +281,6 @@ fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &Plan) {
         .map(|&delay_us| scene_counts(rig, &Pattern::White, delay_us, plan.film.exposure_us))
         .collect();
     let (film, state) = (session.film().unwrap(), session.state().unwrap());
-    assert!(2 * state.cycles().count() > plan.film.cycles as usize, "too few cycles to prove anything");
     for cycle in state.cycles() {
         let frames = film.read(cycle.cycle).unwrap().unwrap();
         for (setting, (frame, expected)) in frames.outer_iter().zip(&expected).enumerate() {
@@ -217,10 +298,8 @@ fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -
     // Time waits for every device.
     drop(vsync);
     let (raster, format) = (rig.file.raster(), camera.capabilities().format);
-    let latency_us = camera.capabilities().trigger_latency_us;
-    let trigger = raster.trigger(scene.first_row(), delay_us, exposure_us, latency_us);
-    let settings =
-        CameraSettings { shutter: Shutter::Rolling, exposure_us, trigger_delay_us: trigger.trigger_delay_us };
+    let trigger_delay_us = trigger_delay_us(rig, delay_us, exposure_us);
+    let settings = CameraSettings { shutter: Shutter::Rolling, exposure_us, trigger_delay_us };
     let applied = camera.configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
     let shown = projector.show(pattern).unwrap();
     camera.arm().unwrap();
@@ -237,4 +316,10 @@ fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -
     let mut counts = vec![0; pixels];
     format.add_to(&frame, &mut counts).unwrap();
     counts
+}
+
+/// What a delay and an exposure are set to.
+fn trigger_delay_us(rig: &Rig, delay_us: f64, exposure_us: f64) -> f64 {
+    let scene: &PlaneRig = rig.simulated();
+    rig.file.raster().trigger(scene.first_row(), delay_us, exposure_us, LATENCY_US).trigger_delay_us
 }

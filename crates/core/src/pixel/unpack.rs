@@ -1,4 +1,4 @@
-//! Unpacking as fast as memory: the same pixels as [`Packing::unpack`], four or sixteen at a time.
+//! Unpacking as fast as memory: the same pixels as [`Packing::unpack`], four to sixteen at a time.
 //!
 //! All packings of 10 and 12 bits are one computation. Two bytes, seen as a 16-bit word, hold all bits of a pixel:
 //! those that a shift to the right brings to their place, and those that have to be shifted to the left first, which
@@ -13,6 +13,8 @@ use super::Packing;
 pub enum UnpackLevel {
     /// What every machine has, as the compiler uses it.
     Portable,
+    /// x86-64 with SSE4.2: eight pixels at a time.
+    Sse42,
     /// x86-64 with AVX2: sixteen pixels at a time.
     Avx2,
 }
@@ -22,7 +24,8 @@ impl UnpackLevel {
     pub fn available() -> &'static [Self] {
         match Self::best() {
             Self::Portable => &[Self::Portable],
-            Self::Avx2 => &[Self::Portable, Self::Avx2],
+            Self::Sse42 => &[Self::Portable, Self::Sse42],
+            Self::Avx2 => &[Self::Portable, Self::Sse42, Self::Avx2],
         }
     }
 
@@ -31,6 +34,8 @@ impl UnpackLevel {
         #[cfg(target_arch = "x86_64")]
         if pulp::x86::V3::is_available() {
             return Self::Avx2;
+        } else if pulp::x86::V2::is_available() {
+            return Self::Sse42;
         }
         Self::Portable
     }
@@ -86,8 +91,18 @@ trait Task {
 
 fn run(level: UnpackLevel, task: impl Task) {
     #[cfg(target_arch = "x86_64")]
-    if let (UnpackLevel::Avx2, Some(simd)) = (level, pulp::x86::V3::try_new()) {
-        return simd.vectorize(On { kernel: simd, task });
+    match level {
+        UnpackLevel::Avx2 => {
+            if let Some(simd) = pulp::x86::V3::try_new() {
+                return simd.vectorize(On { kernel: simd, task });
+            }
+        }
+        UnpackLevel::Sse42 => {
+            if let Some(simd) = pulp::x86::V2::try_new() {
+                return simd.vectorize(On { kernel: simd, task });
+            }
+        }
+        UnpackLevel::Portable => {}
     }
     On { kernel: Portable, task }.call();
 }
@@ -265,13 +280,61 @@ mod x86 {
     use std::arch::x86_64::__m128i;
 
     use pulp::bytemuck::cast;
-    use pulp::x86::V3;
+    use pulp::x86::{V2, V3};
 
     use super::{GROUP, Kernel, Layout};
 
-    /// Groups of a vector of sixteen pixels: two in each of its halves, between which bytes cannot be shuffled.
-    const VECTOR: usize = 4;
-    const HALF: usize = VECTOR / 2;
+    /// Groups of a vector of eight pixels, and of each half of one of sixteen, between which bytes cannot be shuffled.
+    const HALF: usize = 2;
+    const WHOLE: usize = 2 * HALF;
+
+    /// From which byte of its half each byte of a vector of words comes.
+    fn shuffle<const VECTOR_BYTES: usize, const BYTES: usize>(layout: &Layout<BYTES>) -> [u8; VECTOR_BYTES] {
+        std::array::from_fn(|i| {
+            let group = i % 16 / (2 * GROUP);
+            (group * BYTES) as u8 + layout.word[i / 2 % GROUP][i % 2]
+        })
+    }
+
+    fn scale<const PIXELS: usize, const BYTES: usize>(layout: &Layout<BYTES>) -> [u16; PIXELS] {
+        std::array::from_fn(|i| layout.scale[i % GROUP])
+    }
+
+    /// Sixteen bytes, of which a half needs the first; nothing where they would reach beyond the end.
+    #[inline(always)]
+    fn half(bytes: &[u8], at: usize) -> Option<__m128i> {
+        Some(cast::<[u8; 16], __m128i>(*bytes.get(at..)?.first_chunk()?))
+    }
+
+    impl Kernel for V2 {
+        #[inline(always)]
+        fn groups<const SHIFT: u32, const BYTES: usize>(
+            self,
+            layout: &Layout<BYTES>,
+            groups: &[[u8; BYTES]],
+            pixels: &mut [[u16; GROUP]],
+        ) -> usize {
+            let (sse2, ssse3) = (self.sse2, self.ssse3);
+            let (shuffle, scale) = (cast(shuffle::<16, BYTES>(layout)), cast(scale::<8, BYTES>(layout)));
+            let (high_mask, low_mask) = (cast([layout.high_mask; 8]), cast([layout.low_mask; 8]));
+            let shifted = |word| match SHIFT {
+                4 => sse2._mm_srli_epi16::<4>(word),
+                _ => sse2._mm_srli_epi16::<6>(word),
+            };
+
+            let bytes = groups.as_flattened();
+            let mut done = 0;
+            for pixels in pixels.as_chunks_mut::<HALF>().0 {
+                let Some(bytes) = half(bytes, done * BYTES) else { break };
+                let word = ssse3._mm_shuffle_epi8(bytes, shuffle);
+                let high = sse2._mm_and_si128(shifted(word), high_mask);
+                let low = sse2._mm_and_si128(shifted(sse2._mm_mullo_epi16(word, scale)), low_mask);
+                *pixels = cast(sse2._mm_or_si128(high, low));
+                done += HALF;
+            }
+            done
+        }
+    }
 
     impl Kernel for V3 {
         #[inline(always)]
@@ -282,35 +345,23 @@ mod x86 {
             pixels: &mut [[u16; GROUP]],
         ) -> usize {
             let (avx, avx2) = (self.avx, self.avx2);
-            let shuffle = cast(std::array::from_fn::<u8, 32, _>(|i| {
-                let group = i % 16 / (2 * GROUP);
-                (group * BYTES) as u8 + layout.word[i / 2 % GROUP][i % 2]
-            }));
-            let scale = cast(std::array::from_fn::<u16, 16, _>(|i| layout.scale[i % GROUP]));
+            let (shuffle, scale) = (cast(shuffle::<32, BYTES>(layout)), cast(scale::<16, BYTES>(layout)));
             let (high_mask, low_mask) = (cast([layout.high_mask; 16]), cast([layout.low_mask; 16]));
+            let shifted = |word| match SHIFT {
+                4 => avx2._mm256_srli_epi16::<4>(word),
+                _ => avx2._mm256_srli_epi16::<6>(word),
+            };
 
             let bytes = groups.as_flattened();
-            let half = |at: usize| Some(cast::<[u8; 16], __m128i>(*bytes.get(at..)?.first_chunk()?));
             let mut done = 0;
-            for pixels in pixels.as_chunks_mut::<VECTOR>().0 {
-                // The last loads would reach beyond the end.
-                let (Some(first), Some(second)) = (half(done * BYTES), half((done + HALF) * BYTES)) else {
-                    break;
-                };
+            for pixels in pixels.as_chunks_mut::<WHOLE>().0 {
+                let halves = (half(bytes, done * BYTES), half(bytes, (done + HALF) * BYTES));
+                let (Some(first), Some(second)) = halves else { break };
                 let word = avx2._mm256_shuffle_epi8(avx._mm256_set_m128i(second, first), shuffle);
-                let high = match SHIFT {
-                    4 => avx2._mm256_srli_epi16::<4>(word),
-                    _ => avx2._mm256_srli_epi16::<6>(word),
-                };
-                let scaled = avx2._mm256_mullo_epi16(word, scale);
-                let low = match SHIFT {
-                    4 => avx2._mm256_srli_epi16::<4>(scaled),
-                    _ => avx2._mm256_srli_epi16::<6>(scaled),
-                };
-                let high = avx2._mm256_and_si256(high, high_mask);
-                let low = avx2._mm256_and_si256(low, low_mask);
+                let high = avx2._mm256_and_si256(shifted(word), high_mask);
+                let low = avx2._mm256_and_si256(shifted(avx2._mm256_mullo_epi16(word, scale)), low_mask);
                 *pixels = cast(avx2._mm256_or_si256(high, low));
-                done += VECTOR;
+                done += WHOLE;
             }
             done
         }

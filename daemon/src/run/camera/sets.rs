@@ -2,9 +2,9 @@
 //! that must come between two triggers.
 //!
 //! Each frame exposed has the set after that of the frame before, whether it arrives or not. So one number, the phase, says
-//! of every id which set it has. The camera does not promise it; it is believed when a whole cycle of frames agrees with it
-//! and with no other, and given up for another that does. The assembler holds each frame's delay against its edge
-//! all the same.
+//! of every id which set it has. Where frames say their set, two in a row that say the same phase are believed. Else, and
+//! where it proves them wrong, it is that with which the stamps of a whole cycle of frames agree, and with no other. The
+//! assembler holds each frame's delay against its edge all the same.
 
 use std::iter::Peekable;
 
@@ -29,7 +29,7 @@ impl Sequencer {
     ) -> Result<(), DeviceError> {
         let settings: Vec<CameraSettings> =
             film.settings.iter().map(|setting| setting.shot.settings).collect();
-        if !Phase::tells(&settings, &self.line) {
+        if !(self.line.distinct && self.line.has_one_exposure) {
             return Ok(());
         }
         while slots.peek().is_some() && self.orders.go_on() {
@@ -96,7 +96,7 @@ impl Sequencer {
                 }
             }
             next_seq = Some(stamp.seq + 1);
-            phase.see(&stamp);
+            phase.see(&stamp, self.camera.active_set());
             if phase.is_hopeless() {
                 self.hand_on(received, Label::Settling)?;
                 return Ok(false);
@@ -128,26 +128,41 @@ struct Phase {
     /// For each phase, how many frames in a row have agreed with it, each with the one before.
     agreeing: Vec<usize>,
     newest: Option<FrameStamp>,
+    /// Whether stamps tell each phase from all others.
+    stamps_tell: bool,
+    /// The phase that the newest frame said.
+    said: Option<usize>,
+    /// Whether stamps have not proved such a word wrong.
+    is_word_true: bool,
     /// Frames that have been looked at without result.
     in_vain: usize,
 }
 
 impl Phase {
     fn new(sets: Vec<CameraSettings>, line: Line) -> Self {
-        Self { known: None, agreeing: vec![0; sets.len()], newest: None, in_vain: 0, sets, line }
+        Self {
+            known: None,
+            agreeing: vec![0; sets.len()],
+            newest: None,
+            stamps_tell: Self::differ(&sets, &line),
+            said: None,
+            is_word_true: true,
+            in_vain: 0,
+            sets,
+            line,
+        }
     }
 
-    /// Whether stamps tell each phase of a cycle of settings from all others, and each frame's settings from all others
-    /// once its edge is known.
-    fn tells(settings: &[CameraSettings], line: &Line) -> bool {
-        let delay_us = |place: usize| settings[place % settings.len()].trigger_delay_us;
+    /// Whether the stamps of a cycle of frames differ by the phase that it has.
+    fn differ(sets: &[CameraSettings], line: &Line) -> bool {
+        let delay_us = |place: usize| sets[place % sets.len()].trigger_delay_us;
         let step_us = |place: usize| delay_us(place + 1) - delay_us(place);
         // Edges may be off by the jitter that is allowed, and so may what is asked of the frames.
         let differs = |shift: usize| {
-            (0..settings.len())
+            (0..sets.len())
                 .any(|place| line.off_us(step_us(place + shift) - step_us(place)) > 2.0 * line.max_jitter_us)
         };
-        line.distinct && line.has_one_exposure && (1..settings.len()).all(differs)
+        (1..sets.len()).all(differs)
     }
 
     fn set_of(&self, seq: u64) -> Option<usize> {
@@ -159,13 +174,19 @@ impl Phase {
         ((seq % sets as u64) as usize + phase) % sets
     }
 
+    /// The phase in which the frame `seq` has a set, where there is such a set.
+    fn phase_by(&self, set: usize, seq: u64) -> Option<usize> {
+        let sets = self.sets.len();
+        (set < sets).then(|| (sets + set - (seq % sets as u64) as usize) % sets)
+    }
+
     /// Nothing that was seen counts any more.
     fn forget(&mut self) {
         *self = Self::new(std::mem::take(&mut self.sets), self.line);
     }
 
-    /// Looks at a frame.
-    fn see(&mut self, stamp: &FrameStamp) {
+    /// Looks at a frame, and at the set that it says it has.
+    fn see(&mut self, stamp: &FrameStamp, said: Option<usize>) {
         let before = self.newest.replace(*stamp);
         let before = before.filter(|before| stamp.exposure_start_ns - before.exposure_start_ns < COMPARED_NS);
         for phase in 0..self.sets.len() {
@@ -173,14 +194,26 @@ impl Phase {
             self.agreeing[phase] = if agrees { self.agreeing[phase] + 1 } else { 0 };
         }
         let mut certain = (0..self.sets.len()).filter(|&phase| self.agreeing[phase] >= self.sets.len());
-        if let (Some(phase), None) = (certain.next(), certain.next()) {
-            self.known = Some(phase);
+        let by_stamps = certain.next().filter(|_| certain.next().is_none());
+        let mut said = said.filter(|_| self.is_word_true).and_then(|set| self.phase_by(set, stamp.seq));
+        if let (Some(phase), Some(by_stamps)) = (said, by_stamps)
+            && phase != by_stamps
+        {
+            tracing::warn!(
+                "frames say another set of the camera's sequencer than their times show: their times are believed"
+            );
+            (self.is_word_true, said) = (false, None);
         }
+        // A word that the frame before did not give is none: a sequence that stutters, or a frame from before it.
+        let by_word = said.filter(|_| self.said == said);
+        self.said = said;
+        self.known = by_word.or(by_stamps).or(self.known.filter(|_| said.is_none()));
         self.in_vain = if self.known.is_some() { 0 } else { self.in_vain + 1 };
     }
 
     fn is_hopeless(&self) -> bool {
-        self.in_vain > PATIENCE_CYCLES * self.sets.len()
+        let can_tell = self.stamps_tell || self.said.is_some();
+        self.in_vain > if can_tell { PATIENCE_CYCLES * self.sets.len() } else { 0 }
     }
 
     /// Whether by a phase two frames were triggered whole periods apart and have the exposures that they say.

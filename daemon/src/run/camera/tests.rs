@@ -32,6 +32,19 @@ struct Script {
     stutters: &'static [u64],
     /// Whether its sequencer stays with the first set.
     stuck: bool,
+    /// Whether its frames say which set they have.
+    says: Says,
+}
+
+/// What frames say of the sequencer's set that they have.
+#[derive(Clone, Copy, PartialEq)]
+enum Says {
+    Nothing,
+    Truth,
+    /// The set of the frame after.
+    Next,
+    /// Always the first.
+    First,
 }
 
 const EXACT: Script = Script {
@@ -44,6 +57,7 @@ const EXACT: Script = Script {
     sets: 0,
     stutters: &[],
     stuck: false,
+    says: Says::Nothing,
 };
 
 /// A camera whose every trigger is answered, and whose frames are on the host 18 ms after their exposure.
@@ -68,13 +82,16 @@ impl Scripted {
         self.clock.now_ns().unsigned_abs().div_ceil(PERIOD_NS.unsigned_abs())
     }
 
+    /// The sequencer's set that a frame has; the first of `sets` where it is not of the sequence.
+    fn set_of(&self, seq: u64, (first_seq, sets): &(u64, Vec<CameraSettings>)) -> usize {
+        let stutters = self.script.stutters.iter().filter(|stutter| **stutter <= seq).count();
+        let taken = seq.saturating_sub(*first_seq) as usize;
+        if self.script.stuck { 0 } else { taken.saturating_sub(stutters) % sets.len() }
+    }
+
     fn settings(&self, seq: u64) -> CameraSettings {
-        if let Some((first_seq, sets)) = &self.sequence
-            && seq >= *first_seq
-        {
-            let stutters = self.script.stutters.iter().filter(|stutter| **stutter <= seq).count();
-            let place = ((seq - first_seq) as usize - stutters) % sets.len();
-            return sets[if self.script.stuck { 0 } else { place }];
+        if let Some(sequence) = self.sequence.as_ref().filter(|(first_seq, _)| seq >= *first_seq) {
+            return sequence.1[self.set_of(seq, sequence)];
         }
         let written = self.written.iter().rev().find(|(first_seq, _)| *first_seq <= seq);
         written.map_or(settings(0.0, 100.0), |(_, settings)| *settings)
@@ -120,6 +137,17 @@ impl Camera for Scripted {
         self.told.lock().unwrap().push(first_seq);
         self.sequence = Some((first_seq, all.to_vec()));
         Ok(Some(all.to_vec()))
+    }
+
+    fn active_set(&self) -> Option<usize> {
+        let (newest_seq, sequence) = (self.next_seq - 1, self.sequence.as_ref()?);
+        let set = self.set_of(newest_seq, sequence);
+        match self.script.says {
+            Says::Nothing => None,
+            Says::Truth => Some(set),
+            Says::Next => Some((set + 1) % sequence.1.len()),
+            Says::First => Some(0),
+        }
     }
 
     fn arm(&mut self) -> Result<(), DeviceError> {
@@ -202,6 +230,12 @@ impl Played {
     fn frames(&self) -> u64 {
         let ids = || self.counted.iter().map(|(_, seq)| *seq);
         ids().max().unwrap() + 1 - ids().min().unwrap()
+    }
+
+    /// Ids of frames that were taken for another point's.
+    fn wrong(&self, plan: &[CameraSettings]) -> Vec<u64> {
+        let is_wrong = |&&(point, seq): &&(u32, u64)| self.truth[seq as usize] != plan[point as usize];
+        self.counted.iter().filter(is_wrong).map(|(_, seq)| *seq).collect()
     }
 
     fn assert_true(&self, plan: &[CameraSettings]) {
@@ -492,8 +526,11 @@ fn film_plan() -> Vec<CameraSettings> {
         .collect()
 }
 
+/// Sequencers whose frames say which set they have, and such whose stamps must tell.
 fn sequencers() -> Vec<Script> {
-    all_late().into_iter().map(|script| Script { sets: 8, ..script }).collect()
+    let says = [Says::Nothing, Says::Truth, Says::First];
+    let scripts = all_late().into_iter().map(|script| Script { sets: 8, ..script });
+    scripts.flat_map(|script| says.map(|says| Script { says, ..script })).collect()
 }
 
 #[test]
@@ -506,9 +543,11 @@ fn a_film_by_the_sequencer_is_told_nothing_while_it_runs() {
         assert_eq!((film.counted.len(), film.short.len(), film.frames()), (40, 0, 40), "{:?}", script.late);
         let ids: Vec<u64> = film.counted.iter().map(|(_, seq)| *seq).collect();
         assert!(!film.told.iter().any(|told| (ids[0]..=ids[39]).contains(told)), "{:?}", film.told);
-        // Two cycles at the most until its place in the sequence is known and its cycle begins.
+        // By their stamps, two cycles at the most until its place in the sequence is known and its cycle begins; one by
+        // their own word.
         let begun = film.told.iter().filter(|told| **told < ids[0]).max().unwrap();
-        assert!(ids[0] - begun <= 2 * 8 + 6, "{begun} {ids:?}");
+        let cycles = if script.says == Says::Truth { 1 } else { 2 };
+        assert!(ids[0] - begun <= cycles * 8 + 6, "{begun} {ids:?}");
         assert!(film.told.last().unwrap() > &ids[39], "it is stopped");
     }
 }
@@ -529,12 +568,24 @@ fn a_lost_frame_of_a_sequence_takes_its_set_with_it() {
 
 #[test]
 fn a_sequence_that_stutters_is_found_again() {
-    let film = play_plan(&film_plan(), Script { sets: 8, stutters: &[120], ..EXACT }, 1, Some(20), None);
-    let plan = film_plan();
-    let is_true = |&(point, seq): &(u32, u64)| film.truth[seq as usize] == plan[point as usize];
+    let script = Script { sets: 8, stutters: &[120], ..EXACT };
+    let film = play_plan(&film_plan(), script, 1, Some(20), None);
     // What is wrong, the assembler sees by its delay: for less than two cycles.
-    let wrong: Vec<u64> = film.counted.iter().filter(|frame| !is_true(frame)).map(|(_, seq)| *seq).collect();
+    let wrong = film.wrong(&film_plan());
     assert!((1..=16).contains(&wrong.len()) && wrong[0] == 120, "{wrong:?}");
+    assert_eq!(film.counted.len(), 160);
+    let film = play_plan(&film_plan(), Script { says: Says::Truth, ..script }, 1, Some(20), None);
+    film.assert_true(&film_plan());
+    let last = film.counted.last().unwrap().1;
+    assert_eq!((film.counted.len(), film.frames(), last > 120), (160, 161, true));
+}
+
+#[test]
+fn a_sequencer_that_says_wrong_sets_is_found_out_by_its_stamps() {
+    let script = Script { sets: 8, says: Says::Next, ..EXACT };
+    let film = play_plan(&film_plan(), script, 1, Some(20), None);
+    let (wrong, first) = (film.wrong(&film_plan()), film.counted[0].1);
+    assert!((1..=16).contains(&wrong.len()) && wrong.iter().all(|seq| seq - first < 16), "{wrong:?}");
     assert_eq!(film.counted.len(), 160);
 }
 
@@ -562,11 +613,17 @@ fn a_film_that_the_sequencer_cannot_take_is_written_ahead() {
     let film = play_plan(&film_plan(), one_set_short, 1, Some(3), None);
     film.assert_true(&film_plan());
     assert_eq!((film.counted.len(), film.frames()), (24, 24));
-    let film = play_plan(&film_plan(), Script { sets: 8, stuck: true, ..EXACT }, 1, Some(3), None);
-    film.assert_true(&film_plan());
-    assert_eq!((film.counted.len(), film.frames()), (24, 24));
-    // Delays all round a period in equal steps: any set might be the first.
+    for says in [Says::Nothing, Says::Truth] {
+        let film = play_plan(&film_plan(), Script { sets: 8, stuck: true, says, ..EXACT }, 1, Some(3), None);
+        film.assert_true(&film_plan());
+        assert_eq!((film.counted.len(), film.frames()), (24, 24));
+    }
+    // Delays all round a period in equal steps: any set might be the first, unless frames say it.
     let round: Vec<_> = (0..6).map(|k| settings(f64::from(k) * PERIOD_NS as f64 / 6e3, 600.0)).collect();
+    let film = play_plan(&round, Script { sets: 8, says: Says::Truth, ..EXACT }, 1, Some(3), None);
+    film.assert_true(&round);
+    let told = film.told.iter().filter(|told| **told > film.counted[0].1).count();
+    assert_eq!((film.counted.len(), film.frames(), told), (18, 18, 1));
     let film = play_plan(&round, Script { sets: 8, ..EXACT }, 1, Some(3), None);
     film.assert_true(&round);
     assert_eq!(film.counted.len(), 18);

@@ -1,26 +1,26 @@
 //! The camera as the traits of `raysweep-core` have it: the side that takes frames.
 
-use std::ffi::CStr;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use aravis::prelude::*;
-use aravis::{Buffer, BufferStatus, ChunkParser, Stream};
+use aravis::{Buffer, BufferStatus};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind,
     DeviceState, FirstFrame, FrameBuf, FrameStamp, LossCause, PixelFormat, RoundTrip, SettingsId, ns_from_us,
     us_from_ns,
 };
 
-use super::buffer;
+use super::chunks::Chunks;
 use super::config::{AravisConfig, TimestampAt};
+use super::frames::{Frames, image_data};
 use super::ids::FrameIds;
 use super::library::Health;
 use super::losses::Losses;
-use super::owner::{BUFFERS, Command, Done, Opened, Order, Owner, Reply, Shared};
+use super::owner::{Command, Done, Opened, Order, Owner, Reply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
+use super::sequencer::Sequence;
 
 /// What the driver must know of the rig that its camera is part of.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -45,7 +45,6 @@ const ROUND_TRIPS: usize = 100;
 const LOOK: Duration = Duration::from_millis(50);
 /// An owner whose camera is dead may be blocked for longer; it then ends by itself.
 const FAREWELL: Duration = Duration::from_secs(3);
-const CHUNK_EXPOSURE: &CStr = c"ChunkExposureTime";
 
 /// A GenICam camera.
 pub struct AravisCamera {
@@ -63,10 +62,12 @@ pub struct AravisCamera {
     losses: Losses,
     promises: Promises<CameraSettings>,
     newest: Option<Newest>,
+    /// The number of the first set of the camera's sequencer, while that runs.
+    first_set: Option<i64>,
 }
 
 enum Link {
-    Up { stream: Stream, chunks: Option<ChunkParser>, tells_time: bool },
+    Up { frames: Frames, chunks: Option<Chunks>, tells_time: bool },
     Lost { since: Instant },
 }
 
@@ -76,6 +77,8 @@ struct Newest {
     seq: u64,
     exposure_start_ns: i64,
     host_ns: i64,
+    /// The sequencer's set, counted from its first, where the frame says it.
+    set: Option<usize>,
 }
 
 fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
@@ -123,7 +126,7 @@ impl AravisCamera {
                 return Err(error(DeviceErrorKind::NotReady, "its thread ended; the log has its message"));
             }
         };
-        let Opened { stream, chunks, capabilities, tells_time, .. } = opened;
+        let Opened { frames, chunks, capabilities, tells_time, .. } = opened;
         let mut ids = FrameIds::default();
         ids.restart(1);
         Ok(Self {
@@ -135,12 +138,13 @@ impl AravisCamera {
             replies,
             owner: Some(thread),
             ticket: 0,
-            link: Link::Up { stream, chunks, tells_time },
+            link: Link::Up { frames, chunks, tells_time },
             armed_ns: None,
             ids,
             losses: Losses::new(),
             promises: Promises::new(),
             newest: None,
+            first_set: None,
         })
     }
 
@@ -204,11 +208,11 @@ impl AravisCamera {
     /// Gives the camera up and has it opened again.
     fn lose(&mut self) {
         let link = std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() });
-        if let (Link::Up { stream, .. }, Some(orders)) = (link, &self.orders) {
+        if let (Link::Up { frames, .. }, Some(orders)) = (link, &self.orders) {
             tracing::warn!(camera = self.capabilities.model, "camera lost; opening it again");
             self.ticket += 1;
             // The channel has room for this and for what was asked before.
-            let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(stream) });
+            let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(frames) });
         }
     }
 
@@ -226,9 +230,9 @@ impl AravisCamera {
                         );
                         return Err(error(DeviceErrorKind::Protocol, what));
                     }
-                    let Opened { stream, chunks, tells_time, armed_ns, .. } = opened;
+                    let Opened { frames, chunks, tells_time, armed_ns, .. } = opened;
                     tracing::warn!(camera = self.capabilities.model, away = ?since.elapsed(), "camera back");
-                    self.link = Link::Up { stream, chunks, tells_time };
+                    self.link = Link::Up { frames, chunks, tells_time };
                     self.armed_ns = self.armed_ns.and(armed_ns);
                     self.resume_ids();
                     return Ok(());
@@ -252,8 +256,8 @@ impl AravisCamera {
         }
     }
 
-    /// Looks at a buffer that the stream gave: a whole frame is copied into `buf`.
-    fn take(&mut self, from: &Buffer, buf: &mut FrameBuf) -> Result<Option<FrameStamp>, DeviceError> {
+    /// Looks at a frame that came, of which `bytes` are wanted; nothing where it is not whole.
+    fn look_at(&mut self, from: &Buffer, bytes: usize) -> Result<Option<FrameStamp>, DeviceError> {
         match from.status() {
             BufferStatus::Success => {}
             // Left over from before a stop.
@@ -264,19 +268,19 @@ impl AravisCamera {
             }
         }
         let host_ns = self.shared.clock.now_ns();
-        let image = buffer::image_data(from);
-        let Some(image) = image.get(..buf.len()) else {
+        let image_bytes = image_data(from).len();
+        if image_bytes < bytes {
             let what = format!(
-                "a frame has {} bytes instead of {}: its region or format was changed",
-                image.len(),
-                buf.len()
+                "a frame has {image_bytes} bytes instead of {bytes}: its region or format was changed"
             );
             return Err(error(DeviceErrorKind::Protocol, what));
-        };
-        buf.copy_from_slice(image);
+        }
         let Link::Up { chunks, tells_time, .. } = &self.link else { return Ok(None) };
-        let exposure_us =
-            chunks.as_ref().and_then(|parser| buffer::chunk_float(parser, from, CHUNK_EXPOSURE));
+        let exposure_us = chunks.as_ref().and_then(|chunks| chunks.exposure_us(from));
+        let set = self.first_set.zip(chunks.as_ref()).and_then(|(first_set, chunks)| {
+            let set = chunks.sequencer_set(from)?;
+            usize::try_from(set - first_set).ok()
+        });
         let set_us =
             exposure_us.or(self.promises.newest().map(|settings| settings.exposure_us)).unwrap_or(0.0);
         let stamped_ns = i64::try_from(from.timestamp()).unwrap_or(i64::MAX);
@@ -293,7 +297,7 @@ impl AravisCamera {
         });
         let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
         self.losses.whole(seq);
-        self.newest = Some(Newest { seq, exposure_start_ns, host_ns });
+        self.newest = Some(Newest { seq, exposure_start_ns, host_ns, set });
         Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
     }
 
@@ -349,10 +353,8 @@ impl AravisCamera {
 
     /// Throws away what has come of frames that nobody asked for.
     fn drain(&self) {
-        if let Link::Up { stream, .. } = &self.link {
-            while let Some(buffer) = stream.try_pop_buffer() {
-                stream.push_buffer(buffer);
-            }
+        if let Link::Up { frames, .. } = &self.link {
+            frames.drain();
         }
     }
 }
@@ -374,6 +376,7 @@ impl Camera for AravisCamera {
         self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         let triggers = self.triggers();
         let Done { written_ns, actual, restarted, .. } = self.ask(Command::Configure(*settings))?;
+        self.first_set = None;
         let actual = actual.unwrap_or(*settings);
         if restarted {
             self.ids.restart(0);
@@ -390,6 +393,8 @@ impl Camera for AravisCamera {
             self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         }
         let Done { sequence, restarted, .. } = self.ask(Command::Sequence(settings.to_vec()))?;
+        self.first_set = sequence.as_ref().map(|sequence| sequence.first_set);
+        let sequence = sequence.map(|Sequence { settings, .. }| settings);
         if restarted {
             self.drain();
             self.ids.restart(0);
@@ -402,6 +407,10 @@ impl Camera for AravisCamera {
             self.promises.push(FirstFrame::Within { earliest: next_seq, certain: next_seq }, *longest);
         }
         Ok(sequence)
+    }
+
+    fn active_set(&self) -> Option<usize> {
+        self.newest.and_then(|newest| newest.set)
     }
 
     fn arm(&mut self) -> Result<(), DeviceError> {
@@ -427,16 +436,16 @@ impl Camera for AravisCamera {
         let until = Instant::now() + timeout;
         loop {
             let left = until.saturating_duration_since(Instant::now());
-            let stream = match &self.link {
+            let frames = match &self.link {
                 Link::Lost { since } => {
                     let since = *since;
                     self.wait_for_return(since, left)?;
                     return Ok(None);
                 }
-                Link::Up { stream, .. } => stream,
+                Link::Up { frames, .. } => frames,
             };
             let wait_us = left.min(LOOK).as_micros().try_into().unwrap_or(u64::MAX);
-            let popped = stream.timeout_pop_buffer(wait_us);
+            let popped = frames.pop(wait_us);
             let Some(buffer) = popped else {
                 let alive_ns = self.newest.map_or(armed_ns, |newest| newest.host_ns.max(armed_ns));
                 if self.silent_since(alive_ns) {
@@ -446,15 +455,21 @@ impl Camera for AravisCamera {
                 }
                 continue;
             };
-            if stream.n_buffers().0 == 0 {
-                self.losses.full(self.ids.next() + BUFFERS);
+            if frames.is_full() {
+                self.losses.full(self.ids.next() + frames.buffers() as u64);
             }
-            let taken = self.take(&buffer, buf);
-            if let Link::Up { stream, .. } = &self.link {
-                stream.push_buffer(buffer);
-            }
-            if let Some(stamp) = taken? {
-                return Ok(Some(stamp));
+            let seen = self.look_at(&buffer, buf.len());
+            let Link::Up { frames, .. } = &mut self.link else { return Ok(None) };
+            match seen {
+                Ok(Some(stamp)) => {
+                    frames.take(buffer, buf);
+                    return Ok(Some(stamp));
+                }
+                Ok(None) => frames.give_back(buffer),
+                Err(error) => {
+                    frames.give_back(buffer);
+                    return Err(error);
+                }
             }
         }
     }
@@ -475,10 +490,10 @@ impl Camera for AravisCamera {
 impl Drop for AravisCamera {
     fn drop(&mut self) {
         let Some(orders) = self.orders.take() else { return };
-        if let Link::Up { stream, .. } =
+        if let Link::Up { frames, .. } =
             std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() })
         {
-            let _ = orders.try_send(Order { ticket: 0, command: Command::Close(stream) });
+            let _ = orders.try_send(Order { ticket: 0, command: Command::Close(frames) });
         }
         drop(orders);
         // The owner of a dead camera may be blocked in the library: it is waited for, but not for ever.

@@ -249,8 +249,8 @@ pub struct DeviceClock {
 /// Between two looks at a clock whose unit is not known.
 const CLOCK_LOOK: Duration = Duration::from_millis(20);
 
-/// Times that a camera is asked for its time in a row.
-const ASKS: usize = 4;
+/// Times that a camera is asked for its time in a row: each takes as much processor time as half a frame.
+const ASKS: usize = 2;
 
 impl DeviceClock {
     /// Finds out how the camera tells its time, and in which unit; nothing if it does not, or stands still.

@@ -12,13 +12,15 @@ mod config;
 pub use config::{AravisConfig, ConfigFault, Region, TimestampAt};
 
 #[cfg(feature = "aravis")]
-mod buffer;
+mod chunks;
 #[cfg(feature = "aravis")]
 mod driver;
 #[cfg(feature = "aravis")]
 mod features;
 #[cfg(feature = "aravis")]
 mod file;
+#[cfg(feature = "aravis")]
+mod frames;
 #[cfg(feature = "aravis")]
 mod ids;
 #[cfg(feature = "aravis")]

@@ -5,20 +5,21 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use aravis::prelude::*;
-use aravis::{Buffer, ChunkParser, Stream};
-use raysweep_core::{CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind};
+use raysweep_core::{
+    CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind, FrameBuf,
+};
 
+use super::chunks::Chunks;
 use super::config::AravisConfig;
 use super::driver::RigFacts;
 use super::features::{FeatureError, Features};
+use super::frames::Frames;
 use super::library::{Device, DeviceClock, Health, device_error};
 use super::network::{self, SocketBuffer};
-use super::sequencer;
+use super::sequencer::{self, Sequence};
 use super::settings::Writer;
 use super::setup::set_up;
 
-/// Buffers that frames arrive in: a quarter of a second and more at 60 frames/s.
-pub const BUFFERS: u64 = 32;
 /// How often a camera is asked for its time, and so whether it is there.
 const ASK_PERIOD: Duration = Duration::from_millis(200);
 /// Times that it is asked at first, so that its first frame has a time.
@@ -40,9 +41,9 @@ pub enum Command {
     /// Have the camera's sequencer go through settings.
     Sequence(Vec<CameraSettings>),
     /// The camera is given up: dispose of its stream and open it again.
-    Reopen(Stream),
+    Reopen(Frames),
     /// The same for good; the channel's end says so, too.
-    Close(Stream),
+    Close(Frames),
 }
 
 /// A command with the number that its reply carries.
@@ -65,16 +66,16 @@ pub struct Done {
     pub written_ns: i64,
     /// The settings that the camera has, where some were written.
     pub actual: Option<CameraSettings>,
-    /// The settings of its sequencer, where that was started.
-    pub sequence: Option<Vec<CameraSettings>>,
+    /// What its sequencer goes through, where that was started.
+    pub sequence: Option<Sequence>,
     /// Whether it had to stop for them, so that it counts its frames anew.
     pub restarted: bool,
 }
 
 /// An open camera, as far as whoever takes its frames needs it.
 pub struct Opened {
-    pub stream: Stream,
-    pub chunks: Option<ChunkParser>,
+    pub frames: Frames,
+    pub chunks: Option<Chunks>,
     pub capabilities: CameraCapabilities,
     /// Whether its clock can be asked.
     pub tells_time: bool,
@@ -196,9 +197,8 @@ impl Owner {
         }
         let stream = device.camera.create_stream().map_err(|error| device_error("no stream", &error))?;
         network::tune(&device.camera, &stream, socket, payload_bytes);
-        for _ in 0..BUFFERS {
-            stream.push_buffer(Buffer::new_allocate(payload_bytes));
-        }
+        let image_bytes = facts.format.frame_bytes(set_up.width * set_up.height);
+        let frames = Frames::new(stream, payload_bytes, FrameBuf::memory_bytes(image_bytes));
         let clock = DeviceClock::probe(&device, &shared.clock);
         shared.with_model(|model| *model = ClockModel::new(model.capacity()));
         if let Some(clock) = clock {
@@ -229,7 +229,8 @@ impl Owner {
             exposure_us: device.float_range(set_up.names.exposure)?,
             trigger_delay_us: delay_us,
         };
-        let chunks = if set_up.chunk_exposure { device.camera.create_chunk_parser() } else { None };
+        let parser = device.camera.create_chunk_parser();
+        let chunks = parser.map(|parser| Chunks::new(parser, set_up.chunks));
         let mut writer = Writer::new(set_up.names);
         if let Some(settings) = &self.settings {
             writer.write(&device, settings)?;
@@ -242,7 +243,7 @@ impl Owner {
         if self.armed {
             device.execute("AcquisitionStart")?;
         }
-        let opened = Opened { stream, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
+        let opened = Opened { frames, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
         Ok((Connection { device, writer, clock }, opened))
     }
 
@@ -250,17 +251,15 @@ impl Owner {
         let mut next_ask = Instant::now() + ASK_PERIOD;
         loop {
             match self.orders.recv_timeout(next_ask.saturating_duration_since(Instant::now())) {
-                Ok(Order { command: Command::Reopen(stream), .. }) => {
-                    drop(stream);
+                Ok(Order { command: Command::Reopen(frames), .. }) => {
+                    drop(frames);
                     return Ended::Lost;
                 }
-                Ok(Order { command: Command::Close(stream), .. }) => {
+                Ok(Order { command: Command::Close(frames), .. }) => {
                     let _ = connection.device.execute("AcquisitionStop");
-                    if self.sequence.is_some() {
-                        // A camera that is gone is not left with it; one that is there takes it.
-                        let _ = sequencer::stop(&connection.device);
-                    }
-                    drop(stream);
+                    // A camera that is gone is not left with it; one that is there takes it.
+                    let _ = self.end_sequence(&mut connection);
+                    drop(frames);
                     return Ended::Closed;
                 }
                 Err(RecvTimeoutError::Disconnected) => return Ended::Closed,
@@ -294,6 +293,20 @@ impl Owner {
         }
     }
 
+    /// Switches the camera's sequencer off, where it runs, and writes the settings that the camera had before.
+    fn end_sequence(
+        &mut self,
+        Connection { device, writer, .. }: &mut Connection,
+    ) -> Result<(), FeatureError> {
+        if self.sequence.take().is_some() {
+            sequencer::stop(device)?;
+            if let Some(settings) = &self.settings {
+                writer.write(device, settings)?;
+            }
+        }
+        Ok(())
+    }
+
     fn obey(&mut self, connection: &mut Connection, command: Command) -> Result<Done, DeviceError> {
         let Connection { device, writer, .. } = connection;
         let mut done = Done { written_ns: 0, actual: None, sequence: None, restarted: false };
@@ -305,9 +318,7 @@ impl Owner {
             Command::Disarm => {
                 self.armed = false;
                 device.execute("AcquisitionStop")?;
-                if self.sequence.take().is_some() {
-                    sequencer::stop(device)?;
-                }
+                self.end_sequence(connection)?;
             }
             Command::Configure(settings) => {
                 self.settings = Some(settings);
@@ -337,8 +348,8 @@ impl Owner {
                     device.execute("AcquisitionStart")?;
                 }
                 match started {
-                    Ok(actual) => {
-                        (self.sequence, done.sequence) = (Some(settings), Some(actual));
+                    Ok(sequence) => {
+                        (self.sequence, done.sequence) = (Some(settings), Some(sequence));
                     }
                     Err(error) if is_gone(&error) => return Err(error.into()),
                     Err(error) => {

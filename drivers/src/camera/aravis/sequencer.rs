@@ -10,6 +10,15 @@ use super::setup::require;
 /// What the sets are advanced by: any of these comes once a frame.
 const ADVANCED_BY: [&str; 2] = ["FrameStart", "ExposureStart"];
 
+/// What the camera goes through.
+#[derive(Debug, PartialEq)]
+pub struct Sequence {
+    /// The number of the first set.
+    pub first_set: i64,
+    /// The settings of each set, as the camera took them.
+    pub settings: Vec<CameraSettings>,
+}
+
 /// Whether the camera says that it has a sequencer.
 pub fn is_offered(features: &impl Features) -> bool {
     features.has("SequencerMode")
@@ -26,28 +35,23 @@ pub fn stop(features: &impl Features) -> Result<()> {
     Ok(())
 }
 
-/// Saves settings as sets, in a ring, makes sure that the camera kept them, and switches the sequencer on. Returns the
-/// settings as the camera took them.
+/// Saves settings as sets, in a ring, makes sure that the camera kept them, and switches the sequencer on.
 ///
 /// # Errors
 /// A feature that is missing, or a set that was not kept; the sequencer is then off.
-pub fn start(
-    features: &impl Features,
-    names: &Names,
-    settings: &[CameraSettings],
-) -> Result<Vec<CameraSettings>> {
+pub fn start(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<Sequence> {
     stop(features)?;
     require(features, &["SequencerConfigurationMode"], "a way to configure its sequencer")?;
     put_text(features, "SequencerConfigurationMode", "On")?;
     let loaded = load(features, names, settings);
     // Left on, it would also refuse what is then written in the place of sets.
     put_text(features, "SequencerConfigurationMode", "Off")?;
-    let actual = loaded?;
+    let sequence = loaded?;
     put_text(features, "SequencerMode", "On")?;
-    Ok(actual)
+    Ok(sequence)
 }
 
-fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<Vec<CameraSettings>> {
+fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<Sequence> {
     let delay = names.delay.map_or_else(|| require(features, &["TriggerDelay"], "a trigger delay"), Ok)?;
     enable(features, names.exposure, delay)?;
     let sets = features.integer_range("SequencerSetSelector")?;
@@ -91,7 +95,7 @@ fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) ->
             }
         }
     }
-    Ok(actual)
+    Ok(Sequence { first_set: *sets.start(), settings: actual })
 }
 
 /// Makes exposure and delay a part of the sets, where that can be chosen.
@@ -134,7 +138,7 @@ mod tests {
         CameraSettings { shutter: Shutter::Rolling, exposure_us: 600.0, trigger_delay_us: delay_us }
     }
 
-    fn started(camera: &Scripted, delays_us: &[f64]) -> Result<Vec<CameraSettings>> {
+    fn started(camera: &Scripted, delays_us: &[f64]) -> Result<Sequence> {
         let all: Vec<_> = delays_us.iter().map(|&delay_us| settings(delay_us)).collect();
         start(camera, &Names::probe(camera).unwrap(), &all)
     }
@@ -143,7 +147,8 @@ mod tests {
     fn settings_are_saved_in_a_ring_between_the_modes() {
         let camera = camera(4);
         // One set is all that a table can play: it keeps nothing by set.
-        assert_eq!(started(&camera, &[50.0]).unwrap(), [settings(50.0)]);
+        let sequence = Sequence { first_set: 0, settings: vec![settings(50.0)] };
+        assert_eq!(started(&camera, &[50.0]).unwrap(), sequence);
         let written = camera.take_written();
         let expected = [
             "SequencerConfigurationMode=On",

@@ -17,12 +17,21 @@ pub struct SetUp {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// Whether frames carry their exposure.
-    pub chunk_exposure: bool,
+    /// What frames say of themselves.
+    pub chunks: ChunksOn,
     /// From the end of row 0's exposure to the camera being ready, where it says so.
     pub readout_us: Option<f64>,
     /// What it lacks, in words.
     pub lacks: Vec<String>,
+}
+
+/// The chunk data that a camera was told to send.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct ChunksOn {
+    /// `ChunkExposureTime`: the exposure.
+    pub exposure: bool,
+    /// `ChunkSequencerSetActive`: the set of the camera's sequencer.
+    pub sequencer_set: bool,
 }
 
 /// Sets a camera up as the rig file wants it.
@@ -80,8 +89,8 @@ pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelForm
             "a shutter mode (SensorShutterMode, ShutterMode): its shutter is taken for a rolling one".into(),
         );
     }
-    let chunk_exposure = set_chunks(features)?;
-    if !chunk_exposure {
+    let chunks = set_chunks(features)?;
+    if !chunks.exposure {
         lacks.push(
             "the exposure time as chunk data: the exposure that it was set to is taken for true".into(),
         );
@@ -91,7 +100,7 @@ pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelForm
         Some(name) => features.float(name).ok(),
         None => None,
     };
-    Ok(SetUp { names, width, height, chunk_exposure, readout_us, lacks })
+    Ok(SetUp { names, width, height, chunks, readout_us, lacks })
 }
 
 /// The first of the names that is there.
@@ -147,21 +156,30 @@ fn set_region(
     Ok((pixels("Width")?, pixels("Height")?))
 }
 
-/// Asks for the exposure with every frame.
-fn set_chunks(features: &impl Features) -> Result<bool> {
+/// Asks for the exposure with every frame, and for the sequencer's set where there is a sequencer.
+fn set_chunks(features: &impl Features) -> Result<ChunksOn> {
     if !features.has("ChunkModeActive") || !features.has("ChunkSelector") {
-        return Ok(false);
+        return Ok(ChunksOn::default());
     }
     // Only while chunk mode is on can chunks be chosen on some cameras.
     put_boolean(features, "ChunkModeActive", true)?;
-    let offered = features.choices("ChunkSelector")?.iter().any(|choice| choice == "ExposureTime");
-    if !offered {
+    let offered = features.choices("ChunkSelector")?;
+    let enable = |chunk: &str| -> Result<bool> {
+        let is_offered = offered.iter().any(|choice| choice == chunk);
+        if is_offered {
+            put_text(features, "ChunkSelector", chunk)?;
+            put_boolean(features, "ChunkEnable", true)?;
+        }
+        Ok(is_offered)
+    };
+    let on = ChunksOn {
+        exposure: enable("ExposureTime")?,
+        sequencer_set: sequencer::is_offered(features) && enable("SequencerSetActive")?,
+    };
+    if on == ChunksOn::default() {
         put_boolean(features, "ChunkModeActive", false)?;
-        return Ok(false);
     }
-    put_text(features, "ChunkSelector", "ExposureTime")?;
-    put_boolean(features, "ChunkEnable", true)?;
-    Ok(true)
+    Ok(on)
 }
 
 fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
@@ -240,7 +258,9 @@ mod tests {
     fn settings_are_written_in_the_order_that_cameras_need() {
         let camera = sfnc();
         let set_up = set_up(&camera, &config(), PixelFormat::Mono12p).unwrap();
-        assert_eq!((set_up.width, set_up.height, set_up.chunk_exposure), (640, 480, true));
+        assert_eq!((set_up.width, set_up.height), (640, 480));
+        // There is no sequencer whose set could be told.
+        assert_eq!(set_up.chunks, ChunksOn { exposure: true, sequencer_set: false });
         assert_eq!((set_up.readout_us, set_up.lacks), (Some(16_100.0), vec![]));
         let written = camera.take_written();
         assert_eq!(written[..2], ["LineSelector=Line0", "LineMode=Input"]);
@@ -267,6 +287,19 @@ mod tests {
         for line in ["GammaEnable=false", "ExposureAuto=Off", "GainAuto=Off"] {
             position(&written, line);
         }
+    }
+
+    #[test]
+    fn frames_tell_the_sequencers_set_where_they_can() {
+        let chunks = |chunks: &[&'static str]| {
+            let camera = sfnc().with_text("SequencerMode", &["Off", "On"]).with_text("ChunkSelector", chunks);
+            let on = set_up(&camera, &config(), PixelFormat::Mono8).unwrap().chunks;
+            (on.exposure, on.sequencer_set, camera.boolean("ChunkModeActive").unwrap())
+        };
+        assert_eq!(chunks(&["ExposureTime", "SequencerSetActive"]), (true, true, true));
+        assert_eq!(chunks(&["ExposureTime"]), (true, false, true));
+        assert_eq!(chunks(&["SequencerSetActive"]), (false, true, true));
+        assert_eq!(chunks(&["FrameID"]), (false, false, false));
     }
 
     #[test]
