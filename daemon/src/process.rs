@@ -212,7 +212,12 @@ fn process_response(
         report: session.report_path(),
         stored: state.stored_points(),
         points: state.session.shape.points,
-        problems: findings.refusal().map(ToString::to_string).into_iter().collect(),
+        problems: findings
+            .refusal()
+            .map(ToString::to_string)
+            .into_iter()
+            .chain(findings.warnings())
+            .collect(),
     })
 }
 
