@@ -14,7 +14,7 @@ use raysweep_pipeline::Registry;
 use raysweep_proto::RunParams;
 use raysweep_session::manifest;
 use raysweep_tests::dots::{plan, rig};
-use raysweep_tests::{Bench, Ended};
+use raysweep_tests::{Bench, Ended, end_of};
 use serde_json::Value;
 
 /// Resonances of the simulated mirror.
@@ -196,6 +196,22 @@ fn what_shows_no_resonance_faults_the_run_and_overwrites_nothing() {
         let made = process(&ended.session).unwrap();
         assert!(made.problems[0].contains(expected), "{:?}", made.problems);
     }
+}
+
+#[test]
+fn a_run_that_is_cancelled_knows_no_response() {
+    let bench = Bench::dots(&rig(&mirror(5000.0, "")));
+    let mut events = bench.runner.events();
+    bench
+        .runner
+        .run(RunParams { plan: chirps("chirp_s = 3").replace("chirp_s = 0.5\n", ""), ..RunParams::default() })
+        .unwrap();
+    bench.runner.cancel().unwrap();
+    let ended = end_of(&mut events);
+    assert_eq!(ended.state, "cancelled", "{:?}", ended.error);
+    assert!(ended.open().1.counts.balanced() && !kept_path(&bench).exists());
+    let error = process(&ended.session).unwrap_err().to_string();
+    assert!(error.contains("of 2 axes"), "{error}");
 }
 
 #[test]
