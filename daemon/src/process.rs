@@ -202,6 +202,14 @@ fn process_response(
         let message = "a session of kind \"response\" has no products to ask for: leave --product out";
         return Err(ProcessError::Product(message.into()));
     }
+    let (stored, points) = (state.stored_points(), state.session.shape.points);
+    if stored < points {
+        let message = format!(
+            "{} has the records of {stored} of {points} axes: its run was ended early, and an axis alone makes no response; run the plan again",
+            session.dir().display()
+        );
+        return Err(ProcessError::Config(message));
+    }
     let size = (state.session.shape.rows, state.session.shape.columns);
     let task = ResponseTask::new(plan, plan_text, rig, rig.camera.pixel_format, size)
         .map_err(|error| ProcessError::Config(error.to_string()))?;
@@ -210,9 +218,14 @@ fn process_response(
     findings.write(session, state, &task, rig)?;
     Ok(Processed {
         report: session.report_path(),
-        stored: state.stored_points(),
-        points: state.session.shape.points,
-        problems: findings.refusal().map(ToString::to_string).into_iter().collect(),
+        stored,
+        points,
+        problems: findings
+            .refusal()
+            .map(ToString::to_string)
+            .into_iter()
+            .chain(findings.warnings())
+            .collect(),
     })
 }
 

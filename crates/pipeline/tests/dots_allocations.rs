@@ -116,7 +116,7 @@ fn allocations_a_batch(dots: u32, format: PixelFormat) -> f64 {
     let lit: Vec<Vec<u8>> = (0..16)
         .map(|dot| packed(counts(100 + dot, Some((20 + dot as usize, 10 + 2 * dot as usize)))))
         .collect();
-    let (flow, input) = DotsFlow::start(config, Ledger::default()).unwrap();
+    let (flow, mut input) = DotsFlow::start(config, Ledger::default()).unwrap();
     for step in 0..u64::from(dots) * u64::from(BATCHES + 2) {
         let index = step % u64::from(dots);
         let image = match index {
@@ -135,7 +135,7 @@ fn allocations_a_batch(dots: u32, format: PixelFormat) -> f64 {
             exposure_us: None,
         };
         let arrival = Arrival { frame: Frame { data, format, stamp }, lost_before: Vec::new() };
-        assert!(input.send(arrival).is_ok());
+        assert!(input.offer(arrival).is_ok());
     }
     drop(input);
     let gathered = flow.join().unwrap();

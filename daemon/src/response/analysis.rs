@@ -120,6 +120,17 @@ impl Axis {
         self.measured.iter().map(|measured| found.at(measured.hz)).collect()
     }
 
+    /// What an operator should know of a resonance that was found.
+    pub fn warning(&self, name: &str) -> Option<String> {
+        let [low_hz, high_hz] = self.found.as_ref().ok()?.band_hz;
+        let is_narrowed = self.measured.first().is_some_and(|lowest| low_hz > lowest.hz);
+        is_narrowed.then(|| {
+            format!(
+                "axis {name}: only from {low_hz:.0} to {high_hz:.0} Hz does a resonance explain the movement; a low-pass, such as the controller's, bends it elsewhere. Paths that are distorted beforehand make good for the resonance alone: set the controller's bandwidth beyond it"
+            )
+        })
+    }
+
     /// Writes the table `response_x` or `response_y` among the session's products, if there is a spectrum.
     ///
     /// # Errors

@@ -121,6 +121,11 @@ impl Findings {
         self.axes.iter().find_map(|axis| axis.found.as_ref().err())
     }
 
+    /// What an operator should know of what was found.
+    pub fn warnings(&self) -> Vec<String> {
+        self.axes.iter().zip(AXES).filter_map(|(axis, name)| axis.warning(name)).collect()
+    }
+
     /// Keeps the response in the session's folder; in `data` too, if it is given, where later runs take it from.
     /// Nothing is written of an axis that was refused, nor of the other.
     ///
@@ -129,6 +134,7 @@ impl Findings {
     pub fn keep(&self, session: &Session, state: &State, data: Option<&Path>) -> Result<()> {
         let [Ok(x), Ok(y)] = self.axes.each_ref().map(|axis| axis.found.as_ref()) else { return Ok(()) };
         let kept = KeptResponse::new(session, state, [x, y]);
+        tracing::info!(x = ?x.response, y = ?y.response, "mirror identified");
         kept.write(&session.mirror_response_path())?;
         data.map_or(Ok(()), |data| kept.write(&kept::path_in(data)))
     }

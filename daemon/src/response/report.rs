@@ -48,14 +48,7 @@ fn section(state: &State, number: usize, (axis, name): (&Axis, &str)) -> Section
         Ok(found) => Block::Table(figures(found)),
         Err(refusal) => Block::Note(NoteLevel::Error, refusal.to_string()),
     }];
-    if let Ok(Identified { band_hz: [low_hz, high_hz], .. }) = axis.found
-        && axis.measured.first().is_some_and(|lowest| low_hz > lowest.hz)
-    {
-        blocks.push(Block::Note(
-            NoteLevel::Warning,
-            format!("Only from {low_hz:.0} to {high_hz:.0} Hz does a resonance explain the movement: a low-pass, such as the controller's, bends it elsewhere. Paths that are distorted beforehand make good for the resonance alone; set the controller's bandwidth beyond it."),
-        ));
-    }
+    blocks.extend(axis.warning(name).map(|warning| Block::Note(NoteLevel::Warning, warning)));
     if let Some(entry) = state.axes().find(|entry| entry.axis == number) {
         let facts = [
             ("frames of the chirp", entry.frames.to_string()),

@@ -91,10 +91,10 @@ pub fn conduct_response(run: ResponseRun, board: &Board, dir: &Path) {
         let error = fault.map(|fault| fault.to_string());
         let end = EndEntry { error, ..end_entry(state, stored, points - stored) };
         ledger.append(&Entry::End(end.clone()))?;
-        if let Some(findings) = findings {
+        if let Some(findings) = &findings {
             findings.write(&session, ledger.state(), &task, &rig.file)?;
         }
-        Ok((end, Vec::new()))
+        Ok((end, findings.map_or_else(Vec::new, |findings| findings.warnings())))
     }))
     .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
     finish(ended, points, board, dir);

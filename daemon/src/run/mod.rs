@@ -9,6 +9,7 @@ mod film;
 mod operator;
 mod orders;
 pub(crate) mod priority;
+mod response;
 mod storage;
 mod vsync;
 
@@ -29,11 +30,12 @@ use tokio::sync::broadcast;
 
 pub(crate) use self::board::Board;
 use self::board::WrongState;
-use self::conclude::{conduct, conduct_batches, conduct_response};
-use self::dots::{DotRun, ResponseRun};
+use self::conclude::{conduct, conduct_batches};
+use self::dots::DotRun;
 pub(crate) use self::dots::{FRAMES_AT_WORK, frames_waiting};
 use self::engine::Run;
 use self::orders::{Order, Orders};
+use self::response::is_response;
 use crate::advice;
 use crate::check;
 use crate::config::{ConfigError, Plan, PlanKind};
@@ -43,7 +45,6 @@ use crate::live::{LiveFile, Outlet};
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::mirror;
 use crate::processing::Task;
-use crate::response::{self, ResponseTask};
 use crate::results;
 use crate::rig::{AnyRig, DotRig, Rig, RigError};
 
@@ -155,18 +156,6 @@ impl Runner {
                 &self.data,
                 limit_bytes,
             )?;
-            Ok((task, report))
-        };
-        foreseen().map_err(|error| invalid_plan(&error))
-    }
-
-    /// A plan of a mirror's chirps on this rig, and what it would do.
-    fn foresee_response(&self, rig: &DotRig, plan: &str) -> Result<(ResponseTask, CheckReport), RpcError> {
-        let foreseen = || {
-            let size = (self.camera.height, self.camera.width);
-            let task = ResponseTask::new(Plan::parse(plan)?, plan, &rig.file, self.camera.format, size)?;
-            let camera = self.camera_at(task.response().camera_rate_hz);
-            let report = response::check::check(&task, plan, &camera, &self.data, self.memory_limit_bytes)?;
             Ok((task, report))
         };
         foreseen().map_err(|error| invalid_plan(&error))
@@ -285,33 +274,6 @@ impl Runner {
         let thread = spawn_run({
             let (orders, dir) = (orders.clone(), dir.clone());
             move || conduct_batches(run, &orders, &board, &dir)
-        })?;
-        Ok((Started { session: dir }, Current { orders, thread }))
-    }
-
-    /// Prepares a run of a mirror's chirps and starts its thread.
-    fn begin_response(&self, rig: &Arc<DotRig>, params: &RunParams) -> Result<(Started, Current), RpcError> {
-        let (task, report) = self.foresee_response(rig, &params.plan)?;
-        self.check_room(&report, "take smaller frames")?;
-        let (name, shape) = (task.plan.name.clone(), task.stack_shape());
-        let (session, ledger) =
-            self.create_session(params, PlanKind::Response, &name, shape, 0, &rig.text)?;
-        let dir = session.dir().to_owned();
-        self.board.set_session(dir.clone());
-        let orders = Arc::new(Orders::default());
-        let run = ResponseRun {
-            rig: rig.clone(),
-            task: Arc::new(task),
-            session,
-            ledger,
-            data: self.data.clone(),
-            orders: orders.clone(),
-            board: self.board.clone(),
-        };
-        let board = self.board.clone();
-        let thread = spawn_run({
-            let dir = dir.clone();
-            move || conduct_response(run, &board, &dir)
         })?;
         Ok((Started { session: dir }, Current { orders, thread }))
     }
@@ -544,12 +506,6 @@ impl Control for Runner {
     fn events(&self) -> broadcast::Receiver<Event> {
         self.board.subscribe()
     }
-}
-
-/// Whether a plan is one of a mirror's chirps.
-fn is_response(plan: &str) -> Result<bool, RpcError> {
-    let plan = Plan::parse(plan).map_err(|error| invalid_plan(&error))?;
-    Ok(plan.kind == PlanKind::Response)
 }
 
 fn invalid_plan(error: &ConfigError) -> RpcError {

@@ -234,8 +234,7 @@ fn fit(points: &[Point], band: &RangeInclusive<f64>) -> Result<Identified, Ident
     let better = |a: Model, b: Model| if b.error(points) < a.error(points) { b } else { a };
     let model = others.into_iter().fold(first, better);
     let residual = (model.error(points) / points.iter().map(Point::energy).sum::<f64>()).sqrt();
-    // Also for NaN.
-    if !(residual <= LARGEST_RESIDUAL) {
+    if residual.is_nan() || residual > LARGEST_RESIDUAL {
         return Err(IdentifyError::NoResonator { residual });
     }
     if !(model.q > 0.0 && band.contains(&model.f0_hz)) {
