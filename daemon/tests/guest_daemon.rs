@@ -1,6 +1,6 @@
 //! The daemon with a logic analyser on its VSYNC line, behind the kernel's USB stack (`vhci-hcd`): every frame that counts is
-//! tied to an edge that the analyser saw, whatever befalls the line and the analyser meanwhile. The camera is the simulated one,
-//! in a process of its own with the daemon, and both live by the guest's clock, on whose multiples of the period the line's edges stand.
+//! tied to an edge that the analyser saw, whatever befalls the line and the analyser meanwhile. The camera is the daemon's simulated
+//! one, the analyser is in the test's process; the line's edges stand on the multiples of its period on the guest's clock for both.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
