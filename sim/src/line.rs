@@ -1,12 +1,16 @@
 //! The electrical side of the rig: the VSYNC line, the projector's frames of light behind it, and the camera that its
 //! edges trigger. Events happen in the order of time, whoever looks first.
 
+mod camera;
+
 use std::collections::VecDeque;
 use std::sync::Arc;
 
 use rand_distr::{Distribution, StandardNormal};
-use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, Shutter, ns_from_us};
+use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, ns_from_us};
 
+use self::camera::{CameraLine, Sequence, Written};
+pub use self::camera::{Exposure, Sets, TriggeredBy};
 use crate::config::{SimCamera, SimProjector, SimVsync};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::optics::Optics;
@@ -24,22 +28,6 @@ pub struct Light {
     pub start_ns: i64,
     /// The scene under the pattern shown.
     pub optics: Option<Arc<Optics>>,
-}
-
-/// One exposure of the camera.
-pub struct Exposure {
-    /// The camera's frame id.
-    pub seq: u64,
-    /// Point, attempt, and frames since the settings were written: what noise is keyed by.
-    pub key: [u64; 3],
-    /// Settings in force.
-    pub settings: CameraSettings,
-    /// Start of row 0's exposure.
-    pub start_ns: i64,
-    /// When the frame is on the host.
-    pub done_ns: i64,
-    /// Whether it gets there.
-    pub delivered: bool,
 }
 
 /// Constants of the line.
@@ -99,94 +87,6 @@ enum EdgeKind {
     False,
 }
 
-/// What starts the camera's exposures.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum TriggeredBy {
-    /// The edges of the VSYNC line.
-    Edges,
-    /// [`Line::fire`] alone.
-    Software,
-    /// The camera's own clock, as often as it is ready and no faster than this.
-    FreeRun {
-        /// From one exposure's trigger to the next one's.
-        period_ns: i64,
-    },
-}
-
-struct CameraLine {
-    armed: bool,
-    triggered_by: TriggeredBy,
-    /// When a free-running camera triggers itself next.
-    next_free_ns: i64,
-    /// Triggers before this are not heard.
-    deaf_until_ns: i64,
-    /// No exposure may start before this.
-    occupied_until_ns: i64,
-    in_force: Written,
-    /// Triggers answered under the settings in force.
-    frames: u64,
-    /// Settings on their way into the sensor, in the order of their first frames.
-    written: VecDeque<Written>,
-    sequence: Option<Sequence>,
-    seq: u64,
-    exposures: VecDeque<Exposure>,
-}
-
-/// Settings of the camera's own sequencer, each with the number of those that the frame after has.
-pub type Sets = Vec<(CameraSettings, usize)>;
-
-/// The camera's own sequencer while it runs.
-struct Sequence {
-    sets: Sets,
-    /// Which one the next frame has.
-    next: usize,
-    frames: u32,
-}
-
-/// Settings, and the first frame that has them.
-#[derive(Clone, Copy)]
-struct Written {
-    first_seq: u64,
-    id: SettingsId,
-    settings: CameraSettings,
-}
-
-impl CameraLine {
-    /// The settings of the next frame to be triggered, and how many frames have had them.
-    fn due(&self) -> (Written, u64) {
-        let due = self.written.iter().rev().find(|written| written.first_seq <= self.seq);
-        due.map_or((self.in_force, self.frames), |written| (*written, 0))
-    }
-
-    /// What noise and faults of the next frame are keyed by.
-    fn key(&self) -> [u64; 3] {
-        let (Written { id, .. }, frames) = self.due();
-        [u64::from(id.point), u64::from(id.attempt), frames]
-    }
-
-    /// Where the sequencer runs, the next frame has its next set.
-    fn take_next_set(&mut self) {
-        let Some(Sequence { sets, next, frames }) = &mut self.sequence else { return };
-        let Some(&(settings, after)) = sets.get(*next) else { return };
-        let id = SettingsId { point: *next as u32, attempt: *frames };
-        self.written.push_back(Written { first_seq: self.seq, id, settings });
-        (*next, *frames) = (after, *frames + 1);
-    }
-
-    /// When the camera triggers itself, where it does.
-    fn free_run_ns(&self) -> i64 {
-        let runs = self.armed && matches!(self.triggered_by, TriggeredBy::FreeRun { .. });
-        if runs { self.next_free_ns } else { i64::MAX }
-    }
-
-    /// Whether an edge at `edge_ns` would be answered.
-    fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
-        let (Written { settings, .. }, _) = self.due();
-        let start_ns = edge_ns + ns_from_us(latency_us + settings.trigger_delay_us);
-        edge_ns >= self.deaf_until_ns && start_ns >= self.occupied_until_ns
-    }
-}
-
 /// What really happened, for tests alone.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LineTruth {
@@ -212,11 +112,6 @@ const GUARD_NS: i64 = 400_000;
 impl Line {
     /// A line at rest at `now_ns`.
     pub fn new(config: LineConfig, now_ns: i64) -> Self {
-        let idle = Written {
-            first_seq: 0,
-            id: SettingsId { point: u32::MAX, attempt: u32::MAX },
-            settings: CameraSettings { shutter: Shutter::Rolling, exposure_us: 100.0, trigger_delay_us: 0.0 },
-        };
         Self {
             next_period: now_ns / config.period_ns + 1,
             config,
@@ -229,19 +124,7 @@ impl Line {
             next_shown: None,
             seen: VecDeque::new(),
             edges: 0,
-            camera: CameraLine {
-                armed: false,
-                triggered_by: TriggeredBy::Edges,
-                next_free_ns: 0,
-                deaf_until_ns: 0,
-                occupied_until_ns: 0,
-                in_force: idle,
-                frames: 0,
-                written: VecDeque::new(),
-                sequence: None,
-                seq: 0,
-                exposures: VecDeque::new(),
-            },
+            camera: CameraLine::at_rest(),
             late_frames: None,
             truth: LineTruth::default(),
         }

@@ -223,8 +223,8 @@ pub trait Camera: Send {
     /// Any kind; the camera then stays disarmed.
     fn arm(&mut self) -> Result<(), DeviceError>;
 
-    /// Waits for the next frame and copies it into `buf`; `None` when none came within `timeout`, also while the camera is
-    /// [`DeviceState::Lost`].
+    /// Waits for the next frame and puts it into `buf`, by a copy or by [`FrameBuf::exchange`]; `None` when none came within
+    /// `timeout`, also while the camera is [`DeviceState::Lost`].
     ///
     /// # Errors
     /// `NotReady` before [`Camera::arm`], `Disconnected` when the device is gone for good.
