@@ -12,7 +12,7 @@ use raysweep_core::{
     us_from_ns,
 };
 
-use super::chunks::Chunks;
+use super::chunks::{Chunks, Said};
 use super::config::{AravisConfig, TimestampAt};
 use super::frames::{Frames, image_data};
 use super::ids::FrameIds;
@@ -275,12 +275,11 @@ impl AravisCamera {
             );
             return Err(error(DeviceErrorKind::Protocol, what));
         }
-        let Link::Up { chunks, tells_time, .. } = &self.link else { return Ok(None) };
-        let exposure_us = chunks.as_ref().and_then(|chunks| chunks.exposure_us(from));
-        let set = self.first_set.zip(chunks.as_ref()).and_then(|(first_set, chunks)| {
-            let set = chunks.sequencer_set(from)?;
-            usize::try_from(set - first_set).ok()
-        });
+        let Link::Up { chunks, tells_time, .. } = &mut self.link else { return Ok(None) };
+        let Said { exposure_us, sequencer_set } =
+            chunks.as_mut().map(|chunks| chunks.read(from)).unwrap_or_default();
+        let set = sequencer_set.zip(self.first_set);
+        let set = set.and_then(|(set, first_set)| usize::try_from(set - first_set).ok());
         let set_us =
             exposure_us.or(self.promises.newest().map(|settings| settings.exposure_us)).unwrap_or(0.0);
         let stamped_ns = i64::try_from(from.timestamp()).unwrap_or(i64::MAX);
@@ -290,7 +289,7 @@ impl AravisCamera {
         };
         let arrived_ns = host_ns - ns_from_us(set_us + self.capabilities.readout_us);
         let exposure_start_ns = self.shared.with_model(|model| {
-            if !tells_time {
+            if !*tells_time {
                 model.add(RoundTrip { request_ns: arrived_ns, device_ns, receive_ns: arrived_ns });
             }
             model.host_ns(device_ns).unwrap_or(arrived_ns)

@@ -133,6 +133,17 @@ impl Drop for Lent {
     }
 }
 
+/// What lies behind the image of a frame that was popped; nothing where the image is not the first.
+pub fn behind_image(buffer: &Buffer) -> &[u8] {
+    let (image, mut size) = (image_data(buffer), 0);
+    // SAFETY: as for `image_data`, of all the memory that the buffer has.
+    let data = unsafe {
+        let data = aravis_sys::arv_buffer_get_data(buffer.to_glib_none().0, &mut size);
+        if data.is_null() { &[] } else { std::slice::from_raw_parts(data, size) }
+    };
+    if image.as_ptr() == data.as_ptr() { data.get(image.len()..).unwrap_or_default() } else { &[] }
+}
+
 /// Where a buffer's memory begins.
 fn address(buffer: &Buffer) -> NonNull<u8> {
     let mut size = 0;
