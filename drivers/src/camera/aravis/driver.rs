@@ -150,7 +150,7 @@ impl AravisCamera {
 
     /// Frames lost so far, by cause.
     pub fn losses(&self) -> impl Iterator<Item = (LossCause, u64)> {
-        self.losses.totals().iter().map(|(&cause, &frames)| (cause, frames))
+        self.losses.totals()
     }
 
     /// How far the round trips of the clock model scatter about it; nothing where the camera has no clock to ask.

@@ -20,7 +20,7 @@ use raysweep_core::FrameBuf;
 const FEWEST: usize = 32;
 /// As many as lie in so much memory: libaravis waits 100 ms for packets that are missing, and keeps all frames behind.
 const MEMORY_BYTES: usize = 64 << 20;
-const MOST: usize = 128;
+pub const MOST_BUFFERS: usize = 128;
 /// Buffers that wait for their memory to come back from the pool.
 const MOST_IDLE: usize = 128;
 
@@ -43,11 +43,12 @@ unsafe impl Send for Lent {}
 impl Frames {
     /// Gives a stream buffers for frames of `payload_bytes`, in pieces of `memory_bytes` or more.
     pub fn new(stream: Stream, payload_bytes: usize, memory_bytes: usize) -> Self {
-        let buffers = (MEMORY_BYTES / payload_bytes.max(1)).clamp(FEWEST, MOST);
+        let buffers = (MEMORY_BYTES / payload_bytes.max(1)).clamp(FEWEST, MOST_BUFFERS);
         let lent = Lent(Vec::with_capacity(buffers));
         let mut frames = Self { stream, lent, idle: Vec::with_capacity(MOST_IDLE), payload_bytes };
         for _ in 0..buffers {
-            frames.lend(vec![0; memory_bytes.max(payload_bytes)].into());
+            // Not zeros, whose pages would be made when the first frames come.
+            frames.lend(vec![u8::MAX; memory_bytes.max(payload_bytes)].into());
         }
         frames
     }

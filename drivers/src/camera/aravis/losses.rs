@@ -1,12 +1,17 @@
 //! Frames that never came, by cause. That they are lost, gaps between frame ids tell; why, what was seen meanwhile.
 
-use std::collections::BTreeMap;
 use std::ops::Range;
 
 use raysweep_core::LossCause;
 
+use super::frames::MOST_BUFFERS;
+
 /// Frames with missing packets that are remembered within one gap; more than the driver has buffers never are.
-const REMEMBERED: usize = 64;
+const REMEMBERED: usize = MOST_BUFFERS;
+
+/// What the driver can tell.
+const CAUSES: [LossCause; 4] =
+    [LossCause::CameraGap, LossCause::PacketsLost, LossCause::DriverFull, LossCause::CameraLost];
 
 /// Why the frames of the newest gap are lost, and how many were lost so far.
 #[derive(Debug)]
@@ -22,7 +27,8 @@ pub struct Losses {
     /// The gap before the newest whole frame.
     gap: Range<u64>,
     newest: Option<u64>,
-    totals: BTreeMap<LossCause, u64>,
+    /// Of each of the [`CAUSES`]: counting takes no memory.
+    totals: [u64; CAUSES.len()],
 }
 
 impl Losses {
@@ -34,7 +40,7 @@ impl Losses {
             full_until: None,
             gap: 0..0,
             newest: None,
-            totals: BTreeMap::new(),
+            totals: [0; CAUSES.len()],
         }
     }
 
@@ -79,7 +85,12 @@ impl Losses {
         }
         self.nameless = 0;
         for lost in self.gap.clone() {
-            *self.totals.entry(self.cause(lost)).or_default() += 1;
+            let cause = self.cause(lost);
+            CAUSES
+                .iter()
+                .zip(&mut self.totals)
+                .filter(|(of, _)| **of == cause)
+                .for_each(|(_, total)| *total += 1);
         }
     }
 
@@ -97,8 +108,8 @@ impl Losses {
     }
 
     /// Frames lost so far, by cause.
-    pub fn totals(&self) -> &BTreeMap<LossCause, u64> {
-        &self.totals
+    pub fn totals(&self) -> impl Iterator<Item = (LossCause, u64)> {
+        CAUSES.into_iter().zip(self.totals).filter(|(_, frames)| *frames > 0)
     }
 }
 
@@ -132,7 +143,7 @@ mod tests {
         losses.away(14..20);
         losses.whole(21);
         assert_eq!([19, 20].map(|seq| losses.cause(seq)), [LossCause::CameraLost, LossCause::CameraGap]);
-        let totals: Vec<_> = losses.totals().iter().map(|(cause, frames)| (*cause, *frames)).collect();
+        let totals: Vec<_> = losses.totals().collect();
         assert_eq!(
             totals,
             [(LossCause::CameraGap, 2), (LossCause::DriverFull, 2), (LossCause::CameraLost, 6)]
@@ -149,6 +160,6 @@ mod tests {
             assert_eq!(losses.cause(seq), LossCause::PacketsLost);
         }
         assert_eq!(losses.incomplete.capacity(), REMEMBERED);
-        assert_eq!(losses.totals()[&LossCause::PacketsLost], 5_000);
+        assert!(losses.totals().eq([(LossCause::PacketsLost, 5_000)]));
     }
 }
