@@ -260,7 +260,8 @@ fn underrun() {
     lab.assert_parked("underrun, from when the daemon goes on", since_ns);
     let (state, error) = lab.ended();
     assert_eq!(state, RunState::Faulted);
-    assert!(error.unwrap().contains("ran out of samples"));
+    let error = error.unwrap();
+    assert!(error.contains("ran out of samples"), "{error}");
 }
 
 #[test]
@@ -272,7 +273,8 @@ fn unplug() {
     lab.pty.unplug();
     let (state, error) = lab.ended();
     assert_eq!(state, RunState::Faulted);
-    assert!(error.unwrap().contains("the controller is gone"));
+    let error = error.unwrap();
+    assert!(error.contains("the controller is gone"), "{error}");
     println!("unplug: the run had ended after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
     let status = lab.client().status().unwrap().mirror.unwrap();
     assert!(!status.parked, "nobody takes it for parked: {status:?}");

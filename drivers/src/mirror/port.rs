@@ -130,12 +130,14 @@ impl Port {
     ) -> Result<Option<T>, DeviceError> {
         let deadline = Instant::now() + timeout;
         loop {
+            // Looked at first: a reply that came while this thread was not run is not late.
+            let is_over = Instant::now() >= deadline;
             while let Some(reply) = self.reply(&parse)? {
                 if let Some(picked) = pick(reply) {
                     return Ok(Some(picked));
                 }
             }
-            if Instant::now() >= deadline {
+            if is_over {
                 return Ok(None);
             }
             std::thread::sleep(Duration::from_micros(200));

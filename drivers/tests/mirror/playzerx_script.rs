@@ -193,6 +193,27 @@ fn the_fifo_is_filled_and_never_overfilled_by_the_controllers_own_count() {
 }
 
 #[test]
+fn a_host_that_stands_still_is_no_fault_of_the_controller() {
+    let lab = Lab::new(1000.0);
+    let mut mirror = lab.open();
+    mirror.load(&turn(2000, 1000.0)).unwrap();
+    mirror.start(2).unwrap();
+    let began = Instant::now();
+    while mirror.feed().unwrap().played < 100 {
+        assert!(began.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    // The FIFO has more than a second, and longer than that no answer may be awaited.
+    for _ in 0..5 {
+        std::thread::sleep(Duration::from_millis(400));
+        mirror.feed().unwrap();
+        std::thread::sleep(Duration::from_millis(2));
+        mirror.feed().unwrap();
+    }
+    mirror.park().unwrap();
+}
+
+#[test]
 fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     let lab = Lab::new(1000.0);
     let mut mirror = lab.open();

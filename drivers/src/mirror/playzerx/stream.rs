@@ -80,6 +80,7 @@ impl Stream {
 
     /// Reads what has come and sends what there is room for; notes in `record` what was sent.
     pub fn step(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
+        let looked = Instant::now();
         while let Some(reply) = port.reply(parse_response)? {
             if let Reply::Left(left) = reply {
                 self.take_answer(u64::from(left))?;
@@ -93,7 +94,7 @@ impl Stream {
                 break;
             }
         }
-        self.check_life()
+        self.check_life(looked)
     }
 
     /// Puts the next samples and questions into `out`; `false` if there is nothing to send now.
@@ -192,16 +193,18 @@ impl Stream {
         self.is_within_path(self.next) && since.as_secs_f64() * self.asked_rate_hz * 1.1 >= held as f64
     }
 
-    /// A controller that does not answer, or whose FIFO does not drain, does not move the mirror.
-    fn check_life(&self) -> Result<(), DeviceError> {
-        if self.question.is_some_and(|(asked, _)| asked.elapsed() > REPLY_WAIT) {
+    /// A controller that does not answer, or whose FIFO does not drain, does not move the mirror. `looked` is when its answers
+    /// were read: what it says while the host stands still is not late.
+    fn check_life(&self, looked: Instant) -> Result<(), DeviceError> {
+        let unanswered = |(asked, _)| looked.saturating_duration_since(asked) > REPLY_WAIT;
+        if self.question.is_some_and(unanswered) {
             return Err(fault(
                 DeviceErrorKind::Timeout,
                 "the controller no longer answers: check its cable, or switch it off and on",
             ));
         }
         let waiting = self.began.is_some() && self.played < self.certain && !self.may_have_run_dry();
-        if waiting && self.moved.elapsed() > REPLY_WAIT {
+        if waiting && self.answer_asked.saturating_duration_since(self.moved) > REPLY_WAIT {
             return Err(fault(
                 DeviceErrorKind::Timeout,
                 format!(
