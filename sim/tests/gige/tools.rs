@@ -131,12 +131,11 @@ fn arv_camera_test_streams_without_loss() {
     {
         assert_eq!(figure(&report, name), 0, "{name}: {report}");
     }
-    // Underruns are the tool's own: on a busy machine it has no buffer ready, and counts each
-    // packet of such a frame. What was on its way when it stopped, it does not count.
+    // On a busy machine the tool is late with its buffers and passes packets over, which it does not count as frames. What
+    // was on its way when it stopped, it does not count at all.
     let truth = camera.truth();
-    let turned_away = figure(&report, "n_underruns") * truth.frames / truth.packets;
-    assert!(completed + turned_away <= truth.frames, "{truth:?} {report}");
-    assert!((completed + turned_away) * 2 > truth.frames, "{truth:?} {report}");
+    assert!(completed <= truth.frames, "{truth:?} {report}");
+    assert!(figure(&report, "n_received_packets") * 2 > truth.packets, "{truth:?} {report}");
     assert!(report.contains("ChunkExposureTime = 1000"), "{report}");
 }
 
