@@ -1,6 +1,7 @@
 //! The accounting of frames: every trigger that was expected ends in exactly one column.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
@@ -42,6 +43,29 @@ pub enum LossCause {
     StageFailed,
 }
 
+impl fmt::Display for LossCause {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::CameraGap => "camera gap",
+            Self::PacketsLost => "packets lost",
+            Self::DriverFull => "driver full",
+            Self::CameraLost => "camera lost",
+            Self::MissedTrigger => "missed trigger",
+            Self::EdgeMissing => "edge missing",
+            Self::FalseEdge => "false edge",
+            Self::Jitter => "jitter",
+            Self::SettingsMismatch => "settings mismatch",
+            Self::PoolEmpty => "pool empty",
+            Self::QueueFull => "queue full",
+            Self::WriterError => "writer error",
+            Self::Unsynchronised => "unsynchronised",
+            Self::Saturated => "saturated",
+            Self::Surplus => "surplus",
+            Self::StageFailed => "stage failed",
+        })
+    }
+}
+
 /// Where the triggers of a point, an attempt or a run went.
 ///
 /// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` grows with the
@@ -72,6 +96,15 @@ impl Counts {
     /// Frames lost, over all causes.
     pub fn lost_total(&self) -> u64 {
         self.lost.values().sum()
+    }
+
+    /// Frames lost, by cause, in words.
+    pub fn losses(&self) -> String {
+        let causes: Vec<_> = self.lost.iter().map(|(cause, frames)| format!("{frames} {cause}")).collect();
+        match causes.is_empty() {
+            true => "none lost".into(),
+            false => format!("{} lost ({})", self.lost_total(), causes.join(", ")),
+        }
     }
 
     /// Whether every expected trigger is accounted for exactly once.
@@ -116,4 +149,18 @@ pub struct VsyncStats {
     /// Allan deviation of the line's frequency over one second, once two seconds of it were seen.
     #[serde(default)]
     pub allan_1s: Option<f64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn losses_are_told_by_cause() {
+        let mut counts = Counts::default();
+        assert_eq!(counts.losses(), "none lost");
+        counts.lose(LossCause::CameraGap, 3);
+        counts.lose(LossCause::Jitter, 1);
+        assert_eq!(counts.losses(), "4 lost (3 camera gap, 1 jitter)");
+    }
 }

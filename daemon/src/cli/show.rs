@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use indicatif::{BinaryBytes, FormattedDuration};
-use raysweep_core::{ClockQuality, Counts, FilmSummary, Percentiles, SettingsLatency};
+use raysweep_core::{ClockQuality, FilmSummary, Percentiles, SettingsLatency};
 use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
     BetterSweep, CheckReport, Description, ExpectedError, MirrorStatus, NoiseSource, Progress, Role,
@@ -312,17 +312,7 @@ pub(super) fn processed(made: &Processed) -> String {
 pub(super) fn pace(progress: &Progress) -> String {
     let left =
         progress.left_s.map_or_else(|| "time left unknown".into(), |left| format!("{} left", duration(left)));
-    format!("{:.0} frames/s  {}  {left}", progress.frames_per_s, losses(&progress.counts))
-}
-
-/// Frames lost, by cause.
-pub(super) fn losses(counts: &Counts) -> String {
-    let causes: Vec<_> =
-        counts.lost.iter().map(|(cause, frames)| format!("{frames} {}", words(cause))).collect();
-    match causes.is_empty() {
-        true => "none lost".into(),
-        false => format!("{} lost ({})", counts.lost_total(), causes.join(", ")),
-    }
+    format!("{:.0} frames/s  {}  {left}", progress.frames_per_s, progress.counts.losses())
 }
 
 /// A state in a word or two.
@@ -336,12 +326,6 @@ pub(super) fn state(state: RunState) -> &'static str {
         RunState::Draining => "finishing",
         RunState::Faulted => "faulted",
     }
-}
-
-/// A name as it stands in JSON, without its underscores.
-fn words(name: &impl serde::Serialize) -> String {
-    let json = serde_json::to_value(name).unwrap_or_default();
-    json.as_str().unwrap_or_default().replace('_', " ")
 }
 
 fn name(session: &Path) -> String {
@@ -363,18 +347,8 @@ fn block(rows: &[(&str, String)]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use raysweep_core::LossCause;
 
     use super::*;
-
-    #[test]
-    fn losses_are_told_by_cause() {
-        let mut counts = Counts::default();
-        assert_eq!(losses(&counts), "none lost");
-        counts.lose(LossCause::CameraGap, 3);
-        counts.lose(LossCause::Jitter, 1);
-        assert_eq!(losses(&counts), "4 lost (3 camera gap, 1 jitter)");
-    }
 
     #[test]
     fn no_time_is_too_strange_to_be_told() {

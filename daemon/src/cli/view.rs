@@ -50,7 +50,7 @@ impl View {
             Event::State { state, .. } => self.state(*state),
             Event::Progress(progress) => self.progress(progress),
             Event::Lost { point, attempt, counts } => {
-                let lost = show::losses(counts);
+                let lost = counts.losses();
                 self.note(&format!("point {point}, attempt {attempt}: {lost}; the point is taken again"));
             }
             Event::Film(estimate) => self.film(estimate),

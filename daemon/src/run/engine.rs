@@ -2,10 +2,11 @@
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
+use std::time::Duration;
 
 use raysweep_core::{
-    CameraCapabilities, CameraSettings, DeviceError, Pattern, Projector, SettingsId, SettingsLatency, Shown,
-    VsyncStats, ns_from_us,
+    CameraCapabilities, CameraSettings, Counts, DeviceError, Pattern, Projector, SettingsId, SettingsLatency,
+    Shown, VsyncStats, ns_from_us,
 };
 use raysweep_pipeline::{
     AssemblerConfig, CycleOrder, Pipeline, PipelineConfig, PipelineError, Point, Policy, Role,
@@ -28,8 +29,10 @@ use crate::processing::{Processing, Task, place};
 use crate::response::ResponseError;
 use crate::rig::{Devices, Pace, Rig, RigError};
 
-/// Attempts at a point before it stays missing.
-const MAX_ATTEMPTS: u32 = 8;
+/// So many passes in a row that bring no point end a run.
+const FRUITLESS_PASSES: u32 = 8;
+/// The rest after the first of them, twice as long after each: together twelve seconds, in which a disturbance may pass.
+const FIRST_REST: Duration = Duration::from_millis(100);
 /// Events that may wait for the assembler.
 const QUEUE_EVENTS: usize = 64;
 /// Units between the assembler and the disk.
@@ -74,13 +77,16 @@ pub enum RunError {
     /// The plan makes no model on this rig.
     #[error("{0}")]
     Plan(#[from] ConfigError),
-    /// A point failed again and again.
+    /// Points failed again and again.
     #[error(
-        "{points} points failed {MAX_ATTEMPTS} times each; the ledger has their causes. Mend the cause and resume the session"
+        "{points} points failed in {FRUITLESS_PASSES} passes in a row, at last by {}; the ledger has the causes of each. Mend them and resume the session",
+        .counts.losses()
     )]
     Hopeless {
         /// How many.
         points: usize,
+        /// Of the last pass.
+        counts: Counts,
     },
     /// A thread of the run is gone; another error says which and why.
     #[error(
@@ -246,6 +252,7 @@ impl Run {
             projector,
             results: &results,
             orders: &self.orders,
+            pace,
             trigger_latency_us,
         };
         let _ = self.board.go(RunState::Running);
@@ -374,6 +381,7 @@ struct Passes<'a> {
     projector: Lit,
     results: &'a Receiver<Verdict>,
     orders: &'a Orders,
+    pace: Pace,
     trigger_latency_us: f64,
 }
 
@@ -392,26 +400,35 @@ impl Passes<'_> {
 
     fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
         let mut todo = missing;
-        for _ in 0..MAX_ATTEMPTS {
+        let mut fruitless = 0;
+        loop {
+            let before = todo.len();
+            let mut counts = Counts::default();
             let (dark, lit): (Vec<_>, Vec<_>) =
                 todo.iter().partition(|id| matches!(self.point(**id).role, Role::Dark(_)));
             todo = Vec::new();
             if !dark.is_empty() {
                 let Some(shown) = self.projector.show(None, self.orders)? else { return Ok(()) };
-                todo.extend(self.pass(&dark, shown)?);
+                todo.extend(self.pass(&dark, shown, &mut counts)?);
             }
             if !lit.is_empty() && self.orders.go_on() {
                 let white = self.projector.show(Some(&Pattern::White), self.orders)?;
                 let Some(shown) = white else { return Ok(()) };
-                todo.extend(self.pass(&lit, shown)?);
+                todo.extend(self.pass(&lit, shown, &mut counts)?);
             }
             if todo.is_empty() || !self.orders.go_on() {
                 return Ok(());
             }
+            fruitless = if todo.len() < before { 0 } else { fruitless + 1 };
+            if fruitless == FRUITLESS_PASSES {
+                return Err(RunError::Hopeless { points: todo.len(), counts });
+            }
+            if fruitless > 0 && self.pace == Pace::Devices {
+                self.orders.rest(FIRST_REST * (1 << (fruitless - 1)));
+            }
             // As long as nobody watches the line, no point has a chance.
             self.vsync.await_watcher(self.orders);
         }
-        Err(RunError::Hopeless { points: todo.len() })
     }
 
     /// Takes the film; what became of its cycles, the ledger says.
@@ -440,8 +457,13 @@ impl Passes<'_> {
         self.task.schedule.points[id.point as usize]
     }
 
-    /// Acquires points under one picture; returns those to take again.
-    fn pass(&self, ids: &[SettingsId], shown: Shown) -> Result<Vec<SettingsId>, RunError> {
+    /// Acquires points under one picture; returns those to take again, and adds up what became of their frames.
+    fn pass(
+        &self,
+        ids: &[SettingsId],
+        shown: Shown,
+        counts: &mut Counts,
+    ) -> Result<Vec<SettingsId>, RunError> {
         let geometry = &self.task.geometry;
         let attempts = ids
             .iter()
@@ -458,7 +480,10 @@ impl Passes<'_> {
         // The sink closes the channel when it ends, so this waits for nothing that cannot come.
         for verdict in self.results {
             match verdict {
-                Verdict::Failed(id) => again.push(SettingsId { attempt: id.attempt + 1, ..id }),
+                Verdict::Failed(id, of_attempt) => {
+                    again.push(SettingsId { attempt: id.attempt + 1, ..id });
+                    counts.add(&of_attempt);
+                }
                 Verdict::Flushed => break,
             }
         }

@@ -1,6 +1,7 @@
 //! What the run is told from outside while it acquires.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 /// The latest word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,6 +50,12 @@ impl Orders {
             *now = order;
             self.changed.notify_all();
         }
+    }
+
+    /// Waits for a while, unless the run ends.
+    pub fn rest(&self, time: Duration) {
+        let ends = |now: &mut Order| matches!(now, Order::Go | Order::Pause);
+        let _ = self.changed.wait_timeout_while(self.lock(), time, ends);
     }
 
     /// Waits until the order is no longer to pause.

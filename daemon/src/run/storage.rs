@@ -20,7 +20,7 @@ use crate::processing::{Processing, Task, place};
 #[derive(Debug)]
 pub enum Verdict {
     /// An attempt failed, or its data could not be stored.
-    Failed(SettingsId),
+    Failed(SettingsId, Counts),
     /// The pass is over.
     Flushed,
 }
@@ -147,12 +147,12 @@ impl Storage {
         self.pace.counts.add(&counts);
         if counts.lost_total() > 0 {
             self.append(&Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() });
-            self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts });
+            self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() });
         } else {
             // Cut short by a cancel or a fault: not the point's failure, so a resumed run begins the same attempt.
-            self.append(&Entry::Outside { counts });
+            self.append(&Entry::Outside { counts: counts.clone() });
         }
-        self.tell(Verdict::Failed(id));
+        self.tell(Verdict::Failed(id, counts));
     }
 
     fn tell(&self, verdict: Verdict) {
