@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use aravis::prelude::*;
 use raysweep_core::{
-    CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind, FrameBuf,
+    CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind, FrameBuf, priority,
 };
 
 use super::chunks::Chunks;
@@ -20,8 +20,12 @@ use super::sequencer::{self, Sequence};
 use super::settings::Writer;
 use super::setup::set_up;
 
-/// How often a camera is asked for its time, and so whether it is there.
+/// How often a camera that gives no frames is asked for its time, and so whether it is there.
 const ASK_PERIOD: Duration = Duration::from_millis(200);
+/// The same of one whose frames say that it is there, once its clock has been seen for long.
+const LONGEST_ASK_PERIOD: Duration = Duration::from_secs(1);
+/// Its time is never foretold for more than this part of how long its clock has been seen.
+const FORETOLD: u32 = 8;
 /// Times that it is asked at first, so that its first frame has a time.
 const FIRST_ASKS: usize = 8;
 /// A program that was killed holds a camera until its heartbeat is missed, 3 s.
@@ -125,6 +129,8 @@ struct Connection {
 impl Owner {
     /// Opens the camera, serves it, opens it again when it was lost, until nobody wants it any more.
     pub fn run(mut self) {
+        // The library's thread that receives frames is begun by this one and has its priority.
+        priority::for_device("camera");
         let begun = Instant::now();
         let mut was_open = false;
         let mut pause = SHORTEST_PAUSE;
@@ -248,9 +254,10 @@ impl Owner {
     }
 
     fn serve(&mut self, mut connection: Connection) -> Ended {
-        let mut next_ask = Instant::now() + ASK_PERIOD;
+        let opened = Instant::now();
+        let (mut asked, mut next_look) = (opened, opened + ASK_PERIOD);
         loop {
-            match self.orders.recv_timeout(next_ask.saturating_duration_since(Instant::now())) {
+            match self.orders.recv_timeout(next_look.saturating_duration_since(Instant::now())) {
                 Ok(Order { command: Command::Reopen(frames), .. }) => {
                     drop(frames);
                     return Ended::Lost;
@@ -270,8 +277,13 @@ impl Owner {
                     }
                 }
                 Err(RecvTimeoutError::Timeout) => {
-                    self.ask(&connection);
-                    next_ask = Instant::now() + ASK_PERIOD;
+                    let now = Instant::now();
+                    let foretold = ((now - opened) / FORETOLD).min(LONGEST_ASK_PERIOD);
+                    if now - asked >= foretold || !self.shared.health.gave_frame_within(ASK_PERIOD) {
+                        self.ask(&connection);
+                        asked = now;
+                    }
+                    next_look = now + ASK_PERIOD;
                 }
             }
         }
