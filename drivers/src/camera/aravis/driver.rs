@@ -39,7 +39,7 @@ pub struct RigFacts {
 
 /// A camera that has neither answered nor given a frame for so long is lost.
 const SILENCE_NS: i64 = 900_000_000;
-/// Round trips that the clock model keeps: 20 s of them.
+/// Round trips that the clock model keeps: 20 s of them, and 100 s where frames come.
 const ROUND_TRIPS: usize = 100;
 /// The longest wait on a channel or a stream before the camera's health is looked at.
 const LOOK: Duration = Duration::from_millis(50);
@@ -296,6 +296,7 @@ impl AravisCamera {
         });
         let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
         self.losses.whole(seq);
+        self.shared.health.gave_frame(host_ns);
         self.newest = Some(Newest { seq, exposure_start_ns, host_ns, set });
         Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
     }

@@ -9,6 +9,7 @@
 )]
 
 use std::ffi::c_void;
+use std::num::NonZeroUsize;
 use std::ptr::NonNull;
 
 use aravis::glib::translate::{ToGlibPtr, from_glib_full};
@@ -29,8 +30,9 @@ pub struct Frames {
     // Dropped first: its thread ends, and nobody writes any more.
     stream: Stream,
     lent: Lent,
-    /// Buffers of the library whose memory is the pool's at present.
-    idle: Vec<Buffer>,
+    /// Buffers of the library whose memory is the pool's at present, each with the address of that memory: asking all of
+    /// them for it would fetch each from memory anew, frame by frame.
+    idle: Vec<(NonZeroUsize, Buffer)>,
     payload_bytes: usize,
 }
 
@@ -93,7 +95,7 @@ impl Frames {
                     if self.idle.len() == MOST_IDLE {
                         self.idle.clear();
                     }
-                    self.idle.push(buffer);
+                    self.idle.push((at.addr(), buffer));
                     self.lend(memory);
                     return;
                 }
@@ -111,9 +113,9 @@ impl Frames {
         self.lent.0.push(memory);
         let at = memory.cast::<u8>();
         // All memory is of one length, so whichever had this address before, the buffer fits.
-        let known = self.idle.iter().position(|buffer| address(buffer) == at);
+        let known = self.idle.iter().position(|(idle_at, _)| *idle_at == at.addr());
         let buffer = match known {
-            Some(place) => self.idle.swap_remove(place),
+            Some(place) => self.idle.swap_remove(place).1,
             // SAFETY: the memory has `payload_bytes` and lives as long as it is in `lent`; what is not there is never
             // given to the stream.
             None => unsafe {

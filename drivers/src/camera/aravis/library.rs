@@ -52,15 +52,27 @@ pub fn discover() -> Vec<Found> {
     found.collect()
 }
 
-/// When a camera last answered on its control channel, for whoever waits for it on another thread.
+/// When a camera last answered on its control channel and last gave a frame: what the threads of the two tell each other.
 pub struct Health {
     clock: Clock,
     answered_ns: AtomicI64,
+    gave_frame_ns: AtomicI64,
 }
 
 impl Health {
     pub fn new(clock: Clock) -> Self {
-        Self { answered_ns: AtomicI64::new(clock.now_ns()), clock }
+        let now_ns = clock.now_ns();
+        Self { clock, answered_ns: AtomicI64::new(now_ns), gave_frame_ns: AtomicI64::new(i64::MIN) }
+    }
+
+    /// A frame was taken.
+    pub fn gave_frame(&self, host_ns: i64) {
+        self.gave_frame_ns.store(host_ns, Ordering::Relaxed);
+    }
+
+    pub fn gave_frame_within(&self, time: Duration) -> bool {
+        let ago_ns = self.clock.now_ns().saturating_sub(self.gave_frame_ns.load(Ordering::Relaxed));
+        u128::try_from(ago_ns).is_ok_and(|ago_ns| ago_ns < time.as_nanos())
     }
 
     pub fn answered(&self) {
