@@ -258,8 +258,19 @@ pub struct DeviceClock {
     ticks_per_s: i64,
 }
 
-/// Between two looks at a clock whose unit is not known.
-const CLOCK_LOOK: Duration = Duration::from_millis(20);
+/// From one look at a clock whose unit is not known to the next, longer where the host was too busy to tell.
+const CLOCK_LOOKS_MS: [u64; 5] = [20, 40, 80, 160, 320];
+/// By what part of it a clock may run fast or slow.
+const CLOCK_ERROR: f64 = 0.1;
+
+/// Whether a clock may count `ticks_per_s`, by two round trips as of one that counts nanoseconds: whatever part of a round
+/// trip was the way there, and what the way back.
+fn may_have_unit(begin: RoundTrip, end: RoundTrip, ticks_per_s: i64) -> bool {
+    let passed_ns = (end.device_ns - begin.device_ns) as f64 * 1e9 / ticks_per_s as f64;
+    let shortest_ns = (end.request_ns - begin.receive_ns) as f64 * (1.0 - CLOCK_ERROR);
+    let longest_ns = (end.receive_ns - begin.request_ns) as f64 * (1.0 + CLOCK_ERROR);
+    (shortest_ns..longest_ns).contains(&passed_ns)
+}
 
 /// Times that a camera is asked for its time in a row: each takes as much processor time as half a frame.
 const ASKS: usize = 2;
@@ -269,23 +280,23 @@ impl DeviceClock {
     pub fn probe(device: &Device, clock: &Clock) -> Option<Self> {
         let latch = first_present(device, &["TimestampLatch", "GevTimestampControlLatch"])?;
         let value = first_present(device, &["TimestampLatchValue", "GevTimestampValue"])?;
-        let read = || -> Option<(i64, i64)> {
-            device.execute(latch).ok()?;
-            Some((clock.now_ns(), device.integer(value).ok()?))
-        };
-        let (begin_ns, begin) = read()?;
-        thread::sleep(CLOCK_LOOK);
-        let (end_ns, end) = read()?;
-        let ticks_per_s = (end - begin) as f64 * 1e9 / (end_ns - begin_ns) as f64;
+        let nanoseconds = Self { latch, value, ticks_per_s: 1_000_000_000 };
         // The standards disagree on whether the value counts ticks or nanoseconds, so what it does decides.
         let gige = device.device.downcast_ref::<GvDevice>();
         let stated = gige.and_then(|device| device.timestamp_tick_frequency().ok());
-        let units = [Some(1_000_000_000), stated.and_then(|hz| i64::try_from(hz).ok())];
-        let ticks_per_s = units.into_iter().flatten().find(|&unit| {
-            let ratio = ticks_per_s / unit as f64;
-            (0.9..1.1).contains(&ratio)
-        })?;
-        Some(Self { latch, value, ticks_per_s })
+        let stated = stated.and_then(|hz| i64::try_from(hz).ok());
+        let stated = stated.filter(|hz| *hz > 0 && *hz != nanoseconds.ticks_per_s);
+        CLOCK_LOOKS_MS.into_iter().find_map(|look_ms| {
+            let begin = nanoseconds.ask_once(device, clock).ok()?;
+            thread::sleep(Duration::from_millis(look_ms));
+            let end = nanoseconds.ask_once(device, clock).ok()?;
+            let possible = [Some(nanoseconds.ticks_per_s), stated].into_iter().flatten();
+            let mut possible = possible.filter(|&ticks_per_s| may_have_unit(begin, end, ticks_per_s));
+            match (possible.next(), possible.next()) {
+                (Some(ticks_per_s), None) => Some(Self { ticks_per_s, ..nanoseconds }),
+                _ => None,
+            }
+        })
     }
 
     /// Asks for the camera's time some times in a row and returns the quickest answer, which is the truest: the first is slow
@@ -308,5 +319,37 @@ impl DeviceClock {
         let ticks = i128::from(device.integer(self.value)?);
         let device_ns = ticks * 1_000_000_000 / i128::from(self.ticks_per_s);
         Ok(RoundTrip { request_ns, device_ns: device_ns.try_into().unwrap_or(i64::MAX), receive_ns })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clocks_unit_is_told_however_long_its_answers_travel() {
+        const UNITS: [i64; 2] = [1_000_000_000, 125_000_000];
+        let trip = |request_ns, there_ns, back_ns, ticks_per_s: i64| RoundTrip {
+            request_ns,
+            device_ns: (request_ns + there_ns) * ticks_per_s / 1_000_000_000,
+            receive_ns: request_ns + there_ns + back_ns,
+        };
+        // The ways there and back of two round trips, the second 20 ms after the first.
+        let possible = |truth, [there, back]: [i64; 2], [there_again, back_again]: [i64; 2]| {
+            let begin = trip(1_000_000_000, there, back, truth);
+            let end = trip(begin.receive_ns + 20_000_000, there_again, back_again, truth);
+            UNITS.map(|unit| may_have_unit(begin, end, unit))
+        };
+        let (quick, slow) = (50_000, 15_000_000);
+        let ways = [[quick, quick], [slow, quick], [quick, slow], [slow, slow]];
+        for (first, second) in ways.into_iter().flat_map(|first| ways.map(|second| (first, second))) {
+            assert_eq!(possible(UNITS[0], first, second), [true, false], "{first:?} {second:?}");
+            assert_eq!(possible(UNITS[1], first, second), [false, true], "{first:?} {second:?}");
+        }
+        let stalled = [900_000_000, quick];
+        assert_eq!(possible(UNITS[1], stalled, stalled), [true, true], "a longer look is needed");
+        let still = RoundTrip { request_ns: 0, device_ns: 7, receive_ns: quick };
+        let later = RoundTrip { request_ns: 2 * quick, receive_ns: 3 * quick, ..still };
+        assert!(!UNITS.into_iter().any(|unit| may_have_unit(still, later, unit)), "it stands still");
     }
 }

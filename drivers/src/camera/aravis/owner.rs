@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use aravis::prelude::*;
 use raysweep_core::{
-    CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind, FrameBuf, priority,
+    CameraCapabilities, CameraSettings, Clock, ClockModel, DeviceError, DeviceErrorKind, FrameBuf,
 };
 
 use super::chunks::Chunks;
@@ -129,8 +129,6 @@ struct Connection {
 impl Owner {
     /// Opens the camera, serves it, opens it again when it was lost, until nobody wants it any more.
     pub fn run(mut self) {
-        // The library's thread that receives frames is begun by this one and has its priority.
-        priority::for_device("camera");
         let begun = Instant::now();
         let mut was_open = false;
         let mut pause = SHORTEST_PAUSE;
