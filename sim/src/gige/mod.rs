@@ -26,7 +26,6 @@ use std::time::{Duration, Instant};
 
 pub use clock::DeviceClock;
 pub use faults::{Faults, TriggerOrder, WireTruth};
-use raysweep_core::priority;
 pub use source::test_pixel;
 
 use self::control::Control;
@@ -139,11 +138,6 @@ impl GigeCamera {
     }
 
     fn thread(&mut self, name: &str, work: impl FnOnce() + Send + 'static) -> io::Result<()> {
-        let work = move || {
-            // A camera has a processor of its own and answers whatever the host is busy with.
-            priority::for_device("simulated camera");
-            work();
-        };
         self.threads.push(std::thread::Builder::new().name(name.into()).spawn(work)?);
         Ok(())
     }
