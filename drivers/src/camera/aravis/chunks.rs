@@ -40,10 +40,10 @@ impl Chunks {
         Self { parser, on, bytes: Vec::with_capacity(MOST_BYTES), said: Said::default() }
     }
 
-    /// What a frame says. Where its bytes are those of the frame before they are not parsed, which would take a tenth of the
-    /// processor time of a small frame.
-    pub fn read(&mut self, buffer: &Buffer) -> Said {
-        let bytes = behind_image(buffer);
+    /// What a frame says behind the `image_bytes` of its image. Where its bytes are those of the frame before they are not
+    /// parsed, which would take a tenth of the processor time of a small frame.
+    pub fn read(&mut self, buffer: &Buffer, image_bytes: usize) -> Said {
+        let bytes = behind_image(buffer, image_bytes);
         if bytes.is_empty() || bytes != self.bytes {
             let exposure = self.on.exposure.then_some(EXPOSURE_TIME);
             let set = self.on.sequencer_set.then_some(SEQUENCER_SET_ACTIVE);

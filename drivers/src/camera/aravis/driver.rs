@@ -277,7 +277,7 @@ impl AravisCamera {
         }
         let Link::Up { chunks, tells_time, .. } = &mut self.link else { return Ok(None) };
         let Said { exposure_us, sequencer_set } =
-            chunks.as_mut().map(|chunks| chunks.read(from)).unwrap_or_default();
+            chunks.as_mut().map(|chunks| chunks.read(from, bytes)).unwrap_or_default();
         let set = sequencer_set.zip(self.first_set);
         let set = set.and_then(|(set, first_set)| usize::try_from(set - first_set).ok());
         let set_us =

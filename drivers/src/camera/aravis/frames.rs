@@ -136,15 +136,15 @@ impl Drop for Lent {
     }
 }
 
-/// What lies behind the image of a frame that was popped; nothing where the image is not the first.
-pub fn behind_image(buffer: &Buffer) -> &[u8] {
-    let (image, mut size) = (image_data(buffer), 0);
-    // SAFETY: as for `image_data`, of all the memory that the buffer has.
+/// What lies behind the first `image_bytes` of a frame that was popped; libaravis takes it for a part of the image.
+pub fn behind_image(buffer: &Buffer, image_bytes: usize) -> &[u8] {
+    let mut size = 0;
+    // SAFETY: as for `image_data`, of all that was received.
     let data = unsafe {
         let data = aravis_sys::arv_buffer_get_data(buffer.to_glib_none().0, &mut size);
         if data.is_null() { &[] } else { std::slice::from_raw_parts(data, size) }
     };
-    if image.as_ptr() == data.as_ptr() { data.get(image.len()..).unwrap_or_default() } else { &[] }
+    data.get(image_bytes..).unwrap_or_default()
 }
 
 /// Where a buffer's memory begins.
