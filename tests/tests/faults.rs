@@ -160,3 +160,18 @@ fn a_camera_without_a_trigger_faults_the_run_and_says_so() {
     assert_eq!(ended.state, "faulted");
     assert!(ended.error.unwrap().contains("VSYNC"), "the error says what to look at");
 }
+
+#[test]
+fn points_that_no_pass_brings_are_given_up_and_the_error_says_what_was_lost() {
+    let bench = Bench::new(&rig("[sim.vsync]\njitter_us = 5\n"));
+    // No line is so punctual.
+    let ended = bench.run(&PLAN.replace("average = 4", "average = 4\nmax_jitter_us = 0.001"));
+    assert_eq!(ended.state, "faulted");
+    let error = ended.error.clone().unwrap();
+    assert!(
+        error.contains("points failed in 8 passes in a row, at last by") && error.contains("jitter)"),
+        "{error}"
+    );
+    let counts = ended.open().1.counts;
+    assert!(counts.balanced() && counts.lost.keys().eq([&LossCause::Jitter]), "{counts:?}");
+}

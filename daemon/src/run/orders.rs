@@ -66,3 +66,26 @@ impl Orders {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    #[test]
+    fn a_rest_ends_with_the_run_and_not_with_a_pause() {
+        let orders = Orders::default();
+        std::thread::scope(|scope| {
+            let resting = scope.spawn(|| orders.rest(Duration::from_secs(3600)));
+            orders.give(Order::Pause);
+            orders.give(Order::Cancel);
+            resting.join().unwrap();
+        });
+        let orders = Orders::default();
+        orders.give(Order::Pause);
+        let began = Instant::now();
+        orders.rest(Duration::from_millis(20));
+        assert!(began.elapsed() >= Duration::from_millis(20));
+    }
+}

@@ -18,6 +18,9 @@ const LEAD_IN_US: f64 = 2_000.0;
 /// How often it is looked whether the last frames are decided.
 const SETTLE_POLL: Duration = Duration::from_millis(2);
 
+/// A point that has failed oftener gets no more frames to spare: it has three times its own by then.
+const MOST_SPARED_FOR: u32 = 8;
+
 /// A film to take under one picture of the projector.
 #[derive(Debug, Clone)]
 pub struct FilmPass {
@@ -200,7 +203,7 @@ impl Sequencer {
                 // counts its cycles there.
                 frames: match slot.periods_from_last {
                     Some(_) => point.frames,
-                    None => point.frames + id.attempt * point.frames.div_ceil(4),
+                    None => point.frames + id.attempt.min(MOST_SPARED_FOR) * point.frames.div_ceil(4),
                 },
                 passed: 0,
                 // Frames that found no room are taken again within the attempt, but not for ever.
