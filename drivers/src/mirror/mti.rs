@@ -179,7 +179,7 @@ impl MtiLine {
     fn enter(port: &std::path::Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
         let mut line = Self { port: Port::open(port, BAUD)?, full_scale };
         line.port.send(b"\n")?;
-        line.port.await_reply(Duration::from_millis(50), parse_mti, Some)?;
+        line.port.await_silence(parse_mti)?;
         let model = match line.ask(MtiCommand::Enter, REPLY_WAIT)? {
             MtiReply::Device(model) => model,
             MtiReply::Done | MtiReply::Refused(_) => "MTI controller".into(),

@@ -139,7 +139,7 @@ impl OptotuneLine {
         line.light(false)?;
         // Ends whatever line is begun; what is said to that is no answer to us.
         line.port.send(b"\r\n")?;
-        line.port.await_reply(Duration::from_millis(50), parse_optotune, Some)?;
+        line.port.await_silence(parse_optotune)?;
         line.tell(OptotuneCommand::Start)?;
         Ok(line)
     }

@@ -15,6 +15,11 @@ const WRITE_WAIT: Duration = Duration::from_millis(5);
 /// How long the port's other end may take no byte at all before a whole message is given up.
 const SEND_WAIT: Duration = Duration::from_millis(500);
 
+/// After so long without a reply none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are shorter.
+const SILENCE: Duration = Duration::from_millis(50);
+/// A device that says more than this without being asked never falls silent.
+const MOST_STALE: usize = 16;
+
 /// An error of the mirror.
 pub(super) fn fault(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
     DeviceError::new("mirror", kind, what.into())
@@ -142,6 +147,16 @@ impl Port {
             }
             std::thread::sleep(Duration::from_micros(200));
         }
+    }
+
+    /// Reads replies until no more come: they answer what was said before, perhaps by a process that was killed.
+    pub fn await_silence<R>(&mut self, parse: impl Fn(&[u8]) -> Parsed<R>) -> Result<(), DeviceError> {
+        for _ in 0..MOST_STALE {
+            if self.await_reply(SILENCE, &parse, Some)?.is_none() {
+                break;
+            }
+        }
+        Ok(())
     }
 
     /// Bytes so far that belonged to no reply.

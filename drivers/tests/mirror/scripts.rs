@@ -109,6 +109,24 @@ fn mti_says_what_the_maker_documents() {
 }
 
 #[test]
+fn what_a_killed_process_was_answered_is_no_answer_to_us() {
+    // It was told to go somewhere, and half a line more that ours ends; it is in its command mode still.
+    const STALE: &[u8] = b"MTI-OK\r\nMTI-ERR InvalidCommand\r\n";
+    let answers: Answers =
+        &[(b"\n", STALE), (b"$MTI$", b"MTI-ERR InvalidCommand\r\n"), (b"MTI+", b"MTI-OK\r\n")];
+    let script = Script::new(answers, line);
+    let config = mti_config(script.pty.path().to_owned(), script.state(), script.light());
+    play(&mut Mti::open(config).unwrap());
+
+    let answers: Answers = &[(b"\r\n", b"OK\r\nNO\r\n"), (b"START", b"OK\r\n"), (b"XY=", b"OK\r\n")];
+    let script = Script::new(answers, line);
+    let (state, light) = (script.state(), script.light());
+    let port = script.pty.path().to_owned();
+    let config = OptotuneConfig { port, laser_port: None, limits: LIMITS, state, light };
+    play(&mut Optotune::open(config, Box::new(Lamp::default())).unwrap());
+}
+
+#[test]
 fn an_mti_that_refuses_is_quoted() {
     let script = Script::new(
         &[
