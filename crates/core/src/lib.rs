@@ -1,5 +1,5 @@
 //! The vocabulary of a light-transport rig: units, pixel formats, frames and their pool, clocks, device traits,
-//! the accounting of frames, the priorities of threads, and errors.
+//! the accounting of frames, and errors.
 //!
 //! Nothing here opens a device, starts a thread or touches a file. Times are nanoseconds of `CLOCK_MONOTONIC` as
 //! `i64` (`_ns`) or microseconds as `f64` (`_us`); the unit stands in every name.
@@ -14,7 +14,6 @@ mod frame;
 mod mirror;
 mod pattern;
 mod pixel;
-pub mod priority;
 mod raster;
 mod units;
 

@@ -7,14 +7,13 @@ use std::time::{Duration, Instant};
 
 use ndarray::Array2;
 use rayon::{ThreadPool, ThreadPoolBuilder};
-use raysweep_core::priority;
 use raysweep_pipeline::{Snapshot, message_of};
 use raysweep_proto::Event;
 use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::{EPIPOLAR, INDIRECT, LiveError, LiveFile, TOTAL};
-use crate::run::Board;
+use crate::run::{Board, priority};
 
 /// Between two estimates, at least: no display or subscriber wants more.
 const REST: Duration = Duration::from_millis(100);

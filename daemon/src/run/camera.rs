@@ -21,8 +21,8 @@ pub use self::ahead::Line;
 use self::ahead::{Ahead, Seen};
 pub use self::sequence::{FilmPass, FilmSetting};
 use super::orders::Orders;
+use super::priority;
 use crate::rig::Pace;
-use raysweep_core::priority;
 
 /// One attempt at a point.
 #[derive(Debug, Clone, Copy)]

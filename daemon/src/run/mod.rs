@@ -8,6 +8,7 @@ mod engine;
 mod film;
 mod operator;
 mod orders;
+pub(crate) mod priority;
 mod response;
 mod storage;
 mod vsync;

@@ -11,8 +11,8 @@ use raysweep_proto::Event as Told;
 
 use super::board::Board;
 use super::orders::{Order, Orders};
+use super::priority;
 use crate::rig::Pace;
-use raysweep_core::priority;
 
 const POLL: Duration = Duration::from_millis(100);
 /// How often the line is shown.

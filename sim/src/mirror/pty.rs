@@ -13,7 +13,7 @@ use std::time::Duration;
 use nix::fcntl::OFlag;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::pty::{grantpt, posix_openpt, ptsname_r, unlockpt};
-use raysweep_core::{Clock, priority};
+use raysweep_core::Clock;
 
 use super::plant::{MirrorTruth, lock};
 use crate::keyed::{Purpose, keyed, uniform};
@@ -187,8 +187,6 @@ struct Wire {
 
 impl Wire {
     fn run(&mut self) {
-        // A controller has a processor of its own and answers whatever the host is busy with.
-        priority::for_device("simulated controller");
         let start_ns = self.clock.now_ns();
         let (mut taken, mut stalled_until_ns, mut last_ms) = (0_u64, 0, 0);
         let mut buffer = [0; 4096];

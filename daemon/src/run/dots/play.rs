@@ -14,7 +14,7 @@ use crate::rig::{Pace, Stand};
 use crate::run::board::Board;
 use crate::run::engine::RunError;
 use crate::run::orders::{Order, Orders};
-use raysweep_core::priority;
+use crate::run::priority;
 
 /// The devices of a run, and who is told and tells.
 pub struct Player<'a> {

@@ -17,7 +17,7 @@ use crate::live::{EPIPOLAR, INDIRECT, Outlet};
 use crate::rig::Pace;
 use crate::run::board::Board;
 use crate::run::orders::{Order, Orders};
-use raysweep_core::priority;
+use crate::run::priority;
 
 /// Cycles that may wait for the solver.
 const WAITING_CYCLES: usize = 4;
