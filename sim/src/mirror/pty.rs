@@ -14,6 +14,10 @@ use nix::fcntl::OFlag;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::pty::{grantpt, posix_openpt, ptsname_r, unlockpt};
 use raysweep_core::Clock;
+use thread_priority::{
+    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy,
+    thread_native_id,
+};
 
 use super::plant::{MirrorTruth, lock};
 use crate::keyed::{Purpose, keyed, uniform};
@@ -80,7 +84,7 @@ impl Pty {
         grantpt(&master)?;
         unlockpt(&master)?;
         let path = ptsname_r(&master)?.into();
-        Self::attach(File::from(OwnedFd::from(master)), path, run, link, faults)
+        Self::start(File::from(OwnedFd::from(master)), path, run, link, faults, run_as_soon_as_awake)
     }
 
     /// Plugs a device in at one end of a line, opened without blocking, whose other end a driver opens at `path`.
@@ -88,6 +92,18 @@ impl Pty {
     /// # Errors
     /// When there is no thread.
     pub fn attach(end: File, path: PathBuf, run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
+        // In a guest whose one processor is emulated it would leave none for the driver.
+        Self::start(end, path, run, link, faults, || ())
+    }
+
+    fn start(
+        end: File,
+        path: PathBuf,
+        run: Run,
+        link: Link,
+        faults: WireFaults,
+        begin: fn(),
+    ) -> io::Result<Self> {
         let unplugged = Arc::new(AtomicBool::new(false));
         let mut wire = Wire {
             end,
@@ -98,7 +114,11 @@ impl Pty {
             clock: Clock::real(),
             replies: 0,
         };
-        let thread = std::thread::Builder::new().name("pty".into()).spawn(move || wire.run())?;
+        let work = move || {
+            begin();
+            wire.run();
+        };
+        let thread = std::thread::Builder::new().name("pty".into()).spawn(work)?;
         Ok(Self { path, unplugged, thread: Some(thread) })
     }
 
@@ -173,6 +193,13 @@ impl MirrorPty {
 
 fn run_of(mut controller: impl Controller) -> Run {
     Box::new(move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| controller.run(bytes, now_ns, replies))
+}
+
+/// Has the calling thread run as soon as it wakes, where that is permitted: a controller has a processor of its own, and
+/// answers in time whatever the host is busy with.
+fn run_as_soon_as_awake() {
+    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
+    let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, policy);
 }
 
 struct Wire {
