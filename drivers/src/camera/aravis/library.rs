@@ -266,7 +266,7 @@ const CLOCK_ERROR: f64 = 0.1;
 /// Whether a clock may count `ticks_per_s`, by two round trips as of one that counts nanoseconds: whatever part of a round
 /// trip was the way there, and what the way back.
 fn may_have_unit(begin: RoundTrip, end: RoundTrip, ticks_per_s: i64) -> bool {
-    let passed_ns = (end.device_ns - begin.device_ns) as f64 * 1e9 / ticks_per_s as f64;
+    let passed_ns = end.device_ns.saturating_sub(begin.device_ns) as f64 * 1e9 / ticks_per_s as f64;
     let shortest_ns = (end.request_ns - begin.receive_ns) as f64 * (1.0 - CLOCK_ERROR);
     let longest_ns = (end.receive_ns - begin.request_ns) as f64 * (1.0 + CLOCK_ERROR);
     (shortest_ns..longest_ns).contains(&passed_ns)
@@ -351,5 +351,7 @@ mod tests {
         let still = RoundTrip { request_ns: 0, device_ns: 7, receive_ns: quick };
         let later = RoundTrip { request_ns: 2 * quick, receive_ns: 3 * quick, ..still };
         assert!(!UNITS.into_iter().any(|unit| may_have_unit(still, later, unit)), "it stands still");
+        let [least, most] = [i64::MIN, i64::MAX].map(|device_ns| RoundTrip { device_ns, ..still });
+        assert!(!UNITS.into_iter().any(|unit| may_have_unit(least, most, unit)), "it says anything");
     }
 }
