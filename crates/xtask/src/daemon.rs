@@ -64,7 +64,8 @@ impl Daemon {
 
     /// Asks the daemon to end, as systemd does, and waits until it has.
     pub fn stop(mut self) -> Done {
-        run(Command::new("kill").args(["-TERM", &self.process.id().to_string()]))?;
+        // The shell's own `kill`: a bare Debian has no other.
+        run(Command::new("sh").args(["-c", &format!("kill -TERM {}", self.process.id())]))?;
         let status = self.process.wait().map_err(|error| format!("raysweepd: {error}"))?;
         if status.success() { Ok(()) } else { Err(format!("raysweepd ended with {status}")) }
     }

@@ -1,12 +1,14 @@
-//! `cargo xtask demo | test | guest | bench`: the project's own commands. Plain std, so that they build at once everywhere.
+//! `cargo xtask demo | test | packages | fresh | guest | bench`: the project's own commands. Plain std, so that they build at once everywhere.
 
 mod bench;
 mod daemon;
 mod demo;
+mod fresh;
 mod guest;
 mod live;
 mod packages;
 mod python;
+mod rootfs;
 mod run;
 mod test;
 
@@ -19,6 +21,9 @@ usage: cargo xtask <command>
 
   demo    build, run the paper's sweep on the simulated rig, write a report
   test    install what the tests need, then format, lints, tests, the guest's too; --no-guest leaves these out
+  packages
+          what the tests need of Debian, and whether it is there
+  fresh   both commands above on a bare Debian 12 and 13, each in a root file system made for it; [12|13]... only those
   guest   the drivers' tests against real kernel drivers, in a QEMU guest; [TEST...] runs only those
   bench   measure: without a name, tells which benchmarks there are";
 
@@ -29,6 +34,8 @@ fn main() -> ExitCode {
         ["demo"] => demo::demo(),
         ["test"] => test::test(Guest::Run),
         ["test", "--no-guest"] => test::test(Guest::Skip),
+        ["fresh", numbers @ ..] => fresh::fresh(numbers),
+        ["packages"] => packages::print(),
         ["guest", names @ ..] => guest::guest(names),
         ["bench", arguments @ ..] => bench::bench(arguments),
         _ => Err(USAGE.to_owned()),

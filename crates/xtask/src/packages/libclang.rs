@@ -1,0 +1,160 @@
+//! Whether bindgen finds libclang: where its crate clang-sys looks, and by the names that it takes.
+
+use std::ffi::OsString;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Folders that are searched, each `*` standing for any one name.
+const FOLDERS: [&str; 7] = [
+    "usr/local/llvm*/lib*",
+    "usr/local/lib*/*/*",
+    "usr/local/lib*/*",
+    "usr/local/lib*",
+    "usr/lib*/*/*",
+    "usr/lib*/*",
+    "usr/lib*",
+];
+
+/// Whether bindgen finds it here.
+pub fn is_there() -> bool {
+    if let Some(place) = std::env::var_os("LIBCLANG_PATH").map(PathBuf::from) {
+        // Then it is the only place: the file, or its folder.
+        return is_libclang(&place) || has_libclang(&place);
+    }
+    let listed = ["LD_LIBRARY_PATH", "LIBRARY_PATH"].map(|name| listed(std::env::var_os(name))).concat();
+    is_in(Path::new("/"), &[llvm_folders(), listed].concat())
+}
+
+/// Whether it lies in one of these folders, or below `root` where systems have their libraries.
+fn is_in(root: &Path, folders: &[PathBuf]) -> bool {
+    folders.iter().any(|folder| has_libclang(folder))
+        || FOLDERS.iter().any(|pattern| matching(root, pattern).iter().any(|folder| has_libclang(folder)))
+}
+
+fn listed(variable: Option<OsString>) -> Vec<PathBuf> {
+    variable.map(|list| std::env::split_paths(&list).collect()).unwrap_or_default()
+}
+
+/// The library folders of the LLVM that `llvm-config` belongs to.
+fn llvm_folders() -> Vec<PathBuf> {
+    let program = std::env::var_os("LLVM_CONFIG_PATH").unwrap_or_else(|| "llvm-config".into());
+    let Ok(output) = Command::new(program).arg("--prefix").output() else { return Vec::new() };
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    let prefix = said.lines().next().filter(|_| output.status.success());
+    prefix.map_or_else(Vec::new, |prefix| {
+        ["bin", "lib", "lib64"].iter().map(|name| Path::new(prefix).join(name)).collect()
+    })
+}
+
+/// The folders below `root` that a pattern stands for.
+fn matching(root: &Path, pattern: &str) -> Vec<PathBuf> {
+    pattern.split('/').fold(vec![root.to_owned()], |folders, pattern| {
+        let below = folders.iter().flat_map(|folder| names(folder).map(|name| folder.join(name)));
+        let fits =
+            |path: &PathBuf| path.file_name().is_some_and(|name| fits(&name.to_string_lossy(), pattern));
+        below.filter(|path| fits(path) && path.is_dir()).collect()
+    })
+}
+
+/// Whether a name is the pattern, or begins as it does where it ends in `*`.
+fn fits(name: &str, pattern: &str) -> bool {
+    pattern.strip_suffix('*').map_or(name == pattern, |beginning| name.starts_with(beginning))
+}
+
+fn names(folder: &Path) -> impl Iterator<Item = OsString> + use<> {
+    std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name())
+}
+
+fn has_libclang(folder: &Path) -> bool {
+    names(folder).any(|name| is_libclang(&folder.join(name)))
+}
+
+/// Whether a file has a name of the library and is one for this machine.
+fn is_libclang(file: &Path) -> bool {
+    file.file_name().is_some_and(|name| is_named_libclang(&name.to_string_lossy())) && is_64_bit_elf(file)
+}
+
+/// `libclang.so`, `libclang-*.so`, `libclang.so.*`, `libclang-*.so.*`; libclang-cpp is another library.
+fn is_named_libclang(name: &str) -> bool {
+    let Some(rest) = name.strip_prefix("libclang") else { return false };
+    let is_library = rest.ends_with(".so") || rest.contains(".so.");
+    is_library && (rest.starts_with(".so") || rest.starts_with('-')) && !rest.contains("-cpp.")
+}
+
+fn is_64_bit_elf(file: &Path) -> bool {
+    let mut header = [0; 5];
+    let read = std::fs::File::open(file).and_then(|mut file| file.read_exact(&mut header));
+    read.is_ok() && header == *b"\x7fELF\x02"
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ELF: &[u8] = b"\x7fELF\x02\x01\x01";
+
+    /// A root in which these files lie.
+    struct Root(PathBuf);
+
+    impl Root {
+        fn new(name: &str) -> Self {
+            let root = std::env::temp_dir().join(format!("raysweep-libclang-{name}-{}", std::process::id()));
+            std::fs::create_dir_all(&root).unwrap();
+            Self(root)
+        }
+
+        fn put(&self, file: &str, bytes: &[u8]) {
+            let file = self.0.join(file);
+            std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+            std::fs::write(file, bytes).unwrap();
+        }
+
+        fn has_libclang(&self) -> bool {
+            is_in(&self.0, &[])
+        }
+    }
+
+    impl Drop for Root {
+        fn drop(&mut self) {
+            let _ = std::fs::remove_dir_all(&self.0);
+        }
+    }
+
+    #[test]
+    fn what_only_looks_like_it_is_passed_over() {
+        let root = Root::new("decoys");
+        assert!(!root.has_libclang());
+        root.put("usr/lib/x86_64-linux-gnu/libclang-cpp.so.14", ELF);
+        root.put("usr/lib/llvm-14/lib/libclang-cpp.so", ELF);
+        root.put("usr/lib/llvm-14/lib/libclangBasic.a", b"!<arch>\n");
+        root.put("usr/lib/llvm-14/lib/libclang-14.so.1", b"INPUT(nothing)\n");
+        root.put("opt/lib/libclang-14.so.1", ELF);
+        assert!(!root.has_libclang());
+    }
+
+    #[test]
+    fn it_is_found_wherever_releases_put_it() {
+        for file in [
+            "usr/lib/x86_64-linux-gnu/libclang-14.so.1",
+            "usr/lib/llvm-19/lib/libclang.so.1",
+            "usr/lib64/libclang.so.20.1",
+            "usr/local/lib/libclang.so",
+            "usr/local/llvm-18/lib/libclang-18.so",
+        ] {
+            let root = Root::new("places");
+            root.put(file, ELF);
+            assert!(root.has_libclang(), "{file}");
+        }
+    }
+
+    #[test]
+    fn folders_that_variables_name_count_too() {
+        let root = Root::new("variables");
+        root.put("opt/lib/libclang.so", ELF);
+        let folders =
+            listed(Some(std::env::join_paths([Path::new("/nowhere"), &root.0.join("opt/lib")]).unwrap()));
+        assert!(is_in(&root.0.join("opt"), &folders));
+        assert!(is_libclang(&root.0.join("opt/lib/libclang.so")));
+    }
+}

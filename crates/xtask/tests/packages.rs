@@ -1,0 +1,62 @@
+//! The list of packages, `tests/packages.txt`, held against a bare Debian: what shows that a package is there must be missing
+//! without it, also beside packages that resemble it, and there with it.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+#[path = "../src/rootfs.rs"]
+mod rootfs;
+
+use std::io::Write;
+use std::path::Path;
+use std::process::Command;
+
+const SCRIPT: &str = include_str!("packages.sh");
+
+/// The suites that the list is made for, and packages of each that were or could be taken for listed ones: libraries without
+/// their headers, libclang-cpp, a compiler under another name, a Python that makes no environments, a busybox that needs libraries.
+const SUITES: [(&str, &str); 2] = [
+    ("bookworm", "gcc-12,python3,libusb-1.0-0,libaravis-0.8-0,libclang-cpp14,qemu-utils,busybox"),
+    ("trixie", "gcc-14,python3,libusb-1.0-0,libaravis-0.8-0,libclang-cpp19,qemu-utils,busybox"),
+];
+
+#[test]
+fn each_package_is_missing_before_it_is_installed_and_present_after() {
+    let Some((suite, decoys)) = own_suite() else {
+        return skipped("this machine is neither Debian 12 nor 13");
+    };
+    if let Some(why) = rootfs::forbidden() {
+        return skipped(&why);
+    }
+    if Command::new("mmdebstrap").arg("--version").output().is_err() {
+        return skipped("mmdebstrap is missing; `cargo xtask test` installs it");
+    }
+    let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("packages");
+    let script =
+        rootfs::Running::start(SCRIPT, &root, &[suite, decoys, env!("CARGO_BIN_EXE_xtask")]).unwrap();
+    let mut said = Vec::new();
+    let ended_well = script.follow(|line| said.push(line.to_owned())).unwrap();
+    let all = said.join("\n");
+    assert!(ended_well, "{all}");
+    assert!(!root.exists(), "the root is removed");
+
+    let entries: Vec<&str> = said.iter().filter_map(|line| line.strip_prefix("entry ")).collect();
+    let listed =
+        include_str!("../../../tests/packages.txt").lines().filter(|line| !line.starts_with('#')).count();
+    assert_eq!(entries.len(), listed, "{all}");
+    for entry in entries {
+        let states = entry.split_once(' ').unwrap().1;
+        assert!(["missing installed present", "present already present"].contains(&states), "{entry}\n{all}");
+    }
+}
+
+/// The suite of this machine, and the packages that resemble listed ones in it.
+fn own_suite() -> Option<(&'static str, &'static str)> {
+    let about = std::fs::read_to_string("/etc/os-release").ok()?;
+    let suite = about.lines().find_map(|line| line.strip_prefix("VERSION_CODENAME="))?;
+    SUITES.into_iter().find(|&(known, _)| about.lines().any(|line| line == "ID=debian") && known == suite)
+}
+
+/// Says so past the harness, which prints nothing of tests that pass.
+fn skipped(why: &str) {
+    std::io::stdout().write_all(format!("packages: SKIPPED: {why}\n").as_bytes()).unwrap();
+}

@@ -1,0 +1,31 @@
+# Holds the list of packages against a bare Debian: $1 the root to make, $2 its suite, $3 packages that resemble listed ones,
+# $4 the executable of xtask. Prints a line for each entry: its names, what xtask says before, installed or already, after.
+root=$1 suite=$2 decoys=$3 xtask=$4
+
+mmdebstrap --mode=root --variant=minbase --quiet --skip=cleanup/apt --include="$decoys" \
+    --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
+    --dpkgopt='path-exclude=/usr/share/man/*' "$suite" "$root"
+cp "$xtask" "$root/usr/bin/xtask"
+mount --bind /dev "$root/dev"
+mount -t proc proc "$root/proc"
+
+within() { env --ignore-environment LC_ALL=C DEBIAN_FRONTEND=noninteractive PATH=/usr/sbin:/usr/bin:/sbin:/bin chroot "$root" "$@"; }
+# What xtask has said of the entry with these names.
+state() { echo "$said" | while read -r state names why; do [ "$names" != "$1:" ] || echo "$state"; done; }
+has_candidate() { within apt-cache policy "$1" | grep -q '^ *Candidate: [0-9]'; }
+is_installed() { [ "$(within dpkg-query --show --showformat='${db:Status-Status}' "$1" 2>/dev/null)" = installed ]; }
+
+said=$(within xtask packages)
+for names in $(echo "$said" | cut -d ' ' -f 2 | tr -d :); do
+    for package in $(echo "$names" | tr '|' ' '); do
+        ! has_candidate "$package" || break
+    done
+    before=$(state "$names")
+    how=already
+    if ! is_installed "$package"; then
+        within apt-get install --yes -qq --no-install-recommends "$package" >"$root/tmp/log" 2>&1 </dev/null || cat "$root/tmp/log"
+        how=installed
+    fi
+    said=$(within xtask packages)
+    echo "entry $names $before $how $(state "$names")"
+done
