@@ -10,10 +10,11 @@ use crate::run::{Done, run};
 /// The package that names the newest kernel. Not the cloud variant, which has neither cameras nor USB.
 const META_PACKAGE: &str = "linux-image-amd64";
 
-/// Where the modules lie that a test may ask for. Unpacking all 4000 would take longer than the tests.
+/// Where the modules lie that a test may ask for. Unpacking all 4000 would take longer than the tests. What a kernel of either
+/// release lacks must not be named: `fs/f*` stands for `fs/fscache`, which Debian 13 has as a part of `fs/netfs`.
 const MODULE_FOLDERS: [&str; 15] = [
     "drivers/char",
-    "drivers/gpu/drm/*.ko",
+    "drivers/gpu/drm/*.ko*",
     "drivers/gpu/drm/display",
     "drivers/gpu/drm/virtio",
     "drivers/i2c",
@@ -23,7 +24,7 @@ const MODULE_FOLDERS: [&str; 15] = [
     "drivers/video",
     "drivers/virtio",
     "fs/9p",
-    "fs/fscache",
+    "fs/f*",
     "fs/netfs",
     "lib",
     "net/9p",
@@ -31,7 +32,7 @@ const MODULE_FOLDERS: [&str; 15] = [
 
 /// An unpacked kernel.
 pub struct Kernel {
-    /// The ELF image, which QEMU boots faster than the compressed one.
+    /// An ELF image, which QEMU boots faster than a compressed one, or what the package has.
     pub image: PathBuf,
     /// What the guest mounts at `/lib/modules`: one folder, named as `uname -r` says.
     pub modules: PathBuf,
@@ -61,12 +62,15 @@ impl Kernel {
         &self.release
     }
 
-    /// The files of modules and of all that they need, relative to the folder of the release.
+    /// The files of modules and of all that they need, relative to the folder of the release; none of those built in.
     pub fn files_of(&self, names: &[&str]) -> Done<BTreeSet<String>> {
-        let path = self.modules.join(&self.release).join("modules.dep");
-        let text = std::fs::read_to_string(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+        let folder = self.modules.join(&self.release);
+        let path = folder.join("modules.dep");
+        let text = read_to_string(&path)?;
+        let builtin = read_to_string(&folder.join("modules.builtin"))?;
+        let is_builtin = |name: &&&str| builtin.lines().any(|file| file.ends_with(&format!("/{name}.ko")));
         let mut files = BTreeSet::new();
-        for name in names {
+        for name in names.iter().filter(|name| !is_builtin(name)) {
             let line = text.lines().find(|line| {
                 line.split_once(':').is_some_and(|(file, _)| file.ends_with(&format!("/{name}.ko")))
             });
@@ -118,32 +122,43 @@ fn unpack(package: &Path, folder: &Path) -> Done {
         .spawn()
         .map_err(|error| format!("cannot start dpkg-deb: {error}"))?;
     let stream = archive.stdout.take().ok_or("dpkg-deb without output")?;
+    // Debian 13 has its modules below /usr and compressed, Debian 12 neither.
     run(Command::new("tar")
         .arg("-x")
         .arg("-C")
         .arg(folder)
-        .args(["--wildcards", "./boot/vmlinuz-*", "./lib/modules/*/modules.*"])
-        .args(MODULE_FOLDERS.map(|path| format!("./lib/modules/*/kernel/{path}")))
+        .arg("--transform=s,^\\./usr/lib/,./lib/,")
+        .args(["--wildcards", "--no-anchored", "boot/vmlinuz-*", "lib/modules/*/modules.*"])
+        .args(MODULE_FOLDERS.map(|path| format!("lib/modules/*/kernel/{path}")))
         .stdin(stream))?;
     let status = archive.wait().map_err(|error| format!("dpkg-deb: {error}"))?;
     if !status.success() {
         return Err(format!("dpkg-deb ended with {status}: is {} whole?", package.display()));
     }
     let _ = std::fs::remove_file(package);
+    run(Command::new("find").arg(folder).args([
+        "-name",
+        "*.ko.xz",
+        "-exec",
+        "xz",
+        "--decompress",
+        "{}",
+        "+",
+    ]))?;
     let release = only_entry(&folder.join("lib/modules"), "")?;
     run(Command::new("busybox").args(["depmod", "-b"]).arg(folder).arg(&release))?;
     let compressed = folder.join("boot").join(format!("vmlinuz-{release}"));
     decompress(&compressed, &folder.join("vmlinux"))
 }
 
-/// The ELF image inside `vmlinuz`, which is a loader followed by an xz stream.
+/// The ELF image inside `vmlinuz`, which is a loader followed by a stream: of xz in Debian 12. Debian 13's is quickly
+/// decompressed by its own loader.
 fn decompress(compressed: &Path, image: &Path) -> Done {
     const XZ: &[u8] = b"\xfd7zXZ\0";
     let bytes = std::fs::read(compressed).map_err(|error| format!("{}: {error}", compressed.display()))?;
-    let start = bytes
-        .windows(XZ.len())
-        .position(|window| window == XZ)
-        .ok_or_else(|| format!("{}: no xz stream", compressed.display()))?;
+    let Some(start) = bytes.windows(XZ.len()).position(|window| window == XZ) else {
+        return std::fs::rename(compressed, image).map_err(|error| format!("{}: {error}", image.display()));
+    };
     let stream = image.with_extension("xz");
     std::fs::write(&stream, &bytes[start..]).map_err(|error| format!("{}: {error}", stream.display()))?;
     let part = image.with_extension("part");
@@ -161,6 +176,10 @@ fn decompress(compressed: &Path, image: &Path) -> Done {
         return Err(format!("{}: its xz stream holds no ELF image", compressed.display()));
     }
     std::fs::rename(&part, image).map_err(|error| format!("{}: {error}", image.display()))
+}
+
+fn read_to_string(path: &Path) -> Done<String> {
+    std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))
 }
 
 /// The name of the one entry of a folder that ends so.
