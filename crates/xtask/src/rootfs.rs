@@ -17,6 +17,9 @@ for attempt in 1 2 3 4 5; do
 done
 "#;
 
+/// What precedes each script, and a function for it: `mount_system ROOT`.
+const PRELUDE: &str = include_str!("rootfs.sh");
+
 /// Why this machine can make none, if so.
 pub fn forbidden() -> Option<String> {
     let tried = Command::new("unshare").args(namespaces()).args(["chroot", "/", "true"]).output();
@@ -41,8 +44,7 @@ impl Running {
     /// Starts a shell script, whose `$1` is the folder, and what follows the arguments. It prints to a pipe.
     pub fn start(script: &str, folder: &Path, arguments: &[&str]) -> Result<Self, String> {
         let mut guard = Guard::start(folder)?;
-        // What a guard that was killed has left goes first.
-        let script = format!("exec 2>&1\nrm --recursive --force --one-file-system \"$1\"\n{script}");
+        let script = format!("{PRELUDE}\n{script}");
         // A group of its own: whoever interrupts us leaves the rest to the guard.
         let process = Command::new("unshare")
             .args(namespaces())

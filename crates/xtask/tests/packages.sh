@@ -6,8 +6,7 @@ mmdebstrap --mode=root --variant=minbase --quiet --skip=cleanup/apt --include="$
     --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
     --dpkgopt='path-exclude=/usr/share/man/*' "$suite" "$root"
 cp "$xtask" "$root/usr/bin/xtask"
-mount --bind /dev "$root/dev"
-mount -t proc proc "$root/proc"
+mount_system "$root"
 
 within() { env --ignore-environment LC_ALL=C DEBIAN_FRONTEND=noninteractive PATH=/usr/sbin:/usr/bin:/sbin:/bin chroot "$root" "$@"; }
 # What xtask has said of the entry with these names.

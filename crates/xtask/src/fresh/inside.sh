@@ -8,24 +8,8 @@ mmdebstrap --mode=root --variant=minbase --quiet --include=ca-certificates,git,g
 # Where the machine trusts more than Debian does, what the root downloads does too.
 ! [ -e /etc/ssl/certs/ca-certificates.crt ] || cp /etc/ssl/certs/ca-certificates.crt "$root/etc/ssl/certs/"
 
-# A program that has mounts of its own needs a root that is one.
-mount --bind "$root" "$root"
-mount -t proc proc "$root/proc"
-mount -t sysfs -o ro sysfs "$root/sys" || mount --rbind /sys "$root/sys"
-mount -t tmpfs -o mode=755 tmpfs "$root/dev"
-for device in null zero full random urandom tty; do
-    touch "$root/dev/$device"
-    mount --bind "/dev/$device" "$root/dev/$device"
-done
-mkdir "$root/dev/pts" "$root/dev/shm"
-mount -t devpts -o newinstance,ptmxmode=0666,mode=620,gid=5 devpts "$root/dev/pts"
-mount -t tmpfs -o mode=1777 tmpfs "$root/dev/shm"
-ln -s pts/ptmx "$root/dev/ptmx"
-ln -s /proc/self/fd "$root/dev/fd"
-ln -s fd/0 "$root/dev/stdin"
-ln -s fd/1 "$root/dev/stdout"
-ln -s fd/2 "$root/dev/stderr"
-
+mount_system "$root"
+# Lets the root read a folder of the machine.
 lend() {
     mkdir "$root$2"
     mount --bind "$1" "$root$2"
@@ -34,10 +18,6 @@ lend() {
 lend "$rust" /opt/rust
 lend "$checkout" /opt/checkout
 
-within() {
-    env --ignore-environment "$@" HOME=/root LANG=C.UTF-8 PATH=/opt/rust/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
-        chroot "$root" sh -euc "$script"
-}
 script='
 git config --global --add safe.directory "*"
 git clone --quiet /opt/checkout /root/raysweep
@@ -50,4 +30,5 @@ for command in demo test; do
     echo "fresh: cargo xtask $command: code $code, $(($(date +%s) - began)) s"
     [ $code = 0 ] || exit $code
 done'
-within "$@"
+env --ignore-environment "$@" HOME=/root LANG=C.UTF-8 \
+    PATH=/opt/rust/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin chroot "$root" sh -euc "$script"
