@@ -10,6 +10,10 @@ use std::process::Command;
 use crate::run::Done;
 use list::{Entry, PATH};
 
+/// What to do on systems that the list is not made for.
+const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install what serves the same purposes\n\
+                         by its own means: `cargo xtask packages` tells what is found";
+
 /// Prints what the list asks for, and whether it is there.
 pub fn print() -> Done {
     for entry in list::entries()? {
@@ -25,13 +29,13 @@ pub fn install() -> Done {
     if missing.is_empty() {
         return Ok(());
     }
-    eprintln!("missing:\n{}", lines(&missing));
     if !apt::is_there() {
         return Err(format!(
-            "this system has no apt-get to install with. Install what serves the purposes above by its own means;\n\
-             {PATH} tells what shows that each is there, `cargo xtask packages` whether it is"
+            "these packages are missing, and this system has no apt-get to install them with:\n{}\n{ELSEWHERE}",
+            lines(&missing)
         ));
     }
+    eprintln!("missing:\n{}", lines(&missing));
     if is_root() {
         apt::update()?;
     }
@@ -56,8 +60,7 @@ fn chosen(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Done<Ve
     }
     let unknown = missing.iter().zip(choices).filter(|(_, choice)| choice.is_none()).map(|(entry, _)| entry);
     Err(format!(
-        "apt has no package for\n{}\n{PATH} is made for Debian 12 and 13, with apt's lists up to date (`apt-get update`). On \
-         another system, install what serves these purposes by its own means; `cargo xtask packages` tells whether it is there",
+        "apt has no package to install for these:\n{}\nare apt's lists up to date (`apt-get update`)?\n{ELSEWHERE}",
         lines(unknown)
     ))
 }
