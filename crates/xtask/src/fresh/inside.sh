@@ -19,6 +19,7 @@ lend "$rust" /opt/rust
 lend "$checkout" /opt/checkout
 
 script='
+umount --lazy /mnt
 git config --global --add safe.directory "*"
 git clone --quiet /opt/checkout /root/raysweep
 cd /root/raysweep
@@ -30,5 +31,8 @@ for command in demo test; do
     echo "fresh: cargo xtask $command: code $code, $(($(date +%s) - began)) s"
     [ $code = 0 ] || exit $code
 done'
-env --ignore-environment "$@" HOME=/root LANG=C.UTF-8 \
-    PATH=/opt/rust/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin chroot "$root" sh -euc "$script"
+# The root becomes that of all mounts: where chroot alone has changed it, the kernel refuses user namespaces.
+cd "$root"
+pivot_root . mnt
+exec env --ignore-environment "$@" HOME=/root LANG=C.UTF-8 \
+    PATH=/opt/rust/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin chroot . sh -euc "$script"
