@@ -69,8 +69,8 @@ pub struct Line {
     truth: LineTruth,
 }
 
-/// The frame that a period may trigger (point, attempt, frames before it under the same settings), and whether the camera
-/// is ready for it.
+/// A frame (point, attempt, frames before it under the same settings) and whether the camera is ready for another: the
+/// frame that a period may trigger if it is, and else the frame that sees the period's light.
 type DrawnFor = ([u64; 3], bool);
 
 struct PendingEdge {
@@ -167,13 +167,13 @@ impl Line {
         period * self.config.period_ns
     }
 
-    /// Decides what the next period brings. All that is random is keyed by the frame that it may trigger and whether the
-    /// camera is ready for it, so that a point has the same edges in an uninterrupted run and in a resumed one.
+    /// Decides what the next period brings. All that is random is keyed by the frame that it concerns, so that a point
+    /// has the same edges in an uninterrupted run and in a resumed one.
     fn draw_period(&mut self) {
         let nominal_ns = self.nominal_ns(self.next_period);
         let asked_ns = nominal_ns.max(self.configured_ns);
         let ready = self.camera.is_ready(asked_ns, self.config.camera.trigger_latency_us);
-        let drawn_for = (self.camera.key(), ready);
+        let drawn_for = (if ready { self.camera.key() } else { self.camera.newest_key() }, ready);
         if drawn_for != self.drawn_for {
             (self.drawn_for, self.draws) = (drawn_for, 0);
         }
@@ -233,8 +233,11 @@ impl Line {
         } else {
             self.seen.push_back(Edge { seq: self.edges, host_ns: edge.at_ns });
         }
-        let answered = self.camera.triggered_by == TriggeredBy::Edges && self.trigger(edge.at_ns);
-        if answered && edge.kind == EdgeKind::False {
+        // False edges are keyed by the frame before them. One that triggered the first frame under new settings would
+        // make a point depend on the point before it, which a resumed run may not have taken.
+        let is_heard = edge.kind != EdgeKind::False || self.camera.due().1 > 0;
+        let by_edges = self.camera.triggered_by == TriggeredBy::Edges;
+        if by_edges && is_heard && self.trigger(edge.at_ns) && edge.kind == EdgeKind::False {
             self.truth.false_triggers += 1;
         }
     }
@@ -325,10 +328,8 @@ impl Line {
             self.next_period -= 1;
             self.draws = self.draws.saturating_sub(1);
         }
-        // A false edge of the period under way would belong to frames of other settings.
-        let is_next = self.camera.due().1 == 0;
         let next_period = self.next_period;
-        self.pending.retain(|edge| !is_next && edge.period < next_period);
+        self.pending.retain(|edge| edge.period < next_period);
     }
 
     /// Triggers the camera by command; whether it answered.

@@ -55,7 +55,7 @@ fn observe(faults: &str) -> (Counts, Truth) {
     let mut counts = Counts::default();
     let mut push = |event| {
         assembler.push(event, |decision| {
-            let (Decision::Failed(_, account) | Decision::Flushed(account, _)) = decision else {
+            let (Decision::Failed(_, _, account) | Decision::Flushed(account, _)) = decision else {
                 panic!("a unit")
             };
             counts.add(&account);

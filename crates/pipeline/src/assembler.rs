@@ -37,6 +37,12 @@ pub struct Job {
 pub enum Label {
     /// It belongs to the point.
     Counted,
+    /// It belongs to the point, unless a false edge at this moment triggered it under the settings before: then its
+    /// stamps would be the same.
+    CountedUnless {
+        /// On the clock of the stamps.
+        triggered_ns: i64,
+    },
     /// It was, or may have been, exposed under the settings before.
     Settling,
     /// Nobody waits for it.
@@ -53,8 +59,10 @@ pub enum Event {
     Frame(Frame, Label),
     /// The id of a frame that there was no room for, or that never came; without a cause, one that no point waited for.
     Lost(u64, Option<LossCause>),
-    /// The attempt is over: complete, or given up.
+    /// The attempt is over: all its frames have come or were lost on their way.
     End,
+    /// The attempt is over before its last frame: other settings, or the end of the pass, came first.
+    Interrupt,
     /// Nobody takes frames for a while: those that pass are nobody's loss.
     Idle,
     /// To be raised when everything before it is decided.
@@ -68,9 +76,18 @@ pub enum Decision {
     /// A point's image.
     Unit(Unit),
     /// An attempt without all its frames.
-    Failed(SettingsId, Counts),
+    Failed(SettingsId, Failure, Counts),
     /// The pass is over; frames outside any attempt, and the line so far.
     Flushed(Counts, VsyncStats),
+}
+
+/// Why an attempt lacks frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Failure {
+    /// Too many of its own frames were lost or unsound: the point needs another attempt.
+    Losses,
+    /// It ended before its last frame, by no fault of its own: the same attempt is made again.
+    Interrupted,
 }
 
 /// What the assembler must know of the rig.
@@ -123,6 +140,7 @@ enum Waiting {
     Frame(Frame, Label),
     Lost(u64, Option<LossCause>),
     End,
+    Interrupt,
     Idle,
     Settle(Arc<AtomicBool>),
     Flush,
@@ -135,6 +153,8 @@ struct Attempt {
     delays_us: Vec<f64>,
     counts: Counts,
     last_exposure_ns: Option<i64>,
+    /// Whether a frame of its own may have been taken for one of the settings before: those after it do not count.
+    is_interrupted: bool,
     chain: Chain,
 }
 
@@ -152,8 +172,16 @@ struct Chain {
 /// The light of a frame, or why it does not count.
 enum Verdict {
     Undecided,
-    Sound { trigger: TrueEdge, delay_us: f64 },
-    Unsound { trigger: Option<TrueEdge>, cause: LossCause },
+    Sound {
+        trigger: TrueEdge,
+        delay_us: f64,
+    },
+    Unsound {
+        trigger: Option<TrueEdge>,
+        cause: LossCause,
+    },
+    /// It may have been exposed under the settings before.
+    Doubtful,
 }
 
 impl Assembler {
@@ -186,6 +214,7 @@ impl Assembler {
             }
             Event::Lost(seq, cause) => self.waiting.push_back(Waiting::Lost(seq, cause)),
             Event::End => self.waiting.push_back(Waiting::End),
+            Event::Interrupt => self.waiting.push_back(Waiting::Interrupt),
             Event::Idle => self.waiting.push_back(Waiting::Idle),
             Event::Settle(decided) => self.waiting.push_back(Waiting::Settle(decided)),
             Event::Flush => self.waiting.push_back(Waiting::Flush),
@@ -215,33 +244,28 @@ impl Assembler {
                     None => self.counts().cancelled += 1,
                 }
             }
-            Waiting::Frame(frame, Label::Counted) => match self.judge(&frame.stamp, flushing) {
-                Verdict::Undecided => return Some(Waiting::Frame(frame, Label::Counted)),
-                verdict => self.count(&frame, verdict),
-            },
-            Waiting::Frame(frame, label) => {
+            Waiting::Frame(frame, label @ (Label::Counted | Label::CountedUnless { .. })) => {
+                match self.judge(&frame.stamp, label, flushing) {
+                    Verdict::Undecided => return Some(Waiting::Frame(frame, label)),
+                    verdict => self.count(&frame, verdict),
+                }
+            }
+            Waiting::Frame(frame, Label::Settling) => {
                 self.follow(frame.stamp.seq);
-                let counts = self.counts();
-                if label == Label::Settling {
-                    counts.settling += 1;
-                } else {
-                    counts.cancelled += 1;
-                }
+                self.counts().settling += 1;
             }
-            Waiting::End => {
-                if let Some(mut attempt) = self.attempt.take() {
-                    self.chain = std::mem::take(&mut attempt.chain);
-                    decide(attempt.finish());
-                }
+            Waiting::Frame(frame, Label::Cancelled) => {
+                self.follow(frame.stamp.seq);
+                self.counts().cancelled += 1;
             }
+            Waiting::End => self.end(Failure::Losses, decide),
+            Waiting::Interrupt => self.end(Failure::Interrupted, decide),
             Waiting::Idle => self.idle = true,
             Waiting::Settle(decided) => decided.store(true, Ordering::Release),
             Waiting::Flush => {
                 self.idle = true;
                 // A device that failed may have left its attempt open.
-                if let Some(attempt) = self.attempt.take() {
-                    decide(attempt.finish());
-                }
+                self.end(Failure::Interrupted, decide);
                 decide(Decision::Flushed(std::mem::take(&mut self.outside), self.tracker.stats()));
             }
         }
@@ -261,8 +285,17 @@ impl Assembler {
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
             last_exposure_ns: None,
+            is_interrupted: false,
             chain,
         });
+    }
+
+    /// Ends the attempt, if there is one; `failure` is why it lacks frames if it does.
+    fn end(&mut self, failure: Failure, decide: &mut impl FnMut(Decision)) {
+        if let Some(mut attempt) = self.attempt.take() {
+            self.chain = std::mem::take(&mut attempt.chain);
+            decide(attempt.finish(failure));
+        }
     }
 
     fn periods_per_frame(&self, job: &Job) -> i64 {
@@ -289,7 +322,7 @@ impl Assembler {
     }
 
     /// Ties a frame to the edge that triggered it and to the edge of the light that it saw.
-    fn judge(&self, stamp: &FrameStamp, flushing: bool) -> Verdict {
+    fn judge(&self, stamp: &FrameStamp, label: Label, flushing: bool) -> Verdict {
         let Some(Attempt { job, .. }) = &self.attempt else {
             return Verdict::Unsound { trigger: None, cause: LossCause::SettingsMismatch };
         };
@@ -301,6 +334,14 @@ impl Assembler {
             - ns_from_us(self.config.camera.trigger_latency_us + settings.trigger_delay_us);
         if known_ns < trigger_ns + TRIGGER_TOLERANCE_NS {
             return Verdict::Undecided;
+        }
+        if let Label::CountedUnless { triggered_ns } = label {
+            if known_ns < triggered_ns + TRIGGER_TOLERANCE_NS {
+                return Verdict::Undecided;
+            }
+            if self.tracker.near(triggered_ns, TRIGGER_TOLERANCE_NS) == Found::False {
+                return Verdict::Doubtful;
+            }
         }
         let trigger = match self.tracker.near(trigger_ns, TRIGGER_TOLERANCE_NS) {
             Found::True(edge) => edge,
@@ -343,6 +384,11 @@ impl Assembler {
         let (trigger, sound) = match verdict {
             Verdict::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
             Verdict::Unsound { trigger, cause } => (trigger, Err(cause)),
+            Verdict::Doubtful => {
+                attempt.is_interrupted = true;
+                attempt.counts.settling += 1;
+                return;
+            }
             Verdict::Undecided => return,
         };
         match trigger {
@@ -354,7 +400,9 @@ impl Assembler {
             None => attempt.chain.untied += 1,
         }
         match sound {
-            Ok(_) if attempt.averaged == attempt.job.frames => attempt.counts.cancelled += 1,
+            Ok(_) if attempt.averaged == attempt.job.frames || attempt.is_interrupted => {
+                attempt.counts.cancelled += 1;
+            }
             Ok(delay_us) => {
                 // An array that was made of zeros is one slice, row by row, as frames are.
                 let sums = attempt.sum.as_slice_mut().unwrap_or_default();
@@ -383,12 +431,13 @@ impl Chain {
 }
 
 impl Attempt {
-    fn finish(mut self) -> Decision {
+    fn finish(mut self, failure: Failure) -> Decision {
         self.counts.averaged = u64::from(self.averaged);
         if self.averaged < self.job.frames {
             // Sound frames of an attempt that lacks others are not kept: the point is taken again as a whole.
             self.counts.cancelled += std::mem::take(&mut self.counts.averaged);
-            return Decision::Failed(self.job.id, self.counts);
+            let failure = if self.is_interrupted { Failure::Interrupted } else { failure };
+            return Decision::Failed(self.job.id, failure, self.counts);
         }
         Decision::Unit(Unit {
             id: self.job.id,

@@ -19,7 +19,9 @@ mod stage;
 mod strips;
 mod unit;
 
-pub use assembler::{Assembler, AssemblerConfig, Decision, EXPOSURE_TOLERANCE_US, Event, Job, Label};
+pub use assembler::{
+    Assembler, AssemblerConfig, Decision, EXPOSURE_TOLERANCE_US, Event, Failure, Job, Label,
+};
 pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
 pub use edges::{EdgeTracker, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};

@@ -10,7 +10,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use ndarray::Array2;
 use raysweep_core::{Counts, SettingsId, VsyncStats};
 
-use crate::assembler::{Assembler, AssemblerConfig, Decision, Event};
+use crate::assembler::{Assembler, AssemblerConfig, Decision, Event, Failure};
 use crate::queue::{Input, Policy};
 use crate::stage::{Stage, StageError};
 use crate::unit::Unit;
@@ -49,7 +49,7 @@ pub enum Ordered {
     /// A point's unit, and its image after all stages or why it has none.
     Unit(Unit, Result<Array2<f32>, StageError>),
     /// An attempt without all its frames.
-    Failed(SettingsId, Counts),
+    Failed(SettingsId, Failure, Counts),
     /// A pass is over; frames outside any attempt, and the line so far.
     Flushed(Counts, VsyncStats),
 }
@@ -156,7 +156,9 @@ impl Dispatch {
                     let _ = done.send((seq, Ordered::Unit(unit, image)));
                 });
             }
-            Decision::Failed(id, counts) => drop(done.send((seq, Ordered::Failed(id, counts)))),
+            Decision::Failed(id, failure, counts) => {
+                let _ = done.send((seq, Ordered::Failed(id, failure, counts)));
+            }
             Decision::Flushed(outside, vsync) => drop(done.send((seq, Ordered::Flushed(outside, vsync)))),
         }
     }

@@ -15,7 +15,7 @@ use raysweep_core::{
     Camera, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState, Frame, FrameBuf, FramePool,
     FrameStamp, LossCause, SettingsId, SettingsLatency, ns_from_us,
 };
-use raysweep_pipeline::{Event, Input, Label, Point, QueueError, Shot, message_of};
+use raysweep_pipeline::{Event, Failure, Input, Label, Point, QueueError, Shot, message_of};
 
 pub use self::ahead::Line;
 use self::ahead::{Ahead, Seen};
@@ -33,6 +33,21 @@ pub struct Attempt {
     pub point: Point,
     /// How to set the camera for it.
     pub shot: Shot,
+    /// How often it was interrupted in this run.
+    pub interruptions: u32,
+}
+
+impl Attempt {
+    /// The attempt to make after this one has failed.
+    pub fn after(self, failure: Failure) -> Self {
+        match failure {
+            Failure::Losses => {
+                let id = SettingsId { attempt: self.id.attempt + 1, ..self.id };
+                Self { id, interruptions: 0, ..self }
+            }
+            Failure::Interrupted => Self { interruptions: self.interruptions + 1, ..self },
+        }
+    }
 }
 
 /// Points to acquire under one picture of the projector.
@@ -360,7 +375,7 @@ impl Sequencer {
     /// Only a frame that a point waits for is lost; the others are merely not looked at.
     fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
         let event = match label {
-            Label::Counted => Event::Lost(stamp.seq, Some(cause)),
+            Label::Counted | Label::CountedUnless { .. } => Event::Lost(stamp.seq, Some(cause)),
             Label::Settling | Label::Cancelled => Event::Lost(stamp.seq, None),
         };
         self.input.send(event).map_err(closed)?;

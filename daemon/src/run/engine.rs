@@ -399,22 +399,22 @@ impl Passes<'_> {
     }
 
     fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
-        let mut todo = missing;
+        let mut todo: Vec<Attempt> = missing.into_iter().map(|id| self.attempt(id)).collect();
         let mut fruitless = 0;
         loop {
             let before = todo.len();
             let mut counts = Counts::default();
             let (dark, lit): (Vec<_>, Vec<_>) =
-                todo.iter().partition(|id| matches!(self.point(**id).role, Role::Dark(_)));
+                todo.into_iter().partition(|attempt| matches!(attempt.point.role, Role::Dark(_)));
             todo = Vec::new();
             if !dark.is_empty() {
                 let Some(shown) = self.projector.show(None, self.orders)? else { return Ok(()) };
-                todo.extend(self.pass(&dark, shown, &mut counts)?);
+                todo.extend(self.pass(dark, shown, &mut counts)?);
             }
             if !lit.is_empty() && self.orders.go_on() {
                 let white = self.projector.show(Some(&Pattern::White), self.orders)?;
                 let Some(shown) = white else { return Ok(()) };
-                todo.extend(self.pass(&lit, shown, &mut counts)?);
+                todo.extend(self.pass(lit, shown, &mut counts)?);
             }
             if todo.is_empty() || !self.orders.go_on() {
                 return Ok(());
@@ -453,35 +453,28 @@ impl Passes<'_> {
         Ok(acquired?)
     }
 
-    fn point(&self, id: SettingsId) -> Point {
-        self.task.schedule.points[id.point as usize]
+    fn attempt(&self, id: SettingsId) -> Attempt {
+        let point = self.task.schedule.points[id.point as usize];
+        let shot = self.task.geometry.shot(&point, self.trigger_latency_us);
+        Attempt { id, point, shot, interruptions: 0 }
     }
 
-    /// Acquires points under one picture; returns those to take again, and adds up what became of their frames.
+    /// Makes attempts under one picture; returns those to make next, and adds up what became of their frames.
     fn pass(
         &self,
-        ids: &[SettingsId],
+        attempts: Vec<Attempt>,
         shown: Shown,
         counts: &mut Counts,
-    ) -> Result<Vec<SettingsId>, RunError> {
-        let geometry = &self.task.geometry;
-        let attempts = ids
-            .iter()
-            .map(|&id| {
-                let point = self.point(id);
-                Attempt { id, point, shot: geometry.shot(&point, self.trigger_latency_us) }
-            })
-            .collect();
-        let acquired = self
-            .camera
-            .acquire(Work::Pass(Pass { attempts, not_before_ns: shown.not_before_ns }))
-            .map_err(|Gone| RunError::Interrupted)?;
+    ) -> Result<Vec<Attempt>, RunError> {
+        let pass = Pass { attempts: attempts.clone(), not_before_ns: shown.not_before_ns };
+        let acquired = self.camera.acquire(Work::Pass(pass)).map_err(|Gone| RunError::Interrupted)?;
         let mut again = Vec::new();
         // The sink closes the channel when it ends, so this waits for nothing that cannot come.
         for verdict in self.results {
             match verdict {
-                Verdict::Failed(id, of_attempt) => {
-                    again.push(SettingsId { attempt: id.attempt + 1, ..id });
+                Verdict::Failed(id, failure, of_attempt) => {
+                    let failed = attempts.iter().filter(|attempt| attempt.id == id);
+                    again.extend(failed.map(|attempt| attempt.after(failure)));
                     counts.add(&of_attempt);
                 }
                 Verdict::Flushed => break,

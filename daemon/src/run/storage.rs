@@ -5,7 +5,7 @@ use std::sync::mpsc::Sender;
 use std::time::Instant;
 
 use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
-use raysweep_pipeline::{Ordered, Sink, StageError, Unit};
+use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
 use raysweep_proto::{Event, Progress};
 use raysweep_session::ledger::{Entry, Ledger, PointEntry};
 use raysweep_session::stack::Stack;
@@ -20,7 +20,7 @@ use crate::processing::{Processing, Task, place};
 #[derive(Debug)]
 pub enum Verdict {
     /// An attempt failed, or its data could not be stored.
-    Failed(SettingsId, Counts),
+    Failed(SettingsId, Failure, Counts),
     /// The pass is over.
     Flushed,
 }
@@ -78,14 +78,14 @@ impl Sink for Storage {
     fn take(&mut self, item: Ordered) {
         match item {
             Ordered::Unit(unit, image) if self.film_frame(&unit, &image) => {}
-            Ordered::Failed(id, counts) if self.film_frame_lost(id, &counts) => {}
+            Ordered::Failed(id, _, counts) if self.film_frame_lost(id, &counts) => {}
             Ordered::Unit(unit, image) => {
                 if let Err(error) = self.store(&unit) {
                     tracing::error!(%error, point = unit.id.point, "point not stored");
                     self.note_write_error(error);
                     let mut counts = unit.counts.clone();
                     counts.forfeit(LossCause::WriterError);
-                    self.fail(unit.id, counts);
+                    self.fail(unit.id, Failure::Interrupted, counts);
                     return;
                 }
                 self.pace.stored += 1;
@@ -103,7 +103,7 @@ impl Sink for Storage {
                 }
                 self.board.publish(Event::Progress(self.pace.progress()));
             }
-            Ordered::Failed(id, counts) => self.fail(id, counts),
+            Ordered::Failed(id, failure, counts) => self.fail(id, failure, counts),
             Ordered::Flushed(outside, vsync) => {
                 self.film_over();
                 if outside != Counts::default() {
@@ -142,17 +142,20 @@ impl Storage {
         }))
     }
 
-    fn fail(&mut self, id: SettingsId, counts: Counts) {
+    fn fail(&mut self, id: SettingsId, failure: Failure, counts: Counts) {
         let (array, index) = place(self.task.schedule.points[id.point as usize].role);
         self.pace.counts.add(&counts);
         if counts.lost_total() > 0 {
-            self.append(&Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() });
             self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() });
-        } else {
-            // Cut short by a cancel or a fault: not the point's failure, so a resumed run begins the same attempt.
-            self.append(&Entry::Outside { counts: counts.clone() });
         }
-        self.tell(Verdict::Failed(id, counts));
+        self.append(&match failure {
+            Failure::Losses => {
+                Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() }
+            }
+            // The point is not to blame: this run, or one that resumes it, makes the same attempt again.
+            Failure::Interrupted => Entry::Outside { counts: counts.clone() },
+        });
+        self.tell(Verdict::Failed(id, failure, counts));
     }
 
     fn tell(&self, verdict: Verdict) {

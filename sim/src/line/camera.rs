@@ -107,6 +107,12 @@ impl CameraLine {
         [u64::from(id.point), u64::from(id.attempt), frames]
     }
 
+    /// The key of the newest frame.
+    pub(super) fn newest_key(&self) -> [u64; 3] {
+        let Written { id, .. } = self.in_force;
+        [u64::from(id.point), u64::from(id.attempt), self.frames.saturating_sub(1)]
+    }
+
     /// Where the sequencer runs, the next frame has its next set.
     pub(super) fn take_next_set(&mut self) {
         let Some(Sequence { sets, next, frames }) = &mut self.sequence else { return };

@@ -110,7 +110,7 @@ impl Feed {
 
     fn failed(&self) -> &Counts {
         match &self.decisions[..] {
-            [Decision::Failed(_, counts)] => counts,
+            [Decision::Failed(_, Failure::Losses, counts)] => counts,
             other => panic!("{} decisions", other.len()),
         }
     }
@@ -302,8 +302,48 @@ fn a_flush_ends_an_attempt_that_a_failing_device_left_open() {
     feed.begin(2, 700.0, 0);
     feed.frame(2, 9);
     feed.push(Event::Flush);
-    let [Decision::Failed(_, counts), Decision::Flushed(..)] = &feed.decisions[..] else { panic!() };
+    let [Decision::Failed(_, Failure::Interrupted, counts), Decision::Flushed(..)] = &feed.decisions[..]
+    else {
+        panic!()
+    };
     assert_eq!((counts.expected, counts.cancelled), (1, 1));
+}
+
+#[test]
+fn an_attempt_that_is_interrupted_is_not_to_blame_for_what_it_lacks() {
+    let mut feed = Feed::new();
+    feed.edges(0, 3);
+    feed.begin(2, 700.0, 0);
+    feed.frame_at(2 * PERIOD_NS, 700.0 + 60.0, 9, Label::Counted);
+    feed.push(Event::Interrupt);
+    feed.edges(3, 5);
+    let [Decision::Failed(_, Failure::Interrupted, counts)] = &feed.decisions[..] else { panic!() };
+    assert_eq!(counts.lost, [(LossCause::Jitter, 1)].into());
+}
+
+#[test]
+fn a_frame_that_a_false_edge_may_have_triggered_under_the_settings_before_does_not_count() {
+    let label = |triggered_ns: i64| Label::CountedUnless { triggered_ns };
+    let false_ns = 3 * PERIOD_NS - 2_000_000;
+    let decide = |has_false_edge: bool| {
+        let mut feed = Feed::new();
+        feed.edges(0, 3);
+        feed.begin(2, 700.0, 0);
+        feed.frame(2, 100);
+        if has_false_edge {
+            feed.edge(false_ns);
+        }
+        // The settings before had 2 ms more delay, so both triggers give the same start of the exposure.
+        feed.frame_at(3 * PERIOD_NS, 700.0, 100, label(false_ns));
+        feed.edges(3, 6);
+        feed.frame(4, 100);
+        feed.push(Event::End);
+        feed.decisions
+    };
+    assert!(matches!(&decide(false)[..], [Decision::Unit(_)]));
+    let decisions = decide(true);
+    let [Decision::Failed(_, Failure::Interrupted, counts)] = &decisions[..] else { panic!() };
+    assert_eq!((counts.expected, counts.settling, counts.cancelled), (3, 1, 2), "frames after it neither");
 }
 
 #[test]

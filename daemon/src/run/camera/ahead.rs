@@ -6,7 +6,7 @@
 //! triggers are, the clock says, by the stamps of the frames before.
 
 use std::collections::VecDeque;
-use std::ops::RangeInclusive;
+use std::ops::{Range, RangeInclusive};
 
 use raysweep_core::{
     Applied, CameraCapabilities, CameraSettings, FirstFrame, FrameStamp, SettingsLatency, ns_from_us,
@@ -80,6 +80,8 @@ pub struct Written {
     planned_seq: u64,
     /// Whether stamps may tell its frames from those of the settings before.
     by_stamps: bool,
+    /// The first frame that was seen to have them.
+    seen_seq: u64,
     /// From the first register's write to the last one's.
     written_ns: (i64, i64),
     /// What they are for; nothing where they only lead from one to the next.
@@ -94,9 +96,14 @@ pub struct Wanted {
     pub is_lit: bool,
     /// Whether the assembler has been told.
     pub is_begun: bool,
-    /// Frames to hand on: of a job that failed before, some more than it needs.
+    /// Whether it ended before its last frame.
+    pub is_interrupted: bool,
+    /// How many frames in a row are the job's: of one that failed before, some more than it needs. A frame that is lost
+    /// on its way is one of them, so that which frames a job has does not depend on when the loss is noticed.
     pub frames: u32,
-    /// Frames handed on.
+    /// How many more the settings stay for before others are written ahead of their last frame.
+    pub margin_frames: u32,
+    /// Those of its frames that have been handed on or were lost on their way.
     pub passed: u32,
     /// Frames that may find no room before it is given up.
     pub spare_frames: u32,
@@ -105,7 +112,7 @@ pub struct Wanted {
 impl Wanted {
     /// Whether it waits for no frame any more.
     pub fn is_complete(&self) -> bool {
-        self.passed >= self.frames || self.spare_frames == 0
+        self.is_interrupted || self.passed >= self.frames || self.spare_frames == 0
     }
 }
 
@@ -123,8 +130,15 @@ impl Written {
         self.work.as_mut().filter(|wanted| !wanted.is_complete())
     }
 
+    /// The ids from `since_seq` on, below `seq`, that the job waited for and that never came.
+    pub fn lost(&self, since_seq: u64, seq: u64) -> Range<u64> {
+        let Some(wanted) = self.work.as_ref().filter(|wanted| !wanted.is_complete()) else { return seq..seq };
+        let first_seq = if wanted.passed > 0 { since_seq } else { self.certain().max(since_seq) };
+        first_seq..seq.min(first_seq + u64::from(wanted.frames - wanted.passed))
+    }
+
     /// The first frame that may have the settings.
-    fn earliest(&self) -> u64 {
+    pub fn earliest(&self) -> u64 {
         match self.promised {
             FirstFrame::Exactly(seq) => seq,
             FirstFrame::Within { earliest, certain } => {
@@ -135,12 +149,13 @@ impl Written {
 
     /// The first frame that is certain to have the settings.
     pub fn certain(&self) -> u64 {
-        match (self.promised, self.late_frames) {
+        let known_seq = match (self.promised, self.late_frames) {
             (FirstFrame::Within { certain, .. }, Some(late_frames)) => {
                 certain.min(self.next_seq.1.saturating_add(late_frames)).max(self.earliest())
             }
             (promised, _) => promised.certain(),
-        }
+        };
+        known_seq.min(self.seen_seq)
     }
 
     /// The first frame that has the settings if all goes as planned.
@@ -164,6 +179,8 @@ impl Written {
 pub struct Seen {
     /// Which of the written settings it has, counted from those in force; nothing where it is not known.
     pub owner: Option<usize>,
+    /// Where its stamps say that and its id does not: when it was triggered if it has the settings in force instead.
+    pub else_triggered_ns: Option<i64>,
     /// Where it is the first with new settings: how many frames later than the next to be triggered when they were
     /// written.
     pub late_frames: Option<u32>,
@@ -212,6 +229,11 @@ impl Ahead {
     /// What is in force for certain, or was written first.
     pub fn front(&mut self) -> Option<&mut Written> {
         self.written.front_mut()
+    }
+
+    /// What was written after that.
+    pub fn second(&self) -> Option<&Written> {
+        self.written.get(1)
     }
 
     /// Takes what is in force out, since something later is.
@@ -278,7 +300,7 @@ impl Ahead {
     fn end_seq(&self, written: &Written, wanted: &Wanted) -> u64 {
         let next_seq = self.newest_seq.map_or(0, |seq| seq + 1);
         let first_seq = if wanted.passed > 0 { next_seq } else { written.planned().max(next_seq) };
-        first_seq + u64::from(wanted.frames - wanted.passed) - 1
+        first_seq + u64::from(wanted.frames - wanted.passed + wanted.margin_frames) - 1
     }
 
     /// The first frame to be triggered after a moment, if every trigger is answered.
@@ -346,6 +368,7 @@ impl Ahead {
             late_frames,
             planned_seq,
             by_stamps,
+            seen_seq: u64::MAX,
             written_ns,
             work,
         });
@@ -359,15 +382,20 @@ impl Ahead {
         let since_seq = self.newest_seq.map_or(stamp.seq, |newest| newest + 1);
         self.newest_seq = Some(stamp.seq);
         self.frames_carry_exposure = stamp.exposure_us.is_some();
-        let Some(written) = owner.and_then(|owner| self.written.get(owner)) else {
-            return Seen { owner, late_frames: None, since_seq };
+        let Some(written) = owner.and_then(|owner| self.written.get_mut(owner)) else {
+            return Seen { owner, else_triggered_ns: None, late_frames: None, since_seq };
         };
-        self.triggers.note(stamp.seq, self.trigger_ns(stamp, &written.settings));
-        let is_new = owner.is_some_and(|owner| owner > 0) && since_seq == stamp.seq;
-        let (next_seq, latest_seq) = written.next_seq;
+        let is_by_stamps = stamp.seq < written.certain();
+        written.seen_seq = written.seen_seq.min(stamp.seq);
+        let (settings, (next_seq, latest_seq)) = (written.settings, written.next_seq);
+        let is_new = owner > Some(0);
+        let in_force = self.written.front().filter(|_| is_new && is_by_stamps);
+        let else_triggered_ns = in_force.map(|in_force| self.trigger_ns(stamp, &in_force.settings));
+        self.triggers.note(stamp.seq, self.trigger_ns(stamp, &settings));
         let late_frames = u32::try_from(stamp.seq.saturating_sub(next_seq)).ok();
-        let late_frames = late_frames.filter(|_| is_new && next_seq == latest_seq);
-        Seen { owner, late_frames, since_seq }
+        let is_first = is_new && since_seq == stamp.seq;
+        let late_frames = late_frames.filter(|_| is_first && next_seq == latest_seq);
+        Seen { owner, else_triggered_ns, late_frames, since_seq }
     }
 
     /// Learns from a frame which settings were written before it and which after.

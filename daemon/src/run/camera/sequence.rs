@@ -18,7 +18,7 @@ const LEAD_IN_US: f64 = 2_000.0;
 /// How often it is looked whether the last frames are decided.
 const SETTLE_POLL: Duration = Duration::from_millis(2);
 
-/// A point that has failed oftener gets no more frames to spare: it has three times its own by then.
+/// A point that has failed, or was interrupted, oftener gets no more frames to spare: it has three times its own by then.
 const MOST_SPARED_FOR: u32 = 8;
 
 /// A film to take under one picture of the projector.
@@ -62,7 +62,7 @@ impl FilmPass {
                 let FilmSetting { ordinal, point, shot, periods_from_last } = *setting;
                 let id = SettingsId { point: ordinal, attempt: cycle };
                 Slot {
-                    attempt: Attempt { id, point, shot },
+                    attempt: Attempt { id, point, shot, interruptions: 0 },
                     periods_from_last: Some(periods_from_last),
                     place,
                     may_hold: place == 0,
@@ -185,7 +185,9 @@ impl Sequencer {
     }
 
     fn write(&mut self, slot: &Slot, runs_on: bool) -> Result<(), DeviceError> {
-        let Attempt { id, point, shot } = slot.attempt;
+        let Attempt { id, point, shot, interruptions } = slot.attempt;
+        // The oftener a point failed, the more frames it has to spare.
+        let spared = |failures: u32| failures.min(MOST_SPARED_FOR) * point.frames.div_ceil(4);
         self.configure(id, &shot.settings, |applied| {
             let job = Job {
                 id,
@@ -199,12 +201,13 @@ impl Sequencer {
                 job,
                 is_lit: !matches!(point.role, Role::Dark(_)),
                 is_begun: false,
-                // A point that has failed is taken with some frames to spare, the more the oftener it failed. A film
-                // counts its cycles there.
+                is_interrupted: false,
+                // A film counts its cycles as attempts.
                 frames: match slot.periods_from_last {
                     Some(_) => point.frames,
-                    None => point.frames + id.attempt.min(MOST_SPARED_FOR) * point.frames.div_ceil(4),
+                    None => point.frames + spared(id.attempt),
                 },
+                margin_frames: spared(interruptions),
                 passed: 0,
                 // Frames that found no room are taken again within the attempt, but not for ever.
                 spare_frames: 64 + 3 * point.frames,
@@ -247,14 +250,23 @@ impl Sequencer {
         }
     }
 
-    /// Hands a frame on as that of the settings that it was exposed with; those before, whose frames never came, are
-    /// given up first.
+    /// Hands a frame on as that of the settings that it was exposed with. Jobs before it that lack frames are over.
     fn deliver(&mut self, received: Received) -> Result<(), DeviceError> {
         let (seq, seen) = (received.stamp.seq, received.seen);
         for _ in 0..seen.owner.unwrap_or(0) {
-            self.close_front(seen.since_seq, seq)?;
+            // Lost frames that may have had the next settings already are not held against this job.
+            let next_seq = self.ahead.second().map_or(seq, |next| next.earliest().min(seq));
+            self.note_lost(seen.since_seq, next_seq)?;
+            self.interrupt_if(|_| true)?;
+            self.ahead.pop();
         }
         let is_owned = seen.owner.is_some();
+        if is_owned {
+            self.note_lost(seen.since_seq, seq)?;
+        } else {
+            // One of a job's frames that may be another's: which frames it has must not depend on what comes after it.
+            self.interrupt_if(|wanted| wanted.passed > 0)?;
+        }
         let Some(wanted) = self.ahead.front().filter(|_| is_owned).and_then(|front| front.open()) else {
             // Exposed under settings that have their frames, or nobody knows under which.
             if let Some(next) = self.ahead.opening(seq)
@@ -270,7 +282,11 @@ impl Sequencer {
             self.input.send(Event::Begin(job)).map_err(closed)?;
         }
         let stamp = received.stamp;
-        let taken = self.hand_on(received, Label::Counted)?;
+        let label = match seen.else_triggered_ns {
+            Some(triggered_ns) => Label::CountedUnless { triggered_ns },
+            None => Label::Counted,
+        };
+        let taken = self.hand_on(received, label)?;
         let Some(wanted) = self.ahead.front().and_then(|front| front.work.as_mut()) else { return Ok(()) };
         match taken {
             Taken::Passed => wanted.passed += 1,
@@ -285,20 +301,34 @@ impl Sequencer {
         Ok(())
     }
 
-    /// The settings in force are so no more at the frame `seq`; ids from `since_seq` on that are not there are lost frames.
-    fn close_front(&mut self, since_seq: u64, seq: u64) -> Result<(), DeviceError> {
-        let Some(mut over) = self.ahead.pop() else { return Ok(()) };
-        let first_seq = over.certain().max(since_seq);
-        let end_seq = self.ahead.front().map_or(seq, |next| next.certain().min(seq));
-        let Some(wanted) = over.open() else { return Ok(()) };
-        if !wanted.is_begun {
+    /// Tells of the frames from `since_seq` on, below `seq`, that the job in force waited for and that never came.
+    fn note_lost(&mut self, since_seq: u64, seq: u64) -> Result<(), DeviceError> {
+        let Some(front) = self.ahead.front() else { return Ok(()) };
+        let lost = front.lost(since_seq, seq);
+        let Some(wanted) = front.open().filter(|_| !lost.is_empty()) else { return Ok(()) };
+        if !std::mem::replace(&mut wanted.is_begun, true) {
             self.input.send(Event::Begin(wanted.job)).map_err(closed)?;
         }
-        for lost_seq in first_seq..end_seq {
+        for lost_seq in lost {
             let cause = self.camera.loss_of(lost_seq);
             self.input.send(Event::Lost(lost_seq, Some(cause))).map_err(closed)?;
             self.told_seq = Some(lost_seq);
+            wanted.passed += 1;
         }
-        self.input.send(Event::End).map_err(closed)
+        if wanted.is_complete() {
+            self.input.send(Event::End).map_err(closed)?;
+        }
+        Ok(())
+    }
+
+    /// Ends the job in force before its last frame, if it waits for any.
+    fn interrupt_if(&mut self, is_over: impl FnOnce(&Wanted) -> bool) -> Result<(), DeviceError> {
+        let wanted = self.ahead.front().and_then(|front| front.open());
+        let Some(wanted) = wanted.filter(|wanted| is_over(wanted)) else { return Ok(()) };
+        wanted.is_interrupted = true;
+        if !std::mem::replace(&mut wanted.is_begun, true) {
+            self.input.send(Event::Begin(wanted.job)).map_err(closed)?;
+        }
+        self.input.send(Event::Interrupt).map_err(closed)
     }
 }

@@ -306,6 +306,7 @@ fn play_plan(
                     id: SettingsId { point: index, attempt: 0 },
                     point: point(index, settings),
                     shot: shot(settings),
+                    interruptions: 0,
                 })
                 .collect(),
             not_before_ns: 0,
@@ -345,7 +346,7 @@ fn follow(
                 assert!(open.is_none(), "a job begins within another");
                 open = Some((job.id.point, 0));
             }
-            Event::Frame(frame, Label::Counted) => {
+            Event::Frame(frame, Label::Counted | Label::CountedUnless { .. }) => {
                 let (point, passed) = open.as_mut().expect("a job");
                 *passed += 1;
                 counted.push((*point, frame.stamp.seq));
@@ -354,7 +355,7 @@ fn follow(
                 }
             }
             Event::Idle => orders.give(Order::Go),
-            Event::End => {
+            Event::End | Event::Interrupt => {
                 let (point, passed) = open.take().expect("a job");
                 if passed < frames {
                     short.push(point);
