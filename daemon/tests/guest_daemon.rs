@@ -30,7 +30,7 @@ use thread_priority::{
 /// A line and a sample rate that software emulation keeps up with, also on a busy host.
 const PERIOD_NS: i64 = 50_000_000;
 const SAMPLE_RATE_HZ: u32 = 100_000;
-const POINTS: usize = 8;
+const POINTS: usize = 12;
 const FRAMES: u32 = 2;
 /// Frames are tied to edges within 200 us.
 const MAX_JITTER_US: f64 = 180.0;
@@ -191,18 +191,20 @@ fn an_analyser_that_halts_stops_or_is_unplugged_within_a_sweep_costs_the_frames_
     let latency_us = lateness_us();
     let (first, faults) = plug(signal(0.0, 0.0));
     let mut plugged = Some(first);
-    // How often it had been started before each of them.
-    let mut starts = Vec::new();
+    // How often it had been started before each of them. Points whose frames were exposed before a fault are stored after
+    // it, so that the next one waits until the analyser has been started again.
+    let mut starts = vec![0];
     let state = Lab::new(latency_us).sweep(|stored| match starts.len() {
-        0 if stored >= 3 => {
+        _ if starts.last() == Some(&faults.starts()) => {}
+        1 if stored >= 3 => {
             starts.push(faults.starts());
             faults.stall();
         }
-        1 if stored >= 5 => {
+        2 if stored >= 5 => {
             starts.push(faults.starts());
             faults.overrun();
         }
-        2 if stored >= 7 => {
+        3 if stored >= 7 => {
             starts.push(faults.starts());
             plugged = None;
             std::thread::sleep(Duration::from_secs(3));
@@ -210,7 +212,7 @@ fn an_analyser_that_halts_stops_or_is_unplugged_within_a_sweep_costs_the_frames_
         }
         _ => {}
     });
-    assert!(starts.len() == 3 && starts.is_sorted_by(|a, b| a < b), "{starts:?}");
+    assert!(starts.len() == 4 && starts.is_sorted_by(|a, b| a < b), "{starts:?}");
     assert_tied(&state);
     assert!(state.counts.lost[&LossCause::EdgeMissing] > 0, "{:?}", state.counts);
 }

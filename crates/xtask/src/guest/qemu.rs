@@ -9,8 +9,7 @@ use super::kernel::Kernel;
 use crate::run::Done;
 
 /// The guest falls back to a slower clock and to mitigations that emulation does not need, unless told not to.
-const KERNEL_ARGUMENTS: &str =
-    "console=ttyS0 loglevel=4 panic=-1 tsc=reliable clocksource=tsc mitigations=off";
+const KERNEL_ARGUMENTS: &str = "console=ttyS0 loglevel=4 panic=-1 clocksource=hpet mitigations=off";
 
 /// A running guest, killed when dropped.
 pub struct Machine(Child);
