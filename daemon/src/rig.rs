@@ -1,6 +1,7 @@
 //! The factory: from a rig file to open devices.
 
 mod dots;
+mod simulated;
 mod vsync;
 
 use std::path::{Path, PathBuf};
@@ -12,10 +13,11 @@ use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, V
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
 use raysweep_drivers::projector::external::{External, Request};
-use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
-use raysweep_sim::{PlaneRig, PlaneSetup};
+use raysweep_sim::PlaneRig;
 
 use crate::config::{CameraDriver, ConfigError, DrmSection, ProjectorDriver, RigFile, RigKind, VsyncDriver};
+
+use self::simulated::{Simulated, simulate};
 
 pub use self::dots::{DotDevices, DotRig, Stand};
 
@@ -81,7 +83,8 @@ pub struct Rig {
     pub file: RigFile,
     /// The file's text, as sessions keep it.
     pub text: String,
-    sim: Arc<PlaneRig>,
+    /// The simulated rig, where any of its devices is simulated.
+    sim: Option<Arc<PlaneRig>>,
 }
 
 /// The open devices of a rig.
@@ -119,30 +122,24 @@ impl Rig {
             .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
         let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
         let mut file = RigFile::parse(&text).map_err(shown)?;
-        let setup = PlaneSetup {
-            raster: file.raster(),
-            camera_row_time_us: file.camera_row_time_us(),
-            row_pitch: file.camera.row_pitch,
-            white_dn: file.camera.white_dn(),
-            black_dn: file.camera.black_dn(),
-            format: file.camera.pixel_format,
-            first_row: file.camera.first_projector_row,
-        };
         let folder = path.parent().unwrap_or(Path::new("."));
         file.sim.bench = file.sim.bench.map(|bench| folder.join(bench));
-        let sim = PlaneRig::new(file.sim.clone(), setup, folder).map_err(|error| {
-            let path: Vec<&str> = ["sim"].into_iter().chain(error.key().split('.')).collect();
-            shown(ConfigError::at(&text, &path, error.to_string()))
-        })?;
-        let sim = Arc::new(sim);
-        Ok(Self { file, text, sim })
+        let simulate = || {
+            simulate(&file, folder).map_err(|error| {
+                let path: Vec<&str> = ["sim"].into_iter().chain(error.key().split('.')).collect();
+                shown(ConfigError::at(&text, &path, error.to_string()))
+            })
+        };
+        let sim = file.has_simulated_device().then(simulate).transpose()?;
+        Ok(Self { sim: sim.map(Arc::new), file, text })
     }
 
     /// Projector row that row 0 of its camera sees.
     pub fn first_row(&self, camera: &CameraCapabilities) -> usize {
         let RigFile { camera: section, projector, sim, .. } = &self.file;
-        if section.driver == CameraDriver::Sim || sim.bench.is_some() {
-            return self.sim.first_row();
+        let is_simulated = section.driver == CameraDriver::Sim || sim.bench.is_some();
+        if let Some(sim) = self.sim.as_ref().filter(|_| is_simulated) {
+            return sim.first_row();
         }
         let middle = projector.rows.saturating_sub(self.projector_rows_of(camera)) / 2;
         section.first_projector_row.unwrap_or(middle)
@@ -166,9 +163,9 @@ impl Rig {
         )))
     }
 
-    /// The simulated rig.
-    pub fn simulated(&self) -> &PlaneRig {
-        &self.sim
+    /// The simulated rig, where any of its devices is simulated.
+    pub fn simulated(&self) -> Option<&PlaneRig> {
+        self.sim.as_deref()
     }
 
     /// Opens all devices.
@@ -176,38 +173,30 @@ impl Rig {
     /// # Errors
     /// The first device that does not open.
     pub fn open(&self) -> Result<Devices, RigError> {
-        if self.file.sim.bench.is_some() && self.file.camera.driver == CameraDriver::Sim {
-            let message = "sim.bench: the camera of a bench is reached over its wire: set camera.driver to the driver that does, or leave sim.bench out";
-            return Err(RigError::Config(message.into()));
-        }
         self.check_pace()?;
-        let sim = self.sim.open();
-        let vsync: Box<dyn Vsync> = match (vsync::open(&self.file.vsync)?, &self.file.sim.bench) {
-            (Some(real), _) => real,
-            (None, Some(bench)) => Box::new(RemoteVsync::open(bench)?),
-            (None, None) => sim.vsync,
+        let mut simulated = Simulated::open(self)?;
+        let vsync = match vsync::open(&self.file.vsync)? {
+            Some(real) => real,
+            None => simulated.vsync()?,
         };
-        let (projector, questions): (Box<dyn Projector>, _) =
-            match (self.file.projector.driver, &self.file.sim.bench) {
-                (ProjectorDriver::Drm, _) => (Box::new(self.open_drm()?), None),
-                (ProjectorDriver::External, _) => {
-                    // A run that waits for its operator can be cancelled, so no patience ends before the operator's.
-                    let (projector, questions) = External::new(Duration::MAX);
-                    (Box::new(projector), Some(questions))
-                }
-                (ProjectorDriver::Sim, Some(bench)) => (Box::new(RemoteProjector::open(bench)?), None),
-                (ProjectorDriver::Sim, None) => (sim.projector, None),
-            };
-        let camera = match self.file.camera.driver {
-            CameraDriver::Sim => sim.camera,
-            CameraDriver::Aravis => self.open_aravis()?,
-            CameraDriver::V4l2 => self.open_v4l2()?,
+        let (projector, questions): (Box<dyn Projector>, _) = match self.file.projector.driver {
+            ProjectorDriver::Drm => (Box::new(self.open_drm()?), None),
+            ProjectorDriver::External => {
+                // A run that waits for its operator can be cancelled, so no patience ends before the operator's.
+                let (projector, questions) = External::new(Duration::MAX);
+                (Box::new(projector), Some(questions))
+            }
+            ProjectorDriver::Sim => (simulated.projector()?, None),
+        };
+        // Real devices know no time but the machine's, also where others of the rig are simulated.
+        let (camera, clock) = match self.file.camera.driver {
+            CameraDriver::Sim => simulated.camera()?,
+            CameraDriver::Aravis => (self.open_aravis()?, Clock::real()),
+            CameraDriver::V4l2 => (self.open_v4l2()?, Clock::real()),
         };
         self.check_rows(camera.capabilities())?;
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
-        // Real devices know no time but the machine's, also where others of the rig are simulated.
-        let clock = if self.file.camera.driver == CameraDriver::Sim { sim.clock } else { Clock::real() };
         Ok(Devices { camera, vsync, projector, questions, clock, pace })
     }
 
@@ -274,6 +263,24 @@ fn built_without_aravis() -> RigError {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_rig_of_real_devices_has_no_simulation_that_must_fit_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let load = |driver: &str| {
+            let text = format!(
+                "kind = \"plane\"\n[camera]\ndriver = \"v4l2\"\nfirst_projector_row = 650\n[camera.v4l2]\ndevice = \"/nowhere\"\nwidth = 8\nheight = 8\n\
+                 [vsync]\ndriver = \"fx2lafw\"\n[projector]\ndriver = \"{driver}\"\n"
+            );
+            let path = folder.path().join("rig.toml");
+            std::fs::write(&path, text).unwrap();
+            Rig::load(&path)
+        };
+        assert!(load("external").unwrap().simulated().is_none());
+        // The simulated scene has 128 rows, and the projector 720.
+        let Err(error) = load("sim") else { panic!("the scene does not fit") };
+        assert!(error.to_string().contains("sim.scene has 128 rows"), "{error}");
+    }
 
     #[test]
     fn a_bench_stands_beside_the_rig_file_and_goes_with_a_camera_on_a_wire() {

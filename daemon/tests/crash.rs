@@ -246,6 +246,7 @@ fn outcomes_from_every_line(rig: &str, plan_text: &str) -> Vec<(usize, Outcome)>
     let mut outcomes = vec![(lines.len(), outcome(&session))];
     for kept in 1..lines.len() {
         std::fs::write(session.join("ledger.jsonl"), lines[..kept].concat()).unwrap();
+        let _ = std::fs::remove_dir_all(session.join("products"));
         let (session, state) = end(&mut daemon, |client| drop(client.resume(&session).unwrap()));
         assert_eq!(state, "complete", "resumed after line {kept}");
         outcomes.push((kept, outcome(&session)));

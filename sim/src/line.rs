@@ -234,8 +234,9 @@ impl Line {
             self.seen.push_back(Edge { seq: self.edges, host_ns: edge.at_ns });
         }
         // False edges are keyed by the frame before them. One that triggered the first frame under new settings would
-        // make a point depend on the point before it, which a resumed run may not have taken.
-        let is_heard = edge.kind != EdgeKind::False || self.camera.due().1 > 0;
+        // make a point depend on the point before it, which a resumed run may not have taken; a sequence is never resumed.
+        let is_first = self.camera.due().1 == 0 && self.camera.sequence.is_none();
+        let is_heard = edge.kind != EdgeKind::False || !is_first;
         let by_edges = self.camera.triggered_by == TriggeredBy::Edges;
         if by_edges && is_heard && self.trigger(edge.at_ns) && edge.kind == EdgeKind::False {
             self.truth.false_triggers += 1;

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::process::Command;
 
 fn allowed() -> BTreeMap<&'static str, &'static [&'static str]> {
@@ -62,6 +63,33 @@ fn crates_depend_on_each_other_as_allowed() {
         assert!(name != "xtask" || external == 0, "xtask depends on nothing but std");
     }
     assert_eq!(seen.len(), allowed.len(), "crates are missing: {seen:?}");
+}
+
+/// Where the daemon may name the simulator: the factory, the types of the section `[sim]`, and the simulated camera's program.
+const KNOW_THE_SIMULATOR: [&str; 5] =
+    ["src/rig.rs", "src/rig/", "src/config/rig.rs", "src/config/dots.rs", "src/bin/raysweep-sim-camera.rs"];
+
+#[test]
+fn only_the_factory_knows_that_devices_may_be_simulated() {
+    let daemon = Path::new(env!("CARGO_MANIFEST_DIR")).join("../daemon");
+    let mut folders = vec![daemon.join("src")];
+    let mut named = 0;
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if std::fs::read_to_string(&path).unwrap().contains("raysweep_sim") {
+                let file = path.strip_prefix(&daemon).unwrap().to_str().unwrap();
+                assert!(
+                    KNOW_THE_SIMULATOR.iter().any(|known| file.starts_with(known)),
+                    "{file} names raysweep_sim"
+                );
+                named += 1;
+            }
+        }
+    }
+    assert!(named > 1, "nothing names raysweep_sim: is it called otherwise?");
 }
 
 #[test]

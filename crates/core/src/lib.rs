@@ -15,6 +15,7 @@ mod mirror;
 mod pattern;
 mod pixel;
 mod raster;
+mod subject;
 mod units;
 
 pub use clock::{Clock, ClockHandle};
@@ -34,4 +35,5 @@ pub use mirror::{
 pub use pattern::{Pattern, PatternError};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
+pub use subject::Subject;
 pub use units::{ns_from_us, us_from_ns};

@@ -61,7 +61,7 @@ pub enum Event {
     Lost(u64, Option<LossCause>),
     /// The attempt is over: all its frames have come or were lost on their way.
     End,
-    /// The attempt is over before its last frame: other settings, or the end of the pass, came first.
+    /// The attempt is over before its last frame: frames of other settings came first, or the camera was away.
     Interrupt,
     /// Nobody takes frames for a while: those that pass are nobody's loss.
     Idle,
@@ -153,8 +153,8 @@ struct Attempt {
     delays_us: Vec<f64>,
     counts: Counts,
     last_exposure_ns: Option<i64>,
-    /// Whether a frame of its own may have been taken for one of the settings before: those after it do not count.
-    is_interrupted: bool,
+    /// Whether one of its frames may have been exposed under the settings before: none after it counts.
+    is_doubtful: bool,
     chain: Chain,
 }
 
@@ -285,7 +285,7 @@ impl Assembler {
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
             last_exposure_ns: None,
-            is_interrupted: false,
+            is_doubtful: false,
             chain,
         });
     }
@@ -385,7 +385,8 @@ impl Assembler {
             Verdict::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
             Verdict::Unsound { trigger, cause } => (trigger, Err(cause)),
             Verdict::Doubtful => {
-                attempt.is_interrupted = true;
+                attempt.is_doubtful = true;
+                attempt.chain.untied += 1;
                 attempt.counts.settling += 1;
                 return;
             }
@@ -400,7 +401,7 @@ impl Assembler {
             None => attempt.chain.untied += 1,
         }
         match sound {
-            Ok(_) if attempt.averaged == attempt.job.frames || attempt.is_interrupted => {
+            Ok(_) if attempt.averaged == attempt.job.frames || attempt.is_doubtful => {
                 attempt.counts.cancelled += 1;
             }
             Ok(delay_us) => {
@@ -436,7 +437,7 @@ impl Attempt {
         if self.averaged < self.job.frames {
             // Sound frames of an attempt that lacks others are not kept: the point is taken again as a whole.
             self.counts.cancelled += std::mem::take(&mut self.counts.averaged);
-            let failure = if self.is_interrupted { Failure::Interrupted } else { failure };
+            let failure = if self.is_doubtful { Failure::Interrupted } else { failure };
             return Decision::Failed(self.job.id, failure, self.counts);
         }
         Decision::Unit(Unit {

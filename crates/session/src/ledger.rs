@@ -47,6 +47,17 @@ pub enum Entry {
         /// What became of its frames.
         counts: Counts,
     },
+    /// An attempt at a point ended before its last frame, by no fault of its own: it is made again under its number.
+    AttemptInterrupted {
+        /// The array of the stack.
+        array: ArrayName,
+        /// Its first index.
+        index: usize,
+        /// Counted from 0.
+        attempt: u32,
+        /// What became of its frames.
+        counts: Counts,
+    },
     /// A point is stored, and a stage failed on it: the results of this run lack it.
     StageFailed {
         /// The array of the stack.
@@ -290,8 +301,8 @@ impl State {
         (0..self.session.shape.len(array)).filter(move |&index| self.point(array, index).is_none())
     }
 
-    /// The number of the next attempt at a point: attempts that reached the ledger are never repeated, the one that
-    /// a crash cut short is.
+    /// The number of the next attempt at a point: attempts that were stored or failed are never repeated, those that were
+    /// interrupted, or cut short by a crash, are.
     pub fn next_attempt(&self, array: ArrayName, index: usize) -> u32 {
         self.next_attempts.get(&(array, index)).copied().unwrap_or(0)
     }
@@ -301,6 +312,7 @@ impl State {
             Entry::Session(_) => Err("a `session` entry may only be the first line".into()),
             Entry::Point(PointEntry { array, index, .. })
             | Entry::AttemptFailed { array, index, .. }
+            | Entry::AttemptInterrupted { array, index, .. }
             | Entry::StageFailed { array, index, .. } => {
                 let len = self.session.shape.len(*array);
                 if *index < len {
@@ -371,7 +383,7 @@ impl State {
             }
             Entry::CycleLost { counts, .. } | Entry::BatchLost { counts, .. } => self.counts.add(counts),
             Entry::Film(film) => self.film = Some(film.clone()),
-            Entry::Outside { counts } => self.counts.add(counts),
+            Entry::Outside { counts } | Entry::AttemptInterrupted { counts, .. } => self.counts.add(counts),
             Entry::StageFailed { .. } => {}
             Entry::End(end) => self.end = Some(end.clone()),
         }

@@ -64,7 +64,10 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     }
     let path = arguments.rig.as_ref().ok_or("neither --rig nor --test-pictures is given")?;
     let rig = Rig::load(path)?;
-    let WireDevices { camera, vsync, projector, truth } = rig.simulated().open_for_wire();
+    let sim = rig
+        .simulated()
+        .ok_or("no device of the rig file has the driver `sim`, and it names no `sim.bench`")?;
+    let WireDevices { camera, vsync, projector, truth } = sim.open_for_wire();
     let camera = Arc::new(GigeCamera::start(&setup, camera)?);
     let bench = rig.file.sim.bench.as_deref();
     let _bench =

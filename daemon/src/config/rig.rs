@@ -12,7 +12,7 @@ use raysweep_sim::config::Spot as SimSpot;
 use raysweep_transport::plane::{PlaneError, RowTiming};
 use serde::Deserialize;
 
-use super::{ConfigError, VsyncSection};
+use super::{ConfigError, VsyncDriver, VsyncSection};
 
 /// A rig.
 #[derive(Debug, Clone, Deserialize)]
@@ -264,6 +264,14 @@ impl RigFile {
         }
         rig.check(text)?;
         Ok(rig)
+    }
+
+    /// Whether any of its devices is simulated, in this process or on a bench.
+    pub fn has_simulated_device(&self) -> bool {
+        self.camera.driver == CameraDriver::Sim
+            || self.vsync.driver == VsyncDriver::Sim
+            || self.projector.driver == ProjectorDriver::Sim
+            || self.sim.bench.is_some()
     }
 
     /// When the projector lights its rows.

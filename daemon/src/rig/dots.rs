@@ -4,13 +4,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror};
+use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror, Subject};
 use raysweep_drivers::camera::replay::{ReplayCamera, ReplayConfig, ReplayPace};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::mirror::{
     LightGuard, Mti, MtiConfig, Optotune, OptotuneConfig, PlayzerX, PlayzerXConfig, RtsLaser,
 };
-use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, Subject, SubjectSwitch};
+use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, SubjectSwitch};
 
 use super::{Pace, RigError};
 use crate::config::{ConfigError, DotCameraDriver, DotRigFile, MirrorDriver};

@@ -33,7 +33,7 @@ pub struct Attempt {
     pub point: Point,
     /// How to set the camera for it.
     pub shot: Shot,
-    /// How often it was interrupted in this run.
+    /// How often it, the attempt of this number, was interrupted in this run.
     pub interruptions: u32,
 }
 

@@ -79,7 +79,7 @@ pub enum RunError {
     Plan(#[from] ConfigError),
     /// Points failed again and again.
     #[error(
-        "{points} points failed in {FRUITLESS_PASSES} passes in a row, at last by {}; the ledger has the causes of each. Mend them and resume the session",
+        "{points} points failed in {FRUITLESS_PASSES} passes in a row; frames of the last pass: {}, {interrupted} attempts interrupted. The ledger has the causes of each; mend them and resume the session",
         .counts.losses()
     )]
     Hopeless {
@@ -87,6 +87,8 @@ pub enum RunError {
         points: usize,
         /// Of the last pass.
         counts: Counts,
+        /// Attempts of the last pass that ended before their last frame.
+        interrupted: usize,
     },
     /// A thread of the run is gone; another error says which and why.
     #[error(
@@ -421,7 +423,8 @@ impl Passes<'_> {
             }
             fruitless = if todo.len() < before { 0 } else { fruitless + 1 };
             if fruitless == FRUITLESS_PASSES {
-                return Err(RunError::Hopeless { points: todo.len(), counts });
+                let interrupted = todo.iter().filter(|attempt| attempt.interruptions > 0).count();
+                return Err(RunError::Hopeless { points: todo.len(), counts, interrupted });
             }
             if fruitless > 0 && self.pace == Pace::Devices {
                 self.orders.rest(FIRST_REST * (1 << (fruitless - 1)));

@@ -148,12 +148,10 @@ impl Storage {
         if counts.lost_total() > 0 {
             self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() });
         }
+        let (attempt, of_attempt) = (id.attempt, counts.clone());
         self.append(&match failure {
-            Failure::Losses => {
-                Entry::AttemptFailed { array, index, attempt: id.attempt, counts: counts.clone() }
-            }
-            // The point is not to blame: this run, or one that resumes it, makes the same attempt again.
-            Failure::Interrupted => Entry::Outside { counts: counts.clone() },
+            Failure::Losses => Entry::AttemptFailed { array, index, attempt, counts: of_attempt },
+            Failure::Interrupted => Entry::AttemptInterrupted { array, index, attempt, counts: of_attempt },
         });
         self.tell(Verdict::Failed(id, failure, counts));
     }

@@ -293,7 +293,7 @@ fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &Plan) {
 
 /// One frame of the simulated camera itself, without wire or daemon.
 fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -> Vec<u32> {
-    let scene: &PlaneRig = rig.simulated();
+    let scene: &PlaneRig = rig.simulated().unwrap();
     let Devices { mut camera, mut projector, vsync, .. } = scene.open();
     // Time waits for every device.
     drop(vsync);
@@ -320,6 +320,6 @@ fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -
 
 /// What a delay and an exposure are set to.
 fn trigger_delay_us(rig: &Rig, delay_us: f64, exposure_us: f64) -> f64 {
-    let scene: &PlaneRig = rig.simulated();
+    let scene: &PlaneRig = rig.simulated().unwrap();
     rig.file.raster().trigger(scene.first_row(), delay_us, exposure_us, LATENCY_US).trigger_delay_us
 }

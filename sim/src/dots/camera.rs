@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, ClockHandle, DeviceError, DeviceErrorKind,
-    DeviceState, FirstFrame, FrameBuf, FrameStamp, Readout, SettingsId, Shutter,
+    DeviceState, FirstFrame, FrameBuf, FrameStamp, Readout, SettingsId, Shutter, Subject,
 };
 
 use super::scene::{Light, Still};
-use super::world::{Due, FrameFate, Next, Subject, World};
+use super::world::{Due, FrameFate, Next, World, even_light};
 use crate::sensor::Exposed;
 
 /// The trailing dot's standard deviation, in parts of the margin's rows.
@@ -103,7 +103,7 @@ impl DotCamera {
             .zip(direct.iter().zip(global))
             .for_each(|(sum, (direct, global))| *sum = direct + global);
         margin.iter_mut().zip(&self.trailing).for_each(|(sum, light)| *sum = light * trailing as f32);
-        if let Some(even) = due.subject.even_light() {
+        if let Some(even) = even_light(due.subject) {
             self.sensor_light.fill(even);
         }
         if due.fate == FrameFate::Saturated {

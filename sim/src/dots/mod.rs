@@ -18,4 +18,4 @@ mod world;
 pub use config::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
 pub use rig::{DotsDevices, DotsError, DotsRig, DotsSetup};
 pub use scene::{BUILTIN_NAMES, DotSceneError};
-pub use world::{DotsTruth, FrameFate, FrameTruth, Subject, SubjectSwitch};
+pub use world::{DotsTruth, FrameFate, FrameTruth, SubjectSwitch};

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use raysweep_core::{Clock, DeviceError, DeviceErrorKind, MirrorPath, ns_from_us};
+use raysweep_core::{Clock, DeviceError, DeviceErrorKind, MirrorPath, Subject, ns_from_us};
 
 use super::rig::Bench;
 use super::scan::{Lit, Scan};
@@ -12,25 +12,12 @@ use crate::keyed::{Purpose, keyed, uniform};
 /// Frames that a camera by the host's clock keeps for a host that is late.
 const CAMERA_BUFFERS: u64 = 64;
 
-/// What stands before the camera.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Subject {
-    /// The scene.
-    Scene,
-    /// One of the Lambertian planes, by its number in the rig file.
-    Plane(usize),
-    /// An evenly lit diffuser right before the lens.
-    Diffuser,
-}
-
 /// What a pixel sees of the diffuser, in parts of a white plane: its lamp is dimmed until the exposure suits.
 const DIFFUSER_LIGHT: f32 = 0.6;
 
-impl Subject {
-    /// Light that is the same in every pixel, whatever the mirror does.
-    pub(super) fn even_light(self) -> Option<f32> {
-        matches!(self, Self::Diffuser).then_some(DIFFUSER_LIGHT)
-    }
+/// Light that is the same in every pixel, whatever the mirror does.
+pub(super) fn even_light(subject: Subject) -> Option<f32> {
+    (subject == Subject::Diffuser).then_some(DIFFUSER_LIGHT)
 }
 
 /// Puts planes before the camera, as an operator would.
@@ -112,7 +99,7 @@ impl DotsTruth {
         let (mut scan, still, frame) = {
             let state = self.0.lock();
             let (record, frame) = state.record_of(seq)?;
-            if let Some(even) = record.subject.even_light() {
+            if let Some(even) = even_light(record.subject) {
                 let Light { direct, mut global } = self.0.dark();
                 global.fill(even);
                 return Some((direct, global));

@@ -296,7 +296,7 @@ impl Ahead {
         }
     }
 
-    /// The last frame that a job waits for, if none is lost.
+    /// The last frame before which no other settings are to act: a job's last, and its margin.
     fn end_seq(&self, written: &Written, wanted: &Wanted) -> u64 {
         let next_seq = self.newest_seq.map_or(0, |seq| seq + 1);
         let first_seq = if wanted.passed > 0 { next_seq } else { written.planned().max(next_seq) };
@@ -379,6 +379,7 @@ impl Ahead {
         let trigger_ns = self.trigger_of(stamp);
         self.learn(stamp.seq, stamp.exposure_start_ns, trigger_ns);
         let owner = self.owner(stamp);
+        let in_force = self.possible(stamp.seq).map(|candidates| *candidates.start());
         let since_seq = self.newest_seq.map_or(stamp.seq, |newest| newest + 1);
         self.newest_seq = Some(stamp.seq);
         self.frames_carry_exposure = stamp.exposure_us.is_some();
@@ -386,11 +387,12 @@ impl Ahead {
             return Seen { owner, else_triggered_ns: None, late_frames: None, since_seq };
         };
         let is_by_stamps = stamp.seq < written.certain();
+        let in_force = in_force.filter(|in_force| is_by_stamps && owner != Some(*in_force));
         written.seen_seq = written.seen_seq.min(stamp.seq);
         let (settings, (next_seq, latest_seq)) = (written.settings, written.next_seq);
         let is_new = owner > Some(0);
-        let in_force = self.written.front().filter(|_| is_new && is_by_stamps);
-        let else_triggered_ns = in_force.map(|in_force| self.trigger_ns(stamp, &in_force.settings));
+        let else_triggered_ns =
+            in_force.map(|in_force| self.trigger_ns(stamp, &self.written[in_force].settings));
         self.triggers.note(stamp.seq, self.trigger_ns(stamp, &settings));
         let late_frames = u32::try_from(stamp.seq.saturating_sub(next_seq)).ok();
         let is_first = is_new && since_seq == stamp.seq;

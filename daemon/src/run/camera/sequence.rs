@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use raysweep_core::{Applied, Camera, CameraSettings, DeviceError, DeviceState, SettingsId};
+use raysweep_core::{Applied, Camera, CameraSettings, DeviceError, DeviceState, LossCause, SettingsId};
 use raysweep_pipeline::{Event, Job, Label, Point, Role, Shot};
 
 use super::ahead::Wanted;
@@ -254,9 +254,7 @@ impl Sequencer {
     fn deliver(&mut self, received: Received) -> Result<(), DeviceError> {
         let (seq, seen) = (received.stamp.seq, received.seen);
         for _ in 0..seen.owner.unwrap_or(0) {
-            // Lost frames that may have had the next settings already are not held against this job.
-            let next_seq = self.ahead.second().map_or(seq, |next| next.earliest().min(seq));
-            self.note_lost(seen.since_seq, next_seq)?;
+            self.note_lost(seen.since_seq, self.next_earliest(seq))?;
             self.interrupt_if(|_| true)?;
             self.ahead.pop();
         }
@@ -265,6 +263,7 @@ impl Sequencer {
             self.note_lost(seen.since_seq, seq)?;
         } else {
             // One of a job's frames that may be another's: which frames it has must not depend on what comes after it.
+            self.note_lost(seen.since_seq, self.next_earliest(seq))?;
             self.interrupt_if(|wanted| wanted.passed > 0)?;
         }
         let Some(wanted) = self.ahead.front().filter(|_| is_owned).and_then(|front| front.open()) else {
@@ -301,11 +300,25 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Tells of the frames from `since_seq` on, below `seq`, that the job in force waited for and that never came.
+    /// The first frame, up to `seq`, that may have had the settings after those in force: lost ones from there on are not
+    /// held against the job in force.
+    fn next_earliest(&self, seq: u64) -> u64 {
+        self.ahead.second().map_or(seq, |next| next.earliest().min(seq))
+    }
+
+    /// Tells of the frames from `since_seq` on, below `seq`, that the job in force waited for and that never came. A camera
+    /// that was away interrupts the job: these are not its frames.
     fn note_lost(&mut self, since_seq: u64, seq: u64) -> Result<(), DeviceError> {
         let Some(front) = self.ahead.front() else { return Ok(()) };
         let lost = front.lost(since_seq, seq);
-        let Some(wanted) = front.open().filter(|_| !lost.is_empty()) else { return Ok(()) };
+        if lost.is_empty() {
+            return Ok(());
+        }
+        self.tell_losses(lost.start)?;
+        if lost.clone().any(|seq| self.camera.loss_of(seq) == LossCause::CameraLost) {
+            return self.interrupt_if(|_| true);
+        }
+        let Some(wanted) = self.ahead.front().and_then(|front| front.open()) else { return Ok(()) };
         if !std::mem::replace(&mut wanted.is_begun, true) {
             self.input.send(Event::Begin(wanted.job)).map_err(closed)?;
         }

@@ -10,14 +10,13 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use raysweep_core::{Counts, FramePool, SettingsId};
+use raysweep_core::{Counts, FramePool, SettingsId, Subject};
 use raysweep_pipeline::dots::{DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
 use raysweep_pipeline::{Policy, Registry};
 use raysweep_proto::RunState;
 use raysweep_session::Session;
 use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::{Entry, Ledger};
-use raysweep_sim::dots::Subject;
 use raysweep_transport::dots::{DotsError, FlatField};
 
 use self::camera::Refused;

@@ -3,10 +3,9 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 
-use raysweep_core::{Camera, Clock, FramePool, MirrorPath};
+use raysweep_core::{Camera, Clock, FramePool, MirrorPath, Subject};
 use raysweep_pipeline::dots::{Arrival, Loss};
 use raysweep_pipeline::{PipelineError, message_of};
-use raysweep_sim::dots::Subject;
 
 use super::camera::{Refused, Source, Wanted};
 use super::motion::Motion;

@@ -4,12 +4,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use raysweep_core::{Counts, FramePool, SettingsId};
+use raysweep_core::{Counts, FramePool, SettingsId, Subject};
 use raysweep_pipeline::dots::{Arrival, DarkRun, Loss, Sensor};
 use raysweep_proto::{Event, RunState};
 use raysweep_session::Session;
 use raysweep_session::ledger::{AxisEntry, Entry, Ledger};
-use raysweep_sim::dots::Subject;
 
 use super::FRAMES_AT_WORK;
 use super::camera::Refused;

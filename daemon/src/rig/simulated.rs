@@ -1,0 +1,80 @@
+//! The simulated devices of a plane rig: all of one world, on one clock, in this process or on a bench in another.
+
+use std::path::{Path, PathBuf};
+
+use raysweep_core::{Camera, Clock, Projector, Vsync};
+use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
+use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimError};
+
+use super::{Rig, RigError};
+use crate::config::{CameraDriver, RigFile};
+
+/// Makes the simulated rig that a file describes; scenes lie beside it, in `folder`.
+pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimError> {
+    let setup = PlaneSetup {
+        raster: file.raster(),
+        camera_row_time_us: file.camera_row_time_us(),
+        row_pitch: file.camera.row_pitch,
+        white_dn: file.camera.white_dn(),
+        black_dn: file.camera.black_dn(),
+        format: file.camera.pixel_format,
+        first_row: file.camera.first_projector_row,
+    };
+    PlaneRig::new(file.sim.clone(), setup, folder)
+}
+
+/// The devices of a simulated rig, to be taken one by one; those that real ones stand in for are dropped.
+#[derive(Default)]
+pub(super) struct Simulated {
+    camera: Option<(Box<dyn Camera>, Clock)>,
+    vsync: Option<Box<dyn Vsync>>,
+    projector: Option<Box<dyn Projector>>,
+    /// Where another process has them.
+    bench: Option<PathBuf>,
+}
+
+impl Simulated {
+    /// Opens what is simulated of a rig, which may be nothing.
+    pub(super) fn open(rig: &Rig) -> Result<Self, RigError> {
+        match (&rig.file.sim.bench, rig.simulated()) {
+            (Some(_), _) if rig.file.camera.driver == CameraDriver::Sim => {
+                let message = "sim.bench: the camera of a bench is reached over its wire: set camera.driver to the driver that does, or leave sim.bench out";
+                Err(RigError::Config(message.into()))
+            }
+            (Some(bench), _) => Ok(Self { bench: Some(bench.clone()), ..Self::default() }),
+            (None, Some(sim)) => {
+                let Devices { camera, vsync, projector, clock, .. } = sim.open();
+                let camera = Some((camera, clock));
+                Ok(Self { camera, vsync: Some(vsync), projector: Some(projector), bench: None })
+            }
+            (None, None) => Ok(Self::default()),
+        }
+    }
+
+    /// The camera, and the clock of its stamps.
+    pub(super) fn camera(&mut self) -> Result<(Box<dyn Camera>, Clock), RigError> {
+        self.camera.take().ok_or_else(|| not_simulated("camera"))
+    }
+
+    /// The watcher of the VSYNC line.
+    pub(super) fn vsync(&mut self) -> Result<Box<dyn Vsync>, RigError> {
+        match &self.bench {
+            Some(bench) => Ok(Box::new(RemoteVsync::open(bench)?)),
+            None => self.vsync.take().ok_or_else(|| not_simulated("vsync")),
+        }
+    }
+
+    /// The projector.
+    pub(super) fn projector(&mut self) -> Result<Box<dyn Projector>, RigError> {
+        match &self.bench {
+            Some(bench) => Ok(Box::new(RemoteProjector::open(bench)?)),
+            None => self.projector.take().ok_or_else(|| not_simulated("projector")),
+        }
+    }
+}
+
+fn not_simulated(section: &str) -> RigError {
+    RigError::Config(format!(
+        "{section}.driver: nothing of this rig is simulated; name the driver of a real device"
+    ))
+}
