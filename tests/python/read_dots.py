@@ -1,6 +1,6 @@
 """Prints sum of values, number of pixels, and the sum of the residual times its pixels, of batches of `dots.zarr`.
 
-Run as `python read_dots.py SESSION BATCH...`; the columns are read as docs/plan.md shows.
+Run as `python read_dots.py SESSION BATCH...`; the columns are read as docs/how-to/read-dots.md shows.
 """
 
 import json
@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 session, *batches = sys.argv[1:]
-page = (Path(__file__).resolve().parents[2] / "docs" / "plan.md").read_text()
+page = (Path(__file__).resolve().parents[2] / "docs" / "how-to" / "read-dots.md").read_text()
 example = re.search(r"```python\n(.*?)```", page, re.S).group(1)
 for batch in batches:
     names = {"session": session}

@@ -246,7 +246,7 @@ fn an_estimate_that_fails_or_hangs_costs_the_run_nothing() {
     }
 }
 
-/// Reads with the example of `docs/socket.md` while it is written, and checks that each image is whole.
+/// Reads with the example of `docs/reference/socket.md` while it is written, and checks that each image is whole.
 const RACE: &str = "
 reads, last = 0, 0
 while last < 3000:
@@ -265,7 +265,7 @@ fn numpy_reads_the_live_file_as_documented_also_while_it_is_written() {
     let python = std::env::var_os("RAYSWEEP_PYTHON").expect(
         "RAYSWEEP_PYTHON names a Python with tests/python/requirements.txt: `cargo xtask test` makes one",
     );
-    let docs = std::fs::read_to_string(data("").join("../../docs/socket.md")).unwrap();
+    let docs = std::fs::read_to_string(data("").join("../../docs/reference/socket.md")).unwrap();
     let (_, section) = docs.split_once("## Live images").unwrap();
     let example = section.split("```python\n").nth(1).unwrap().split("```").next().unwrap();
 

@@ -1,7 +1,7 @@
 //! The layout of the live file: the newest images of a run, in memory that clients map.
 //!
 //! All numbers are little-endian. The file starts with a header ([`HEADER`]), then come slots of equal size, each with
-//! one image behind a header of its own ([`SLOT`]). `docs/socket.md` says what the fields mean.
+//! one image behind a header of its own ([`SLOT`]). `docs/reference/socket.md` says what the fields mean.
 //!
 //! A reader takes the slot of the name with the largest sequence, copies it, and keeps the copy if the lock was even
 //! and the same before and after and the checksum holds; otherwise it tries again.

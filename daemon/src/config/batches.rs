@@ -355,7 +355,7 @@ mod tests {
         assert!((plan.camera_rate_hz() - 13_500.0).abs() < 1e-9);
         assert_eq!((plan.total(), plan.plane_of(1), plan.plane_of(2)), (14, Some(0), None));
         assert_eq!(plan.trailing_index(), 2249);
-        let page = include_str!("../../../docs/plan.md");
+        let page = include_str!("../../../docs/reference/plan.md");
         let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
         let documented = blocks.find(|block| block.contains("kind = \"batches\"")).unwrap();
         assert_eq!(Plan::parse(documented).unwrap().batches, plan);

@@ -413,7 +413,7 @@ mod tests {
 
     #[test]
     fn the_documented_rig_file_is_the_defaults() {
-        let page = include_str!("../../../docs/rig.md");
+        let page = include_str!("../../../docs/reference/rig.md");
         let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
         let documented = blocks.find(|block| block.contains("kind = \"dots\"")).unwrap();
         assert_eq!(

@@ -91,7 +91,7 @@ mod tests {
 
     #[test]
     fn the_default_film_is_the_documented_one_and_its_delays_follow_their_law() {
-        let page = include_str!("../../../docs/plan.md");
+        let page = include_str!("../../../docs/reference/plan.md");
         let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
         let documented = blocks.find(|block| block.contains("kind = \"film\"")).unwrap();
         let documented = Plan::parse(documented).unwrap();

@@ -331,7 +331,7 @@ mod tests {
 
     #[test]
     fn the_documented_plan_file_is_the_defaults() {
-        let page = include_str!("../../../docs/plan.md");
+        let page = include_str!("../../../docs/reference/plan.md");
         let documented = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
         let (documented, default) =
             (Plan::parse(documented).unwrap(), Plan::parse("kind = \"sweep\"").unwrap());

@@ -179,7 +179,7 @@ mod tests {
     #[test]
     fn the_default_is_the_documented_one_and_a_path() {
         let plan = parse("").unwrap();
-        let page = include_str!("../../../docs/plan.md");
+        let page = include_str!("../../../docs/reference/plan.md");
         let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
         let documented = blocks.find(|block| block.contains("kind = \"response\"")).unwrap();
         assert_eq!(Plan::parse(documented).unwrap().response, plan);

@@ -563,7 +563,7 @@ mod tests {
 
     #[test]
     fn the_documented_rig_file_is_the_defaults() {
-        let page = include_str!("../../../docs/rig.md");
+        let page = include_str!("../../../docs/reference/rig.md");
         let documented = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
         assert_eq!(
             format!("{:#?}", RigFile::parse(documented).unwrap()),

@@ -1,4 +1,4 @@
-//! What `docs/socket.md` promises.
+//! What `docs/reference/socket.md` promises.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use raysweep_proto::describe;
 
 use crate::fake::{Daemon, session};
 
-const DOCS: &str = include_str!("../../../docs/socket.md");
+const DOCS: &str = include_str!("../../../docs/reference/socket.md");
 
 #[test]
 fn the_tables_have_every_method_and_every_error() {
