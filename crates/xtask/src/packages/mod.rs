@@ -5,8 +5,7 @@ mod libclang;
 mod list;
 mod probe;
 
-use std::process::Command;
-
+use crate::rootfs::is_root;
 use crate::run::Done;
 use list::{Entry, PATH};
 
@@ -80,12 +79,6 @@ fn still_missing(entries: &[Entry]) -> Done {
 fn lines<'a>(entries: impl IntoIterator<Item = &'a Entry>) -> String {
     let line = |entry: &Entry| format!("  {}: {}", entry.name(), entry.why);
     entries.into_iter().map(line).collect::<Vec<_>>().join("\n")
-}
-
-/// Whether we may install packages.
-pub fn is_root() -> bool {
-    let uid = Command::new("id").arg("-u").output();
-    uid.is_ok_and(|output| output.stdout.trim_ascii() == b"0")
 }
 
 #[cfg(test)]
