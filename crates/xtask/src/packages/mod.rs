@@ -6,7 +6,7 @@ mod list;
 mod probe;
 
 use crate::rootfs::is_root;
-use crate::run::Done;
+use crate::run::{Done, say};
 use list::{Entry, PATH};
 
 /// What to do on systems that the list is not made for.
@@ -17,7 +17,7 @@ const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On ano
 pub fn print() -> Done {
     for entry in list::entries()? {
         let state = if entry.is_there() { "present" } else { "missing" };
-        println!("{state} {}: {}", entry.names.join("|"), entry.why);
+        say(&format!("{state} {}: {}", entry.names.join("|"), entry.why))?;
     }
     Ok(())
 }
