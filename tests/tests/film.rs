@@ -401,8 +401,12 @@ fn a_film_is_held_between_two_cycles_and_goes_on() {
 
 #[test]
 fn between_its_cycles_a_film_shows_sliding_estimates_where_there_is_time() {
-    // A solver that takes some ms, and cycles of a quarter of a second on the host's clock.
-    let rig = rig(60.0, "").replace("seed = 5", "seed = 5\nrealtime = true");
+    // A solver that takes some ms, and a line so slow that a cycle takes one and a half seconds of the host's clock: then
+    // there is time on a busy machine, too.
+    let rig = rig(60.0, "")
+        .replace("seed = 5", "seed = 5\nrealtime = true")
+        .replace("[vsync]\ndriver = \"sim\"\n", "[vsync]\ndriver = \"sim\"\nperiod_us = 100_000\n");
+    assert!(rig.contains("period_us"), "{rig}");
     let bench = Bench::new(&rig);
     let mut events = bench.runner.events();
     bench.runner.run(RunParams { plan: plan(4000), ..RunParams::default() }).unwrap();

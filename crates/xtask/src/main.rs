@@ -23,7 +23,8 @@ usage: cargo xtask <command>
   test    install what the tests need, then format, lints, tests, the guest's too; --no-guest leaves these out
   packages
           what the tests need of Debian, and whether it is there
-  fresh   both commands above on a bare Debian 12 and 13, each in a root file system made for it; [12|13]... only those
+  fresh   demo and test of the last commit on a bare Debian 12 and 13, each in a root file system made for it; [12|13]... only
+          those
   guest   the drivers' tests against real kernel drivers, in a QEMU guest; [TEST...] runs only those
   bench   measure: without a name, tells which benchmarks there are";
 

@@ -6,14 +6,15 @@ use std::process::Command;
 use crate::run::{Done, root, run, target};
 
 /// The Python of an environment with the packages that `requirements` in `tests/python` names; made anew whenever that
-/// file has changed.
+/// file has changed, or the system's Python, which it leads to, has gone.
 pub fn environment(name: &str, requirements: &str) -> Done<PathBuf> {
     let requirements = root().join("tests/python").join(requirements);
     let wanted =
         std::fs::read(&requirements).map_err(|error| format!("{}: {error}", requirements.display()))?;
     let venv = target().join(name);
     let (python, installed) = (venv.join("bin/python"), venv.join("requirements.txt"));
-    if std::fs::read(&installed).is_ok_and(|installed| installed == wanted) {
+    let starts = || Command::new(&python).arg("--version").output().is_ok_and(|it| it.status.success());
+    if std::fs::read(&installed).is_ok_and(|installed| installed == wanted) && starts() {
         return Ok(python);
     }
     eprintln!("making a Python environment with what {} names", requirements.display());

@@ -81,9 +81,13 @@ fn namespaces() -> Vec<&'static str> {
 }
 
 fn user_namespace() -> Vec<&'static str> {
+    if is_root() { Vec::new() } else { vec!["--user", "--map-root-user", "--map-auto"] }
+}
+
+/// Whether we may do everything.
+pub fn is_root() -> bool {
     let uid = Command::new("id").arg("-u").output();
-    let is_root = uid.is_ok_and(|output| output.stdout.trim_ascii() == b"0");
-    if is_root { Vec::new() } else { vec!["--user", "--map-root-user", "--map-auto"] }
+    uid.is_ok_and(|output| output.stdout.trim_ascii() == b"0")
 }
 
 /// The process that cleans up. Dropping it waits until it has.

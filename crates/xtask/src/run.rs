@@ -1,5 +1,6 @@
 //! Running other programs.
 
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -14,14 +15,31 @@ pub fn root() -> &'static Path {
 
 /// Where cargo puts what it builds.
 pub fn target() -> PathBuf {
-    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from)
+    named_target().unwrap_or_else(|| root().join("target"))
+}
+
+/// The folder that the environment names, as seen from where we were started.
+fn named_target() -> Option<PathBuf> {
+    std::path::absolute(std::env::var_os("CARGO_TARGET_DIR")?).ok()
 }
 
 /// The cargo that runs us.
 pub fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.current_dir(root());
+    // It runs in another folder than we do, from which a relative name would lead elsewhere.
+    if let Some(target) = named_target() {
+        command.env("CARGO_TARGET_DIR", target);
+    }
     command
+}
+
+/// Prints a line. A reader who has seen enough and left is no fault.
+pub fn say(line: &str) -> Done {
+    match writeln!(std::io::stdout(), "{line}") {
+        Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(format!("cannot print: {error}")),
+        _ => Ok(()),
+    }
 }
 
 /// Runs a program to its end and says which one failed.

@@ -1,14 +1,21 @@
 # Holds the list of packages against a bare Debian: $1 the root to make, $2 its suite, $3 packages that resemble listed ones,
-# $4 the executable of xtask. Prints a line for each entry: its names, what xtask says before, installed or already, after.
+# $4 the executable of xtask. Prints a line for each entry: its names, what xtask says before, installed or already, after;
+# or, at last, that there is no root to hold it against.
 root=$1 suite=$2 decoys=$3 xtask=$4
 
 mmdebstrap --mode=root --variant=minbase --quiet --skip=cleanup/apt --include="$decoys" \
     --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
-    --dpkgopt='path-exclude=/usr/share/man/*' "$suite" "$root"
+    --dpkgopt='path-exclude=/usr/share/man/*' "$suite" "$root" || { echo "no root"; exit 1; }
 cp "$xtask" "$root/usr/bin/xtask"
 mount_system "$root"
 
-within() { env --ignore-environment LC_ALL=C DEBIAN_FRONTEND=noninteractive PATH=/usr/sbin:/usr/bin:/sbin:/bin chroot "$root" "$@"; }
+# Of the machine's environment, only what its network may not be reached without.
+within() {
+    env --ignore-environment LC_ALL=C DEBIAN_FRONTEND=noninteractive PATH=/usr/sbin:/usr/bin:/sbin:/bin \
+        ${http_proxy+"http_proxy=$http_proxy"} ${HTTP_PROXY+"HTTP_PROXY=$HTTP_PROXY"} \
+        ${https_proxy+"https_proxy=$https_proxy"} ${HTTPS_PROXY+"HTTPS_PROXY=$HTTPS_PROXY"} \
+        ${no_proxy+"no_proxy=$no_proxy"} ${NO_PROXY+"NO_PROXY=$NO_PROXY"} chroot "$root" "$@"
+}
 # What xtask has said of the entry with these names.
 state() { echo "$said" | while read -r state names why; do [ "$names" != "$1:" ] || echo "$state"; done; }
 has_candidate() { within apt-cache policy "$1" | grep -q '^ *Candidate: [0-9]'; }

@@ -1,4 +1,4 @@
-# The README's two commands on a bare Debian: $1 the root to make, $2 its suite, $3 the machine's Rust, $4 the checkout; what
+# The README's two commands on a bare Debian: $1 the root to make, $2 its suite, $3 the machine's Rust, $4 the repository; what
 # follows are environment variables NAME=VALUE that the network needs.
 root=$1 suite=$2 rust=$3 checkout=$4
 shift 4

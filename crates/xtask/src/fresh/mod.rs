@@ -1,11 +1,13 @@
 //! `cargo xtask fresh`: the README's two commands where nothing is but a bare Debian, Rust and a C compiler.
 
+use std::fs::{File, TryLockError};
 use std::io::Write;
-use std::process::Command;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::time::Instant;
 
 use crate::rootfs::{self, Running};
-use crate::run::{Done, root, target};
+use crate::run::{Done, root, run, say, target};
 
 const SCRIPT: &str = include_str!("inside.sh");
 
@@ -18,25 +20,28 @@ struct Release {
 const RELEASES: [Release; 2] =
     [Release { number: "12", suite: "bookworm" }, Release { number: "13", suite: "trixie" }];
 
+/// What it takes here, and the packages that have it.
+const PROGRAMS: [(&str, &str); 3] = [("unshare", "util-linux"), ("mmdebstrap", "mmdebstrap"), ("git", "git")];
+
 /// Variables of a machine without which its network is not reached.
 const NETWORK: [&str; 6] = ["http_proxy", "https_proxy", "no_proxy", "HTTP_PROXY", "HTTPS_PROXY", "NO_PROXY"];
 
 /// Tries the releases that are named, or all; a line for each at the end.
 pub fn fresh(numbers: &[&str]) -> Done {
     let releases = chosen(numbers)?;
-    if let Some(why) = rootfs::forbidden() {
-        println!("fresh: SKIPPED: {why}");
-        return Ok(());
-    }
-    for program in ["mmdebstrap", "git"] {
+    for (program, package) in PROGRAMS {
         if Command::new(program).arg("--version").output().is_err() {
-            return Err(format!("`cargo xtask fresh` needs {program}: apt-get install {program}"));
+            return Err(format!("`cargo xtask fresh` needs {program}: apt-get install {package}"));
         }
     }
+    if let Some(why) = rootfs::forbidden() {
+        return Err(format!("fresh: SKIPPED: {why}"));
+    }
     let rust = sysroot()?;
+    tell_uncommitted()?;
     let tried = releases.iter().map(|release| attempt(release, &rust)).collect::<Done<Vec<Attempt>>>()?;
     for Attempt { line, .. } in &tried {
-        println!("{line}");
+        say(line)?;
     }
     match tried.iter().filter(|attempt| !attempt.passed).count() {
         0 => Ok(()),
@@ -63,22 +68,24 @@ fn attempt(Release { number, suite }: &Release, rust: &str) -> Done<Attempt> {
     let began = Instant::now();
     let folder = target().join("fresh").join(number);
     std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    // Held until we return.
+    let _lock = lock(&folder.join("lock"), number)?;
     let path = folder.join("log");
-    let mut log = std::fs::File::create(&path).map_err(|error| format!("{}: {error}", path.display()))?;
-    println!("fresh: Debian {number}; log: {}", path.display());
+    let mut log = File::create(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+    say(&format!("fresh: Debian {number}; log: {}", path.display()))?;
 
-    let checkout = root().display().to_string();
+    let checkout = copy_of_commits(&folder)?.display().to_string();
     let network = network();
     let arguments = [suite, rust, &checkout].into_iter().chain(network.iter().map(String::as_str));
     let running = Running::start(SCRIPT, &folder.join("root"), &arguments.collect::<Vec<_>>())?;
-    let mut logged = Ok(());
+    let mut noted = Ok(());
     let passed = running.follow(|line| {
-        println!("{line}");
-        if logged.is_ok() {
-            logged = writeln!(log, "{line}");
+        if noted.is_ok() {
+            let logged = writeln!(log, "{line}").map_err(|error| format!("{}: {error}", path.display()));
+            noted = logged.and_then(|()| say(line));
         }
     })?;
-    logged.map_err(|error| format!("{}: {error}", path.display()))?;
+    noted?;
 
     let seconds = began.elapsed().as_secs();
     let line = if passed {
@@ -89,12 +96,76 @@ fn attempt(Release { number, suite }: &Release, rust: &str) -> Done<Attempt> {
     Ok(Attempt { passed, line })
 }
 
+/// Two at once would remove each other's root.
+fn lock(path: &Path, number: &str) -> Done<File> {
+    let failed = |error| format!("{}: {error}", path.display());
+    let file = File::create(path).map_err(failed)?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            Err(format!("another `cargo xtask fresh` is at work on Debian {number}"))
+        }
+        Err(TryLockError::Error(error)) => Err(failed(error)),
+    }
+}
+
+/// Says that what is tried is not what lies here, if so.
+fn tell_uncommitted() -> Done {
+    let output = Command::new("git").args(["status", "--porcelain"]).current_dir(root()).output();
+    let output = output.map_err(|error| format!("cannot start git: {error}"))?;
+    // Where there is no repository, its copy fails and says so.
+    let changed = String::from_utf8_lossy(&output.stdout).into_owned();
+    let Some(first) = changed.lines().next() else { return Ok(()) };
+    let rest = match changed.lines().count() - 1 {
+        0 => String::new(),
+        rest => format!(" and {rest} more"),
+    };
+    say(&format!("fresh: uncommitted changes are not tried: {}{rest}", first.trim()))
+}
+
+/// A repository that is whole in one folder, so that the root can be lent it: a worktree's or a shared clone's commits lie
+/// elsewhere.
+fn copy_of_commits(folder: &Path) -> Done<PathBuf> {
+    let copy = folder.join("source.git");
+    if copy.exists() {
+        std::fs::remove_dir_all(&copy).map_err(|error| format!("{}: {error}", copy.display()))?;
+    }
+    run(Command::new("git")
+        .args(["clone", "--quiet", "--bare", "--no-local"])
+        .args([root(), &copy])
+        .stdin(Stdio::null()))?;
+    Ok(copy)
+}
+
 /// Where the Rust lies that runs us: its programs and libraries, in one folder.
 fn sysroot() -> Done<String> {
     let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
     let output = Command::new(rustc).args(["--print", "sysroot"]).current_dir(root()).output();
     let output = output.map_err(|error| format!("cannot start rustc: {error}"))?;
-    Ok(String::from_utf8_lossy(&output.stdout).trim().to_owned())
+    if !output.status.success() {
+        let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+        return Err(format!("`rustc --print sysroot` ended with {}: {said}", output.status));
+    }
+    let sysroot = String::from_utf8_lossy(&output.stdout).trim().to_owned();
+    lendable(Path::new(&sysroot))?;
+    Ok(sysroot)
+}
+
+/// A bare Debian with all that a distribution has installed beside its Rust would not be bare.
+fn lendable(sysroot: &Path) -> Done {
+    let shown = sysroot.display();
+    if sysroot.canonicalize().is_ok_and(|sysroot| sysroot == Path::new("/usr")) {
+        return Err(format!(
+            "the root is lent the folder in which Rust lies; yours lies in {shown}, with all other programs: `cargo xtask \
+             fresh` needs a Rust in a folder of its own, as rustup installs it"
+        ));
+    }
+    if !sysroot.join("bin/cargo").is_file() {
+        return Err(format!(
+            "{shown}, where rustc lies, has no bin/cargo: `cargo xtask fresh` needs both in one folder, as rustup installs them"
+        ));
+    }
+    Ok(())
 }
 
 fn network() -> Vec<String> {
@@ -114,5 +185,21 @@ mod tests {
         assert_eq!(suites(&[]), ["bookworm", "trixie"]);
         assert_eq!(suites(&["13"]), ["trixie"]);
         assert!(chosen(&["12", "11"]).err().unwrap().contains("`11`"));
+    }
+
+    #[test]
+    fn only_a_rust_in_a_folder_of_its_own_is_lent() {
+        assert!(lendable(Path::new("/usr")).unwrap_err().contains("with all other programs"));
+        assert!(lendable(Path::new("/nowhere")).unwrap_err().contains("no bin/cargo"));
+    }
+
+    #[test]
+    fn a_release_is_tried_by_one_at_a_time() {
+        let path = std::env::temp_dir().join(format!("raysweep-fresh-lock-{}", std::process::id()));
+        let first = lock(&path, "12").unwrap();
+        assert!(lock(&path, "12").unwrap_err().contains("at work on Debian 12"));
+        drop(first);
+        assert!(lock(&path, "12").is_ok());
+        std::fs::remove_file(&path).unwrap();
     }
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use crate::packages;
+use crate::rootfs;
 use crate::run::{Done, run};
 
 /// The package that names the newest kernel. Not the cloud variant, which has neither cameras nor USB.
@@ -84,7 +84,7 @@ impl Kernel {
 /// The kernel's package, through apt.
 fn download(folder: &Path) -> Done<PathBuf> {
     let fetched = package_name().and_then(|name| download_package(&name, folder)).or_else(|error| {
-        if !packages::is_root() {
+        if !rootfs::is_root() {
             return Err(format!(
                 "cannot download the guest's kernel: {error}\nthe guest needs Debian's {META_PACKAGE}; is the list of \
                  packages fresh?\n  sudo apt-get update"

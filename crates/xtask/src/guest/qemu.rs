@@ -8,7 +8,8 @@ use super::GuestTest;
 use super::kernel::Kernel;
 use crate::run::Done;
 
-/// The guest falls back to a slower clock and to mitigations that emulation does not need, unless told not to.
+/// The clock is the HPET: on a busy host the kernel misjudges the TSC's rate, and the guest's time then runs several times too
+/// fast. Mitigations are nothing that emulation needs.
 const KERNEL_ARGUMENTS: &str = "console=ttyS0 loglevel=4 panic=-1 clocksource=hpet mitigations=off";
 
 /// A running guest, killed when dropped.

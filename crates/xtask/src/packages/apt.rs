@@ -37,9 +37,9 @@ pub fn install(names: &[String]) -> Done {
         .map_err(|error| format!("{error}\ninstall them by hand:\n  {}", by_hand(names)))
 }
 
-/// The commands that install packages.
+/// The commands that install packages; lists that are not all fetched may do.
 pub fn by_hand(names: &[String]) -> String {
-    format!("apt-get update && apt-get {} {}", INSTALL.join(" "), names.join(" "))
+    format!("apt-get update; apt-get {} {}", INSTALL.join(" "), names.join(" "))
 }
 
 fn apt_get(arguments: &[&str]) -> Done {

@@ -5,6 +5,8 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use super::elf;
+
 /// Folders that are searched, each `*` standing for any one name.
 const FOLDERS: [&str; 7] = [
     "usr/local/llvm*/lib*",
@@ -19,11 +21,12 @@ const FOLDERS: [&str; 7] = [
 /// Whether bindgen finds it here.
 pub fn is_there() -> bool {
     if let Some(place) = std::env::var_os("LIBCLANG_PATH").map(PathBuf::from) {
-        // Then it is the only place: the file, or its folder.
-        return is_libclang(&place) || has_libclang(&place);
+        // Then it is the only place: the file, or its folder. Build scripts, which look there, run in folders of their own.
+        return place.is_absolute() && (is_libclang(&place) || has_libclang(&place));
     }
+    let Some(llvm_folders) = llvm_folders() else { return false };
     let listed = ["LD_LIBRARY_PATH", "LIBRARY_PATH"].map(|name| listed(std::env::var_os(name))).concat();
-    is_in(Path::new("/"), &[llvm_folders(), listed].concat())
+    is_in(Path::new("/"), &[llvm_folders, listed].concat())
 }
 
 /// Whether it lies in one of these folders, or below `root` where systems have their libraries.
@@ -36,15 +39,20 @@ fn listed(variable: Option<OsString>) -> Vec<PathBuf> {
     variable.map(|list| std::env::split_paths(&list).collect()).unwrap_or_default()
 }
 
-/// The library folders of the LLVM that `llvm-config` belongs to.
-fn llvm_folders() -> Vec<PathBuf> {
+/// The library folders of the LLVM that `llvm-config` belongs to. None: clang-sys ends there.
+fn llvm_folders() -> Option<Vec<PathBuf>> {
     let program = std::env::var_os("LLVM_CONFIG_PATH").unwrap_or_else(|| "llvm-config".into());
-    let Ok(output) = Command::new(program).arg("--prefix").output() else { return Vec::new() };
-    let said = String::from_utf8_lossy(&output.stdout).into_owned();
-    let prefix = said.lines().next().filter(|_| output.status.success());
-    prefix.map_or_else(Vec::new, |prefix| {
-        ["bin", "lib", "lib64"].iter().map(|name| Path::new(prefix).join(name)).collect()
-    })
+    let Ok(output) = Command::new(program).arg("--prefix").output() else { return Some(Vec::new()) };
+    if !output.status.success() {
+        return Some(Vec::new());
+    }
+    folders_below(&String::from_utf8_lossy(&output.stdout))
+}
+
+/// What `llvm-config --prefix` says; that it says something is taken for granted by clang-sys.
+fn folders_below(said: &str) -> Option<Vec<PathBuf>> {
+    let prefix = Path::new(said.lines().next()?);
+    Some(["bin", "lib", "lib64"].iter().map(|name| prefix.join(name)).collect())
 }
 
 /// The folders below `root` that a pattern stands for.
@@ -72,7 +80,7 @@ fn has_libclang(folder: &Path) -> bool {
 
 /// Whether a file has a name of the library and is one for this machine.
 fn is_libclang(file: &Path) -> bool {
-    file.file_name().is_some_and(|name| is_named_libclang(&name.to_string_lossy())) && is_64_bit_elf(file)
+    file.file_name().is_some_and(|name| is_named_libclang(&name.to_string_lossy())) && is_for_us(file)
 }
 
 /// `libclang.so`, `libclang-*.so`, `libclang.so.*`, `libclang-*.so.*`; libclang-cpp is another library.
@@ -82,17 +90,15 @@ fn is_named_libclang(name: &str) -> bool {
     is_library && (rest.starts_with(".so") || rest.starts_with('-')) && !rest.contains("-cpp.")
 }
 
-fn is_64_bit_elf(file: &Path) -> bool {
-    let mut header = [0; 5];
+fn is_for_us(file: &Path) -> bool {
+    let mut header = [0; elf::HEADER];
     let read = std::fs::File::open(file).and_then(|mut file| file.read_exact(&mut header));
-    read.is_ok() && header == *b"\x7fELF\x02"
+    read.is_ok() && elf::is_for_this_machine(&header)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const ELF: &[u8] = b"\x7fELF\x02\x01\x01";
 
     /// A root in which these files lie.
     struct Root(PathBuf);
@@ -125,11 +131,14 @@ mod tests {
     fn what_only_looks_like_it_is_passed_over() {
         let root = Root::new("decoys");
         assert!(!root.has_libclang());
-        root.put("usr/lib/x86_64-linux-gnu/libclang-cpp.so.14", ELF);
-        root.put("usr/lib/llvm-14/lib/libclang-cpp.so", ELF);
+        root.put("usr/lib/x86_64-linux-gnu/libclang-cpp.so.14", &elf::own_header());
+        root.put("usr/lib/llvm-14/lib/libclang-cpp.so", &elf::own_header());
         root.put("usr/lib/llvm-14/lib/libclangBasic.a", b"!<arch>\n");
         root.put("usr/lib/llvm-14/lib/libclang-14.so.1", b"INPUT(nothing)\n");
-        root.put("opt/lib/libclang-14.so.1", ELF);
+        let mut other_machine = elf::own_header();
+        other_machine[18] = 243;
+        root.put("usr/lib/libclang-14.so.1", &other_machine);
+        root.put("opt/lib/libclang-14.so.1", &elf::own_header());
         assert!(!root.has_libclang());
     }
 
@@ -143,15 +152,22 @@ mod tests {
             "usr/local/llvm-18/lib/libclang-18.so",
         ] {
             let root = Root::new("places");
-            root.put(file, ELF);
+            root.put(file, &elf::own_header());
             assert!(root.has_libclang(), "{file}");
         }
     }
 
     #[test]
+    fn an_llvm_config_without_an_answer_is_a_failure() {
+        assert_eq!(folders_below(""), None);
+        let folders = ["bin", "lib", "lib64"].map(|name| Path::new("/opt/llvm").join(name));
+        assert_eq!(folders_below("/opt/llvm\n"), Some(folders.to_vec()));
+    }
+
+    #[test]
     fn folders_that_variables_name_count_too() {
         let root = Root::new("variables");
-        root.put("opt/lib/libclang.so", ELF);
+        root.put("opt/lib/libclang.so", &elf::own_header());
         let folders =
             listed(Some(std::env::join_paths([Path::new("/nowhere"), &root.0.join("opt/lib")]).unwrap()));
         assert!(is_in(&root.0.join("opt"), &folders));

@@ -1,24 +1,27 @@
 //! System packages that the tests need: a list in the project, installed when we may.
 
 mod apt;
+mod elf;
 mod libclang;
 mod list;
 mod probe;
 
-use std::process::Command;
-
-use crate::run::Done;
+use crate::rootfs::is_root;
+use crate::run::{Done, say};
 use list::{Entry, PATH};
 
 /// What to do on systems that the list is not made for.
 const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install what serves the same purposes\n\
                          by its own means: `cargo xtask packages` tells what is found";
 
+/// How a package may be installed and yet not be what programs find.
+const SHADOWED: &str = "another program of the same name may come first on the path, or an environment variable may name another folder";
+
 /// Prints what the list asks for, and whether it is there.
 pub fn print() -> Done {
     for entry in list::entries()? {
         let state = if entry.is_there() { "present" } else { "missing" };
-        println!("{state} {}: {}", entry.names.join("|"), entry.why);
+        say(&format!("{state} {}: {}", entry.names.join("|"), entry.why))?;
     }
     Ok(())
 }
@@ -36,14 +39,14 @@ pub fn install() -> Done {
         ));
     }
     eprintln!("missing:\n{}", lines(&missing));
-    if is_root() {
-        apt::update()?;
-    }
-    let names = chosen(&missing, apt::has_candidate)?;
     if !is_root() {
-        return Err(format!("only root may install packages; run\n  sudo sh -c '{}'", apt::by_hand(&names)));
+        return Err(for_root(&missing, apt::has_candidate));
     }
-    apt::install(&names)?;
+    // One source of several may be out of reach, and another one have what is missing.
+    if let Err(error) = apt::update() {
+        eprintln!("{error}; going on with the lists that there are");
+    }
+    apt::install(&chosen(&missing, apt::has_candidate)?)?;
     still_missing(&self::missing(missing))
 }
 
@@ -53,16 +56,38 @@ fn missing(entries: Vec<Entry>) -> Vec<Entry> {
 
 /// The first name of each entry that can be installed, or which entries have none.
 fn chosen(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Done<Vec<String>> {
-    let choose = |entry: &Entry| entry.names.iter().find(|name| can_be_installed(name)).cloned();
-    let choices: Vec<Option<String>> = missing.iter().map(choose).collect();
-    if choices.iter().all(Option::is_some) {
-        return Ok(choices.into_iter().flatten().collect());
+    let (names, unknown) = choices(missing, can_be_installed);
+    if unknown.is_empty() {
+        return Ok(names);
     }
-    let unknown = missing.iter().zip(choices).filter(|(_, choice)| choice.is_none()).map(|(entry, _)| entry);
     Err(format!(
         "apt has no package to install for these:\n{}\nare apt's lists up to date (`apt-get update`)?\n{ELSEWHERE}",
         lines(unknown)
     ))
+}
+
+/// What to tell who may not install: the command to run. Apt's lists may never have been fetched, and only root may do that, so
+/// what they do not have is no failure yet.
+fn for_root(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> String {
+    let (names, unknown) = choices(missing, can_be_installed);
+    let mut said = format!("only root may install packages; run\n  sudo sh -c '{}'", apt::by_hand(&names));
+    if !unknown.is_empty() {
+        said += &format!(
+            "\napt's lists do not have these yet, by any name:\n{}\nif they still lack one after the update, run this again for \
+             the name that they have\n{ELSEWHERE}",
+            lines(unknown)
+        );
+    }
+    said + "\nif they are installed already: " + SHADOWED
+}
+
+/// Each entry's first name that can be installed, or its first one; and the entries without any that can.
+fn choices(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> (Vec<String>, Vec<&Entry>) {
+    let known = |entry: &Entry| entry.names.iter().find(|name| can_be_installed(name)).cloned();
+    let choices: Vec<_> = missing.iter().map(|entry| (entry, known(entry))).collect();
+    let unknown = choices.iter().filter(|(_, known)| known.is_none()).map(|&(entry, _)| entry).collect();
+    let name = |(entry, known): (&Entry, Option<String>)| known.or_else(|| entry.names.first().cloned());
+    (choices.into_iter().filter_map(name).collect(), unknown)
 }
 
 /// A package may be installed and yet not be what programs find.
@@ -71,8 +96,7 @@ fn still_missing(entries: &[Entry]) -> Done {
         return Ok(());
     }
     Err(format!(
-        "these packages are installed, yet what {PATH} has them for is not found:\n{}\nanother program of the same name may \
-         come first on the path, or an environment variable may name another folder",
+        "these packages are installed, yet what {PATH} has them for is not found:\n{}\n{SHADOWED}",
         lines(entries)
     ))
 }
@@ -80,12 +104,6 @@ fn still_missing(entries: &[Entry]) -> Done {
 fn lines<'a>(entries: impl IntoIterator<Item = &'a Entry>) -> String {
     let line = |entry: &Entry| format!("  {}: {}", entry.name(), entry.why);
     entries.into_iter().map(line).collect::<Vec<_>>().join("\n")
-}
-
-/// Whether we may install packages.
-pub fn is_root() -> bool {
-    let uid = Command::new("id").arg("-u").output();
-    uid.is_ok_and(|output| output.stdout.trim_ascii() == b"0")
 }
 
 #[cfg(test)]
@@ -107,5 +125,20 @@ mod tests {
         let error = chosen_of(&["b"]).unwrap_err();
         assert!(error.contains("a-14 or a-19: reads") && error.contains(PATH), "{error}");
         assert!(!error.contains("writes"), "{error}");
+    }
+
+    #[test]
+    fn who_is_not_root_is_told_a_command_whatever_apt_knows() {
+        let missing = [entry(&["a-14", "a-19"], "reads"), entry(&["b"], "writes")];
+        let told = |known: &[&str]| for_root(&missing, |name| known.contains(&name));
+        let command = |names: &str| {
+            format!("sudo sh -c 'apt-get update; apt-get install --yes --no-install-recommends {names}'\n")
+        };
+        let all = told(&["a-19", "b"]);
+        assert!(all.contains(&command("a-19 b")) && all.ends_with(SHADOWED), "{all}");
+        assert!(!all.contains("lists"), "{all}");
+        let none = told(&[]);
+        assert!(none.contains(&command("a-14 b")) && none.ends_with(SHADOWED), "{none}");
+        assert!(none.contains("a-14 or a-19: reads") && none.contains(ELSEWHERE), "{none}");
     }
 }

@@ -5,7 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use super::libclang;
+use super::{elf, libclang};
 use crate::run::Done;
 
 /// One thing that must be there.
@@ -63,7 +63,9 @@ impl Probe {
             Self::Compiles(language) => compiles(*language),
             Self::Python { major, minor } => succeeds(Command::new("python3").args([
                 "-c",
-                &format!("import sys, venv, ensurepip; sys.exit(sys.version_info < ({major}, {minor}))"),
+                &format!(
+                    "import sys, venv, ensurepip, ssl, zlib; sys.exit(sys.version_info < ({major}, {minor}))"
+                ),
             ])),
             Self::PkgConfig { library, version } => {
                 let is_new_enough = version.as_ref().is_none_or(|version| {
@@ -99,22 +101,27 @@ fn program_on(path: &OsStr, name: &str) -> Option<PathBuf> {
     })
 }
 
-/// Whether a 64-bit ELF file names no interpreter, which would load its libraries.
 fn is_static(path: &Path) -> bool {
-    std::fs::read(path).ok().and_then(|bytes| has_interpreter(&bytes)) == Some(false)
+    std::fs::read(path).is_ok_and(|bytes| {
+        let kinds = program_headers(&bytes).unwrap_or_default();
+        // Something to run, and no interpreter, which would load libraries for it.
+        kinds.contains(&PT_LOAD) && !kinds.contains(&PT_INTERP)
+    })
 }
 
-/// None: no 64-bit little-endian ELF file.
-fn has_interpreter(bytes: &[u8]) -> Option<bool> {
-    const PT_INTERP: u32 = 3;
+const PT_LOAD: u32 = 1;
+const PT_INTERP: u32 = 3;
+
+/// The kinds of an ELF file's program headers. None: no such file, or none for this machine.
+fn program_headers(bytes: &[u8]) -> Option<Vec<u32>> {
     let u16_at = |at: usize| Some(u16::from_le_bytes(bytes.get(at..at.checked_add(2)?)?.try_into().ok()?));
     let u32_at = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at.checked_add(4)?)?.try_into().ok()?));
-    if !bytes.starts_with(b"\x7fELF\x02\x01") {
+    if !elf::is_for_this_machine(bytes) {
         return None;
     }
     // The program headers' place, the size of one, their number: of the file's header.
     let (start, size, count) = (u32_at(32)? as usize, u16_at(54)? as usize, u16_at(56)? as usize);
-    (0..count).try_fold(false, |found, index| Some(found || u32_at(start + index * size)? == PT_INTERP))
+    (0..count).map(|index| u32_at(start + index * size)).collect()
 }
 
 /// Compiles and links a program that does nothing, by the compiler that crates and cargo use.
@@ -182,14 +189,26 @@ mod tests {
     }
 
     #[test]
-    fn an_interpreter_is_found_in_an_elf_file() {
-        let own = std::fs::read(std::env::current_exe().unwrap()).unwrap();
-        assert_eq!(has_interpreter(&own), Some(true));
-        assert_eq!(has_interpreter(&own[..60]), None, "cut off");
-        assert_eq!(has_interpreter(b"#!/bin/sh\n"), None);
-        // A header alone, without any program header, is enough.
-        let mut header = [0; 64];
-        header[..6].copy_from_slice(b"\x7fELF\x02\x01");
-        assert_eq!(has_interpreter(&header), Some(false));
+    fn a_static_program_is_loaded_by_the_kernel_alone() {
+        // One program header of each of these kinds, right after the file's header.
+        let program = |kinds: &[u8]| {
+            let mut bytes = vec![0; 64 + 56 * kinds.len()];
+            bytes[..elf::HEADER].copy_from_slice(&elf::own_header());
+            (bytes[32], bytes[54], bytes[56]) = (64, 56, kinds.len() as u8);
+            kinds.iter().enumerate().for_each(|(index, &kind)| bytes[64 + 56 * index] = kind);
+            bytes
+        };
+        let file = std::env::temp_dir().join(format!("raysweep-static-{}", std::process::id()));
+        let is_static = |bytes: &[u8]| {
+            std::fs::write(&file, bytes).unwrap();
+            is_static(&file)
+        };
+        assert!(is_static(&program(&[1, 1])));
+        assert!(!is_static(&program(&[3, 1])), "an interpreter");
+        assert!(!is_static(&program(&[4])), "nothing to load");
+        assert!(!is_static(&program(&[])), "a header alone");
+        assert!(!is_static(&program(&[1, 1])[..100]), "cut off");
+        assert!(!is_static(b"#!/bin/sh\n"), "a script");
+        std::fs::remove_file(&file).unwrap();
     }
 }
