@@ -11,11 +11,11 @@ use ndarray::{Array2, Array3, Array4};
 use ndarray_npy::{NpzWriter, write_npy};
 use raysweep_core::{
     CameraSettings, FramePool, FrameStamp, MechanicalDeg, MirrorLimits, MirrorPath, MirrorPoint, PixelFormat,
-    RasterScan, SettingsId, Shutter, Tilt,
+    RasterScan, SettingsId, Shutter, Subject, Tilt,
 };
 use raysweep_sim::dots::{
     DotsConfig, DotsDevices, DotsError, DotsRig, DotsSetup, FrameFate, SimDot, SimDotCamera, SimDotSensor,
-    SimMirror, Subject,
+    SimMirror,
 };
 use raysweep_sim::mirror::{Mechanics, MechanicsConfig};
 
