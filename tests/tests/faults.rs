@@ -169,7 +169,8 @@ fn points_that_no_pass_brings_are_given_up_and_the_error_says_what_was_lost() {
     assert_eq!(ended.state, "faulted");
     let error = ended.error.clone().unwrap();
     assert!(
-        error.contains("points failed in 8 passes in a row, at last by") && error.contains("jitter)"),
+        error.contains("points failed in 8 passes in a row; frames of the last pass:")
+            && error.contains("jitter)"),
         "{error}"
     );
     let counts = ended.open().1.counts;
