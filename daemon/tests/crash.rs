@@ -254,7 +254,7 @@ fn outcomes_from_every_line(rig: &str, plan_text: &str) -> Vec<(usize, Outcome)>
     outcomes
 }
 
-/// What to try: each once found a fault of ours. `RAYSWEEP_SEEDS=40` tries so many more seeds with every camera.
+/// What to try: every camera, with seeds that have found faults. `RAYSWEEP_SEEDS=40` tries so many more with each.
 fn trials() -> Vec<(&'static str, String, u64)> {
     let (short, long) = (PLAN.to_owned(), light_after_the_trigger());
     let mut trials = vec![
