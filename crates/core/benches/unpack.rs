@@ -1,5 +1,5 @@
-//! Unpacking measured against a `memcpy` of the same output in the same run, for each packing and each level of
-//! instructions; and what adding frames to a sum costs. `cargo xtask bench unpack` runs it.
+//! Compares unpacking with a `memcpy` of the same output in the same run, for each packing and instruction level, and
+//! measures the cost of adding frames to a sum. Run it with `cargo xtask bench unpack`.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot go on may panic")]
 
@@ -8,11 +8,11 @@ use std::time::{Duration, Instant};
 
 use raysweep_core::{Mosaic, Packing, PixelFormat, UnpackLevel};
 
-/// The fastest of the repetitions counts: the others had to share the machine.
+/// The fastest repetition counts: the others were slowed down by other processes.
 const REPETITIONS: usize = 60;
 
 fn main() {
-    // Cargo's own.
+    // Cargo passes `--bench`.
     if let Some(unknown) = std::env::args().skip(1).find(|argument| argument != "--bench") {
         eprintln!("no option `{unknown}`: there are none");
         std::process::exit(2);
@@ -22,7 +22,7 @@ fn main() {
     }
 }
 
-/// One size of frame.
+/// Measures frames of one size.
 fn frame(width: usize, height: usize) {
     let pixels = width * height;
     let source: Vec<u16> = (0..pixels).map(|i| (i as u16).wrapping_mul(40_503)).collect();
@@ -44,7 +44,7 @@ fn frame(width: usize, height: usize) {
         let mut levels = vec![Duration::MAX; UnpackLevel::available().len()];
         let (mut fused, mut in_two_passes) = (Duration::MAX, Duration::MAX);
         for _ in 0..REPETITIONS {
-            // In turn, so that whatever else the machine does hits all alike.
+            // In turn, so that other load on the machine affects all of them alike.
             fastest(&mut copied, || black_box(&mut unpacked).copy_from_slice(black_box(&source)));
             for (level, best) in UnpackLevel::available().iter().zip(&mut levels) {
                 fastest(best, || {

@@ -1,5 +1,5 @@
-//! Time, real or virtual. Virtual time stands still while any registered thread works and jumps to the nearest
-//! deadline when all of them wait, so a simulated rig runs as fast as it can and always in the same order.
+//! Time, real or virtual. Virtual time stands still while any registered thread works. It jumps to the nearest
+//! deadline when all of them wait, so a simulated rig runs as fast as possible and always in the same order.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};
 
-/// A clock that devices and their threads share. Cloning gives the same clock.
+/// A clock shared by devices and their threads. A clone is the same clock.
 #[derive(Clone)]
 pub struct Clock(Arc<Kind>);
 
@@ -20,7 +20,7 @@ enum Kind {
 struct VirtualTime {
     now_ns: i64,
     registered: usize,
-    /// Deadlines of the threads that wait, with how many wait for each.
+    /// Deadlines of the waiting threads, each with the number of threads that wait for it.
     deadlines: BTreeMap<i64, usize>,
     waiting: usize,
 }
@@ -33,14 +33,15 @@ impl VirtualTime {
         }
         let Some((deadline, threads)) = self.deadlines.pop_first() else { return false };
         self.now_ns = deadline;
-        // The threads count as working from now on, not from when the scheduler runs them: time would jump twice.
+        // Count the threads as working from now on, not from when the scheduler runs them: otherwise time would jump
+        // twice.
         self.waiting -= threads;
         true
     }
 }
 
 impl Clock {
-    /// `CLOCK_MONOTONIC`.
+    /// The real clock: `CLOCK_MONOTONIC`.
     pub fn real() -> Self {
         Self(Arc::new(Kind::Real))
     }
@@ -50,7 +51,7 @@ impl Clock {
         Self(Arc::new(Kind::Virtual { state: Mutex::default(), woken: Condvar::new() }))
     }
 
-    /// Nanoseconds on this clock.
+    /// Current time in nanoseconds.
     pub fn now_ns(&self) -> i64 {
         match &*self.0 {
             Kind::Real => monotonic_ns(),
@@ -58,7 +59,7 @@ impl Clock {
         }
     }
 
-    /// Takes part in the clock: virtual time waits for whoever holds the handle.
+    /// Registers a participant: virtual time waits for the holder of the handle.
     pub fn register(&self) -> ClockHandle {
         if let Kind::Virtual { state, .. } = &*self.0 {
             lock(state).registered += 1;
@@ -67,13 +68,13 @@ impl Clock {
     }
 }
 
-/// One participant of a [`Clock`]. Dropping it leaves the clock, so that the others' time goes on.
+/// One participant of a [`Clock`]. Dropping it removes the participant, so that time goes on for the others.
 pub struct ClockHandle {
     clock: Clock,
 }
 
 impl ClockHandle {
-    /// Nanoseconds on the clock.
+    /// Current time in nanoseconds.
     pub fn now_ns(&self) -> i64 {
         self.clock.now_ns()
     }
@@ -118,12 +119,12 @@ impl Drop for ClockHandle {
 }
 
 fn lock(state: &Mutex<VirtualTime>) -> MutexGuard<'_, VirtualTime> {
-    // No code panics between changing two fields, so a poisoned lock still guards a consistent time.
+    // No code panics between changing two fields, so the time is consistent even behind a poisoned lock.
     state.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn monotonic_ns() -> i64 {
-    // CLOCK_MONOTONIC exists on every Linux; zero would only stop time for this reader.
+    // CLOCK_MONOTONIC exists on every Linux. A zero would only stop time for this reader.
     clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(0, |time| time.tv_sec() * 1_000_000_000 + time.tv_nsec())
 }
 

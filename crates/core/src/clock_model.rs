@@ -1,25 +1,26 @@
-//! From a device's clock to the host's: a line through round trips of the question "what time is it?".
+//! Converts a device's clock to the host's: a line fitted to round trips of the question "what time is it?".
 //!
-//! Each round trip bounds the host's time at the moment when the device read its clock; the middle of it is the estimate, half of
-//! its length the largest possible error (Cristian, *Probabilistic clock synchronization*, 1989). The line is a least-squares
-//! fit in which a round trip weighs by the inverse square of its length, so that long ones, when host or wire were busy, say next to
-//! nothing; its slope is held near 1 until the round trips span long enough to tell better.
+//! Each round trip bounds the host's time at the moment when the device read its clock. The estimate is its middle,
+//! and the largest possible error is half its length (Cristian, *Probabilistic clock synchronization*, 1989). The
+//! line is a least-squares fit that weights each round trip by the inverse square of its length, so that long ones,
+//! taken while host or wire were busy, have next to no influence. The slope is held near 1 until the round trips span
+//! long enough to determine it better.
 
 use std::collections::VecDeque;
 
-/// One question for a device's time, and its answer.
+/// One request for a device's time, and the answer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RoundTrip {
-    /// When the host asked.
+    /// Host time of the request.
     pub request_ns: i64,
-    /// What the device answered, in nanoseconds of its own clock.
+    /// The device's answer, in nanoseconds of its own clock.
     pub device_ns: i64,
-    /// When the host had the answer.
+    /// Host time when the answer arrived.
     pub receive_ns: i64,
 }
 
 impl RoundTrip {
-    /// How long the answer took.
+    /// Time from the request to the answer.
     pub fn duration_ns(&self) -> i64 {
         self.receive_ns - self.request_ns
     }
@@ -29,12 +30,12 @@ impl RoundTrip {
     }
 }
 
-/// Standard deviation of the rate error of two crystals, before anything is measured [A].
+/// Standard deviation of the relative rate error between two crystals, before any measurement [A].
 const RATE_SIGMA: f64 = 50e-6;
-/// Host time cannot be known better than a clock can be read.
+/// Lower limit of the uncertainty: host time cannot be known better than a clock can be read.
 const MIN_SIGMA_NS: f64 = 100.0;
 
-/// The relation of a device's clock to the host's, from its newest round trips.
+/// The relation of a device's clock to the host's, fitted to the newest round trips.
 #[derive(Debug, Clone)]
 pub struct ClockModel {
     trips: VecDeque<RoundTrip>,
@@ -42,18 +43,18 @@ pub struct ClockModel {
     fit: Option<Fit>,
 }
 
-/// How well a device's clock is known.
+/// How accurately a device's clock is known.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ClockQuality {
-    /// Weighted root mean square of the round trips' middles about the line.
+    /// Weighted root mean square distance of the round trips' middles from the line.
     pub residual_us: f64,
-    /// By how many parts in a million the host's clock runs faster than the device's.
+    /// How much faster the host's clock runs than the device's, in parts per million.
     pub rate_ppm: f64,
-    /// Round trips that the line goes through.
+    /// Number of round trips in the fit.
     pub round_trips: usize,
 }
 
-/// host = host_ns + (device - device_ns) (1 + rate), with both origins within the data, so that no digit is lost.
+/// host = host_ns + (device - device_ns) (1 + rate). Both origins lie within the data, so that no digits are lost.
 #[derive(Debug, Clone, Copy)]
 struct Fit {
     device_ns: i64,
@@ -69,7 +70,7 @@ impl ClockModel {
         Self { trips: VecDeque::with_capacity(capacity), capacity, fit: None }
     }
 
-    /// How many round trips it keeps.
+    /// Largest number of round trips that it keeps.
     pub fn capacity(&self) -> usize {
         self.capacity
     }
@@ -80,7 +81,7 @@ impl ClockModel {
         self.fit = None;
     }
 
-    /// Takes a round trip into account; one that ends before it begins is none.
+    /// Adds a round trip. Ignores one that ends before it begins.
     pub fn add(&mut self, trip: RoundTrip) {
         if trip.duration_ns() < 0 {
             return;
@@ -92,7 +93,7 @@ impl ClockModel {
         self.fit = self.fitted();
     }
 
-    /// The host's time at a moment of the device's clock; nothing before the first round trip.
+    /// The host's time at a moment of the device's clock; `None` before the first round trip.
     pub fn host_ns(&self, device_ns: i64) -> Option<i64> {
         self.fit.map(|fit| {
             let since_ns = device_ns.saturating_sub(fit.device_ns);
@@ -100,17 +101,17 @@ impl ClockModel {
         })
     }
 
-    /// By how much the host's clock runs faster than the device's: host nanoseconds a device nanosecond, less 1.
+    /// How much faster the host's clock runs than the device's: host nanoseconds per device nanosecond, minus 1.
     pub fn rate(&self) -> f64 {
         self.fit.map_or(0.0, |fit| fit.rate)
     }
 
-    /// Weighted root mean square of the round trips' middles about the line.
+    /// Weighted root mean square distance of the round trips' middles from the line.
     pub fn residual_ns(&self) -> Option<f64> {
         self.fit.map(|fit| fit.residual_ns)
     }
 
-    /// How well the clock is known; nothing before the first round trip.
+    /// How accurately the clock is known; `None` before the first round trip.
     pub fn quality(&self) -> Option<ClockQuality> {
         self.fit.map(|fit| ClockQuality {
             residual_us: fit.residual_ns / 1e3,
@@ -121,7 +122,8 @@ impl ClockModel {
 
     fn fitted(&self) -> Option<Fit> {
         let origin = *self.trips.front()?;
-        // The middle of a round trip is off by anything up to half of it: the variance of a uniform distribution.
+        // The error of a middle is uniformly distributed over plus or minus half the round trip; this is its
+        // variance.
         let points = || {
             self.trips.iter().map(|trip| {
                 let sigma_ns = (trip.duration_ns() as f64 / 12_f64.sqrt()).max(MIN_SIGMA_NS);
@@ -158,8 +160,8 @@ impl ClockModel {
 mod tests {
     use super::*;
 
-    /// A device whose clock shows 0 at `start_ns` and runs slow by `rate`, and a host whose round trips are drawn from a
-    /// small generator: uniform answer times, now and then a long and lopsided one.
+    /// A device whose clock shows 0 at `start_ns` and runs slow by `rate`, and a host with pseudorandom round trips:
+    /// uniformly distributed durations, and occasionally a long and asymmetric one.
     struct Bench {
         state: u64,
         start_ns: i64,
@@ -246,7 +248,7 @@ mod tests {
                 let trip = bench.ask(6_000_000_000_000 + k * 200_000);
                 model.add(trip);
             }
-            // A second later: the middle is off by tens of us at most, the rate by what crystals are.
+            // One second later: the middle is off by at most tens of us, the rate by the tolerance of crystals.
             let host_ns = 6_001_000_000_000;
             let error_ns = model.host_ns(bench.device_ns(host_ns)).unwrap() - host_ns;
             assert!(error_ns.abs() < 100_000, "seed {seed}: {error_ns} ns");

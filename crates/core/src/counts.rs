@@ -1,11 +1,11 @@
-//! The accounting of frames: every trigger that was expected ends in exactly one column.
+//! The accounting of frames: every expected trigger is counted in exactly one column.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Why a frame that a point needed did not count towards it.
+/// Why a frame that a point needed was not used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LossCause {
@@ -13,33 +13,33 @@ pub enum LossCause {
     CameraGap,
     /// Packets of the frame were lost on the wire, and the camera did not or could not send them again.
     PacketsLost,
-    /// The camera's driver had no free buffer: the host took its frames too late.
+    /// The camera's driver had no free buffer: the host fetched frames too late.
     DriverFull,
-    /// The camera had stopped answering and was being opened again.
+    /// The camera had stopped answering and was being reopened.
     CameraLost,
     /// A VSYNC edge came while the camera should have been ready, and no frame followed.
     MissedTrigger,
-    /// No VSYNC edge was seen where the frame's, or its light's, should have been.
+    /// No VSYNC edge was seen where that of the frame, or that of its light, should have been.
     EdgeMissing,
-    /// The frame was triggered by an edge that is not the projector's.
+    /// The frame was triggered by an edge that did not come from the projector.
     FalseEdge,
-    /// The measured delay lies further from the wanted one than the plan's `max_jitter_us`.
+    /// The measured delay differs from the wanted one by more than the plan's `max_jitter_us`.
     Jitter,
-    /// The frame's own exposure differs from the one that the point asked for.
+    /// The exposure that the frame reports differs from the one that the point asked for.
     SettingsMismatch,
-    /// No buffer of the pool was free.
+    /// The pool had no free buffer.
     PoolEmpty,
     /// The pipeline's queue was full.
     QueueFull,
     /// The data could not be written.
     WriterError,
-    /// No trailing dots enclose the frame, so that nobody knows which dot it shows.
+    /// No trailing dots enclose the frame, so its dot is unknown.
     Unsynchronised,
     /// The frame is overexposed.
     Saturated,
-    /// Its batch was longer by a frame, and another is nearer to the dot.
+    /// Its batch had a frame too many, and another frame is nearer to the dot.
     Surplus,
-    /// The stage that makes its column failed.
+    /// The stage that computes its column failed.
     StageFailed,
 }
 
@@ -66,19 +66,19 @@ impl fmt::Display for LossCause {
     }
 }
 
-/// Where the triggers of a point, an attempt or a run went.
+/// What became of the triggers of a point, an attempt or a run.
 ///
-/// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` grows with the
-/// camera's frame ids and with edges that stayed unanswered, the other columns where the fate of a frame is decided.
+/// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` grows with
+/// the camera's frame ids and with unanswered edges. The other columns grow where the fate of a frame is decided.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Counts {
     /// Triggers that the camera should have answered.
     pub expected: u64,
     /// Frames summed into stored images.
     pub averaged: u64,
-    /// Frames that may have been exposed under the settings before.
+    /// Frames that may have been exposed with the previous settings.
     pub settling: u64,
-    /// Frames that nobody waited for: between passes, after a pause or a cancel, or of an attempt given up.
+    /// Frames that were not needed: between passes, after a pause or cancellation, or of an abandoned attempt.
     pub cancelled: u64,
     /// Frames lost, by cause.
     #[serde(default)]
@@ -86,19 +86,19 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// Notes `frames` lost to `cause`; none leaves no entry.
+    /// Counts `frames` as lost to `cause`; zero frames add no entry.
     pub fn lose(&mut self, cause: LossCause, frames: u64) {
         if frames > 0 {
             *self.lost.entry(cause).or_default() += frames;
         }
     }
 
-    /// Frames lost, over all causes.
+    /// Total number of lost frames.
     pub fn lost_total(&self) -> u64 {
         self.lost.values().sum()
     }
 
-    /// Frames lost, by cause, in words.
+    /// The lost frames by cause, as text.
     pub fn losses(&self) -> String {
         let causes: Vec<_> = self.lost.iter().map(|(cause, frames)| format!("{frames} {cause}")).collect();
         match causes.is_empty() {
@@ -112,7 +112,7 @@ impl Counts {
         self.expected == self.averaged + self.settling + self.cancelled + self.lost_total()
     }
 
-    /// Adds another account to this one.
+    /// Adds the counts of `other`.
     pub fn add(&mut self, other: &Counts) {
         self.expected += other.expected;
         self.averaged += other.averaged;
@@ -123,30 +123,30 @@ impl Counts {
         }
     }
 
-    /// Turns the frames that had been averaged into frames lost to `cause`: their sum could not be kept.
+    /// Counts all averaged frames as lost to `cause`: their sum could not be stored.
     pub fn forfeit(&mut self, cause: LossCause) {
         let frames = std::mem::take(&mut self.averaged);
         self.lose(cause, frames);
     }
 }
 
-/// What the edges of a run's VSYNC line were like.
+/// Statistics of the edges on a run's VSYNC line.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct VsyncStats {
-    /// True edges seen.
+    /// Genuine edges seen.
     pub edges: u64,
-    /// Edges that should have been and were not seen.
+    /// Edges that should have come but were not seen.
     pub missed: u64,
-    /// Edges that are not the projector's.
+    /// Edges that did not come from the projector.
     pub false_edges: u64,
     /// Mean period.
     pub period_us: f64,
-    /// Standard deviation of edges from the straight line through their neighbours; 0 before enough are seen.
+    /// Standard deviation of edges from the straight line through their neighbours; 0 until enough edges are seen.
     pub jitter_us: f64,
-    /// What 99 % of the edges deviate less than.
+    /// 99th percentile of the edges' deviation.
     #[serde(default)]
     pub jitter_p99_us: f64,
-    /// Allan deviation of the line's frequency over one second, once two seconds of it were seen.
+    /// Allan deviation of the line's frequency over one second; `None` until two seconds of the line have been seen.
     #[serde(default)]
     pub allan_1s: Option<f64>,
 }

@@ -1,41 +1,41 @@
-//! The one error type that a device reports.
+//! The error type that all devices report.
 
 use std::error::Error;
 
-/// What kind of failure it was: what a caller can act on.
+/// The kind of failure, as far as callers can react to it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DeviceErrorKind {
-    /// Somebody else holds the device.
+    /// The device is in use by somebody else.
     Busy,
     /// The device is gone: unplugged, powered off, or its process died.
     Disconnected,
-    /// The device is there and did not answer in time.
+    /// The device is present but did not answer in time.
     Timeout,
-    /// A call that needs the device armed or open came while it was not.
+    /// The call needs the device armed or open, but it was not.
     NotReady,
-    /// The device cannot do what was asked, at any value.
+    /// The device cannot do what was asked, with any value.
     Unsupported,
-    /// The device can do what was asked, but not at that value.
+    /// The device can do what was asked, but not with this value.
     OutOfRange,
-    /// The device said something that its protocol does not allow.
+    /// The device violated its protocol.
     Protocol,
 }
 
-/// A failure of one device, with its name in the rig and the cause beneath it.
+/// A failure of one device, with the device's name in the rig and the underlying cause.
 #[derive(Debug, thiserror::Error)]
 #[error("{device}: {source}")]
 pub struct DeviceError {
     /// The device's name in the rig: `camera`, `vsync`, `projector`.
     pub device: &'static str,
-    /// What kind of failure it was.
+    /// The kind of failure.
     pub kind: DeviceErrorKind,
     /// What exactly happened, and what to do about it.
     pub source: Box<dyn Error + Send + Sync>,
 }
 
 impl DeviceError {
-    /// An error of `device` from anything that tells what happened.
+    /// An error of `device` with the cause `source`.
     pub fn new(
         device: &'static str,
         kind: DeviceErrorKind,

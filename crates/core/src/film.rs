@@ -1,30 +1,30 @@
-//! How a film went: what its end, its report and the daemon's status say.
+//! The outcome of a film, as given in its end record, its report and the daemon's status.
 
 use serde::{Deserialize, Serialize};
 
-/// The account of a film. Cycles planned = stored + incomplete + those not taken.
+/// The result of a film. Planned cycles = stored + incomplete + not taken.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct FilmSummary {
     /// Cycles that the plan asks for.
     pub cycles_planned: usize,
     /// Cycles whose frames are all stored.
     pub cycles_stored: usize,
-    /// Cycles that lack a frame; the ledger says which, and why.
+    /// Cycles that lack a frame; the ledger says which frame, and why.
     pub cycles_incomplete: usize,
-    /// Stored cycles whose transport was estimated during the film.
+    /// Stored cycles whose transport was estimated while the film was running.
     pub transports: usize,
-    /// Stored cycles whose transport was not, because the machine did not keep up or a stage failed: `raysweep process`
-    /// makes them.
+    /// Stored cycles without a transport, because the machine did not keep up or a stage failed. `raysweep process`
+    /// computes them.
     pub transports_missing: usize,
-    /// Estimates between the cycles, published and not stored.
+    /// Estimates between cycles, published but not stored.
     pub sliding_estimates: usize,
-    /// Cycles a second between the first and the last that were stored.
+    /// Cycles per second between the first and the last stored cycle.
     pub cycles_per_s: Option<f64>,
-    /// From the end of the last exposure of a cycle to the publication of its transport; nothing on a virtual clock.
+    /// Time from the end of a cycle's last exposure to the publication of its transport; `None` on a virtual clock.
     pub latency_ms: Option<Percentiles>,
 }
 
-/// Percentiles of something that was measured again and again.
+/// Percentiles of repeated measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Percentiles {
     /// Median.
@@ -33,12 +33,13 @@ pub struct Percentiles {
     pub p95: f64,
     /// 99th percentile.
     pub p99: f64,
-    /// The largest.
+    /// Maximum.
     pub max: f64,
 }
 
 impl Percentiles {
-    /// Of values in ascending order; nothing of none. Each is the smallest value that so many percent do not exceed.
+    /// Computes them from values in ascending order; `None` if there are no values. Each is the smallest value that
+    /// at least so many percent of the values do not exceed.
     pub fn of_sorted(values: &[f64]) -> Option<Self> {
         let at = |percent: usize| values.get((values.len() * percent).div_ceil(100).max(1) - 1).copied();
         Some(Self { p50: at(50)?, p95: at(95)?, p99: at(99)?, max: at(100)? })

@@ -1,23 +1,23 @@
-//! Frames, their stamps, and the bounded pool that their buffers come from and return to by themselves.
+//! Frames, their timestamps, and the bounded pool of buffers to which dropped buffers return automatically.
 
 use std::ops::{Deref, DerefMut};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use crate::PixelFormat;
 
-/// One VSYNC edge as the device that watches it reports it.
+/// One VSYNC edge as reported by the device that watches the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Edge {
-    /// The device's own count of edges, so that edges lost on the way show.
+    /// The device's own count of edges, which reveals edges lost on the way.
     pub seq: u64,
-    /// When the edge was, on the host's clock.
+    /// Time of the edge on the host's clock.
     pub host_ns: i64,
 }
 
-/// What a camera says of a frame. Everything here exists on a real camera.
+/// The metadata that a camera reports with a frame. Everything here is available on a real camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameStamp {
-    /// The device's frame id. It counts every exposure, also one whose frame is lost on the way.
+    /// The device's frame id. It counts every exposure, even if the frame is lost on the way.
     pub seq: u64,
     /// Start of the exposure of row 0 on the device's own clock.
     pub device_ns: i64,
@@ -25,13 +25,13 @@ pub struct FrameStamp {
     pub exposure_start_ns: i64,
     /// When the frame was complete on the host.
     pub host_ns: i64,
-    /// The exposure that the frame itself carries (chunk data), where the camera offers it.
+    /// The exposure reported in the frame itself (chunk data), if the camera offers it.
     pub exposure_us: Option<f64>,
 }
 
-/// A frame as it came off the device: packed pixels, row by row, top row first.
+/// A frame as delivered by the device: packed pixels, row by row, top row first.
 pub struct Frame {
-    /// The pixels; goes back to its pool when the frame is dropped.
+    /// The pixels. The buffer returns to its pool when the frame is dropped.
     pub data: FrameBuf,
     /// How they are packed.
     pub format: PixelFormat,
@@ -39,7 +39,7 @@ pub struct Frame {
     pub stamp: FrameStamp,
 }
 
-/// Room in each buffer behind the frame, for what cameras send there: chunk data, padding.
+/// Space in each buffer after the frame, for what cameras append: chunk data, padding.
 const TAIL_BYTES: usize = 4096;
 
 struct Shelf {
@@ -49,12 +49,12 @@ struct Shelf {
 
 impl Shelf {
     fn lock(&self) -> MutexGuard<'_, Vec<Box<[u8]>>> {
-        // A push or pop cannot be half done, so the shelf outlives a panic elsewhere.
+        // A push or pop cannot be left half done, so the list stays valid after a panic elsewhere.
         self.free.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// A fixed number of buffers of one size, allocated once. Cloning gives the same pool.
+/// A fixed number of buffers of one size, allocated once. A clone is the same pool.
 #[derive(Clone)]
 pub struct FramePool {
     shelf: Arc<Shelf>,
@@ -62,19 +62,19 @@ pub struct FramePool {
 }
 
 impl FramePool {
-    /// `buffers` buffers of `buffer_bytes` bytes each.
+    /// A pool of `buffers` buffers of `buffer_bytes` bytes each.
     pub fn new(buffers: usize, buffer_bytes: usize) -> Self {
         let free = (0..buffers).map(|_| memory(buffer_bytes)).collect();
         Self { shelf: Arc::new(Shelf { free: Mutex::new(free), returned: Condvar::new() }), buffer_bytes }
     }
 
-    /// A buffer if one is free.
+    /// A buffer, if one is free.
     pub fn try_take(&self) -> Option<FrameBuf> {
         let data = self.shelf.lock().pop()?;
         Some(self.lend(data))
     }
 
-    /// A buffer as soon as one is free.
+    /// Waits until a buffer is free and takes it.
     pub fn take(&self) -> FrameBuf {
         let mut free = self.shelf.lock();
         loop {
@@ -85,7 +85,8 @@ impl FramePool {
         }
     }
 
-    /// A buffer of the pool's size that belongs to no pool: where a frame goes that there is no room for.
+    /// A buffer of the pool's size that does not belong to the pool: for a frame that has to be received but cannot
+    /// be kept.
     pub fn spare(&self) -> FrameBuf {
         FrameBuf { data: memory(self.buffer_bytes), bytes: self.buffer_bytes, home: None }
     }
@@ -96,11 +97,11 @@ impl FramePool {
 }
 
 fn memory(buffer_bytes: usize) -> Box<[u8]> {
-    // Not zeros, which the system hands out as pages yet to be made: the first frames would pay for them.
+    // Not zeros: the system maps zeroed pages only on first use, which would slow down the first frames.
     vec![u8::MAX; FrameBuf::memory_bytes(buffer_bytes)].into()
 }
 
-/// A buffer on loan from a [`FramePool`]; dropping it gives it back.
+/// A buffer borrowed from a [`FramePool`], to which it returns when dropped.
 pub struct FrameBuf {
     /// The frame and its tail.
     data: Box<[u8]>,
@@ -110,16 +111,16 @@ pub struct FrameBuf {
 }
 
 impl FrameBuf {
-    /// Bytes of memory that a buffer for a frame of so many bytes has.
+    /// Bytes of memory in a buffer for a frame of `frame_bytes` bytes.
     pub fn memory_bytes(frame_bytes: usize) -> usize {
         frame_bytes + TAIL_BYTES
     }
 
-    /// Puts other memory in the place of the buffer's own, which it returns: for a device that has written its frame, from
-    /// the start of the memory on, without knowing of the pool.
+    /// Replaces the buffer's memory by `memory` and returns the old memory: for a device that has written its frame
+    /// at the start of `memory` without knowing of the pool.
     ///
     /// # Errors
-    /// The memory that was given, where it is not as long as the buffer's own.
+    /// Returns `memory` if it is not as long as the buffer's own.
     pub fn exchange(&mut self, memory: Box<[u8]>) -> Result<Box<[u8]>, Box<[u8]>> {
         if memory.len() == self.data.len() {
             Ok(std::mem::replace(&mut self.data, memory))

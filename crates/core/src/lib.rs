@@ -2,7 +2,7 @@
 //! the accounting of frames, and errors.
 //!
 //! Nothing here opens a device, starts a thread or touches a file. Times are nanoseconds of `CLOCK_MONOTONIC` as
-//! `i64` (`_ns`) or microseconds as `f64` (`_us`); the unit stands in every name.
+//! `i64` (`_ns`) or microseconds as `f64` (`_us`); every name includes the unit.
 
 mod clock;
 mod clock_model;

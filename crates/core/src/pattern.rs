@@ -8,7 +8,7 @@ use std::path::PathBuf;
 pub enum Pattern {
     /// Every row fully lit.
     White,
-    /// Every pixel at the picture's zero. A projector may leak some light then; [`crate::Projector::blank`] turns it off.
+    /// Every pixel at zero. A projector may leak some light then; [`crate::Projector::blank`] turns it off.
     Black,
     /// One row fully lit, the others dark.
     Line {
@@ -17,11 +17,11 @@ pub enum Pattern {
     },
     /// A weight in 0..=1 for each row, top row first.
     Rows(Vec<f32>),
-    /// Squares, lit and dark in turn; unshifted, the one at the top left is lit.
+    /// Alternating lit and dark squares. Unshifted, the one at the top left is lit.
     Checkerboard {
         /// Side of a square in pixels, at least 1.
         cell_px: u32,
-        /// Pixels by which the board is moved to the right and down: (x, y).
+        /// Shift of the board to the right and down in pixels: (x, y).
         shift_px: (u32, u32),
     },
     /// A picture of the projector's size, from a PNG file.
@@ -39,7 +39,7 @@ pub enum PatternError {
         /// Rows of the projector.
         rows: usize,
     },
-    /// Weights for another number of rows.
+    /// The number of weights differs from the number of rows.
     #[error("the pattern has {given} rows, projector.rows = {rows}: give one weight for each row")]
     Rows {
         /// Rows of the pattern.
@@ -47,7 +47,7 @@ pub enum PatternError {
         /// Rows of the projector.
         rows: usize,
     },
-    /// A weight that is no share of full light.
+    /// A weight outside 0..=1.
     #[error("weight {weight} of row {row}: allowed is 0 to 1")]
     Weight {
         /// The row.
@@ -55,7 +55,7 @@ pub enum PatternError {
         /// Its weight.
         weight: f32,
     },
-    /// Squares without a size.
+    /// Squares of size zero.
     #[error("checkerboard with cell_px = 0: give at least 1")]
     Cell,
 }
@@ -64,7 +64,7 @@ impl Pattern {
     /// A weight in 0..=1 for each of a projector's rows, if the pattern is constant along them; `None` if it is not.
     ///
     /// # Errors
-    /// If the pattern does not fit a projector of so many rows.
+    /// If the pattern does not fit a projector with `rows` rows.
     pub fn row_weights(&self, rows: usize) -> Result<Option<Vec<f32>>, PatternError> {
         match self {
             Self::White => Ok(Some(vec![1.0; rows])),

@@ -1,11 +1,11 @@
-//! The geometry of time between a raster projector and a rolling-shutter camera, stated once.
+//! The timing between a raster projector and a rolling-shutter camera.
 
 /// When a projector lights its rows, measured from its VSYNC edge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Raster {
-    /// Rows that it draws.
+    /// Number of rows.
     pub rows: usize,
-    /// Time that each row is lit, and from one row to the next.
+    /// Time for which each row is lit, which is also the time from one row to the next.
     pub row_time_us: f64,
     /// From the VSYNC edge to the start of row 0.
     pub first_row_us: f64,
@@ -13,17 +13,17 @@ pub struct Raster {
     pub period_us: f64,
 }
 
-/// How a camera must be triggered to see a wanted delay.
+/// How to trigger a camera to obtain a wanted delay.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trigger {
-    /// From the trigger's edge, after the camera's latency, to the start of row 0's exposure; never negative.
+    /// Time from the trigger's edge, after the camera's latency, to the start of row 0's exposure; never negative.
     pub trigger_delay_us: f64,
-    /// Which edge's light is measured: the trigger's own (0) or a later one.
+    /// The edge whose light is measured, in edges after the trigger's own (0).
     pub light_edges_later: u32,
 }
 
 impl Raster {
-    /// From the VSYNC edge to the centre of a row's illumination.
+    /// Time from the VSYNC edge to the centre of a row's illumination.
     pub fn row_centre_us(&self, row: usize) -> f64 {
         self.first_row_us + (row as f64 + 0.5) * self.row_time_us
     }
@@ -31,8 +31,8 @@ impl Raster {
     /// The trigger delay for a wanted `delay_us` (t_d: centre of exposure minus centre of illumination of the same
     /// row; positive: the camera row receives light from lower rows).
     ///
-    /// `row` is the projector row whose epipolar plane camera row 0 sees. Trigger delays cannot be negative: the
-    /// trigger then comes from an earlier edge.
+    /// `row` is the projector row whose epipolar plane camera row 0 sees. Trigger delays cannot be negative: where
+    /// one would be, an earlier edge triggers the frame.
     pub fn trigger(&self, row: usize, delay_us: f64, exposure_us: f64, latency_us: f64) -> Trigger {
         let after_light_edge_us = self.row_centre_us(row) + delay_us - exposure_us / 2.0 - latency_us;
         let light_edges_later = (-after_light_edge_us / self.period_us).ceil().max(0.0);

@@ -1,5 +1,6 @@
-//! The flying dot's pipeline at the pace that the machine sustains: frames of 1024 x 1024 pixels from memory through pool,
-//! queue, workers and gatherer, beside the same kernels in a plain loop over the same frames.
+//! Benchmark of the flying dot's pipeline at the rate that the machine sustains: frames of 1024 x 1024 pixels from
+//! memory through pool, queue, workers and gatherer, compared with the same kernels in a plain loop over the same
+//! frames.
 //!
 //! `cargo xtask bench dots --live [--json]`
 
@@ -18,23 +19,23 @@ use raysweep_transport::dots::product::floodlit;
 use raysweep_transport::dots::{Background, Batch, FrameShape, Region, Sampling, SparseColumn};
 
 const SIDE_PX: usize = 1024;
-/// The paper's.
+/// Dots per batch, as in the paper.
 const DOTS: u32 = 2250;
 const FORMAT: PixelFormat = PixelFormat::Mono12;
-/// Distinct frames, more bytes than caches hold.
+/// Number of distinct frames; together they exceed the caches.
 const DISTINCT: usize = 128;
 /// Frames without light.
 const DARK: usize = 32;
-/// A host that stands still for a fifth of a second, as virtual machines do, loses nothing.
+/// Enough that a host which stalls for a fifth of a second, as virtual machines do, loses no frames.
 const POOL_FRAMES: usize = QUEUE_FRAMES + 16;
 const QUEUE_FRAMES: usize = 640;
-/// How long the rates are measured, and how long the paced run is.
+/// Duration of the rate measurements, and of the paced run.
 const MEASURED: Duration = Duration::from_secs(10);
 const PACED: Duration = Duration::from_secs(60);
-/// Share of the measured rate at which frames come in the paced run.
+/// Share of the measured rate at which frames arrive in the paced run.
 const PACE: f64 = 0.8;
 
-/// Frames in memory: without light, some of the scene, one of the beam dump, one with the trailing dot.
+/// Frames in memory: some without light, some of the scene, one of the beam dump, one with the trailing dot.
 struct Memory {
     shape: FrameShape,
     dark: Vec<Vec<u16>>,
@@ -51,7 +52,7 @@ impl Memory {
                     state ^= state << 13;
                     state ^= state >> 7;
                     state ^= state << 17;
-                    // The sum of four uniform numbers is near enough to normal noise of 3 counts.
+                    // The sum of four uniform numbers approximates normal noise of 3 counts.
                     100 + (0..4).map(|byte| (state >> (8 * byte) & 0xff) as f32 / 49.0).sum::<f32>() as u16
                 })
                 .collect();
@@ -80,7 +81,7 @@ impl Memory {
         Ok(Self { shape, dark, frames })
     }
 
-    /// The frame that the camera gives as number `seq`.
+    /// The camera's frame number `seq`.
     fn frame(&self, seq: u64) -> &[u16] {
         let index = (seq % u64::from(DOTS)) as u32;
         match index {
@@ -110,7 +111,7 @@ impl Memory {
     }
 }
 
-/// Counts, and makes the floodlit image of each batch as the daemon does.
+/// Counts batches, and computes the floodlit image of each as the daemon does.
 struct Watched {
     shape: FrameShape,
     batches: u64,
@@ -131,7 +132,7 @@ impl CutSink for Watched {
     }
 }
 
-/// What a flow came to.
+/// The results of a flow.
 struct Ran {
     frames: u64,
     lost: u64,
@@ -145,7 +146,7 @@ impl Ran {
     }
 }
 
-/// Sends frames for so long, as fast as they are taken or at this rate.
+/// Sends frames for `duration`, as fast as they are accepted or at the given rate.
 fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran, Box<dyn Error>> {
     let Sensor { correction, background, floor } = memory.sensor()?;
     let stage = DotStages::default().make("denoise", serde_json::json!({}), &correction)?;
@@ -177,7 +178,7 @@ fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran
             seq += 1;
             continue;
         };
-        // The source's copy, as a driver's.
+        // The copy that a driver would make.
         data.copy_from_slice(bytemuck::cast_slice(memory.frame(seq)));
         let stamp = FrameStamp { seq, device_ns: 0, exposure_start_ns: 0, host_ns: 0, exposure_us: None };
         let arrival = Arrival { frame: Frame { data, format: FORMAT, stamp }, lost_before: Vec::new() };
@@ -202,18 +203,18 @@ fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran
     }
 }
 
-/// Whose copy the frames of a plain loop are.
+/// Who copies the frames of a plain loop.
 #[derive(Clone, Copy)]
 enum Copying {
-    /// Nobody's: they are worked on where they lie.
+    /// Nobody: they are processed in place.
     No,
-    /// Each thread copies its own, all at once.
+    /// Each thread copies its own frames, all in parallel.
     ByEach,
-    /// One source copies them, one after the other, as a device's driver does.
+    /// One source copies them, one after the other, like a device's driver.
     ByOneSource,
 }
 
-/// The same kernels over the same frames without queues and batches, frames a second.
+/// Runs the same kernels over the same frames without queues and batches; returns frames per second.
 fn plain(memory: &Memory, copying: Copying) -> Result<f64, Box<dyn Error>> {
     let Sensor { correction, background, floor } = memory.sensor()?;
     let stage = DotStages::default().make("denoise", serde_json::json!({}), &correction)?;

@@ -1,5 +1,5 @@
-//! Frames and VSYNC edges in, averaged units out. A plain state machine: no thread, no clock, no channel; what a frame
-//! is taken for hangs on its stamps, not on whether it or its edges came first.
+//! Turns frames and VSYNC edges into averaged units. A plain state machine: no thread, no clock, no channel. How a
+//! frame is classified depends on its timestamps, not on whether it or its edges arrived first.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -14,83 +14,84 @@ use raysweep_core::{
 use crate::edges::{EdgeTracker, Found, Line, TrueEdge};
 use crate::unit::Unit;
 
-/// One attempt at a point, as the camera was set for it.
+/// One attempt at a point, with the camera's settings for it.
 #[derive(Debug, Clone, Copy)]
 pub struct Job {
     /// Point and attempt.
     pub id: SettingsId,
     /// Frames to average.
     pub frames: u32,
-    /// What the camera made of the settings.
+    /// The settings as the camera applied them.
     pub applied: Applied,
-    /// Wanted t_d.
+    /// Wanted delay t_d.
     pub delay_us: f64,
-    /// Which edge's light is measured: the trigger's own (0) or a later one.
+    /// The edge whose light is measured, in edges after the trigger's own (0).
     pub light_edges_later: u32,
-    /// In a film, VSYNC periods from the trigger of the job before to this one's first; nothing after a pause and
-    /// where jobs stand alone.
+    /// In a film, VSYNC periods from the trigger of the previous job to the first trigger of this one; `None` after a
+    /// pause and for independent jobs.
     pub periods_from_last: Option<u32>,
 }
 
-/// What a frame is taken for, before it is known whether it is sound.
+/// The classification of a frame, before it is known whether the frame is sound.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Label {
     /// It belongs to the point.
     Counted,
-    /// It belongs to the point, unless a false edge at this moment triggered it under the settings before: then its
-    /// stamps would be the same.
+    /// It belongs to the point, unless a false edge at this time triggered it with the previous settings, which would
+    /// give the same timestamps.
     CountedUnless {
-        /// On the clock of the stamps.
+        /// Time of the false edge, on the clock of the timestamps.
         triggered_ns: i64,
     },
-    /// It was, or may have been, exposed under the settings before.
+    /// It was, or may have been, exposed with the previous settings.
     Settling,
-    /// Nobody waits for it.
+    /// It is not needed.
     Cancelled,
 }
 
-/// What the device threads tell the assembler, in order.
+/// Messages from the device threads to the assembler, in order.
 pub enum Event {
-    /// The line had an edge.
+    /// An edge of the VSYNC line.
     Edge(Edge),
-    /// The camera has been set for an attempt.
+    /// The camera has been configured for an attempt.
     Begin(Job),
     /// A frame.
     Frame(Frame, Label),
-    /// The id of a frame that there was no room for, or that never came; without a cause, one that no point waited for.
+    /// The id of a frame that found no room or never arrived; without a cause if no point needed it.
     Lost(u64, Option<LossCause>),
-    /// The attempt is over: all its frames have come or were lost on their way.
+    /// The attempt is over: all its frames have arrived or were lost on the way.
     End,
-    /// The attempt is over before its last frame: frames of other settings came first, or the camera was away.
+    /// The attempt ended before its last frame: frames with other settings came first, or the camera was
+    /// disconnected.
     Interrupt,
-    /// Nobody takes frames for a while: those that pass are nobody's loss.
+    /// No frames are taken for a while; those that pass do not count as lost.
     Idle,
-    /// To be raised when everything before it is decided.
+    /// A flag to set when everything before it is decided.
     Settle(Arc<AtomicBool>),
-    /// No further frame of this pass comes: decide everything.
+    /// No more frames of this pass will arrive: decide everything.
     Flush,
 }
 
-/// What the assembler decided.
+/// The assembler's results.
 pub enum Decision {
-    /// A point's image.
+    /// The averaged image of a point.
     Unit(Unit),
-    /// An attempt without all its frames.
+    /// An attempt that lacks frames.
     Failed(SettingsId, Failure, Counts),
-    /// The pass is over; frames outside any attempt, and the line so far.
+    /// The pass is over; counts of frames outside any attempt, and statistics of the line so far.
     Flushed(Counts, VsyncStats),
 }
 
 /// Why an attempt lacks frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Failure {
-    /// Too many of its own frames were lost or unsound: the point needs another attempt.
+    /// Too many of its own frames were lost or not sound: the point needs another attempt.
     Losses,
-    /// It ended before its last frame, by no fault of its own: the same attempt is made again.
+    /// It ended early for external reasons: the same attempt is repeated.
     Interrupted,
 }
 
-/// What the assembler must know of the rig.
+/// What the assembler needs to know about the rig.
 #[derive(Debug, Clone)]
 pub struct AssemblerConfig {
     /// The camera.
@@ -99,24 +100,24 @@ pub struct AssemblerConfig {
     pub raster: Raster,
     /// Projector row that camera row 0 sees.
     pub first_row: usize,
-    /// Frames whose measured delay is further off than this do not count.
+    /// Frames whose measured delay is off by more than this are not used.
     pub max_jitter_us: f64,
-    /// How far an edge may lie from where the last true one puts it.
+    /// Largest distance of an edge from its position expected from the last true edge.
     pub edge_gate_us: f64,
 }
 
 impl AssemblerConfig {
-    /// The VSYNC line as its tracker must know it.
+    /// The VSYNC line, as the tracker needs it.
     pub fn line(&self) -> Line {
         Line { period_ns: ns_from_us(self.raster.period_us), gate_ns: ns_from_us(self.edge_gate_us) }
     }
 }
 
-/// A frame is tied to the edge within this of the one that must have triggered it.
+/// Largest distance between the edge to which a frame is tied and the expected time of its trigger.
 const TRIGGER_TOLERANCE_NS: i64 = 200_000;
-/// A frame waits this long, on the host's clock, for the edges around it.
+/// How long a frame waits, on the host's clock, for the edges around it.
 const EDGE_PATIENCE_NS: i64 = 100_000_000;
-/// A camera's own word for its exposure may differ by rounding from what it was set to.
+/// The exposure that a camera reports may differ from its setting by rounding.
 pub const EXPOSURE_TOLERANCE_US: f64 = 0.5;
 
 /// The assembler's state.
@@ -125,16 +126,16 @@ pub struct Assembler {
     tracker: EdgeTracker,
     waiting: VecDeque<Waiting>,
     attempt: Option<Attempt>,
-    /// Of the attempt before.
+    /// Chain of the previous attempt.
     chain: Chain,
     outside: Counts,
     last_seq: Option<u64>,
-    /// Whether frames may have passed that nobody asked for.
+    /// Whether unrequested frames may have passed.
     idle: bool,
     newest_ns: i64,
 }
 
-/// Events that wait for edges, in their order.
+/// Events that wait for edges, in order.
 enum Waiting {
     Begin(Job),
     Frame(Frame, Label),
@@ -153,23 +154,23 @@ struct Attempt {
     delays_us: Vec<f64>,
     counts: Counts,
     last_exposure_ns: Option<i64>,
-    /// Whether one of its frames may have been exposed under the settings before: none after it counts.
+    /// Whether one of its frames may have been exposed with the previous settings; later frames are then not used.
     is_doubtful: bool,
     chain: Chain,
 }
 
-/// Follows the triggers from frame to frame, so that those that no frame answered show.
+/// Follows the triggers from frame to frame, to detect triggers without a frame.
 #[derive(Default)]
 struct Chain {
     /// The last frame that was tied to an edge.
     tied: Option<(u64, TrueEdge)>,
-    /// Frames since then that were triggered by no true edge.
+    /// Frames since then that were not triggered by a true edge.
     untied: i64,
-    /// Periods that changes of settings have taken since then, beyond those of the frames.
+    /// Additional periods since then that were needed for changes of settings.
     extra_periods: i64,
 }
 
-/// The light of a frame, or why it does not count.
+/// The light of a frame, or why the frame is not used.
 enum Verdict {
     Undecided,
     Sound {
@@ -180,12 +181,12 @@ enum Verdict {
         trigger: Option<TrueEdge>,
         cause: LossCause,
     },
-    /// It may have been exposed under the settings before.
+    /// It may have been exposed with the previous settings.
     Doubtful,
 }
 
 impl Assembler {
-    /// An assembler that has seen nothing.
+    /// An assembler in its initial state.
     pub fn new(config: AssemblerConfig) -> Self {
         Self {
             tracker: EdgeTracker::new(config.line()),
@@ -200,7 +201,7 @@ impl Assembler {
         }
     }
 
-    /// Takes an event; what can be decided now goes to `decide`, in order.
+    /// Processes an event; passes what can be decided now to `decide`, in order.
     pub fn push(&mut self, event: Event, mut decide: impl FnMut(Decision)) {
         match event {
             Event::Edge(edge) => {
@@ -228,7 +229,7 @@ impl Assembler {
         }
     }
 
-    /// Settles one item; gives it back if its edges are still to come.
+    /// Settles one item, or returns it if its edges are still missing.
     fn settle(
         &mut self,
         item: Waiting,
@@ -264,7 +265,7 @@ impl Assembler {
             Waiting::Settle(decided) => decided.store(true, Ordering::Release),
             Waiting::Flush => {
                 self.idle = true;
-                // A device that failed may have left its attempt open.
+                // A failed device may have left its attempt open.
                 self.end(Failure::Interrupted, decide);
                 decide(Decision::Flushed(std::mem::take(&mut self.outside), self.tracker.stats()));
             }
@@ -290,7 +291,7 @@ impl Assembler {
         });
     }
 
-    /// Ends the attempt, if there is one; `failure` is why it lacks frames if it does.
+    /// Ends the current attempt, if any. `failure` is the reason if the attempt lacks frames.
     fn end(&mut self, failure: Failure, decide: &mut impl FnMut(Decision)) {
         if let Some(mut attempt) = self.attempt.take() {
             self.chain = std::mem::take(&mut attempt.chain);
@@ -303,12 +304,12 @@ impl Assembler {
         i64::from(self.config.camera.periods_per_frame(&job.applied.actual, period_us))
     }
 
-    /// The account that the present belongs to.
+    /// The counts of the current attempt, or those outside any attempt.
     fn counts(&mut self) -> &mut Counts {
         self.attempt.as_mut().map_or(&mut self.outside, |attempt| &mut attempt.counts)
     }
 
-    /// Follows the camera's frame ids: every id is a trigger that was answered, an id left out is a lost frame.
+    /// Follows the camera's frame ids: every id is an answered trigger, a skipped id is a lost frame.
     fn follow(&mut self, seq: u64) {
         let gap = self.last_seq.map_or(0, |last| seq.saturating_sub(last + 1));
         self.last_seq = Some(seq);
@@ -372,7 +373,7 @@ impl Assembler {
         Verdict::Sound { trigger, delay_us }
     }
 
-    /// Adds a sound frame to the sum, or notes why it does not count.
+    /// Adds a sound frame to the sum, or counts the reason why it is not used.
     fn count(&mut self, frame: &Frame, verdict: Verdict) {
         self.follow(frame.stamp.seq);
         let Some(periods_per_frame) =
@@ -405,7 +406,7 @@ impl Assembler {
                 attempt.counts.cancelled += 1;
             }
             Ok(delay_us) => {
-                // An array that was made of zeros is one slice, row by row, as frames are.
+                // An array created from zeros is one slice, row by row, like a frame.
                 let sums = attempt.sum.as_slice_mut().unwrap_or_default();
                 if let Err(error) = frame.format.add_to(&frame.data, sums) {
                     tracing::warn!(%error, seq = frame.stamp.seq, "frame does not match its format");
@@ -421,7 +422,7 @@ impl Assembler {
 }
 
 impl Chain {
-    /// How many triggers stayed unanswered since the last frame that was tied to an edge.
+    /// Number of triggers without a frame since the last frame that was tied to an edge.
     fn tie(&mut self, seq: u64, edge: TrueEdge, periods_per_frame: i64) -> u64 {
         let last = std::mem::replace(self, Self { tied: Some((seq, edge)), ..Self::default() });
         let Some((last_seq, last_edge)) = last.tied else { return 0 };
@@ -435,7 +436,7 @@ impl Attempt {
     fn finish(mut self, failure: Failure) -> Decision {
         self.counts.averaged = u64::from(self.averaged);
         if self.averaged < self.job.frames {
-            // Sound frames of an attempt that lacks others are not kept: the point is taken again as a whole.
+            // Sound frames of an incomplete attempt are not kept: the whole point is taken again.
             self.counts.cancelled += std::mem::take(&mut self.counts.averaged);
             let failure = if self.is_doubtful { Failure::Interrupted } else { failure };
             return Decision::Failed(self.job.id, failure, self.counts);

@@ -25,12 +25,12 @@ use self::tally::Tally;
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DemuxOptions {
-    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`; left out, with its weights: the one that
-    /// predicts held-out settings best, `split` in doubt.
+    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`. If omitted, prior and weights are those
+    /// that predict held-out settings best, or `split` if there is no clear difference.
     pub prior: Option<PriorName>,
-    /// Weight of smoothness over rows; left out: the prior's own.
+    /// Weight of smoothness over rows; if omitted, the prior's default.
     pub alpha: Option<f64>,
-    /// Weight of sparsity; left out: the prior's own.
+    /// Weight of sparsity; if omitted, the prior's default.
     pub beta: Option<f64>,
     /// Whether neighbouring pixels that see the same kind of light are averaged before they are solved.
     pub coupling: bool,
@@ -42,18 +42,18 @@ impl Default for DemuxOptions {
     }
 }
 
-/// The priors by their names in plans.
+/// The names of priors in plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PriorName {
-    /// Scale-free smoothness that leaves u = 0 alone.
+    /// Scale-free smoothness that excludes u = 0.
     Split,
-    /// The printed objective.
+    /// The paper's objective as printed.
     Paper,
 }
 
 impl DemuxOptions {
-    /// Whether a plan leaves nothing of the prior open.
+    /// Whether a plan fully specifies the prior.
     pub(crate) fn states_prior(&self) -> bool {
         self.prior.is_some() || self.alpha.is_some() || self.beta.is_some()
     }
@@ -74,17 +74,18 @@ impl DemuxOptions {
     }
 }
 
-/// Name of the figure that closes the circle: the light of the regular image, by the model over by the camera.
+/// Name of the figure that checks consistency: the light of the regular image, predicted by the model over captured
+/// by the camera.
 pub const PREDICTED_SHARE: &str = "predicted / captured regular light";
 
-/// One image of the sweep, as it was taken.
+/// One image of the sweep and its settings.
 struct Taken {
     setting: Setting,
     /// Mean counts.
     image: Array2<f32>,
 }
 
-/// Collects a sweep and demultiplexes it. A copy shares the images.
+/// Collects a sweep and demultiplexes it. Clones share the images.
 #[derive(Clone)]
 pub struct DemuxFold {
     options: DemuxOptions,
@@ -92,27 +93,27 @@ pub struct DemuxFold {
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
     taken: BTreeMap<Role, Arc<Taken>>,
-    /// Of images that are not kept: the point's ordinal and the setting. None: they are.
+    /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
     not_kept: Option<BTreeMap<Role, (u32, Setting)>>,
 }
 
-/// Camera rows of a sweep that are to be solved, and those beside them that they depend on.
+/// The camera rows of a sweep to be solved, and the neighbouring rows on which they depend.
 struct Held {
-    /// The camera row that is row 0 of the images.
+    /// The camera row of row 0 of the images.
     first_row: usize,
     stack: SweepStack,
     /// The regular image and its dark image, if both were taken.
     regular: Option<(Arc<Taken>, Arc<Taken>)>,
 }
 
-/// Fewer points than this make no estimate worth a look.
+/// Smallest number of points for a useful estimate.
 const MIN_LIVE_POINTS: usize = 5;
 
 impl DemuxFold {
     /// A fold for the sweep of `schedule`.
     ///
     /// # Errors
-    /// When the options or the geometry make no model.
+    /// If the options or the geometry do not give a valid model.
     pub fn new(
         options: DemuxOptions,
         schedule: &Schedule,
@@ -128,24 +129,24 @@ impl DemuxFold {
         Ok(fold)
     }
 
-    /// The plan's demultiplexer, before anything is taken: its reach and its conditioning.
+    /// The plan's demultiplexer, before any image is taken: its reach and its conditioning.
     ///
     /// # Errors
-    /// When delays and exposures make no model on this rig.
+    /// If delays and exposures do not give a valid model on this rig.
     pub fn demux(&self) -> Result<Demux, PlaneError> {
         let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
         let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
         Demux::new(self.timing.clone(), planned, self.options.prior())
     }
 
-    /// The dark image that belongs to the exposure of a role's image, if it was taken.
+    /// The dark image for the exposure of a role's image, if it was taken.
     fn dark_of(&self, taken: &BTreeMap<Role, Arc<Taken>>, role: Role) -> Option<Arc<Taken>> {
         let point = self.schedule.points.iter().find(|point| point.role == role)?;
         taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
     }
 
-    /// The sweep in these images, without those whose dark image is not among them. Each image is given up as soon as
-    /// it is in the stack: unless a copy of the fold shares it, a sweep is held once, not twice.
+    /// The sweep in these images, without those whose dark image is missing. Each image is dropped as soon as it is
+    /// in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
     fn stack(&self, mut taken: BTreeMap<Role, Arc<Taken>>) -> Result<SweepStack, FoldError> {
         let darks = taken.extract_if(.., |role, _| matches!(role, Role::Dark(_))).collect();
         taken.retain(|role, _| matches!(role, Role::Sweep(_)) && self.dark_of(&darks, *role).is_some());
@@ -188,13 +189,13 @@ impl DemuxFold {
         })
     }
 
-    /// The camera rows from `first_row` on, of which the images are.
+    /// The camera rows starting at `first_row`, to which the images belong.
     fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<Taken>>) -> Result<Held, FoldError> {
         let regular = taken.get(&Role::Regular).cloned().zip(self.dark_of(&taken, Role::Regular));
         Ok(Held { first_row, stack: self.stack(taken)?, regular })
     }
 
-    /// Chooses how to demultiplex by the rows of [`rows_to_choose_by`], which the stack holds alone.
+    /// Chooses how to demultiplex, from a stack that contains only the rows of [`rows_to_choose_by`].
     fn choose(&self, stack: SweepStack) -> Result<Choices, FoldError> {
         let rows = rows_to_choose_by(self.geometry.height);
         self.demux()
@@ -202,7 +203,7 @@ impl DemuxFold {
             .map_err(refused)
     }
 
-    /// Stack and transport of some camera rows; what there is to say of them goes into `tally`.
+    /// Stack and transport of some camera rows; adds their figures and warnings to `tally`.
     fn strip(
         &self,
         choices: &Choices,

@@ -1,4 +1,4 @@
-//! Which VSYNC edges are the projector's: period gate, missed and false edges, jitter.
+//! Detects which VSYNC edges come from the projector: period gate, missed and false edges, jitter.
 
 use std::collections::VecDeque;
 
@@ -6,57 +6,57 @@ use raysweep_core::{Edge, VsyncStats, us_from_ns};
 
 use crate::regularity::Regularity;
 
-/// The line as a rig states it.
+/// The properties of the line given by the rig file.
 #[derive(Debug, Clone, Copy)]
 pub struct Line {
     /// Nominal period.
     pub period_ns: i64,
-    /// An edge this far from where the last true one puts it is not the projector's.
+    /// An edge farther than this from its position expected from the last true edge is false.
     pub gate_ns: i64,
 }
 
-/// A true edge and its place in the count of periods.
+/// A true edge and its index in the count of periods.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TrueEdge {
-    /// Periods since the first true edge, missed ones counted.
+    /// Periods since the first true edge, including missed ones.
     pub index: i64,
-    /// When it was.
+    /// Time of the edge on the host's clock.
     pub host_ns: i64,
 }
 
-/// What lies near a moment on the line.
+/// The edge near a given time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Found {
     /// A true edge.
     True(TrueEdge),
-    /// An edge that is not the projector's.
+    /// An edge that does not come from the projector.
     False,
-    /// None.
+    /// No edge.
     Nothing,
 }
 
-/// How many edges the tracker remembers: more than any exposure spans.
+/// Number of edges that the tracker remembers: more than any exposure spans.
 const MEMORY: usize = 256;
-/// So many false edges in a row mean that it was the lock that was false.
+/// This many consecutive false edges mean that the lock itself was wrong.
 const RELOCK_AFTER: u32 = 8;
 
-/// Sorts the edges of a VSYNC line into true and false ones.
+/// Classifies the edges of a VSYNC line as true or false.
 pub struct EdgeTracker {
     line: Line,
     last: Option<TrueEdge>,
-    /// Edges before the first pair that lies a whole number of periods apart.
+    /// Edges before the first pair that is an integer number of periods apart.
     candidates: VecDeque<i64>,
     false_in_a_row: u32,
     recent: VecDeque<(i64, Option<TrueEdge>)>,
     stats: VsyncStats,
     regularity: Regularity,
-    /// Pairs of edges one period apart, and by how much they were more than that together.
+    /// Number of pairs of edges one period apart, and their total excess over the nominal period.
     periods: u64,
     sum_us: f64,
 }
 
 impl EdgeTracker {
-    /// A tracker that has seen nothing.
+    /// A tracker in its initial state.
     pub fn new(line: Line) -> Self {
         Self {
             line,
@@ -71,7 +71,7 @@ impl EdgeTracker {
         }
     }
 
-    /// Takes the next edge of the line.
+    /// Processes the next edge of the line.
     pub fn push(&mut self, edge: Edge) {
         let now_ns = edge.host_ns;
         let accepted = match self.last {
@@ -98,14 +98,14 @@ impl EdgeTracker {
                 self.last = None;
                 self.candidates.clear();
                 self.regularity.restart();
-                // Counting starts anew, and no index may mean two edges.
+                // Counting restarts, and an index must not refer to two edges.
                 self.recent.iter_mut().for_each(|(_, edge)| *edge = None);
             }
         }
         self.remember(now_ns, true_edge);
     }
 
-    /// Two edges lie where one belongs: which of them is the projector's nobody knows, so no frame is tied to either.
+    /// Two edges lie where one is expected. Either could be the projector's, so no frame is tied to them.
     fn doubt(&mut self, taken: TrueEdge) {
         for (_, edge) in &mut self.recent {
             edge.take_if(|edge| *edge == taken);
@@ -119,14 +119,14 @@ impl EdgeTracker {
         self.recent.push_back((host_ns, edge));
     }
 
-    /// Whole periods, at least one, between two moments; `None` when they are not a whole number apart.
+    /// Number of periods between two times, at least one; `None` if it is not an integer within the gate.
     fn periods_between(&self, from_ns: i64, to_ns: i64) -> Option<i64> {
         let n = ((to_ns - from_ns) as f64 / self.line.period_ns as f64).round() as i64;
         let off_ns = (to_ns - from_ns - n * self.line.period_ns).abs();
         (n >= 1 && off_ns <= self.line.gate_ns).then_some(n)
     }
 
-    /// Looks for the first edge that a later one confirms.
+    /// Looks for the first edge that is confirmed by a later one.
     fn lock(&mut self, now_ns: i64) -> Option<(TrueEdge, i64)> {
         let found = self.candidates.iter().find_map(|&first_ns| {
             let n = self.periods_between(first_ns, now_ns).filter(|&n| n <= 4)?;
@@ -179,17 +179,17 @@ impl EdgeTracker {
         }
     }
 
-    /// The true edge with an index, if it was seen.
+    /// The true edge with this index, if it was seen.
     pub fn by_index(&self, index: i64) -> Option<TrueEdge> {
         self.recent.iter().rev().find_map(|&(_, edge)| edge.filter(|edge| edge.index == index))
     }
 
-    /// Nominal time of the edge `periods` after `edge`, for knowing when it is overdue.
+    /// Nominal time of the edge `periods` after `edge`, which tells when it is overdue.
     pub fn expected_ns(&self, edge: TrueEdge, periods: i64) -> i64 {
         edge.host_ns + periods * self.line.period_ns
     }
 
-    /// How far an edge may lie from where it is expected.
+    /// Largest distance of an edge from its expected position.
     pub fn gate_ns(&self) -> i64 {
         self.line.gate_ns
     }
@@ -283,8 +283,8 @@ mod tests {
         assert_eq!(tracker.by_index(80), None);
     }
 
-    /// Edges with 5 us of jitter, 1 % missing, and 1 % false ones at any moment: once the line is known, what is taken for
-    /// true is true.
+    /// Edges with 5 us of jitter, 1 % missing, and 1 % false ones at any time: once the line is known, all edges
+    /// classified as true are true.
     #[test]
     fn no_false_edge_is_taken_wherever_it_lies() {
         let mut random = Normal(3);
@@ -305,7 +305,7 @@ mod tests {
         let mut taken = 0;
         for (seq, pair) in edges.windows(2).enumerate() {
             tracker.push(Edge { seq: seq as u64, host_ns: pair[0] });
-            // Judged when the next edge is known, as the assembler does.
+            // Evaluated when the next edge is known, as in the assembler.
             if seq > 100
                 && let Found::True(edge) = tracker.near(edges[seq - 1], 0)
             {

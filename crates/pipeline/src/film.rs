@@ -1,4 +1,4 @@
-//! Films: a short sweep, one frame a setting, again and again without pause; each cycle has its own light transport.
+//! Films: a short sweep with one frame per setting, repeated without pause. Each cycle has its own light transport.
 
 use std::sync::Arc;
 
@@ -12,24 +12,25 @@ use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage::FoldError;
 use crate::unit::Unit;
 
-/// The order in which a cycle takes its settings, as indices, and the VSYNC periods from each one's frame to the
-/// next one's (of the last: to the first one's of the next cycle).
+/// The order in which a cycle takes its settings, as indices, and the VSYNC periods from each frame to the next one
+/// (from the last frame to the first of the next cycle).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CycleOrder {
     /// Indices of the settings.
     pub settings: Vec<usize>,
-    /// Periods after the frame of the same place.
+    /// Periods after the frame at the same position.
     pub periods: Vec<u32>,
 }
 
 impl CycleOrder {
-    /// The order that takes the fewest periods on this camera; `margin_us` is kept free of every period, since edges
-    /// jitter.
+    /// The order that takes the fewest periods on this camera. `margin_us` of every period is kept free, because
+    /// edges jitter.
     ///
-    /// A camera that overlaps readout and exposure misses a trigger where the trigger delay falls back by more than
-    /// period - readout. Downwards, a cycle falls back by no more than the largest gap between neighbouring delays,
-    /// and less is impossible: each gap must be crossed on the way down from the largest delay to the smallest. Where
-    /// even that is too much, one fall a cycle is the least that can be, and upwards there is just one.
+    /// A camera that overlaps readout and exposure misses a trigger if the trigger delay decreases by more than
+    /// period - readout. With descending delays, the largest decrease in a cycle is the largest gap between
+    /// neighbouring delays. No order does better, because each gap must be crossed on the way from the largest delay
+    /// to the smallest. If even that is too much, at least one such decrease per cycle is unavoidable, and ascending
+    /// order has exactly one.
     pub fn fastest(
         shots: &[CameraSettings],
         camera: &CameraCapabilities,
@@ -52,7 +53,7 @@ impl CycleOrder {
         if upwards.cycle_periods() < downwards.cycle_periods() { upwards } else { downwards }
     }
 
-    /// VSYNC periods that a cycle takes.
+    /// Number of VSYNC periods in a cycle.
     pub fn cycle_periods(&self) -> u32 {
         self.periods.iter().sum()
     }
@@ -61,13 +62,13 @@ impl CycleOrder {
 /// One sound frame of a film.
 #[derive(Debug, Clone)]
 pub struct FilmFrame {
-    /// The delay as measured, the exposure as taken.
+    /// The measured delay and the actual exposure.
     pub setting: Setting,
     /// Start of the exposure of row 0, on the host's clock.
     pub exposure_start_ns: i64,
     /// Raw counts, `[t, s]`.
     pub raw: Arc<Array2<u32>>,
-    /// Counts after all stages, `[t, s]`; nothing where a stage failed.
+    /// Counts after all stages, `[t, s]`; `None` if a stage failed.
     pub image: Option<Arc<Array2<f32>>>,
 }
 
@@ -80,38 +81,38 @@ impl FilmFrame {
     }
 }
 
-/// A cycle that is being taken.
+/// A cycle during acquisition.
 #[derive(Debug, Clone)]
 pub struct Cycle {
-    /// Counted from 0.
+    /// Number of the cycle, from 0.
     pub number: u32,
-    /// By setting.
+    /// The frames, by setting.
     pub frames: Vec<Option<FilmFrame>>,
-    /// Where its triggers went.
+    /// What became of its triggers.
     pub counts: Counts,
-    /// Settings whose fate is decided.
+    /// Number of settings whose fate is decided.
     pub decided: usize,
 }
 
 impl Cycle {
-    /// A cycle of `settings` settings, nothing of which is there yet.
+    /// An empty cycle of `settings` settings.
     pub fn new(number: u32, settings: usize) -> Self {
         Self { number, frames: vec![None; settings], counts: Counts::default(), decided: 0 }
     }
 
-    /// Whether nothing more comes.
+    /// Whether all settings are decided.
     pub fn is_over(&self) -> bool {
         self.decided == self.frames.len()
     }
 
-    /// The settings that have no sound frame.
+    /// The settings without a sound frame.
     pub fn missing(&self) -> Vec<usize> {
         let missing = self.frames.iter().enumerate().filter(|(_, frame)| frame.is_none());
         missing.map(|(setting, _)| setting).collect()
     }
 }
 
-/// From the frames of a cycle to its light transport.
+/// Computes a cycle's light transport from its frames.
 pub struct FilmSolver {
     demux: Demux,
     geometry: SweepGeometry,
@@ -121,7 +122,7 @@ impl FilmSolver {
     /// A solver for the cycles of `schedule`.
     ///
     /// # Errors
-    /// When the options or the geometry make no model.
+    /// If options or geometry do not give a valid model.
     pub fn new(
         options: DemuxOptions,
         schedule: &Schedule,
@@ -139,14 +140,15 @@ impl FilmSolver {
         (*reach.start(), *reach.end())
     }
 
-    /// The transport of one frame of each setting, in the settings' order; `dark` is the image `[t, s]` without light.
-    /// Ends early, with an error, soon after `go_on` says no.
+    /// The transport from one frame of each setting, in the settings' order. `dark` is the image `[t, s]` without
+    /// light. Stops early, with an error, soon after `go_on` returns false.
     ///
-    /// It is not started from the transport of the cycle before: the noise of single frames decides which rows are 0, so
-    /// that this saves no step (5.2 a pixel with and without), and the bits would hang on what was solved before.
+    /// It does not start from the previous cycle's transport: the noise of single frames determines which rows are 0,
+    /// so this would save no steps (5.2 per pixel with and without), and the bits would depend on what was solved
+    /// before.
     ///
     /// # Errors
-    /// When a frame's delay makes no model, or `go_on` said no.
+    /// If a frame's delay does not give a valid model, or `go_on` returned false.
     pub fn solve(
         &self,
         frames: &[(Setting, Arc<Array2<f32>>)],
@@ -266,7 +268,8 @@ mod tests {
             CycleOrder::fastest(&shots, &camera(Readout::Overlapped, readout_us), PERIOD_US, 50.0)
                 .cycle_periods()
         };
-        // Upwards the fall from +1500 to -1500 leaves 13.67 ms, which is 3.75 cycles a second at 60 Hz.
+        // In ascending order the decrease from +1500 to -1500 leaves 13.67 ms; this gives 3.75 cycles per second at
+        // 60 Hz.
         assert_eq!((periods(16_100.0), periods(16_400.0)), (15, 16));
         let sequential = camera(Readout::Sequential, 16_100.0);
         assert_eq!(CycleOrder::fastest(&shots, &sequential, PERIOD_US, 50.0).cycle_periods(), 30);

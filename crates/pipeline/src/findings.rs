@@ -1,5 +1,5 @@
-//! What the stack of a sweep says of the rig and of the scene, before it is demultiplexed: settings that cannot be
-//! trusted, the beam's width, the place of direct light, the prior, the noise.
+//! What a sweep's stack tells about the rig and the scene, before it is demultiplexed: unreliable settings, the
+//! beam's width, the position of direct light, the prior, the noise.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -17,45 +17,45 @@ use crate::demux::DemuxOptions;
 use crate::products::SweepStack;
 use crate::schedule::{Spot, SweepGeometry};
 
-/// Offsets of direct light below this are not worth models of their own, of which each row then needs several.
+/// Smaller offsets of direct light are ignored, because modelling them requires several models per row.
 const NEGLIGIBLE_U0_ROWS: f32 = 0.02;
 
-/// How a sweep was demultiplexed, and why so.
+/// How a sweep was demultiplexed, and why.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Findings {
     /// The prior.
     pub prior: Prior,
-    /// The held-out error of the priors compared; none if the plan names its prior, or it could not be found.
+    /// The held-out errors of the priors compared; `None` if the plan names its prior, or the comparison failed.
     pub choice: Option<Choice>,
-    /// Standard deviation of the beam, 0 for an ideal one.
+    /// Standard deviation of the beam in rows, 0 for an ideal one.
     pub beam_sigma_rows: f64,
-    /// Median place of direct light in projector rows, 0 where it lies in its own row.
+    /// Median position of direct light in projector rows, 0 if it lies in its own row.
     pub u0_rows: f64,
     /// Delay and exposure of the images that were left out.
     pub left_out_us: Vec<(f64, f64)>,
-    /// What was found, as a key and a sentence each.
+    /// Findings, each as a key and a sentence.
     pub remarks: Vec<(&'static str, String)>,
-    /// What makes the result worse than it looks.
+    /// Problems that make the result worse than it looks.
     pub warnings: Vec<String>,
 }
 
-/// How a sweep is to be demultiplexed, and why so. It is chosen by a few camera rows, so that a sweep which is solved in
-/// parts is solved as it would be in one.
+/// How a sweep is to be demultiplexed, and why. The choice is based on a few camera rows, so that a sweep solved in
+/// parts gives the same result as one solved as a whole.
 pub struct Choices {
-    /// Solves the images that are used.
+    /// Solves the images in use.
     demux: Demux,
-    /// Indices of the images that are used.
+    /// Indices of the images in use.
     kept: Vec<usize>,
-    /// Which of the kept images may be coupled.
+    /// Which of these images may be coupled.
     steady: Vec<usize>,
     noise: Option<NoiseModel>,
     coupling: Option<Coupling>,
-    /// Why so.
+    /// The reasons for the choices.
     pub findings: Findings,
 }
 
-/// The camera rows that [`choose`] looks at, of an image with so many: those of a sample, with the neighbours that they are
-/// coupled to.
+/// The camera rows that [`choose`] uses, for an image with `camera_rows` rows: those of a sample, with the neighbours
+/// that they are coupled to.
 pub fn rows_to_choose_by(camera_rows: usize) -> Vec<usize> {
     let halo_rows = Coupling::default().radius_px;
     let with_halo = |t: usize| t.saturating_sub(halo_rows)..(t + halo_rows + 1).min(camera_rows);
@@ -63,11 +63,11 @@ pub fn rows_to_choose_by(camera_rows: usize) -> Vec<usize> {
     rows.into_iter().collect()
 }
 
-/// Chooses how to demultiplex a sweep by some of its rows, those of [`rows_to_choose_by`]. `planned` is the plan's
-/// demultiplexer, `stack` holds `rows` alone.
+/// Chooses how to demultiplex a sweep from some of its rows, those of [`rows_to_choose_by`]. `planned` is the plan's
+/// demultiplexer; `stack` contains only the camera rows `rows`.
 ///
 /// # Errors
-/// When the stack makes no model.
+/// If the stack does not give a valid model.
 pub fn choose(
     planned: &Demux,
     options: &DemuxOptions,
@@ -101,7 +101,7 @@ pub fn choose(
             let coupled = noise.zip(coupling).map(|(noise, coupling)| couple(&coupling, &noise, &stack));
             (noise, coupling, coupled)
         },
-        // From the images as they were taken.
+        // From the images before coupling.
         || estimate_optics(&sample_of(&stack.images)?, geometry.beam_sigma_rows),
     );
     let coupled = coupled.transpose()?;
@@ -114,7 +114,7 @@ pub fn choose(
             ),
         ));
     }
-    // Of the images that are solved.
+    // From the images that will be solved.
     let sample = || sample_of(coupled.as_ref().map_or(&stack.images, |coupled| &coupled.stack));
     let calibrated =
         optics.and_then(|optics| calibrate(&planned, options, &stack.timing, optics, &sample, &mut findings));
@@ -126,7 +126,7 @@ pub fn choose(
         }
     };
     Ok(match spot {
-        // Neighbours see other moments of the spot, so images that depend on it are solved as they were taken.
+        // Neighbours see the spot at other times, so images that depend on it are not coupled.
         Some(spot) => {
             let demux = demux.with_settings(settings)?.with_spot(spot)?;
             Choices { demux, kept: all, steady: uncut, noise, coupling, findings }
@@ -139,16 +139,17 @@ pub fn choose(
 }
 
 impl Choices {
-    /// Rows on either side of those solved that the stack must hold beside them, where the image has them.
+    /// Number of additional rows that the stack must contain on either side of those solved, where the image has
+    /// them.
     pub fn halo_rows(&self) -> usize {
         self.coupling.map_or(0, |coupling| coupling.radius_px)
     }
 
-    /// Solves camera rows `rows`. `stack` holds the rows from `held_from` on, at least [`Self::halo_rows`] more than those
-    /// solved; it comes back with `rows` and the images that were used.
+    /// Solves camera rows `rows`. `stack` contains the rows starting at `held_from`, with at least
+    /// [`Self::halo_rows`] more than those solved; the returned stack is reduced to `rows` and the images in use.
     ///
     /// # Errors
-    /// When the stack makes no model, or `go_on` said no.
+    /// If the stack does not give a valid model, or `go_on` returned false.
     pub fn solve(
         &self,
         rows: Range<usize>,
@@ -218,7 +219,7 @@ fn couple(coupling: &Coupling, noise: &NoiseModel, stack: &SweepStack) -> Result
     coupling.apply(stack.images.view(), valid, noise, &frames_of(stack))
 }
 
-/// Takes the optics for what they were estimated to be, and chooses the prior for a sample of the images that are solved.
+/// Adopts the estimated optics, and chooses the prior for a sample of the images that will be solved.
 fn calibrate(
     planned: &Demux,
     options: &DemuxOptions,
@@ -267,7 +268,7 @@ fn calibrate(
             let default = findings.prior;
             let others = candidates().into_iter().filter(|prior| *prior != default);
             let compared: Vec<Prior> = std::iter::once(default).chain(others).collect();
-            // Noise asks for smoothness, and coupling has taken most of it.
+            // More noise requires more smoothness, but coupling has removed most of the noise.
             match sample().and_then(|sample| choose_prior(&sample, &optics, &compared)) {
                 Ok(choice) => {
                     findings.prior = choice.prior();
@@ -297,13 +298,14 @@ fn say_beam(estimate: Option<&Result<BeamEstimate, CalibrateError>>, sigma_rows:
     }
 }
 
-/// A prior with its weights.
+/// A prior with its weights, as text.
 pub fn name(prior: Prior) -> String {
     format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta())
 }
 
-/// The images whose edge cuts the direct row while a flying spot draws it; and the spot's way if the rig knows when it
-/// passes each pixel's column, and the beam lets that be modelled. Without it they are left out.
+/// The images with an edge on the direct row, which a flying spot makes unreliable. Also returns the spot's path, if
+/// the rig knows when it passes each pixel's column and the beam allows modelling it; without the path these images
+/// are left out.
 fn cut_by_the_spot(
     geometry: &SweepGeometry,
     stack: &SweepStack,

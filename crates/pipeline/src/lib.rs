@@ -1,7 +1,7 @@
-//! From frames to results: frames and VSYNC edges become averaged units, units pass stages in parallel, and sinks and
-//! folds receive them in order.
+//! From frames to results: frames and VSYNC edges become averaged units, units pass through stages in parallel, and
+//! sinks and folds receive them in order.
 //!
-//! No device, no file and no socket is known here; threads are `std` threads with names, workers are rayon's.
+//! This crate accesses no devices, files or sockets. Threads are named `std` threads, workers are rayon's.
 
 mod assembler;
 mod demux;

@@ -15,51 +15,51 @@ use crate::queue::{Input, Policy};
 use crate::stage::{Stage, StageError};
 use crate::unit::Unit;
 
-/// How large the pipeline is.
+/// The size of the pipeline.
 #[derive(Debug, Clone, Copy)]
 pub struct PipelineConfig {
-    /// Events that may wait for the assembler.
+    /// Largest number of events waiting for the assembler.
     pub queue_events: usize,
-    /// What happens to a frame when so many do.
+    /// What happens to a frame when the queue is full.
     pub policy: Policy,
-    /// Units that may be under way between the assembler and the sink.
+    /// Largest number of units between the assembler and the sink.
     pub units_under_way: usize,
-    /// Threads that run stages; 0: one a processor.
+    /// Number of threads that run stages; 0: one per processor.
     pub worker_threads: usize,
 }
 
-/// Why the pipeline could not start or did not end well.
+/// Why the pipeline could not start or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum PipelineError {
-    /// The system gave no thread.
+    /// The system could not create a thread.
     #[error("cannot start thread {name}: {source}; raise the unit's TasksMax or the user's process limit")]
     Spawn {
         /// The thread's name.
         name: &'static str,
-        /// What the system said.
+        /// The system's error.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// A thread of the pipeline panicked: a defect.
+    /// A thread of the pipeline panicked, which is a bug.
     #[error("the {0} thread panicked; the log has its message. What was stored stays stored")]
     Panicked(&'static str),
 }
 
-/// What the sink receives, in the order in which it was assembled.
+/// The items that the sink receives, in the order of assembly.
 pub enum Ordered {
-    /// A point's unit, and its image after all stages or why it has none.
+    /// A point's unit, with its image after all stages or the error that prevented it.
     Unit(Unit, Result<Array2<f32>, StageError>),
-    /// An attempt without all its frames.
+    /// An attempt that lacks frames.
     Failed(SettingsId, Failure, Counts),
-    /// A pass is over; frames outside any attempt, and the line so far.
+    /// A pass is over; counts of frames outside any attempt, and statistics of the line so far.
     Flushed(Counts, VsyncStats),
 }
 
-/// Receives a run in order, on a thread of its own.
+/// Receives a run's results in order, on its own thread.
 pub trait Sink: Send {
     /// Takes the next item.
     fn take(&mut self, item: Ordered);
 
-    /// Nothing more comes, in order or because the assembler has failed.
+    /// Called when no more items will come, either at the regular end or because the assembler has failed.
     fn end(&mut self);
 }
 
@@ -75,7 +75,7 @@ impl<S: Sink + 'static> Pipeline<S> {
     /// Starts the threads; events go into the returned input.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// If the system cannot create a thread.
     pub fn start(
         config: PipelineConfig,
         assembler: AssemblerConfig,
@@ -89,7 +89,8 @@ impl<S: Sink + 'static> Pipeline<S> {
             .map_err(|error| PipelineError::Spawn { name: "stage", source: error.into() })?;
         let (input, events) = Input::new(config.queue_events, config.policy);
         let under_way = config.units_under_way.max(1);
-        // Every item under way holds a permit, so the channel to the sink never fills and no worker waits in it.
+        // Every item under way holds a permit, so the channel to the sink never fills and no worker has to wait for
+        // it.
         let (done, items) = bounded::<Numbered>(under_way);
         let (give_back, permits) = bounded::<()>(under_way);
         for _ in 0..under_way {
@@ -102,10 +103,10 @@ impl<S: Sink + 'static> Pipeline<S> {
         Ok((Self { assembler, sink }, input))
     }
 
-    /// Waits for the end of everything sent and returns the sink.
+    /// Waits until everything sent is processed and returns the sink.
     ///
     /// # Errors
-    /// When a thread of the pipeline panicked.
+    /// If a thread of the pipeline panicked.
     pub fn join(self) -> Result<S, PipelineError> {
         let assembler = self.assembler.join();
         let sink = self.sink.join().map_err(|_panic| PipelineError::Panicked("sink"))?;
@@ -124,7 +125,7 @@ fn spawn<T: Send + 'static>(
         .map_err(|source| PipelineError::Spawn { name, source: source.into() })
 }
 
-/// The way from the assembler to the sink.
+/// Hands items from the assembler to the workers and the sink.
 struct Dispatch {
     workers: rayon::ThreadPool,
     stages: Arc<[Box<dyn Stage>]>,
@@ -164,10 +165,10 @@ impl Dispatch {
     }
 }
 
-/// Passes a unit's mean image through all stages. A stage that panics costs its unit, never the run.
+/// Passes a unit's mean image through all stages. A stage that panics loses its unit but does not end the run.
 ///
 /// # Errors
-/// What the first stage that gave up, or panicked, said.
+/// The error or panic message of the first stage that failed.
 pub fn run_stages(stages: &[Box<dyn Stage>], unit: &Unit) -> Result<Array2<f32>, StageError> {
     stages.iter().try_fold(unit.mean(), |image, stage| {
         catch_unwind(AssertUnwindSafe(|| stage.apply(unit, image))).unwrap_or_else(|panic| {
@@ -176,7 +177,7 @@ pub fn run_stages(stages: &[Box<dyn Stage>], unit: &Unit) -> Result<Array2<f32>,
     })
 }
 
-/// What a panic said.
+/// The message of a panic.
 pub fn message_of(panic: &(dyn Any + Send)) -> &str {
     panic
         .downcast_ref::<&str>()
@@ -185,7 +186,7 @@ pub fn message_of(panic: &(dyn Any + Send)) -> &str {
         .unwrap_or("without a message")
 }
 
-/// Puts what the workers finish back into the order in which it was assembled.
+/// Restores the order of assembly in the workers' results.
 fn run_sink<S: Sink>(mut sink: S, items: &Receiver<Numbered>, give_back: &Sender<()>) -> S {
     let mut next = 0;
     let mut early = BTreeMap::new();

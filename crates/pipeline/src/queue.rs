@@ -3,27 +3,27 @@
 pub use crossbeam_channel::Receiver;
 use crossbeam_channel::{Sender, TrySendError, bounded};
 
-/// What happens to an item that finds the queue full.
+/// What happens to an item when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Policy {
-    /// The sender waits: simulation and replay, where the source can.
+    /// The sender waits: for simulation and replay, whose source can wait.
     Wait,
-    /// The item is handed back and counted by its owner: science on a real camera, where the point is repeated.
+    /// The item is returned to its owner, who counts it: for real cameras, where the point is repeated.
     Fail,
 }
 
 /// Why an item did not enter the queue.
 #[derive(Debug, thiserror::Error)]
 pub enum QueueError<T> {
-    /// Full, under [`Policy::Fail`].
+    /// The queue is full, with [`Policy::Fail`].
     #[error("the queue is full")]
     Full(T),
-    /// The other side has ended.
+    /// The receiver is gone.
     #[error("the receiving thread has ended")]
     Closed,
 }
 
-/// The sending side. Cloning gives another sender into the same queue.
+/// The sending side. A clone sends into the same queue.
 pub struct Input<T> {
     sender: Sender<T>,
     policy: Policy,
@@ -42,10 +42,10 @@ impl<T> Input<T> {
         (Self { sender, policy }, receiver)
     }
 
-    /// Sends what may be refused, by the queue's policy.
+    /// Sends an item that may be refused, according to the queue's policy.
     ///
     /// # Errors
-    /// `Full` under [`Policy::Fail`]; `Closed` when the receiver is gone.
+    /// `Full` with [`Policy::Fail`]; `Closed` if the receiver is gone.
     pub fn offer(&self, item: T) -> Result<(), QueueError<T>> {
         if self.policy == Policy::Wait {
             return self.send(item);
@@ -57,10 +57,10 @@ impl<T> Input<T> {
         }
     }
 
-    /// Sends what must arrive, waiting for room.
+    /// Sends an item that must arrive; waits for room.
     ///
     /// # Errors
-    /// `Closed` when the receiver is gone.
+    /// `Closed` if the receiver is gone.
     pub fn send(&self, item: T) -> Result<(), QueueError<T>> {
         self.sender.send(item).map_err(|_closed| QueueError::Closed)
     }

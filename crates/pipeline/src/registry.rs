@@ -1,4 +1,4 @@
-//! Stages and folds by the names that plans use.
+//! Stages and folds by their names in plans.
 
 use std::collections::BTreeMap;
 
@@ -9,46 +9,46 @@ use crate::dots::DotStages;
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage::{Fold, HotPixels, Stage};
 
-/// Why a plan's stage cannot be made.
+/// Why a plan's stage cannot be created.
 #[derive(Debug, thiserror::Error)]
 pub enum RegistryError {
-    /// Nothing has that name.
+    /// The name does not exist.
     #[error("stage name = {name:?}: known are {known}")]
     Unknown {
         /// The name in the plan.
         name: String,
-        /// All names there are.
+        /// All existing names.
         known: String,
     },
-    /// An option that the stage does not have, or at a value it does not take.
+    /// An option that the stage does not have, or a value that it does not accept.
     #[error("stage {name}: {source}")]
     Options {
         /// The stage's name.
         name: String,
-        /// What serde says of it.
+        /// The error message of serde.
         source: serde_json::Error,
     },
-    /// Options that are well formed and make no sense.
+    /// Options that are well formed but invalid.
     #[error("stage {name}: {what}")]
     Invalid {
         /// The stage's name.
         name: String,
-        /// Field, value, what is allowed.
+        /// Field, value, and the allowed values.
         what: String,
     },
 }
 
-/// What a name stands for.
+/// The entry of a name.
 pub enum Entry {
-    /// Works on each unit alone.
+    /// Processes each unit independently.
     Stage(Box<dyn Stage>),
-    /// Works on all units in order.
+    /// Processes all units in order.
     Fold(Box<dyn Fold>),
 }
 
 type Make = Box<dyn Fn(Value, &Schedule, &SweepGeometry) -> Result<Entry, RegistryError> + Send + Sync>;
 
-/// All stages and folds that plans may name.
+/// All stages and folds available to plans.
 pub struct Registry {
     makers: BTreeMap<&'static str, Make>,
     /// The column stages of the dot rig.
@@ -78,7 +78,7 @@ fn parse<T: serde::de::DeserializeOwned>(name: &str, options: Value) -> Result<T
 }
 
 impl Registry {
-    /// Adds a name, or replaces what it stood for.
+    /// Registers an entry; replaces an existing one of that name.
     pub fn register(
         &mut self,
         name: &'static str,
@@ -87,10 +87,10 @@ impl Registry {
         self.makers.insert(name, Box::new(make));
     }
 
-    /// Makes what `name` stands for, with the plan's options (a JSON object).
+    /// Creates the entry of `name` with the plan's options (a JSON object).
     ///
     /// # Errors
-    /// For names that nothing has and options that the stage refuses.
+    /// For unknown names, and for options that the stage rejects.
     pub fn make(
         &self,
         name: &str,

@@ -1,25 +1,26 @@
-//! How regular a VSYNC line is: where its next edge belongs, and how far edges lie from the straight line through their
-//! neighbours.
+//! Measures how regular a VSYNC line is: the expected position of its next edge, and the distance of edges from the
+//! straight line through their neighbours.
 
 use std::collections::VecDeque;
 
 use crate::edges::TrueEdge;
 
-/// Edges on each side of the one whose deviation is measured: a quarter of a second at 60 Hz, in which no crystal drifts.
+/// Edges on each side of the one whose deviation is measured: a quarter of a second at 60 Hz, too short for crystal
+/// drift.
 const REACH: usize = 8;
 const WINDOW: usize = 2 * REACH + 1;
-/// Edges from which the place of the next one is told.
+/// Number of edges needed to predict the position of the next one.
 const MIN_EDGES: usize = REACH;
-/// Deviations from which their spread is taken for known.
+/// Number of deviations from which their standard deviation is considered known.
 const MIN_DEVIATIONS: u64 = 16;
-/// An edge further off than so many standard deviations is none of the line's.
+/// An edge farther off than this many standard deviations does not belong to the line.
 const GATE_SIGMAS: f64 = 8.0;
-/// Nor is the gate ever narrower than this: a clock model's corrections move a perfect line too.
+/// Smallest half-width of the gate: corrections of a clock model shift a perfect line too.
 const MIN_GATE_NS: f64 = 50_000.0;
-/// Over which time frequency is averaged for the Allan deviation.
+/// Averaging time of the frequency for the Allan deviation.
 const ALLAN_NS: i64 = 1_000_000_000;
 
-/// What is known of a line from its true edges.
+/// Statistics of a line, computed from its true edges.
 pub struct Regularity {
     period_ns: i64,
     recent: VecDeque<TrueEdge>,
@@ -28,7 +29,7 @@ pub struct Regularity {
 }
 
 impl Regularity {
-    /// Nothing is known yet of a line with this nominal period.
+    /// Empty statistics of a line with this nominal period.
     pub fn new(period_ns: i64) -> Self {
         Self {
             period_ns,
@@ -38,13 +39,13 @@ impl Regularity {
         }
     }
 
-    /// The count of periods begins anew.
+    /// Restarts after a new count of periods.
     pub fn restart(&mut self) {
         self.recent.clear();
         self.allan.seen.fill(None);
     }
 
-    /// Takes the next true edge.
+    /// Adds the next true edge.
     pub fn push(&mut self, edge: TrueEdge) {
         if self.recent.len() == WINDOW {
             self.recent.pop_front();
@@ -54,14 +55,15 @@ impl Regularity {
             && let Some(line) = self.line()
         {
             let middle = self.recent[REACH];
-            // The line has taken part of the edge's own deviation away.
+            // The fit has absorbed part of the edge's own deviation.
             let left = (1.0 - line.leverage(middle.index)).sqrt();
             self.deviations.note((middle.host_ns as f64 - line.host_ns(middle.index)).abs() / left);
         }
         self.allan.note(edge);
     }
 
-    /// Whether an edge lies where the line's edge `index` belongs; anywhere, while that is not known.
+    /// Whether an edge lies at the expected position of the line's edge `index`; always true while the position is
+    /// unknown.
     pub fn fits(&self, index: i64, host_ns: i64) -> bool {
         let near = self.recent.back().is_some_and(|last| index - last.index <= WINDOW as i64);
         if !near || self.deviations.count < MIN_DEVIATIONS || self.recent.len() < MIN_EDGES {
@@ -76,12 +78,12 @@ impl Regularity {
         self.deviations.sigma_ns() / 1e3
     }
 
-    /// What 99 % of the edges deviate less than, to 2 %.
+    /// 99th percentile of the edges' deviation, to 2 %.
     pub fn p99_us(&self) -> f64 {
         self.deviations.quantile_ns(0.99) / 1e3
     }
 
-    /// Allan deviation over a second (IEEE Std 1139-2008, overlapping estimate); nothing before two seconds.
+    /// Allan deviation over a second (IEEE Std 1139-2008, overlapping estimate); `None` before two seconds.
     pub fn allan_1s(&self) -> Option<f64> {
         self.allan.deviation()
     }
@@ -103,7 +105,8 @@ impl Regularity {
     }
 }
 
-/// A least-squares line: nanoseconds beyond nominal over periods, both from `origin` on.
+/// A least-squares line: excess over the nominal time in nanoseconds as a function of periods, both relative to
+/// `origin`.
 struct Fit {
     origin: TrueEdge,
     period_ns: i64,
@@ -121,24 +124,24 @@ impl Fit {
         nominal_ns as f64 + self.y + self.slope_ns * (periods as f64 - self.x)
     }
 
-    /// Share of a point's own deviation that the line follows.
+    /// Share of a point's own deviation that the fit follows.
     fn leverage(&self, index: i64) -> f64 {
         let periods = (index - self.origin.index) as f64;
         1.0 / self.n + (periods - self.x).powi(2) / self.xx
     }
 }
 
-/// Sum of squares, and counts over a logarithmic scale.
+/// Sum of squares, and a histogram with logarithmic bins.
 #[derive(Default)]
 struct Deviations {
     count: u64,
     sum_squares_ns2: f64,
-    /// `bins[k]`: from 2^(k/32) - 1 ns on.
+    /// `bins[k]` starts at 2^(k/32) - 1 ns.
     bins: Vec<u64>,
 }
 
 const BINS_PER_OCTAVE: f64 = 32.0;
-/// Up to a second, which no gate lets pass.
+/// Up to a second, which exceeds every gate.
 const BINS: usize = 30 * BINS_PER_OCTAVE as usize;
 
 impl Deviations {
@@ -160,15 +163,15 @@ impl Deviations {
             below += count;
             below as f64 >= share * self.count as f64
         });
-        // The middle of the bin.
+        // The centre of the bin.
         bin.map_or(0.0, |bin| ((bin as f64 + 0.5) / BINS_PER_OCTAVE).exp2() - 1.0)
     }
 }
 
-/// Second differences of the edges' times over a second, from which the nominal period falls out.
+/// Second differences of the edges' times over a second, in which the nominal period cancels.
 struct Allan {
     period_ns: i64,
-    /// Periods in a second.
+    /// Number of periods in a second.
     periods: i64,
     /// The edges of the last two seconds, each at its index modulo the length.
     seen: Vec<Option<TrueEdge>>,
@@ -219,7 +222,7 @@ pub(crate) mod tests {
 
     const PERIOD_NS: i64 = 16_666_667;
 
-    /// Standard normal numbers (SplitMix64, Box-Muller).
+    /// Generator of standard normal numbers (SplitMix64, Box-Muller).
     pub struct Normal(pub u64);
 
     impl Normal {
@@ -237,7 +240,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// A line that runs 80 ppm off its nominal period and drifts by 1 ppm a minute, with every 100th edge missing.
+    /// A line that is 80 ppm off its nominal period and drifts by 1 ppm per minute, with every 100th edge missing.
     fn line(jitter_ns: f64, edges: i64) -> Regularity {
         let mut normal = Normal(7);
         let mut regularity = Regularity::new(PERIOD_NS);
@@ -263,8 +266,8 @@ pub(crate) mod tests {
 
     #[test]
     fn allan_deviation_is_that_of_a_frequency_that_steps() {
-        // Fast and slow by 2 ppm in turn, a second each: averages over a second, taken at any moment, differ by
-        // a triangle of height 4 ppm, whose mean square is a third of its peak's.
+        // Alternately fast and slow by 2 ppm, for a second each: the difference of consecutive averages over a
+        // second, as a function of time, is a triangle of height 4 ppm, whose mean square is a third of its peak's.
         let mut regularity = Regularity::new(10_000_000);
         let mut host_ns = 0;
         for index in 0..20_000 {

@@ -1,4 +1,4 @@
-//! What a sweep acquires, point by point, in the order of acquisition.
+//! The points that a sweep acquires, in the order of acquisition.
 
 use std::sync::Arc;
 
@@ -7,31 +7,31 @@ use raysweep_transport::plane::calibrate::{self, FlyingSpot};
 use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming};
 use serde::Deserialize;
 
-/// What a point's image is for.
+/// The purpose of a point's image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Role {
     /// Projector dark; the index counts the exposures, shortest first.
     Dark(u32),
-    /// One whole VSYNC period of exposure: every row lit once.
+    /// One whole VSYNC period of exposure: every row is lit once.
     Regular,
-    /// The plan's point: `exposure_index * delays + delay_index`.
+    /// A point of the plan's sweep: `exposure_index * delays + delay_index`.
     Sweep(u32),
 }
 
-/// One point: frames under one setting that are averaged.
+/// One point: frames with the same setting that are averaged.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
-    /// What it is for.
+    /// Purpose of its image.
     pub role: Role,
-    /// Wanted t_d.
+    /// Wanted delay t_d.
     pub delay_us: f64,
-    /// Wanted t_e.
+    /// Wanted exposure t_e.
     pub exposure_us: f64,
     /// Frames to average.
     pub frames: u32,
 }
 
-/// All points of a run. A point's ordinal is its place in `points`.
+/// All points of a run. A point's ordinal is its index in `points`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Schedule {
     /// In the order of acquisition: dark frames, the regular image, then the sweep.
@@ -39,12 +39,12 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// How many points the plan's sweep has.
+    /// Number of points in the plan's sweep.
     pub fn sweep_len(&self) -> usize {
         self.points.iter().filter(|point| matches!(point.role, Role::Sweep(_))).count()
     }
 
-    /// How many dark points belong to it.
+    /// Number of dark points.
     pub fn dark_len(&self) -> usize {
         self.points.iter().filter(|point| matches!(point.role, Role::Dark(_))).count()
     }
@@ -56,71 +56,71 @@ impl Schedule {
     }
 }
 
-/// What turns counts and times into light transport: the rig, as the rig file states it.
+/// The properties of the rig that convert counts and times into light transport, from the rig file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SweepGeometry {
-    /// When the projector lights its rows, nominally: delays are measured against it.
+    /// Nominal timing of the projector's rows, to which delays refer.
     pub raster: Raster,
-    /// When it lights them in truth: start of each row and end of the last, from the nominal start of row 0; none if no
-    /// table was measured.
+    /// True timing of the rows: start of each row and end of the last, relative to the nominal start of row 0; `None`
+    /// if no table was measured.
     pub row_table_us: Option<Arc<[f64]>>,
-    /// Standard deviation of the beam over projector rows, 0 for the ideal beam; none if it is not known.
+    /// Standard deviation of the beam in projector rows, 0 for the ideal beam; `None` if unknown.
     pub beam_sigma_rows: Option<f64>,
-    /// When within its row a pixel's direct light arrives.
+    /// Determines when within its row a pixel's direct light arrives.
     pub spot: Spot,
-    /// Projector columns, 0 to 1 over its width, that the image's left and right edges see; none: not known.
+    /// Projector columns, in 0..=1 over its width, seen by the image's left and right edges; `None` if unknown.
     pub projector_columns: Option<[f64; 2]>,
     /// Projector row that camera row 0 sees.
     pub first_row: usize,
     /// Projector rows from one camera row to the next.
     pub row_pitch: f64,
-    /// From the start of one camera row's exposure to the next row's.
+    /// Time from the start of one camera row's exposure to the start of the next row's.
     pub camera_row_time_us: f64,
-    /// Camera rows.
+    /// Number of camera rows.
     pub height: usize,
-    /// Camera columns.
+    /// Number of camera columns.
     pub width: usize,
-    /// Counts, above black, of a white pixel in the time of one projector row.
+    /// Counts above black that a white pixel collects in the time of one projector row.
     pub white_dn: f64,
-    /// Counts from which on a pixel counts as saturated.
+    /// Counts from which a pixel is saturated.
     pub saturation_dn: f64,
 }
 
-/// How the light of a row is drawn, which decides when within its row a pixel's direct light arrives.
+/// How the light of a row is drawn, which determines when within its row a pixel's direct light arrives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Spot {
     /// The whole row at once: evenly over the row's time.
     Uniform,
-    /// By a spot that flies along the row: at the moment when it passes the projector column that the pixel sees.
+    /// By a spot that flies along the row: at the time when it passes the projector column that the pixel sees.
     Flying(Scan),
 }
 
-/// Which way a flying spot runs.
+/// Direction of a flying spot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Scan {
-    /// Nobody knows.
+    /// Unknown.
     Unknown,
     /// Every row from the first column to the last.
     OneWay,
-    /// Odd rows backwards.
+    /// Odd rows from the last column to the first.
     Bidirectional,
 }
 
-/// How a camera must be set for a point.
+/// The camera's configuration for a point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shot {
     /// Its settings.
     pub settings: CameraSettings,
-    /// Which edge's light is measured: the trigger's own (0) or a later one.
+    /// The edge whose light is measured, in edges after the trigger's own (0).
     pub light_edges_later: u32,
 }
 
 impl SweepGeometry {
-    /// When rows are lit and exposed, as the model takes it. A beam that is not known counts as ideal.
+    /// The timing of projector and camera rows for the model. An unknown beam counts as ideal.
     ///
     /// # Errors
-    /// When table, beam or camera rows do not fit the raster.
+    /// If table, beam or camera rows do not fit the raster.
     pub fn timing(&self) -> Result<RowTiming, PlaneError> {
         let raster = &self.raster;
         let mut timing = RowTiming::new(raster.rows, raster.row_time_us, raster.period_us)?;
@@ -136,7 +136,7 @@ impl SweepGeometry {
         timing.with_camera(camera)?.with_beam(Beam::of_sigma(self.beam_sigma_rows.unwrap_or(0.0)))
     }
 
-    /// The way of a flying spot over the camera's columns, where the rig knows it.
+    /// The path of a flying spot over the camera's columns, if the rig file gives it.
     pub fn flying_spot(&self) -> Option<FlyingSpot> {
         let scan = match self.spot {
             Spot::Uniform | Spot::Flying(Scan::Unknown) => return None,
@@ -148,12 +148,12 @@ impl SweepGeometry {
         Some(FlyingSpot { scan, columns: (0..self.width).map(column).collect() })
     }
 
-    /// The same, where the model can take it into account: with an ideal beam.
+    /// The same, but only with an ideal beam, which the model requires.
     pub fn modelled_spot(&self) -> Option<FlyingSpot> {
         self.flying_spot().filter(|_| self.beam_sigma_rows == Some(0.0))
     }
 
-    /// The settings for a point on a camera with this trigger latency.
+    /// The configuration for a point on a camera with this trigger latency.
     pub fn shot(&self, point: &Point, trigger_latency_us: f64) -> Shot {
         let trigger =
             self.raster.trigger(self.first_row, point.delay_us, point.exposure_us, trigger_latency_us);

@@ -1,4 +1,4 @@
-//! What is done to units: stages, in parallel and each alone; folds, over all of them in order.
+//! Processing of units: stages, in parallel and each unit independently; folds, over all units in order.
 
 use ndarray::{Array2, Array3, ArrayView2};
 use raysweep_transport::plane::Transport;
@@ -9,7 +9,7 @@ use crate::products::{Profile, SweepStack};
 use crate::strips::InStrips;
 use crate::unit::Unit;
 
-/// Why a stage gave up on a unit.
+/// Why a stage failed on a unit.
 #[derive(Debug, thiserror::Error)]
 #[error("stage {stage}: {what}")]
 pub struct StageError {
@@ -19,33 +19,33 @@ pub struct StageError {
     pub what: String,
 }
 
-/// A pure step on one unit's mean image; runs on any worker thread.
+/// A pure computation on one unit's mean image; runs on any worker thread.
 pub trait Stage: Send + Sync {
     /// Its name in plans.
     fn name(&self) -> &str;
 
-    /// The image that the next stage, or the folds, receive: counts, `[t, s]`.
+    /// Returns the image for the next stage or the folds: counts, `[t, s]`.
     ///
     /// # Errors
-    /// When this unit cannot be processed; its raw image is stored all the same.
+    /// If this unit cannot be processed; its raw image is still stored.
     fn apply(&self, unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError>;
 
-    /// How many rows above and below a pixel its result may depend on, wherever in the image it lies: then a stage can
-    /// be given some rows and these beside them. None: it must see the whole image, which costs time where the sweep is
-    /// larger than the memory.
+    /// Number of rows above and below a pixel on which its result may depend, anywhere in the image. A stage can then
+    /// process some rows given these additional ones. `None`: it needs the whole image, which costs time if the sweep
+    /// is larger than the memory.
     fn halo_rows(&self) -> Option<usize> {
         None
     }
 }
 
-/// What a fold makes.
+/// The results of a fold.
 #[derive(Debug, Clone)]
 pub enum Product {
     /// An image `[t, s]` in the scene's units (1 = a white pixel).
     Image {
         /// File name without extension.
         name: String,
-        /// What it shows, in a sentence.
+        /// Description in one sentence.
         about: String,
         /// The pixels.
         image: Array2<f32>,
@@ -54,28 +54,29 @@ pub enum Product {
     Sequence {
         /// File name without extension.
         name: String,
-        /// What it shows, in a sentence.
+        /// Description in one sentence.
         about: String,
-        /// What the images differ in, with its unit.
+        /// The quantity in which the images differ, with its unit.
         axis: String,
-        /// The value of `axis` of each image.
+        /// The value of `axis` for each image.
         at: Vec<f64>,
         /// The pixels.
         images: Array3<f32>,
     },
-    /// Light over the delay.
+    /// Light as a function of the delay.
     Profile(Profile),
     /// The light transport `[u, t, s]`.
     Transport(Box<Transport>),
-    /// The images that it was made of: what [`crate::ProductSpec`] makes more of. It is not written.
+    /// The images from which it was computed, needed by [`crate::ProductSpec`] to compute other products. Not written
+    /// to disk.
     Stack(Box<SweepStack>),
-    /// How the transport was found.
+    /// How the sweep was demultiplexed.
     Findings(Box<Findings>),
-    /// Something that makes the others worse than they look.
+    /// A problem that makes other products worse than they look.
     Warning(String),
-    /// A number that the report states.
+    /// A number for the report.
     Figure {
-        /// What it is, with its unit.
+        /// Name, with the unit.
         name: &'static str,
         /// Its value.
         value: f64,
@@ -92,35 +93,36 @@ pub struct FoldError {
     pub what: String,
 }
 
-/// Takes units in order and makes products of all of them.
+/// Takes units in order and computes products from all of them.
 pub trait Fold: Send {
     /// Its name in plans.
     fn name(&self) -> &str;
 
-    /// Takes the next unit; a later attempt of a point replaces the earlier.
+    /// Takes the next unit; a later attempt at a point replaces an earlier one.
     fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>);
 
-    /// What was taken so far, for another thread to estimate from while more comes; nothing from a fold that estimates
-    /// nothing, or has too little. Cheap: images are shared, not copied.
+    /// The units taken so far, from which another thread can compute an estimate while more arrive; `None` if the
+    /// fold has no estimates, or too few units. Cheap: images are shared, not copied.
     fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
         None
     }
 
-    /// The products of what was taken, which is given up for them. Ends early, with an error, soon after `go_on` says no.
+    /// Computes the products from the units taken, which it consumes. Stops early, with an error, soon after `go_on`
+    /// returns false.
     ///
     /// # Errors
-    /// When too little was taken, or `go_on` said no.
+    /// If too few units were taken, or `go_on` returned false.
     fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError>;
 
-    /// Keeps no images from now on, and gives no snapshots: [`Self::finish_in_strips`] reads them again. Nothing to do
+    /// Stops keeping images and providing snapshots: [`Self::finish_in_strips`] reads the images again. Does nothing
     /// for a fold whose memory does not grow with the sweep.
     fn keep_no_images(&mut self) {}
 
-    /// [`Self::finish`] after [`Self::keep_no_images`]. The transport and its stack are not among the products: they are
-    /// given away strip by strip.
+    /// [`Self::finish`] after [`Self::keep_no_images`]. The transport and its stack are not among the products; they
+    /// are handed over strip by strip.
     ///
     /// # Errors
-    /// Those of [`Self::finish`]; when an image cannot be read again, or a strip is not taken.
+    /// Those of [`Self::finish`]; if an image cannot be read again, or a strip is refused.
     fn finish_in_strips(
         &mut self,
         _strips: InStrips<'_>,
@@ -130,16 +132,16 @@ pub trait Fold: Send {
     }
 }
 
-/// A fold's units at some moment.
+/// The units of a fold at some time.
 pub trait Snapshot: Send + Sync {
-    /// How many points of the sweep it can estimate from.
+    /// Number of points of the sweep that it can use for an estimate.
     fn points(&self) -> usize;
 
-    /// The transport as these points tell it, sooner for being started from the estimate of fewer points. Ends early,
-    /// with an error, soon after `go_on` says no.
+    /// The transport estimated from these points; starting from the estimate of fewer points makes it faster. Stops
+    /// early, with an error, soon after `go_on` returns false.
     ///
     /// # Errors
-    /// When it cannot be told, or `go_on` said no.
+    /// If it cannot be estimated, or `go_on` returned false.
     fn estimate(
         &self,
         before: Option<&Transport>,
@@ -147,11 +149,11 @@ pub trait Snapshot: Send + Sync {
     ) -> Result<Transport, FoldError>;
 }
 
-/// Stage `hot-pixels`: a pixel that outshines all its neighbours by more than `threshold_dn` takes their median.
+/// Stage `hot-pixels`: replaces a pixel that exceeds all its neighbours by more than `threshold_dn` by their median.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct HotPixels {
-    /// Counts above the brightest neighbour from which on a pixel counts as hot.
+    /// Counts above the brightest neighbour from which a pixel is hot.
     pub threshold_dn: f32,
     /// Distance of the neighbours: 1, or 2 on a Bayer mosaic.
     pub step_px: usize,
@@ -164,7 +166,7 @@ impl Default for HotPixels {
 }
 
 impl HotPixels {
-    /// Field, value and what is allowed, where an option makes no sense.
+    /// Checks the options; an error names field, value and the allowed values.
     pub(crate) fn check(&self) -> Result<(), String> {
         if !(self.threshold_dn > 0.0 && self.threshold_dn.is_finite()) {
             return Err(format!("threshold_dn = {}: give counts greater than 0", self.threshold_dn));
@@ -229,7 +231,7 @@ mod tests {
 
     #[test]
     fn a_hot_pixel_takes_its_neighbours_median_and_an_edge_stays() {
-        // A bright right half is no defect; single pixels at a border and in the middle are.
+        // A bright right half is not a defect; single bright pixels at a border and in the middle are.
         let mut image = Array2::from_shape_fn((5, 5), |(_, s)| if s >= 3 { 1000.0 } else { 10.0 });
         let clean = image.clone();
         (image[[0, 0]], image[[2, 1]]) = (500.0, 3000.0);

@@ -1,4 +1,4 @@
-//! Sweeps that are larger than the memory: images that were not kept are read again, some camera rows at a time.
+//! Sweeps that are larger than the memory: images are not kept but read again, some camera rows at a time.
 
 use std::ops::Range;
 
@@ -9,32 +9,32 @@ use crate::findings::Findings;
 use crate::products::SweepStack;
 use crate::stage::FoldError;
 
-/// Reads again what a fold was given and did not keep.
+/// Reads images again that a fold was given and did not keep.
 pub trait ImageRows: Sync {
-    /// Some rows of the image of a point of the schedule, as [`crate::Fold::push`] was given it: counts, `[rows, s]`.
+    /// Some rows of the image of a point of the schedule, as passed to [`crate::Fold::push`]: counts, `[rows, s]`.
     ///
     /// # Errors
     /// What cannot be read, why, and what to do.
     fn read(&self, point: u32, rows: Range<usize>) -> Result<Array2<f32>, String>;
 }
 
-/// Camera rows of a sweep that follow each other, and what they were made into.
+/// Consecutive camera rows of a sweep and their results.
 #[derive(Debug, Clone)]
 pub struct Strip {
-    /// The camera row that is row 0 of the strip.
+    /// The camera row of row 0 of the strip.
     pub first_row: usize,
     /// The images; the timing is that of the whole camera.
     pub stack: SweepStack,
-    /// The transport of these rows alone.
+    /// The transport of these rows only.
     pub transport: Transport,
 }
 
-/// How a fold is to finish that has kept no images.
+/// How a fold that has kept no images finishes.
 pub struct InStrips<'a> {
-    /// Where it reads them again.
+    /// Source of the images.
     pub images: &'a dyn ImageRows,
-    /// Camera rows of a strip; the last may be lower.
+    /// Number of camera rows per strip; the last strip may have fewer.
     pub strip_rows: usize,
-    /// Takes each strip, from top to bottom, once; and how all of them are demultiplexed.
+    /// Receives each strip once, from top to bottom, and the findings common to all of them.
     pub take: &'a mut dyn FnMut(&Findings, Strip) -> Result<(), FoldError>,
 }

@@ -5,27 +5,27 @@ use std::sync::Arc;
 use ndarray::Array2;
 use raysweep_core::{Counts, SettingsId};
 
-/// The sum of a point's frames and everything that is known of how they were exposed.
+/// The sum of a point's frames and everything known about their exposure.
 #[derive(Debug, Clone)]
 pub struct Unit {
     /// Point and attempt.
     pub id: SettingsId,
     /// Frames summed.
     pub frames: u32,
-    /// Exposure as the hardware took it.
+    /// The actual exposure of the hardware.
     pub exposure_us: f64,
-    /// True t_d of each frame, measured against the VSYNC edge of its light.
+    /// True delay t_d of each frame, relative to the VSYNC edge of its light.
     pub delays_us: Vec<f64>,
-    /// Start of the exposure of row 0 in the last frame, on the host's clock; nothing in a unit that is read back.
+    /// Start of the exposure of row 0 in the last frame, on the host's clock; `None` for a unit read from disk.
     pub last_exposure_ns: Option<i64>,
     /// Sum of counts, `[t, s]`.
     pub sum: Arc<Array2<u32>>,
-    /// Where the attempt's triggers went.
+    /// What became of the attempt's triggers.
     pub counts: Counts,
 }
 
 impl Unit {
-    /// The mean image in counts, `[t, s]`: what stages work on.
+    /// The mean image in counts, `[t, s]`, which stages process.
     pub fn mean(&self) -> Array2<f32> {
         let scale = 1.0 / f64::from(self.frames);
         self.sum.mapv(|sum| (f64::from(sum) * scale) as f32)

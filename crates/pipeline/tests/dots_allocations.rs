@@ -1,5 +1,5 @@
-//! What a frame of the flying dot costs in allocations, from the pool to its batch: none. A batch costs some, however many
-//! frames it has.
+//! Number of allocations per frame of the flying dot, from the pool to its batch: none. A batch costs a few, however
+//! many frames it has.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 #![allow(unsafe_code, reason = "an allocator that counts")]
@@ -15,21 +15,21 @@ use raysweep_pipeline::dots::{
 use raysweep_transport::dots::{FrameShape, Region, Sampling};
 use serde_json::json;
 
-/// Of all threads.
+/// Number of allocations by all threads.
 static ALLOCATED: AtomicU64 = AtomicU64::new(0);
 
 struct Counting;
 
-// SAFETY: every call goes to the system's allocator as it came; the counter is a plain number.
+// SAFETY: every call is forwarded unchanged to the system's allocator; the counter is a plain number.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATED.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller upholds the contract, which is the same.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller upholds the contract, which is the same.
         unsafe { System.dealloc(memory, layout) }
     }
 }
@@ -39,10 +39,10 @@ static ALLOCATOR: Counting = Counting;
 
 const SIDE: usize = 64;
 const BATCHES: u32 = 40;
-/// Batches after which all memory has its size.
+/// Number of batches after which all buffers have their final size.
 const WARM: usize = 24;
 
-/// Notes how much was allocated by the end of each batch.
+/// Records the allocations up to the end of each batch.
 #[derive(Default)]
 struct Ledger(Vec<u64>);
 
@@ -55,7 +55,7 @@ impl CutSink for Ledger {
     fn outside(&mut self, _: Counts) {}
 }
 
-/// A frame with noise, and light around a place.
+/// A frame with noise, and light around `centre`.
 fn counts(seed: u64, centre: Option<(usize, usize)>) -> Vec<u16> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut counts: Vec<u16> = (0..SIDE * SIDE)
@@ -76,7 +76,7 @@ fn counts(seed: u64, centre: Option<(usize, usize)>) -> Vec<u16> {
     counts
 }
 
-/// Allocations a batch of so many dots, in the steady state.
+/// Allocations per batch of this many dots, in the steady state.
 fn allocations_a_batch(dots: u32, format: PixelFormat) -> f64 {
     let shape = FrameShape::new(SIDE, SIDE, 1).unwrap();
     let mut dark = DarkRun::new(shape, 4000, 32, 16).unwrap();
@@ -142,8 +142,8 @@ fn allocations_a_batch(dots: u32, format: PixelFormat) -> f64 {
     assert!(gathered.error.is_none());
     let allocated = gathered.sink.0;
     assert_eq!(allocated.len(), BATCHES as usize);
-    // Memory for columns grows whenever more of them are under way than ever before, which on a busy machine happens now
-    // and then; what each frame allocates shows in the median batch.
+    // Memory for columns grows whenever more of them are under way than ever before, which happens occasionally on a
+    // busy machine. Allocations of individual frames would show in the median batch.
     let mut batches: Vec<u64> = allocated[WARM..]
         .windows(2)
         .map(|ends| ends[1] - ends[0])

@@ -1,4 +1,4 @@
-//! What the stack says of itself, against what it was made with.
+//! Calibration from the stack, compared with the values that the stack was made with.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -15,7 +15,7 @@ use raysweep_transport::plane::calibrate::{
 };
 use raysweep_transport::plane::{PlaneError, Prior, RowModel, Setting, reach, reference};
 
-/// The paper's sweep and settings of 600 us that begin or end at each of `edges_rows`.
+/// The paper's sweep, plus settings of 600 us that begin or end at each of `edges_rows`.
 fn plan_with_edges(edges_rows: &[f64]) -> Vec<Setting> {
     let edge =
         |side: f64| edges_rows.iter().map(move |rows| Setting::new(side * 300.0 + rows * 22.22, 600.0));
@@ -35,7 +35,7 @@ fn scene(light: impl Fn(f64, usize) -> f64) -> Array3<f32> {
     Array3::from_shape_fn((128, 128, 64), |(v, t, s)| light(v as f64 - t as f64, s) as f32)
 }
 
-/// Subsurface scattering: a quarter of white light direct, the rest in two wide, slightly lopsided tails.
+/// Subsurface scattering: a quarter of white light is direct, the rest in two wide, slightly asymmetric tails.
 fn wax() -> Array3<f32> {
     scene(|u, s| {
         let near = 0.02 * (-u.abs() / (6.0 + s as f64 / 6.5)).exp();
@@ -44,7 +44,7 @@ fn wax() -> Array3<f32> {
     })
 }
 
-/// Smooth light from about u = 0 and nothing that is direct.
+/// Smooth light around u = 0 without any direct light.
 fn no_direct_light() -> Array3<f32> {
     scene(|u, s| {
         let centre = 10.0 * (s as f64 / 10.0).sin();
@@ -67,7 +67,8 @@ fn glints() -> Array3<f32> {
     transport
 }
 
-/// The scene with rectification off: direct light of row `t` lies at row `t + u0`, between two rows of the projector.
+/// The scene with imperfect rectification: direct light of row `t` lies at row `t + u0`, between two rows of the
+/// projector.
 fn shifted(transport: &Array3<f32>, u0_rows: impl Fn(usize, usize) -> f64) -> Array3<f32> {
     Array3::from_shape_fn(transport.dim(), |(v, t, s)| {
         let u0 = u0_rows(t, s);
@@ -84,7 +85,7 @@ fn gaussian(sigma_rows: f64) -> Vec<(i64, f64)> {
     (-reach..=reach).map(|d| (d, share(d) / total)).collect()
 }
 
-/// The light while each row is drawn, with a beam that reaches the rows about it.
+/// The light while each row is drawn, with a beam that spreads it to the neighbouring rows.
 fn under_beam(transport: &Array3<f32>, sigma_rows: f64) -> Array3<f32> {
     let mut spread = Array3::zeros(transport.dim());
     for (offset, share) in gaussian(sigma_rows) {
@@ -106,8 +107,8 @@ fn sample(stack: &Array3<f32>, settings: &[Setting]) -> Sample {
     Sample::new(timing(), settings.to_vec(), stack.view(), None).unwrap()
 }
 
-/// Median relative l2 error of the profile over some pixels, solved by the reference with a beam and a place of direct
-/// light, and the spike put where it was said to be.
+/// Median relative l2 error of the profile over some pixels, solved by the reference with a given beam and position
+/// of direct light; the spike is moved to the given position.
 fn profile_error(
     truth: &Array3<f32>,
     stack: &Array3<f32>,
@@ -119,7 +120,7 @@ fn profile_error(
     solved_error(truth, stack, settings, prior, sigma_rows, u0_rows, |_, _| None)
 }
 
-/// [`profile_error`] with the weights of direct light as they are given.
+/// [`profile_error`] with the given weights of direct light.
 fn solved_error(
     truth: &Array3<f32>,
     stack: &Array3<f32>,
@@ -189,7 +190,7 @@ fn the_width_of_the_beam_is_found() {
                 "{scene} offset {offset_rows} sigma {sigma_rows}: {beam:?}, T {error:.4}, width known {known:.4}"
             );
             assert!((beam.sigma_rows / sigma_rows - 1.0).abs() <= 0.05, "{scene} {sigma_rows}: {beam:?}");
-            // The cusp of wax about u = 0 widens the beam by 2 %: 0.043 measured, 0.027 with the true width.
+            // The cusp of wax around u = 0 widens the beam by 2 %: 0.043 measured, 0.027 with the true width.
             let allowed = if scene == "wax" { 0.05 } else { 0.04 };
             assert!(error <= allowed, "{scene} {sigma_rows}: {error}");
         }
@@ -228,7 +229,8 @@ fn direct_light_is_found_between_rows() {
         assert!(off <= 0.03, "{offset_rows}: off by {off}");
         assert!(calibrated <= papers / 5.0, "{offset_rows}: {calibrated} against {papers}");
 
-        // Whether or not the place is known, the choice by held-out settings is never worse than the paper's prior.
+        // Whether or not the position is known, the choice by held-out settings is never worse than the paper's
+        // prior.
         let known = Optics { spike: Some(map.clone()), ..Optics::default() };
         for (optics, split) in [(Optics::default(), uncalibrated), (known, calibrated)] {
             let choice = choose_prior(&sample, &optics, &[Prior::SPLIT, Prior::PAPER]).unwrap();
@@ -242,7 +244,7 @@ fn direct_light_is_found_between_rows() {
 
 #[test]
 fn indirect_light_on_the_direct_row_does_not_draw_it_back() {
-    // A tenth of wax's light at u = 0 is scattered; counted as direct, it would leave the place at -0.45.
+    // A tenth of wax's light at u = 0 is scattered; if it counted as direct, the position would be -0.45.
     let stack = stack(&shifted(&wax(), |_, _| -0.5), &edge_plan(), 0.0);
     let map = spike_offset(&sample(&stack, &edge_plan()), 0.0).unwrap();
     let mean = map.u0.mean().unwrap();
@@ -274,7 +276,7 @@ fn what_the_stack_does_not_say_is_said() {
     let estimate = estimate_optics(&sample_of_none, None).unwrap();
     assert!(estimate.optics.beam_sigma_rows == 0.0 && estimate.optics.spike.is_none());
 
-    // Fifteen delays dense about 0, with all edges far from u = 0.
+    // Fifteen delays, denser around 0, with all edges far from u = 0.
     let film: Vec<Setting> = (-7..=7)
         .map(|k: i32| {
             Setting::new(1500.0 * f64::from(k.signum()) * (f64::from(k.abs()) / 7.0).powf(1.7), 600.0)
@@ -365,7 +367,7 @@ fn masked_pixels_are_left_out_and_bad_stacks_refused() {
     ));
 }
 
-/// Direct light drawn by a spot that flies to and fro, on a plan whose edges fall on the direct row.
+/// Direct light drawn by a bidirectional spot, on a plan whose edges fall on the direct row.
 #[test]
 fn a_flying_spot_is_dropped_or_modelled() {
     let settings = plan_with_edges(&[-0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45]);

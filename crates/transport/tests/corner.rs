@@ -1,4 +1,4 @@
-//! Forward model and recovery on transport that an independent renderer made.
+//! Forward model and recovery on transport rendered by independent software.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -28,7 +28,7 @@ fn frames_made_by_stepping_through_time_are_predicted() {
     }
 }
 
-/// Figures of a recovery from a noisy stack of the paper's sweep.
+/// Metrics of a recovery from a noisy stack of the paper's sweep.
 struct Recovery {
     profile_error: f64,
     direct_image_error: f64,

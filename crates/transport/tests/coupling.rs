@@ -1,4 +1,4 @@
-//! What coupling neighbours gains on a rendered scene, and that it spoils nothing on made-up ones.
+//! The gain from coupling neighbours on a rendered scene, and checks on synthetic scenes that it does no harm.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -14,7 +14,7 @@ use rand_xoshiro::rand_core::SeedableRng;
 use raysweep_transport::plane::{Coupling, Demux, NoiseModel, PlaneError, Prior, relative_rows};
 use raysweep_transport::quality::{median_profile_error, relative_l2};
 
-/// The noise of the test camera's frame.
+/// The noise of one frame of the test camera.
 fn camera_noise() -> NoiseModel {
     let white_electrons = WHITE_COUNTS * ELECTRONS_PER_COUNT;
     NoiseModel {
@@ -75,8 +75,8 @@ const ROWS: usize = 24;
 const COLUMNS: usize = 45;
 const EDGE: usize = 20;
 
-/// A stack of two surfaces that meet at column `EDGE`, each with a profile of its own that changes slowly over the
-/// image, under a texture that changes from pixel to pixel. Pixel (12, 8) mirrors light that none of the others sees.
+/// A stack of two surfaces that meet at column `EDGE`, each with its own profile that changes slowly over the image,
+/// with a texture that changes from pixel to pixel. Pixel (12, 8) mirrors light that no other pixel sees.
 fn two_surfaces() -> Array3<f32> {
     Array3::from_shape_fn((SETTINGS, ROWS, COLUMNS), |(n, t, s)| {
         let bump = |centre: f32, width: f32| (-((n as f32 - centre) / width).powi(2)).exp();
@@ -138,13 +138,13 @@ fn surfaces_do_not_mix_and_mirrors_keep_their_light() {
 
 #[test]
 fn without_noise_nothing_changes() {
-    // Profiles of the left surface all differ, though by little.
+    // All profiles of the left surface differ, though only slightly.
     let ideal = two_surfaces().slice(s![.., .., ..EDGE]).to_owned();
     let change = |share| {
         let coupled = couple(&ideal, None, &quieter(share));
         relative_l2(coupled.view(), ideal.view())
     };
-    // Faster than the noise itself, which falls with the root.
+    // Faster than the noise itself, which falls with the square root.
     let changes = [1.0, 1e-1, 1e-2, 1e-4].map(change);
     assert!(changes.is_sorted_by(|a, b| *a > 3.0 * b), "{changes:?}");
     assert!(changes[3] < 1e-6, "{changes:?}");
@@ -159,7 +159,7 @@ fn a_uniform_surface_loses_all_the_noise_that_it_can() {
     let coupled = Coupling::default().apply(stack.view(), None, &noise, &[1; SETTINGS]).unwrap();
     let inner = s![3..ROWS - 3, 3..COLUMNS - 3];
     let variance_ratio = coupled.variance_ratio.slice(inner).mean().unwrap();
-    // What is left besides the noise of the total, 1/40 of the variance, is what is predicted.
+    // The remaining variance, besides the noise of the total, 1/40 of the variance, is the predicted one.
     let variance = |stack: &Array3<f32>| (stack - &ideal).pow2().sum_axis(Axis(0)).slice(inner).sum();
     let left = variance(&coupled.stack) / variance(&stack);
     assert!(variance_ratio < 1.5 / 49.0, "{variance_ratio}");
@@ -170,7 +170,7 @@ fn a_uniform_surface_loses_all_the_noise_that_it_can() {
 fn masked_samples_neither_give_nor_take() {
     let noise = camera_noise();
     let stack = noisy(&two_surfaces(), &noise, 6);
-    // A highlight whose long exposures are saturated, single dead samples, and a pixel without any.
+    // A highlight whose long exposures are saturated, single dead samples, and a pixel without any samples.
     let valid = Array3::from_shape_fn(stack.dim(), |(n, t, s)| {
         let highlight = (10..16).contains(&t) && (15..30).contains(&s) && n >= 24 + s % 3;
         !(highlight || (n + 7 * t + 13 * s) % 61 == 0 || (t, s) == (4, 4))
@@ -184,7 +184,7 @@ fn masked_samples_neither_give_nor_take() {
         assert_eq!(coupled_other[index].to_bits(), expected.to_bits(), "{index:?}");
     }
 
-    // Highlights are coupled among themselves, over the settings they have.
+    // Highlights are coupled with each other, over the settings that they have.
     let error = |stack: &Array3<f32>| {
         let mut difference = stack - &two_surfaces();
         difference.zip_mut_with(&valid, |difference, &valid| *difference *= f32::from(valid));
@@ -204,7 +204,7 @@ fn dark_pixels_keep_their_samples() {
     let stack = noisy(&ideal, &noise, 7);
     let coupled = Coupling::default().apply(stack.view(), None, &noise, &[1; SETTINGS]).unwrap();
     let unchanged = stack.axis_iter(Axis(2)).zip(coupled.stack.axis_iter(Axis(2))).map(|(a, b)| a == b);
-    // A dark pixel in a thousand passes for a lit one.
+    // One dark pixel in a thousand is mistaken for a lit one.
     assert!(relative_l2(coupled.stack.slice(s![.., .., ..6]), stack.slice(s![.., .., ..6])) < 0.1);
     assert_eq!(unchanged.skip(6).filter(|&unchanged| unchanged).count(), 0);
     assert_eq!(couple(&Array3::zeros(stack.dim()), None, &noise), Array3::zeros(stack.dim()));
@@ -222,7 +222,7 @@ fn tiles_with_a_halo_and_any_number_of_threads_give_the_same_bits() {
     let tile = stack.slice(s![.., 5..18, 9..30]).to_owned();
     let inner = s![.., 3..10, 3..18];
     assert!(couple(&tile, None, &noise).slice(inner) == whole.stack.slice(s![.., 8..15, 12..27]));
-    // The order of the axes in memory does not matter.
+    // The memory order of the axes does not matter.
     let mut transposed = Array3::zeros((COLUMNS, ROWS, SETTINGS)).reversed_axes();
     transposed.assign(&stack);
     assert!(couple(&transposed, None, &noise) == whole.stack);
@@ -267,10 +267,10 @@ fn the_noise_is_found_in_the_stack() {
         close(fit.read_variance, truth.read_variance) && close(fit.gain, truth.gain)
     };
     assert!(near(fit(&stack, &[1; 75]), camera_noise(), 0.06));
-    // With few settings, each sample is a good part of the total that it is scaled by.
+    // With few settings, each sample is a large part of the total by which it is scaled.
     let few = ideal_stack(&corner(), &paper_sweep()).slice(s![3..12, .., ..]).to_owned();
     assert!(near(fit(&photographed_in(1, &few, 4), &[1; 9]), camera_noise(), 0.08));
-    // Frames that were averaged, in different numbers.
+    // Different numbers of averaged frames.
     let frames: Vec<usize> = (0..SETTINGS).map(|n| 1 + n % 4).collect();
     let ideal = two_surfaces();
     let mut averaged = ideal.clone();
@@ -279,7 +279,7 @@ fn the_noise_is_found_in_the_stack() {
         averaged.index_axis_mut(Axis(0), n).assign(&noisy(&ideal, &noise, 9).index_axis(Axis(0), n));
     }
     assert!(near(fit(&averaged, &frames), camera_noise(), 0.1));
-    // Far below the camera's: of the texture nothing passes for shot noise.
+    // Far below the camera's noise: no texture is mistaken for shot noise.
     let constant = NoiseModel { read_variance: 1e-4, gain: 0.0 };
     let found = fit(&noisy(&ideal, &constant, 10), &[1; SETTINGS]);
     assert!((found.read_variance / 1e-4 - 1.0).abs() < 0.05 && found.gain < 4e-5, "{found:?}");

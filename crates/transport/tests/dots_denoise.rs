@@ -1,4 +1,4 @@
-//! Denoising against its plain reference, and what it must never do.
+//! Denoising compared with its simple reference implementation, and its invariants.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -15,7 +15,7 @@ use raysweep_transport::plane::SimdLevel;
 
 const SIGMA: f64 = 3.0;
 
-/// A frame of background 100.3 with noise, and round spots of light, (row, column, radius, counts), on it.
+/// A frame with a noisy background of 100.3 and round spots of light, (row, column, radius, counts).
 fn frame(shape: FrameShape, seed: u64, spots: &[(f64, f64, f64, f64)]) -> Vec<u16> {
     let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
     let noise = Normal::new(0.0, SIGMA).unwrap();
@@ -43,7 +43,7 @@ fn measured(frame: &[u16], correction: &Correction, background: &Background) -> 
     NoiseFloor::measured([frame], correction, background, &Region::whole(correction.shape())).unwrap()
 }
 
-/// Checks every level of instructions against the reference: all equal, but the residual to rounding.
+/// Compares every instruction level with the reference: all results are equal, the residual to within rounding.
 fn assert_equals_reference(
     frame: &[u16],
     correction: &Correction,
@@ -55,7 +55,7 @@ fn assert_equals_reference(
     for level in SimdLevel::available() {
         let denoiser = Denoiser::new(correction.clone(), settings.clone()).unwrap().at_level(level);
         let (mut scratch, mut column) = (denoiser.scratch(), SparseColumn::default());
-        // The second time with memory that has been used.
+        // The second time with reused memory.
         for _ in 0..2 {
             denoiser.column(frame, background, floor, &mut scratch, &mut column).unwrap();
             assert_eq!(column.outcome, expected.outcome, "{level:?}");
@@ -182,7 +182,7 @@ fn the_result_does_not_depend_on_where_the_background_patch_lies() {
     });
     assert!(batches[0].counts() == BatchCounts { dots: 40, empty: 0, capped: 0 });
     assert_eq!(batches[0], batches[1]);
-    // Light in the third patch raises its noise by a few percent: the dimmest rims may differ, the dots may not.
+    // Light in the third patch raises its noise by a few percent: the dimmest rims may differ, but not the dots.
     let discs = |at: usize| batches[at].arrays().discs.iter().sum::<u32>();
     assert!(discs(2).abs_diff(discs(0)) <= discs(0) / 10, "{} {}", discs(2), discs(0));
 }
@@ -215,7 +215,7 @@ fn columns_and_residuals_hold_all_light() {
         kept +=
             column.residual().iter().zip(&outside).map(|(&mean, count)| f64::from(mean) * count).sum::<f64>();
     }
-    // Hot pixels have their neighbours' light, so what they had themselves is not missed.
+    // Hot pixels get their neighbours' light, so their own light is not missing.
     assert!(((sparse + kept) / expected - 1.0).abs() < 0.005, "{} of {expected}", sparse + kept);
     assert!(sparse / expected < 0.98, "the glow is beyond the discs: {}", sparse / expected);
 }
@@ -235,8 +235,8 @@ fn noise_alone_gives_no_more_discs_than_stated() {
             Denoiser::new(correction.clone(), settings).unwrap().batch(&slices, &background, floor).unwrap();
         batch.dots() - batch.counts().empty
     };
-    // Four standard deviations of a binomial beyond 400 x 0.05 and 400 x 0.5; half of the second, so that a rule which
-    // never fires does not pass.
+    // Four standard deviations of a binomial above 400 x 0.05 and 400 x 0.5. At least half of the second is required,
+    // so that a rule that never fires fails.
     let (rare, frequent) = (alarms(0.05), alarms(0.5));
     assert!(rare <= 20 + 18, "{rare}");
     assert!((75..=240).contains(&frequent), "{frequent}");
@@ -259,7 +259,7 @@ fn a_hot_pixel_is_never_the_maximum() {
         let settings = DenoiseSettings { radius_px: 8.0, ..DenoiseSettings::default() };
         let column = assert_equals_reference(&dark, &correction, &background, floor, &settings);
         assert_eq!(column.outcome.discs, 0);
-        // Within a disc it has its neighbours' light.
+        // Inside a disc it gets its neighbours' light.
         let column = assert_equals_reference(&lit, &correction, &background, floor, &settings);
         let repaired = column.pixels().position(|pixel| pixel == 30 * 64 + 31).unwrap();
         assert!((250.0..350.0).contains(&column.values[repaired]), "{}", column.values[repaired]);

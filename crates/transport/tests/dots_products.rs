@@ -1,4 +1,4 @@
-//! Calibration and products against plain sums over dense images.
+//! Calibration and products compared with direct sums over dense images.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -14,7 +14,7 @@ use raysweep_transport::dots::product::{
 };
 use raysweep_transport::dots::{Batch, BatchArrays, DotsError, FrameShape, Outcome, SparseColumn};
 
-/// A column that keeps the pixels above `least` and the means of the rest, made without the denoiser.
+/// A column with the pixels above `least` and the means of the rest, computed without the denoiser.
 fn column(shape: FrameShape, image: &Array3<f32>, least: f32) -> SparseColumn {
     let channels = shape.channels();
     let mut column = SparseColumn { outcome: Outcome { discs: 1, capped: false }, ..SparseColumn::default() };
@@ -46,7 +46,7 @@ fn batch(shape: FrameShape, images: &[Array3<f32>], least: f32) -> Batch {
     Batch::new(shape, arrays).unwrap()
 }
 
-/// The images that a batch stands for: values in masks, means elsewhere.
+/// The images that a batch represents: values in masks, means elsewhere.
 fn dense(batch: &Batch) -> Vec<Array3<f64>> {
     let shape = batch.shape();
     let image = |dot: usize| {
@@ -124,7 +124,7 @@ fn patterns_are_looked_up_at_the_centroids() {
     let shape = FrameShape::new(96, 96, 1).unwrap();
     let batch = batch(shape, &random_images(shape, 12, 2), 0.61);
     let centroids = Centroids::new(&batch, &Footprints::new(&batch, 0.3).unwrap()).unwrap();
-    // Interpolation repeats a plane in place and colour, whatever the size of the pattern.
+    // Interpolation reproduces a linear function of position and colour, whatever the size of the pattern.
     for size in [96, 24] {
         let scale = 96.0 / size as f32;
         let plane = Array3::from_shape_fn((size, size, 3), |(row, column, colour)| {
@@ -199,8 +199,9 @@ fn confusion_is_the_dense_popcount() {
     assert!(overlapping > 20);
 }
 
-/// A scan of round overlapping dots, 8 pixels apart with radius 8, over frames of 160 x 160; off the plane by
-/// `shift_px` where the scene bulges. Direct light is `albedo` times the dot, global light a share of all dots' light.
+/// A scan of round overlapping dots, 8 pixels apart with radius 8, over frames of 160 x 160; shifted by `shift_px`
+/// where the scene lies off the plane. Direct light is `albedo` times the dot, global light a share of all dots'
+/// light.
 struct Scan {
     shape: FrameShape,
     images: Vec<Array3<f32>>,
@@ -226,7 +227,7 @@ fn scan(shift_px: impl Fn(f64) -> f64, global: f64) -> Scan {
     Scan { shape, images, direct, centres }
 }
 
-/// Where direct light is most of what a dot gives, away from the rim of the scan.
+/// The region where direct light is most of a dot's light, away from the rim of the scan.
 fn middle(image: &Array3<f64>) -> f64 {
     image.slice(s![40..120, 40..120, ..]).sum()
 }
@@ -236,7 +237,7 @@ fn neighbours_give_the_direct_light_of_overlapping_dots_on_and_off_the_plane() {
     let plane = scan(|_| 0.0, 0.0);
     let footprints = Footprints::new(&batch(plane.shape, &plane.images, 1.0), 0.01).unwrap();
     let confusion = Confusion::new(&footprints);
-    // A groove: dots land up to 12 pixels beside their place on the plane.
+    // A groove: dots land up to 12 pixels from their position on the plane.
     for scan in [scan(|_| 0.0, 2.0), scan(|x| 12.0 - 0.2 * (x - 80.0).abs(), 2.0)] {
         let batch = batch(scan.shape, &scan.images, 3.0);
         let of_truth =
@@ -251,7 +252,7 @@ fn neighbours_give_the_direct_light_of_overlapping_dots_on_and_off_the_plane() {
     }
 }
 
-/// A mirror to the left of the camera: lines are rows.
+/// A mirror to the left of the camera: epipolar lines are rows.
 fn level_lines() -> Fundamental {
     // l = F' m = (0, 1, -m_y) for m = (x, y).
     Fundamental::from_rows([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -260,7 +261,7 @@ fn level_lines() -> Fundamental {
 #[test]
 fn masks_split_the_floodlit_image_as_dense_masks_do() {
     let shape = FrameShape::new(70, 96, 1).unwrap();
-    // Without any residual, whose light has no place within its block: every pixel is exact.
+    // Without any residual, whose light has no position within its block, every pixel is exact.
     let bright = |image: &Array3<f32>| image.mapv(|light| if light > 0.61 { light } else { 0.0 });
     let images: Vec<_> = random_images(shape, 6, 5).iter().map(bright).collect();
     let batch = batch(shape, &images, 0.61);
@@ -268,7 +269,7 @@ fn masks_split_the_floodlit_image_as_dense_masks_do() {
     let mirror: Vec<_> = (0..6).map(|dot| (dot > 0).then_some([0.0, 10.0 * dot as f64])).collect();
     for rule in [MaskRule::Plateau, MaskRule::Printed] {
         for sigma_px in [0.0, 40.0] {
-            // Given for frames 1024 wide; here 8 and 3.75 pixels.
+            // Distances refer to frames 1024 pixels wide; here they are 8 and 3.75 pixels.
             let mask = EpipolarMask { distance_px: 8.0 * 1024.0 / 96.0, sigma_px, rule };
             let separation = epipolar(&batch, &floodlit(&batch), &fundamental, &mirror, &mask).unwrap();
             let sigma = sigma_px * 96.0 / 1024.0;
@@ -310,7 +311,7 @@ fn masks_split_the_floodlit_image_as_dense_masks_do() {
 fn a_residual_is_direct_as_far_as_the_mask_covers_its_blocks() {
     let shape = FrameShape::new(160, 192, 1).unwrap();
     let even = Array3::from_elem((160, 192, 1), 1.0);
-    // All of it is residual.
+    // All light is residual.
     let batch = batch(shape, &[even.clone(), even], 2.0);
     for (x, y, through) in [(0.5, -0.8, 20.0), (-0.6, -0.9, 150.0), (1.0, 0.02, -90.0), (0.0, 1.0, -60.0)] {
         let line = |dot: f64| [x, y, through + 40.0 * dot];
@@ -347,7 +348,7 @@ fn a_mask_of_the_dots_own_width_keeps_the_planes_light_and_the_printed_one_a_fif
     let fundamental = level_lines();
     let mirror: Vec<_> = plane.centres.iter().map(|&centre| Some(centre)).collect();
     let share = |rule| {
-        // The paper's d_thresh and sigma for its dots, 16 pixels in radius of 1024; here 8 of 160.
+        // The paper's d_thresh and sigma for its dots, which have a radius of 16 pixels of 1024; here 8 of 160.
         let scale = 8.0 * 1024.0 / 160.0 / 16.0;
         let mask = EpipolarMask { distance_px: 19.0 * scale, sigma_px: 2.0 * scale, rule };
         let separation = epipolar(&batch, &floodlit(&batch), &fundamental, &mirror, &mask).unwrap();
@@ -378,7 +379,7 @@ fn overlapping_dots_are_compensated_by_their_spreads() {
 #[test]
 fn a_dot_on_a_boundary_of_textures_is_taken_for_a_pillbox() {
     let mut plane = scan(|_| 0.0, 0.0);
-    // A black line through the first dot; what is left of it there is still in the mask.
+    // A black line through the first dot; the remaining light there is still in the mask.
     plane.images[0].slice_mut(s![12..29, 19..22, ..]).fill(5.0);
     let spreads = PointSpreads::new(&batch(plane.shape, &plane.images[..2], 3.0)).unwrap();
     assert_eq!(spreads.unimodal, [false, true]);
@@ -423,7 +424,7 @@ fn the_plane_is_its_own_dual_and_samples_stay() {
     assert!(whole.image.iter().all(|&value| (value - 1.0).abs() < 1e-6));
     assert_eq!(whole.known.iter().filter(|&&known| known).count(), 256);
 
-    // A dot on a dark patch is dark in the dual, and only there and around.
+    // A dot on a dark patch is dark in the dual, and only there and in its surroundings.
     let half: Vec<f64> = energies
         .iter()
         .enumerate()
@@ -451,7 +452,7 @@ fn holes_are_filled_from_what_is_known_and_nothing_ends_as_nothing() {
     Zip::from(image.lanes(Axis(2))).and(original.lanes(Axis(2))).and(&known).for_each(|now, then, &known| {
         assert!(!known || now == then);
     });
-    // As if each step looked at the whole image.
+    // As if each step processed the whole image.
     let mut plain = original.clone();
     let mut filled = known.clone();
     while filled.iter().any(|&filled| !filled) {
@@ -485,7 +486,7 @@ fn holes_are_filled_from_what_is_known_and_nothing_ends_as_nothing() {
 
 #[test]
 fn two_scanned_planes_calibrate_the_lines_of_a_third() {
-    // The mirror's rays meet planes at other places; the nearer, the farther apart.
+    // The mirror's rays meet planes at different positions; the nearer the plane, the farther apart.
     let plane = |shift: f64| {
         let scan = scan(|_| shift, 0.0);
         let batch = batch(scan.shape, &scan.images, 3.0);

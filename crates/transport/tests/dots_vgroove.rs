@@ -1,4 +1,4 @@
-//! The whole way from frames to images on a V-groove that an independent renderer made.
+//! The complete path from frames to images, on a V-groove rendered by independent software.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -20,14 +20,14 @@ use raysweep_transport::dots::{
 };
 use raysweep_transport::quality::{relative_l2, snr_db, ssim};
 
-/// Camera pixels a side of one rendered pixel: 32 pixels a dot, as the paper's.
+/// Camera pixels per side of one rendered pixel: 32 pixels per dot, as in the paper.
 const PX: usize = 16;
 const SIZE: usize = 32 * PX;
-/// Counts of a white plane under its dot, of ambient light, and of the dark level, which is no whole number.
+/// Counts of a white plane under its dot, of ambient light, and of the dark level, which is not an integer.
 const WHITE: f64 = 600.0;
 const AMBIENT: f64 = 5.0;
 const DARK: f64 = 85.4;
-/// In counts; 4095 of them are 16,000 electrons.
+/// In counts; 4095 counts are 16,000 electrons.
 const READ_NOISE: f64 = 3.0;
 const ELECTRONS_PER_COUNT: f64 = 4.0;
 
@@ -36,7 +36,7 @@ fn transport() -> Array3<f32> {
     NpzReader::new(File::open(path).unwrap()).unwrap().by_name("T.npy").unwrap()
 }
 
-/// A frame under one dot, or none, in counts with shot and read noise.
+/// A frame with one dot, or none, in counts with shot and read noise.
 fn photographed(image: Option<&Array2<f32>>, seed: u64) -> Vec<u16> {
     let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
     let mut count = |pixel: usize| {
@@ -82,7 +82,7 @@ impl Acquired {
     }
 }
 
-/// Enlarged to the camera's pixels and in counts.
+/// Enlarged to the camera's pixels, in counts.
 fn counts(image: &Array2<f32>) -> Array3<f32> {
     Array3::from_shape_fn((SIZE, SIZE, 1), |(row, column, _)| WHITE as f32 * image[[row / PX, column / PX]])
 }
@@ -103,7 +103,7 @@ fn the_floodlit_scene_has_its_light_and_its_look() {
     // Measured: 26.3 dB against 20.2, where 0.93 of the light is in the discs.
     assert!(snr(&with_residual) >= snr(&discs_alone) + 5.0, "{} {}", snr(&with_residual), snr(&discs_alone));
 
-    // At half of a rendered pixel, whose copies in the camera's pixels have no structure of their own.
+    // At half a rendered pixel, as its copies in the camera's pixels have no structure of their own.
     let binned = |image: &Array3<f32>| {
         let bins = image.exact_chunks((PX / 2, PX / 2, 1)).into_iter().map(|bin| bin.mean().unwrap());
         Array2::from_shape_vec((64, 64), bins.collect()).unwrap()
@@ -159,7 +159,7 @@ fn the_dual_image_and_relit_halves_are_those_of_the_transport() {
 
     let half = |left: bool| {
         let lit = |(_, column, _)| if (column < 8) == left { 1.0 } else { 0.0 };
-        // As large as the grid of dots, so that each dot has a pixel of its own.
+        // As large as the grid of dots, so that each dot has its own pixel.
         let weights = pattern_weights(&centroids, Array3::from_shape_fn((16, 16, 1), lit).view()).unwrap();
         relight(&batch, weights.view()).unwrap()
     };

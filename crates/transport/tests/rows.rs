@@ -1,4 +1,4 @@
-//! The weights of rows whose time, place and extent are not ideal, against the clock.
+//! The weights of rows with non-ideal time, position and extent, compared with a simulation of the clock.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -10,7 +10,7 @@ use stepping::by_stepping_through_time;
 
 const TAU_US: f64 = 20.0;
 
-/// The light that drawing row `v` sends, when `light` falls on the scene under each row.
+/// The light emitted while row `v` is drawn, when `light` falls on the scene under each row.
 fn drawn_light(light: &[f64], beam: Beam, v: usize) -> f64 {
     let Beam::Gaussian { sigma_rows } = beam else { return light[v] };
     let bell = |distance: f64| (-distance * distance / (2.0 * sigma_rows * sigma_rows)).exp();
@@ -19,8 +19,8 @@ fn drawn_light(light: &[f64], beam: Beam, v: usize) -> f64 {
 }
 
 prop_compose! {
-    /// A small projector with a measured table, an extended beam and a short retrace, and a camera that keeps another
-    /// pitch and does not quite keep pace.
+    /// A small projector with a measured table, an extended beam and a short retrace, and a camera with another pitch
+    /// and a slightly different speed.
     fn rigs()(
         (rows, dwells_us) in (6_usize..14).prop_flat_map(|rows| (Just(rows), prop::collection::vec(8.0..32.0, rows))),
         retrace_us in 0.0..90.0,
@@ -58,7 +58,7 @@ proptest! {
     ) {
         let light = &light[..timing.projector_rows()];
         let drawn: Vec<f64> = (0..light.len()).map(|v| drawn_light(light, timing.beam(), v)).collect();
-        // Stepping needs whole steps.
+        // The simulation needs an integer number of steps.
         let setting = Setting::new(delay * timing.period_us(), f64::round(exposure_us * 100.0) / 100.0);
         for t in 0..timing.camera_rows() {
             let by_clock = by_stepping_through_time(&timing, &setting, t, |v| drawn[v]);
@@ -67,7 +67,7 @@ proptest! {
         }
     }
 
-    /// No row is left out and none is asked for twice, and the model's weights are the timing's.
+    /// No row is missing or duplicated, and the model's weights are the timing's.
     #[test]
     fn the_model_has_every_row_that_is_seen(
         timing in rigs(),
@@ -96,8 +96,8 @@ proptest! {
         }
     }
 
-    /// Whatever the table and the beam, an exposure of a whole period sees the light that was drawn, each row once; the
-    /// beam loses only what leaves the frame.
+    /// With any table and beam, an exposure of a whole period sees the light that was drawn, each row once; the beam
+    /// loses only light that leaves the frame.
     #[test]
     fn a_whole_period_sees_all_light_once(timing in rigs(), delay in -0.9..0.9) {
         let setting = Setting::new(delay * timing.period_us(), timing.period_us());
@@ -112,7 +112,7 @@ proptest! {
 
 #[test]
 fn the_reach_of_a_bent_table_holds_what_any_row_sees() {
-    // Mid-sweep is early by 4 rows of 200; a delay of 0 sees 4 rows further there than at the ends.
+    // The middle of the sweep is early by 4 rows of 200; a delay of 0 sees 4 rows further there than at the ends.
     let nominal = RowTiming::new(200, TAU_US, 5000.0).unwrap();
     let starts_us: Vec<f64> = (0..=200)
         .map(|v| f64::from(v) / 200.0)
@@ -123,7 +123,7 @@ fn the_reach_of_a_bent_table_holds_what_any_row_sees() {
     assert_eq!(reach(&nominal, &settings), Ok(-5..=5));
     assert_eq!(reach(&bent, &settings), Ok(-5..=9));
 
-    // What is asked for does not hang on the beam; what it adds beyond is solved for and dropped.
+    // The reach does not depend on the beam; rows that only the beam reaches are solved for and dropped.
     let spread = nominal.with_beam(Beam::Gaussian { sigma_rows: 1.5 }).unwrap();
     assert_eq!(reach(&spread, &settings), Ok(-5..=5));
     let model = RowModel::new(&spread, &settings, &(-5..=5), 100);

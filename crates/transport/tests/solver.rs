@@ -1,4 +1,4 @@
-//! The demultiplexer against the optimality conditions, the reference solver and itself.
+//! The demultiplexer compared with the optimality conditions, the reference solver and itself.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -29,7 +29,7 @@ impl Objective {
         Self { model, differences, prior }
     }
 
-    /// Positive definite even where the settings leave rows undetermined, as the reference solver asks.
+    /// Positive definite even if the settings leave rows undetermined, as the reference solver requires.
     fn h(&self) -> Array2<f64> {
         let mut h = self.model.weights.t().dot(&self.model.weights)
             + self.prior.alpha() * self.differences.t().dot(&self.differences);
@@ -65,7 +65,7 @@ impl Objective {
         violation.fold(0.0, f64::max) / scale
     }
 
-    /// The own slots of `x`, as they stand in a transport's row.
+    /// The own slots of `x`, in the order of a transport's rows.
     fn profile(&self, estimate: &Transport, t: usize, column: usize) -> Array1<f64> {
         let own = self.model.slots.iter().filter(|slot| slot.kind == SlotKind::Own);
         own.map(|slot| f64::from(estimate.t[[(slot.u - estimate.u_min) as usize, t, column]])).collect()
@@ -146,7 +146,7 @@ fn some_rows_are_solved_as_all_are_and_predict_their_images() {
     assert_eq!(some.exists, all.exists.select(Axis(1), &rows));
 
     let predicted = demux.predict_rows(&rows, &some).unwrap();
-    // Less 0.65 % of the light, which comes from beyond the reach.
+    // Minus 0.65 % of the light, which comes from beyond the reach.
     let flat = |images: Array3<f32>| images.into_shape_with_order((75, 4 * 128)).unwrap();
     let error = relative_l2(flat(predicted).view(), flat(band.as_standard_layout().into_owned()).view());
     assert!(error < 0.02, "{error}");
@@ -155,7 +155,7 @@ fn some_rows_are_solved_as_all_are_and_predict_their_images() {
 
 #[test]
 fn channels_are_columns() {
-    // Red, green and blue of the same pixels, interleaved as a camera sends them.
+    // Red, green and blue of the same pixels, interleaved as in a camera's frames.
     let red = noisy_corner().slice_move(s![.., .., ..11]);
     let rgb = ndarray::stack(Axis(3), &[red.view(), (&red * 0.5).view(), (&red * 0.1).view()]).unwrap();
     let interleaved = rgb.to_shape((75, 128, 33)).unwrap();
@@ -170,7 +170,8 @@ fn channels_are_columns() {
 
 #[test]
 fn direct_light_between_rows_is_found_where_it_is_said_to_be() {
-    // 30 % of each pixel's direct light in the row below, as rectification leaves it; edges of exposures cut the rows.
+    // 30 % of each pixel's direct light in the row below, due to imperfect rectification; edges of exposures cut the
+    // rows.
     let settings: Vec<Setting> = (0..60)
         .map(|k| Setting::new(-1500.0 + 50.7 * f64::from(k), 600.0 + 7.0 * f64::from(k % 4)))
         .collect();
@@ -225,7 +226,7 @@ fn the_number_of_threads_does_not_change_a_bit() {
 
 #[test]
 fn other_rows_do_not_change_a_bit_of_a_row() {
-    // Rows that share a model, in tiles of many rows; pixels of several models, and some that lack samples.
+    // Rows that share a model, in tiles of many rows; pixels of several models, some with missing samples.
     let timing = RowTiming::new(720, 22.22, 50_000.0 / 3.0).unwrap().centred(60).unwrap();
     let settings = paper_sweep();
     let stack = noisy_corner().slice_move(s![.., 30..90, 20..61]);
@@ -273,7 +274,7 @@ fn masked_samples_have_no_influence() {
     let demux = Demux::new(timing(), paper_sweep(), Prior::SPLIT).unwrap();
     let plain = demux.solve(stack.view(), None).unwrap();
 
-    // Two neighbours lose the same settings, one pixel others, and one pixel all of them.
+    // Two neighbours lack the same settings, one pixel others, and one pixel all of them.
     let mut valid = Array3::from_elem(stack.dim(), true);
     valid.slice_mut(s![30..40, 50, 4..6]).fill(false);
     valid.slice_mut(s![0..74;7, 50, 9]).fill(false);
@@ -318,7 +319,7 @@ fn a_mask_of_whole_settings_equals_leaving_them_out() {
 
 #[test]
 fn exposures_over_the_retrace_see_what_the_clock_says() {
-    // Camera rows 592..720 of the paper's projector; the light of the top rows is distinct from the bottom's.
+    // Camera rows 592..720 of the paper's projector; the light of the top rows differs from that of the bottom rows.
     let timing = RowTiming::new(720, 22.22, 50_000.0 / 3.0).unwrap().window(592, 128).unwrap();
     let light_of_row =
         |row: usize| if row < 100 { 0.01 } else { 0.002 + if row == 592 + 108 { 0.7 } else { 0.0 } };
@@ -335,7 +336,7 @@ fn exposures_over_the_retrace_see_what_the_clock_says() {
         assert!((predicted - stepped).abs() < 1e-3 * stepped.max(0.1), "{n}: {predicted} is not {stepped}");
     }
 
-    // The next frame's light must not end up in the last rows of this one.
+    // The next frame's light must not be assigned to the last rows of this one.
     let mut stack = Array3::zeros((75, 128, 1));
     stack.slice_mut(s![.., 108, 0]).assign(&stepped.mapv(|sample| sample as f32));
     let estimate = Demux::new(timing, settings, Prior::SPLIT).unwrap().solve(stack.view(), None).unwrap();
@@ -351,7 +352,7 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(60))]
 
     /// Small projectors with a short retrace, exposures up to two periods, several measured delays per setting: the
-    /// weights follow the clock, the reference is optimal, and the solver equals it.
+    /// weights agree with the clock, the reference is optimal, and the solver equals it.
     #[test]
     fn random_rigs(
         (rows, retrace_us) in (3_usize..14, 0.0..90.0),
@@ -367,7 +368,7 @@ proptest! {
             .map(|&(delay, exposure_us)| Setting::new(delay * timing.period_us(), exposure_us))
             .collect();
         let Ok(demux) = Demux::new(timing.clone(), settings.clone(), prior) else {
-            // Every delay may point into the retrace or beyond the border.
+            // Every delay may fall into the retrace or beyond the border.
             prop_assert_eq!(reach(&timing, &settings), Err(PlaneError::NothingSeen));
             return Ok(());
         };
@@ -388,8 +389,8 @@ proptest! {
             let residual = objective.kkt_residual(&expected, &samples);
             prop_assert!(residual <= 1e-9, "row {t}: KKT residual {residual}, {expected} for {samples}");
 
-            // Few settings leave directions flat, so the value is compared rather than T; and only where the transport
-            // holds all unknowns, because wrapped ones may stand in for own ones.
+            // Few settings leave directions flat, so the value is compared rather than T, and only if the transport
+            // contains all unknowns, because wrapped ones may replace own ones.
             let x = objective.profile(&estimate, t, 0);
             if x.len() == expected.len() {
                 let (value, best) = (objective.value(&x, &samples), objective.value(&expected, &samples));
@@ -401,7 +402,7 @@ proptest! {
 
 #[test]
 fn one_setting_alone_still_gives_the_minimum() {
-    // Three unknowns, one sample: H is singular, and its inverse holds rounding only. Five periods of three rows.
+    // Three unknowns, one sample: H is singular, and its inverse is pure rounding. Five periods of three rows.
     let timing = RowTiming::new(3, 20.0, 60.0).unwrap();
     let settings = [Setting::new(0.0, 306.2)];
     let demux = Demux::new(timing.clone(), settings.to_vec(), Prior::SPLIT).unwrap();

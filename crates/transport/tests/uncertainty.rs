@@ -1,4 +1,4 @@
-//! The predicted uncertainty against repeated measurements and against the estimate's change with each sample.
+//! The predicted uncertainty compared with repeated measurements and with the estimate's change with each sample.
 
 #![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
 
@@ -15,7 +15,7 @@ use raysweep_transport::plane::{
     Uncertainty, reach, reference,
 };
 
-/// The noise of the test camera's frame.
+/// The noise of one frame of the test camera.
 fn camera_noise() -> NoiseModel {
     let white_electrons = WHITE_COUNTS * ELECTRONS_PER_COUNT;
     NoiseModel {
@@ -24,7 +24,7 @@ fn camera_noise() -> NoiseModel {
     }
 }
 
-/// Epipolar image, non-epipolar image, bands of short and long range, and all light.
+/// Epipolar image, non-epipolar image, short-range band, long-range band, and all light.
 fn bands() -> [Vec<RangeInclusive<i32>>; 5] {
     let all = i32::MIN..=i32::MAX;
     [vec![0..=0], vec![i32::MIN..=-1, 1..=i32::MAX], vec![1..=6], vec![-30..=-7], vec![all]]
@@ -71,7 +71,7 @@ fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Cou
     let mean =
         measured.iter().fold(Array3::<f32>::zeros(measured[0].0.raw_dim()), |sum, (light, _)| sum + light)
             / REPEATS as f32;
-    // Measurements are nearer to their own mean than to the true one.
+    // Measurements are closer to their own mean than to the true one.
     let nearer = (1.0 - 1.0 / REPEATS as f64).sqrt();
     std::array::from_fn(|band| {
         let mut deviations: Vec<f64> = Vec::new();
@@ -96,7 +96,7 @@ fn repeated_measurements_spread_as_predicted() {
 
 #[test]
 fn coupled_measurements_spread_as_predicted() {
-    // Measured: 0.98 to 1.30; neighbours are chosen by the same noise that they are to average out.
+    // Measured: 0.98 to 1.30; neighbours are chosen by the same noise that averaging them should reduce.
     for frames in [1, 8] {
         let spread = spread(56..66, 3, frames, Some(Coupling::default()));
         assert!(spread.iter().all(|spread| (0.8..1.4).contains(spread)), "{frames}: {spread:?}");
@@ -122,7 +122,7 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
     let frames: Vec<usize> = (0..24).map(|n| 1 + n % 3).collect();
     let noise = camera_noise();
     let bands = [vec![0..=0], vec![i32::MIN..=-1, 1..=i32::MAX], vec![2..=5]];
-    // Undetermined rows, for which no inverse can be shared, take the other way through the code.
+    // Undetermined rows, for which no inverse can be shared, use the other code path.
     for (prior, masked) in [
         (Prior::SPLIT, vec![]),
         (Prior::SPLIT, vec![3, 17]),

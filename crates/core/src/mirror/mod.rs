@@ -1,4 +1,4 @@
-//! A two-axis mirror that steers a beam: angles, limits, and what a driver of one must do.
+//! A two-axis mirror that steers a beam: angles, limits, and the trait of its drivers.
 
 mod path;
 
@@ -21,20 +21,20 @@ pub struct MechanicalDeg(pub f64);
 #[serde(transparent)]
 pub struct OpticalDeg(pub f64);
 
-/// How far the mirror is tilted: x in the plane of incidence, y across it.
+/// The tilt of the mirror: x in the plane of incidence, y perpendicular to it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Tilt {
-    /// In the plane of incidence.
+    /// Tilt in the plane of incidence.
     pub x: MechanicalDeg,
-    /// Across it.
+    /// Tilt perpendicular to it.
     pub y: MechanicalDeg,
 }
 
 impl Tilt {
-    /// At rest.
+    /// The mirror at rest.
     pub const ORIGIN: Self = Self { x: MechanicalDeg(0.0), y: MechanicalDeg(0.0) };
 
-    /// From degrees of the mirror.
+    /// A tilt from degrees of the mirror.
     pub fn new(x_deg: f64, y_deg: f64) -> Self {
         Self { x: MechanicalDeg(x_deg), y: MechanicalDeg(y_deg) }
     }
@@ -44,12 +44,13 @@ impl Tilt {
         [self.x.0, self.y.0]
     }
 
-    /// The larger of the two axes' distances to `other`, in degrees of the mirror.
+    /// The larger of the distances to `other` along the two axes, in degrees of the mirror.
     pub fn distance_deg(self, other: Self) -> f64 {
         (self.x.0 - other.x.0).abs().max((self.y.0 - other.y.0).abs())
     }
 
-    /// Where the beam goes: `m = d_xy / d_z` of the reflected direction d, whose z axis is the reflected beam at rest.
+    /// Direction of the beam: `m = d_xy / d_z` of the reflected direction d, whose z axis is the reflected beam at
+    /// rest.
     ///
     /// `incidence` is the angle between the beam and the mirror's normal at rest. To first order the beam turns by
     /// twice the tilt in the plane of incidence and by `2 cos(incidence)` times the tilt across it; the reflection
@@ -57,7 +58,8 @@ impl Tilt {
     pub fn beam(self, incidence: MechanicalDeg) -> [f64; 2] {
         let (sin, cos) = incidence.0.to_radians().sin_cos();
         let (tan_x, tan_y) = (self.x.0.to_radians().tan(), self.y.0.to_radians().tan());
-        // The mirror's frame in the beam's: its normal at rest (sin, 0, cos), its x axis (cos, 0, -sin), its y axis y.
+        // The mirror's axes in the beam's coordinates: its normal at rest (sin, 0, cos), its x axis (cos, 0, -sin),
+        // its y axis y.
         let normal = [sin + tan_x * cos, tan_y, cos - tan_x * sin];
         let square: f64 = normal.iter().map(|n| n * n).sum();
         let into = [-2.0 * sin * cos, 0.0, sin * sin - cos * cos];
@@ -66,13 +68,13 @@ impl Tilt {
         [out[0] / out[2], out[1] / out[2]]
     }
 
-    /// The same as angles of the beam in its x and y directions.
+    /// The direction of the beam as angles in its x and y directions.
     pub fn beam_deg(self, incidence: MechanicalDeg) -> [OpticalDeg; 2] {
         self.beam(incidence).map(|tangent| OpticalDeg(tangent.atan().to_degrees()))
     }
 }
 
-/// What a mirror survives, per axis. A step or a voltage beyond its limits destroys a MEMS mirror.
+/// Limits of a mirror, per axis. A step or a voltage beyond its limits destroys a MEMS mirror.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MirrorLimits {
@@ -82,15 +84,15 @@ pub struct MirrorLimits {
     pub max_step: MechanicalDeg,
     /// Fastest movement, in degrees of the mirror per second.
     pub max_slew_deg_per_s: f64,
-    /// Up to which frequency a path may move the mirror.
+    /// Highest frequency at which a path may move the mirror.
     pub bandwidth_hz: f64,
-    /// Root mean square of what a path may hold beyond `bandwidth_hz`: rounding and the turns of a raster.
+    /// Largest root mean square of a path's content above `bandwidth_hz`, from rounding and the turns of a raster.
     pub out_of_band: MechanicalDeg,
 }
 
 impl MirrorLimits {
-    /// Mirrorcle A7B2.3-3600AL: 6.5 degrees and 200 Hz are the maker's. Steps of a tenth of the tilt, the slew of a
-    /// full sine at the bandwidth, and 1 % of the tilt beyond it are [A].
+    /// Mirrorcle A7B2.3-3600AL: 6.5 degrees and 200 Hz are from the maker. Steps of a tenth of the tilt, the slew of
+    /// a full sine at the bandwidth, and 1 % of the tilt above the bandwidth are [A].
     pub const A7B2_3_3600AL: Self = Self {
         max_tilt: MechanicalDeg(6.5),
         max_step: MechanicalDeg(0.65),
@@ -99,11 +101,12 @@ impl MirrorLimits {
         out_of_band: MechanicalDeg(0.065),
     };
 
-    /// The tilts of a ramp at `rate_hz` that leaves `from` (not part of it) at rest and comes to rest on `to`: half a
-    /// cosine, slow enough for the step, the slew and two periods of the bandwidth. One tilt if the mirror is there.
+    /// The tilts of a ramp at `rate_hz` that starts at rest at `from` (not included) and comes to rest at `to`: half
+    /// a cosine, slow enough for the step, the slew and two periods of the bandwidth. A single tilt if the mirror is
+    /// already there.
     pub fn ramp(&self, from: Tilt, to: Tilt, rate_hz: f64) -> impl ExactSizeIterator<Item = Tilt> + use<> {
         let distance_deg = from.distance_deg(to);
-        // A half cosine is at its fastest pi/2 times its mean.
+        // The peak speed of a half cosine is pi/2 times its mean.
         let by_step = PI / 2.0 * distance_deg / self.max_step.0;
         let by_slew = PI / 2.0 * distance_deg / self.max_slew_deg_per_s * rate_hz;
         let by_bandwidth = if distance_deg > 0.0 { 2.0 * rate_hz / self.bandwidth_hz } else { 1.0 };
@@ -119,78 +122,79 @@ impl MirrorLimits {
     }
 }
 
-/// How one axis answers below and around its resonance: x'' + (w0/Q) x' + w0^2 x = w0^2 u.
+/// The response of one axis below and around its resonance: x'' + (w0/Q) x' + w0^2 x = w0^2 u.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SecondOrder {
-    /// Its resonance.
+    /// Resonance frequency.
     pub f0_hz: f64,
-    /// Its quality factor.
+    /// Quality factor.
     pub q: f64,
 }
 
-/// What a mirror and its controller are.
+/// The capabilities of a mirror and its controller.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MirrorCapabilities {
-    /// Maker, model and firmware as the controller says them, for the manifest.
+    /// Maker, model and firmware as reported by the controller, for the manifest.
     pub model: String,
-    /// What paths must keep to.
+    /// Limits that paths must respect.
     pub limits: MirrorLimits,
-    /// Samples per second that it takes over this link.
+    /// Sample rates that it accepts over this link, in samples per second.
     pub rate_hz: RangeInclusive<f64>,
-    /// Samples that it holds; 1 where the host sends each sample when it is due.
+    /// Samples that its FIFO holds; 1 if the host sends each sample when it is due.
     pub fifo_samples: u32,
 }
 
-/// How far a mirror has come with its path.
+/// The progress of a mirror along its path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MirrorProgress {
     /// Samples of the path that the mirror has confirmed as played, over all batches.
     pub played: u64,
-    /// Samples of the path that were sent.
+    /// Samples of the path sent so far.
     pub sent: u64,
-    /// Samples of the path that will have been played at its end.
+    /// Samples of the path to be played in all.
     pub total: u64,
-    /// Whether it has played all of them and is back at the origin with the light off.
+    /// Whether it has played all samples and is back at the origin with the light off.
     pub parked: bool,
-    /// Samples per second as the confirmations show them; none before enough have come.
+    /// Samples per second according to the confirmations; `None` until enough have arrived.
     pub rate_hz: Option<f64>,
 }
 
 /// A mirror and the light that it steers.
 ///
-/// Light and motion go together: the light is on only while a path is being played and the controller confirms the
+/// Light and motion are coupled: the light is on only while a path is being played and the controller confirms the
 /// motion. Every failure, and dropping the mirror, parks it.
 pub trait Mirror: Send {
-    /// What the mirror is; constant while it is open.
+    /// The mirror's capabilities; constant while it is open.
     fn capabilities(&self) -> &MirrorCapabilities;
 
-    /// Sets the path's rate and takes the mirror, dark, to the path's first point. Returns the rate that the
-    /// controller really keeps.
+    /// Sets the path's rate and moves the mirror, with the light off, to the path's first point. Returns the rate
+    /// that the controller really keeps.
     ///
     /// # Errors
     /// `OutOfRange` if the controller cannot keep the path's rate or the path breaks its limits.
     fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError>;
 
-    /// Begins to play the loaded path `batches` times; after the last the mirror goes to the origin by itself, dark.
+    /// Starts playing the loaded path `batches` times. Afterwards the mirror returns to the origin by itself, with
+    /// the light off.
     ///
     /// # Errors
-    /// `NotReady` before [`Mirror::load`], or if the path has light and nobody has permitted light; `OutOfRange` for no
-    /// batch.
+    /// `NotReady` before [`Mirror::load`], or if the path has light and light has not been permitted; `OutOfRange`
+    /// for zero batches.
     fn start(&mut self, batches: u32) -> Result<(), DeviceError>;
 
-    /// Sends what the controller has room for and reads what it confirms; to be called every few milliseconds while a
-    /// path is played.
+    /// Sends as many samples as the controller has room for and reads its confirmations. Must be called every few
+    /// milliseconds while a path is played.
     ///
     /// # Errors
-    /// `Timeout` when the controller confirms no motion, `Protocol` on an underrun, `Disconnected` when it is gone,
-    /// `NotReady` when light is no longer permitted. The mirror has then been parked as far as it still answers.
+    /// `Timeout` if the controller confirms no motion, `Protocol` on an underrun, `Disconnected` when it is gone,
+    /// `NotReady` when light is no longer permitted. The mirror has then been parked, as far as it still answers.
     fn feed(&mut self) -> Result<MirrorProgress, DeviceError>;
 
-    /// Light off, then a ramp to the origin. Idempotent.
+    /// Turns the light off, then ramps to the origin. Idempotent.
     ///
     /// # Errors
-    /// `Disconnected` or `Timeout` when the controller cannot be told.
+    /// `Disconnected` or `Timeout` if the controller cannot be reached.
     fn park(&mut self) -> Result<(), DeviceError>;
 }
 

@@ -1,4 +1,4 @@
-//! Paths that a mirror can follow: no other can be made.
+//! Paths that a mirror can follow. Paths that break its limits cannot be constructed.
 
 use std::f64::consts::{PI, TAU};
 
@@ -6,125 +6,125 @@ use serde::{Deserialize, Serialize};
 
 use super::{MirrorLimits, SecondOrder, Tilt};
 
-/// Samples that a path may have, at most: more than any controller holds.
+/// Largest number of samples in a path: more than any controller holds.
 pub const MAX_POINTS: usize = 131_072;
 
-/// Where the mirror is to be in one sample, and how bright the light.
+/// Position of the mirror and brightness of the light in one sample.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct MirrorPoint {
-    /// Where.
+    /// The mirror's position.
     pub tilt: Tilt,
     /// 0: off, 255: full.
     pub light: u8,
 }
 
-/// A closed path, played once a batch: after its last point comes its first. Its points keep to the limits that it was
-/// made with, on the way round too.
+/// A closed path, played once per batch: its last point is followed by its first. Its points respect the limits that
+/// it was made with, including the step from the last point to the first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MirrorPath {
     points: Vec<MirrorPoint>,
     rate_hz: f64,
 }
 
-/// Why points make no path.
+/// Why points do not form a valid path.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PathError {
-    /// No points, or too many.
+    /// No points, or more than [`MAX_POINTS`].
     #[error("path of {points} points: allowed is 1 to {MAX_POINTS}")]
     Points {
-        /// How many.
+        /// Number of points.
         points: usize,
     },
-    /// No rate.
+    /// The rate is not positive and finite.
     #[error("rate_hz = {rate_hz}: give samples per second, more than 0")]
     Rate {
-        /// As given.
+        /// The rate in Hz.
         rate_hz: f64,
     },
-    /// A shape that cannot be made.
+    /// Invalid parameter of a shape.
     #[error("{field} = {value}: allowed is {allowed}")]
     Shape {
-        /// What of the shape.
+        /// Name of the parameter.
         field: &'static str,
-        /// As given.
+        /// Its value.
         value: f64,
-        /// In words.
+        /// The allowed values, in words.
         allowed: &'static str,
     },
-    /// A point too far out.
+    /// A point beyond the largest tilt.
     #[error(
         "{axis} = {deg} degrees at point {point}: the mirror tilts by {allowed_deg} degrees at most; make the path smaller"
     )]
     Tilt {
-        /// Which point.
+        /// Index of the point.
         point: usize,
-        /// Which axis.
+        /// Name of the axis.
         axis: char,
-        /// Where it would be.
+        /// Tilt of the point.
         deg: f64,
-        /// What is allowed.
+        /// Largest allowed tilt.
         allowed_deg: f64,
     },
-    /// Two points too far from each other.
+    /// Two consecutive points too far apart.
     #[error(
         "{axis} changes by {deg} degrees from point {point} to the next: allowed are {allowed_deg} degrees in a sample; take more points"
     )]
     Step {
-        /// The first of them.
+        /// Index of the first of the two points.
         point: usize,
-        /// Which axis.
+        /// Name of the axis.
         axis: char,
-        /// How far.
+        /// Distance between them along this axis.
         deg: f64,
-        /// What is allowed.
+        /// Largest allowed distance.
         allowed_deg: f64,
     },
-    /// Two points too far from each other for the rate.
+    /// Two consecutive points too far apart for the rate.
     #[error(
         "{axis} moves at {deg_per_s} degrees/s from point {point} to the next: allowed are {allowed_deg_per_s}; take more points or a lower rate_hz"
     )]
     Slew {
-        /// The first of them.
+        /// Index of the first of the two points.
         point: usize,
-        /// Which axis.
+        /// Name of the axis.
         axis: char,
-        /// How fast.
+        /// Speed from one to the other.
         deg_per_s: f64,
-        /// What is allowed.
+        /// Largest allowed speed.
         allowed_deg_per_s: f64,
     },
-    /// A movement that the mirror cannot follow.
+    /// Too much movement above the bandwidth.
     #[error(
         "{axis} moves by {deg} degrees (rms) above the bandwidth of {bandwidth_hz} Hz: allowed are {allowed_deg}; take more points, rounder turns, or a lower rate_hz"
     )]
     Bandwidth {
-        /// Which axis.
+        /// Name of the axis.
         axis: char,
-        /// How much.
+        /// Root mean square of the movement above the bandwidth.
         deg: f64,
-        /// What is allowed.
+        /// Largest allowed root mean square.
         allowed_deg: f64,
-        /// Above which frequency.
+        /// The bandwidth.
         bandwidth_hz: f64,
     },
 }
 
-/// A raster: x goes to and fro as a sine, y down at an even pace and back up once a batch.
+/// A raster: x oscillates as a sine; y moves down at constant speed and back up once per batch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterScan {
     /// Largest tilt to either side, x and y.
     pub amplitude: Tilt,
-    /// Lines, each one crossing; an even number, as the path comes back to where it began.
+    /// Number of lines, each one crossing. Must be even, as the path is closed.
     pub lines: u32,
-    /// Share of the batch in which y goes back; more than 0, less than 1.
+    /// Share of the batch in which y moves back; more than 0, less than 1.
     pub flyback: f64,
 }
 
 impl MirrorPath {
-    /// The path through these points, in order and round again, `rate_hz` of them a second.
+    /// The path through these points, in order and cyclically, at `rate_hz` points per second.
     ///
     /// # Errors
-    /// The first limit that a point, or the path as a whole, would break.
+    /// The first limit that a point, or the path as a whole, breaks.
     pub fn new(points: Vec<MirrorPoint>, rate_hz: f64, limits: &MirrorLimits) -> Result<Self, PathError> {
         if !(1..=MAX_POINTS).contains(&points.len()) {
             return Err(PathError::Points { points: points.len() });
@@ -135,7 +135,7 @@ impl MirrorPath {
         for (axis, of) in [('x', 0), ('y', 1)] {
             let deg = |point: usize| points[point % points.len()].tilt.deg()[of];
             for point in 0..points.len() {
-                // NaN is in no range.
+                // NaN lies in no range.
                 if !(-limits.max_tilt.0..=limits.max_tilt.0).contains(&deg(point)) {
                     let allowed_deg = limits.max_tilt.0;
                     return Err(PathError::Tilt { point, axis, deg: deg(point), allowed_deg });
@@ -171,7 +171,7 @@ impl MirrorPath {
         Ok(Self { points, rate_hz })
     }
 
-    /// A path through tilts, lit all the way.
+    /// A path through tilts, with the light on all the way.
     ///
     /// # Errors
     /// As [`MirrorPath::new`].
@@ -186,7 +186,7 @@ impl MirrorPath {
     /// A raster of `points` points.
     ///
     /// # Errors
-    /// As [`MirrorPath::new`]; `Shape` for lines or a flyback that make no raster.
+    /// As [`MirrorPath::new`]; `Shape` for an invalid number of lines or flyback.
     pub fn raster(
         scan: &RasterScan,
         points: usize,
@@ -213,7 +213,8 @@ impl MirrorPath {
         Self::sampled(points, rate_hz, limits, tilt)
     }
 
-    /// A Lissajous figure of `points` points: sines with whole numbers of `cycles` a batch (x, y), y ahead by a quarter of its cycle.
+    /// A Lissajous figure of `points` points: sines with integer numbers of `cycles` per batch (x, y), y a quarter of
+    /// its cycle ahead.
     ///
     /// # Errors
     /// As [`MirrorPath::new`].
@@ -230,7 +231,7 @@ impl MirrorPath {
         })
     }
 
-    /// A spiral of `points` points: from the centre out to `amplitude` and back in one batch, `turns` in all.
+    /// A spiral of `points` points: from the centre out to `amplitude` and back in one batch, `turns` turns in all.
     ///
     /// # Errors
     /// As [`MirrorPath::new`].
@@ -260,18 +261,18 @@ impl MirrorPath {
         Self::through((0..points).map(|point| tilt(point as f64 / points as f64)), rate_hz, limits)
     }
 
-    /// The same path with the light of each point as `light` says.
+    /// The same path with the light of point `i` set to `light(i)`.
     #[must_use]
     pub fn with_light(mut self, light: impl Fn(usize) -> u8) -> Self {
         self.points.iter_mut().enumerate().for_each(|(index, point)| point.light = light(index));
         self
     }
 
-    /// The path to command so that axes that answer as `responses` (x, y) follow this one:
+    /// The path to command so that axes with these `responses` (x, y) follow this path:
     /// `u = x + x' / (w0 Q) + x'' / w0^2`, with the derivatives as central differences round the loop.
     ///
     /// # Errors
-    /// As [`MirrorPath::new`]: what must be commanded keeps to the limits too. `Shape` for a response that is none.
+    /// As [`MirrorPath::new`], as the commands must respect the limits too. `Shape` for an invalid response.
     pub fn predistorted(
         &self,
         responses: [SecondOrder; 2],
@@ -288,7 +289,7 @@ impl MirrorPath {
         let command = |index: usize, axis: usize| {
             let at = |index: usize| self.points[index % len].tilt.deg()[axis];
             let (before, here, after) = (at(index + len - 1), at(index), at(index + 1));
-            // Radians of the resonance in one sample.
+            // Phase of the resonance per sample, in radians.
             let w0 = TAU * responses[axis].f0_hz / self.rate_hz;
             let velocity = (after - before) / 2.0;
             let acceleration = after - 2.0 * here + before;
@@ -306,7 +307,7 @@ impl MirrorPath {
         &self.points
     }
 
-    /// The point of any sample, over batches.
+    /// The point of a sample, counted over all batches.
     pub fn at(&self, sample: u64) -> MirrorPoint {
         self.points[(sample % self.points.len() as u64) as usize]
     }
@@ -322,8 +323,8 @@ impl MirrorPath {
     }
 }
 
-/// Root mean square of what a closed loop of values holds beyond `cycles_per_sample`, by Parseval's theorem: all but
-/// its mean and the discrete Fourier terms up to there.
+/// Root mean square of the part of a closed loop of values above `cycles_per_sample`, by Parseval's theorem: without
+/// the mean and the discrete Fourier terms up to that frequency.
 fn rms_beyond(values: &[f64], cycles_per_sample: f64) -> f64 {
     let count = values.len() as f64;
     let last_term = (cycles_per_sample * count).floor();
@@ -357,7 +358,8 @@ mod tests {
     const LIMITS: MirrorLimits = MirrorLimits::A7B2_3_3600AL;
     const RATE_HZ: f64 = 39_000.0;
 
-    /// What a path's limits mean, written without a look at how they are checked; the spectrum term by term.
+    /// The definition of a path's limits, written independently of the code that checks them; the spectrum is summed
+    /// term by term.
     fn keeps_to(points: &[Tilt], rate_hz: f64, limits: &MirrorLimits) -> bool {
         let n = points.len();
         (0..2).all(|axis| {
@@ -475,13 +477,13 @@ mod tests {
         assert_eq!(path.at(6500 * 59 + 17), path.points()[17]);
     }
 
-    /// The axis integrated in small steps, as it would move: an independent look at what pre-distortion promises.
+    /// The motion of the axis, integrated in small steps: an independent check of the pre-distortion.
     fn follow(commands: &[f64], rate_hz: f64, response: SecondOrder) -> Vec<f64> {
         const SUBSTEPS: u32 = 64;
         let (w0, dt) = (TAU * response.f0_hz, 1.0 / rate_hz / f64::from(SUBSTEPS));
         let (mut x, mut v) = (commands[0], 0.0);
         let mut out = Vec::new();
-        // Long enough for what the start sets ringing to die down.
+        // Long enough for the ringing from the start to decay.
         for _ in 0..8 {
             out.clear();
             for (index, &command) in commands.iter().enumerate() {

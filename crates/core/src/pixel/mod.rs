@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 pub use self::packing::Packing;
 pub use self::unpack::UnpackLevel;
 
-/// What a pixel sees: all light, or one colour of a Bayer mosaic, named by the first two pixels of its first row.
+/// What a pixel sees: all light, or one colour of a Bayer mosaic, which is named by the first two pixels of its first
+/// row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mosaic {
     /// No mosaic.
@@ -30,7 +31,7 @@ impl Mosaic {
     /// All mosaics.
     pub const ALL: [Self; 5] = [Self::Mono, Self::BayerGR, Self::BayerRG, Self::BayerGB, Self::BayerBG];
 
-    /// Of a mosaic, column and row (0 or 1) of the red pixel of the first two rows' first two pixels.
+    /// Column and row (0 or 1) of the red pixel in the mosaic's 2 x 2 cell; `None` for [`Mosaic::Mono`].
     pub fn red(self) -> Option<(usize, usize)> {
         match self {
             Self::Mono => None,
@@ -52,18 +53,18 @@ impl Mosaic {
     }
 }
 
-/// How a camera delivers its pixels: every mosaic in every packing. In files and messages a format is called by its name
-/// in the GenICam Pixel Format Naming Convention.
+/// How a camera delivers its pixels: every mosaic in every packing. Files and messages use the names of the GenICam
+/// Pixel Format Naming Convention.
 #[derive(Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct PixelFormat {
-    /// What its pixels see.
+    /// The colours that its pixels see.
     pub mosaic: Mosaic,
-    /// How they lie in memory.
+    /// The layout of its pixels in memory.
     pub packing: Packing,
 }
 
-/// The formats that code calls by name.
+/// The formats that code refers to by name.
 #[allow(non_upper_case_globals, reason = "the names are the convention's")]
 #[allow(missing_docs, reason = "mosaic and packing say it")]
 impl PixelFormat {
@@ -94,7 +95,7 @@ pub struct PixelError {
     actual: usize,
 }
 
-/// A name that is no pixel format's.
+/// A name that is not the name of a pixel format.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "no pixel format is called {0:?}: give Mono, BayerGR, BayerRG, BayerGB or BayerBG, then 8, 10, 12, 16, 10p, 12p, 10Packed, 12Packed, 10g40 or 12g24, as in Mono12p"
@@ -102,7 +103,7 @@ pub struct PixelError {
 pub struct UnknownPixelFormat(String);
 
 impl PixelFormat {
-    /// The format of a mosaic in a packing.
+    /// The pixel format with this mosaic and packing.
     pub const fn new(mosaic: Mosaic, packing: Packing) -> Self {
         Self { mosaic, packing }
     }
@@ -114,15 +115,15 @@ impl PixelFormat {
             .flat_map(|mosaic| Packing::ALL.into_iter().map(move |packing| Self::new(mosaic, packing)))
     }
 
-    /// The format of a 32-bit PFNC code.
+    /// The format with a 32-bit PFNC code.
     pub fn from_pfnc(code: u32) -> Option<Self> {
         Self::all().find(|format| format.pfnc() == Some(code))
     }
 
-    /// The 32-bit PFNC code; the packings of MIPI CSI-2 have none.
+    /// The 32-bit PFNC code; `None` for the packings of MIPI CSI-2, which have none.
     pub fn pfnc(self) -> Option<u32> {
         const MONOCHROME: u32 = 0x0100_0000;
-        // Numbers of the mosaics in the order of `Mosaic`.
+        // PFNC numbers of the mosaics, in the order of `Mosaic`.
         let numbers: [u32; 5] = match self.packing {
             Packing::Bits8 => [0x01, 0x08, 0x09, 0x0A, 0x0B],
             Packing::Bits10 => [0x03, 0x0C, 0x0D, 0x0E, 0x0F],
@@ -147,7 +148,8 @@ impl PixelFormat {
         self.packing.max_value()
     }
 
-    /// Bytes of a frame of `pixels` pixels; a packed frame ends with a whole byte, one packed in groups with a whole group.
+    /// Bytes in a frame of `pixels` pixels. A packed frame is padded to a whole byte, or to a whole group if it is
+    /// packed in groups.
     pub fn frame_bytes(self, pixels: usize) -> usize {
         self.packing.bytes(pixels)
     }
@@ -157,38 +159,38 @@ impl PixelFormat {
         if actual == expected { Ok(()) } else { Err(PixelError { format: self, pixels, expected, actual }) }
     }
 
-    /// Unpacks a frame to one `u16` a pixel with the fastest instructions of this machine.
+    /// Unpacks a frame to one `u16` per pixel with the fastest instructions of this machine.
     ///
     /// # Errors
-    /// When `bytes` is not exactly a frame of `pixels.len()` pixels.
+    /// If `bytes` is not exactly a frame of `pixels.len()` pixels.
     pub fn unpack_into(self, bytes: &[u8], pixels: &mut [u16]) -> Result<(), PixelError> {
         self.unpack_with(UnpackLevel::best(), bytes, pixels)
     }
 
-    /// Unpacks a frame with the instructions that are asked for; all give the same pixels.
+    /// Unpacks a frame with the given instruction level; all levels give the same pixels.
     ///
     /// # Errors
-    /// When `bytes` is not exactly a frame of `pixels.len()` pixels.
+    /// If `bytes` is not exactly a frame of `pixels.len()` pixels.
     pub fn unpack_with(self, level: UnpackLevel, bytes: &[u8], pixels: &mut [u16]) -> Result<(), PixelError> {
         self.checked(pixels.len(), bytes.len())?;
         unpack::unpack(level, self.packing, bytes, pixels);
         Ok(())
     }
 
-    /// Unpacks a frame one pixel after the other, by the packing's definition: what every faster way must equal.
+    /// Unpacks a frame pixel by pixel, as the packing is defined: the reference for all faster implementations.
     ///
     /// # Errors
-    /// When `bytes` is not exactly a frame of `pixels.len()` pixels.
+    /// If `bytes` is not exactly a frame of `pixels.len()` pixels.
     pub fn unpack_plain(self, bytes: &[u8], pixels: &mut [u16]) -> Result<(), PixelError> {
         self.checked(pixels.len(), bytes.len())?;
         self.packing.unpack(bytes, pixels);
         Ok(())
     }
 
-    /// Adds a frame's pixels to sums, without a pass over memory for the unpacked frame.
+    /// Adds a frame's pixels to `sums`, without writing the unpacked frame to memory.
     ///
     /// # Errors
-    /// When `bytes` is not exactly a frame of `sums.len()` pixels; the sums are as before.
+    /// If `bytes` is not exactly a frame of `sums.len()` pixels; `sums` is then unchanged.
     pub fn add_to(self, bytes: &[u8], sums: &mut [u32]) -> Result<(), PixelError> {
         self.checked(sums.len(), bytes.len())?;
         unpack::add(UnpackLevel::best(), self.packing, bytes, sums);
@@ -198,7 +200,7 @@ impl PixelFormat {
     /// Packs pixels into a frame, as a camera does; bits beyond [`PixelFormat::bits`] are cut off.
     ///
     /// # Errors
-    /// When `bytes` is not exactly a frame of `pixels.len()` pixels.
+    /// If `bytes` is not exactly a frame of `pixels.len()` pixels.
     pub fn pack_into(self, pixels: &[u16], bytes: &mut [u8]) -> Result<(), PixelError> {
         self.checked(pixels.len(), bytes.len())?;
         self.packing.pack(pixels, bytes);

@@ -1,6 +1,6 @@
-//! How pixels lie in memory, each packing by its definition: the plain way, one pixel after the other.
+//! Layouts of pixels in memory, and their reference implementations, which process pixel by pixel.
 
-/// How the pixels of a frame lie in memory, whatever they see.
+/// The layout of a frame's pixels in memory, whatever their mosaic.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Packing {
     /// 8 bits in a byte.
@@ -15,8 +15,8 @@ pub enum Packing {
     Bits10p,
     /// Two 12-bit pixels in three bytes, least significant bits first, without gaps.
     Bits12p,
-    /// Two 10-bit pixels in three bytes as in GigE Vision 1: their high bytes outside; in the middle byte the low bits
-    /// of the first at bit 0, of the second at bit 4.
+    /// Two 10-bit pixels in three bytes as in GigE Vision 1: the outer bytes hold their high bits; the middle byte
+    /// holds the low bits of the first at bit 0, those of the second at bit 4.
     Bits10Packed,
     /// Two 12-bit pixels in three bytes as in GigE Vision 1: the same with four low bits each.
     Bits12Packed,
@@ -57,7 +57,7 @@ impl Packing {
         u16::MAX >> (16 - self.bits())
     }
 
-    /// Bits that a pixel takes in memory, on average.
+    /// Bits that a pixel occupies in memory, on average.
     pub fn occupied_bits(self) -> u32 {
         match self {
             Self::Bits8 => 8,
@@ -67,7 +67,7 @@ impl Packing {
         }
     }
 
-    /// Bytes of `pixels` pixels; a packed frame ends with a whole byte, one packed in groups with a whole group.
+    /// Bytes of `pixels` pixels, padded to a whole byte, or to a whole group if pixels are packed in groups.
     pub(super) fn bytes(self, pixels: usize) -> usize {
         match self {
             Self::Bits10g40 => pixels.div_ceil(4) * 5,
@@ -91,7 +91,7 @@ impl Packing {
         }
     }
 
-    /// `bytes` holds exactly `pixels`.
+    /// `bytes` must hold exactly as many pixels as `pixels`.
     pub(super) fn unpack(self, bytes: &[u8], pixels: &mut [u16]) {
         match self {
             Self::Bits8 => pixels.iter_mut().zip(bytes).for_each(|(pixel, &byte)| *pixel = u16::from(byte)),
@@ -109,7 +109,7 @@ impl Packing {
         }
     }
 
-    /// `bytes` has room for exactly `pixels`.
+    /// `bytes` must have room for exactly these pixels.
     pub(super) fn pack(self, pixels: &[u16], bytes: &mut [u8]) {
         match self {
             Self::Bits8 => bytes.iter_mut().zip(pixels).for_each(|(byte, &pixel)| *byte = pixel as u8),
@@ -149,13 +149,14 @@ fn pack_stream(bits: usize, pixels: &[u16], bytes: &mut [u8]) {
     }
 }
 
-/// Where GigE Vision 1 puts pixel `index`: its high byte, the byte with its low bits, and the first of these.
+/// Location of pixel `index` in GigE Vision 1: its high byte, the byte with its low bits, and the first bit of these.
 fn gige_place(index: usize) -> (usize, usize, u32) {
     let group = index / 2 * 3;
     if index.is_multiple_of(2) { (group, group + 1, 0) } else { (group + 2, group + 1, 4) }
 }
 
-/// Where MIPI CSI-2 puts pixel `index`, in the same terms: `low_bits` each, as many pixels in a group as fill a byte.
+/// The same for MIPI CSI-2: each pixel has `low_bits` low bits, and a group has as many pixels as fill a byte with
+/// them.
 fn mipi_place(low_bits: usize, index: usize) -> (usize, usize, u32) {
     let pixels = 8 / low_bits;
     let (group, within) = (index / pixels * (pixels + 1), index % pixels);

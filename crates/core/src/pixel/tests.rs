@@ -1,7 +1,7 @@
 use super::*;
 
-/// Vectors worked by hand from the figures of PFNC 2.4, GigE Vision 2.0 (pixel payload formats) and MIPI CSI-2 as V4L2
-/// documents it (Y10P, Y12P): each bit of the first pixels stands where the figure has it.
+/// Vectors worked out by hand from the figures of PFNC 2.4, GigE Vision 2.0 (pixel payload formats) and MIPI CSI-2 as
+/// documented by V4L2 (Y10P, Y12P): each bit of the first pixels is where the figure shows it.
 #[test]
 fn bit_orders_are_the_standards() {
     let cases: [(&str, &[u8], &[u16]); 18] = [
@@ -18,7 +18,7 @@ fn bit_orders_are_the_standards() {
         // 1, 2, 4, 8 in ten bits each: ...1 | ...10 | ...100 | ...1000 from bit 0 on.
         ("Mono10p", &[0x01, 0x08, 0x40, 0x00, 0x02], &[1, 2, 4, 8]),
         ("Mono10p", &[0x00, 0x00, 0xF0, 0x3F], &[0, 0, 0x3FF]),
-        // The middle byte's bits 2, 3, 6, 7 belong to nobody.
+        // Bits 2, 3, 6 and 7 of the middle byte are unused.
         ("Mono10Packed", &[0xAB, 0xDE, 0x12], &[0x2AE, 0x049]),
         ("Mono10Packed", &[0xAB, 0x02], &[0x2AE]),
         ("Mono10g40", &[0xAA, 0x55, 0xFF, 0x00, 0b11_10_01_00], &[0x2A8, 0x155, 0x3FE, 0x003]),
@@ -36,7 +36,7 @@ fn bit_orders_are_the_standards() {
     }
 }
 
-/// Bytes without a pattern that a wrong shuffle could share.
+/// Bytes without a pattern that could hide a wrong shuffle.
 fn noise(length: usize) -> Vec<u8> {
     let mut state = 0x2545_F491_4F6C_DD1D_u64;
     let mut next = || {
@@ -61,7 +61,7 @@ fn every_level_gives_the_plain_pixels_at_every_length_and_alignment() {
                 let mut plain = vec![0; length];
                 format.unpack_plain(bytes, &mut plain).unwrap();
                 for &level in UnpackLevel::available() {
-                    // The pixels' own alignment varies too; what lies beside them must stay.
+                    // The alignment of the pixels varies too; memory next to them must not change.
                     let mut pixels = vec![0xA5A5; length + 16];
                     let start = offset % 16;
                     format.unpack_with(level, bytes, &mut pixels[start..start + length]).unwrap();
@@ -98,7 +98,7 @@ fn unpacking_undoes_packing_at_every_length() {
     }
 }
 
-/// The codes as the header of a GigE Vision library has them, some of each row and column of the table.
+/// The codes from the header of a GigE Vision library, a few from each row and column of the table.
 #[test]
 fn names_and_codes_are_the_conventions() {
     let cases = [

@@ -1,17 +1,17 @@
-//! Unpacking as fast as memory: the same pixels as [`Packing::unpack`], four to sixteen at a time.
+//! Unpacking at the speed of memory: the same pixels as [`Packing::unpack`], four to sixteen at a time.
 //!
-//! All packings of 10 and 12 bits are one computation. Two bytes, seen as a 16-bit word, hold all bits of a pixel:
-//! those that a shift to the right brings to their place, and those that have to be shifted to the left first, which
-//! is a multiplication. Only where the bytes lie, the factors, and the masks differ.
+//! All packings of 10 and 12 bits use the same computation. Two bytes, read as a 16-bit word, contain all bits of a
+//! pixel: some need only a shift to the right, others must first be shifted to the left, which is a multiplication.
+//! Packings differ only in the positions of the bytes, the factors and the masks.
 
 use pulp::NullaryFnOnce;
 
 use super::Packing;
 
-/// The instructions that pixels are unpacked with. All give the same pixels.
+/// The instruction set used to unpack pixels. All give the same pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnpackLevel {
-    /// What every machine has, as the compiler uses it.
+    /// The baseline instruction set, as the compiler uses it.
     Portable,
     /// x86-64 with SSE4.2: eight pixels at a time.
     Sse42,
@@ -20,7 +20,7 @@ pub enum UnpackLevel {
 }
 
 impl UnpackLevel {
-    /// All levels that this machine has, the fastest last.
+    /// All levels that this machine supports, fastest last.
     pub fn available() -> &'static [Self] {
         match Self::best() {
             Self::Portable => &[Self::Portable],
@@ -29,7 +29,7 @@ impl UnpackLevel {
         }
     }
 
-    /// The fastest level that this machine has.
+    /// The fastest level that this machine supports.
     pub fn best() -> Self {
         #[cfg(target_arch = "x86_64")]
         if pulp::x86::V3::is_available() {
@@ -41,18 +41,18 @@ impl UnpackLevel {
     }
 }
 
-/// Pixels that a [`Layout`] speaks of: as many as lie in whole bytes in every packing.
+/// Pixels described by a [`Layout`]: the smallest number that fills whole bytes in every packing.
 const GROUP: usize = 4;
 
-/// Where four neighbouring pixels lie in `BYTES` bytes. Pixel `k` is
-/// `word >> shift & high_mask | word * scale[k] >> shift & low_mask` of the word that its two bytes make.
+/// The layout of four neighbouring pixels in `BYTES` bytes. With the word made of its two bytes, pixel `k` is
+/// `word >> shift & high_mask | word * scale[k] >> shift & low_mask`.
 struct Layout<const BYTES: usize> {
     /// Low and high byte of each pixel's word.
     word: [[u8; 2]; GROUP],
     scale: [u16; GROUP],
     high_mask: u16,
     low_mask: u16,
-    /// The same for the portable kernel, made when this is compiled.
+    /// The same for the portable kernel, computed at compile time.
     moves: [Move; MOVES],
 }
 
@@ -74,17 +74,17 @@ impl<const BYTES: usize> Layout<BYTES> {
     }
 }
 
-/// Unpacks `bytes`, which holds exactly `pixels`.
+/// Unpacks `bytes`, which must hold exactly as many pixels as `pixels`.
 pub(super) fn unpack(level: UnpackLevel, packing: Packing, bytes: &[u8], pixels: &mut [u16]) {
     run(level, Unpack { packing, bytes, pixels });
 }
 
-/// Adds the pixels of `bytes`, which holds exactly as many as there are sums.
+/// Adds the pixels of `bytes`, which must hold exactly one pixel per sum.
 pub(super) fn add(level: UnpackLevel, packing: Packing, bytes: &[u8], sums: &mut [u32]) {
     run(level, Add { packing, bytes, sums });
 }
 
-/// What can be done on every level.
+/// A computation that every level can run.
 trait Task {
     fn run<K: Kernel>(self, kernel: K);
 }
@@ -107,7 +107,7 @@ fn run(level: UnpackLevel, task: impl Task) {
     On { kernel: Portable, task }.call();
 }
 
-/// A task on a level's instructions.
+/// A task with a level's instructions.
 struct On<K, T> {
     kernel: K,
     task: T,
@@ -133,7 +133,7 @@ impl Task for Unpack<'_> {
     fn run<K: Kernel>(self, kernel: K) {
         let Self { packing, bytes, pixels } = self;
         match packing {
-            // What the compiler makes of the plain way is as fast as memory.
+            // The compiler's code for the reference implementation is as fast as memory.
             Packing::Bits8 | Packing::Bits10 | Packing::Bits12 | Packing::Bits16 => {
                 packing.unpack(bytes, pixels);
             }
@@ -156,7 +156,8 @@ struct Add<'a> {
 impl Task for Add<'_> {
     #[inline(always)]
     fn run<K: Kernel>(self, kernel: K) {
-        // A block of pixels stays in the first cache; a multiple of the group, so that it begins with a whole byte.
+        // A block of pixels fits in the L1 cache. It is a multiple of the group, so that each block begins at a whole
+        // byte.
         const BLOCK: usize = 1024;
         let mut block = [0; BLOCK];
         let blocks = self.bytes.chunks(self.packing.bytes(BLOCK)).zip(self.sums.chunks_mut(BLOCK));
@@ -168,9 +169,9 @@ impl Task for Add<'_> {
     }
 }
 
-/// One level's way to unpack whole groups.
+/// The implementation of one level, which unpacks whole groups.
 trait Kernel: Copy {
-    /// Unpacks groups from the first on, as many as it likes, and says how many.
+    /// Unpacks any number of groups, starting at the first, and returns how many.
     fn groups<const SHIFT: u32, const BYTES: usize>(
         self,
         layout: &Layout<BYTES>,
@@ -183,7 +184,8 @@ trait Kernel: Copy {
 struct Portable;
 
 impl Kernel for Portable {
-    /// Whole groups as numbers of 64 bits: bits that move equally far move at once, and vectors hold several groups.
+    /// Handles whole groups as 64-bit numbers: bits that move by the same distance move at once, and vectors hold
+    /// several groups.
     #[inline(always)]
     fn groups<const SHIFT: u32, const BYTES: usize>(
         self,
@@ -194,7 +196,7 @@ impl Kernel for Portable {
         let bytes = groups.as_flattened();
         let mut done = 0;
         for pixels in pixels.as_chunks_mut::<ABREAST>().0 {
-            // The last load reaches beyond its group.
+            // The last load reads beyond its group.
             let Some(bytes) = bytes.get(done * BYTES..(done + ABREAST - 1) * BYTES + 8) else { break };
             let groups: [u64; ABREAST] = std::array::from_fn(|group| {
                 let bytes = bytes[group * BYTES..].first_chunk();
@@ -210,12 +212,12 @@ impl Kernel for Portable {
     }
 }
 
-/// Groups that the portable kernel unpacks in one step.
+/// Groups that the portable kernel unpacks per step.
 const ABREAST: usize = 4;
-/// No packing needs more.
+/// An upper limit: no packing needs more.
 const MOVES: usize = 8;
 
-/// Bits of a group that move equally far to the left, to where they are in four unpacked pixels.
+/// Bits of a group that move to the left by the same distance, to their positions in four unpacked pixels.
 #[derive(Clone, Copy)]
 struct Move {
     by: i32,
@@ -231,7 +233,7 @@ impl Move {
 }
 
 impl<const BYTES: usize> Layout<BYTES> {
-    /// What the portable kernel does to a group.
+    /// The moves by which the portable kernel unpacks a group.
     const fn moved(&self, shift: u32) -> [Move; MOVES] {
         let mut moves = [Move { by: 0, mask: 0 }; MOVES];
         let mut to = 0;
@@ -259,7 +261,7 @@ impl<const BYTES: usize> Layout<BYTES> {
     }
 }
 
-/// The kernel's groups, and the plain way for the few pixels that it leaves over.
+/// Unpacks with the kernel, and the few remaining pixels with the reference implementation.
 #[inline(always)]
 fn by_groups<const SHIFT: u32, const BYTES: usize, K: Kernel>(
     kernel: K,
@@ -284,11 +286,12 @@ mod x86 {
 
     use super::{GROUP, Kernel, Layout};
 
-    /// Groups of a vector of eight pixels, and of each half of one of sixteen, between which bytes cannot be shuffled.
+    /// Groups in a vector of eight pixels, and in each half of a vector of sixteen; bytes cannot be shuffled between
+    /// halves.
     const HALF: usize = 2;
     const WHOLE: usize = 2 * HALF;
 
-    /// From which byte of its half each byte of a vector of words comes.
+    /// For each byte of a vector of words, the byte of its half that it comes from.
     fn shuffle<const VECTOR_BYTES: usize, const BYTES: usize>(layout: &Layout<BYTES>) -> [u8; VECTOR_BYTES] {
         std::array::from_fn(|i| {
             let group = i % 16 / (2 * GROUP);
@@ -300,7 +303,7 @@ mod x86 {
         std::array::from_fn(|i| layout.scale[i % GROUP])
     }
 
-    /// Sixteen bytes, of which a half needs the first; nothing where they would reach beyond the end.
+    /// Sixteen bytes, of which a half needs the first ones; `None` if they would reach beyond the end.
     #[inline(always)]
     fn half(bytes: &[u8], at: usize) -> Option<__m128i> {
         Some(cast::<[u8; 16], __m128i>(*bytes.get(at..)?.first_chunk()?))

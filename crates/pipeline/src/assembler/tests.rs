@@ -5,7 +5,7 @@ use super::*;
 const PERIOD_NS: i64 = 16_666_667;
 const EXPOSURE_US: f64 = 600.0;
 
-/// A camera without latency on a projector whose row 0 is centred 1 ms after its edge: t_d = 0 at a trigger delay of
+/// A camera without latency on a projector whose row 0 is centred 1 ms after its edge: t_d = 0 for a trigger delay of
 /// 700 us.
 fn config() -> AssemblerConfig {
     AssemblerConfig {
@@ -28,7 +28,7 @@ fn config() -> AssemblerConfig {
     }
 }
 
-/// Feeds an assembler and keeps what it decides.
+/// Feeds an assembler and records its decisions.
 struct Feed {
     assembler: Assembler,
     decisions: Vec<Decision>,
@@ -51,7 +51,7 @@ impl Feed {
         self.push(Event::Edge(Edge { seq: 0, host_ns }));
     }
 
-    /// Edges number `from..to` of a perfect line.
+    /// Edges number `from..to` of a perfectly regular line.
     fn edges(&mut self, from: i64, to: i64) {
         (from..to).for_each(|k| self.edge(k * PERIOD_NS));
     }
@@ -138,7 +138,7 @@ fn frames_are_summed_once_their_edges_are_known() {
 fn the_delay_is_measured_against_the_edge_of_the_light_not_of_the_trigger() {
     let mut feed = Feed::new();
     feed.edges(0, 3);
-    // One period more than a delay of zero; the light's edge is 30 us late, so the delay is 30 us short.
+    // One period more than for a delay of zero. The light's edge is 30 us late, so the delay is 30 us short.
     let trigger_delay_us = 700.0 + 16_666.667;
     feed.begin(1, trigger_delay_us, 1);
     feed.edge(3 * PERIOD_NS + 30_000);
@@ -181,7 +181,7 @@ fn a_line_that_has_died_does_not_hold_frames_for_ever() {
     feed.begin(1, 700.0, 0);
     feed.frame(3, 9);
     feed.push(Event::End);
-    // A frame 100 ms later says on the host's clock that the edge is not coming.
+    // A frame 100 ms later on the host's clock shows that the edge will not come.
     feed.frame_at(10 * PERIOD_NS, 700.0, 9, Label::Cancelled);
     assert_eq!(feed.failed().lost, [(LossCause::EdgeMissing, 1)].into());
 }
@@ -240,7 +240,7 @@ fn gaps_in_frame_ids_and_unanswered_edges_are_counted_where_they_happen() {
     feed.frame(2, 1);
     feed.seq += 2; // two frames exposed by edges 3 and 4, and lost on the way
     feed.frame(5, 1);
-    feed.frame(8, 1); // edges 6 and 7 were not answered
+    feed.frame(8, 1); // edges 6 and 7 triggered no frame
     feed.push(Event::End);
     let counts = &feed.unit().counts;
     assert_eq!(counts.lost, [(LossCause::CameraGap, 2), (LossCause::MissedTrigger, 2)].into());
@@ -266,7 +266,7 @@ fn settling_and_idle_frames_have_columns_of_their_own() {
     feed.edges(0, 12);
     feed.frame_at(PERIOD_NS, 0.0, 1, Label::Cancelled);
     feed.push(Event::Idle);
-    feed.seq += 5; // nobody looked
+    feed.seq += 5; // frames that nobody took
     feed.begin(1, 700.0, 0);
     feed.frame_at(2 * PERIOD_NS, 0.0, 1, Label::Settling);
     feed.frame(3, 1);
@@ -333,7 +333,7 @@ fn a_frame_that_a_false_edge_may_have_triggered_under_the_settings_before_does_n
         if has_false_edge {
             feed.edge(false_ns);
         }
-        // The settings before had 2 ms more delay, so both triggers give the same start of the exposure.
+        // The previous settings had 2 ms more delay, so both triggers give the same start of the exposure.
         feed.frame_at(3 * PERIOD_NS, 700.0, 100, label(false_ns));
         feed.edges(3, 6);
         feed.frame(4, 100);
@@ -343,7 +343,7 @@ fn a_frame_that_a_false_edge_may_have_triggered_under_the_settings_before_does_n
     assert!(matches!(&decide(false)[..], [Decision::Unit(_)]));
     let decisions = decide(true);
     let [Decision::Failed(_, Failure::Interrupted, counts)] = &decisions[..] else { panic!() };
-    // If the false edge did trigger it, the true edge after that was not answered.
+    // If the false edge did trigger it, the next true edge was not answered.
     assert_eq!(counts.lost, [(LossCause::MissedTrigger, 1)].into());
     assert_eq!((counts.expected, counts.settling, counts.cancelled), (4, 1, 2), "frames after it neither");
 }
@@ -355,7 +355,7 @@ fn frame_ids_that_fall_back_do_no_harm() {
     feed.begin(3, 700.0, 0);
     feed.seq = 65_535;
     feed.frame(2, 1);
-    feed.seq = 0; // 16 bits are over
+    feed.seq = 0; // 16-bit ids wrap around
     feed.frame(3, 1);
     feed.frame(4, 1);
     feed.push(Event::End);
@@ -366,8 +366,8 @@ fn frame_ids_that_fall_back_do_no_harm() {
 fn triggers_that_a_film_misses_between_two_settings_are_counted() {
     let mut feed = Feed::new();
     feed.edges(0, 12);
-    // One frame a job; the third takes a period more than the others, by its settings, and the fifth because the
-    // camera heard nothing at edge 7.
+    // One frame per job. The third takes a period more than the others because of its settings, the fifth because the
+    // camera missed edge 7.
     for (job, edge) in [2, 3, 5, 6, 8].into_iter().enumerate() {
         let periods = [None, Some(1), Some(2), Some(1), Some(1)][job];
         feed.begin_after(periods, 1, 700.0, 0);

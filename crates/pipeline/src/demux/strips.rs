@@ -1,4 +1,5 @@
-//! The fold of a sweep that is larger than the memory: it keeps how images were taken, and reads their rows again.
+//! The fold of a sweep that is larger than the memory: it keeps only how images were taken, and reads their rows
+//! again.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -36,8 +37,8 @@ impl DemuxFold {
         Ok(tally.products(choices.findings))
     }
 
-    /// The rows of [`rows_to_choose_by`] of all images. They lie all over an image, so that it is read whole: one at a time,
-    /// because many together may be larger than the memory.
+    /// The rows of [`rows_to_choose_by`] of all images. They are spread over the whole image, so each image is read
+    /// completely: one at a time, because several together may be larger than the memory.
     fn read_to_choose_by(
         &self,
         not_kept: &BTreeMap<Role, (u32, Setting)>,
@@ -57,7 +58,7 @@ impl DemuxFold {
     }
 }
 
-/// The images of some camera rows.
+/// Reads some camera rows of the images.
 fn read_rows(
     not_kept: &BTreeMap<Role, (u32, Setting)>,
     images: &dyn ImageRows,
@@ -88,7 +89,7 @@ mod tests {
     use crate::strips::Strip;
     use crate::unit::Unit;
 
-    /// Higher than the rows that are chosen by, and saturated in the last of its strips only.
+    /// More rows than the choice needs, with saturation only in the last strip.
     const HEIGHT: usize = 130;
     const WIDTH: usize = 12;
     const STRIP_ROWS: usize = 50;
@@ -122,7 +123,7 @@ mod tests {
         Schedule { points: regular.into_iter().chain(sweep).collect() }
     }
 
-    /// Direct light and some that is as bright on either side of it, in noise.
+    /// Direct light with equally bright light on either side of it, and noise.
     fn image(ordinal: usize, point: &Point) -> Array2<f32> {
         let timing = geometry().timing().unwrap();
         let setting = Setting::new(point.delay_us, point.exposure_us);

@@ -1,4 +1,4 @@
-//! What is said of a sweep beside its transport, counted over its camera rows from top to bottom.
+//! Figures and warnings of a sweep, accumulated over its camera rows from top to bottom.
 
 use ndarray::Array2;
 use raysweep_transport::plane::Transport;
@@ -8,39 +8,39 @@ use crate::stage::Product;
 
 use super::PREDICTED_SHARE;
 
-/// So well the transport must predict the regular image.
+/// Largest relative error with which the transport should predict the regular image.
 const CLOSE_SHARE: f64 = 0.02;
-/// More saturated pixels than this deserve a warning: highlights are normal, fields are not.
+/// A larger share of saturated pixels causes a warning: highlights are normal, saturated areas are not.
 const SATURATED_SHARE: f64 = 0.01;
 
-/// Counts over the camera rows so far; the same, to the bit, however the rows come together.
+/// Counts over the camera rows so far; the same, to the bit, however the rows are divided.
 #[derive(Default)]
 pub(super) struct Tally {
     images: usize,
     pixels: usize,
     saturated: usize,
-    /// None: the regular image was not taken.
+    /// `None` if the regular image was not taken.
     regular: Option<Regular>,
 }
 
 #[derive(Default)]
 struct Regular {
     saturated: usize,
-    /// Light where the regular image does not saturate.
+    /// Light where the regular image is not saturated.
     captured: f64,
-    /// The same as the transport predicts it.
+    /// The same light as predicted by the transport.
     predicted: f64,
 }
 
 impl Tally {
-    /// Counts rows whose transport was made of so many images.
+    /// Adds rows whose transport was computed from `images` images.
     pub(super) fn add_sweep(&mut self, images: usize, transport: &Transport) {
         self.images = images;
         self.pixels += transport.saturated.len();
         self.saturated += transport.saturated.iter().filter(|&&saturated| saturated).count();
     }
 
-    /// Counts the light of the regular image in these rows.
+    /// Adds the light of the regular image in these rows.
     pub(super) fn add_regular(&mut self, valid: &Array2<bool>, light: &Array2<f32>, transport: &Transport) {
         let regular = self.regular.get_or_insert_default();
         regular.saturated += valid.iter().filter(|valid| !**valid).count();
@@ -52,7 +52,7 @@ impl Tally {
         add(&mut regular.predicted, &transport.total());
     }
 
-    /// Figures and warnings, and how the transport was found.
+    /// Figures and warnings, and the findings.
     pub(super) fn products(self, findings: Findings) -> Vec<Product> {
         let mut products = vec![
             Product::Figure { name: "images demultiplexed", value: self.images as f64 },
@@ -69,7 +69,7 @@ impl Tally {
 }
 
 impl Regular {
-    /// How well the transport predicts the light of the regular image where it is not saturated.
+    /// How well the transport predicts the light of the regular image where the image is not saturated.
     fn products(self, pixels: usize) -> Vec<Product> {
         let what = "the regular image (a whole VSYNC period long)";
         let mut products: Vec<Product> =

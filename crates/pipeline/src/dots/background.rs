@@ -1,12 +1,13 @@
-//! Which background a frame is denoised with.
+//! Selects the background with which a frame is denoised.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use raysweep_transport::dots::Background;
 
-/// Backgrounds by epoch, as many frames each as a batch has. That of an epoch is known when all frames up to the one
-/// before the last epoch are decided: whoever asks earlier waits. So it never depends on the threads.
+/// Backgrounds by epoch, where an epoch has as many frames as a batch. The background of an epoch is known when all
+/// frames up to the end of the epoch before the previous one are decided; earlier requests wait. It therefore never
+/// depends on the threads.
 pub(super) struct Backgrounds {
     frames_per_epoch: u64,
     known: Mutex<Known>,
@@ -16,15 +17,15 @@ pub(super) struct Backgrounds {
 struct Known {
     first_epoch: u64,
     backgrounds: VecDeque<Arc<Background>>,
-    /// Nothing is decided any more: the last one serves.
+    /// No more frames will be decided: the last background is used.
     closed: bool,
 }
 
-/// Epochs that may be worked on at once: frames of one, and stragglers of the one before.
+/// Number of epochs that may be in progress at once: frames of one, and stragglers of the previous one.
 const KEPT: usize = 3;
 
 impl Backgrounds {
-    /// With what serves the first two epochs.
+    /// Starts with the background of the first two epochs.
     pub fn new(frames_per_epoch: u64, first: Arc<Background>) -> Self {
         let backgrounds = VecDeque::from([first.clone(), first]);
         let known = Known { first_epoch: 0, backgrounds, closed: false };
@@ -54,8 +55,8 @@ impl Backgrounds {
         }
     }
 
-    /// Frame `arrival` and all before it are decided; `next` tells the background of the epoch after the next, if one
-    /// begins; none: as before.
+    /// Reports that frame `arrival` and all before it are decided. If this ends an epoch, `next` returns the
+    /// background of the epoch after the next one, or `None` to keep the last.
     pub fn decided(&self, arrival: u64, next: impl FnOnce() -> Option<Arc<Background>>) {
         if !(arrival + 1).is_multiple_of(self.frames_per_epoch) {
             return;

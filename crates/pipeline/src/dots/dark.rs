@@ -1,4 +1,4 @@
-//! What frames without light, and of even light, tell of the sensor.
+//! Calibrates the sensor from frames without light and frames of even light.
 
 use ndarray::Array3;
 use raysweep_transport::dots::{
@@ -6,10 +6,10 @@ use raysweep_transport::dots::{
     Region, RunStatistics, Sampling,
 };
 
-/// Frames in which the noise is measured; they are not in the mean that is subtracted from them.
+/// Number of frames in which the noise is measured; they are not part of the mean that is subtracted from them.
 const NOISE_FRAMES: usize = 8;
 
-/// Dark frames on their way to a [`Sensor`].
+/// Collects dark frames for a [`Sensor`].
 pub struct DarkRun {
     shape: FrameShape,
     saturation_dn: u16,
@@ -20,22 +20,22 @@ pub struct DarkRun {
     noisy: Vec<Vec<u16>>,
 }
 
-/// What is known of the sensor before the first dot.
+/// The sensor's calibration, known before the first dot.
 pub struct Sensor {
     /// Flat field and hot pixels.
     pub correction: Correction,
-    /// The mean of the dark frames, in which the frames of the beam dump will be mixed.
+    /// The mean of the dark frames, to which the frames of the beam dump will be added.
     pub background: BackgroundMean,
-    /// The noise of a frame above that background.
+    /// The noise of a frame relative to that background.
     pub floor: NoiseFloor,
 }
 
 impl DarkRun {
-    /// A run of `frames` dark frames, the first part of a rolling mean worth `background_batches` frames. Frames in which
+    /// A run of `frames` dark frames, which start a rolling mean worth `background_batches` frames. Frames in which
     /// most pixels have `saturation_dn` or more are left out.
     ///
     /// # Errors
-    /// [`DotsError::OutOfRange`] for no batch, [`DotsError::TooFew`] for fewer frames than a sensor is known from.
+    /// [`DotsError::OutOfRange`] for zero batches, [`DotsError::TooFew`] for fewer frames than the calibration needs.
     pub fn new(
         shape: FrameShape,
         saturation_dn: u16,
@@ -58,10 +58,10 @@ impl DarkRun {
         })
     }
 
-    /// Takes a frame; whether more are wanted.
+    /// Adds a frame; returns whether more are needed.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if it is not of the frames' size.
+    /// [`DotsError::Shape`] if it does not have the frames' size.
     pub fn push(&mut self, frame: &[u16]) -> Result<bool, DotsError> {
         if self.taken < self.wanted && !is_flash(self.shape, frame, self.saturation_dn)? {
             self.taken += 1;
@@ -74,12 +74,12 @@ impl DarkRun {
         Ok(self.taken < self.wanted)
     }
 
-    /// The sensor as these frames show it: pixels whose level or noise lies `hot_sigmas` beyond the others' are hot;
-    /// `flat` is the flat field, left out where the sensor is even; its dead pixels are repaired as hot ones are.
+    /// The sensor's calibration: pixels whose level or noise exceeds the others' by `hot_sigmas` are hot. `flat` is
+    /// the flat field, `None` for an even sensor; its dead pixels are repaired like hot ones.
     ///
     /// # Errors
-    /// [`DotsError::TooFew`] while frames are lacking; [`DotsError::Shape`] and [`DotsError::OutOfRange`] for a flat field
-    /// that is none.
+    /// [`DotsError::TooFew`] while frames are missing; [`DotsError::Shape`] and [`DotsError::OutOfRange`] for an
+    /// invalid flat field.
     pub fn finish(
         self,
         hot_sigmas: f64,
@@ -103,7 +103,7 @@ impl DarkRun {
     }
 }
 
-/// Frames of even light on their way to a [`FlatField`].
+/// Collects frames of even light for a [`FlatField`].
 pub struct FlatRun {
     shape: FrameShape,
     saturation_dn: u16,
@@ -121,10 +121,10 @@ impl FlatRun {
         self.statistics.frames() < self.wanted.into()
     }
 
-    /// Takes a frame; whether more are wanted.
+    /// Adds a frame; returns whether more are needed.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if it is not of the frames' size.
+    /// [`DotsError::Shape`] if it does not have the frames' size.
     pub fn push(&mut self, frame: &[u16]) -> Result<bool, DotsError> {
         if self.wants_more() && !is_flash(self.shape, frame, self.saturation_dn)? {
             self.statistics.push(frame)?;
@@ -132,10 +132,10 @@ impl FlatRun {
         Ok(self.wants_more())
     }
 
-    /// The flat field; pixels that `dark` shows to be hot, as in [`DarkRun::finish`], have no part in it.
+    /// The flat field. Pixels that `dark` shows to be hot, as in [`DarkRun::finish`], are excluded.
     ///
     /// # Errors
-    /// [`DotsError::TooFew`] while frames are lacking; else as [`FlatField::measured`].
+    /// [`DotsError::TooFew`] while frames are missing; otherwise as [`FlatField::measured`].
     pub fn finish(self, dark: &DarkRun, hot_sigmas: f64, sampling: Sampling) -> Result<FlatField, DotsError> {
         if self.wants_more() {
             let (given, needed) = (self.statistics.frames() as usize, self.wanted as usize);
@@ -148,7 +148,7 @@ impl FlatRun {
     }
 }
 
-/// Whether most of a frame is overexposed: no frame of a calibration.
+/// Whether most of a frame is overexposed, so that it is unusable for calibration.
 fn is_flash(shape: FrameShape, frame: &[u16], saturation_dn: u16) -> Result<bool, DotsError> {
     Ok(Observation::new(0, frame, shape, &Region::whole(shape), saturation_dn)?.saturated)
 }
@@ -175,7 +175,7 @@ mod tests {
         let sensor = run.finish(8.0, None, Sampling::Full).unwrap();
         assert_eq!(sensor.correction.hot(), [70]);
         assert_eq!(sensor.background.seen(), 32);
-        // Uniform over 0 to 7: sigma is the root of 63/12.
+        // Uniform over 0 to 7: sigma is the square root of 63/12.
         assert!((sensor.floor.sigma - 2.29).abs() < 0.2, "{:?}", sensor.floor);
         assert!(sensor.floor.mean.abs() < 0.3, "{:?}", sensor.floor);
     }

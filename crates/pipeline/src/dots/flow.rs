@@ -1,4 +1,4 @@
-//! The threads: `dots-N` make columns of frames, `dots` puts them in order and cuts them into batches.
+//! The threads: `dots-N` turn frames into columns, `dots` puts the columns in order and divides them into batches.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -18,56 +18,56 @@ use super::stage::{ColumnStage, ColumnWorker};
 use crate::pipeline::{PipelineError, message_of};
 use crate::queue::{Input, Policy, QueueError};
 
-/// Exposures in a row of which no frame came.
+/// Consecutive exposures without a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Loss {
-    /// How many.
+    /// Their number.
     pub frames: u64,
-    /// Why.
+    /// The cause.
     pub cause: LossCause,
 }
 
-/// A frame, and what was lost since the one before.
+/// A frame, and the losses since the previous one.
 pub struct Arrival {
     /// The frame; its id is `stamp.seq`.
     pub frame: Frame,
-    /// Mostly nothing.
+    /// Usually empty.
     pub lost_before: Vec<Loss>,
 }
 
-/// How frames become batches.
+/// How frames are turned into batches.
 pub struct DotsFlowConfig {
-    /// What is scanned.
+    /// The scan.
     pub scan: Scan,
-    /// How frames are packed.
+    /// Pixel format of the frames.
     pub format: PixelFormat,
-    /// Counts from which on a pixel is overexposed.
+    /// Counts from which a pixel is overexposed.
     pub saturation_dn: u16,
-    /// What makes columns of them.
+    /// Turns frames into columns.
     pub stage: Arc<dyn ColumnStage>,
-    /// What the stage knows of the sensor.
+    /// The sensor's flat field and hot pixels.
     pub correction: Correction,
     /// The background so far.
     pub background: BackgroundMean,
-    /// Noise above it.
+    /// Noise of a frame above the background.
     pub floor: NoiseFloor,
-    /// Threads that make columns; 0: one a processor.
+    /// Number of threads that compute columns; 0: one per processor.
     pub threads: usize,
-    /// Frames that may wait for them.
+    /// Largest number of frames waiting for them.
     pub queue_frames: usize,
-    /// What happens to a frame when so many do.
+    /// What happens to a frame when the queue is full.
     pub policy: Policy,
 }
 
-/// Where a flow's frames enter, in the order of their exposure. The flow ends when it is dropped.
+/// The input of a flow; frames must arrive in the order of their exposure. Dropping it ends the flow.
 pub struct DotsInput {
     queue: Input<(u64, Arrival)>,
-    /// The number of the next frame.
+    /// Arrival number of the next frame.
     next: u64,
 }
 
 impl DotsInput {
-    /// Sends a frame that may be refused, by the flow's policy.
+    /// Sends a frame, which may be refused according to the flow's policy.
     ///
     /// # Errors
     /// As [`Input::offer`].
@@ -81,28 +81,28 @@ impl DotsInput {
     }
 }
 
-/// Frames on their way to batches. It ends when its [`DotsInput`] is dropped.
+/// Turns frames into batches. Ends when its [`DotsInput`] is dropped.
 pub struct DotsFlow<S> {
     workers: Vec<JoinHandle<()>>,
     gatherer: JoinHandle<Gathered<S>>,
     is_blind: Arc<AtomicBool>,
 }
 
-/// What a flow leaves behind.
+/// The results of a flow.
 pub struct Gathered<S> {
-    /// Where the batches went.
+    /// The sink that received the batches.
     pub sink: S,
-    /// The background by now.
+    /// The background at the end of the flow.
     pub background: BackgroundMean,
-    /// Why the stream could not be cut.
+    /// Why the stream could not be divided into batches.
     pub error: Option<DotsError>,
 }
 
-/// What the workers share.
+/// Data shared by the workers.
 struct Shop {
     frames: Receiver<(u64, Arrival)>,
     backgrounds: Backgrounds,
-    /// Columns whose memory is free.
+    /// Columns for reuse.
     spare: Mutex<Vec<SparseColumn>>,
     scan: Scan,
     format: PixelFormat,
@@ -116,7 +116,7 @@ impl<S: CutSink + 'static> DotsFlow<S> {
     /// Starts the threads; frames go into the returned input.
     ///
     /// # Errors
-    /// When the system gives no thread, or the background does not fit the frames.
+    /// If the system provides no thread, or the background does not fit the frames.
     pub fn start(config: DotsFlowConfig, sink: S) -> Result<(Self, DotsInput), PipelineError> {
         let DotsFlowConfig {
             scan, format, saturation_dn, stage, correction, background, floor, policy, ..
@@ -158,15 +158,15 @@ impl<S: CutSink + 'static> DotsFlow<S> {
         Ok((Self { workers, gatherer, is_blind }, DotsInput { queue, next: 0 }))
     }
 
-    /// Set when the trailing dot is not seen where it should be: what still comes is counted and thrown away.
+    /// A flag, set when the trailing dot is not seen as expected: further frames are counted and discarded.
     pub fn is_blind(&self) -> Arc<AtomicBool> {
         self.is_blind.clone()
     }
 
-    /// Waits for the end of everything sent.
+    /// Waits until everything sent is processed.
     ///
     /// # Errors
-    /// When a thread panicked.
+    /// If a thread panicked.
     pub fn join(self) -> Result<Gathered<S>, PipelineError> {
         let worked = self.workers.into_iter().map(JoinHandle::join).filter(Result::is_err).count();
         let gathered = self.gatherer.join().map_err(|_panic| PipelineError::Panicked("dots"))?;
@@ -174,7 +174,7 @@ impl<S: CutSink + 'static> DotsFlow<S> {
     }
 }
 
-/// Lets workers that wait for a background go, also when the gatherer panics.
+/// Releases workers that wait for a background, even if the gatherer panics.
 struct Closing<'a>(&'a Backgrounds);
 
 impl Drop for Closing<'_> {
@@ -192,7 +192,7 @@ fn spawn<T: Send + 'static>(
 }
 
 impl Shop {
-    /// Takes frames in turn until there are no more.
+    /// Processes frames until there are no more.
     fn work(&self, worker: &mut dyn ColumnWorker, done: &Sender<Numbered>) {
         let mut unpacked = Vec::new();
         let mut background: Option<(u64, Arc<Background>)> = None;
@@ -216,7 +216,7 @@ impl Shop {
         unpacked: &mut Vec<u16>,
         background: &Background,
     ) -> (Observation, Result<SparseColumn, String>) {
-        // Of a frame that cannot be read nothing is seen.
+        // A frame that cannot be read has no observation.
         let unseen = Observation { id: frame.stamp.seq, energy: 0, saturated: true };
         let counts = match counts_of(frame, self.format, unpacked, self.scan.shape.values()) {
             Ok(counts) => counts,
@@ -236,7 +236,7 @@ impl Shop {
     }
 }
 
-/// A frame's counts: as they lie there where they are 16 bits wide already.
+/// A frame's counts, borrowed if they are already 16 bits wide.
 fn counts_of<'a>(
     frame: &'a Frame,
     format: PixelFormat,
@@ -255,7 +255,7 @@ fn counts_of<'a>(
     Ok(unpacked)
 }
 
-/// Puts what the workers send back into the order of the frames.
+/// Restores the order of frames in the workers' results.
 fn gather<S: CutSink>(
     gatherer: &mut Gatherer<S>,
     shop: &Shop,

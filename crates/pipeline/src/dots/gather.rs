@@ -1,4 +1,4 @@
-//! Columns in the order of their frames become batches; every frame ends in exactly one column of the account.
+//! Combines columns, in the order of their frames, into batches. Every frame is counted exactly once.
 
 use std::collections::VecDeque;
 
@@ -10,54 +10,54 @@ use raysweep_transport::dots::{
 
 use super::flow::Loss;
 
-/// Batches in which the trailing dot's brightness is learnt before the first is cut.
+/// Number of batches from which the trailing dot's brightness is learnt before the first batch is cut.
 const LEARNT_FROM_BATCHES: usize = 2;
-/// How far a frame that waits for its index may be from where the last trailing dot puts it: a drift of one frame a
-/// batch, over the two batches that it may wait.
+/// Largest distance of a waiting frame from its position expected from the last trailing dot: a drift of one frame
+/// per batch, over the two batches for which it may wait.
 const DRIFT_FRAMES: u64 = 2;
 
-/// What is scanned.
+/// The parameters of a scan.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Scan {
     /// Size of the frames.
     pub shape: FrameShape,
-    /// Frames of a batch.
+    /// Number of frames per batch.
     pub dots: u32,
     /// Index of the frame that shows the trailing dot.
     pub trailing_index: u32,
-    /// Where in the frame it lands.
+    /// Region of the frame in which this dot lands.
     pub trailing_region: Region,
-    /// Indices of the frames whose light goes to the beam dump.
+    /// Indices of the frames whose light goes into the beam dump.
     pub background_indices: Vec<u32>,
-    /// Batches that are wanted.
+    /// Number of batches requested.
     pub batches: u32,
 }
 
 impl Scan {
-    /// Whether a frame of the batch shows the scene: no trailing dot, no beam dump.
+    /// Whether a frame of the batch shows the scene: neither trailing dot nor beam dump.
     pub fn is_scene(&self, index: u32) -> bool {
         index != self.trailing_index && !self.background_indices.contains(&index)
     }
 }
 
-/// A batch as it was cut.
+/// A batch of columns.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Cut {
-    /// Its number among those wanted, from 0.
+    /// Its number among the requested batches, from 0.
     pub batch: u32,
-    /// A column for each frame; those without a frame, and those that do not show the scene, have no light.
+    /// A column for each frame. Columns of missing frames, and of frames that do not show the scene, have no light.
     pub columns: BatchArrays,
-    /// Which of them show the scene, `[dots]`.
+    /// Whether each column shows the scene, `[dots]`.
     pub seen: Vec<bool>,
-    /// Where its frames went.
+    /// What became of its frames.
     pub counts: Counts,
-    /// Frames that came twice.
+    /// Number of frames that arrived twice.
     pub duplicates: u64,
-    /// Start of its first frame's exposure, on the host's clock.
+    /// Start of its first frame's exposure on the host's clock.
     pub start_ns: i64,
-    /// When its last frame was complete on the host.
+    /// Time when its last frame was complete on the host.
     pub end_ns: i64,
-    /// What the first of its frames that could not be denoised met.
+    /// Error message of the first of its frames that could not be denoised.
     pub problem: Option<String>,
 }
 
@@ -66,18 +66,18 @@ pub trait CutSink: Send {
     /// Takes the next batch.
     fn take(&mut self, cut: Cut);
 
-    /// Takes note of frames that belong to no batch that is wanted.
+    /// Counts frames that belong to no requested batch.
     fn outside(&mut self, counts: Counts);
 
-    /// Looks at a raw frame, in the order of arrival.
+    /// Called for each raw frame, in the order of arrival.
     fn frame(&mut self, _frame: &Frame) {}
 
-    /// Learns the id, the batch among those wanted, and the index of a frame that [`Self::frame`] has seen as number
-    /// `arrival`, from 0; no batch and index if it has none.
+    /// Called when the fate of a frame is known: `_arrival` is its number in the order of [`Self::frame`], from 0.
+    /// `_place` is its batch among those requested and its index; `None` if it has none.
     fn fate(&mut self, _arrival: u64, _id: u64, _place: Option<(u32, u32)>) {}
 }
 
-/// A frame as a worker has seen it.
+/// A frame as processed by a worker.
 pub(super) struct Looked {
     pub seen: Observation,
     pub column: Result<SparseColumn, String>,
@@ -85,30 +85,30 @@ pub(super) struct Looked {
     pub lost_before: Vec<Loss>,
 }
 
-/// A frame whose index is not certain yet.
+/// A frame whose index is still uncertain.
 struct Waiting {
     id: u64,
     column: Result<SparseColumn, String>,
-    /// Only of a frame that may be one of the beam dump.
+    /// Kept only if it may be a frame of the beam dump.
     frame: Option<Frame>,
     lost_before: Vec<Loss>,
     start_ns: i64,
     end_ns: i64,
 }
 
-/// The batch under construction.
+/// The batch being assembled.
 struct Building {
-    /// The synchroniser's number.
+    /// The synchroniser's batch number.
     number: u64,
     cut: Cut,
 }
 
-/// How the stream is cut.
+/// State of dividing the stream into batches.
 enum Cutter {
-    /// Not yet: nobody knows how bright the trailing dot is.
+    /// Not started: the brightness of the trailing dot is still unknown.
     Learning(Vec<Observation>),
     Cutting(Box<Synchroniser>),
-    /// Never: it was not seen.
+    /// Impossible: the trailing dot was not seen.
     Blind,
 }
 
@@ -121,16 +121,16 @@ pub(super) struct Gatherer<S> {
     first_pending: u64,
     decided: Vec<Decided>,
     building: Option<Building>,
-    /// Id and index of the last frame that has one.
+    /// Id and index of the last frame with an index.
     last: Option<(u64, u32)>,
     outside: Counts,
     duplicates: u64,
     pub background: BackgroundMean,
-    /// Whether the background has changed since it was last asked for.
+    /// Whether the background has changed since it was last requested.
     background_changed: bool,
     counts: Vec<u16>,
     blank: SparseColumn,
-    /// Words and values of the batch before: what the next will need.
+    /// Number of words and values in the previous batch, as an estimate for the next.
     usual: (usize, usize),
     ending: bool,
 }
@@ -163,14 +163,14 @@ impl<S: CutSink> Gatherer<S> {
         }
     }
 
-    /// Takes the next frame; columns that are no longer needed go to `spare`.
+    /// Processes the next frame; passes columns that are no longer needed to `spare`.
     ///
     /// # Errors
-    /// When the trailing dot is not seen where it should be.
+    /// If the trailing dot is not seen as expected.
     pub fn take(&mut self, looked: Looked, spare: &mut dyn FnMut(SparseColumn)) -> Result<(), DotsError> {
         let Looked { seen, column, frame, lost_before } = looked;
         if let Cutter::Blind = self.cutter {
-            // Taken in so that it is accounted for.
+            // Processed even in this state, so that it is counted.
             lose(&mut self.outside, &lost_before);
             self.outside.expected += 1;
             self.outside.cancelled += 1;
@@ -213,7 +213,7 @@ impl<S: CutSink> Gatherer<S> {
             self.settle_all(spare);
         }
         self.close();
-        // What an error has left undecided, nobody waits for any more.
+        // Frames left undecided after an error count as not needed.
         for waiting in self.pending.drain(..).flatten() {
             lose(&mut self.outside, &waiting.lost_before);
             self.outside.expected += 1;
@@ -223,7 +223,7 @@ impl<S: CutSink> Gatherer<S> {
         learnt
     }
 
-    /// The background, if it has changed since this was last asked.
+    /// The background, if it has changed since the last call.
     pub fn changed_background(&mut self) -> Option<&[f32]> {
         std::mem::take(&mut self.background_changed).then(|| self.background.mean())
     }
@@ -243,7 +243,7 @@ impl<S: CutSink> Gatherer<S> {
         Ok(())
     }
 
-    /// Whether a frame that has just come may turn out to be one of the beam dump.
+    /// Whether a frame that has just arrived may be one of the beam dump.
     fn may_be_background(&self, id: u64) -> bool {
         let Some((last_id, last_index)) = self.last else { return false };
         let dots = u64::from(self.scan.dots);
@@ -272,7 +272,7 @@ impl<S: CutSink> Gatherer<S> {
         let Waiting { id, column, frame, lost_before, start_ns, end_ns } = waiting;
         let mut place = None;
         match fate {
-            // An id that has come before: no exposure of its own.
+            // Its id has arrived before, so it is not an exposure of its own.
             Fate::Unused(Cause::Duplicate) => match &mut self.building {
                 Some(Building { cut, .. }) => cut.duplicates += 1,
                 None => self.duplicates += 1,
@@ -286,7 +286,7 @@ impl<S: CutSink> Gatherer<S> {
                     self.close();
                 }
                 if batch == 0 || batch > u64::from(self.scan.batches) {
-                    // The batch of the first trailing dot has no beginning; one beyond the last is not waited for.
+                    // The batch of the first trailing dot has no beginning; batches beyond the last are not needed.
                     lose(&mut self.outside, &lost_before);
                     self.outside.expected += 1;
                     *(if batch == 0 { &mut self.outside.settling } else { &mut self.outside.cancelled }) += 1;
@@ -327,7 +327,7 @@ impl<S: CutSink> Gatherer<S> {
         }
     }
 
-    /// The batch under construction, begun where there is none.
+    /// The batch being assembled; starts one if there is none.
     fn open(&mut self, number: u64, start_ns: i64) -> &mut Cut {
         let dots = self.scan.dots as usize;
         let (words, values) = self.usual;
@@ -357,7 +357,7 @@ impl<S: CutSink> Gatherer<S> {
         &mut building.cut
     }
 
-    /// Adds dots without light until `index` is the next.
+    /// Adds dots without light until `index` is the next one.
     fn fill_to(&mut self, index: u32) {
         let Some(Building { cut, .. }) = &mut self.building else { return };
         while cut.seen.len() < index as usize {
@@ -398,7 +398,7 @@ impl<S: CutSink> Gatherer<S> {
     }
 }
 
-/// Notes exposures of which no frame came.
+/// Counts exposures without a frame.
 fn lose(counts: &mut Counts, losses: &[Loss]) {
     for &Loss { frames, cause } in losses {
         counts.expected += frames;

@@ -1,9 +1,10 @@
-//! From the frames of a flying dot to batches of sparse columns, at the camera's speed.
+//! Turns the frames of a flying dot into batches of sparse columns, at the camera's speed.
 //!
-//! Workers take frames off the queue in turn and denoise each at once, before anybody knows which dot it shows: what
-//! waits for that is its column of a few kilobytes, not the frame. One thread receives the columns in the order of the
-//! frames, cuts them into batches by the trailing dot, and keeps the rolling background. Which background a frame is
-//! denoised with depends on its number alone, so the columns are the same for any number of threads.
+//! Workers take frames off the queue in turn and denoise each immediately, before its dot is known: only its column
+//! of a few kilobytes has to wait for that, not the frame. One thread receives the columns in the order of the
+//! frames, divides them into batches at the trailing dot, and maintains the rolling background. The background with
+//! which a frame is denoised depends only on the frame's number, so the columns are the same for any number of
+//! threads.
 
 mod background;
 mod dark;

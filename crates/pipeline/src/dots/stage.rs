@@ -1,4 +1,4 @@
-//! Stages that make a column of a frame, by the names that plans use.
+//! Stages that turn a frame into a column, by their names in plans.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -12,18 +12,18 @@ use serde_json::Value;
 
 use crate::registry::RegistryError;
 
-/// Makes sparse columns of raw frames.
+/// Computes sparse columns from raw frames.
 pub trait ColumnStage: Send + Sync {
-    /// What one thread works with, from frame to frame.
+    /// The state of one thread, reused from frame to frame.
     fn worker(&self) -> Box<dyn ColumnWorker>;
 }
 
-/// One thread's part of a [`ColumnStage`].
+/// One thread's state of a [`ColumnStage`].
 pub trait ColumnWorker: Send {
-    /// Makes the column of a raw frame `[height, width]` in counts.
+    /// Computes the column of a raw frame `[height, width]` in counts.
     ///
     /// # Errors
-    /// When the frame cannot be processed; its dot is then lost, with the cause.
+    /// If the frame cannot be processed; its dot is then lost, with the cause.
     fn column(
         &mut self,
         frame: &[u16],
@@ -37,19 +37,20 @@ pub trait ColumnWorker: Send {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DenoiseOptions {
-    /// Radius of the discs, as large as the dot; left out: 20 of 1024 pixels of the frame's width.
+    /// Radius of the discs, as large as the dot; if omitted, 20 pixels for a frame width of 1024 pixels.
     pub radius_px: Option<f64>,
     /// When to stop.
     pub stop: Stop,
-    /// False discs a frame without light, of the rule `false-alarms`.
+    /// False discs per frame without light, for the rule `false-alarms`.
     pub false_alarms: f64,
-    /// Background patch of the rule `printed`: first and last row, first and last column; the last ones are left out.
+    /// Background patch of the rule `printed`: first and last row, first and last column, last ones exclusive.
     pub patch: [usize; 4],
-    /// Standard deviations of the patch within which the rule `printed` takes what is left for background.
+    /// For the rule `printed`: tolerance, in standard deviations of the patch, within which the rest equals the
+    /// background.
     pub tolerance: f64,
-    /// Most discs a frame; frames that end here are counted.
+    /// Largest number of discs per frame; frames that stop here are counted.
     pub max_discs: u32,
-    /// Whether the light outside of the discs is kept as means of blocks.
+    /// Whether the light outside the discs is kept as means of blocks.
     pub residual: bool,
 }
 
@@ -57,9 +58,9 @@ pub struct DenoiseOptions {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Stop {
-    /// When what is left can be noise.
+    /// When the rest can be explained by noise.
     FalseAlarms,
-    /// As the paper prints it.
+    /// As printed in the paper.
     Printed,
 }
 
@@ -81,7 +82,7 @@ impl DenoiseOptions {
     fn settings(&self, width_px: usize) -> DenoiseSettings {
         let [top, bottom, left, right] = self.patch;
         DenoiseSettings {
-            // A disc that holds the paper's dot of 32 pixels wherever noise puts its brightest one.
+            // A disc that contains the paper's dot of 32 pixels wherever noise puts its brightest pixel.
             radius_px: self.radius_px.unwrap_or(20.0 * width_px as f64 / 1024.0),
             stop: match self.stop {
                 Stop::FalseAlarms => StopRule::FalseAlarms { per_frame: self.false_alarms },
@@ -130,7 +131,7 @@ impl ColumnWorker for FusedWorker {
     }
 }
 
-/// The plain reference, which the fused pass must equal.
+/// The simple reference, which the fused pass must equal.
 #[derive(Clone)]
 struct Plain {
     correction: Arc<Correction>,
@@ -162,7 +163,7 @@ impl ColumnWorker for Plain {
 
 type Make = Box<dyn Fn(Value, &Correction) -> Result<Box<dyn ColumnStage>, RegistryError> + Send + Sync>;
 
-/// All column stages that plans may name.
+/// All column stages available to plans.
 pub struct DotStages {
     makers: BTreeMap<&'static str, Make>,
 }
@@ -177,7 +178,7 @@ impl Default for DotStages {
         });
         stages.register("denoise-reference", |options, correction| {
             let options: DenoiseOptions = parse("denoise-reference", options)?;
-            // The same settings are refused.
+            // The same settings are rejected.
             denoiser("denoise-reference", &options, correction)?;
             let settings = options.settings(correction.shape().width());
             let correction = Arc::new(correction.clone());
@@ -202,7 +203,7 @@ fn denoiser(
 }
 
 impl DotStages {
-    /// Adds a name, or replaces what it stood for.
+    /// Registers a stage; replaces an existing one of that name.
     pub fn register(
         &mut self,
         name: &'static str,
@@ -211,10 +212,10 @@ impl DotStages {
         self.makers.insert(name, Box::new(make));
     }
 
-    /// Makes what a plan names.
+    /// Creates the stage that a plan names.
     ///
     /// # Errors
-    /// For unknown names, and options that the stage does not take.
+    /// For unknown names, and for options that the stage rejects.
     pub fn make(
         &self,
         name: &str,

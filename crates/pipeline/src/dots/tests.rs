@@ -30,7 +30,7 @@ fn scan(batches: u32) -> Scan {
     }
 }
 
-/// Counts of the frame of a step of the scan: dots wander over the frame, the trailing one lands in its corner.
+/// The frame's counts at a step of the scan: dots wander over the frame, the trailing one lands in its corner.
 fn counts(step: u64) -> Vec<u16> {
     let mut state = step.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut counts: Vec<u16> = (0..HEIGHT * WIDTH)
@@ -79,7 +79,7 @@ fn sensor(format: PixelFormat) -> Sensor {
     let mut run = DarkRun::new(shape(), 4000, 64, 16).unwrap();
     let mut unpacked = vec![0; shape().pixels()];
     for number in 0..64 {
-        // The steps of the beam dump are dark.
+        // The beam dump's steps are dark.
         let dark = frame(&pool, format, number * u64::from(DOTS) + u64::from(BACKGROUND));
         format.unpack_into(&dark.data, &mut unpacked).unwrap();
         run.push(&unpacked).unwrap();
@@ -116,7 +116,7 @@ impl Kept {
     }
 }
 
-/// Sends the frames of these steps through a flow, with what was lost before each.
+/// Sends the frames of these steps through a flow, each preceded by the given losses.
 fn cut(
     format: PixelFormat,
     stage: Arc<dyn ColumnStage>,
@@ -191,7 +191,7 @@ fn every_frame_becomes_the_column_of_its_dot_whatever_the_threads_and_the_packin
             assert_eq!(words[index + 1] > words[index], is_scene, "dot {index}");
         }
     }
-    // From the first trailing dot on every dump is mixed in, as soon as where it comes is known.
+    // From the first trailing dot on, every frame of the beam dump is added as soon as its position is known.
     assert!(kept.background.seen() > 56 + 5, "{}", kept.background.seen());
     let counts = kept.sink.counts();
     assert!(counts.balanced() && counts.averaged == 96 && counts.lost.is_empty(), "{counts:?}");
@@ -224,7 +224,7 @@ fn lost_frames_leave_dots_without_light_and_are_told_by_cause() {
 #[test]
 fn the_background_follows_a_change_of_the_room_by_its_weight() {
     const CHANGE_DN: u16 = 4;
-    /// The dumps of 16 batches make the mean: each leaves 15 of 17 parts of what was before.
+    /// The beam-dump frames of 16 batches form the mean: each keeps 15/17 of the previous mean.
     const KEPT: f64 = 15.0 / 17.0;
     let format = PixelFormat::Mono12;
     let brighter_from = 6 * u64::from(DOTS);
@@ -233,7 +233,7 @@ fn the_background_follows_a_change_of_the_room_by_its_weight() {
         (step, counts(step).iter().map(|counts| counts + change).collect(), Vec::new())
     });
     let kept = cut_frames(format, denoise(format), 2, 30, frames).sink;
-    // Light beyond the dots, the mean of the scene's dots; the first round is no batch.
+    // Light beyond the dots, the mean of the scene's dots; the first round does not give a batch.
     let beyond = |batch: usize| {
         let cut = &kept.cuts[batch - 1];
         let residual = cut.columns.residual.chunks_exact(cut.columns.residual.len() / DOTS as usize);
@@ -242,7 +242,7 @@ fn the_background_follows_a_change_of_the_room_by_its_weight() {
         light.iter().sum::<f64>() / light.len() as f64
     };
     assert!(beyond(5).abs() < 0.2, "{}", beyond(5));
-    // Frames of two rounds are denoised with what was known before.
+    // Frames of two rounds are denoised with the previous background.
     for batch in [6, 7] {
         assert!((beyond(batch) - beyond(5) - f64::from(CHANGE_DN)).abs() < 0.2, "{batch}: {}", beyond(batch));
     }
@@ -252,7 +252,7 @@ fn the_background_follows_a_change_of_the_room_by_its_weight() {
     }
 }
 
-/// Fails for one dot, panics for another.
+/// Returns an error for one dot and panics for another.
 struct Fragile(Arc<dyn ColumnStage>);
 
 struct FragileWorker(Box<dyn ColumnWorker>);

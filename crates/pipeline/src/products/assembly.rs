@@ -1,4 +1,4 @@
-//! Products put together from the strips of a sweep.
+//! Assembles products from the strips of a sweep.
 
 use ndarray::{Array3, Axis, s};
 use raysweep_transport::plane::Transport;
@@ -7,17 +7,17 @@ use super::profile::ProfileSums;
 use super::{Kind, NotMade, ProductSpec, SweepStack, uncertainty};
 use crate::stage::Product;
 
-/// A product in the making. Whatever the strips, it has the same bits.
+/// A product under construction. It has the same bits for any division into strips.
 #[derive(Debug)]
 pub struct Assembly {
     spec: ProductSpec,
-    /// The product of each strip so far; of a profile, none.
+    /// The product of each strip so far; empty for a profile.
     parts: Vec<Product>,
     sums: ProfileSums,
 }
 
 impl Assembly {
-    /// Begins a product.
+    /// Starts a product.
     pub fn new(spec: ProductSpec) -> Self {
         Self { spec, parts: Vec::new(), sums: ProfileSums::default() }
     }
@@ -27,10 +27,11 @@ impl Assembly {
         self.spec.name()
     }
 
-    /// Adds the camera rows from `first_row` on, of which stack and transport are: from top to bottom, each once.
+    /// Adds the camera rows starting at `first_row`, to which stack and transport belong. Strips must be added from
+    /// top to bottom, each once.
     ///
     /// # Errors
-    /// When what it needs was not taken.
+    /// If a required image was not taken.
     pub fn add(
         &mut self,
         first_row: usize,
@@ -69,10 +70,10 @@ impl Assembly {
         Ok(())
     }
 
-    /// The product, once all strips are added.
+    /// The product, after all strips have been added.
     ///
     /// # Errors
-    /// When what it needs saturates.
+    /// If a required image saturates.
     pub fn finish(self) -> Result<Product, NotMade> {
         let Self { spec: ProductSpec { name, kind }, parts, sums } = self;
         if let Kind::DelayProfile(options) = kind {
@@ -105,8 +106,8 @@ impl Assembly {
     }
 }
 
-/// Images `[k, t, s]` of which each part has some rows. In C order, as if they had been made whole: sums of what is made
-/// of them depend, to the bit, on how they lie in memory.
+/// Concatenates images `[k, t, s]` along their rows. The result is in C order, as if it had been computed as a whole:
+/// sums over it depend, to the bit, on the memory layout.
 fn one_below_the_other(first: Array3<f32>, rest: impl Iterator<Item = Array3<f32>>) -> Array3<f32> {
     let parts: Vec<Array3<f32>> = std::iter::once(first).chain(rest).collect();
     let (count, _, columns) = parts[0].dim();

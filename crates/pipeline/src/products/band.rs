@@ -13,7 +13,7 @@ use crate::stage::Product;
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Width {
-    /// Odd, so that they lie symmetrically about u = 0.
+    /// Odd, so that the rows are symmetric about u = 0.
     width_rows: u32,
 }
 
@@ -37,7 +37,7 @@ impl Width {
         }
     }
 
-    /// The name of a product of this width where the plan gives none.
+    /// The name of a product of this width if the plan gives none.
     pub(super) fn named(self, name: &str) -> String {
         match self.width_rows {
             1 => name.into(),
@@ -70,19 +70,19 @@ impl Width {
     }
 }
 
-/// Options of `band`: how far away the rows are.
+/// Options of `band`: the distance of the rows.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Band {
     /// Smallest |u|.
     from_rows: u32,
-    /// Largest |u|; left out: as far as the sweep reaches.
+    /// Largest |u|; if omitted, the sweep's reach.
     to_rows: Option<u32>,
-    /// Left out: both.
+    /// If omitted, both sides.
     side: Option<Side>,
 }
 
-/// Where rows lie, seen from the pixel's own.
+/// Position of rows relative to the pixel's own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Side {
@@ -120,7 +120,7 @@ impl Band {
         }
     }
 
-    /// The rows in words.
+    /// The rows, as text.
     pub(super) fn says(self) -> String {
         if self.to_rows == Some(0) {
             return "light from the pixel's own projector row (u = 0)".into();
@@ -146,15 +146,15 @@ impl Band {
         Product::Image { name, about, image: self.image(transport) }
     }
 
-    /// The relative rows, none twice.
+    /// The relative rows, without duplicates.
     pub(super) fn ranges(self) -> Vec<RangeInclusive<i32>> {
-        // No reach is as long as i32::MAX rows.
+        // Every reach is shorter than i32::MAX rows.
         let rows = |rows: u32| i32::try_from(rows).unwrap_or(i32::MAX);
         let (from, to) = (rows(self.from_rows), self.to_rows.map_or(i32::MAX, rows));
         match self.side {
             Some(Side::Above) => vec![-to..=-from],
             Some(Side::Below) => vec![from..=to],
-            // Both sides hold the pixel's own row, which counts once.
+            // Both sides contain the pixel's own row, which must count once.
             None if from == 0 => vec![-to..=to],
             None => vec![-to..=-from, from..=to],
         }

@@ -1,5 +1,5 @@
-//! Products by the names that plans use: what a `[[product]]` asks for, checked before anything moves, and made of the
-//! transport and the stack at the end of the run or long after it.
+//! Products by their names in plans: a `[[product]]` table is validated before anything moves. The product is
+//! computed from the transport and the stack at the end of the run or any time later.
 
 mod assembly;
 mod band;
@@ -22,34 +22,34 @@ use crate::stage::Product;
 pub use self::assembly::Assembly;
 pub use self::profile::Profile;
 
-/// The images that a transport was made of.
+/// The images from which a transport was computed.
 #[derive(Debug, Clone)]
 pub struct SweepStack {
-    /// The rows that the camera looks along, and when they are lit.
+    /// The timing of projector and camera rows.
     pub timing: RowTiming,
-    /// The prior that the transport was found under.
+    /// The prior used for the transport.
     pub prior: Prior,
-    /// The exposure that the plan asked for, of each image.
+    /// The planned exposure of each image.
     pub exposures_us: Vec<f64>,
-    /// How each image was taken.
+    /// Delays and exposure of each image.
     pub settings: Vec<Setting>,
-    /// `[settings, t, s]` of all camera rows, or those of a [`crate::Strip`]; dark image subtracted, 1 = a white pixel lit
-    /// by its own projector row.
+    /// `[settings, t, s]` of all camera rows, or those of a [`crate::Strip`]; dark image subtracted, 1 = a white pixel
+    /// lit by its own projector row.
     pub images: Array3<f32>,
-    /// Which samples are not saturated, of the same shape; none: all.
+    /// Which samples are not saturated, of the same shape; `None` if all.
     pub valid: Option<Array3<bool>>,
-    /// One whole VSYNC period of exposure, `[t, s]`, where it was taken.
+    /// The image with one whole VSYNC period of exposure, `[t, s]`, if it was taken.
     pub regular: Option<Array2<f32>>,
-    /// The noise of a frame, where it could be fitted.
+    /// The noise of a single frame, if it could be fitted.
     pub noise: Option<NoiseModel>,
-    /// Share of the noise's variance that spatial coupling left, `[t, s]`; none: not coupled.
+    /// Share of the noise variance that remains after spatial coupling, `[t, s]`; `None` if not coupled.
     pub variance_ratio: Option<Array2<f32>>,
-    /// Where direct light was taken to lie, in rows beside its own, `[t, s]`; none: in its own row.
+    /// Assumed position of direct light, in rows from the pixel's own, `[t, s]`; `None` if in its own row.
     pub u0_rows: Option<Array2<f32>>,
 }
 
 impl SweepStack {
-    /// Only these camera rows of the images.
+    /// A stack with only these camera rows.
     pub(crate) fn of_rows(&self, rows: &[usize]) -> Self {
         Self {
             timing: self.timing.clone(),
@@ -65,7 +65,7 @@ impl SweepStack {
         }
     }
 
-    /// Keeps the images whose index `kept` says yes to.
+    /// Keeps the images for whose index `kept` returns true.
     pub(crate) fn keep(&mut self, kept: impl Fn(usize) -> bool) {
         let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
         self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
@@ -75,19 +75,19 @@ impl SweepStack {
     }
 }
 
-/// Why a product cannot be asked for.
+/// Why a product is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("product {kind}: {what}")]
 pub struct ProductError {
     /// The kind that the plan names.
     pub kind: String,
-    /// Keys and numbers that lead to the option within the product's table.
+    /// Keys and indices that lead to the option within the product's table.
     pub path: Vec<String>,
-    /// Field, value, what is allowed.
+    /// Field, value, and the allowed values.
     pub what: String,
 }
 
-/// Why a product could not be made.
+/// Why a product could not be computed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("product {name}: {what}")]
 pub struct NotMade {
@@ -97,7 +97,7 @@ pub struct NotMade {
     pub what: String,
 }
 
-/// A product that can be made of every sweep of its plan.
+/// A valid product, which can be computed from every sweep of its plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProductSpec {
     name: String,
@@ -115,25 +115,25 @@ enum Kind {
     Uncertainty(Band),
 }
 
-/// The kinds as plans name them.
+/// The kinds by their names in plans.
 const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile, uncertainty";
 
-/// The name that the transport itself has among the files.
+/// The file name of the transport itself, which products must not use.
 const TAKEN_NAME: &str = "transport";
 
-/// Longest name; with its extension it is a file name on every file system.
+/// Longest name; with its extension it is a valid file name on every file system.
 const MAX_NAME: usize = 64;
 
-/// `kind = "regular"` has none.
+/// `kind = "regular"` has no options.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NoOptions {}
 
 impl ProductSpec {
-    /// The product of a plan's table: its kind, its name if it has one, and all other keys.
+    /// The product described by a plan's table: its kind, its name if it has one, and all other keys.
     ///
     /// # Errors
-    /// With the option that this plan on this rig cannot have.
+    /// The option that is invalid for this plan on this rig.
     pub fn new(
         kind: &str,
         name: Option<&str>,
@@ -176,7 +176,7 @@ impl ProductSpec {
         Ok(Self { name, kind: made })
     }
 
-    /// What is made where a plan asks for nothing else.
+    /// The products that are made if a plan names none.
     pub fn defaults() -> Vec<Self> {
         let spec = |name: &str, kind| Self { name: name.into(), kind };
         vec![
@@ -194,7 +194,7 @@ impl ProductSpec {
         &self.name
     }
 
-    /// How many images it consists of on this rig.
+    /// The number of its images on this rig.
     pub fn images(&self, geometry: &SweepGeometry) -> usize {
         match &self.kind {
             Kind::Relight(pattern) => pattern.images(geometry),
@@ -207,10 +207,10 @@ impl ProductSpec {
         }
     }
 
-    /// Makes it.
+    /// Computes the product.
     ///
     /// # Errors
-    /// When what it needs was not taken, or saturates.
+    /// If a required image was not taken, or saturates.
     pub fn make(&self, stack: &SweepStack, transport: &Transport) -> Result<Product, NotMade> {
         let mut assembly = Assembly::new(self.clone());
         assembly.add(0, stack, transport)?;
@@ -232,7 +232,7 @@ impl Kind {
     }
 }
 
-/// How far a transport knows its rows, for the texts of products that end there.
+/// The reach of a transport as text, for products that are limited by it.
 fn reach_of(transport: &Transport) -> String {
     format!("the sweep reaches u = {} to {}, beyond nothing is known", transport.u_min, transport.u_max())
 }
@@ -254,7 +254,7 @@ fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Resul
     })
 }
 
-/// A name becomes a file's and so must not lead anywhere else.
+/// A name becomes a file name and must not contain a path.
 fn checked_name(name: &str) -> Result<String, String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
     if name.is_empty() || name.len() > MAX_NAME || !name.chars().all(plain) {

@@ -1,5 +1,5 @@
-//! Product `delay-profile`: the light of a pixel or a region over the delay, as it was measured and as the transport
-//! predicts it.
+//! Product `delay-profile`: the light of a pixel or a region as a function of the delay, as measured and as predicted
+//! from the transport.
 
 use ndarray::Axis;
 use raysweep_transport::plane::{DelayProfile, Setting, Transport};
@@ -9,7 +9,7 @@ use super::SweepStack;
 use crate::schedule::{Role, Schedule, SweepGeometry};
 use crate::stage::Product;
 
-/// Options of `delay-profile`, as they stand in a plan.
+/// Options of `delay-profile`, as given in a plan.
 #[derive(Debug, Clone, Copy, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct ProfileTable {
@@ -17,11 +17,11 @@ pub(super) struct ProfileTable {
     pixel: Option<[usize; 2]>,
     /// `[t0, t1, s0, s1]`, half open: rows `t0..t1`, columns `s0..s1`.
     region: Option<[usize; 4]>,
-    /// One of the plan's; left out: the shortest.
+    /// One of the plan's exposures; if omitted, the shortest.
     exposure_us: Option<f64>,
 }
 
-/// Of which pixels a profile is, and at which exposure.
+/// The pixels and the exposure of a profile.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct ProfileOptions {
     /// `[t0, t1, s0, s1]`, half open; a pixel is a region of one.
@@ -29,34 +29,34 @@ pub(super) struct ProfileOptions {
     exposure_us: f64,
 }
 
-/// Sums over the pixels of a profile, taken from the camera rows from top to bottom.
+/// Sums over the pixels of a profile, accumulated over the camera rows from top to bottom.
 #[derive(Debug, Default)]
 pub(super) struct ProfileSums {
-    /// How the images at the profile's exposure were taken.
+    /// Delays and exposure of the images with the profile's exposure.
     settings: Vec<Setting>,
-    /// Sum of the pixels' light in each of them.
+    /// Sum of the pixels' light in each of these images.
     measured: Vec<f64>,
     predicted: Vec<f64>,
     pixels: usize,
 }
 
-/// Light over the delay at one exposure.
+/// Light as a function of the delay at one exposure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Profile {
     /// File name without extension.
     pub name: String,
-    /// What it shows, in a sentence.
+    /// Description in one sentence.
     pub about: String,
-    /// The exposure that the plan asked for.
+    /// The planned exposure.
     pub exposure_us: f64,
-    /// What the camera saw.
+    /// Measured light.
     pub measured: DelayProfile,
-    /// What the forward model makes of the transport.
+    /// Light predicted from the transport by the forward model.
     pub predicted: DelayProfile,
 }
 
 impl Profile {
-    /// The table that is written: names and values of its columns, one row per delay.
+    /// The table to write: names and values of its columns, one row per delay.
     pub fn columns(&self) -> [(&'static str, Vec<f64>); 5] {
         [
             ("delay_us", self.measured.delays_us.clone()),
@@ -68,11 +68,11 @@ impl Profile {
     }
 }
 
-/// What a profile cannot do without: two delays make an area.
+/// Smallest number of delays of a profile: its area needs two.
 const MIN_DELAYS: usize = 2;
 
 impl ProfileTable {
-    /// The options, where the plan and its camera have what they name.
+    /// The options, if they are valid for the plan and its camera.
     pub(super) fn check(
         self,
         schedule: &Schedule,
@@ -115,7 +115,7 @@ impl ProfileTable {
 }
 
 impl ProfileOptions {
-    /// The pixels in words that suit a file name.
+    /// The pixels as text suitable for a file name.
     pub(super) fn default_name(self) -> String {
         let [t0, t1, s0, s1] = self.region;
         match (t1 - t0, s1 - s0) {
@@ -124,7 +124,7 @@ impl ProfileOptions {
         }
     }
 
-    /// Adds what of it lies in the camera rows from `first_row` on, of which stack and transport are.
+    /// Adds the pixels in the camera rows starting at `first_row`, to which stack and transport belong.
     pub(super) fn add(
         self,
         sums: &mut ProfileSums,
@@ -141,7 +141,7 @@ impl ProfileOptions {
         }
         let [t0, t1, s0, s1] = self.region;
         let end = first_row + stack.images.len_of(Axis(1));
-        // A pixel that saturates at some delays would distort the others' profile there and only there.
+        // A pixel that saturates at some delays would distort the profile at these delays only.
         let unsaturated = |[t, s]: &[usize; 2]| {
             stack.valid.as_ref().is_none_or(|valid| taken.iter().all(|&n| valid[[n, *t, *s]]))
         };

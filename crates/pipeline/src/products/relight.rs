@@ -1,4 +1,4 @@
-//! Product `relight`: the scene under another pattern of projector rows than all of them.
+//! Product `relight`: the scene lit by a pattern of projector rows.
 
 use ndarray::{Array1, Array3, Axis};
 use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
@@ -8,15 +8,15 @@ use super::reach_of;
 use crate::schedule::SweepGeometry;
 use crate::stage::Product;
 
-/// Options of `relight`: how bright each projector row is.
+/// Options of `relight`: the brightness of each projector row.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Pattern {
-    /// Pieces of rows; where they overlap, their weights add up.
+    /// Ranges of rows; where they overlap, their weights add up.
     Rows(Vec<Piece>),
     /// Stripes over the whole projector.
     Stripes(Stripes),
-    /// A sequence of images: a line that moves from the first row that the camera sees to the last.
+    /// A sequence of images: a line that moves from the first row seen by the camera to the last.
     Line(Line),
 }
 
@@ -24,7 +24,7 @@ pub(super) enum Pattern {
 #[serde(deny_unknown_fields)]
 pub(super) struct Piece {
     first: usize,
-    /// Included.
+    /// Inclusive.
     last: usize,
     #[serde(default = "full_weight")]
     weight: f64,
@@ -60,7 +60,8 @@ impl Line {
 }
 
 impl Pattern {
-    /// Keys and numbers that lead to a bad value, and what is allowed there.
+    /// Checks the options. An error consists of the keys and indices that lead to the invalid value, and the allowed
+    /// values.
     pub(super) fn check(&self, geometry: &SweepGeometry) -> Result<(), (Vec<String>, String)> {
         let rows = geometry.raster.rows;
         let within = |path: &[&str], value: usize, lowest: usize, highest: usize, what: &str| {
@@ -105,7 +106,7 @@ impl Pattern {
         Ok(())
     }
 
-    /// How many images it gives.
+    /// The number of its images.
     pub(super) fn images(&self, geometry: &SweepGeometry) -> usize {
         match self {
             Self::Rows(_) | Self::Stripes(_) => 1,
@@ -113,7 +114,7 @@ impl Pattern {
         }
     }
 
-    /// Makes it of the camera rows from `first_row` on, of which the transport is.
+    /// Computes the product for the camera rows starting at `first_row`, to which the transport belongs.
     pub(super) fn make(
         &self,
         name: String,

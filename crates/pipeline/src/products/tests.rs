@@ -6,7 +6,7 @@ use serde_json::json;
 use super::*;
 use crate::schedule::{Point, Role, Spot};
 
-/// A camera of 6 rows and 3 columns that sees the rows from 2 on of a projector with 10.
+/// A camera with 6 rows and 3 columns that sees the rows of a 10-row projector starting at row 2.
 fn geometry() -> SweepGeometry {
     let raster = Raster { rows: 10, row_time_us: 20.0, period_us: 2000.0, first_row_us: 0.0 };
     SweepGeometry {
@@ -41,7 +41,7 @@ fn timing() -> RowTiming {
     RowTiming::new(10, 20.0, 2000.0).unwrap().window(2, 6).unwrap()
 }
 
-/// Values of few bits, so that sums of them are exact in any order.
+/// Values with few bits, so that their sums are exact in any order.
 fn transport() -> Transport {
     let row = |index: usize, t: usize| timing().row_exists(index as i32 - 4, t);
     let t = Array3::from_shape_fn((9, 6, 3), |(index, t, s)| match row(index, t) {
@@ -52,12 +52,12 @@ fn transport() -> Transport {
     Transport { t, u_min: -4, exists, saturated: Array2::from_elem((6, 3), false) }
 }
 
-/// What a camera sees of the transport, without noise.
+/// The camera's images of the transport, without noise.
 fn stack() -> SweepStack {
     let points = schedule().points;
     let settings: Vec<Setting> =
         points.iter().map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
-    // Seen by a camera as high as the projector, of which ours is a window.
+    // As seen by a camera with as many rows as the projector, of which ours is a window.
     let all = Array3::from_shape_fn((10, 10, 3), |(v, t, s)| {
         let known = t.checked_sub(2).zip((v + 4).checked_sub(t));
         known.and_then(|(t, index)| transport().t.get([index, t, s]).copied()).unwrap_or(0.0)
@@ -110,7 +110,7 @@ fn bands_of_both_sides_add_up_to_the_total() {
     assert_eq!(near, image(json!({ "kind": "epipolar", "width_rows": 5 })));
     let far = image(json!({ "kind": "band", "from_rows": 3, "to_rows": u32::MAX }));
     assert_eq!(far, image(json!({ "kind": "non-epipolar", "width_rows": 5 })));
-    // u = -2 and -1 are indices 2 and 3.
+    // u = -2 and -1 have the indices 2 and 3.
     let above = image(json!({ "kind": "band", "from_rows": 1, "to_rows": 2, "side": "above" }));
     assert_eq!(above, transport().t.slice(s![2..4, .., ..]).sum_axis(Axis(0)));
 }

@@ -1,4 +1,4 @@
-//! `uncertainty`: what noise leaves of the certainty of a band's light.
+//! `uncertainty`: the standard deviation of a band's light due to noise.
 
 use ndarray::Axis;
 use raysweep_transport::plane::{Samples, Transport, Uncertainty};
@@ -7,7 +7,7 @@ use super::SweepStack;
 use super::band::Band;
 use crate::stage::Product;
 
-/// Of the camera rows from `first_row` on, of which stack and transport are.
+/// Computes it for the camera rows starting at `first_row`, to which stack and transport belong.
 pub(super) fn make(
     name: String,
     band: Band,

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::scene::Case;
 
-/// The pixels that the slow reference solves, spread evenly.
+/// The pixels solved by the slow reference, spread evenly.
 #[derive(Debug, Clone, Copy)]
 pub struct Sample {
     pub every_row: usize,
@@ -30,11 +30,11 @@ pub struct Accuracy {
     pub error_largest: f64,
 }
 
-/// Compares the sampled pixels of `transport` with [`reference::minimise`]. Gives the least objective values too,
-/// shape `[t, s]`, NaN where a pixel is not in the sample.
+/// Compares the sampled pixels of `transport` with [`reference::minimise`]. Also returns the least objective values,
+/// shape `[t, s]`, NaN for pixels that are not in the sample.
 ///
 /// Rows whose exposures reach into a neighbouring frame are left out: their minimiser has rows that a transport does
-/// not hold.
+/// not contain.
 pub fn against_the_reference(case: &Case, prior: Prior, transport: &Transport) -> (Accuracy, Array2<f64>) {
     let (_, rows, columns) = case.stack.dim();
     let reach = transport.u_min..=transport.u_max();
@@ -91,7 +91,7 @@ impl Objective {
         Self { model, differences, prior, h }
     }
 
-    /// Whether a transport holds all unknowns.
+    /// Whether a transport contains all unknowns.
     fn holds_all_rows(&self) -> bool {
         self.model.slots.iter().all(|slot| slot.kind == SlotKind::Own)
     }

@@ -3,17 +3,17 @@ use std::time::Instant;
 
 use ndarray::{Array2, LinalgScalar};
 
-/// Matrices of this size give what the machine has, and two threads' fit into any cache.
+/// Matrices of this size reach the machine's peak, and those of two threads fit into any cache.
 const SIZE: usize = 512;
 const REPETITIONS: usize = 60;
 
-/// Most floating-point operations a second in products of large matrices, all threads together.
+/// Peak floating-point operations per second in products of large matrices, with all threads.
 pub struct Peak {
     pub f32_flops: f64,
     pub f64_flops: f64,
 }
 
-/// Measured with the library that the solver's own products use, in AVX-512 where the CPU has it.
+/// Measures with the library that the solver's own products use, with AVX-512 if the CPU has it.
 pub fn peak() -> Peak {
     Peak { f32_flops: of(0.5_f32), f64_flops: of(0.5_f64) }
 }

@@ -1,9 +1,10 @@
-//! The demultiplexer measured: seconds, share of the machine's GEMM peak, and every figure's distance from the f64
-//! reference; beside it, on request, what others use for the same problem. `cargo xtask bench demux` runs it.
+//! Benchmark of the demultiplexer: seconds, share of the machine's GEMM peak, and the distance of all results from
+//! the f64 reference; on request also common alternatives for the same problem. Run it with `cargo xtask bench
+//! demux`.
 //!
 //! Options: `--json` prints JSON lines for the table; `--peers PYTHON` times `tests/python/peers.py` with that
-//! interpreter on the same stacks. `--large PRIOR` is for the benchmark itself: the 1280x720 case runs in a process
-//! of its own, whose peak memory is that case's alone.
+//! interpreter on the same stacks. `--large PRIOR` is internal: the 1280x720 case runs in its own process, so that
+//! the peak memory is that of this case alone.
 
 mod check;
 #[allow(clippy::unwrap_used, reason = "shared with the tests, where a helper that cannot go on may panic")]
@@ -29,17 +30,17 @@ use scene::Case;
 
 const PRIORS: [Prior; 2] = [Prior::PAPER, Prior::SPLIT];
 
-/// The pixels by which slower instructions are checked.
+/// The pixels for checking the slower instruction levels.
 const FEW: Sample = Sample { every_row: 8, every_column: 8 };
 
-/// What was measured of one case under one prior.
+/// The measurements of one case with one prior.
 #[derive(Debug, Serialize, Deserialize)]
 struct Figures {
     case: String,
     instructions: String,
     prior: String,
     settings: usize,
-    /// Unknowns of most pixels; those near the projector's borders have fewer.
+    /// Unknowns of most pixels; pixels near the projector's borders have fewer.
     unknowns: usize,
     pixels: usize,
     threads: usize,
@@ -48,9 +49,9 @@ struct Figures {
     seconds_median: f64,
     /// See [`useful_flops`].
     useful_mflops_per_pixel: f64,
-    /// Against the f64 reference.
+    /// Compared with the f64 reference.
     accuracy: Accuracy,
-    /// Of the whole process, stack and result included, before the reference ran; 0 where it was not asked for.
+    /// Of the whole process, including stack and result, before the reference ran; 0 if not requested.
     peak_memory_mib: u64,
 }
 
@@ -76,7 +77,7 @@ impl Options {
                 "--json" => options.json = true,
                 "--peers" => options.peers = Some(arguments.next().ok_or("--peers needs a Python")?.into()),
                 "--large" => options.large = Some(arguments.next().ok_or("--large needs a prior")?.parse()?),
-                // Cargo's own.
+                // Passed by Cargo.
                 "--bench" => {}
                 unknown => {
                     return Err(format!("no option `{unknown}`: there are --json and --peers PYTHON").into());
@@ -123,7 +124,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Times one case, then compares it with the reference; gives the reference's objective values too, `[t, s]`.
+/// Times one case, then compares it with the reference. Also returns the reference's objective values, `[t, s]`.
 fn measure(
     case: &Case,
     prior: Prior,
@@ -166,10 +167,10 @@ fn measure(
     Ok((figures, best))
 }
 
-/// Floating-point operations that the answer itself asks for, over all pixels: `A'I` and `H^-1 c` (`2NV + 2V^2`), then
-/// one confirmation of the set of zero rows that turned out right, on the smaller of the two sides: with `k` rows, a
-/// Cholesky factor, two triangular systems and the other rows' values, `k^3/3 + 2k^2 + 2kV`. What a solver spends
-/// on sets that turn out wrong does not count, so the share of the peak is a lower bound of what the machine does.
+/// Floating-point operations that the result itself requires, over all pixels: `A'I` and `H^-1 c` (`2NV + 2V^2`),
+/// then one confirmation of the correct set of zero rows, on the smaller of the two sides: with `k` rows, a Cholesky
+/// factor, two triangular systems and the values of the other rows, `k^3/3 + 2k^2 + 2kV`. Operations on sets that
+/// turn out wrong are not counted, so the share of the peak is a lower bound of what the machine does.
 fn useful_flops(transport: &Transport, settings: usize) -> f64 {
     let mut flops = 0.0;
     for (profiles, exists) in transport.t.axis_iter(Axis(1)).zip(transport.exists.columns()) {
@@ -183,7 +184,7 @@ fn useful_flops(transport: &Transport, settings: usize) -> f64 {
     flops
 }
 
-/// The 1280x720 case, measured by this program started anew.
+/// The 1280x720 case, measured by a new process of this program.
 fn in_a_process_of_its_own(prior: Prior) -> Result<Figures, Box<dyn Error>> {
     let output = Command::new(std::env::current_exe()?)
         .args(["--large", prior.name()])
@@ -197,7 +198,7 @@ fn in_a_process_of_its_own(prior: Prior) -> Result<Figures, Box<dyn Error>> {
     Ok(serde_json::from_slice(&output.stdout)?)
 }
 
-/// The most memory that this process has held so far, as Linux counts it.
+/// The peak memory of this process so far, as reported by Linux.
 fn peak_memory_mib() -> Result<u64, Box<dyn Error>> {
     let status = std::fs::read_to_string("/proc/self/status")?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).ok_or("VmHWM is not in status")?;

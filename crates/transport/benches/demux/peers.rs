@@ -1,4 +1,4 @@
-//! What others use for the same problem, timed by `tests/python/peers.py`.
+//! Alternative software for the same problem, timed by `tests/python/peers.py`.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -12,11 +12,11 @@ use serde::Deserialize;
 use super::check::Objective;
 use super::scene::Case;
 
-/// What the program says of one method, one JSON line each.
+/// The program's result for one method, printed as one JSON line.
 #[derive(Debug, Deserialize)]
 pub struct Peer {
     pub method: String,
-    /// For all pixels of the case, scaled from those that were timed: least and median of the repetitions.
+    /// For all pixels of the case, extrapolated from those that were timed: minimum and median of the repetitions.
     pub seconds: f64,
     pub seconds_median: f64,
     pub pixels_timed: usize,

@@ -5,7 +5,7 @@ use super::Figures;
 use super::gemm::Peak;
 use super::peers::Peer;
 
-/// One line for each method and case; `seconds` is the least of the repetitions, `ratio` the method's seconds over
+/// One line for each method and case. `seconds` is the minimum of the repetitions, `ratio` the method's seconds over
 /// raysweep's on the same stack, `gap` the largest relative distance from the least objective.
 pub fn json_lines(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
     for (figures, peers) in measured {
@@ -43,7 +43,7 @@ pub fn json_lines(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
     }
 }
 
-/// The same for people.
+/// Prints the same as readable tables.
 pub fn tables(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
     let gflops = |flops: f64| format!("{:.0} GFLOP/s", flops / 1e9);
     println!(
@@ -142,7 +142,7 @@ fn case(figures: &Figures) -> String {
     }
 }
 
-/// The case of the same unknowns and prior with fewer pixels.
+/// The case with the same unknowns and prior but fewer pixels.
 fn same_problem_smaller<'a>(of: &Figures, measured: &'a [(Figures, Vec<Peer>)]) -> Option<&'a Figures> {
     let mut all = measured.iter().map(|(figures, _)| figures);
     all.find(|it| it.unknowns == of.unknowns && it.prior == of.prior && it.pixels < of.pixels)

@@ -6,13 +6,13 @@ use raysweep_transport::plane::{PlaneError, RowTiming, Setting};
 use super::Sample;
 use super::common::{corner, ideal_stack, paper_sweep as papers_settings, photographed};
 
-/// Row time of the figures in the tests.
+/// Row time of the results in the tests.
 const ROW_TIME_US: f64 = 22.22;
 
-/// Rows and columns of the rendered corner, which all stacks are made of.
+/// Rows and columns of the rendered corner from which all stacks are made.
 const TILE: usize = 128;
 
-/// A stack, and how it was taken.
+/// A stack and the settings of its acquisition.
 pub struct Case {
     pub name: &'static str,
     pub timing: RowTiming,
@@ -41,7 +41,7 @@ pub fn paper_sized() -> Result<Case, PlaneError> {
     })
 }
 
-/// The paper's sweep in full, whose delays reach 189 rows.
+/// The paper's full sweep, whose delays cover 189 rows.
 pub fn paper_sweep() -> Result<Case, PlaneError> {
     let settings = papers_settings();
     Ok(Case {
@@ -56,12 +56,13 @@ pub fn paper_sweep() -> Result<Case, PlaneError> {
     })
 }
 
-/// A camera pixel for each of 1280x720 projector pixels: the corner repeated, N = 75 and V = 128 as in the small case.
+/// One camera pixel for each of 1280x720 projector pixels: the corner repeated, N = 75 and V = 128 as in the small
+/// case.
 pub fn whole_projector() -> Result<Case, Box<dyn Error>> {
     let settings = sweep_of_128_rows();
     let (rows, columns) = (720, 1280);
     let whole_tile = photographed(&ideal_stack(&corner(), &settings), 1);
-    // The projector ends within the last tile, and with it the light.
+    // The projector, and with it the light, ends within the last tile.
     let rest = rows % TILE;
     let mut cut_corner = corner();
     cut_corner.slice_mut(s![rest.., .., ..]).fill(0.0);
@@ -95,7 +96,7 @@ fn projector() -> Result<RowTiming, PlaneError> {
     RowTiming::new(720, ROW_TIME_US, 50_000.0 / 3.0)
 }
 
-/// As many delays and exposures as the paper's, the delays drawn together and moved by half a row, so that the
+/// As many delays and exposures as the paper's, with the delays closer together and moved by half a row, so that the
 /// settings see exactly the rows -63..=64.
 fn sweep_of_128_rows() -> Vec<Setting> {
     let delay_us = |point: usize| -822.0 + 1644.0 / 14.0 * (point % 15) as f64 + ROW_TIME_US / 2.0;

@@ -1,5 +1,5 @@
-//! The dot rig's stages measured on synthetic 12-bit batches of 2250 dots, each beside a plain read of the same bytes in
-//! the same run. `cargo xtask bench dots` runs it.
+//! Benchmark of the dot rig's stages on synthetic 12-bit batches of 2250 dots, each compared with a plain read of the
+//! same bytes in the same run. Run it with `cargo xtask bench dots`.
 //!
 //! Options: `--json` prints JSON lines for the table; `--peers PYTHON` times `tests/python/peers_dots.py` with that
 //! interpreter on the same frames and columns.
@@ -21,13 +21,13 @@ struct Figure {
     case: String,
     stage: String,
     method: String,
-    /// Least of the repetitions: of a frame, or of a batch where the stage works on columns.
+    /// Minimum of the repetitions, per frame, or per batch if the stage works on columns.
     seconds: f64,
-    /// Over a plain read of the stage's input, by the same number of threads.
+    /// Relative to a plain read of the stage's input with the same number of threads.
     times_read: f64,
-    /// Over raysweep's seconds with all threads; 1 for raysweep itself.
+    /// Relative to raysweep's seconds with all threads; 1 for raysweep itself.
     ratio: f64,
-    /// Of stages that work on frames.
+    /// Only for stages that work on frames.
     frames_per_second: Option<f64>,
 }
 
@@ -45,7 +45,7 @@ impl Options {
             match argument.as_str() {
                 "--json" => options.json = true,
                 "--peers" => options.peers = Some(arguments.next().ok_or("--peers needs a Python")?.into()),
-                // Cargo's own.
+                // Passed by Cargo.
                 "--bench" => {}
                 unknown => {
                     return Err(format!("no option `{unknown}`: there are --json and --peers PYTHON").into());
@@ -94,7 +94,7 @@ fn print(figure: &Figure) {
     );
 }
 
-/// What a batch costs once its columns are there.
+/// Prints the total time for a batch once its columns exist.
 fn print_sum(figures: &[Figure]) {
     for threads in [1, 2] {
         let case = stages::case(1024, threads);

@@ -1,4 +1,4 @@
-//! NumPy, SciPy and OpenCV at the same stages, timed by `tests/python/peers_dots.py`.
+//! The same stages in NumPy, SciPy and OpenCV, timed by `tests/python/peers_dots.py`.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ struct Peer {
     seconds: f64,
 }
 
-/// Times all peers on the columns that raysweep's figures are of, and on frames of the same scene.
+/// Times all peers on the columns used for raysweep's figures, and on frames of the same scene.
 pub fn time(python: &Path, columns: &Columns, ours: &[Figure]) -> Result<Vec<Figure>, Box<dyn Error>> {
     let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("bench-dots");
     std::fs::create_dir_all(&folder)?;

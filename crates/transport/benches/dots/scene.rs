@@ -11,19 +11,19 @@ use raysweep_transport::dots::FrameShape;
 pub const BACKGROUND: f64 = 100.3;
 pub const NOISE: f64 = 3.0;
 
-/// Dots of a batch, the paper's.
+/// Dots in a batch, as in the paper.
 pub const DOTS: usize = 2250;
 
-/// Fails where a range of random numbers is empty, which none here is.
+/// Fails if a range of random numbers is empty, which never happens here.
 pub type Drawn = Result<(), Box<dyn Error>>;
 
-/// Frames of noise; each frame is cut out of them at a place of its own.
+/// Frames of noise. Each frame is cut out of them at a different place.
 const NOISE_FRAMES: usize = 8;
 
-/// A scan of a frame by a grid of dots.
+/// A scan of a frame with a grid of dots.
 pub struct Scene {
     pub shape: FrameShape,
-    /// `NOISE_FRAMES + 1` frames of background with noise.
+    /// `NOISE_FRAMES + 1` frames of noisy background.
     noise: Vec<u16>,
 }
 
@@ -37,12 +37,12 @@ impl Scene {
         Ok(Self { shape, noise })
     }
 
-    /// Radius of the dots, the paper's 16 pixels of 1024.
+    /// Radius of the dots: 16 pixels of 1024, as in the paper.
     fn radius_px(&self) -> f64 {
         16.0 * self.shape.width() as f64 / 1024.0
     }
 
-    /// Radius of discs that hold a dot wherever noise puts its brightest pixel.
+    /// Radius of discs that contain a dot wherever noise puts its brightest pixel.
     pub fn disc_radius_px(&self) -> f64 {
         1.25 * self.radius_px()
     }
@@ -64,7 +64,8 @@ impl Scene {
         Ok(())
     }
 
-    /// A dot in a scene: itself, for a third of the dots a dimmer image of it elsewhere, and a glow below the noise.
+    /// A dot in a scene: the dot, for a third of the dots also a dimmer image of it elsewhere, and a glow below the
+    /// noise.
     pub fn draw(&self, dot: usize, frame: &mut [u16]) -> Drawn {
         self.draw_plane(dot, frame)?;
         self.stamp(self.centre(dot), 4.0, 4.0, frame);

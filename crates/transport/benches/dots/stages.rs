@@ -27,7 +27,7 @@ pub const OURS: &str = "raysweep";
 const THREADS: [usize; 2] = [1, 2];
 const REPETITIONS: usize = 9;
 
-/// Distinct frames take so many bytes, more than caches hold; a batch goes through them as often as it takes.
+/// Total size of the distinct frames, larger than the caches. A batch cycles through them.
 const BYTES_OF_FRAMES: usize = 256 << 20;
 
 /// Hot pixels of a sensor, one in ten thousand.
@@ -62,7 +62,7 @@ impl Sensor {
     }
 }
 
-/// Least seconds of each of some tasks, which take turns so that a slow moment of the machine meets all of them.
+/// Minimum seconds of each task. The tasks take turns, so that a slow moment of the machine affects all of them.
 fn least<const N: usize>(mut tasks: [&mut (dyn FnMut() + Send); N]) -> [f64; N] {
     let mut least = [f64::INFINITY; N];
     for _ in 0..REPETITIONS {
@@ -84,7 +84,7 @@ fn pool(threads: usize) -> Result<rayon::ThreadPool, rayon::ThreadPoolBuildError
     rayon::ThreadPoolBuilder::new().num_threads(threads).build()
 }
 
-/// Synchronising and denoising of frames of one size, in seconds a frame.
+/// Synchronising and denoising of frames of one size, in seconds per frame.
 pub fn of_frames(size: usize) -> Result<Vec<Figure>, Box<dyn Error>> {
     let scene = Scene::new(size)?;
     let sensor = Sensor::new(&scene)?;
@@ -114,7 +114,7 @@ pub fn of_frames(size: usize) -> Result<Vec<Figure>, Box<dyn Error>> {
                 }
             }
         };
-        // As it runs beside a camera: columns go elsewhere, and their memory comes back.
+        // As during acquisition: columns are handed on, and their memory is reused.
         let mut denoise = || {
             let Sensor { denoiser, background, floor } = &sensor;
             frames.par_chunks(16).for_each_init(
@@ -149,7 +149,7 @@ pub fn of_frames(size: usize) -> Result<Vec<Figure>, Box<dyn Error>> {
     Ok(figures)
 }
 
-/// Columns of a batch and of its calibration plane, and what products need beside them.
+/// Columns of a batch and of its calibration plane, and the other inputs of the products.
 pub struct Columns {
     pub scene: Scene,
     pub sensor: Sensor,
@@ -194,7 +194,7 @@ impl Columns {
     }
 }
 
-/// Products of a batch's columns, in seconds a batch.
+/// Products of a batch's columns, in seconds per batch.
 pub fn of_columns(columns: &Columns) -> Result<Vec<Figure>, Box<dyn Error>> {
     let Columns { plane, batch, pattern, fundamental, mirror, mask, .. } = columns;
     let footprints = Footprints::new(plane, 0.5)?;
@@ -205,7 +205,7 @@ pub fn of_columns(columns: &Columns) -> Result<Vec<Figure>, Box<dyn Error>> {
     let weights: Array2<f32> = pattern_weights(&centroids, pattern.view())?;
     let light = floodlit(batch);
     let arrays = batch.arrays();
-    // The bytes of a batch, as many 16 bits.
+    // As many bytes as the batch has, as 16-bit values.
     let bytes: Vec<u16> = (0..batch.bytes() / 2).map(|at| at as u16).collect();
     eprintln!("{} bytes a dot, {:?}", batch.bytes() / batch.dots(), batch.counts());
     eprintln!("{:.2} discs a frame", f64::from(arrays.discs.iter().sum::<u32>()) / batch.dots() as f64);

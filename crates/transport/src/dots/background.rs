@@ -6,18 +6,18 @@ use super::sensor::median;
 use super::shape::BLOCK_PX;
 use super::{Correction, DotsError, FrameShape, Region};
 
-/// Counts that the vector kernels can take, the 12 bits of fast cameras.
+/// Upper limit of the counts that the vector kernels support: the 12 bits of fast cameras.
 pub(crate) const NARROW_LIMIT: u16 = 1 << 12;
 
-/// Background of a hot pixel: subtracted from any narrow count it leaves less than a sound pixel can have, so a hot pixel is
-/// never the maximum. Its square is small enough for 64 of them to be summed in 32 bits.
+/// Background of a hot pixel: any narrow count minus it is less than the difference of any sound pixel, so a hot
+/// pixel is never the maximum. The square of the difference is small enough to sum 64 of them in 32 bits.
 pub(crate) const HOT_BACKGROUND: u16 = 2 * NARROW_LIMIT - 1;
 
 /// A running mean of the frames whose light went into the beam dump: ambient light and dark level.
 ///
-/// A batch has one such frame. Subtracting it alone would put its noise into every column of the batch, where sums
-/// over all dots see it N times over; the mean lowers that. It is exponential with the weight 2/(n + 1), which has
-/// the noise of a mean of the last n batches, and exact until it has seen that many.
+/// A batch has one such frame. Subtracting it alone would put its noise into every column of the batch, so that sums
+/// over all N dots contain it N times. The mean lowers that noise. It starts as a plain mean and becomes exponential
+/// after (n + 1)/2 frames, with the weight 2/(n + 1), which gives the noise of a mean of the last n batches.
 #[derive(Debug, Clone)]
 pub struct BackgroundMean {
     shape: FrameShape,
@@ -27,7 +27,7 @@ pub struct BackgroundMean {
 }
 
 impl BackgroundMean {
-    /// A mean worth `batches` batches.
+    /// A mean with the noise of `batches` averaged batches.
     ///
     /// # Errors
     /// [`DotsError::OutOfRange`] for 0.
@@ -36,11 +36,11 @@ impl BackgroundMean {
         Ok(Self { shape, batches, seen: 0, mean: vec![0.0; shape.values()] })
     }
 
-    /// Begins with the dark frame, `[height, width, channels]`, for the time until the first batch has ended; it
-    /// then counts no more.
+    /// Starts with the dark frame, `[height, width, channels]`, which is used until the first batch has ended and
+    /// then discarded.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if it is not of the frame's shape.
+    /// [`DotsError::Shape`] if it does not have the frame's shape.
     pub fn starting_with(mut self, dark: &Array3<f32>) -> Result<Self, DotsError> {
         let expected = [self.shape.height(), self.shape.width(), self.shape.channels()];
         check_shape("dark", "[height, width, channels]", dark.shape(), &expected)?;
@@ -48,10 +48,10 @@ impl BackgroundMean {
         Ok(self)
     }
 
-    /// Takes in a batch's frame.
+    /// Adds the background frame of a batch.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if it is not of the frame's size.
+    /// [`DotsError::Shape`] if it does not have the frame's size.
     pub fn push(&mut self, frame: &[u16]) -> Result<(), DotsError> {
         check_shape("frame", "[values]", &[frame.len()], &[self.mean.len()])?;
         self.seen = self.seen.saturating_add(1);
@@ -62,12 +62,12 @@ impl BackgroundMean {
         Ok(())
     }
 
-    /// Frames taken in so far.
+    /// Number of frames added so far.
     pub fn seen(&self) -> u32 {
         self.seen
     }
 
-    /// In counts, `[height, width, channels]`.
+    /// The mean in counts, `[height, width, channels]`.
     pub fn mean(&self) -> &[f32] {
         &self.mean
     }
@@ -78,23 +78,24 @@ impl BackgroundMean {
 pub struct Background {
     /// Mean counts, `[height, width, channels]`.
     pub(crate) mean: Vec<f32>,
-    /// Of each pixel's luminance, rounded to whole counts; [`HOT_BACKGROUND`] at hot pixels.
+    /// Luminance of each pixel's background, rounded to whole counts; [`HOT_BACKGROUND`] at hot pixels.
     pub(crate) counts: Vec<u16>,
-    /// Whether no sound pixel's counts are beyond the vector kernels.
+    /// Whether the counts of all sound pixels are within the limit of the vector kernels.
     pub(crate) narrow: bool,
-    /// What rounding took from each block's sum: rounded minus mean over its sound pixels, `[blocks, channels]`. It
-    /// would be the same in every frame, and add up over all dots. For RGB frames, which have no rounded background of
-    /// their own, minus the whole mean.
+    /// The effect of rounding on each block's sum: rounded minus mean over its sound pixels, `[blocks, channels]`. It
+    /// is the same in every frame, so uncorrected it would add up over all dots. RGB frames have no rounded
+    /// background of their own; for them it is minus the whole mean.
     pub(crate) block_offset: Vec<f64>,
-    /// Sound pixels of each block.
+    /// Number of sound pixels in each block.
     pub(crate) block_sound: Vec<u32>,
 }
 
 impl Background {
-    /// From mean counts `[height, width, channels]`, as [`BackgroundMean::mean`] gives them.
+    /// From mean counts `[height, width, channels]` as returned by [`BackgroundMean::mean`].
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if they are not of the frame's size, [`DotsError::OutOfRange`] if one is not a count.
+    /// [`DotsError::Shape`] if they do not have the frame's size, [`DotsError::OutOfRange`] if a value is not a valid
+    /// count.
     pub fn new(correction: &Correction, mean: &[f32]) -> Result<Self, DotsError> {
         let shape = correction.shape();
         let mut background = Self {
@@ -108,10 +109,10 @@ impl Background {
         Ok(background)
     }
 
-    /// [`Background::new`] in the memory of the batch before.
+    /// The same as [`Background::new`], but reuses this background's memory.
     ///
     /// # Errors
-    /// As there.
+    /// As [`Background::new`].
     pub fn set(&mut self, correction: &Correction, mean: &[f32]) -> Result<(), DotsError> {
         let shape = correction.shape();
         let channels = shape.channels();
@@ -148,7 +149,7 @@ impl Background {
     }
 }
 
-/// Luminance of a pixel's values: itself, or (R + 2 G + B) / 4.
+/// Luminance of a pixel's values: the value itself, or (R + 2 G + B) / 4.
 fn mean_luminance(pixel: &[f32]) -> f32 {
     match pixel {
         [red, green, blue] => (red + 2.0 * green + blue) / 4.0,
@@ -172,12 +173,12 @@ pub struct NoiseFloor {
 }
 
 impl NoiseFloor {
-    /// Variance of rounding to whole counts: what a perfect camera would have.
+    /// Variance of rounding to whole counts, which a noise-free camera would have.
     pub(crate) const ROUNDING_VARIANCE: f64 = 1.0 / 12.0;
 
-    /// The medians over frames of mean and variance within a region; the more frames, the less it matters which
-    /// region, and some may even have light there. Take the batch's own frames and a dark corner, or frames of the
-    /// beam dump, which may not be in the background's mean, and [`Region::whole`].
+    /// The medians over frames of mean and variance within a region. The more frames, the less the choice of region
+    /// matters; some frames may even have light there. Use the batch's own frames and a dark corner, or frames of the
+    /// beam dump that are not part of the background's mean, with [`Region::whole`].
     ///
     /// # Errors
     /// [`DotsError::TooFew`] without frames or with fewer than 16 sound pixels, [`DotsError::Shape`] and
@@ -201,7 +202,7 @@ impl NoiseFloor {
         Ok(Self { mean: median(&mut means), sigma: median(&mut variances).sqrt() })
     }
 
-    /// Of one frame's region alone, as the paper's Algorithm 1 has it.
+    /// Of one frame's region alone, as in the paper's Algorithm 1.
     pub(crate) fn of_frame(
         frame: &[u16],
         correction: &Correction,
@@ -230,7 +231,7 @@ impl NoiseFloor {
         Ok(Self::of_sums(count, sum, squares))
     }
 
-    /// From the number of pixels, their sum and their squares' sum.
+    /// From the number of pixels, their sum and their sum of squares.
     pub(crate) fn of_sums(count: usize, sum: i64, squares: i64) -> Self {
         let mean = sum as f64 / count as f64;
         let variance = squares as f64 / count as f64 - mean * mean;
@@ -284,7 +285,7 @@ mod tests {
         let correction = Correction::none(shape);
         let background = Background::new(&correction, &vec![100.0; 96 * 96]).unwrap();
         let mut frames = noisy_frames(shape, 50);
-        // A third of the frames have light in one of the places.
+        // A third of the frames have light in one of the regions.
         for frame in frames.iter_mut().step_by(3) {
             frame[..32 * 96].iter_mut().for_each(|raw| *raw += 500);
         }

@@ -3,7 +3,7 @@ use super::error::check_shape;
 use super::shape::BLOCK_PX;
 use super::{DotsError, FrameShape, Outcome, SparseColumn};
 
-/// The columns of one batch, one after another, as they are stored: each field is one array of a file.
+/// The columns of one batch in the layout in which they are stored: each field is one array of a file.
 ///
 /// In Python, with the arrays loaded under their names:
 ///
@@ -15,7 +15,7 @@ use super::{DotsError, FrameShape, Outcome, SparseColumn};
 /// ```
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct BatchArrays {
-    /// Where each dot's words begin, `[dots + 1]`; the last is the number of words.
+    /// Start of each dot's words, `[dots + 1]`; the last entry is the number of words.
     pub word_offsets: Vec<u64>,
     /// See [`SparseColumn::words`], `[words]`.
     pub words: Vec<u32>,
@@ -25,14 +25,14 @@ pub struct BatchArrays {
     pub values: Vec<f32>,
     /// See [`SparseColumn::residual`], `[dots, block rows, block columns, channels]`.
     pub residual: Vec<f32>,
-    /// Discs of each dot's frame, `[dots]`.
+    /// Number of discs taken from each dot's frame, `[dots]`.
     pub discs: Vec<u32>,
-    /// Whether each dot's frame ended at the cap, `[dots]`.
+    /// Whether each dot's frame reached the limit on discs, `[dots]`.
     pub capped: Vec<bool>,
 }
 
 impl BatchArrays {
-    /// Puts another dot's column at the end.
+    /// Appends the column of another dot.
     pub fn push(&mut self, column: &SparseColumn) {
         if self.word_offsets.is_empty() {
             self.word_offsets.push(0);
@@ -46,7 +46,7 @@ impl BatchArrays {
         self.capped.push(column.outcome.capped);
     }
 
-    /// Puts the dots of another batch at the end.
+    /// Appends the dots of another batch.
     pub(crate) fn append(&mut self, mut other: Self) {
         if self.word_offsets.is_empty() {
             self.word_offsets.push(0);
@@ -62,34 +62,34 @@ impl BatchArrays {
     }
 }
 
-/// The light transport of one scan: a column for each dot, checked once and indexed for the products.
+/// The light transport of one scan: one column per dot, validated once and indexed for the products.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Batch {
     shape: FrameShape,
     arrays: BatchArrays,
-    /// Pixels before each word, `[words + 1]`.
+    /// Number of pixels before each word, `[words + 1]`.
     starts: Vec<u32>,
-    /// Where the words of each dot in each row of blocks begin, `[block rows + 1, dots]`.
+    /// Start of the words of each dot in each row of blocks, `[block rows + 1, dots]`.
     bands: Vec<u32>,
 }
 
-/// The counts that no batch hides.
+/// Counts to report for every batch.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct BatchCounts {
     /// Dots of the batch.
     pub dots: usize,
-    /// Those in whose frames nothing stood out of the background.
+    /// Dots whose frames contain nothing above the noise of the background.
     pub empty: usize,
-    /// Those whose frames ended at the cap on discs.
+    /// Dots whose frames reached the limit on discs.
     pub capped: usize,
 }
 
 impl Batch {
-    /// Checks and indexes columns, fresh or read from a file.
+    /// Validates and indexes columns, fresh or read from a file.
     ///
     /// # Errors
     /// [`DotsError::Shape`] for arrays that do not fit each other, [`DotsError::Damaged`] for words out of order or
-    /// beyond the frame, masks without pixels, and values that are not finite.
+    /// outside the frame, masks without pixels, and values that are not finite.
     pub fn new(shape: FrameShape, mut arrays: BatchArrays) -> Result<Self, DotsError> {
         if arrays.word_offsets.is_empty() {
             arrays.word_offsets.push(0);
@@ -151,17 +151,17 @@ impl Batch {
         Ok(Self { shape, arrays, starts, bands })
     }
 
-    /// Size of the frames that it was made of.
+    /// Shape of the frames of the batch.
     pub fn shape(&self) -> FrameShape {
         self.shape
     }
 
-    /// How many dots.
+    /// Number of dots.
     pub fn dots(&self) -> usize {
         self.arrays.discs.len()
     }
 
-    /// As it is stored.
+    /// The arrays as they are stored.
     pub fn arrays(&self) -> &BatchArrays {
         &self.arrays
     }
@@ -175,7 +175,7 @@ impl Batch {
         }
     }
 
-    /// Bytes of the arrays that are stored.
+    /// Size of the stored arrays in bytes.
     pub fn bytes(&self) -> usize {
         let BatchArrays { word_offsets, words, masks, values, residual, discs, capped } = &self.arrays;
         8 * word_offsets.len()
@@ -186,14 +186,14 @@ impl Batch {
     /// One dot's column.
     ///
     /// # Panics
-    /// Where there is no such dot.
+    /// If the dot does not exist.
     pub fn column(&self, dot: usize) -> Column<'_> {
         let words = self.arrays.word_offsets[dot] as usize..self.arrays.word_offsets[dot + 1] as usize;
         let residual = self.shape.blocks() * self.shape.channels();
         Column { batch: self, words, residual: &self.arrays.residual[dot * residual..][..residual] }
     }
 
-    /// The dots that have pixels in a row of blocks, in their order, with these.
+    /// The dots with pixels in a row of blocks, in ascending order, each with its words in this row.
     pub(crate) fn in_band(&self, band: usize) -> impl Iterator<Item = (usize, Column<'_>)> {
         let offsets = &self.bands[band * self.dots()..(band + 2) * self.dots()];
         let (first, end) = offsets.split_at(self.dots());
@@ -206,7 +206,7 @@ impl Batch {
     /// How a dot's frame was denoised.
     ///
     /// # Panics
-    /// Where there is no such dot.
+    /// If the dot does not exist.
     pub fn outcome(&self, dot: usize) -> Outcome {
         Outcome { discs: self.arrays.discs[dot], capped: self.arrays.capped[dot] }
     }
@@ -225,7 +225,7 @@ pub struct Column<'a> {
 pub(crate) struct Word<'a> {
     /// Index of the word in the frame.
     pub word: usize,
-    /// Which pixels are in the mask.
+    /// Bit mask of the pixels that are in the column.
     pub mask: u32,
     /// Their values, `[pixels, channels]`.
     pub values: &'a [f32],
@@ -268,12 +268,12 @@ impl<'a> Column<'a> {
         self.residual
     }
 
-    /// All light of the column, those outside the mask by their blocks' means: one sum a channel.
+    /// The total light of the column, one sum per channel. Pixels outside the mask count with their blocks' means.
     pub(crate) fn energy(&self) -> [f64; 3] {
         let shape = self.batch.shape;
         let channels = shape.channels();
         let mut energy = sum_of_channels(self.values(), channels);
-        // As if the means were of whole blocks, then without the pixels that have values of their own.
+        // First as if each mean applied to a whole block, then without the pixels that have values of their own.
         for (row, means) in self.residual.chunks_exact(shape.block_columns() * channels).enumerate() {
             let pixels = shape.pixels_of_block(row * shape.block_columns()) as f64;
             let sums = sum_of_channels(means, channels);
@@ -290,11 +290,11 @@ impl<'a> Column<'a> {
     }
 }
 
-/// Sums of values whose channels lie side by side.
+/// Sums of values with interleaved channels.
 fn sum_of_channels(values: &[f32], channels: usize) -> [f64; 3] {
-    /// A multiple of all numbers of channels.
+    /// A multiple of every supported number of channels.
     const LANES: usize = 12;
-    // Side by side: one sum after another would wait for each.
+    // In parallel lanes: in a single sum, each addition would wait for the previous one.
     let mut partial = [0.0; LANES];
     let (whole, rest) = values.as_chunks::<LANES>();
     whole.iter().for_each(|lanes| (0..LANES).for_each(|lane| partial[lane] += f64::from(lanes[lane])));

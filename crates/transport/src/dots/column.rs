@@ -2,35 +2,35 @@ use std::ops::Range;
 
 use super::shape::BLOCK_PX;
 
-/// What Algorithm 1 did to one frame.
+/// The outcome of Algorithm 1 for one frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Outcome {
-    /// Discs that it took; 0: nothing stood out of the background.
+    /// Number of discs taken; 0 if nothing exceeded the noise of the background.
     pub discs: u32,
-    /// Whether it ended at the cap, so that light may have been left behind.
+    /// Whether it stopped at the limit on discs, so that some light may remain.
     pub capped: bool,
 }
 
-/// The light transport of one dot: pixels in discs around its brightest points one by one, everything else as a
-/// mean of each block of 32 x 32 pixels. In counts above the background, times the flat field's gain; signed.
+/// The light transport of one dot: individual pixels in discs around its brightest points, and for all other pixels
+/// the mean of each block of 32 x 32. In counts above the background, times the flat field's gain; may be negative.
 ///
-/// The arrays keep their memory when the column is written anew.
+/// The arrays keep their memory when the column is overwritten.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SparseColumn {
-    /// Which words of 32 pixels have any in the mask, ascending: pixel index / 32.
+    /// The words of 32 pixels that have pixels in the mask, ascending: pixel index / 32.
     pub words: Vec<u32>,
-    /// Which of the word's pixels: bit `b` is pixel `32 word + b`.
+    /// The pixels of each word: bit `b` is pixel `32 word + b`.
     pub masks: Vec<u32>,
     /// Their values in the order of the bits, `[pixels, channels]`.
     pub values: Vec<f32>,
     /// Mean of each block's pixels outside the mask, `[block rows, block columns, channels]`; 0 where there are none.
     pub residual: Vec<f32>,
-    /// How it came about.
+    /// Outcome of the denoising.
     pub outcome: Outcome,
 }
 
 impl SparseColumn {
-    /// The pixels of the mask and how many words came before, without new memory.
+    /// The pixels of the mask in ascending order, without allocating memory.
     pub fn pixels(&self) -> impl Iterator<Item = usize> {
         self.words
             .iter()
@@ -47,7 +47,7 @@ impl SparseColumn {
     }
 }
 
-/// The set bits of a mask from the lowest on.
+/// The positions of a mask's set bits, lowest first.
 pub(crate) fn bits(mut mask: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let bit = (mask != 0).then(|| mask.trailing_zeros() as usize)?;
@@ -56,9 +56,9 @@ pub(crate) fn bits(mut mask: u32) -> impl Iterator<Item = usize> {
     })
 }
 
-/// The runs of set bits of a mask from the lowest on; a disc's rows are mostly one run a word.
+/// The runs of set bits of a mask, lowest first; a row of a disc is mostly one run per word.
 pub(crate) fn runs(mask: u32) -> impl Iterator<Item = Range<usize>> {
-    // Wider than the mask, so that a run up to its last bit ends.
+    // Wider than the mask, so that a run that includes the last bit ends.
     let mut rest = u64::from(mask);
     std::iter::from_fn(move || {
         let start = (rest != 0).then(|| rest.trailing_zeros())?;

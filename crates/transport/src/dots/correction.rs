@@ -5,7 +5,7 @@ use super::error::{check_range, check_shape};
 use super::shape::BLOCK_PX;
 use super::{DotsError, FrameShape};
 
-/// How the sensor samples colour: whose neighbours may stand in for a hot pixel.
+/// How the sensor samples colour, which determines which neighbours may replace a hot pixel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sampling {
     /// Every pixel sees the same colours.
@@ -14,41 +14,42 @@ pub enum Sampling {
     Bayer,
 }
 
-/// The nearest ring around a hot pixel that has a sound one lies within this many pixels, or it is repaired with 0.
+/// A hot pixel is replaced by the nearest ring with a sound pixel, up to this many pixels away, otherwise by 0.
 const MAX_REPAIR_RINGS: isize = 8;
 
-/// What is known of the sensor: the flat field and the hot pixels.
+/// The sensor's flat field and hot pixels.
 ///
-/// Both are applied to the pixels that are extracted, not to frames: detection works on raw counts above the
-/// background, which the dark level leaves on its own.
+/// Both are applied to extracted pixels, not to frames: detection works on raw counts above the background, from
+/// which the dark level cancels by itself.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Correction {
     shape: FrameShape,
     gain: Vec<f32>,
-    /// Gain of the mean of each block's sound pixels, `[blocks, channels]`: one over the mean of one over the gains, which is
-    /// what even light over the block is multiplied by; the mean of the gains would be too much by their variance.
+    /// Gain of the mean of each block's sound pixels, `[blocks, channels]`: the harmonic mean of the pixels' gains,
+    /// which is the factor that even light over the block requires. The arithmetic mean would be too large because of
+    /// the gains' variance.
     block_gain: Vec<f32>,
     /// Hot pixels in each word.
     hot_masks: Vec<u32>,
     /// Hot pixels, ascending.
     hot: Vec<u32>,
-    /// Where in `sources` the sound neighbours of each hot pixel begin, `[hot + 1]`.
+    /// Start of each hot pixel's sound neighbours in `sources`, `[hot + 1]`.
     source_offsets: Vec<u32>,
     sources: Vec<u32>,
 }
 
 impl Correction {
-    /// A sensor without faults.
+    /// A perfect sensor.
     pub fn none(shape: FrameShape) -> Self {
         Self::build(shape, vec![1.0; shape.values()], &[], Sampling::Full)
     }
 
-    /// From the flat field's gain, `[height, width, channels]`, by which counts are multiplied, and a list of hot
-    /// pixels as (row, column).
+    /// From the flat field's gain, `[height, width, channels]`, which multiplies the counts, and a list of hot pixels
+    /// as (row, column).
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if the gain is not of the frame's shape; [`DotsError::OutOfRange`] for a gain that is not
-    /// above 0 and finite, or a hot pixel beyond the frame.
+    /// [`DotsError::Shape`] if the gain does not have the frame's shape; [`DotsError::OutOfRange`] for a gain that is
+    /// not positive and finite, or a hot pixel outside the frame.
     pub fn new(
         shape: FrameShape,
         gain: ArrayView3<f32>,
@@ -114,7 +115,7 @@ impl Correction {
         Self { shape, gain, block_gain, hot_masks, hot: hot.to_vec(), source_offsets, sources }
     }
 
-    /// Size of the frames.
+    /// Shape of the frames.
     pub fn shape(&self) -> FrameShape {
         self.shape
     }
@@ -138,8 +139,8 @@ impl Correction {
         &self.hot
     }
 
-    /// The corrected value of one channel of any pixel: counts above the background times gain, the mean of the
-    /// sound neighbours where the pixel is hot, 0 where it has none.
+    /// The corrected value of one channel of any pixel: counts above the background times gain; for a hot pixel the
+    /// mean of its sound neighbours, or 0 if it has none.
     pub(crate) fn value(&self, frame: &[u16], background: &[f32], pixel: usize, channel: usize) -> f32 {
         let sound = |pixel: usize| {
             let at = pixel * self.shape.channels() + channel;
@@ -156,7 +157,7 @@ impl Correction {
     }
 }
 
-/// The sound pixels of the nearest ring around a hot one that has any.
+/// The sound pixels of the nearest ring around a hot pixel that contains any.
 fn sound_neighbours(shape: FrameShape, hot_masks: &[u32], pixel: usize, sampling: Sampling) -> Vec<u32> {
     let step = match sampling {
         Sampling::Full => 1,
@@ -202,7 +203,7 @@ mod tests {
         let below: f32 = [4, 5, 6].iter().map(|&column| 2.0 * raw(4, column)).sum();
         let expected = (above + raw(3, 4) + below) / 7.0;
         assert!((correction.value(&frame, &background, 3 * 32 + 5, 0) - expected).abs() < 1e-3);
-        // The whole first ring of the corner is hot: the second one stands in.
+        // The whole first ring around the corner is hot, so the second one is used.
         let ring: f32 =
             [(0, 2), (1, 2), (2, 0), (2, 1), (2, 2)].iter().map(|&(row, column)| raw(row, column)).sum();
         assert!((correction.value(&frame, &background, 0, 0) - ring / 5.0).abs() < 1e-3);
@@ -223,7 +224,7 @@ mod tests {
     #[test]
     fn a_blocks_gain_gives_even_light_its_energy() {
         let shape = FrameShape::new(32, 64, 1).unwrap();
-        // Pixels that answer half as much and one and a half times as much; the second block is hot.
+        // Pixels that respond half as much and one and a half times as much; the second block is hot.
         let response = |pixel: usize| if pixel.is_multiple_of(2) { 0.5 } else { 1.5 };
         let gain = Array3::from_shape_fn((32, 64, 1), |(row, column, _)| 1.0 / response(row * 64 + column));
         let hot: Vec<(usize, usize)> =

@@ -4,44 +4,44 @@ pub enum DotsError {
     /// A number lies outside its range.
     #[error("{field} is {value}, but must be {allowed}")]
     OutOfRange {
-        /// The field, as it is named in the API.
+        /// The field's name in the API.
         field: &'static str,
-        /// The value given.
+        /// Its value.
         value: f64,
-        /// What would be accepted, and what to do.
+        /// The accepted range, and what to do.
         allowed: &'static str,
     },
-    /// An array has another shape than the others imply.
+    /// An array's shape does not fit the other arrays.
     #[error("{array} has shape {actual:?}, but {axes} must be {expected:?}")]
     Shape {
-        /// Which array.
+        /// Name of the array.
         array: &'static str,
-        /// The names of its axes in order.
+        /// Names of its axes, in order.
         axes: &'static str,
-        /// The shape given.
+        /// The actual shape.
         actual: Vec<usize>,
-        /// The shape needed.
+        /// The expected shape.
         expected: Vec<usize>,
     },
-    /// Stored columns contradict themselves.
+    /// Stored columns are inconsistent.
     #[error("the columns are damaged: {problem} at index {index}; read them again or denoise the batch anew")]
     Damaged {
         /// What is wrong.
         problem: &'static str,
-        /// Where in its array.
+        /// Index in its array.
         index: usize,
     },
-    /// A calibration has too little to go by.
+    /// A calibration has too little data.
     #[error("{what}: {given} given, at least {needed} needed")]
     TooFew {
-        /// What is counted, and how to get more.
+        /// The things counted, and how to get more of them.
         what: &'static str,
-        /// How many there are.
+        /// Their number.
         given: usize,
-        /// How many it takes.
+        /// The number needed.
         needed: usize,
     },
-    /// Correspondences that leave the fundamental matrix undetermined.
+    /// Correspondences do not determine the fundamental matrix.
     #[error(
         "the correspondences lie on one plane (singular value ratio {ratio:.1e}, at least {needed:.1e} needed): \
          scan the calibration plane at a second depth, or give mirror angles that were calibrated"
@@ -49,12 +49,12 @@ pub enum DotsError {
     Planar {
         /// The seventh singular value of the eight-point system over the largest.
         ratio: f64,
-        /// The least that is accepted.
+        /// Smallest accepted ratio.
         needed: f64,
     },
 }
 
-/// Checks that an array has the shape that it must have.
+/// Checks that an array has the expected shape.
 pub(crate) fn check_shape(
     array: &'static str,
     axes: &'static str,
@@ -67,7 +67,7 @@ pub(crate) fn check_shape(
     }
 }
 
-/// Checks that a number fulfils what `allowed` says; NaN never does.
+/// Checks that a number lies in the range that `allowed` describes; NaN never does.
 pub(crate) fn check_range(
     field: &'static str,
     value: f64,

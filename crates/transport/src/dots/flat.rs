@@ -1,4 +1,4 @@
-//! The flat field: how unlike the pixels answer to the same light.
+//! The flat field: the differences between the pixels' responses to the same light.
 
 use ndarray::Array3;
 
@@ -6,33 +6,33 @@ use super::error::check_range;
 use super::sensor::median;
 use super::{DotsError, FrameShape, RunStatistics, Sampling};
 
-/// Pixels with less than this share of the median light of their colour are dead, or in the shade of something.
+/// Pixels with less than this share of the median light of their colour are dead or shaded.
 const LEAST_LIGHT: f64 = 0.25;
-/// Share of pixels that may be dead, and that may be overexposed.
+/// Largest share of dead pixels, and largest share of overexposed pixels.
 const MOST_FAULTY: f64 = 0.01;
-/// Noise of a pixel's mean, in parts of its light: what the gain adds to every frame for ever.
+/// Largest noise of a pixel's mean relative to its light; the gain adds this noise to every later frame.
 const MOST_NOISE: f64 = 0.01;
-/// A pixel is overexposed where so many standard deviations above its mean are.
+/// A pixel is overexposed if its mean plus this many standard deviations reaches saturation.
 const HEADROOM_SIGMAS: f64 = 3.0;
 
-/// Gain of each pixel from frames of even light (EMVA 1288's PRNU, with the fall-off of light towards the corners).
+/// Gain of each pixel from frames of even light (EMVA 1288's PRNU, plus the fall-off of light towards the corners).
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlatField {
-    /// What counts above the dark level are multiplied by, `[height, width, channels]`: the mean of the colour's sound
-    /// pixels over the pixel's own, so that even light keeps its energy; 1 where there is no telling.
+    /// Factor for counts above the dark level, `[height, width, channels]`: the mean of the colour's sound pixels
+    /// divided by the pixel's own mean, so that even light keeps its energy; 1 where it is unknown.
     pub gain: Array3<f32>,
-    /// Pixels that cannot be told from their light: dead or overexposed, as (row, column), ascending.
+    /// Pixels whose gain cannot be measured: dead or overexposed, as (row, column), ascending.
     pub dead: Vec<(usize, usize)>,
 }
 
 impl FlatField {
-    /// From frames of even light and from dark ones; `hot` pixels are left out. Colours of a mosaic are made even each by
-    /// itself: the lamp's colour is not the sensor's fault.
+    /// From frames of even light and from dark frames. `hot` pixels are left out. The colours of a mosaic are
+    /// equalised separately: the lamp's colour is not an error of the sensor.
     ///
     /// # Errors
-    /// [`DotsError::OutOfRange`] where the mean's noise is beyond 1 % of the light, or more than 1 % of the pixels are
-    /// overexposed (at `saturation_dn`) or have less than a quarter of the others' light; [`DotsError::TooFew`] for fewer
-    /// than 8 frames.
+    /// [`DotsError::OutOfRange`] if the mean's noise exceeds 1 % of the light, or if more than 1 % of the pixels are
+    /// overexposed (at `saturation_dn`) or have less than a quarter of the others' light; [`DotsError::TooFew`] for
+    /// fewer than 8 frames.
     pub fn measured(
         shape: FrameShape,
         flat: &RunStatistics,
@@ -127,7 +127,7 @@ mod tests {
         FrameShape::new(64, 64, 1).unwrap()
     }
 
-    /// 64 frames of the given mean counts, with noise of 3 counts.
+    /// 64 frames with the given mean counts and noise of 3 counts.
     fn run(seed: u64, mean: impl Fn(usize) -> f64) -> RunStatistics {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut statistics = RunStatistics::new(shape());
@@ -140,7 +140,7 @@ mod tests {
         statistics
     }
 
-    /// Response of each pixel: 5 % up and down like noise, and 30 % less in the last row.
+    /// Response of each pixel: alternating by 5 %, like noise, and 30 % less in the last row.
     fn response(at: usize) -> f64 {
         let scattered = (at as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 63;
         (if scattered == 0 { 0.95 } else { 1.05 }) * (1.0 - 0.3 * (at / 64) as f64 / 63.0)
@@ -173,7 +173,7 @@ mod tests {
             |of: &dyn Fn(usize) -> f64| sound.iter().map(|&at| of(at)).sum::<f64>() / sound.len() as f64;
         let level = mean(&|at| gain[at] * response(at));
         let pattern = mean(&|at| (gain[at] * response(at) / level - 1.0).powi(2)).sqrt();
-        // 3 counts over the root of 64 frames, of light and of dark, in 850 counts.
+        // 3 counts over the square root of 64 frames, for light and for dark, relative to 850 counts.
         assert!(pattern < 8e-4, "{pattern}, {} before", mean(&|at| (response(at) - 0.85).powi(2)).sqrt());
         assert!((level / mean(&response) - 1.0).abs() < 1e-3, "{level}");
     }

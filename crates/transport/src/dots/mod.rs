@@ -1,8 +1,8 @@
-//! Light transport of a flying dot: a mirror moves one spot of light over the scene while a fast camera takes a frame of
-//! each place; every frame is a column of the scene's light transport.
+//! Light transport of a flying dot: a mirror moves one spot of light over the scene while a fast camera takes one
+//! frame per position. Every frame is a column of the scene's light transport.
 //!
-//! Raw frames become a [`Batch`] of sparse columns by way of the [`Synchroniser`], which says which dot a frame shows,
-//! and the [`Denoiser`], which keeps what stands out of the noise pixel by pixel and the rest as means of blocks.
+//! The [`Synchroniser`] determines which dot a frame shows. The [`Denoiser`] turns raw frames into sparse columns:
+//! individual pixels where they exceed the noise, means of blocks elsewhere. The columns of a scan form a [`Batch`].
 mod background;
 mod batch;
 pub mod calibrate;

@@ -18,7 +18,7 @@ pub struct RunStatistics {
 }
 
 impl RunStatistics {
-    /// No frames yet.
+    /// Statistics without frames.
     pub fn new(shape: FrameShape) -> Self {
         Self { shape, frames: 0, sums: vec![0; shape.values()], squares: vec![0; shape.values()] }
     }
@@ -26,7 +26,7 @@ impl RunStatistics {
     /// Adds a raw frame, `[height, width, channels]`.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if it is not of that size.
+    /// [`DotsError::Shape`] if it does not have that size.
     pub fn push(&mut self, frame: &[u16]) -> Result<(), DotsError> {
         check_shape("frame", "[values]", &[frame.len()], &[self.shape.values()])?;
         self.frames += 1;
@@ -37,7 +37,7 @@ impl RunStatistics {
         Ok(())
     }
 
-    /// Mean of each value in counts, `[height, width, channels]`: of frames without light the dark frame.
+    /// Mean of each value in counts, `[height, width, channels]`; for frames without light this is the dark frame.
     ///
     /// # Errors
     /// [`DotsError::TooFew`] without frames.
@@ -47,12 +47,12 @@ impl RunStatistics {
         Ok(shaped(self.shape, mean.collect()))
     }
 
-    /// Pixels whose dark level or noise lies more than `sigmas` above that of most pixels, as (row, column). The
-    /// spread of most is taken from the median absolute deviation, so hot pixels do not hide each other; it counts
-    /// as 1/12 count squared at least, the variance of rounding.
+    /// Pixels whose dark level or noise exceeds that of most pixels by more than `sigmas` standard deviations, as
+    /// (row, column). The standard deviation is derived from the median absolute deviation, so that hot pixels do not
+    /// mask each other. Its square is at least 1/12 count squared, the variance of rounding.
     ///
     /// # Errors
-    /// [`DotsError::TooFew`] below eight frames, [`DotsError::OutOfRange`] for `sigmas` that are not above 0.
+    /// [`DotsError::TooFew`] below eight frames, [`DotsError::OutOfRange`] unless `sigmas` is above 0.
     pub fn hot_pixels(&self, sigmas: f64) -> Result<Vec<(usize, usize)>, DotsError> {
         check_range("sigmas", sigmas, sigmas > 0.0, "above 0, as 8")?;
         let spread = self.spread()?;
@@ -67,7 +67,7 @@ impl RunStatistics {
         Ok(hot.map(|pixel| (pixel / self.shape.width(), pixel % self.shape.width())).collect())
     }
 
-    /// Frames so far.
+    /// Number of frames so far.
     pub fn frames(&self) -> u64 {
         self.frames
     }
@@ -104,7 +104,7 @@ fn limit(values: &[f64], sigmas: f64) -> f64 {
     middle + sigmas * spread.max((1.0_f64 / 12.0).sqrt())
 }
 
-/// The upper median; the values come out in another order. 0 without values.
+/// The upper median; reorders the values. 0 without values.
 pub(crate) fn median(values: &mut [f64]) -> f64 {
     let middle = values.len() / 2;
     match values.is_empty() {
@@ -121,7 +121,7 @@ mod tests {
 
     use super::*;
 
-    /// 64 frames of the given mean counts with normal noise, of 20 counts at `noisy` and 3 elsewhere.
+    /// 64 frames with the given mean counts and normal noise, of 20 counts at `noisy` and 3 elsewhere.
     fn run(shape: FrameShape, noisy: usize, mean: impl Fn(usize) -> f64) -> RunStatistics {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(7);
         let mut statistics = RunStatistics::new(shape);

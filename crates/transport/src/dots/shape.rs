@@ -3,13 +3,13 @@ use std::ops::Range;
 use super::DotsError;
 use super::error::check_range;
 
-/// Pixels of one word of a mask, and rows and columns of a residual's block.
+/// Number of pixels in one word of a mask, and number of rows and columns of a residual's block.
 pub const BLOCK_PX: usize = 32;
 
 /// Size of all frames of a rig: `[height, width, channels]`, row by row from the top, channels interleaved.
 ///
-/// A monochrome camera has one channel. So has a Bayer mosaic, which is processed as the mosaic that it is: products
-/// are sums of columns, so they may be demosaiced afterwards. Demosaiced frames have the three channels R, G, B.
+/// A monochrome camera has one channel. So has a Bayer mosaic, which is processed without demosaicing: products are
+/// sums of columns, so they can be demosaiced afterwards. Demosaiced frames have the three channels R, G, B.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameShape {
     height: usize,
@@ -30,58 +30,58 @@ impl FrameShape {
         Ok(Self { height, width, channels })
     }
 
-    /// Rows.
+    /// Number of rows.
     pub fn height(&self) -> usize {
         self.height
     }
 
-    /// Columns.
+    /// Number of columns.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Values of a pixel.
+    /// Values per pixel.
     pub fn channels(&self) -> usize {
         self.channels
     }
 
-    /// Pixels of a frame.
+    /// Pixels per frame.
     pub fn pixels(&self) -> usize {
         self.height * self.width
     }
 
-    /// Values of a frame.
+    /// Values per frame.
     pub fn values(&self) -> usize {
         self.pixels() * self.channels
     }
 
-    /// Words of 32 pixels of a frame.
+    /// Words of 32 pixels per frame.
     pub fn words(&self) -> usize {
         self.pixels() / BLOCK_PX
     }
 
-    /// Rows of blocks; the last may be cut off by the frame's end.
+    /// Number of rows of blocks; the last row may be cut off by the end of the frame.
     pub fn block_rows(&self) -> usize {
         self.height.div_ceil(BLOCK_PX)
     }
 
-    /// Blocks side by side.
+    /// Number of blocks in a row of blocks.
     pub fn block_columns(&self) -> usize {
         self.width / BLOCK_PX
     }
 
-    /// Blocks of a frame.
+    /// Blocks per frame.
     pub fn blocks(&self) -> usize {
         self.block_rows() * self.block_columns()
     }
 
-    /// The block that a word of 32 pixels lies in.
+    /// The block that contains a word of 32 pixels.
     pub(crate) fn block_of_word(&self, word: usize) -> usize {
         // A row of blocks has 32 rows of width / 32 words.
         word / self.width * self.block_columns() + word % self.block_columns()
     }
 
-    /// Pixels of a block.
+    /// Number of pixels in a block.
     pub(crate) fn pixels_of_block(&self, block: usize) -> usize {
         let first_row = block / self.block_columns() * BLOCK_PX;
         BLOCK_PX * BLOCK_PX.min(self.height - first_row)
@@ -98,7 +98,7 @@ pub struct Region {
 }
 
 impl Region {
-    /// All of a frame.
+    /// The whole frame.
     pub fn whole(shape: FrameShape) -> Self {
         Self { rows: 0..shape.height, columns: 0..shape.width }
     }

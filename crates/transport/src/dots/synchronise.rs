@@ -4,37 +4,39 @@ use super::error::{check_range, check_shape};
 use super::sensor::median;
 use super::{DotsError, FrameShape, Region};
 
-/// Batches that one missing trailing dot may join: the dot after it then confirms both.
+/// Largest number of batches between two seen trailing dots: one dot may be missing, as the next one confirms both
+/// batches.
 const MOST_BATCHES: u64 = 2;
 
-/// Frames that a scan may take more or less than it should. Mirror and camera have clocks of their own.
+/// Number of frames by which a scan may be longer or shorter than nominal, as mirror and camera have independent
+/// clocks.
 const DRIFT_FRAMES: u64 = 1;
 
-/// What the synchroniser needs to know of the scan.
+/// The synchroniser's settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SyncSettings {
     /// Frames from one trailing dot to the next.
     pub frames_per_batch: u32,
-    /// Index in the batch of the frame that shows the trailing dot, mostly the last.
+    /// Index in the batch of the frame that shows the trailing dot, usually the last.
     pub trailing_index: u32,
-    /// Energy of the region from which the dot is in it; see [`pulse_threshold`].
+    /// Energy from which the region counts as showing the dot; see [`pulse_threshold`].
     pub threshold: u64,
 }
 
-/// What the synchroniser sees of a frame.
+/// The properties of a frame that the synchroniser uses.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Observation {
-    /// The camera's number of the frame, which goes on where frames are lost; a count of frames where it has none.
+    /// The camera's frame id, which also counts lost frames; a running count of frames if the camera has no ids.
     pub id: u64,
     /// Sum of the counts in the region of the trailing dot.
     pub energy: u64,
-    /// Whether the frame is overexposed, so that its energy says nothing.
+    /// Whether the frame is overexposed, so that its energy is meaningless.
     pub saturated: bool,
 }
 
 impl Observation {
-    /// Looks at a raw frame, `[height, width, channels]`. It is saturated if more than half of the region's values are
-    /// at `full_scale` or above; so the region should be larger than the dot.
+    /// Evaluates a raw frame, `[height, width, channels]`. It is saturated if more than half of the region's values
+    /// are at `full_scale` or above, so the region should be larger than the dot.
     ///
     /// # Errors
     /// [`DotsError::Shape`] and [`DotsError::OutOfRange`] if frame or region do not fit the shape.
@@ -60,11 +62,11 @@ impl Observation {
     }
 }
 
-/// Halfway between the region's energy without and with the trailing dot, from a run of some batches: the median and
-/// the largest that is not saturated.
+/// Midpoint between the region's energy without and with the trailing dot, from a run of some batches: the median and
+/// the largest energy of the frames that are not saturated.
 ///
 /// # Errors
-/// [`DotsError::OutOfRange`] if no frame stands out of the others' noise.
+/// [`DotsError::OutOfRange`] if no frame exceeds the noise of the others.
 pub fn pulse_threshold(run: &[Observation]) -> Result<u64, DotsError> {
     let mut energies: Vec<f64> =
         run.iter().filter(|seen| !seen.saturated).map(|seen| seen.energy as f64).collect();
@@ -77,43 +79,44 @@ pub fn pulse_threshold(run: &[Observation]) -> Result<u64, DotsError> {
     Ok(((dark + largest) / 2.0) as u64)
 }
 
-/// Which frame of which batch a frame is, or why it is none.
+/// The batch and index of a frame, or the reason why it is not used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fate {
     /// A frame of a batch.
     Dot {
-        /// Scans since the first trailing dot that another one confirmed, whose own batch is 0.
+        /// Number of scans since the first trailing dot that was confirmed by another one, whose own batch is 0.
         batch: u64,
         /// Index in the batch, from 0.
         index: u32,
     },
-    /// Not to be used.
+    /// The frame must not be used.
     Unused(Cause),
 }
 
 /// Why a frame is not used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Cause {
-    /// No two trailing dots around it are whole batches apart.
+    /// It is not enclosed by two trailing dots a whole number of batches apart.
     Unsynchronised,
-    /// Its id, or a later one, has come before.
+    /// Its id, or a later one, has arrived before.
     Duplicate,
     /// It is overexposed.
     Saturated,
-    /// Its batch was longer by a frame, and another is nearer to the index.
+    /// Its batch had a frame too many, and another frame is nearer to the index.
     Surplus,
 }
 
-/// The fate of a frame, told once it is certain.
+/// The fate of a frame, reported once it is certain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Decided {
     /// The frame's number in the order of [`Synchroniser::push`], from 0.
     pub arrival: u64,
-    /// What it is.
+    /// Its fate.
     pub fate: Fate,
 }
 
-/// Where all frames went. `used + unsynchronised + duplicate + saturated + surplus` is the number of frames decided.
+/// The fates of all frames. `used + unsynchronised + duplicate + saturated + surplus` is the number of frames
+/// decided.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SyncCounts {
     /// Frames with a batch and an index.
@@ -126,31 +129,32 @@ pub struct SyncCounts {
     pub saturated: u64,
     /// See [`Cause::Surplus`].
     pub surplus: u64,
-    /// Ids that never came.
+    /// Ids that never arrived.
     pub dropped: u64,
-    /// Batches that were a frame longer or shorter than they should be.
+    /// Batches that were one frame longer or shorter than nominal.
     pub drifted: u64,
-    /// Trailing dots that were not seen, while the next one confirmed the batches.
+    /// Trailing dots that were not seen, but whose batches were confirmed by the next dot.
     pub bridged: u64,
 }
 
-/// Cuts the stream of frames into batches by the trailing dot, anew in every batch.
+/// Divides the stream of frames into batches at the trailing dots, independently for every batch.
 ///
-/// A frame's index is certain only when the trailing dots before and after it have been seen, one batch apart to a
-/// frame, or two where the one between is missing. Until then it waits; at most two batches and a few frames do. A drift
-/// is spread evenly over the batch. Frames that no two dots enclose so are told as unsynchronised, never guessed.
+/// A frame's index is certain only when the trailing dots before and after it have been seen at a distance of one
+/// batch, give or take a frame, or two batches if the dot between is missing. Until then the frame waits; at most two
+/// batches and a few frames are waiting. Drift is distributed evenly over the batch. Frames that are not enclosed by
+/// two such dots are reported as unsynchronised, never guessed.
 #[derive(Debug, Clone)]
 pub struct Synchroniser {
     settings: SyncSettings,
     arrivals: u64,
     last_id: Option<u64>,
     was_lit: bool,
-    /// Frames without a fate, by id.
+    /// Undecided frames, by id.
     pending: VecDeque<Pending>,
-    /// The last trailing dot that was confirmed, or to which a chain of them was lost.
+    /// The last confirmed trailing dot. It is kept when synchronisation is lost, to number later batches.
     anchor: Option<Anchor>,
     locked: bool,
-    /// Later dots that do not fit the anchor, until another confirms one.
+    /// Later dots that do not fit the anchor, until one is confirmed by another.
     candidates: VecDeque<u64>,
     decided: Vec<Decided>,
     counts: SyncCounts,
@@ -171,13 +175,13 @@ struct Anchor {
 
 impl Synchroniser {
     /// # Errors
-    /// [`DotsError::OutOfRange`] for fewer than 8 frames a batch, or a trailing index beyond them.
+    /// [`DotsError::OutOfRange`] for fewer than 8 frames per batch, or a trailing index outside the batch.
     pub fn new(settings: SyncSettings) -> Result<Self, DotsError> {
         let frames = settings.frames_per_batch;
         check_range("frames_per_batch", frames.into(), frames >= 8, "at least 8")?;
         let index = settings.trailing_index;
         check_range("trailing_index", index.into(), index < frames, "below frames_per_batch")?;
-        // So that nothing grows while frames come.
+        // Allocated in advance, so that nothing grows while frames arrive.
         let waiting = (MOST_BATCHES * (u64::from(frames) + DRIFT_FRAMES)) as usize + 2;
         Ok(Self {
             settings,
@@ -193,7 +197,7 @@ impl Synchroniser {
         })
     }
 
-    /// Takes the next frame and tells which frames' fates have become certain.
+    /// Takes the next frame and returns the frames whose fates have become certain.
     pub fn push(&mut self, seen: Observation) -> &[Decided] {
         self.decided.clear();
         let arrival = self.arrivals;
@@ -210,7 +214,7 @@ impl Synchroniser {
         self.last_id = Some(seen.id);
         self.pending.push_back(Pending { arrival, id: seen.id, saturated: seen.saturated });
 
-        // A dot that two frames share counts at the first.
+        // A dot that spans two frames counts at the first.
         if !seen.saturated {
             let is_lit = seen.energy >= self.settings.threshold;
             if is_lit && !self.was_lit {
@@ -222,7 +226,7 @@ impl Synchroniser {
         &self.decided
     }
 
-    /// Ends the stream: what still waits belongs to a batch that was not completed.
+    /// Ends the stream. Frames that still wait belong to an incomplete batch.
     pub fn finish(&mut self) -> &[Decided] {
         self.decided.clear();
         self.reject_until(u64::MAX);
@@ -231,7 +235,7 @@ impl Synchroniser {
         &self.decided
     }
 
-    /// Where all frames went so far.
+    /// The fates of all frames so far.
     pub fn counts(&self) -> SyncCounts {
         self.counts
     }
@@ -254,14 +258,14 @@ impl Synchroniser {
         }
     }
 
-    /// How many batches lie between two trailing dots, if the distance is whole batches.
+    /// Number of batches between two trailing dots, if their distance is a whole number of batches.
     fn batches(&self, first: u64, last: u64) -> Option<u64> {
         let distance = last - first;
         let frames = u64::from(self.settings.frames_per_batch);
         (1..=MOST_BATCHES).find(|batches| distance.abs_diff(batches * frames) <= batches * DRIFT_FRAMES)
     }
 
-    /// Scans from one dot to another, however many frames were lost between.
+    /// Number of scans from one dot to another, however many frames were lost in between.
     fn scans_between(&self, first: u64, last: u64) -> u64 {
         let frames = u64::from(self.settings.frames_per_batch);
         ((last - first + frames / 2) / frames).max(1)
@@ -275,7 +279,7 @@ impl Synchroniser {
         self.counts.bridged += batches - 1;
         let mut last_step = None;
         while let Some(frame) = self.next_until(id) {
-            // Steps of the scan since the anchor; frames in the middle of theirs.
+            // Steps of the scan since the anchor, taken at the middle of each frame.
             let step = (2 * (frame.id - anchor.id) - 1) * should / (2 * took);
             let index = u64::from(self.settings.trailing_index) + 1 + step;
             let fate = match frame.saturated {
@@ -293,7 +297,7 @@ impl Synchroniser {
         self.candidates.clear();
     }
 
-    /// Gives up the anchor when no later frame can confirm it, and frames that nothing can enclose any more.
+    /// Drops the anchor if no later frame can confirm it, and frames that can no longer be enclosed.
     fn give_up_before(&mut self, id: u64) {
         let frames = u64::from(self.settings.frames_per_batch);
         let too_far = |first: u64, batches: u64| id - first > batches * (frames + DRIFT_FRAMES);
@@ -308,7 +312,7 @@ impl Synchroniser {
         }
     }
 
-    /// The frame that has waited longest, if its id is not beyond this one.
+    /// The frame that has waited longest, if its id is at most `id`.
     fn next_until(&mut self, id: u64) -> Option<Pending> {
         let due = self.pending.front().is_some_and(|frame| frame.id <= id);
         if due { self.pending.pop_front() } else { None }
@@ -346,13 +350,13 @@ mod tests {
         SyncSettings { frames_per_batch: FRAMES, trailing_index, threshold: 1000 }
     }
 
-    /// A frame of the scan: its place among all steps of the mirror, and what is seen of it.
+    /// A frame of the scan: its step among all steps of the mirror, and its observation.
     fn at(step: u64, id: u64, trailing_index: u32) -> (u64, Observation) {
         let lit = step % u64::from(FRAMES) == u64::from(trailing_index);
         (step, Observation { id, energy: if lit { 1900 } else { 100 }, saturated: false })
     }
 
-    /// Fates in the order of arrival; each frame has exactly one.
+    /// Fates in order of arrival; each frame has exactly one.
     fn fates(stream: &[(u64, Observation)], trailing_index: u32) -> (Vec<Fate>, SyncCounts) {
         let mut synchroniser = Synchroniser::new(settings(trailing_index)).unwrap();
         let mut fates = vec![None; stream.len()];
@@ -372,7 +376,7 @@ mod tests {
         (fates.into_iter().map(|fate| fate.unwrap()).collect(), counts)
     }
 
-    /// Steps of the mirror between the truth and what the labels say, for all frames that have one.
+    /// Difference between the labels and the truth in steps of the mirror, for all labelled frames.
     fn errors(stream: &[(u64, Observation)], fates: &[Fate]) -> Vec<(u64, i64)> {
         let labelled = stream.iter().zip(fates).filter_map(|((step, _), fate)| match fate {
             Fate::Dot { batch, index } => {
@@ -381,7 +385,7 @@ mod tests {
             Fate::Unused(_) => None,
         });
         let mut errors: Vec<(u64, i64)> = labelled.collect();
-        // Which scan is number 0 is open, but it is a whole one.
+        // The number of the first scan is arbitrary, but the offset must be a whole number of scans.
         let number_0 = errors[0].1;
         assert_eq!(number_0 % i64::from(FRAMES), 0);
         errors.iter_mut().for_each(|(_, error)| *error -= number_0);
@@ -420,7 +424,7 @@ mod tests {
         }
     }
 
-    /// Streams of ten scans, which `change` may alter before they are looked at.
+    /// Streams of ten scans; `change` may alter them before they are processed.
     fn ten_scans(
         change: impl Fn(&mut Vec<(u64, Observation)>),
     ) -> (Vec<(u64, Observation)>, Vec<Fate>, SyncCounts) {
@@ -441,7 +445,7 @@ mod tests {
     #[test]
     fn a_drift_of_one_frame_is_followed_and_spread() {
         for longer in [true, false] {
-            // The fifth scan takes a frame more or less, and all later ones begin so much later.
+            // The fifth scan takes one frame more or less, so all later scans are shifted by a frame.
             let (stream, fates, counts) = ten_scans(|stream| {
                 match longer {
                     true => stream.insert(225, stream[225]),
@@ -480,7 +484,7 @@ mod tests {
 
     #[test]
     fn a_trailing_dot_right_after_a_gap_is_one_of_its_own() {
-        // All that lay between two of them is lost, so they follow each other.
+        // Everything between two dots is lost, so the dots follow each other directly.
         let stream: Vec<_> = (0..100).chain(149..301).map(|step| at(step, step, 49)).collect();
         let (fates, counts) = fates(&stream, 49);
         assert_eq!((counts.bridged, counts.drifted), (0, 0));
@@ -493,7 +497,7 @@ mod tests {
             for flash in [220, 248] {
                 (stream[flash].1.energy, stream[flash].1.saturated) = (900_000, true);
             }
-            // Not overexposed, and in nobody's place.
+            // Not overexposed, but not at the position of a trailing dot.
             stream[333].1.energy = 5000;
         });
         assert_eq!((counts.used, counts.saturated, counts.unsynchronised), (448, 2, 50));

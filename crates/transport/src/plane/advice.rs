@@ -1,4 +1,4 @@
-//! What error a plan must expect, and which plan of the same length must expect less: before anything is captured.
+//! Predicts the error of a plan before anything is captured, and finds plans of the same length with a smaller error.
 
 use std::ops::RangeInclusive;
 
@@ -7,22 +7,23 @@ use rayon::prelude::*;
 
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SlotKind, cholesky, reach};
 
-/// Noise of the camera, in the units of the transport: 1 is what a white pixel collects in one row time.
+/// Noise of the camera, in the units of the transport: 1 is the light that a white pixel collects in one row time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Noise {
     /// Standard deviation of a dark sample of one frame, quantisation included.
     pub read: f64,
-    /// Variance of one frame's sample per light collected: the reciprocal of the electrons of a white pixel's row.
+    /// Variance of one frame's sample per unit of light: the reciprocal of the electrons that a white pixel collects
+    /// per row.
     pub gain: f64,
     /// Frames averaged per setting.
     pub frames: u32,
-    /// Frames of the dark image that is subtracted from all images of one exposure, which all err by its noise; none
-    /// where nothing is subtracted.
+    /// Number of frames averaged in the dark image that is subtracted from all images of one exposure, which
+    /// therefore share its noise; `None` if no dark image is subtracted.
     pub dark_frames: Option<u32>,
 }
 
 impl Noise {
-    /// Variance of the mean of the frames where `light` is collected.
+    /// Variance of the mean of the frames when `light` is collected.
     fn variance(&self, light: f64) -> f64 {
         (self.read.powi(2) + self.gain * light.max(0.0)) / f64::from(self.frames.max(1))
     }
@@ -35,36 +36,35 @@ impl Noise {
 
 /// Expected errors of a white pixel in the middle of the frame, in white units.
 ///
-/// They are those of the linear estimator `H^-1 A' I` with `H = A'A + alpha D'D`: `T >= 0` and beta, which only help
-/// (the paper's prior, which smears the own row without them, by a factor of 3), are left out, and timing, beam and
-/// white level are taken as true. The pixel receives 1 from its own row and [`INDIRECT_PER_ROW`] from all others; around
-/// that, neighbouring rows differ such that the prior's weighted differences have the standard deviation [`ROUGHNESS`].
-/// So the error has two parts: the noise of the samples and of the dark images, and what smoothing takes away or
-/// settings do not see.
+/// They are the errors of the linear estimator `H^-1 A' I` with `H = A'A + alpha D'D`. `T >= 0` and beta are left
+/// out; they only reduce the error (for the paper's prior, which blurs the pixel's own row without them, by a factor
+/// of 3). Timing, beam and white level are assumed to be exact. The pixel receives 1 from its own row and
+/// [`INDIRECT_PER_ROW`] from each other row. Around that, neighbouring rows differ such that the prior's weighted
+/// differences have the standard deviation [`ROUGHNESS`]. The error therefore has two parts: the noise of the samples
+/// and of the dark images, and the bias from smoothing and from rows that the settings do not see.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ExpectedError {
-    /// Standard deviation of the pixel's own row, `u = 0`.
+    /// Standard error of the pixel's own row, `u = 0`.
     pub epipolar: f64,
-    /// Of the sum over `1 <= |u| <= 10`.
+    /// Standard error of the sum over `1 <= |u| <= 10`.
     pub short_range: f64,
-    /// Of the sum over `|u| > 10` within the reach.
+    /// Standard error of the sum over `|u| > 10` within the reach.
     pub long_range: f64,
-    /// Of the profile: the square root of the expected sum of squared errors of all rows.
+    /// Error of the profile: the square root of the expected sum of squared errors of all rows.
     pub profile: f64,
 }
 
-/// Indirect light that a white pixel is taken to receive from each row: 0.38 in all from a 128-row scene. A rendered
-/// corner of two boards has 0.0026 per direct light of 1.
+/// Indirect light that a white pixel is assumed to receive from each row: 0.38 in total from a scene of 128 rows. In
+/// a rendered corner of two boards it is 0.0026 per direct light of 1.
 pub const INDIRECT_PER_ROW: f64 = 0.003;
 
-/// Standard deviation of `|u| (T(u+1) - T(u))` that profiles are taken to have. The rendered corner has 0.011 per direct
-/// light of 1.
+/// Assumed standard deviation of `|u| (T(u+1) - T(u))`. In the rendered corner it is 0.011 per direct light of 1.
 pub const ROUGHNESS: f64 = 0.01;
 
 /// Farthest row that counts as short-range.
 const SHORT_RANGE_ROWS: i32 = 10;
 
-/// The error to expect from `settings`, one delay each, when the rows of `reach` are estimated.
+/// The expected error of `settings`, one delay each, when the rows of `reach` are estimated.
 ///
 /// # Errors
 /// Those of [`RowTiming::check`]; [`PlaneError::NotConvex`].
@@ -81,7 +81,7 @@ pub fn expected_error(
     let smoothness = differences.t().dot(&differences) * prior.alpha();
     let n = slots.len();
     let mut h = weights.t().dot(&weights) + &smoothness;
-    // Rows that nothing determines must not make it singular.
+    // Undetermined rows must not make it singular.
     h.diag_mut().mapv_inplace(|diagonal| if diagonal > 0.0 { diagonal * (1.0 + 1e-12) } else { 1.0 });
     let mut inverse: Vec<f64> = h.into_iter().collect();
     cholesky::invert(&mut inverse, n).map_err(|cholesky::NotPositiveDefinite| PlaneError::NotConvex)?;
@@ -91,14 +91,14 @@ pub fn expected_error(
         0 => 1.0,
         _ => INDIRECT_PER_ROW,
     }));
-    // What is wrong with the right side `A'I` of `H T = A'I`: its covariance,
+    // Errors of the right-hand side `A'I` of `H T = A'I`: its covariance,
     let variances = weights.dot(&truth).mapv(|light| noise.variance(light)).insert_axis(Axis(1));
     let mut wrong = weights.t().dot(&(&weights * &variances));
     wrong.scaled_add(prior.alpha() * ROUGHNESS.powi(2), &smoothness);
     for exposed in of_each_exposure(settings, &weights) {
         add_square(&mut wrong, noise.dark_variance(), &exposed);
     }
-    // and where smoothing draws away from the truth even without noise.
+    // and the bias from smoothing, which exists even without noise.
     add_square(&mut wrong, 1.0, &smoothness.dot(&truth));
 
     let covariance_half = inverse.dot(&wrong);
@@ -121,7 +121,7 @@ pub fn expected_error(
     })
 }
 
-/// Sums of the weights of the settings of each exposure: what an error of its dark image adds to `A'I`.
+/// Sums of the weights of the settings of each exposure: the effect of an error of its dark image on `A'I`.
 fn of_each_exposure(settings: &[Setting], weights: &Array2<f64>) -> Vec<Array1<f64>> {
     let mut sums: Vec<(f64, Array1<f64>)> = Vec::new();
     for (setting, weights) in settings.iter().zip(weights.rows()) {
@@ -140,7 +140,7 @@ fn add_square(to: &mut Array2<f64>, factor: f64, x: &Array1<f64>) {
     }
 }
 
-/// What the pixel that [`ExpectedError`] is about collects under a setting.
+/// The light that the pixel of [`ExpectedError`] collects with a setting.
 pub fn white_light(timing: &RowTiming, setting: &Setting) -> f64 {
     let row = timing.camera_rows() / 2;
     let weights = timing.weights(row, setting);
@@ -167,30 +167,30 @@ impl SweepGrid {
     }
 }
 
-/// What to expect of a sweep, and which to take instead.
+/// The expected error of a sweep, and a better sweep if there is one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Advice {
-    /// Of the sweep.
+    /// Expected error of the sweep.
     pub expected: ExpectedError,
-    /// One of at most as many points that is worth the change, and what to expect of it.
+    /// A better sweep of at most as many points that is worth the change, and its expected error.
     pub better: Option<(SweepGrid, ExpectedError)>,
 }
 
-/// Share of a plan's expected error of the profile below which another is worth the change.
+/// Another sweep is worth the change if its expected error of the profile is below this share of the plan's.
 const WORTHWHILE: f64 = 0.9;
 
-/// How much larger than the plan's another's error of a band may be.
+/// Largest allowed ratio between the other sweep's error of a band and the plan's.
 const HARMLESS: f64 = 1.1;
 
-/// Foresees `plan`, and of the grids of at most as many points over the same delays and exposures finds that with the
-/// smallest expected error of the profile, if that is smaller by 10 % and that of no band larger by 10 %. Tried are the
-/// longest exposure alone and two to four of them, with delays that are even or dense near 0 (`± d_max (k/h)^p`); all
-/// reach as far as `plan`.
+/// Predicts the error of `plan`. Among the grids of at most as many points over the same delays and exposures, finds
+/// the one with the smallest expected error of the profile, provided that it is smaller by 10 % and that no band's
+/// error is larger by 10 %. The candidates use the longest exposure alone and two to four of the exposures, with
+/// delays that are evenly spaced or denser near 0 (`± d_max (k/h)^p`); all have the same reach as `plan`.
 ///
-/// `usable` gives the settings of a grid whose images will serve, nothing where the rig cannot take the grid.
+/// `usable` returns the settings of a grid whose images will be usable, or `None` if the rig cannot acquire the grid.
 ///
 /// # Errors
-/// Those of [`reach`] and [`expected_error`]; [`PlaneError::NoDelays`] if no setting of `plan` serves.
+/// Those of [`reach`] and [`expected_error`]; [`PlaneError::NoDelays`] if no setting of `plan` is usable.
 pub fn advise(
     timing: &RowTiming,
     plan: &SweepGrid,
@@ -219,10 +219,10 @@ pub fn advise(
     Ok(Advice { expected, better })
 }
 
-/// Powers by which delays thin out away from 0 in the grids that are dense there.
+/// Exponents by which the delays of the denser grids spread out away from 0.
 const DENSITIES: [f64; 2] = [1.3, 1.7];
 
-/// Most exposures of the grids that are tried.
+/// Largest number of exposures in candidate grids.
 const MAX_EXPOSURES: usize = 4;
 
 fn alternatives(plan: &SweepGrid) -> Vec<SweepGrid> {
@@ -241,11 +241,11 @@ fn alternatives(plan: &SweepGrid) -> Vec<SweepGrid> {
             let delays_us = even(first_us, last_us, delays);
             grids.push(SweepGrid { delays_us, exposures_us: exposures_us.clone() });
         }
-        // On each side of a delay of 0.
+        // Number of delays on each side of 0.
         let half = delays.saturating_sub(1) / 2;
         if half > 0 && first_us < 0.0 && last_us > 0.0 {
             for density in DENSITIES {
-                // Nobody wants to read, and no camera keeps, more digits.
+                // Rounded: more digits are neither readable nor used by any camera.
                 let place = |far_us: f64, k: usize| {
                     (far_us * (k as f64 / half as f64).powf(density) * 10.0).round() / 10.0
                 };
@@ -264,7 +264,7 @@ fn range_of(values: &[f64]) -> (f64, f64) {
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &value| (low.min(value), high.max(value)))
 }
 
-/// `count` values from `first` to `last`, of which there are at least two.
+/// `count` evenly spaced values from `first` to `last`, at least two.
 fn even(first: f64, last: f64, count: usize) -> Vec<f64> {
     (0..count).map(|k| first + (last - first) * k as f64 / (count - 1) as f64).collect()
 }
@@ -291,14 +291,14 @@ mod tests {
         }
     }
 
-    /// 15 electrons of read noise and 4884 electrons of a white pixel's row.
+    /// 15 electrons of read noise, and 4884 electrons that a white pixel collects per row.
     fn noise(frames: u32) -> Noise {
         Noise { read: 15.0 / 4884.0, gain: 1.0 / 4884.0, frames, dark_frames: None }
     }
 
     #[test]
     fn one_row_by_hand() {
-        // One row, seen whole by four settings: the mean of four samples of variance 0.01 + 0.04.
+        // One row, seen completely by four settings: the mean of four samples of variance 0.01 + 0.04.
         let timing = RowTiming::new(1, 20.0, 100.0).unwrap();
         let settings = vec![Setting::new(0.0, 20.0); 4];
         let noise = Noise { read: 0.1, gain: 0.04, frames: 1, dark_frames: None };
@@ -310,7 +310,8 @@ mod tests {
         let close = |found: f64, variance: f64| assert!((found - variance.sqrt()).abs() < 1e-9, "{found}");
         close(epipolar(&settings, &noise), 0.05 / 4.0);
         close(epipolar(&settings, &Noise { frames: 4, ..noise }), 0.05 / 16.0);
-        // The dark image of five frames is the same for all four, and another for a fifth of half the row.
+        // All four settings share the dark image of five frames; a fifth setting, which sees half of the row, has
+        // another.
         let noise = Noise { dark_frames: Some(5), ..noise };
         close(epipolar(&settings, &noise), 0.05 / 4.0 + 0.01 / 5.0);
         let fifth = [settings, vec![Setting::new(0.0, 10.0)]].concat();
@@ -320,7 +321,7 @@ mod tests {
 
     #[test]
     fn white_light_by_hand() {
-        // Rows 63, 64, 65 whole and half of rows 62 and 66.
+        // Rows 63, 64, 65 completely and half of rows 62 and 66.
         let light = white_light(&timing(), &Setting::new(0.0, 4.0 * TAU_US));
         assert!((light - (1.0 + 3.0 * INDIRECT_PER_ROW)).abs() < 1e-9);
         let beside = white_light(&timing(), &Setting::new(500.0, 4.0 * TAU_US));
@@ -329,13 +330,13 @@ mod tests {
 
     #[test]
     fn the_solver_errs_as_much_as_expected() {
-        // Noise decides with the usual alpha, smoothing with the second.
+        // Noise dominates with the usual alpha, smoothing with the second.
         solver_errs_as_expected(0.1);
         solver_errs_as_expected(30.0);
     }
 
     fn solver_errs_as_expected(alpha: f64) {
-        // A profile so bright that T >= 0 never binds, of the roughness that is assumed, in many pixels.
+        // Many pixels with a profile so bright that T >= 0 never binds, with the assumed roughness.
         const PIXELS: usize = 300;
         let (timing, settings) = (timing().window(64, 1).unwrap(), paper_grid().settings());
         let prior = Prior::Split { alpha, beta: 0.0 };
@@ -348,7 +349,7 @@ mod tests {
         let rows = timing.projector_rows();
         let mut truth = Array2::zeros((rows, PIXELS));
         for mut profile in truth.columns_mut() {
-            // Outwards from beside the own row, each row differs from the one before by its share of the roughness.
+            // Outwards from the own row, each row differs from the previous one by its share of the roughness.
             let sides = [(64 + 1..rows).collect::<Vec<_>>(), (0..64).rev().collect()];
             for side in sides {
                 let mut light = 1.0;
@@ -386,7 +387,7 @@ mod tests {
             deviation(&|pixel| error(54, 63, pixel) + error(65, 74, pixel)),
             deviation(&|pixel| error(0, 53, pixel) + error(75, 127, pixel)),
         ];
-        // 300 pixels know a standard deviation to 4 %.
+        // 300 pixels determine a standard deviation to 4 %.
         let foreseen = [expected.epipolar, expected.short_range, expected.long_range];
         for (measured, foreseen) in measured.into_iter().zip(foreseen) {
             assert!((measured / foreseen - 1.0).abs() < 0.15, "{measured} is not {foreseen}");
@@ -436,7 +437,7 @@ mod tests {
         assert_ne!(advise(&|grid| Some(grid.settings())).unwrap().better.unwrap().0.exposures_us, [1200.0]);
         let (grid, _) = advise(&|grid| long(grid).then(|| grid.settings())).unwrap().better.unwrap();
         assert_eq!(grid.exposures_us, [1200.0]);
-        // Settings that do not serve are not counted on, and a plan without any that does has no error.
+        // Settings that are not usable do not count, and a plan without usable settings has no error.
         let few = advise(&|grid| Some(grid.settings().into_iter().step_by(3).collect())).unwrap();
         assert!(few.expected.profile > advise(&|grid| Some(grid.settings())).unwrap().expected.profile);
         assert_eq!(advise(&|_| None), Err(PlaneError::NoDelays { index: 0 }));

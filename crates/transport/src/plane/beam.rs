@@ -1,9 +1,9 @@
 use super::PlaneError;
 
-/// How the light that the projector draws as one row spreads over the rows of the scene.
+/// The spread of the light of one projector row over the rows of the scene.
 ///
-/// The same profile everywhere: a place `d` rows away from the row drawn receives the share `g(d)` of its light, and
-/// the shares sum to 1. Light that leaves the frame at its upper or lower border is lost to the model.
+/// The profile is the same everywhere: a point `d` rows away from the row drawn receives the share `g(d)` of its
+/// light, and the shares sum to 1. Light that leaves the frame at its upper or lower border is lost to the model.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Beam {
     /// All light falls on the row drawn.
@@ -11,21 +11,21 @@ pub enum Beam {
     Ideal,
     /// A Gaussian sampled at the rows' centres.
     Gaussian {
-        /// Standard deviation.
+        /// Standard deviation in rows.
         sigma_rows: f64,
     },
 }
 
-/// Standard deviations after which a Gaussian's tail is cut off: what lies beyond is below 1e-6 of the light.
+/// A Gaussian's tail is cut off after this many standard deviations: less than 1e-6 of the light is beyond.
 const TAIL_SIGMAS: f64 = 5.0;
 
 impl Beam {
-    /// A Gaussian beam, or the ideal one for a standard deviation of 0.
+    /// A Gaussian beam, or the ideal beam for a standard deviation of 0.
     pub fn of_sigma(sigma_rows: f64) -> Self {
         if sigma_rows == 0.0 { Self::Ideal } else { Self::Gaussian { sigma_rows } }
     }
 
-    /// Standard deviation, 0 for the ideal beam.
+    /// Standard deviation in rows; 0 for the ideal beam.
     pub fn sigma_rows(&self) -> f64 {
         match *self {
             Self::Ideal => 0.0,
@@ -36,7 +36,7 @@ impl Beam {
     /// Checks the profile's extent.
     ///
     /// # Errors
-    /// [`PlaneError::OutOfRange`] for a standard deviation that is not above 0, or above 100 rows.
+    /// [`PlaneError::OutOfRange`] unless the standard deviation is above 0 and at most 100 rows.
     pub fn check(&self) -> Result<(), PlaneError> {
         match *self {
             Self::Gaussian { sigma_rows } if !(sigma_rows > 0.0 && sigma_rows <= 100.0) => {
@@ -50,8 +50,8 @@ impl Beam {
         }
     }
 
-    /// What the scene's rows weigh, given what the drawn rows weigh: `A' = A B`, for one row of `A`. Both hold one
-    /// entry per projector row; drawn rows beyond the borders do not exist and send nothing.
+    /// Converts the weights of the drawn rows to those of the scene's rows: `A' = A B`, for one row of `A`. Both have
+    /// one entry per projector row; there are no drawn rows beyond the borders.
     pub(super) fn spread(&self, drawn: Vec<f64>) -> Vec<f64> {
         let Self::Gaussian { sigma_rows } = *self else { return drawn };
         let reach_rows = (TAIL_SIGMAS * sigma_rows).ceil() as usize;
@@ -82,7 +82,7 @@ mod tests {
         for d in 1..=20 {
             assert_eq!(lit[20 - d], lit[20 + d]);
         }
-        // exp(-1/(2 1.5^2)) of the peak one row away; the variance is that of the Gaussian.
+        // exp(-1/(2 1.5^2)) of the peak at a distance of one row; the variance is that of the Gaussian.
         assert!((lit[21] / lit[20] - (-1.0_f64 / 4.5).exp()).abs() < 1e-12);
         let variance: f64 = lit.iter().zip(-20..).map(|(l, d): (_, i32)| l / 2.0 * f64::from(d * d)).sum();
         assert!((variance - 2.25).abs() < 1e-3, "{variance}");

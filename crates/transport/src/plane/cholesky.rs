@@ -1,10 +1,12 @@
-//! Cholesky factors of small dense matrices, row by row, so that every inner loop runs over contiguous memory.
+//! Cholesky factors of small dense matrices, computed row by row, so that every inner loop runs over contiguous
+//! memory.
 
 /// A matrix is not positive definite.
 #[derive(Debug)]
 pub(super) struct NotPositiveDefinite;
 
-/// Replaces the lower triangle of the row-major `n` x `n` matrix `a` by its Cholesky factor; the rest is not read.
+/// Replaces the lower triangle of the row-major `n` x `n` matrix `a` by its Cholesky factor; the upper triangle is
+/// not read.
 #[inline(always)]
 pub(super) fn factor(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
     for i in 0..n {
@@ -37,12 +39,12 @@ pub(super) fn solve(l: &[f64], n: usize, b: &mut [f64]) {
     }
 }
 
-/// Replaces the lower triangle of the symmetric positive definite `n` x `n` matrix `a` by that of its inverse; the rest
-/// is left undefined.
+/// Replaces the lower triangle of the symmetric positive definite `n` x `n` matrix `a` by that of its inverse; the
+/// upper triangle is left undefined.
 #[inline(always)]
 pub(super) fn invert(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
     factor(a, n)?;
-    // Row by row, so that all inner loops run along rows: first L^-1, which is lower triangular too,
+    // Row by row, so that all inner loops run along rows: first L^-1, which is also lower triangular,
     let mut inverse = vec![0.0; n * n];
     for i in 0..n {
         let (above, rest) = inverse.split_at_mut(i * n);
@@ -55,7 +57,7 @@ pub(super) fn invert(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite>
         let reciprocal = a[i * n + i].recip();
         row[..=i].iter_mut().for_each(|row| *row *= reciprocal);
     }
-    // then L'^-1 times that, of which the lower triangle is enough.
+    // then L'^-1 times L^-1, of which only the lower triangle is needed.
     for i in (0..n).rev() {
         let (upto, below) = inverse.split_at_mut((i + 1) * n);
         let row = &mut upto[i * n..=i * n + i];

@@ -7,55 +7,58 @@ use super::{NoiseModel, PlaneError};
 /// Spatial coupling: averages neighbouring pixels of a stack that see the same kind of light, before [`super::Demux`]
 /// solves each pixel by itself.
 ///
-/// Neighbours on one surface receive the same light from the same relative rows, up to their albedo. So a neighbour's
-/// stack is scaled to the pixel's own total over the settings, which cancels texture, and compared with the pixel's.
-/// What it differs by beyond the noise of both is taken for a bias, and the more of it there is, the less the
-/// neighbour counts. This is a joint bilateral filter (Petschnigg et al., "Digital Photography with Flash and No-Flash
-/// Image Pairs", SIGGRAPH 2004) that compares whole vectors, as non-local means does (Buades et al., "A Non-Local
-/// Algorithm for Image Denoising", CVPR 2005); the vector is the stack. As noise vanishes it becomes the identity.
+/// Neighbours on one surface receive the same light from the same relative rows, except for their albedo. A
+/// neighbour's stack is therefore scaled to the pixel's own total over the settings, which cancels texture, and
+/// compared with the pixel's. Differences beyond the noise of both are treated as bias, and the larger the bias, the
+/// smaller the neighbour's weight. This is a joint bilateral filter (Petschnigg et al., "Digital Photography with
+/// Flash and No-Flash Image Pairs", SIGGRAPH 2004) that compares whole vectors, as non-local means does (Buades et
+/// al., "A Non-Local Algorithm for Image Denoising", CVPR 2005); here the vector is the stack. As noise vanishes, the
+/// filter becomes the identity.
 ///
-/// A pixel depends on those up to [`Self::radius_px`] rows and columns away and on no others: a tile with that halo
-/// gives the bits of the whole.
+/// A pixel depends only on those up to [`Self::radius_px`] rows and columns away: a tile with that halo gives the
+/// same bits as the whole image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Coupling {
-    /// The window is `2 radius_px + 1` pixels wide and high; 0 leaves the stack as it is. Time grows with its area.
+    /// The window is `2 radius_px + 1` pixels wide and high; 0 leaves the stack unchanged. Time grows with its area.
     pub radius_px: usize,
 }
 
 impl Default for Coupling {
-    /// 7 x 7 pixels: wider windows find few more pixels that are alike.
+    /// 7 x 7 pixels: wider windows find few more similar pixels.
     fn default() -> Self {
         Self { radius_px: 3 }
     }
 }
 
-/// A stack after [`Coupling::apply`].
+/// The result of [`Coupling::apply`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Coupled {
-    /// Shape and units of the stack that was given. Masked samples are unchanged.
+    /// Same shape and units as the input stack. Masked samples are unchanged.
     pub stack: Array3<f32>,
-    /// Share of the variance that noise keeps in each pixel, `[t, s]`: 1 where no neighbour helped, 1/49 where all of
-    /// a 7 x 7 window did. It holds for the profile's shape; the noise of a pixel's total over the settings stays.
+    /// Share of the noise variance that remains in each pixel, `[t, s]`: 1 if no neighbour contributed, 1/49 if all
+    /// of a 7 x 7 window did. It applies to the profile's shape; the noise of a pixel's total over the settings
+    /// stays.
     pub variance_ratio: Array2<f32>,
 }
 
-/// How fast a neighbour's weight falls with its bias. Chosen on the corner and on the simulator's scenes together, where
-/// 30 gives figures that mostly lie within 12 % of these.
+/// How fast a neighbour's weight falls with its bias. Chosen on the corner and on the simulator's scenes together,
+/// where 30 gives results that mostly lie within 12 % of these.
 const BIAS_WEIGHT: f32 = 10.0;
-/// A pixel's total must exceed its own noise this many times, for the pixel to be scaled to others.
+/// A pixel's total must exceed its own noise by this factor for the pixel to be scaled to others.
 const MIN_TOTAL_SD: f32 = 3.0;
-/// Columns that are computed together: two vectors of the narrowest machine.
+/// Columns that are computed together: two vectors on the machine with the narrowest vectors.
 const LANES: usize = 8;
 type Lanes = [f32; LANES];
 /// Keeps quotients defined where neither the light nor the model has any noise.
 const MIN_VARIANCE: f32 = 1e-20;
 
 impl Coupling {
-    /// Averages like neighbours in `stack`, `[settings, t, s]`, whose images are means of `frames[setting]` frames.
+    /// Averages similar neighbours in `stack`, `[settings, t, s]`, whose images are means of `frames[setting]`
+    /// frames.
     ///
-    /// `valid`, of the same shape, tells which samples may be used: others neither give nor take, and pixels are
-    /// compared over the settings that both have. A pixel too dark to tell its total from noise keeps its samples and
-    /// lends none. Rows are treated in parallel, with the same bits for any number of threads.
+    /// `valid`, of the same shape, tells which samples may be used: invalid ones are neither changed nor used, and
+    /// pixels are compared over the settings that are valid in both. A pixel whose total does not exceed its noise is
+    /// neither changed nor used. Rows are processed in parallel, with the same bits for any number of threads.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if `valid` or `frames` do not fit; [`PlaneError::NotFinite`] for a NaN or an infinity,
@@ -80,7 +83,7 @@ impl Coupling {
         let mut coupled = Coupled { stack: stack.to_owned(), variance_ratio: Array2::ones((rows, columns)) };
         let out = coupled.stack.axis_iter_mut(Axis(1)).into_par_iter();
         let ratios = coupled.variance_ratio.axis_iter_mut(Axis(0)).into_par_iter();
-        // The compiler's vectors are as wide as the machine's; the bits are the same at any width.
+        // The compiler uses vectors as wide as the machine's; the bits are the same at any width.
         let arch = pulp::Arch::new();
         out.zip(ratios).enumerate().for_each(|(t, (out, ratio))| {
             arch.dispatch(
@@ -92,7 +95,7 @@ impl Coupling {
     }
 }
 
-/// What all rows share.
+/// Data shared by all rows.
 struct Images<'a> {
     stack: ArrayView3<'a, f32>,
     valid: Option<ArrayView3<'a, bool>>,
@@ -101,7 +104,7 @@ struct Images<'a> {
 }
 
 impl Images<'_> {
-    /// Couples camera row `t`: `out` `[settings, columns]` holds its samples, `ratio` `[columns]` ones.
+    /// Couples camera row `t`: `out` `[settings, columns]` contains its samples, `ratio` `[columns]` ones.
     #[inline(always)]
     fn couple_row(&self, t: usize, mut out: ArrayViewMut2<f32>, mut ratio: ArrayViewMut1<f32>) {
         let (settings, rows, columns) = self.stack.dim();
@@ -135,10 +138,10 @@ impl Images<'_> {
         }
     }
 
-    /// Camera row `t`, framed by masked samples for all windows to reach into.
+    /// Camera row `t`, padded with masked samples for windows that reach beyond the border.
     fn row(&self, t: usize) -> Row {
         let (settings, _, columns) = self.stack.dim();
-        // Lanes may begin at any of the columns.
+        // Lanes may begin at any column.
         let width = columns + 2 * self.radius_px + LANES;
         let mut row = Row { width, samples: vec![0.0; settings * width], valid: vec![0.0; settings * width] };
         for n in 0..settings {
@@ -166,7 +169,7 @@ struct Row {
 }
 
 impl Row {
-    /// Samples of one setting from column `first` of the framed row on, and whether they are valid.
+    /// Samples of one setting starting at column `first` of the padded row, and their validity.
     #[inline(always)]
     fn at(&self, setting: usize, first: usize) -> (Lanes, Lanes) {
         let first = setting * self.width + first;
@@ -178,7 +181,7 @@ impl Row {
     }
 }
 
-/// [`NoiseModel`] of one setting's mean of frames.
+/// The [`NoiseModel`] for the mean of one setting's frames.
 #[derive(Clone, Copy)]
 struct SampleNoise {
     read_variance: f32,
@@ -197,18 +200,18 @@ impl SampleNoise {
     }
 }
 
-/// One neighbour of each of a few pixels.
+/// One neighbour of each of several pixels.
 struct Neighbours {
-    /// Factor that brings the neighbour to the pixel's total over the settings that both have.
+    /// Factor that scales the neighbour to the pixel's total over the settings valid in both.
     scale: Lanes,
-    /// How much the neighbour counts; 0 for one that cannot be used.
+    /// Weight of the neighbour; 0 if it cannot be used.
     weight: Lanes,
-    /// Variance of the scaled neighbour over that of the pixel.
+    /// Variance of the scaled neighbour relative to that of the pixel.
     variance: Lanes,
 }
 
 impl Neighbours {
-    /// Compares pixels with neighbours; `own` and `other` give samples and validity of a setting.
+    /// Compares pixels with neighbours; `own` and `other` return samples and validity of a setting.
     #[inline(always)]
     fn compare(
         noise: &[SampleNoise],
@@ -231,7 +234,7 @@ impl Neighbours {
         let scale: Lanes = std::array::from_fn(|lane| {
             let stands_out = |total: f32, variance: f32| total > MIN_TOTAL_SD * variance.sqrt();
             let own_stands_out = stands_out(own_total[lane], own_variance[lane]);
-            // Too few settings in common show neither the scale nor the difference.
+            // Too few common settings determine neither the scale nor the difference.
             let comparable = 2.0 * settings[lane] >= noise.len() as f32;
             match comparable && own_stands_out && stands_out(other_total[lane], other_variance[lane]) {
                 true => own_total[lane] / other_total[lane],
@@ -256,8 +259,8 @@ impl Neighbours {
             if scale[lane] > 0.0 {
                 let variance =
                     scale[lane] * scale[lane] * other_variance[lane] / (own_variance[lane] + MIN_VARIANCE);
-                // What the squares exceed noise by, in units of the noise of both; the scale takes one degree of
-                // freedom. Chance alone makes it a few tenths, which its own square renders harmless.
+                // The excess of the squares over noise, in units of the noise of both; the scale takes one degree of
+                // freedom. Chance alone gives a few tenths, which are harmless once squared.
                 let bias = (squares[lane] / (settings[lane] - 1.0).max(1.0) - 1.0).max(0.0);
                 let spread = variance + BIAS_WEIGHT * bias * bias * (1.0 + variance);
                 neighbours.weight[lane] = 1.0 / (spread + MIN_VARIANCE);
@@ -268,12 +271,12 @@ impl Neighbours {
     }
 }
 
-/// The weighted means of a few pixels, as they build up.
+/// The weighted means of several pixels during summation.
 struct Means {
-    /// Sums of each setting, and the weights in them.
+    /// Sum for each setting, and the weights in it.
     sums: Vec<Lanes>,
     weights: Vec<Lanes>,
-    /// Weights of all neighbours, and the variance that they bring.
+    /// Sum of the weights of all neighbours, and the variance that they contribute.
     weight: Lanes,
     variance: Lanes,
 }
@@ -284,7 +287,7 @@ impl Means {
         Self { sums: zeros.clone(), weights: zeros, weight: [0.0; LANES], variance: [0.0; LANES] }
     }
 
-    /// Adds a neighbour of each pixel; `samples` gives samples and validity of a setting.
+    /// Adds a neighbour of each pixel; `samples` returns samples and validity of a setting.
     #[inline(always)]
     fn add(&mut self, neighbours: &Neighbours, samples: impl Fn(usize) -> (Lanes, Lanes)) {
         let Neighbours { scale, weight, variance } = neighbours;

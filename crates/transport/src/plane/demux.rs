@@ -15,10 +15,10 @@ use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind
 /// Demultiplexes delay-exposure stacks: for each pixel, the exact minimiser of
 /// `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` over `T >= 0` (the paper's section 4).
 ///
-/// All pixels of a camera row share one model, and rows whose model is the same share its factors, so a pixel costs a
-/// few small triangular systems. Tiles of pixels are solved in parallel, and the result does not depend, to the bit, on how
-/// many threads there are, nor a row's on which other rows are solved. Channels are pixels too: an RGB stack is solved as one with three times the columns, a Bayer
-/// mosaic as it is.
+/// All pixels of a camera row share one model, and rows with the same model share its factors, so that a pixel costs
+/// only a few small triangular systems. Tiles of pixels are solved in parallel. The result is the same to the bit for
+/// any number of threads, and a row's result does not depend on which other rows are solved. Channels are treated as
+/// pixels: an RGB stack is solved as one with three times the columns, a Bayer mosaic without demosaicing.
 #[derive(Debug, Clone)]
 pub struct Demux {
     timing: RowTiming,
@@ -41,8 +41,8 @@ impl Demux {
         Ok(Self { timing, settings, prior, reach, u0_rows: None, spot: None, simd: SimdLevel::best() })
     }
 
-    /// The same unknowns and prior for other settings: those of the points captured so far, or the planned ones with
-    /// the delays that were measured. The reach stays, so that every transport of a plan has the same shape.
+    /// The same unknowns and prior with other settings: those of the points captured so far, or the planned ones with
+    /// the measured delays. The reach stays the same, so that every transport of a plan has the same shape.
     ///
     /// # Errors
     /// Those of [`RowTiming::check`].
@@ -51,7 +51,7 @@ impl Demux {
         Ok(Self { settings, ..self.clone() })
     }
 
-    /// The same unknowns and settings under another prior.
+    /// The same unknowns and settings with another prior.
     ///
     /// # Errors
     /// Those of [`Prior::check`].
@@ -60,7 +60,7 @@ impl Demux {
         Ok(Self { prior, ..self.clone() })
     }
 
-    /// The same unknowns, settings and prior with another timing, such as one with another beam.
+    /// The same unknowns, settings and prior with another timing, for example one with another beam.
     ///
     /// # Errors
     /// Those of [`RowTiming::check`].
@@ -69,12 +69,12 @@ impl Demux {
         Ok(Self { timing, ..self.clone() })
     }
 
-    /// Where each pixel's direct light lies, `u0_rows[t, s]` in projector rows from the pixel's own, -1..=1: what
-    /// rectification leaves. Between rows it is shared between the two, `1 - |u0|` in row 0 and `|u0|` in its
-    /// neighbour, and estimated as one unknown; without this it lies in row 0.
+    /// Sets the position of each pixel's direct light, `u0_rows[t, s]` in projector rows from the pixel's own,
+    /// -1..=1: the remaining error of rectification. Direct light between two rows is shared between them, `1 - |u0|`
+    /// in row 0 and `|u0|` in its neighbour, and estimated as one unknown. Without this call it lies in row 0.
     ///
     /// # Errors
-    /// [`PlaneError::OutOfRange`] for an offset that is not within -1..=1.
+    /// [`PlaneError::OutOfRange`] for an offset outside -1..=1.
     pub fn with_spike(&self, u0_rows: Array2<f32>) -> Result<Self, PlaneError> {
         if let Some(&value) = u0_rows.iter().find(|u0| !(-1.0..=1.0).contains(*u0)) {
             return Err(PlaneError::OutOfRange {
@@ -86,8 +86,8 @@ impl Demux {
         Ok(Self { u0_rows: Some(Arc::new(u0_rows)), ..self.clone() })
     }
 
-    /// The moment of direct light within its row, which settings whose edge falls on the row depend on. It holds for a
-    /// beam no wider than a row.
+    /// Sets the moment of direct light within its row, which matters for settings with an edge on the row. Valid for
+    /// beams no wider than a row.
     ///
     /// # Errors
     /// [`PlaneError::OutOfRange`] for a column outside 0..=1.
@@ -99,7 +99,7 @@ impl Demux {
         Ok(Self { spot: Some(Arc::new(spot)), ..self.clone() })
     }
 
-    /// The same, solved with other instructions than the fastest.
+    /// The same, solved with the given instructions instead of the fastest.
     pub fn with_simd(&self, simd: SimdLevel) -> Self {
         Self { simd, ..self.clone() }
     }
@@ -109,7 +109,7 @@ impl Demux {
         self.reach.clone()
     }
 
-    /// When rows are lit and exposed.
+    /// The timing of projector and camera rows.
     pub fn timing(&self) -> &RowTiming {
         &self.timing
     }
@@ -119,7 +119,7 @@ impl Demux {
         &self.settings
     }
 
-    /// Where direct light lies, `[t, s]`, as [`Self::with_spike`] was told.
+    /// Position of direct light, `[t, s]`, as set by [`Self::with_spike`].
     pub fn u0_rows(&self) -> Option<&Array2<f32>> {
         self.u0_rows.as_deref()
     }
@@ -144,15 +144,15 @@ impl Demux {
     }
 
     /// Estimates the transport from `stack`, shape `[settings, camera_rows, columns]`, in units of the light that a
-    /// white pixel collects per row dwell, black level and ambient light already subtracted.
+    /// white pixel collects per row dwell. Black level and ambient light must already be subtracted.
     ///
     /// `valid`, of the same shape, tells which samples may be used; saturated ones may not. A pixel with masked
-    /// samples is estimated from the others and flagged in [`Transport::saturated`]; it takes many times longer,
+    /// samples is estimated from the others and flagged in [`Transport::saturated`]. It takes many times longer,
     /// because its model differs from its row's.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if an array does not fit the timing and the settings; [`PlaneError::NotFinite`] for a
-    /// NaN or an infinity, masked or not; [`PlaneError::NotConvex`].
+    /// NaN or an infinity, even if masked; [`PlaneError::NotConvex`].
     pub fn solve(
         &self,
         stack: ArrayView3<f32>,
@@ -161,10 +161,10 @@ impl Demux {
         self.solve_while(stack, valid, &|| true)
     }
 
-    /// [`Self::solve`] for as long as `go_on` says yes; it is asked before every few camera rows.
+    /// [`Self::solve`] for as long as `go_on` returns true; it is called before every few camera rows.
     ///
     /// # Errors
-    /// Those of [`Self::solve`]; [`PlaneError::Stopped`] once `go_on` said no.
+    /// Those of [`Self::solve`]; [`PlaneError::Stopped`] once `go_on` returns false.
     pub fn solve_while(
         &self,
         stack: ArrayView3<f32>,
@@ -174,8 +174,8 @@ impl Demux {
         self.run(&self.all_rows(), stack, valid, None, go_on)
     }
 
-    /// [`Self::solve_while`], started from an estimate: faster, where the light has changed little since. The minimum
-    /// is the same, but not to the bit.
+    /// [`Self::solve_while`] starting from an estimate, which is faster if the light has changed little since. The
+    /// minimum is the same, but not to the bit.
     ///
     /// # Errors
     /// Those of [`Self::solve_while`]; [`PlaneError::Shape`] if the estimate has another reach or size.
@@ -189,11 +189,11 @@ impl Demux {
         self.run(&self.all_rows(), stack, valid, Some(estimate), go_on)
     }
 
-    /// [`Self::solve_while`] of some camera rows, ascending: a sample of the image, or a part of one that is larger than
-    /// the memory. The stack and the transport hold these rows alone.
+    /// [`Self::solve_while`] for some camera rows, ascending: a sample of the image, or a part of an image that is
+    /// larger than the memory. The stack and the transport contain only these rows.
     ///
     /// # Errors
-    /// Those of [`Self::solve_while`]; [`PlaneError::Rows`] for rows that the camera does not have.
+    /// Those of [`Self::solve_while`]; [`PlaneError::Rows`] for rows that do not exist in the camera.
     pub fn solve_rows(
         &self,
         rows: &[usize],
@@ -205,7 +205,7 @@ impl Demux {
     }
 
     /// The images that the model predicts for the settings, `[settings, rows, columns]`, from a transport of these
-    /// camera rows. Light from beyond the reach is not in it.
+    /// camera rows. Light from beyond the reach is not included.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if the transport does not fit the rows and the reach; [`PlaneError::Rows`].
@@ -362,19 +362,19 @@ impl Demux {
     }
 }
 
-/// A camera row that is to be solved.
+/// A camera row to be solved.
 struct Data<'a> {
     /// `[settings, columns]`
     stack: ArrayView2<'a, f32>,
-    /// What to start from, `[reach, columns]`.
+    /// Starting point of the solver, `[reach, columns]`.
     estimate: Option<ArrayView2<'a, f32>>,
-    /// Its part of the transport, `[reach, columns]`.
+    /// The row's part of the transport, `[reach, columns]`.
     profiles: ArrayViewMut2<'a, f32>,
 }
 
-/// Of a symmetric positive definite matrix, by power iteration to about 1 %.
+/// Largest eigenvalue of a symmetric positive definite matrix, by power iteration to about 1 %.
 fn largest_eigenvalue(matrix: ArrayView2<f64>) -> f64 {
-    // A start without symmetry is orthogonal to no eigenvector.
+    // An asymmetric start is not orthogonal to any eigenvector.
     let mut vector = Array1::from_shape_fn(matrix.nrows(), |i| 1.0 + (i as f64 * 0.7).sin());
     let mut eigenvalue = 0.0;
     for _ in 0..200 {

@@ -1,35 +1,37 @@
-//! The linear systems of pivoting, dense, one pixel's in each lane of the vector registers.
+//! Dense solver for the linear systems of pivoting, with one pixel's system in each lane of the vector registers.
 
 use aligned_vec::{AVec, avec};
 use pulp::Simd;
 
 use super::quadratic::Padded;
 
-/// Rows and columns of the blocks in which matrices are factored: 4 x 2 sums stay in registers at every vector width.
+/// Rows and columns of the blocks in which matrices are factored: sums of 4 x 2 fit in the registers at every vector
+/// width.
 const BLOCK: usize = 4;
 
-/// Vectors of a sum of columns that stay in registers at every vector width.
+/// Number of vectors in a sum of columns; they fit in the registers at every vector width.
 const SUMS: usize = 8;
 
-/// Lanes of the widest registers, AVX-512's.
+/// Number of lanes in the widest registers, those of AVX-512.
 pub(super) const MAX_LANES: usize = 8;
 
-/// Room for the systems of all lanes; arrays hold the lanes' values side by side. Lanes share the symmetric matrix `M`, of
-/// which each has rows and columns `K` of its own; what a lane computes does not depend, to the bit, on the others.
+/// Memory for the systems of all lanes; arrays interleave the lanes' values. Lanes share the symmetric matrix `M`, of
+/// which each uses its own rows and columns `K`. The result of a lane is the same to the bit whatever the other lanes
+/// do.
 pub(super) struct Dense<S: Simd> {
     simd: S,
-    /// `K`, in each lane from the top, then `M`'s row of zeros for want of more.
+    /// `K` of each lane, padded with the index of `M`'s row of zeros.
     rows: Vec<u32>,
-    /// How many rows that are.
+    /// Number of rows in each lane's `K`.
     counts: [usize; MAX_LANES],
-    /// `[n][n][lanes]`, as large as it was ever needed.
+    /// `[n][n][lanes]` for the current size; allocated for the largest size so far.
     matrix: AVec<f64>,
     rhs: AVec<f64>,
     reciprocals: AVec<f64>,
 }
 
 impl<S: Simd> Dense<S> {
-    /// Room for systems of up to `slots` unknowns.
+    /// Memory for systems of up to `slots` unknowns.
     #[inline(always)]
     pub fn new(simd: S, slots: usize) -> Self {
         const { assert!(S::F64_LANES <= MAX_LANES) };
@@ -44,8 +46,8 @@ impl<S: Simd> Dense<S> {
         }
     }
 
-    /// Solves `M_KK x = -b_K` for the lanes that are given, each with a mark of 1 or 0 for each slot, of which `K` has those
-    /// that are `marked`, and its `b`.
+    /// Solves `M_KK x = -b_K` for the given lanes. Each lane has a mark of 1 or 0 for each slot, where `K` consists
+    /// of the slots whose mark is `marked`, and its `b`.
     #[inline(always)]
     pub fn solve<'a>(
         &mut self,
@@ -62,7 +64,7 @@ impl<S: Simd> Dense<S> {
         self.substitute();
     }
 
-    /// Adds `M x` to what is `b` in `y`, and puts `x` itself into the slots of `K`.
+    /// Adds `M x` to `y`, which contains `b`, and writes `x` into the slots of `K`.
     #[inline(always)]
     pub fn spread(&self, lane: usize, symmetric: &Padded, y: &mut [f64]) {
         let vectors = S::as_mut_simd_f64s(y).0;
@@ -82,7 +84,7 @@ impl<S: Simd> Dense<S> {
         }
     }
 
-    /// Adds the `C` vectors from `first` on of `M x`.
+    /// Adds `C` vectors of `M x`, starting at vector `first`.
     #[inline(always)]
     fn add_columns<const C: usize>(&self, lane: usize, symmetric: &Padded, first: usize, to: &mut [S::f64s]) {
         let (simd, lanes) = (self.simd, S::F64_LANES);
@@ -105,7 +107,7 @@ impl<S: Simd> Dense<S> {
         let lanes = S::F64_LANES;
         let mut count = 0;
         for (slot, (&mark, &b)) in marks.iter().zip(b).enumerate() {
-            // Written in any case and kept if it counts: no branch to mispredict.
+            // Written in any case and kept only if marked, to avoid a branch that is hard to predict.
             let at = count * lanes + lane;
             (self.rows[at], self.rhs[at]) = (slot as u32, -b);
             count += usize::from(mark == marked);
@@ -113,13 +115,13 @@ impl<S: Simd> Dense<S> {
         self.counts[lane] = count;
     }
 
-    /// Size of the systems: rows of the largest, in whole blocks.
+    /// Size of the systems: that of the largest lane, rounded up to whole blocks.
     #[inline(always)]
     fn size(&self) -> usize {
         self.counts.iter().copied().max().unwrap_or(0).next_multiple_of(BLOCK)
     }
 
-    /// Collects each lane's rows and columns of `symmetric`, padded by the identity.
+    /// Copies each lane's rows and columns from `symmetric`, padded with the identity.
     #[inline(always)]
     fn gather(&mut self, symmetric: &Padded) {
         let lanes = S::F64_LANES;
@@ -149,7 +151,7 @@ impl<S: Simd> Dense<S> {
         }
     }
 
-    /// Cholesky factors of all lanes' matrices, blocks of 4 x 4 from left to right.
+    /// Cholesky factors of all lanes' matrices, by blocks of 4 x 4 from left to right.
     #[inline(always)]
     fn factor(&mut self) {
         let n = self.size();
@@ -163,7 +165,7 @@ impl<S: Simd> Dense<S> {
             for j in (0..i).step_by(BLOCK) {
                 let columns = &above[j * n..(j + BLOCK) * n];
                 subtract_products(simd, rows, columns, n, j, j);
-                // The block against the factor of its own columns.
+                // Solve the block with the factor of its diagonal block.
                 for c in 0..BLOCK {
                     for r in 0..BLOCK {
                         let mut value = rows[r * n + j + c];
@@ -178,7 +180,7 @@ impl<S: Simd> Dense<S> {
                     }
                 }
             }
-            // The diagonal block: less the products of its own rows, then factored by itself.
+            // The diagonal block: subtract the products of its own rows, then factor it.
             subtract_own_products(simd, rows, n, i);
             for r in 0..BLOCK {
                 for c in 0..=r {
@@ -189,7 +191,7 @@ impl<S: Simd> Dense<S> {
                     if c < r {
                         rows[r * n + i + c] = simd.mul_f64s(value, reciprocals[i + c]);
                     } else {
-                        // A pivot that is not positive gives NaN here, which no later step mistakes for a minimum.
+                        // A pivot that is not positive gives NaN here, which no later step accepts as a minimum.
                         let pivot = simd.sqrt_f64s(value);
                         rows[r * n + i + c] = pivot;
                         reciprocals[i + c] = simd.div_f64s(one, pivot);
@@ -235,7 +237,7 @@ impl<S: Simd> Dense<S> {
     }
 }
 
-/// Subtracts from the block at column `to` of four rows, `n` apart, their products with four columns over the first
+/// Subtracts from the block at column `to` of four rows, `n` apart, their products with four columns, over the first
 /// `length` entries.
 #[inline(always)]
 fn subtract_products<S: Simd>(
@@ -258,7 +260,7 @@ fn subtract_products<S: Simd>(
     }
 }
 
-/// [`subtract_products`] of the rows with themselves, over their first `length` entries, at column `length`.
+/// [`subtract_products`] for the rows with themselves, over their first `length` entries, at column `length`.
 #[inline(always)]
 fn subtract_own_products<S: Simd>(simd: S, rows: &mut [S::f64s], n: usize, length: usize) {
     let column = |c: usize| &rows[c * n..c * n + length];

@@ -4,14 +4,14 @@ pub enum PlaneError {
     /// A number lies outside its range.
     #[error("{field} is {value}, but must be {allowed}")]
     OutOfRange {
-        /// The field, as it is named in the API.
+        /// The field's name in the API.
         field: &'static str,
-        /// The value given.
+        /// Its value.
         value: f64,
-        /// What would be accepted, and what to do.
+        /// The accepted range, and what to do.
         allowed: &'static str,
     },
-    /// The camera's window does not lie on the projector's rows.
+    /// The camera's window is not contained in the projector's rows.
     #[error(
         "camera rows are a window of projector rows {first_row}..{end}, but the projector has {projector_rows}: \
          give a window of at least one row inside the projector's"
@@ -19,9 +19,9 @@ pub enum PlaneError {
     Window {
         /// First projector row of the window.
         first_row: usize,
-        /// One past the window's last projector row.
+        /// End of the window's projector rows (exclusive).
         end: usize,
-        /// Rows of the projector.
+        /// Number of projector rows.
         projector_rows: usize,
     },
     /// A camera row that does not exist.
@@ -29,7 +29,7 @@ pub enum PlaneError {
     Rows {
         /// The row asked for.
         row: usize,
-        /// How many there are.
+        /// Number of rows of the camera.
         camera_rows: usize,
     },
     /// No settings, or a setting without a delay.
@@ -40,7 +40,7 @@ pub enum PlaneError {
         /// Index of the setting, 0 when there are no settings at all.
         index: usize,
     },
-    /// No row is seen strongly enough to be estimated.
+    /// No row collects enough light to be estimated.
     #[error("no setting sees 5 % of any row's light: lengthen the exposures or bring the delays nearer to 0")]
     NothingSeen,
     /// The objective cannot be factored.
@@ -48,22 +48,22 @@ pub enum PlaneError {
         "the objective is not convex in floating point: choose alpha nearer to 0.1, or shorter exposures"
     )]
     NotConvex,
-    /// The caller ended it.
+    /// The caller stopped the computation.
     #[error("ended before it was done; `raysweep process` makes the results again")]
     Stopped,
-    /// An array has another shape than the timing and the settings imply.
+    /// An array's shape does not fit the timing and the settings.
     #[error("{array} has shape {actual:?}, but {axes} must be {expected:?}")]
     Shape {
-        /// Which array.
+        /// Name of the array.
         array: &'static str,
-        /// The names of its axes in order.
+        /// Names of its axes, in order.
         axes: &'static str,
-        /// The shape given.
+        /// The actual shape.
         actual: Vec<usize>,
-        /// The shape needed.
+        /// The expected shape.
         expected: Vec<usize>,
     },
-    /// The stack holds a NaN or an infinity.
+    /// The stack contains a NaN or an infinity.
     #[error(
         "the stack's sample at setting {setting}, row {row}, column {column} is not finite: \
          mask the sample and put any finite value in its place"
@@ -76,26 +76,26 @@ pub enum PlaneError {
         /// Camera column.
         column: usize,
     },
-    /// A stack is too small, too dark or too much masked to tell its noise.
+    /// The stack is too small, too dark or has too many masked samples to estimate its noise.
     #[error(
         "the noise cannot be fitted from {samples} samples, it takes {needed}: \
          give read_variance and gain, or use a larger window with fewer masked pixels"
     )]
     TooFewSamples {
-        /// Samples that could be used.
+        /// Number of usable samples.
         samples: usize,
-        /// Samples needed.
+        /// Number of samples needed.
         needed: usize,
     },
-    /// A name that no prior has.
+    /// A name that is not the name of a prior.
     #[error("prior is \"{name}\", but must be \"paper\" or \"split\"")]
     UnknownPrior {
-        /// The name given.
+        /// The given name.
         name: String,
     },
 }
 
-/// Checks that an array has the shape that it must have.
+/// Checks that an array has the expected shape.
 pub(super) fn check_shape(
     array: &'static str,
     axes: &'static str,

@@ -5,14 +5,14 @@ use rayon::prelude::*;
 
 use super::{PlaneError, RowTiming, Setting};
 
-/// A row belongs to the unknowns when some setting collects at least this share of its dwell.
+/// A row is an unknown if some setting collects at least this share of its dwell.
 pub const MIN_WEIGHT: f64 = 0.05;
 
 /// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings and
-/// camera rows, in the frame that the delays are measured against, is at least [`MIN_WEIGHT`].
+/// camera rows, in the frame that the delays refer to, is at least [`MIN_WEIGHT`].
 ///
-/// The beam does not count here: it sends light of the rows drawn to their neighbours, but what is drawn decides what is
-/// asked for, so that the transport has the same shape whatever is known of the beam.
+/// The beam is not taken into account: it sends light of the drawn rows to their neighbours, but the reach depends
+/// only on the drawn rows, so that the transport has the same shape whatever is known of the beam.
 ///
 /// # Errors
 /// Those of [`RowTiming::check`]; [`PlaneError::NothingSeen`] if no row qualifies.
@@ -38,32 +38,33 @@ pub fn reach(timing: &RowTiming, settings: &[Setting]) -> Result<RangeInclusive<
 pub struct Slot {
     /// Relative row of the projector row.
     pub u: i32,
-    /// Whether the row is asked for.
+    /// Whether the row is part of the result.
     pub kind: SlotKind,
 }
 
-/// What becomes of a slot's estimate.
+/// How a slot's estimate is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SlotKind {
     /// Inside the plan's reach: part of the transport.
     Own,
-    /// Outside the reach, but lit while an exposure reached over the retrace into the next or previous frame, or by the
-    /// beam of a row that was drawn during it: solved for, because the exposure saw it, and then dropped.
+    /// Outside the reach, but lit while an exposure extended over the retrace into the next or previous frame, or by
+    /// the beam of a row that was drawn during the exposure: solved for, because the exposure saw it, and then
+    /// dropped.
     Wrapped,
 }
 
 /// The forward model of all pixels of one camera row.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RowModel {
-    /// The unknowns: own slots by ascending `u`, then wrapped slots by ascending `u`. Rows that the projector does
-    /// not have are not among them.
+    /// The unknowns: own slots by ascending `u`, then wrapped slots by ascending `u`. Rows that do not exist in the
+    /// projector are not included.
     pub slots: Vec<Slot>,
     /// `A' = A B`: weight of each slot in each setting, shape `[settings, slots]`.
     pub weights: Array2<f64>,
 }
 
 impl RowModel {
-    /// The model of camera row `t` under the plan's settings; `reach` is that of the whole plan.
+    /// The model of camera row `t` for the plan's settings; `reach` is that of the whole plan.
     pub fn new(timing: &RowTiming, settings: &[Setting], reach: &RangeInclusive<i32>, t: usize) -> Self {
         let seen: Vec<Vec<f64>> = settings.iter().map(|setting| timing.weights(t, setting)).collect();
         let (own, outside): (Vec<usize>, Vec<usize>) =
@@ -82,12 +83,12 @@ impl RowModel {
 
 /// The image that the model predicts for one setting.
 ///
-/// `transport` is `[v, t, s]` over the projector rows from the camera's first on, shape
-/// `[rows, camera_rows, columns]`; nothing else is lit by the projector. Returns `[t, s]`.
+/// `transport` is `[v, t, s]` over the projector rows starting at the camera's first row, shape `[rows, camera_rows,
+/// columns]`; the projector lights nothing else. Returns `[t, s]`.
 ///
 /// # Errors
-/// Those of [`RowTiming::check`]; [`PlaneError::Shape`] if the transport does not fit the window, or leaves the
-/// projector.
+/// Those of [`RowTiming::check`]; [`PlaneError::Shape`] if the transport does not fit the window or extends beyond
+/// the projector.
 pub fn predict(
     timing: &RowTiming,
     transport: ArrayView3<f32>,
@@ -119,8 +120,8 @@ pub fn predict(
     Ok(image)
 }
 
-/// A transport `[v, t, s]` over a window's projector rows, by relative row: `[u, t, s]` for `u` in `reach`, zero where
-/// the window has no such row. For cameras whose rows have the projector's pitch.
+/// Converts a transport `[v, t, s]` over a window's projector rows to relative rows: `[u, t, s]` for `u` in `reach`,
+/// zero where the window has no such row. Only for cameras whose rows have the projector's pitch.
 pub fn relative_rows(transport: ArrayView3<f32>, reach: &RangeInclusive<i32>) -> Array3<f32> {
     let (rows, camera_rows, columns) = transport.dim();
     let mut relative = Array3::zeros((reach.clone().count(), camera_rows, columns));
@@ -161,7 +162,7 @@ mod tests {
     #[test]
     fn the_papers_sweep_reaches_94_rows() {
         assert_eq!(reach(&timing(TAU_US), &paper_sweep()), Ok(-94..=94));
-        // 2100 us / 18.52 us = 113.4: row 113 is seen to 0.9, row 114 not at all.
+        // 2100 us / 18.52 us = 113.4: the weight of row 113 is 0.9, that of row 114 is 0.
         assert_eq!(reach(&timing(18.52), &paper_sweep()), Ok(-113..=113));
     }
 
@@ -192,8 +193,8 @@ mod tests {
 
     #[test]
     fn late_exposures_of_row_700_reach_over_the_retrace() {
-        // The retrace begins 19.5 rows after row 700's centre, the next frame (16666.67 - 700.5 * 22.22) us = 1101.56 us
-        // after it. Counted from the edges t_d + t_e/2 of the sweep.
+        // The retrace begins 19.5 rows after row 700's centre, the next frame (16666.67 - 700.5 * 22.22) us = 1101.56
+        // us after it. The expected numbers follow from the edges t_d + t_e/2 of the sweep.
         let late = |limit_us: f64| {
             let ends = paper_sweep().into_iter().map(|s| s.delays_us[0] + s.exposure_us / 2.0);
             ends.filter(|&end_us| end_us > limit_us).count()
@@ -224,7 +225,7 @@ mod tests {
         for (weights, setting) in inner.weights.axis_iter(Axis(0)).zip(&settings) {
             assert!((weights.sum() - setting.exposure_us / TAU_US).abs() < 1e-9);
         }
-        // Row 700, t_d 1500 us, t_e 1200 us: lit in 900..2100 us is only what the next frame lights from 1101.56 us.
+        // Row 700, t_d 1500 us, t_e 1200 us: in 900..2100 us only the next frame's rows are lit, from 1101.56 us on.
         let outer = RowModel::new(&timing(TAU_US), &settings, &(-94..=94), 700);
         assert!((outer.weights.row(74).sum() - (2100.0 - 1101.56) / TAU_US).abs() < 1e-3);
     }

@@ -11,11 +11,12 @@
 //! A(u)    = |[u tau - t_p/2, u tau + t_p/2] ∩ [t_d - t_e/2, t_d + t_e/2]| / t_p,    t_p = tau
 //! ```
 //!
-//! where the rows of projector and camera run at one constant speed. [`RowTiming`] knows when they do not, and how the
-//! [`Beam`] spreads a row; it and [`Setting`] hold the quantities on the right. [`RowModel`] is `A` for one camera row
-//! with its borders and the neighbouring frames, and [`Demux`] inverts it under a [`Prior`]. [`Coupling`] averages like
-//! pixels beforehand, under a [`NoiseModel`], and [`Uncertainty`] says what noise is left in the result; [`calibrate`]
-//! finds in the stack itself what the model needs to know.
+//! This applies if the rows of projector and camera advance at one constant speed. [`RowTiming`] covers other cases,
+//! and the [`Beam`] the spread of a row; it and [`Setting`] contain the quantities on the right-hand side.
+//! [`RowModel`] is `A` for one camera row with its borders and the neighbouring frames, and [`Demux`] inverts it with
+//! a [`Prior`]. [`Coupling`] averages similar pixels beforehand, based on a [`NoiseModel`], and [`Uncertainty`]
+//! computes the noise that remains in the result. [`calibrate`] estimates the model's parameters from the stack
+//! itself.
 
 pub mod advice;
 mod beam;

@@ -1,9 +1,9 @@
-//! The linear systems of pivoting where there are few settings and many rows, as in a film.
+//! Solver for the linear systems of pivoting with few settings and many rows, as in a film.
 //!
-//! `H = A'A + alpha D'D` is then dense only for want of rank: `D` joins each row with one before it and one after it, so
-//! `K = alpha D'D` is tridiagonal, and `A` has few rows. With `v = A x` as further unknowns, the rows are eliminated along
-//! their chains, and what is left is a dense system with an unknown for each setting and for each row without which `K`
-//! would be singular: one end of each chain, and the rows that no difference joins to others.
+//! The dense part of `H = A'A + alpha D'D` then has low rank: `D` links each row to one before it and one after it,
+//! so `K = alpha D'D` is tridiagonal, and `A` has few rows. With `v = A x` as additional unknowns, the rows are
+//! eliminated along their chains. What remains is a dense system with one unknown for each setting and for each row
+//! without which `K` would be singular: one end of each chain, and the rows that no difference links to others.
 
 use aligned_vec::{AVec, avec};
 use ndarray::ArrayView2;
@@ -11,14 +11,14 @@ use pulp::Simd;
 
 use super::quadratic::RIDGE;
 
-/// The parts of `H` for this way of solving.
+/// The parts of `H` for this solver.
 #[derive(Debug, Clone)]
 pub(super) struct Narrow {
     settings: usize,
     slots: usize,
     /// `[slots][settings]`
     weights: Vec<f64>,
-    /// First slot along the chains that a setting sees; only slots from there on matter to its column.
+    /// First slot along the chains that a setting sees; only the slots from there on affect its column.
     first_seen: Vec<usize>,
     chain: Vec<Joint>,
     border: Vec<Border>,
@@ -28,28 +28,28 @@ pub(super) struct Narrow {
 #[derive(Debug, Clone, Copy)]
 struct Joint {
     slot: usize,
-    /// Off-diagonal of `K`, negated, with the joint before: 0 at the start of a chain.
+    /// Negated off-diagonal of `K` to the joint before: 0 at the start of a chain.
     before: f64,
-    /// The same with the slot after, which may be in the border.
+    /// Negated off-diagonal of `K` to the slot after, which may be in the border.
     after: f64,
-    /// The same with the joint after: 0 where the slot after is in the border.
+    /// Negated off-diagonal of `K` to the joint after: 0 if the slot after is in the border.
     joint_after: f64,
     ridge: f64,
 }
 
-/// A slot that is kept to the end.
+/// A slot that is not eliminated.
 #[derive(Debug, Clone, Copy)]
 struct Border {
     slot: usize,
     /// Diagonal of `K`.
     diagonal: f64,
-    /// The place in the chain of the one joint that it is joined to, and that off-diagonal, negated.
+    /// Position in the chain of the only joint linked to it, and the negated off-diagonal to this joint.
     neighbour: Option<(usize, f64)>,
 }
 
 impl Narrow {
-    /// The parts, if `D` joins slots into chains and there are so few settings that this way is the shorter one.
-    /// `diagonal` is that of `H` without its ridge.
+    /// The parts, or `None` unless `D` links the slots into chains and there are so few settings that this solver is
+    /// the faster one. `diagonal` is that of `H` without its ridge.
     pub fn new(
         weights: ArrayView2<f64>,
         differences: ArrayView2<f64>,
@@ -102,8 +102,8 @@ impl Narrow {
                 }
             }
         }
-        // Each step takes about half the square of the unknowns for each slot here, and a third of the cube of the free
-        // slots, which are about half of all, where H is factored.
+        // Here each step takes about half the square of the number of unknowns for each slot. Factoring H takes a
+        // third of the cube of the number of free slots, which are about half of all slots.
         if 3 * (settings + border.len()) > slots {
             return None;
         }
@@ -120,7 +120,7 @@ impl Narrow {
         Some(Self { settings, slots, weights, first_seen, chain, border })
     }
 
-    /// Unknowns of the system that is left when the chains are eliminated.
+    /// Number of unknowns that remain after the chains are eliminated.
     fn unknowns(&self) -> usize {
         self.settings + self.border.len()
     }
@@ -130,26 +130,27 @@ impl Narrow {
     }
 }
 
-/// Room for the systems of all lanes; arrays hold the lanes' values side by side.
+/// Memory for the systems of all lanes; arrays interleave the lanes' values.
 pub(super) struct NarrowWork<'a, S: Simd> {
     simd: S,
     narrow: &'a Narrow,
-    /// 1 where a slot is free, else 0, `[slots]`.
+    /// 1 for free slots, 0 for the others, `[slots]`.
     masks: AVec<f64>,
     /// `[slots]`
     c: AVec<f64>,
     /// The minimiser in free slots and half the gradient in the others, `[slots]`.
     y: AVec<f64>,
-    /// By joint: what carries the elimination from the joint before, and 1 / pivot where it is free, else 0.
+    /// For each joint: the factor that carries the elimination on from the joint before, and 1 / pivot if it is free,
+    /// else 0.
     carries: AVec<f64>,
     reciprocals: AVec<f64>,
-    /// The columns' entries at the joint that is being eliminated: settings, border, right-hand side.
+    /// The columns' entries at the joint being eliminated: settings, border, right-hand side.
     columns: AVec<f64>,
-    /// Lower triangle, row by row; its last row belongs to the right-hand side.
+    /// Lower triangle, row by row; its last row is the right-hand side.
     system: AVec<f64>,
     /// `v = A x`, then the border's `x`.
     unknowns: AVec<f64>,
-    /// Right-hand side of each joint once the unknowns are known.
+    /// Right-hand side of each joint after the unknowns are computed.
     known: AVec<f64>,
 }
 
@@ -173,8 +174,8 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
         }
     }
 
-    /// Finds the minimiser of the free slots, and in the others half the gradient, for the lanes that are given: 1 for each
-    /// free slot and 0 for the others, and `-c`.
+    /// Computes the minimiser in the free slots and half the gradient in the others. Each lane gives 1 for each free
+    /// slot and 0 for the others, and `-c`.
     #[inline(always)]
     pub fn solve<'p>(&mut self, lanes: impl Iterator<Item = (&'p [f64], &'p [f64])>) {
         for (lane, (free, slope)) in lanes.enumerate() {
@@ -188,13 +189,13 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
         self.substitute();
     }
 
-    /// Takes a lane's solution.
+    /// Copies a lane's solution to `y`.
     #[inline(always)]
     pub fn take(&self, lane: usize, y: &mut [f64]) {
         y.iter_mut().zip(self.y.iter().skip(lane).step_by(S::F64_LANES)).for_each(|(to, y)| *to = *y);
     }
 
-    /// Eliminates the joints into the system. All that a pivot is made of is positive, so that nothing cancels.
+    /// Eliminates the joints and builds the system. All terms of a pivot are positive, so that no digits cancel.
     #[inline(always)]
     fn eliminate(&mut self) {
         let (simd, narrow) = (self.simd, self.narrow);
@@ -208,7 +209,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
         let zero = simd.splat_f64s(0.0);
         system.fill(zero);
         columns.fill(zero);
-        // What holds the joint before to the ground beside the one after it, times 1 / its pivot; 1 where it is fixed.
+        // `ground` of the joint before divided by its pivot; 1 if that joint is fixed.
         let mut held = simd.splat_f64s(1.0);
         for (place, joint) in narrow.chain.iter().enumerate() {
             let mask = masks[joint.slot];
@@ -248,7 +249,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
     }
 
     /// Solves for `v` and the border. The settings' part is positive definite and the border's, after it, negative
-    /// definite, so the factors need no exchanges.
+    /// definite, so that the factorisation needs no pivoting.
     #[inline(always)]
     fn solve_system(&mut self) {
         let (simd, narrow) = (self.simd, self.narrow);
@@ -272,7 +273,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
             for (entry, other) in system[row(at) + settings..].iter_mut().zip(&narrow.border[..k]) {
                 *entry = simd.mul_f64s(simd.mul_f64s(mask, masks[other.slot]), *entry);
             }
-            // A fixed slot of the border is held to 0 by an equation of its own.
+            // A fixed slot of the border gets an equation of its own that sets it to 0.
             let diagonal = &mut system[row(at) + at];
             let own = simd.sub_f64s(*diagonal, simd.splat_f64s(border.diagonal));
             *diagonal = simd.sub_f64s(simd.mul_f64s(mask, own), simd.sub_f64s(one, mask));
@@ -284,7 +285,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
             for j in 0..i.min(size) {
                 let mut value = system[row(i) + j];
                 for k in 0..j {
-                    // The entries of row i are still times D.
+                    // The entries of row i are still multiplied by D.
                     value = simd.negate_mul_add_e_f64s(system[row(i) + k], system[row(j) + k], value);
                 }
                 system[row(i) + j] = value;
@@ -306,7 +307,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
         }
     }
 
-    /// Puts the unknowns back into the chains.
+    /// Substitutes the unknowns back into the chains.
     #[inline(always)]
     fn substitute(&mut self) {
         let (simd, narrow) = (self.simd, self.narrow);
@@ -339,7 +340,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
             after = simd.mul_f64s(reciprocals[place], simd.add_f64s(y[joint.slot], pull));
             y[joint.slot] = after;
         }
-        // The others' gradient; a free slot keeps its value.
+        // The gradient of the other slots; a free slot keeps its value.
         let mut before = zero;
         for (place, joint) in narrow.chain.iter().enumerate() {
             let x = y[joint.slot];
@@ -366,7 +367,7 @@ impl<'a, S: Simd> NarrowWork<'a, S> {
     }
 }
 
-/// `c - A'v` of one slot: what is left for `K` to balance.
+/// `c - A'v` of one slot, the part that `K` must balance.
 #[inline(always)]
 fn balance<S: Simd>(simd: S, c: S::f64s, weights: &[f64], v: &[S::f64s]) -> S::f64s {
     let mut left = c;

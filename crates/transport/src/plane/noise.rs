@@ -2,7 +2,7 @@ use ndarray::{ArrayView2, ArrayView3, Axis, s};
 
 use super::PlaneError;
 
-/// What the noise of an image is: read noise and shot noise, independent from sample to sample.
+/// The noise of an image: read noise and shot noise, independent from sample to sample.
 ///
 /// In the units of the stack, in which 1.0 is the light that a white pixel collects per row dwell: a camera with read
 /// noise `r` electrons that collects `w` electrons from white has `read_variance = (r / w)^2` and `gain = 1 / w`.
@@ -10,15 +10,15 @@ use super::PlaneError;
 pub struct NoiseModel {
     /// Variance of a sample of one frame in the dark.
     pub read_variance: f64,
-    /// Variance that each unit of light adds to a sample of one frame.
+    /// Variance that each unit of light adds to one frame's sample.
     pub gain: f64,
 }
 
-/// Most samples that a fit looks at; half a million give both parameters to about 1 %.
+/// Largest number of samples used for a fit; half a million determine both parameters to about 1 %.
 const MAX_SAMPLES: usize = 500_000;
-/// Fewest samples from which a line over the intensity says anything.
+/// Smallest number of samples for a meaningful line over the intensity.
 const MIN_SAMPLES: usize = 1000;
-/// Groups of like intensity, each of which gives one variance.
+/// Number of groups of similar intensity, each of which gives one variance.
 const GROUPS: usize = 20;
 /// Median of the square of a standard normal variable.
 const MEDIAN_SQUARE: f64 = 0.454_94;
@@ -27,7 +27,7 @@ impl NoiseModel {
     /// Checks the parameters.
     ///
     /// # Errors
-    /// [`PlaneError::OutOfRange`] for one that is negative or not finite.
+    /// [`PlaneError::OutOfRange`] for a parameter that is negative or not finite.
     pub fn check(&self) -> Result<(), PlaneError> {
         for (field, value) in [("read_variance", self.read_variance), ("gain", self.gain)] {
             if !(value.is_finite() && value >= 0.0) {
@@ -38,19 +38,18 @@ impl NoiseModel {
         Ok(())
     }
 
-    /// Variance of the mean of `frames` samples of this intensity. Negative intensities are noise about 0.
+    /// Variance of the mean of `frames` samples of this intensity. Negative intensities count as 0.
     pub fn variance(&self, intensity: f64, frames: usize) -> f64 {
         (self.read_variance + self.gain * intensity.max(0.0)) / frames as f64
     }
 
     /// Fits the noise to a stack `[settings, t, s]` whose images are means of `frames[setting]` frames.
     ///
-    /// A pixel is compared with the mean of its neighbours left and right, each scaled to the pixel's own total, so
-    /// that texture cancels and a profile that changes steadily from pixel to pixel cancels too. Medians over groups
-    /// of like intensity resist edges, and a line through the groups gives both parameters; once more without the
-    /// pixels that this noise does not explain. What neighbours differ
-    /// by beside noise is counted as noise: the fit is an upper bound, a close one for stacks of few frames. Pixels
-    /// with samples masked in `valid` are left out.
+    /// A pixel is compared with the mean of its left and right neighbours, each scaled to the pixel's own total, so
+    /// that texture cancels, as does a profile that changes steadily from pixel to pixel. Medians over groups of
+    /// similar intensity resist edges, and a line through the groups gives both parameters. A second fit leaves out
+    /// the pixels that this noise does not explain. Other differences between neighbours count as noise: the fit is
+    /// an upper bound, and a close one for stacks of few frames. Pixels with samples masked in `valid` are left out.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if `frames` or `valid` do not fit the stack; [`PlaneError::TooFewSamples`].
@@ -78,7 +77,7 @@ impl NoiseModel {
             }
         }
         let first = Self::of_pixels(&pixels)?;
-        // Even medians shift by a tenth where one pixel in twenty lies at an edge, so such pixels are left out.
+        // Even medians shift by a tenth if one pixel in twenty lies at an edge, so such pixels are left out.
         let most = 1.0 + 3.0 * (2.0 / settings as f64).sqrt();
         let excess = |pixel: &[SquaredDifference]| {
             let variance = |s: &SquaredDifference| first.variance(s.intensity, 1).max(f64::MIN_POSITIVE);
@@ -88,7 +87,7 @@ impl NoiseModel {
         Self::of_pixels(&pixels)
     }
 
-    /// The line through the medians of groups of like intensity.
+    /// The line through the medians of groups of similar intensity.
     fn of_pixels(pixels: &[Vec<SquaredDifference>]) -> Result<Self, PlaneError> {
         let mut squares: Vec<SquaredDifference> = pixels.concat();
         if squares.len() < MIN_SAMPLES {
@@ -100,7 +99,7 @@ impl NoiseModel {
         Ok(Self::line(&groups))
     }
 
-    /// The line through variances over intensities, each weighted by its own relative precision.
+    /// The line through variances as a function of intensity, each weighted by its own relative precision.
     fn line(groups: &[SquaredDifference]) -> Self {
         let mean_variance = groups.iter().map(|group| group.square).sum::<f64>() / groups.len() as f64;
         let mut model = Self { read_variance: mean_variance, gain: 0.0 };
@@ -117,7 +116,7 @@ impl NoiseModel {
             let spread = w * wxx - wx * wx;
             let gain = if spread > 0.0 { (w * wxy - wx * wy) / spread } else { 0.0 };
             let read_variance = (wy - gain * wx) / w;
-            // A line that leaves the quadrant is replaced by the best one on its border.
+            // A line with a negative parameter is replaced by the best line with that parameter at 0.
             model = match (read_variance >= 0.0, gain >= 0.0) {
                 (true, true) => Self { read_variance, gain },
                 (false, _) => Self { read_variance: 0.0, gain: wxy / wxx },
@@ -128,7 +127,7 @@ impl NoiseModel {
     }
 }
 
-/// The square of a difference in which noise alone remains, scaled to the variance of one sample of one frame.
+/// The square of a difference that contains only noise, scaled to the variance of one sample of one frame.
 #[derive(Debug, Clone, Copy)]
 struct SquaredDifference {
     intensity: f64,
@@ -136,7 +135,7 @@ struct SquaredDifference {
 }
 
 impl SquaredDifference {
-    /// Median intensity of a group, and the variance that the median of its squares implies.
+    /// Median intensity of a group, and the variance implied by the median of its squares.
     fn median(group: &mut [Self]) -> Self {
         let middle = group.len() / 2;
         let intensity = group[middle].intensity;
@@ -145,7 +144,8 @@ impl SquaredDifference {
     }
 }
 
-/// Of `samples` `[settings, 3]`, the middle pixel, whose sum is `total`, against the mean of the others times `scales`.
+/// From `samples` `[settings, 3]`: the middle pixel, whose sum is `total`, minus the mean of the others times
+/// `scales`.
 fn squared_differences<'a>(
     samples: ArrayView2<'a, f32>,
     scales: [f64; 2],
@@ -158,7 +158,7 @@ fn squared_differences<'a>(
     (0..frames.len()).map(move |setting| {
         let [a, b, c] = [0, 1, 2].map(|pixel| f64::from(samples[[setting, pixel]]));
         let difference = b - (left * a + right * c) / 2.0;
-        // Scaling to equal totals removes the part of the noise that a sample has of its total.
+        // Scaling to equal totals removes the part of a sample's noise that it shares with its total.
         let kept = 1.0 - (b / total).clamp(0.0, 0.5);
         SquaredDifference {
             intensity: (b + (left * left * a + right * right * c) / 4.0) / spread,

@@ -1,9 +1,9 @@
 //! Block principal pivoting of many pixels that share a quadratic: exact in finitely many steps (Kim and Park, "Fast
 //! Nonnegative Matrix Factorization: An Active-Set-Like Method and Comparisons", 2011, section 4).
 //!
-//! All pixels go on by one step at a time, sorted anew by the size of their systems before each, so that those which share
-//! the lanes of the vector registers have as much to do. What is computed for a pixel does not depend, to the bit, on the
-//! others, so pixels may come together in any way.
+//! All pixels advance one step at a time. Before each step they are sorted by the size of their systems, so that
+//! pixels sharing vector registers have the same amount of work. The result of a pixel is the same to the bit
+//! whatever the other pixels are, so pixels may be combined in any way.
 
 use aligned_vec::{AVec, avec};
 use ndarray::{Array1, Array2, ArrayView2, Axis};
@@ -20,23 +20,24 @@ const PATIENCE: usize = 3;
 /// Steps after which a pixel is left to the reference solver; ordinary pixels take about five.
 const MAX_STEPS: usize = 300;
 
-/// Infeasibility below this share of the problem's own scale is rounding.
+/// Infeasibility below this share of the problem's own scale is attributed to rounding.
 const TOLERANCE: f64 = 1e-11;
 
-/// Length of runs for [`Start::Runs`]: shorter ones have many means to solve, longer ones are less alike.
+/// Length of runs for [`Start::Runs`]: shorter runs need more means to be solved, the pixels of longer ones differ
+/// more.
 pub(super) const RUN_PX: usize = 64;
 
-/// Which slots are free at first.
+/// The initial set of free slots.
 pub(super) enum Start<'a> {
-    /// These, `[pixels, slots]`.
+    /// The given slots, `[pixels, slots]`.
     Free(ArrayView2<'a, bool>),
-    /// In runs of so many pixels, one after the other, those of the minimum for the run's mean: it has less noise than a
-    /// neighbour's.
+    /// The pixels form consecutive runs of these lengths. Each starts from the free slots of the minimum for its
+    /// run's mean, which has less noise than a neighbour's.
     Runs(&'a [usize]),
 }
 
-/// Minimises `x'Hx - 2 c'x` over `x >= 0` for pixels that share `H`. `linear` holds their `c`, `[pixels, slots]` in
-/// standard layout, and comes back with their `x`.
+/// Minimises `x'Hx - 2 c'x` over `x >= 0` for pixels that share `H`. `linear` contains their `c`, `[pixels, slots]`
+/// in standard layout; the result contains their `x`.
 pub(super) fn minimise(
     simd: SimdLevel,
     quadratic: &Quadratic,
@@ -70,7 +71,7 @@ pub(super) fn minimise(
     slope
 }
 
-/// Minimises `x'Hx - 2 c'x` with `x = 0` in all slots that are not free, whatever sign `x` has in the others. `free` is
+/// Minimises `x'Hx - 2 c'x` with `x = 0` in all slots that are not free and any sign of `x` in the others. `free` is
 /// `[pixels, slots]`; `linear` as in [`minimise`].
 pub(super) fn minimise_free(
     simd: SimdLevel,
@@ -102,7 +103,7 @@ fn means_of_runs(pixels: ArrayView2<f64>, lengths: &[usize]) -> Array2<f64> {
     means
 }
 
-/// The slots of each pixel that are free: 1, and the others 0, as are those that pad the quadratic's rows.
+/// Marks of each pixel's slots: 1 for free slots, 0 for the others and for the padding of the quadratic's rows.
 struct Free {
     stride: usize,
     marks: AVec<f64>,
@@ -135,45 +136,45 @@ impl Free {
     }
 }
 
-/// Which minimum is sought.
+/// The kind of minimum to compute.
 #[derive(Clone, Copy)]
 enum Aim {
     /// Over `x >= 0`.
     NonNegative,
-    /// Over the free slots as they are.
+    /// With the given free slots.
     Free,
 }
 
-/// Takes pixels to their minima.
+/// The pivoting of a set of pixels.
 struct Pivoting<'a> {
     aim: Aim,
     quadratic: &'a Quadratic,
     slots: usize,
     /// `H^-1 c`, `[pixels][slots]`.
     unconstrained: &'a [f64],
-    /// Half the gradient at `x = 0`, `-c`, `[pixels][slots]`; minima take its place.
+    /// Half the gradient at `x = 0`, `-c`, `[pixels][slots]`; overwritten with the minima.
     slope: &'a mut [f64],
-    /// Those of the minima in the end.
+    /// The free slots, in the end those of the minima.
     free: &'a mut Free,
 }
 
-/// What a step solves for.
+/// The unknowns of a step's systems.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Side {
     /// `x` in the free slots `F`: `H_FF x_F = c_F`.
     Free,
-    /// Half the gradient `g` in the others, where it makes `x = H^-1 (c + g)` zero.
+    /// Half the gradient `g` in the slots that are not free, such that `x = H^-1 (c + g)` is zero there.
     Zero,
 }
 
-/// How a pixel's pivoting goes.
+/// The state of a pixel's pivoting.
 struct Pixel {
     number: usize,
     largest_c: f64,
     fewest: usize,
     patience: usize,
     steps: usize,
-    /// Of the next step, and the size of its system.
+    /// Kind and size of the next step's system.
     side: Side,
     size: usize,
     state: State,
@@ -204,7 +205,7 @@ impl<'a> Pivoting<'a> {
         }
     }
 
-    /// Brings pixels together whose next systems are of the same kind and about the same size.
+    /// Sorts the pixels so that the next systems of neighbours are of the same kind and about the same size.
     fn sort(&self, pixels: &mut [Pixel]) {
         for pixel in &mut *pixels {
             let free = self.free.count(pixel.number);
@@ -216,7 +217,7 @@ impl<'a> Pivoting<'a> {
         pixels.sort_unstable_by_key(|pixel| (pixel.side, pixel.size, pixel.number));
     }
 
-    /// The matrix of a side's systems, the mark of the slots solved for, and what a pixel has in all slots before.
+    /// The matrix of a side's systems, the mark of the slots solved for, and the pixel's initial values in all slots.
     fn system(&self, side: Side, pixel: usize) -> (&Padded, f64, &[f64]) {
         let own = pixel * self.slots..(pixel + 1) * self.slots;
         match side {
@@ -227,7 +228,7 @@ impl<'a> Pivoting<'a> {
 }
 
 impl WithSimd for Pivoting<'_> {
-    /// The pixels that pivoting gave up on, left to the reference solver.
+    /// The pixels that pivoting gave up on, which the reference solver must handle.
     type Output = Vec<usize>;
 
     #[inline(always)]
@@ -306,8 +307,8 @@ impl Pixel {
         }
     }
 
-    /// Looks for slots with the wrong sign in a step's `y`, and has them change sides; `free_costs`: a step costs the more, the
-    /// more slots are free.
+    /// Finds slots with the wrong sign in a step's `y` and exchanges them. `free_costs`: the cost of a step grows
+    /// with the number of free slots.
     #[inline(always)]
     fn exchange<S: Simd>(
         &mut self,
@@ -348,14 +349,14 @@ impl Pixel {
             self.patience -= 1;
             exchange_most(y, free_costs, free, exchanged);
         } else if let Some(last) = (0..free.len()).rev().find(|&slot| free[slot] != exchanged[slot]) {
-            // Exchanging only the last row cannot cycle (Murty), so the count falls below `fewest` at last.
+            // Exchanging only the last row cannot cycle (Murty), so the count eventually falls below `fewest`.
             free[last] = exchanged[last];
         }
     }
 }
 
-/// Exchanges all slots; where free ones are what a step costs, of neighbours that are to become free only those that gain
-/// most: they are mostly enough, and the others would have to go again.
+/// Exchanges all slots. If free slots make steps expensive, only the best of neighbouring slots becomes free: this is
+/// usually enough, and the others would mostly have to be removed again.
 #[inline(always)]
 fn exchange_most(y: &[f64], free_costs: bool, free: &mut [f64], exchanged: &mut [f64]) {
     if free_costs {
@@ -381,7 +382,7 @@ mod tests {
         (-(count as i32) / 2..).take(count).map(|u| Slot { u, kind: SlotKind::Own }).collect()
     }
 
-    /// Solves pixels at every level that the machine has, and compares each with the reference.
+    /// Solves pixels at every level that the machine supports, and compares each with the reference.
     fn equals_the_reference(quadratic: &Quadratic, linear: &Array2<f64>, start: &Start) {
         for level in SimdLevel::available() {
             let x = minimise(level, quadratic, linear.clone(), start);
@@ -395,7 +396,7 @@ mod tests {
         }
     }
 
-    /// Solves pixels one by one, and compares their bits with those of all together.
+    /// Solves pixels one by one, and compares the results bit for bit with those of all pixels together.
     fn equals_itself_alone(quadratic: &Quadratic, linear: &Array2<f64>, start: &Array2<bool>) {
         for level in SimdLevel::available() {
             let together = minimise(level, quadratic, linear.clone(), &Start::Free(start.view()));
@@ -441,8 +442,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(60))]
 
-        /// Few settings for many slots, which are solved along their chains: both priors, boxes and anything else, rows
-        /// that no setting sees.
+        /// Few settings for many slots, which are solved along their chains: both priors, boxes and arbitrary
+        /// weights, rows that no setting sees.
         #[test]
         fn few_settings(slot_count in 30..90_usize, settings in 1..9_usize, pixels in 1..20_usize, beta in 0.0..1.0, split: bool, warm: bool, boxes: bool, seed: u64) {
             let mut random = random(seed);
@@ -476,7 +477,7 @@ mod tests {
             let linear = quadratic.linear(weights.view(), samples.view());
             let minima = minimise(SimdLevel::best(), &quadratic, linear.clone(), &Start::Runs(&[2, 1]));
             for (x, c) in minima.rows().into_iter().zip(linear.rows()) {
-                // The conditions of the minimum, because the reference would take minutes.
+                // Checks the optimality conditions, because the reference would take minutes.
                 let gradient = quadratic.h().dot(&x) - c;
                 let scale = c.iter().fold(0.0_f64, |most, c| most.max(c.abs()));
                 for (x, gradient) in x.iter().zip(&gradient) {

@@ -4,25 +4,25 @@ use ndarray::Array2;
 
 use super::{PlaneError, Slot};
 
-/// What is assumed of a pixel's profile `T(u)` beside `T >= 0`: the terms `alpha ||D T||^2 + beta sum(T)`.
+/// Prior of a pixel's profile `T(u)` in addition to `T >= 0`: the terms `alpha ||D T||^2 + beta sum(T)`.
 ///
-/// `alpha` and `beta` mean what they say only for intensities on the scale on which a white surface gives 1.0.
+/// The values of `alpha` and `beta` assume intensities on the scale on which a white surface gives 1.0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Prior {
-    /// The paper's: `D` holds all differences `T(u+1) - T(u)` between existing rows, all of weight 1.
+    /// The paper's prior: `D` contains all differences `T(u+1) - T(u)` between existing rows, all with weight 1.
     Paper {
         /// Weight of smoothness.
         alpha: f64,
         /// Weight of sparsity.
         beta: f64,
     },
-    /// Direct light is a spike at `u = 0` by geometry, and indirect light is the smoother the farther away it comes
-    /// from: the difference `T(u+1) - T(u)` has weight `|u + 1/2|`, none touches `u = 0`, and the bridge
-    /// `T(1) - T(-1)` has weight 1.
+    /// Direct light is a spike at `u = 0` by geometry, and indirect light is smoother the farther away it comes from:
+    /// the difference `T(u+1) - T(u)` has weight `|u + 1/2|`, no difference involves `u = 0`, and the bridge `T(1) -
+    /// T(-1)` has weight 1.
     Split {
         /// Weight of smoothness.
         alpha: f64,
-        /// Weight of sparsity, of `u = 0` too.
+        /// Weight of sparsity, which includes `u = 0`.
         beta: f64,
     },
 }
@@ -30,10 +30,10 @@ pub enum Prior {
 impl Prior {
     /// The paper's prior with the paper's weights.
     pub const PAPER: Self = Self::Paper { alpha: 0.01, beta: 0.01 };
-    /// The split prior with the weights that suit most scenes.
+    /// The split prior with weights that suit most scenes.
     pub const SPLIT: Self = Self::Split { alpha: 0.1, beta: 0.001 };
 
-    /// The name by which plans and reports call the prior: `paper` or `split`.
+    /// The prior's name in plans and reports: `paper` or `split`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Paper { .. } => "paper",
@@ -70,7 +70,7 @@ impl Prior {
     }
 
     /// `D`, one row per difference between neighbouring existing slots, shape `[differences, slots]`. Wrapped slots
-    /// are a chain of their own, because no measured row joins them to the others.
+    /// form separate chains, because no measured row links them to the others.
     pub fn differences(&self, slots: &[Slot]) -> Array2<f64> {
         let index_of = |wanted: Slot| slots.iter().position(|&slot| slot == wanted);
         let mut pairs = Vec::new();
@@ -148,7 +148,7 @@ mod tests {
 
     #[test]
     fn wrapped_slots_are_a_chain_of_their_own() {
-        // 3 follows 2, and -5 does not follow 4: neither pair is joined.
+        // 3 follows 2, but belongs to another frame, and -5 does not follow 4: neither pair is linked.
         let slots = slots(&[1, 2], &[-5, -4, 3]);
         assert_eq!(Prior::PAPER.differences(&slots), array![[-1., 1., 0., 0., 0.], [0., 0., -1., 1., 0.]]);
         assert_eq!(

@@ -2,12 +2,12 @@ use ndarray::{ArrayView3, Axis, s};
 
 use super::{RowModel, RowTiming, Setting, Slot, SlotKind, Transport};
 
-/// Light over the delay `t_d` at one exposure, by ascending delay.
+/// Light as a function of the delay `t_d` at one exposure, by ascending delay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DelayProfile {
     /// Mean true delay of each image.
     pub delays_us: Vec<f64>,
-    /// Mean light of the pixels in each image, 1.0 for a white surface under its own row.
+    /// Mean light of the pixels in each image; 1.0 for a white surface under its own row.
     pub light: Vec<f64>,
 }
 
@@ -19,8 +19,8 @@ impl DelayProfile {
         Self::mean(settings, &sums, pixels.len())
     }
 
-    /// The same as the forward model predicts it from `transport`. What an exposure sees of the next or the previous
-    /// frame is not in the transport, and so not in the prediction.
+    /// The profile that the forward model predicts from `transport`. Light of the next or the previous frame is not
+    /// in the transport, and therefore not in the prediction.
     pub fn predicted(
         timing: &RowTiming,
         transport: &Transport,
@@ -32,8 +32,8 @@ impl DelayProfile {
         Self::mean(settings, &sums, pixels.len())
     }
 
-    /// The mean of `pixels` whose light was summed by [`Self::add_measured`] or [`Self::add_predicted`], a sum for each
-    /// setting.
+    /// The mean of `pixels` whose light was summed by [`Self::add_measured`] or [`Self::add_predicted`], one sum for
+    /// each setting.
     pub fn mean(settings: &[Setting], sums: &[f64], pixels: usize) -> Self {
         let mean_us =
             |setting: &Setting| setting.delays_us.iter().sum::<f64>() / setting.delays_us.len() as f64;
@@ -44,16 +44,16 @@ impl DelayProfile {
         Self { delays_us, light }
     }
 
-    /// Adds the light of `pixels` to that of those before, in their order: some camera rows after others give the bits of
-    /// all at once.
+    /// Adds the light of `pixels` to the sums, in order: processing the camera rows in parts gives the same bits as
+    /// processing all at once.
     pub fn add_measured(sums: &mut [f64], stack: ArrayView3<f32>, pixels: &[[usize; 2]]) {
         for (sum, image) in sums.iter_mut().zip(stack.axis_iter(Axis(0))) {
             pixels.iter().for_each(|&pixel| *sum += f64::from(image[pixel]));
         }
     }
 
-    /// [`Self::add_measured`] of the prediction from the camera rows from `first_row` on, of which `transport` and
-    /// `pixels` are.
+    /// [`Self::add_measured`] for the prediction of the camera rows starting at `first_row`, to which `transport` and
+    /// `pixels` refer.
     pub fn add_predicted(
         sums: &mut [f64],
         timing: &RowTiming,
@@ -76,8 +76,8 @@ impl DelayProfile {
         }
     }
 
-    /// The profile over its area (trapezium rule), per microsecond: albedo and brightness cancel, as the recognition
-    /// of materials needs it (the paper's Figure 11). NaN where the area is not positive.
+    /// The profile divided by its area (trapezium rule), per microsecond: albedo and brightness cancel, as required
+    /// for material recognition (the paper's Figure 11). NaN if the area is not positive.
     pub fn normalised_per_us(&self) -> Vec<f64> {
         let pieces = self.delays_us.windows(2).zip(self.light.windows(2));
         let area: f64 = pieces.map(|(us, light)| (us[1] - us[0]) * (light[0] + light[1]) / 2.0).sum();

@@ -5,11 +5,12 @@ use super::dense::MAX_LANES;
 use super::narrow::Narrow;
 use super::{PlaneError, Prior, Slot, cholesky};
 
-/// Relative increase of the diagonal of `H`. Rows that the settings leave undetermined then have one solution, the
-/// smallest, and every factorisation succeeds; the minimum moves by far less than a sample's rounding.
+/// Relative increase of the diagonal of `H`. Rows that the settings leave undetermined then have a unique solution,
+/// the smallest, and every factorisation succeeds. The minimum moves by far less than a sample's rounding.
 pub(super) const RIDGE: f64 = 1e-12;
 
-/// Condition up to which the inverse is used; the paper's sweep has at most 1e4, undetermined rows 1e12.
+/// Largest condition number for which the inverse is used; the paper's sweep has at most 1e4, undetermined rows give
+/// 1e12.
 const WELL_CONDITIONED: f64 = 1e7;
 
 /// The objective `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` of one camera row, as `T'HT - 2 c'T + I'I` with
@@ -19,24 +20,24 @@ pub(super) struct Quadratic {
     h: Padded,
     /// The inverse of `H`.
     inverse: Padded,
-    /// Whether solutions may be taken from the inverse. Settings that leave rows undetermined give it entries so
-    /// large that nothing but rounding would remain.
+    /// Whether solutions may be computed from the inverse. If settings leave rows undetermined, its entries are so
+    /// large that only rounding errors would remain.
     well_conditioned: bool,
     half_beta: f64,
-    /// The parts of `H`, where there are few settings for many rows.
+    /// The parts of `H` for the chain solver; `None` unless there are few settings for many rows.
     narrow: Option<Narrow>,
 }
 
 impl Quadratic {
-    /// The objective of the settings whose `weights` are given, shape `[settings, slots]`.
+    /// The objective of settings with these `weights`, shape `[settings, slots]`.
     ///
     /// # Errors
-    /// [`PlaneError::NotConvex`] if the numbers leave the range of floating point.
+    /// [`PlaneError::NotConvex`] if values exceed the range of floating point.
     pub fn new(weights: ArrayView2<f64>, slots: &[Slot], prior: &Prior) -> Result<Self, PlaneError> {
         Self::with_differences(weights, prior.differences(slots).view(), prior)
     }
 
-    /// The objective under a `D` of one's own, shape `[differences, slots]`.
+    /// The objective with the given `D`, shape `[differences, slots]`.
     ///
     /// # Errors
     /// Those of [`Self::new`].
@@ -58,7 +59,7 @@ impl Quadratic {
         }
         let narrow = Narrow::new(weights, differences, prior.alpha(), &h.diag().to_vec());
         for diagonal in h.diag_mut() {
-            // A slot that no setting sees and no difference holds must not make H singular; its T is 0 in any case.
+            // A slot without any setting or difference must not make H singular; its T is 0 in any case.
             *diagonal = if *diagonal > 0.0 { *diagonal * (1.0 + RIDGE) } else { 1.0 };
         }
         let inverse = invert(h.view())?;
@@ -66,20 +67,20 @@ impl Quadratic {
     }
 
     fn from_parts(h: Array2<f64>, inverse: Array2<f64>, half_beta: f64) -> Self {
-        // The diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
+        // From the diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
         let condition =
             h.diag().iter().zip(inverse.diag()).fold(1.0_f64, |most, (h, inverse)| most.max(h * inverse));
         let [h, inverse] = [h, inverse].map(|matrix| Padded::new(matrix.view()));
         Self { h, inverse, well_conditioned: condition < WELL_CONDITIONED, half_beta, narrow: None }
     }
 
-    /// The same objective without some of its settings, whose weights are `dropped`, shape `[dropped settings, slots]`:
-    /// a downdate of `H` and of its inverse (Sherman, Morrison and Woodbury), much cheaper than a new factorisation.
-    /// None where too little would remain to be accurate.
+    /// The same objective without some of its settings, whose weights are `dropped`, shape `[dropped settings,
+    /// slots]`: a downdate of `H` and of its inverse (Sherman, Morrison and Woodbury), much cheaper than a new
+    /// factorisation. `None` if too little would remain to be accurate.
     pub fn without(&self, dropped: ArrayView2<f64>) -> Option<Self> {
         let (settings, _) = dropped.dim();
         let h = &self.h() - &dropped.t().dot(&dropped);
-        // The ridge and rounding are all that is left of rows that only the dropped settings saw.
+        // Only the ridge and rounding remain of rows that only the dropped settings saw.
         let lost = h.diag().iter().zip(self.h().diag()).any(|(left, had)| *left <= 1e-9 * had);
         let seen = dropped.dot(&self.inverse());
         let mut core = (Array2::<f64>::eye(settings) - seen.dot(&dropped.t())).into_raw_vec_and_offset().0;
@@ -101,12 +102,12 @@ impl Quadratic {
         Some(Self::from_parts(h, inverse, self.half_beta)).filter(|downdated| downdated.well_conditioned)
     }
 
-    /// The parts of `H` that systems are solved by where there are few settings for many rows.
+    /// The parts of `H` for the chain solver, if there are few settings for many rows.
     pub fn narrow(&self) -> Option<&Narrow> {
         self.narrow.as_ref()
     }
 
-    /// How many unknowns there are.
+    /// Number of unknowns.
     pub fn slots(&self) -> usize {
         self.h.slots
     }
@@ -121,17 +122,17 @@ impl Quadratic {
         self.inverse.view()
     }
 
-    /// `H` as systems are gathered from it.
+    /// `H`, padded for gathering systems.
     pub fn padded_h(&self) -> &Padded {
         &self.h
     }
 
-    /// The inverse, as [`Self::padded_h`].
+    /// The inverse, padded as [`Self::padded_h`].
     pub fn padded_inverse(&self) -> &Padded {
         &self.inverse
     }
 
-    /// Whether solutions may be taken from the inverse.
+    /// Whether solutions may be computed from the inverse.
     pub fn well_conditioned(&self) -> bool {
         self.well_conditioned
     }
@@ -142,12 +143,12 @@ impl Quadratic {
     }
 }
 
-/// A square matrix in whole vectors of any width: after each row, and after the last, come zeros.
+/// A square matrix padded to whole vectors of any width: zeros follow each row, and a row of zeros follows the last.
 #[derive(Debug, Clone)]
 pub(super) struct Padded {
     /// Rows and columns without the zeros.
     pub slots: usize,
-    /// Columns with the zeros, of which there is at least one.
+    /// Number of columns with the zeros, of which there is at least one.
     pub stride: usize,
     values: AVec<f64>,
 }
@@ -163,7 +164,7 @@ impl Padded {
         Self { slots, stride, values }
     }
 
-    /// A row with its zeros; that of number [`Self::slots`] has nothing else.
+    /// A row with its padding; row number [`Self::slots`] is all zeros.
     #[inline(always)]
     pub fn row(&self, slot: usize) -> &[f64] {
         &self.values[slot * self.stride..(slot + 1) * self.stride]

@@ -1,4 +1,4 @@
-//! The plain solver that the fast one must equal: one pixel at a time, one row freed at a time.
+//! The simple solver that the fast one must equal: one pixel at a time, one row freed at a time.
 
 use ndarray::ArrayView2;
 
@@ -13,7 +13,7 @@ pub fn minimise(h: ArrayView2<f64>, c: &[f64]) -> Vec<f64> {
     let scale = c.iter().fold(0.0_f64, |largest, c| largest.max(c.abs()));
     let mut x = vec![0.0; n];
     let mut free = vec![false; n];
-    // Rows whose descent was rounding only: freeing them again would not end.
+    // Rows that were freed because of rounding errors only; freeing them again would never end.
     let mut refused = vec![false; n];
     loop {
         let descent: Vec<f64> = (0..n).map(|i| c[i] - dot_row(h, i, &x)).collect();
@@ -27,7 +27,7 @@ pub fn minimise(h: ArrayView2<f64>, c: &[f64]) -> Vec<f64> {
             continue;
         }
         refused.fill(false);
-        // Walk towards the stationary point; each time a row reaches 0 first, fix it there and aim anew.
+        // Move towards the stationary point; whenever a row reaches 0 first, fix it there and recompute the target.
         while let Some(leaving) = first_to_reach_zero(&x, &solution, &free) {
             let step = x[leaving] / (x[leaving] - solution[leaving]);
             for i in 0..n {
@@ -43,7 +43,7 @@ pub fn minimise(h: ArrayView2<f64>, c: &[f64]) -> Vec<f64> {
     }
 }
 
-/// The minimum over the free rows, with 0 in all others.
+/// The minimum over the free rows, with 0 in all other rows.
 fn stationary_point(h: ArrayView2<f64>, c: &[f64], free: &[bool]) -> Vec<f64> {
     let rows: Vec<usize> = (0..c.len()).filter(|&i| free[i]).collect();
     let mut matrix: Vec<f64> = rows.iter().flat_map(|&i| rows.iter().map(move |&j| h[[i, j]])).collect();
@@ -83,7 +83,7 @@ mod tests {
     }
 
     proptest! {
-        /// With three unknowns every choice of zero rows can be tried.
+        /// With three unknowns all sets of zero rows can be tried.
         #[test]
         fn equals_trying_all_active_sets(a in prop::collection::vec(-1.0..1.0, 12), c in prop::array::uniform3(-1.0..1.0)) {
             let a = Array2::from_shape_vec((4, 3), a).unwrap();

@@ -4,15 +4,14 @@ use rayon::prelude::*;
 use super::error::check_shape;
 use super::{PlaneError, RowTiming, Transport};
 
-/// The image `[t, s]` under a projector that shows each of its rows with one weight, shape `[projector_rows]`:
+/// The image `[t, s]` for a projector that shows each of its rows with one weight, shape `[projector_rows]`:
 /// `sum over v of weights[v] T(v, t, s)`, 1.0 for a white surface under its own row at weight 1.
 ///
-/// Rows outside the transport's reach are unknown and add nothing, so all rows at weight 1 give
+/// Rows outside the transport's reach are unknown and contribute nothing, so all rows at weight 1 give
 /// [`Transport::total`].
 ///
 /// # Errors
-/// [`PlaneError::Shape`] if the weights are not those of the projector's rows, or the transport not that of the
-/// camera's.
+/// [`PlaneError::Shape`] if the weights do not fit the projector's rows, or the transport does not fit the camera's.
 pub fn relight(
     timing: &RowTiming,
     transport: &Transport,
@@ -22,11 +21,11 @@ pub fn relight(
     relight_rows(timing, 0, transport, weights)
 }
 
-/// [`relight`] of the camera rows from `first_row` on that `transport` holds alone.
+/// [`relight`] for a `transport` that contains only the camera rows starting at `first_row`.
 ///
 /// # Errors
-/// [`PlaneError::Shape`] if the weights are not those of the projector's rows; [`PlaneError::Rows`] for rows that the
-/// camera does not have.
+/// [`PlaneError::Shape`] if the weights do not fit the projector's rows; [`PlaneError::Rows`] for rows that do not
+/// exist in the camera.
 pub fn relight_rows(
     timing: &RowTiming,
     first_row: usize,
@@ -43,7 +42,7 @@ pub fn relight_rows(
     let mut image = Array2::zeros((rows, columns));
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(at, mut image_row)| {
         let profiles = transport.t.index_axis(Axis(1), at);
-        // In f64, because thousands of dim rows add up beside a bright one.
+        // In f64, because the light of thousands of dim rows adds up next to a bright one.
         let mut sum = Array1::<f64>::zeros(columns);
         let u_of_row_0 = i64::from(timing.relative_row(0, first_row + at));
         for (u, light) in (i64::from(transport.u_min)..).zip(profiles.outer_iter()) {

@@ -1,8 +1,8 @@
-/// How one image of a stack was exposed: the mean of one frame per delay, all with the same exposure.
+/// The exposure of one image of a stack: the mean of one frame per delay, all with the same exposure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
-    /// True delay `t_d` of each averaged frame: centre of a row's exposure minus centre of its illumination, measured
-    /// against the VSYNC edge of that frame. Positive: the camera row sees rows below its own (`u > 0`).
+    /// True delay `t_d` of each averaged frame: centre of a row's exposure minus centre of its illumination, relative
+    /// to the VSYNC edge of that frame. Positive: the camera row sees rows below its own (`u > 0`).
     pub delays_us: Vec<f64>,
     /// Exposure of a camera row, `t_e`.
     pub exposure_us: f64,

@@ -1,7 +1,7 @@
 use pulp::{Scalar, Simd, WithSimd};
 
-/// The instructions that the solver uses. All give the same transport to rounding; on one of them it is the same to the
-/// bit, whatever the number of threads.
+/// The instruction set that the solver uses. All give the same transport to rounding; with one level it is the same
+/// to the bit for any number of threads.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SimdLevel {
     /// Plain floating point: one pixel at a time.
@@ -13,17 +13,17 @@ pub enum SimdLevel {
 }
 
 impl SimdLevel {
-    /// All levels that this machine has, the fastest last.
+    /// All levels that this machine supports, fastest last.
     pub fn available() -> Vec<Self> {
         [Self::Portable, Self::Avx2, Self::Avx512].into_iter().filter(|level| level.is_available()).collect()
     }
 
-    /// The fastest level that this machine has.
+    /// The fastest level that this machine supports.
     pub fn best() -> Self {
         Self::available().pop().unwrap_or(Self::Portable)
     }
 
-    /// The name by which reports call it.
+    /// The name used in reports.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Portable => "portable",
@@ -46,7 +46,7 @@ impl SimdLevel {
         self == Self::Portable
     }
 
-    /// Runs `op` with these instructions, or with the portable ones where the machine lacks them.
+    /// Runs `op` with these instructions, or with the portable ones if the machine does not support them.
     #[cfg(target_arch = "x86_64")]
     pub(super) fn run<Op: WithSimd>(self, op: Op) -> Op::Output {
         match (self, pulp::x86::V3::try_new(), pulp::x86::V4::try_new()) {

@@ -1,4 +1,4 @@
-//! An image's pixels in tiles that share an objective: what [`super::Demux`] solves and [`super::Uncertainty`] judges.
+//! Divides an image's pixels into tiles that share an objective, for [`super::Demux`] and [`super::Uncertainty`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -11,23 +11,23 @@ use super::pivot::RUN_PX;
 use super::quadratic::Quadratic;
 use super::{PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind};
 
-/// Pixels that are solved together: as many as keep their vectors in the cache beside the model.
+/// Number of pixels that are solved together: their vectors fit in the cache together with the model.
 const TILE_PX: usize = 512;
 
-/// Objectives that are held at a time: few enough for the memory, enough for all threads.
+/// Number of objectives held at a time: few enough for the memory, enough for all threads.
 const PROBLEMS: usize = 16;
 
-/// Steps, per projector row, of the place of direct light: pixels within one step share an objective.
+/// Steps of the position of direct light per projector row: pixels within one step share an objective.
 const SPIKE_STEPS: f32 = 64.0;
 
-/// Bytes of the objectives that solving on `threads` threads holds at a time, of pixels that see `reach_rows` projector rows:
-/// of each its matrix, the inverse, and the settings' weights or what both were made of.
+/// Memory in bytes for the objectives held at a time when solving on `threads` threads, for pixels that see
+/// `reach_rows` projector rows: for each its matrix, the inverse, and the settings' weights or their inputs.
 pub fn objectives_bytes(reach_rows: u64, threads: u64) -> u64 {
     let matrix_bytes = 8 * reach_rows.pow(2);
     3 * matrix_bytes * PROBLEMS as u64 * threads
 }
 
-/// What the objectives of all pixels are made of.
+/// The inputs of the objectives of all pixels.
 #[derive(Clone, Copy)]
 pub(super) struct Objectives<'a> {
     pub timing: &'a RowTiming,
@@ -37,9 +37,9 @@ pub(super) struct Objectives<'a> {
     pub spot: Option<&'a FlyingSpot>,
 }
 
-/// A camera row, and what is done with it.
+/// A camera row and the data to process.
 pub(super) struct Row<'a, T> {
-    /// Its number in the camera.
+    /// Its index in the camera.
     t: usize,
     columns: usize,
     /// `[settings, columns]`
@@ -47,11 +47,11 @@ pub(super) struct Row<'a, T> {
     /// `[columns]`
     u0_rows: Option<ArrayView1<'a, f32>>,
     pub data: T,
-    /// Columns by their direct light, once they are known.
+    /// Columns grouped by their direct light, once it is known.
     groups: BTreeMap<Direct, Vec<usize>>,
 }
 
-/// Where and when direct light arrives: the place in steps, and its weights as bits where they are not even.
+/// Position and time of direct light: the position in steps, and its weights as bits if the row is not lit evenly.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Direct {
     step: i32,
@@ -61,7 +61,7 @@ struct Direct {
 /// The objective of pixels with the same direct light and the same valid samples.
 pub(super) struct Problem<'a> {
     pub model: &'a RowModel,
-    /// Which of the settings count.
+    /// The indices of the settings in use.
     pub settings: Vec<usize>,
     /// `[settings, slots]`
     pub weights: Array2<f64>,
@@ -69,33 +69,33 @@ pub(super) struct Problem<'a> {
     pub spike: Option<Spike>,
 }
 
-/// Direct light between rows: one unknown, in the slot of row 0, that stands for light in two rows.
+/// Direct light between two rows: one unknown, in the slot of row 0, that represents light in both rows.
 #[derive(Clone, Copy)]
 pub(super) struct Spike {
     /// The slot of row 0.
     pub own: usize,
-    /// The slot of the row on the other side, if the projector has it.
+    /// The slot of the row on the other side, if the projector has this row.
     pub neighbour: Option<usize>,
     /// The neighbour's share of the light.
     pub share: f64,
 }
 
-/// Pixels that share an objective, each as the index of its row and its column.
+/// Pixels that share an objective, each given by the index of its row and its column.
 #[derive(Default)]
 pub(super) struct Tile {
     pub pixels: Vec<(usize, usize)>,
-    /// Lengths of the runs that they come in: neighbours in one row, so that an image which is solved in parts is solved as
-    /// it would be in one.
+    /// Lengths of the runs of pixels: neighbours in one row, so that an image solved in parts gives the same result
+    /// as one solved as a whole.
     pub runs: Vec<usize>,
 }
 
-/// What is done with a tile, whose pixels lie in these rows.
+/// The processing of a tile, whose pixels lie in these rows.
 pub(super) trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
 impl<T, F: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync> Work<T> for F {}
 
 impl Objectives<'_> {
-    /// Does `work` with all pixels of some camera rows, ascending, for as long as `go_on` says yes; tiles in parallel, with
-    /// each pixel in the same run however the rows come together.
+    /// Calls `work` for all pixels of some camera rows, ascending, for as long as `go_on` returns true. Tiles are
+    /// processed in parallel. The run of each pixel does not depend on which rows are combined.
     ///
     /// # Errors
     /// Those of `work`; [`PlaneError::NotConvex`]; [`PlaneError::Stopped`].
@@ -105,7 +105,8 @@ impl Objectives<'_> {
         go_on: &(dyn Fn() -> bool + Sync),
         work: &impl Work<T>,
     ) -> Result<(), PlaneError> {
-        // Neighbouring rows with the same model, a class at a time, so that its factors live no longer than they are needed.
+        // Neighbouring rows with the same model form a class. Classes are processed one at a time, so that factors
+        // are kept no longer than needed.
         let mut classes: Vec<(RowModel, &mut [Row<T>])> = Vec::new();
         let mut rest = rows;
         while let Some(first) = rest.first() {
@@ -122,7 +123,7 @@ impl Objectives<'_> {
         RowModel::new(self.timing, self.settings, self.reach, t)
     }
 
-    /// Rows that have the same model.
+    /// Processes rows with the same model.
     fn for_class<T: Send>(
         &self,
         model: &RowModel,
@@ -135,7 +136,7 @@ impl Objectives<'_> {
         }
         let directs: BTreeSet<Direct> = rows.iter().flat_map(|row| row.groups.keys().cloned()).collect();
         let directs: Vec<Direct> = directs.into_iter().collect();
-        // Rows of narrow images fill a tile together.
+        // Rows of narrow images share a tile.
         let columns = rows.first().map_or(1, |row| row.columns.max(1));
         let tile_rows = (TILE_PX / columns).max(1);
         for directs in directs.chunks(PROBLEMS) {
@@ -153,7 +154,7 @@ impl Objectives<'_> {
         Ok(())
     }
 
-    /// The pixels of these rows that have this direct light.
+    /// Processes the pixels of these rows that have this direct light.
     fn for_group<T>(
         &self,
         problem: &Problem,
@@ -186,7 +187,7 @@ impl Objectives<'_> {
         work(problem, &tile, rows)
     }
 
-    /// Columns of a row by where and when their direct light arrives.
+    /// Groups the columns of a row by position and time of their direct light.
     fn group<T>(&self, model: &RowModel, row: &Row<T>) -> Result<BTreeMap<Direct, Vec<usize>>, PlaneError> {
         let own = slot_of(model, 0);
         let uneven = match self.spot.zip(own) {
@@ -203,7 +204,7 @@ impl Objectives<'_> {
             let part = part.and_then(|(part, weights)| weights[part].as_ref().map(|_| part));
             by_part.entry(((u0_rows * SPIKE_STEPS).round() as i32, part)).or_default().push(column);
         }
-        // Parts that are drawn alike have the same weights, in other rows too.
+        // Parts that are drawn in the same way have the same weights, in other rows too.
         let mut groups: BTreeMap<Direct, Vec<usize>> = BTreeMap::new();
         for ((step, part), columns) in by_part {
             let weights = part.zip(uneven.as_ref()).and_then(|(part, (_, weights))| weights[part].as_ref());
@@ -215,8 +216,8 @@ impl Objectives<'_> {
 }
 
 impl<'a, T> Row<'a, T> {
-    /// A camera row of so many columns. `valid`, `[settings, columns]`, tells which samples count; `u0_rows`, `[columns]`,
-    /// where direct light lies.
+    /// A camera row of `columns` columns. `valid`, `[settings, columns]`, tells which samples are used; `u0_rows`,
+    /// `[columns]`, is the position of direct light.
     pub fn new(
         t: usize,
         columns: usize,
@@ -257,7 +258,7 @@ impl<'a> Problem<'a> {
         Ok(Self { model, settings: (0..weights.nrows()).collect(), weights, quadratic, spike })
     }
 
-    /// The same for pixels of which only some samples are valid.
+    /// The same problem for pixels with only some valid samples.
     fn masked(&self, valid: ArrayView1<bool>, prior: &Prior) -> Result<Self, PlaneError> {
         let (settings, dropped): (Vec<usize>, Vec<usize>) = self.settings.iter().partition(|&&n| valid[n]);
         let weights = self.weights.select(Axis(0), &settings);
@@ -269,7 +270,7 @@ impl<'a> Problem<'a> {
         Ok(Self { model: self.model, settings, weights, quadratic, spike: self.spike })
     }
 
-    /// The slots that a profile has a value for, `[slot, relative row - u_min]`.
+    /// The slots that are part of the profile, `[slot, relative row - u_min]`.
     pub fn places(&self, u_min: i32) -> impl Iterator<Item = (usize, usize)> {
         let own = self.model.slots.iter().enumerate().filter(|(_, slot)| slot.kind == SlotKind::Own);
         own.map(move |(slot, own)| (slot, (own.u - u_min) as usize))

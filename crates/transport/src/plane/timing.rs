@@ -3,58 +3,59 @@ use std::sync::Arc;
 
 use super::{Beam, PlaneError, Setting};
 
-/// When each projector row is lit, how its light spreads, and which projector rows the camera's rows look along.
+/// When each projector row is lit, how its light spreads, and which projector rows the camera's rows see.
 ///
-/// Nominally, rows are lit for `row_time_us` each, one after the other, once per VSYNC period; the rest of the period
-/// is the retrace, in which nothing is lit. [`Self::with_row_table`] says when they are lit in truth. A row sends the
-/// same light whatever its dwell, evenly over it: `T` is the light of one whole row.
+/// Nominally, each row is lit for `row_time_us`, one after the other, once per VSYNC period. The rest of the period
+/// is the retrace, in which nothing is lit. [`Self::with_row_table`] sets the real times. A row emits the same light
+/// whatever its dwell, evenly over it: `T` is the light of one whole row.
 ///
-/// Camera row `t` lies on the epipolar plane of the projector place `first_row + pitch t`, and its exposure begins
+/// Camera row `t` lies on the epipolar plane of the projector position `first_row + pitch t`, and its exposure begins
 /// `row_time_us` of the camera after that of row `t - 1`. Relative rows count from the projector row nearest to that
-/// place. Delays are measured for camera row 0, against the nominal raster: centre of its exposure minus nominal centre
-/// of row `first_row`. With the camera's row time at `pitch` times the projector's, that is the delay of every row
-/// against its own place; otherwise it drifts from row to row, by the difference, and the weights follow.
+/// position. Delays refer to camera row 0 and the nominal raster: centre of its exposure minus nominal centre of row
+/// `first_row`. If the camera's row time is `pitch` times the projector's, this is the delay of every row relative to
+/// its own position. Otherwise the delay drifts by the difference from row to row, and the weights follow.
 ///
 /// A scene with fewer rows than the projector is a window in the middle of its frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RowTiming {
     row_time_us: f64,
     period_us: f64,
-    /// Row `v` is lit from entry `v` to entry `v + 1`, from the nominal start of row 0 on.
+    /// Row `v` is lit from entry `v` to entry `v + 1`, relative to the nominal start of row 0.
     row_starts_us: Arc<[f64]>,
     camera: CameraRows,
     beam: Beam,
 }
 
-/// Which places of the projector the camera's rows look along, and when they are exposed.
+/// Which positions of the projector the camera's rows see, and when they are exposed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraRows {
     /// Projector row on whose epipolar plane camera row 0 lies.
     pub first_row: usize,
-    /// Camera rows.
+    /// Number of camera rows.
     pub rows: usize,
     /// Projector rows from one camera row to the next.
     pub pitch: f64,
-    /// From the start of one camera row's exposure to the next row's.
+    /// Time from the start of one camera row's exposure to the start of the next row's.
     pub row_time_us: f64,
 }
 
 impl CameraRows {
-    /// Place, in projector rows, on whose epipolar plane camera row `t` lies; between two rows where the pitch is not
-    /// whole.
+    /// Position, in projector rows, on whose epipolar plane camera row `t` lies. It is between two rows if the pitch
+    /// is not an integer.
     pub fn place(&self, t: usize) -> f64 {
         self.first_row as f64 + self.pitch * t as f64
     }
 
-    /// The projector row nearest to [`Self::place`], from which relative rows count; the lower on the screen of two
-    /// that are as near.
+    /// The projector row nearest to [`Self::place`], from which relative rows count; of two equally near rows, the
+    /// lower on the screen.
     pub fn own_row(&self, t: usize) -> usize {
         self.place(t).round() as usize
     }
 }
 
 impl RowTiming {
-    /// A projector of `projector_rows` rows of `row_time_us` every `period_us`, seen by as many camera rows.
+    /// A projector of `projector_rows` rows of `row_time_us` every `period_us`, seen by the same number of camera
+    /// rows.
     ///
     /// # Errors
     /// [`PlaneError::OutOfRange`] for a row time that is not positive, or rows that do not fit into the period;
@@ -67,7 +68,7 @@ impl RowTiming {
                 allowed: "positive: calibrate it as the slope of lit lines over exposure",
             });
         }
-        // Rows that end within rounding of the period leave a retrace of zero.
+        // If rows end at the period to within rounding, the retrace is zero.
         let lit_us = projector_rows as f64 * row_time_us;
         if !(period_us.is_finite() && period_us >= lit_us * (1.0 - 1e-9)) {
             return Err(PlaneError::OutOfRange {
@@ -81,12 +82,12 @@ impl RowTiming {
         Self { row_time_us, period_us, row_starts_us, camera, beam: Beam::Ideal }.with_camera(camera)
     }
 
-    /// The same projector, each of whose rows `v` is lit from `starts_us[v]` to `starts_us[v + 1]`, counted from the
-    /// nominal start of row 0. The camera, and with it the delays, keep to the nominal raster.
+    /// The same projector with each row `v` lit from `starts_us[v]` to `starts_us[v + 1]`, relative to the nominal
+    /// start of row 0. The camera, and with it the delays, still refer to the nominal raster.
     ///
     /// # Errors
-    /// [`PlaneError::OutOfRange`] for a table that has not one entry more than the projector has rows, does not rise
-    /// throughout, or begins or lasts longer than a VSYNC period.
+    /// [`PlaneError::OutOfRange`] for a table that does not have exactly one entry more than the projector has rows,
+    /// is not strictly increasing, or begins or lasts longer than a VSYNC period.
     pub fn with_row_table(self, starts_us: &[f64]) -> Result<Self, PlaneError> {
         let refused = |value, allowed| Err(PlaneError::OutOfRange { field: "row_table", value, allowed });
         if starts_us.len() != self.projector_rows() + 1 {
@@ -120,7 +121,7 @@ impl RowTiming {
     ///
     /// # Errors
     /// [`PlaneError::OutOfRange`] for a pitch or a row time that is not positive; [`PlaneError::Window`] if there are
-    /// no camera rows, or they leave the projector.
+    /// no camera rows, or they extend beyond the projector.
     pub fn with_camera(self, camera: CameraRows) -> Result<Self, PlaneError> {
         for (field, value) in [("row_pitch", camera.pitch), ("camera row_time_us", camera.row_time_us)] {
             if !(value.is_finite() && value > 0.0) {
@@ -140,11 +141,11 @@ impl RowTiming {
         Ok(Self { camera, ..self })
     }
 
-    /// The same projector, seen by `camera_rows` rows of its own pitch and row time that start on projector row
-    /// `first_row`.
+    /// The same projector, seen by `camera_rows` rows with the projector's pitch and row time, starting at projector
+    /// row `first_row`.
     ///
     /// # Errors
-    /// [`PlaneError::Window`] if the window is empty or leaves the projector.
+    /// [`PlaneError::Window`] if the window is empty or extends beyond the projector.
     pub fn window(self, first_row: usize, camera_rows: usize) -> Result<Self, PlaneError> {
         let row_time_us = self.row_time_us;
         self.with_camera(CameraRows { first_row, rows: camera_rows, pitch: 1.0, row_time_us })
@@ -159,7 +160,7 @@ impl RowTiming {
         self.window(first_row, camera_rows)
     }
 
-    /// Rows of the projector.
+    /// Number of projector rows.
     pub fn projector_rows(&self) -> usize {
         self.row_starts_us.len() - 1
     }
@@ -169,22 +170,23 @@ impl RowTiming {
         self.row_time_us
     }
 
-    /// Time from one VSYNC edge to the next; not necessarily a whole number of row times.
+    /// Time from one VSYNC edge to the next; not necessarily an integer number of row times.
     pub fn period_us(&self) -> f64 {
         self.period_us
     }
 
-    /// Start of each row's light and end of the last's, counted from the nominal start of row 0, `[projector_rows + 1]`.
+    /// Start of each row's light and end of the last row's, relative to the nominal start of row 0,
+    /// `[projector_rows + 1]`.
     pub fn row_starts_us(&self) -> &[f64] {
         &self.row_starts_us
     }
 
-    /// How the projector's light spreads over rows.
+    /// The spread of the projector's light over rows.
     pub fn beam(&self) -> Beam {
         self.beam
     }
 
-    /// Which places of the projector the camera's rows look along.
+    /// Which positions of the projector the camera's rows see, and when they are exposed.
     pub fn camera(&self) -> CameraRows {
         self.camera
     }
@@ -194,27 +196,29 @@ impl RowTiming {
         self.camera.first_row
     }
 
-    /// Rows of the camera's window.
+    /// Number of rows in the camera's window.
     pub fn camera_rows(&self) -> usize {
         self.camera.rows
     }
 
-    /// Relative row of projector row `v` seen from camera row `t`: `v` minus the row nearest to the camera row's place.
+    /// Relative row of projector row `v` as seen from camera row `t`: `v` minus the row nearest to the camera row's
+    /// position.
     pub fn relative_row(&self, v: usize, t: usize) -> i32 {
         v as i32 - self.camera.own_row(t) as i32
     }
 
-    /// Whether relative row `u` of camera row `t` is a row of the projector.
+    /// Whether relative row `u` of camera row `t` exists in the projector.
     pub fn row_exists(&self, u: i32, t: usize) -> bool {
         let v = i64::from(u) + self.camera.own_row(t) as i64;
         (0..self.projector_rows() as i64).contains(&v)
     }
 
-    /// What camera row `t` collects of each projector row under a setting: one row of `A' = A B`, `[projector_rows]`.
+    /// The light that camera row `t` collects from each projector row with a setting: one row of `A' = A B`,
+    /// `[projector_rows]`.
     ///
     /// `A` is the share of the row's dwell that falls inside the exposure, averaged over the delays of the setting: a
-    /// box with fractional ends. An exposure that reaches over the retrace also collects from the neighbouring VSYNC
-    /// periods; shares are above 1 only where it is longer than a period and sees the row more than once. `B` is the
+    /// box with fractional ends. An exposure that extends over the retrace also collects light of the neighbouring
+    /// VSYNC periods; shares exceed 1 only if it is longer than a period and sees the row more than once. `B` is the
     /// beam.
     pub fn weights(&self, t: usize, setting: &Setting) -> Vec<f64> {
         let rows = self.projector_rows();
@@ -229,10 +233,10 @@ impl RowTiming {
     }
 
     /// The share of each projector row's dwell that falls inside the exposure of camera row `t`, for rows that may be
-    /// seen at all; averaged over the delays of the setting, and without the beam.
+    /// seen at all; averaged over the delays of the setting, without the beam.
     ///
-    /// `frame` says which lighting of the rows is meant: 0 in the frame that the delay is measured against, 1 in the
-    /// next VSYNC period, -1 in the one before.
+    /// `frame` selects the frame in which the rows are lit: 0 for the one that the delay refers to, 1 for the next
+    /// VSYNC period, -1 for the previous one.
     pub(super) fn shares_in_frame(
         &self,
         t: usize,
@@ -248,8 +252,8 @@ impl RowTiming {
         let first = self.row_starts_us.partition_point(|&start_us| start_us + frame_us < from_us);
         let end = self.row_starts_us.partition_point(|&start_us| start_us + frame_us < to_us);
         (first.saturating_sub(1)..end.min(self.projector_rows())).map(move |v| {
-            // Relative to the nominal centre of the camera row's own row, so that rows of one and the same timing have
-            // one and the same weights, to the bit.
+            // Relative to the nominal centre of the camera row's own row, so that rows with the same timing have the
+            // same weights, to the bit.
             let centre_us = (v as f64 - own) * self.row_time_us + frame_us;
             let (late_us, next_late_us) = (self.late_us(v), self.late_us(v + 1));
             let overlap_us = |delay_us: f64| {
@@ -264,7 +268,8 @@ impl RowTiming {
         })
     }
 
-    /// When camera row `t` is exposed at some delay of the setting, counted from the nominal start of row 0.
+    /// Start and end of the exposure of camera row `t` at a delay of the setting, relative to the nominal start of
+    /// row 0.
     fn exposed_us(&self, t: usize, setting: &Setting) -> (f64, f64) {
         let own_centre_us =
             (self.camera.own_row(t) as f64 + 0.5) * self.row_time_us + self.exposure_shift_us(t);
@@ -274,14 +279,14 @@ impl RowTiming {
         (own_centre_us + earliest_us - half_exposure_us, own_centre_us + latest_us + half_exposure_us)
     }
 
-    /// How much later than its setting's delay camera row `t` is exposed, against the nominal centre of its own row:
-    /// nothing for rows of the projector's pitch and row time.
+    /// By how much the exposure of camera row `t` is later than its setting's delay, relative to the nominal centre
+    /// of its own row: zero for rows with the projector's pitch and row time.
     fn exposure_shift_us(&self, t: usize) -> f64 {
         let rows = self.camera.own_row(t) - self.camera.first_row;
         t as f64 * self.camera.row_time_us - rows as f64 * self.row_time_us
     }
 
-    /// How much later than nominally row `v` begins.
+    /// By how much row `v` begins later than nominally.
     fn late_us(&self, v: usize) -> f64 {
         self.row_starts_us[v] - v as f64 * self.row_time_us
     }
@@ -330,7 +335,7 @@ mod tests {
         RowTiming::new(720, TAU_US, 50_000.0 / 3.0).unwrap()
     }
 
-    /// Weight of relative row `u` seen from camera row `t`.
+    /// Weight of relative row `u` as seen from camera row `t`.
     fn weight(timing: &RowTiming, t: usize, u: i32, setting: &Setting) -> f64 {
         timing.weights(t, setting)[(timing.camera().own_row(t) as i32 + u) as usize]
     }
@@ -341,7 +346,7 @@ mod tests {
 
     #[test]
     fn ends_are_fractional() {
-        // 100 us around the row's own light: rows 0, ±1 whole (66.66 us), and 16.67 us of each of rows ±2.
+        // 100 us around the row's own light: rows 0, ±1 completely (66.66 us), and 16.67 us of each of rows ±2.
         let setting = Setting::new(0.0, 100.0);
         let expected = [(0, 1.0), (1, 1.0), (2, 16.67 / 22.22), (3, 0.0)];
         for (u, share) in expected {
@@ -417,13 +422,13 @@ mod tests {
 
     #[test]
     fn rows_of_unequal_dwell_send_the_same_light() {
-        // Rows 0..720 lit twice as fast as nominally in the first half of the sweep, and slower after it.
+        // Rows 0..720, lit twice as fast as nominally in the first half of the sweep, and slower after it.
         let starts_us: Vec<f64> = (0..=720)
             .map(f64::from)
             .map(|v| if v <= 360.0 { v / 2.0 * TAU_US } else { (180.0 + (v - 360.0) * 1.5) * TAU_US })
             .collect();
         let bent = timing().with_row_table(&starts_us).unwrap();
-        // Row 100 is lit from 50 tau on for tau/2. Camera row 100 keeps to the nominal raster: its own light comes
+        // Row 100 is lit from 50 tau on for tau/2. Camera row 100 follows the nominal raster: its own light comes
         // 100.5 - 50.25 rows early.
         let own = Setting::new(-50.25 * TAU_US, 0.5 * TAU_US);
         close(weight(&bent, 100, 0, &own), 1.0);
@@ -432,7 +437,7 @@ mod tests {
         close(weight(&bent, 100, 0, &Setting::new(-50.25 * TAU_US, 0.1 * TAU_US)), 0.2);
         // Row 500 is lit from 390 tau to 391.5 tau; its nominal centre is at 500.5 tau.
         close(weight(&bent, 500, 0, &Setting::new((390.75 - 500.5) * TAU_US, 0.1 * TAU_US)), 0.1 / 1.5);
-        // All rows are lit once a period, whatever their dwell.
+        // Each row is lit once per period, whatever its dwell.
         let period = Setting::new(0.0, timing().period_us());
         bent.weights(300, &period).into_iter().for_each(|share| close(share, 1.0));
     }
@@ -456,13 +461,13 @@ mod tests {
         let pitch = 1.5;
         let camera = CameraRows { first_row: 10, rows: 200, pitch, row_time_us: pitch * TAU_US };
         let timing = timing().with_camera(camera).unwrap();
-        // Camera row 3 looks along place 14.5, half a row above the centre of row 15, its own.
+        // Camera row 3 sees position 14.5, half a row above the centre of row 15, its own.
         assert_eq!((camera.place(3), camera.own_row(3), timing.relative_row(15, 3)), (14.5, 15, 0));
-        // An exposure of one row time around the place holds half of each row beside it.
+        // An exposure of one row time around the position contains half of each row next to it.
         let short = Setting::new(0.0, TAU_US);
         close(weight(&timing, 3, -1, &short), 0.5);
         close(weight(&timing, 3, 0, &short), 0.5);
-        // The delay is measured from the place: half a row later, it is row 15 alone.
+        // The delay refers to the position: half a row later, it is row 15 alone.
         close(weight(&timing, 3, 0, &Setting::new(TAU_US / 2.0, TAU_US)), 1.0);
     }
 
@@ -470,7 +475,7 @@ mod tests {
     fn a_camera_of_another_row_time_drifts() {
         let camera = CameraRows { first_row: 0, rows: 500, pitch: 1.0, row_time_us: 1.01 * TAU_US };
         let timing = timing().with_camera(camera).unwrap();
-        // After 400 rows its exposures come four rows late.
+        // After 400 rows its exposures are four rows late.
         let setting = Setting::new(0.0, TAU_US);
         close(weight(&timing, 0, 0, &setting), 1.0);
         close(weight(&timing, 400, 4, &setting), 1.0);
@@ -484,7 +489,7 @@ mod tests {
         let (sharp, wide) =
             (timing().weights(360, &setting), timing().with_beam(beam).unwrap().weights(360, &setting));
         close(sharp.iter().sum(), wide.iter().sum());
-        // Rows -4..=4 and half of ±5 are drawn: the edge is a Gaussian's integral, the middle stays full.
+        // Rows -4..=4 and half of ±5 are drawn: the edge is the integral of a Gaussian, the middle is unchanged.
         assert!(
             (wide[360] - 0.9987).abs() < 1e-3 && (wide[365] - 0.5).abs() < 1e-3,
             "{} {}",

@@ -6,7 +6,7 @@ use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Transport {
     /// `T[u, t, s]`, shape `[U, camera_rows, columns]`: light from the projector row that lies `u_min + index` rows
-    /// below the pixel's own, 1.0 for a white surface under its own row. 0 where the projector has no such row.
+    /// below the pixel's own; 1.0 for a white surface under its own row. 0 if the projector has no such row.
     pub t: Array3<f32>,
     /// Relative row of index 0 of `t`.
     pub u_min: i32,
@@ -22,7 +22,7 @@ impl Transport {
         self.u_min + self.t.len_of(Axis(0)) as i32 - 1
     }
 
-    /// Light from the relative rows `u` in `rows`, `[t, s]`; rows outside the reach add nothing.
+    /// Light from the relative rows `u` in `rows`, `[t, s]`; rows outside the reach contribute nothing.
     pub fn band(&self, rows: RangeInclusive<i32>) -> Array2<f32> {
         let from = (i64::from(*rows.start()) - i64::from(self.u_min)).max(0) as usize;
         let to = (i64::from(*rows.end()) - i64::from(self.u_min) + 1).clamp(0, self.t.len_of(Axis(0)) as i64);
@@ -30,19 +30,19 @@ impl Transport {
     }
 
     /// Epipolar image: light from the pixel's own row and its nearest neighbours, `|u| <= (width_rows - 1) / 2`.
-    /// Width 1 is `u = 0` alone; an even width counts as the odd one below.
+    /// Width 1 is `u = 0` alone; an even width is treated as the next smaller odd one.
     pub fn epipolar(&self, width_rows: u32) -> Array2<f32> {
         let half = half_width(width_rows);
         self.band(-half..=half)
     }
 
-    /// All light within the reach that [`Self::epipolar`] of the same width leaves out.
+    /// All light within the reach that is not part of [`Self::epipolar`] of the same width.
     pub fn non_epipolar(&self, width_rows: u32) -> Array2<f32> {
         let half = half_width(width_rows);
         self.band(i32::MIN..=-half - 1) + self.band(half + 1..=i32::MAX)
     }
 
-    /// All light within the reach: what the model predicts for an exposure of one whole period.
+    /// All light within the reach: the model's prediction for an exposure of one whole period.
     pub fn total(&self) -> Array2<f32> {
         sum_rows(self.t.view())
     }
@@ -52,7 +52,7 @@ fn half_width(width_rows: u32) -> i32 {
     (width_rows.saturating_sub(1) / 2) as i32
 }
 
-/// Sum over the first axis, in f64, because thousands of dim rows add up beside a bright one.
+/// Sum over the first axis, in f64, because the light of thousands of dim rows adds up next to a bright one.
 fn sum_rows(rows: ArrayView3<f32>) -> Array2<f32> {
     let sum = rows.fold_axis(Axis(0), 0.0_f64, |sum, &value| sum + f64::from(value));
     sum.mapv(|sum| sum as f32)
@@ -66,7 +66,7 @@ mod tests {
 
     #[test]
     fn bands_split_the_total() {
-        // u = -2..=3 hold 1, 10, 100, ...
+        // u = -2..=3 have the values 1, 10, 100, ...
         let transport = Transport {
             t: Array3::from_shape_fn((6, 1, 2), |(u, _, s)| (s + 1) as f32 * 10_f32.powi(u as i32)),
             u_min: -2,

@@ -8,15 +8,16 @@ use super::pivot::minimise_free;
 use super::tiles::{Objectives, Problem, Row, Spike, Tile};
 use super::{NoiseModel, PlaneError, Prior, RowTiming, Setting, SimdLevel, SlotKind, Transport};
 
-/// How uncertain a transport is through the noise of its stack.
+/// The uncertainty of a transport due to the noise of its stack.
 ///
-/// Where `T > 0`, the estimate is linear in the samples: with `F` the free rows of a pixel, `T_F = H_FF^-1 (A_F' I -
-/// beta/2)`, `H = A'A + alpha D'D`. So the covariance of the free rows is `H_FF^-1 A_F' S A_F H_FF^-1`, with `S` the
-/// diagonal covariance of the samples, and all other rows have none. Rows of the next or previous frame, whose
-/// estimates were dropped, count as free.
+/// Where `T > 0`, the estimate is linear in the samples: with `F` the free rows of a pixel,
+/// `T_F = H_FF^-1 (A_F' I - beta/2)`, `H = A'A + alpha D'D`. The covariance of the free rows is therefore
+/// `H_FF^-1 A_F' S A_F H_FF^-1`, with `S` the diagonal covariance of the samples, and that of all other rows is 0.
+/// Rows of the next or previous frame, whose estimates were dropped, count as free.
 ///
-/// It is the spread of repeated measurements about their mean, and holds nothing else: not the bias of the prior,
-/// which smooths what the settings cannot tell apart, nor that of coupling, nor errors of delays, beam, or alignment.
+/// It is the spread of repeated measurements around their mean, and includes nothing else: neither the bias of the
+/// prior, which smooths what the settings cannot resolve, nor that of coupling, nor errors of delays, beam, or
+/// alignment.
 #[derive(Debug, Clone)]
 pub struct Uncertainty<'a> {
     /// The timing of the stack.
@@ -25,13 +26,13 @@ pub struct Uncertainty<'a> {
     pub settings: &'a [Setting],
     /// The prior that the transport was estimated with.
     pub prior: Prior,
-    /// The noise of a frame.
+    /// The noise of a single frame.
     pub noise: NoiseModel,
-    /// Frames that each setting's image is the mean of.
+    /// Number of frames averaged in each setting's image.
     pub frames: &'a [usize],
 }
 
-/// A stack and what is known about its samples.
+/// A stack and the known properties of its samples.
 #[derive(Debug, Clone, Copy)]
 pub struct Samples<'a> {
     /// The stack that the transport was estimated from, `[settings, t, s]`.
@@ -40,18 +41,18 @@ pub struct Samples<'a> {
     pub valid: Option<ArrayView3<'a, bool>>,
     /// [`super::Coupled::variance_ratio`] if the stack was coupled, `[t, s]`.
     pub variance_ratio: Option<ArrayView2<'a, f32>>,
-    /// Where direct light was taken to lie, as in [`super::Demux::with_spike`] but of these rows alone, `[t, s]`; `None` for
-    /// row 0.
+    /// Assumed position of direct light, as in [`super::Demux::with_spike`] but for these rows alone, `[t, s]`;
+    /// `None` for row 0.
     pub u0_rows: Option<ArrayView2<'a, f32>>,
 }
 
-/// Light of a row that is less than this share of the direct light which reaches it is rounding.
+/// Light of a row below this share of the direct light that reaches it is attributed to rounding.
 const ROUNDING: f32 = 1e-6;
 
 impl Uncertainty<'_> {
     /// Standard deviation of the light in each band of relative rows, `[bands, t, s]`, in the units of the transport.
     ///
-    /// A band is a list of ranges, so that the light around the direct row is one: the non-epipolar image of
+    /// A band is a list of ranges, so that a band may exclude the direct row: the non-epipolar image of
     /// [`Transport::non_epipolar`] with width 1 is `[i32::MIN..=-1, 1..=i32::MAX]`.
     ///
     /// # Errors
@@ -69,10 +70,10 @@ impl Uncertainty<'_> {
         self.of_bands_in_rows(0, transport, samples, bands)
     }
 
-    /// [`Self::of_bands`] in the camera rows from `first_row` on that `transport` and `samples` hold alone.
+    /// [`Self::of_bands`] for `transport` and `samples` that contain only the camera rows starting at `first_row`.
     ///
     /// # Errors
-    /// Those of [`Self::of_bands`]; [`PlaneError::Rows`] for rows that the camera does not have.
+    /// Those of [`Self::of_bands`]; [`PlaneError::Rows`] for rows that do not exist in the camera.
     pub fn of_bands_in_rows(
         &self,
         first_row: usize,
@@ -131,7 +132,7 @@ impl Uncertainty<'_> {
         if solutions.iter().any(|entry| !entry.is_finite()) {
             return Err(PlaneError::NotConvex);
         }
-        // The change of each band of each pixel with each sample.
+        // The derivative of each band of each pixel with respect to each sample.
         let gains = solutions.dot(&problem.weights.t());
         for (gains, &(at, column)) in gains.axis_chunks_iter(Axis(0), bands.len()).zip(&tile.pixels) {
             let Data { t, sd, .. } = &mut rows[at].data;
@@ -164,18 +165,18 @@ impl Uncertainty<'_> {
     }
 }
 
-/// A camera row that is to be judged.
+/// A camera row to be processed.
 struct Data<'a> {
-    /// Its place in the stack.
+    /// Its index in the stack.
     t: usize,
-    /// Its part of the transport, `[reach, columns]`.
+    /// The row's part of the transport, `[reach, columns]`.
     profiles: ArrayView2<'a, f32>,
     /// The result, `[bands, columns]`.
     sd: ArrayViewMut2<'a, f32>,
 }
 
 impl Problem<'_> {
-    /// What each unknown adds to the light of each band, `[bands, slots]`.
+    /// The weight of each unknown in the light of each band, `[bands, slots]`.
     fn sums(&self, bands: &[Vec<RangeInclusive<i32>>]) -> Array2<f64> {
         let slots = &self.model.slots;
         let mut sums = Array2::from_shape_fn((bands.len(), slots.len()), |(band, slot)| {
@@ -191,12 +192,13 @@ impl Problem<'_> {
         sums
     }
 
-    /// The unknowns that are free in a pixel's profile, by slot. Those without a place in it count as free.
+    /// The unknowns that are free in a pixel's profile, by slot. Those that are not part of the profile count as
+    /// free.
     fn lit(&self, places: &[(usize, usize)], profile: ArrayView1<f32>) -> Array1<bool> {
         let mut light = Array1::from_elem(self.model.slots.len(), 1.0_f32);
         places.iter().for_each(|&(slot, place)| light[slot] = profile[place]);
         if let Some(Spike { own, neighbour: Some(neighbour), share }) = self.spike {
-            // What the direct light sends to the neighbour is no light of the neighbour's own.
+            // Direct light that falls on the neighbour's row does not count as the neighbour's own light.
             let share = share as f32;
             let direct = if share < 1.0 { light[own] / (1.0 - share) } else { light[neighbour] };
             light[own] = direct;
@@ -206,7 +208,7 @@ impl Problem<'_> {
     }
 }
 
-/// One pixel's samples.
+/// The samples of one pixel.
 struct Pixel {
     light: Array1<f64>,
     /// Before coupling.
@@ -215,7 +217,7 @@ struct Pixel {
 }
 
 impl Pixel {
-    /// Those of some settings.
+    /// The samples of the given settings.
     fn new(of: &Uncertainty, samples: &Samples, settings: &[usize], t: usize, column: usize) -> Self {
         let light: Array1<f64> = settings.iter().map(|&n| f64::from(samples.stack[[n, t, column]])).collect();
         let variances =
@@ -227,13 +229,13 @@ impl Pixel {
         }
     }
 
-    /// Variance of a sum of the samples, each times its gain.
+    /// Variance of the sum of the samples weighted by `gains`.
     fn variance_of(&self, gains: ArrayView1<f64>) -> f64 {
         let independent = (&gains * &gains).dot(&self.variance);
         if self.variance_ratio == 1.0 {
             return independent;
         }
-        // Coupling leaves the noise of the pixel's total, by which the whole profile is scaled.
+        // Coupling keeps the noise of the pixel's total, by which the whole profile is scaled.
         let scaling = (gains.dot(&self.light) / self.light.sum()).powi(2) * self.variance.sum();
         self.variance_ratio * independent + (1.0 - self.variance_ratio) * scaling
     }

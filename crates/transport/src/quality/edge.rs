@@ -1,12 +1,12 @@
 use ndarray::{ArrayView1, ArrayView2};
 
-/// Samples a pixel of the edge's profile, as the standard has it.
+/// Samples per pixel of the edge's profile, as in the standard.
 const OVERSAMPLING: f64 = 4.0;
 
-/// Correction for the finite difference beyond this is noise.
+/// Upper limit of the correction for the finite difference; larger values would only amplify noise.
 const MOST_CORRECTION: f64 = 10.0;
 
-/// Why an image is not that of a slanted edge.
+/// Why an image does not show a slanted edge.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum EdgeError {
     /// Too few pixels.
@@ -14,12 +14,12 @@ pub enum EdgeError {
         "the image of the edge is {rows} x {columns} pixels, but must be at least 8 x 16: choose a larger region"
     )]
     TooSmall {
-        /// Its rows.
+        /// Number of rows.
         rows: usize,
-        /// Its columns.
+        /// Number of columns.
         columns: usize,
     },
-    /// No edge from the top to the bottom.
+    /// A row without an edge.
     #[error(
         "row {row} of the image has no edge: choose a region that an edge crosses from the top to the bottom"
     )]
@@ -27,13 +27,13 @@ pub enum EdgeError {
         /// The first such row.
         row: usize,
     },
-    /// The edge samples no places between pixels.
+    /// The tilt of the edge does not suit sampling between pixels.
     #[error(
         "the edge moves by {shift_px:.2} pixels from the first row to the last, but must by 1 to its height / 2: \
          tilt it by about 5 degrees from the vertical"
     )]
     Slant {
-        /// How far it moves.
+        /// Shift of the edge from the first row to the last.
         shift_px: f64,
     },
 }
@@ -43,12 +43,12 @@ pub enum EdgeError {
 pub struct EdgeResponse {
     /// Spatial frequencies in cycles/pixel, from 0 to Nyquist's 0.5.
     pub cycles_per_px: Vec<f64>,
-    /// Contrast that is left at each, 1 at 0.
+    /// Remaining contrast at each frequency, 1 at 0.
     pub mtf: Vec<f64>,
 }
 
 impl EdgeResponse {
-    /// The frequency at which half of the contrast is left, in cycles/pixel; none if it is more up to Nyquist's.
+    /// The frequency at which half of the contrast remains, in cycles/pixel; `None` if more remains up to Nyquist's.
     pub fn mtf50(&self) -> Option<f64> {
         let below = self.mtf.iter().position(|&mtf| mtf < 0.5)?;
         let (f0, f1) = (self.cycles_per_px[below - 1], self.cycles_per_px[below]);
@@ -57,17 +57,17 @@ impl EdgeResponse {
     }
 }
 
-/// Modulation transfer function by the slanted edge (ISO 12233 e-SFR; Burns 2000) of a linear image `[rows, columns]` of
-/// an edge about 5 degrees off the vertical.
+/// Modulation transfer function by the slanted-edge method (ISO 12233 e-SFR; Burns 2000), from a linear image
+/// `[rows, columns]` of an edge about 5 degrees off the vertical.
 ///
 /// # Errors
-/// [`EdgeError`] where there is no such edge.
+/// [`EdgeError`] if there is no such edge.
 pub fn slanted_edge(image: ArrayView2<f32>) -> Result<EdgeResponse, EdgeError> {
     let (rows, columns) = image.dim();
     if rows < 8 || columns < 16 {
         return Err(EdgeError::TooSmall { rows, columns });
     }
-    // Found in all of the row, then again near the line that the rows' edges lie on.
+    // Found in the whole row first, then again near the line fitted to the rows' edges.
     let mut line = (columns as f64 / 2.0, 0.0);
     for width_px in [4 * columns, columns / 2] {
         let places = image.rows().into_iter().enumerate();
@@ -81,7 +81,7 @@ pub fn slanted_edge(image: ArrayView2<f32>) -> Result<EdgeResponse, EdgeError> {
         return Err(EdgeError::Slant { shift_px });
     }
 
-    // Distances across the edge, from which the profile is sampled between the pixels.
+    // Distances perpendicular to the edge, which sample the profile between the pixels.
     let across = 1.0 / line.1.hypot(1.0);
     let distance = |row: usize, column: usize| (column as f64 - line.0 - line.1 * row as f64) * across;
     let reach = (0..rows)
@@ -102,7 +102,7 @@ pub fn slanted_edge(image: ArrayView2<f32>) -> Result<EdgeResponse, EdgeError> {
     let total = modulus(&spread, 0.0);
     for step in 0..=(period_px / 2.0) as usize {
         let frequency = step as f64 / period_px;
-        // The difference of samples two apart is itself a filter.
+        // The difference of samples two apart acts as a filter itself.
         let phase = 2.0 * std::f64::consts::PI * frequency / OVERSAMPLING;
         let correction = if step == 0 { 1.0 } else { (phase / phase.sin()).min(MOST_CORRECTION) };
         cycles_per_px.push(frequency);
@@ -111,7 +111,7 @@ pub fn slanted_edge(image: ArrayView2<f32>) -> Result<EdgeResponse, EdgeError> {
     Ok(EdgeResponse { cycles_per_px, mtf })
 }
 
-/// Where a row has its edge: the mean place of its differences, in a Hamming window about `expected`.
+/// Position of a row's edge: the centroid of its differences, in a Hamming window around `expected`.
 fn edge_in(row: ArrayView1<f32>, expected: f64, width_px: f64) -> Option<f64> {
     let (mut weight, mut place) = (0.0, 0.0);
     for (column, pair) in row.windows(2).into_iter().enumerate() {
@@ -126,7 +126,7 @@ fn edge_in(row: ArrayView1<f32>, expected: f64, width_px: f64) -> Option<f64> {
     (place.is_finite() && place > 0.0 && place < row.len() as f64 - 1.0).then_some(place)
 }
 
-/// The line through `places` at 0, 1, ...: its place at 0 and its slope.
+/// The line through `places` at 0, 1, ...: its value at 0 and its slope.
 fn fitted(places: &[f64]) -> (f64, f64) {
     let count = places.len() as f64;
     let (middle, mean) = ((count - 1.0) / 2.0, places.iter().sum::<f64>() / count);
@@ -137,7 +137,7 @@ fn fitted(places: &[f64]) -> (f64, f64) {
     (mean - slope * middle, slope)
 }
 
-/// Means of the samples; where there are none, that of the sample before.
+/// Means of the samples; an empty bin gets the mean of the previous one.
 fn means(profile: &[(f64, u32)]) -> Vec<f64> {
     let first =
         profile.iter().find(|(_, count)| *count > 0).map_or(0.0, |(sum, count)| sum / f64::from(*count));
@@ -150,7 +150,7 @@ fn means(profile: &[(f64, u32)]) -> Vec<f64> {
     means.collect()
 }
 
-/// Differences of the profile in a Hamming window about their largest.
+/// Differences of the profile in a Hamming window around the largest one.
 fn line_spread(profile: &[f64]) -> Vec<f64> {
     let spread: Vec<f64> = profile.windows(3).map(|three| (three[2] - three[0]) / 2.0).collect();
     let (sum, place) = spread
@@ -163,7 +163,7 @@ fn line_spread(profile: &[f64]) -> Vec<f64> {
     spread.iter().enumerate().map(|(at, value)| value * window(at as f64)).collect()
 }
 
-/// Size of the Fourier coefficient at a frequency in cycles/sample.
+/// Magnitude of the Fourier coefficient at a frequency in cycles/sample.
 fn modulus(values: &[f64], frequency: f64) -> f64 {
     let (mut real, mut imaginary) = (0.0, 0.0);
     for (at, value) in values.iter().enumerate() {
@@ -179,9 +179,9 @@ mod tests {
 
     use super::*;
 
-    /// An edge with this slope, blurred by a Gaussian, sampled by 16 points a side in each pixel.
+    /// An edge with this slope, blurred by a Gaussian, sampled at 16 points per side in each pixel.
     fn edge(slope: f64, sigma_px: f64) -> Array2<f32> {
-        // Integral of the Gaussian by the logistic approximation would bias the tails: summed instead.
+        // A logistic approximation of the Gaussian's integral would bias the tails, so it is summed numerically.
         let step = |distance: f64| {
             let points = (-40..=40).map(|point| f64::from(point) / 10.0);
             let (above, all) = points.fold((0.0, 0.0), |(above, all), point| {

@@ -1,6 +1,6 @@
 use ndarray::{Array2, ArrayView, ArrayView2, Dimension, Zip};
 
-/// Weights of the paper's window: 11 pixels of a Gaussian of 1.5.
+/// The paper's window: 11 pixels of a Gaussian with a sigma of 1.5.
 const WINDOW_PX: usize = 11;
 const WINDOW_SIGMA_PX: f64 = 1.5;
 
@@ -27,7 +27,7 @@ fn squared_error<D: Dimension>(estimate: ArrayView<f32, D>, truth: ArrayView<f32
 }
 
 /// Structural similarity (Wang et al. 2004) of two images `[rows, columns]` of the same shape, whose values span
-/// `range`: the mean over all places of a window of 11 x 11 pixels, Gaussian with sigma 1.5, K1 = 0.01, K2 = 0.03.
+/// `range`: the mean over all positions of a window of 11 x 11 pixels, Gaussian with sigma 1.5, K1 = 0.01, K2 = 0.03.
 /// NaN for images smaller than the window.
 pub fn ssim(one: ArrayView2<f32>, other: ArrayView2<f32>, range: f64) -> f64 {
     let (c1, c2) = ((0.01 * range).powi(2), (0.03 * range).powi(2));
@@ -45,7 +45,7 @@ pub fn ssim(one: ArrayView2<f32>, other: ArrayView2<f32>, range: f64) -> f64 {
     sum / products.len() as f64
 }
 
-/// Weighted means over the window, at all places where it lies within the image.
+/// Weighted means over the window, at all positions where it lies within the image.
 fn blurred(image: &Array2<f64>) -> Array2<f64> {
     let middle = (WINDOW_PX / 2) as f64;
     let weight = |at: usize| (-0.5 * ((at as f64 - middle) / WINDOW_SIGMA_PX).powi(2)).exp();

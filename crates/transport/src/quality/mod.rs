@@ -1,4 +1,4 @@
-//! The figures by which an estimated transport is judged against a known one.
+//! Metrics that compare an estimated transport with a known one.
 
 mod edge;
 mod fidelity;
@@ -8,7 +8,7 @@ pub use fidelity::{psnr_db, snr_db, ssim};
 
 use ndarray::{ArrayView, ArrayView3, Axis, Dimension, Zip};
 
-/// Relative l2 error of a whole array, `||estimate - truth|| / ||truth||`; used for images such as `u = 0`.
+/// Relative l2 error of a whole array, `||estimate - truth|| / ||truth||`; used for example for the image at `u = 0`.
 ///
 /// Infinite if the truth is 0 everywhere and the estimate is not. Both arrays have the same shape.
 pub fn relative_l2<D: Dimension>(estimate: ArrayView<f32, D>, truth: ArrayView<f32, D>) -> f64 {
@@ -22,7 +22,7 @@ pub fn relative_l2<D: Dimension>(estimate: ArrayView<f32, D>, truth: ArrayView<f
 }
 
 /// Median over pixels of the relative l2 error of the profile over `u`; arrays `[u, t, s]` of the same shape. Pixels
-/// whose true profile is 0 are left out; NaN if none is left.
+/// whose true profile is 0 are left out; NaN if no pixel remains.
 pub fn median_profile_error(estimate: ArrayView3<f32>, truth: ArrayView3<f32>) -> f64 {
     let mut errors: Vec<f64> = estimate
         .lanes(Axis(0))

@@ -50,7 +50,7 @@ pub fn photographed(ideal: &Array3<f32>, seed: u64) -> Array3<f32> {
     photographed_in(8, ideal, seed)
 }
 
-/// [`photographed`] as the mean of another number of frames.
+/// [`photographed`] with the given number of frames.
 pub fn photographed_in(frames: usize, ideal: &Array3<f32>, seed: u64) -> Array3<f32> {
     let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
     let read_noise = Normal::new(0.0, READ_NOISE_ELECTRONS).unwrap();

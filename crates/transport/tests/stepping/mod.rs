@@ -1,9 +1,10 @@
-//! The clock's word on what an exposure sees, shared by the tests.
+//! Simulation of an exposure by the clock, shared by the tests.
 
 use raysweep_transport::plane::{RowTiming, Setting};
 
-/// Light that a pixel of camera row `t` collects, by stepping through time: which row the projector lights at each
-/// instant follows from the clock and the row table alone. A row sends `light_of_row` in all, evenly over its dwell.
+/// Light that a pixel of camera row `t` collects, computed by stepping through time: the row that the projector
+/// lights at each instant follows from the clock and the row table alone. A row emits `light_of_row` in total, evenly
+/// over its dwell.
 pub fn by_stepping_through_time(
     timing: &RowTiming,
     setting: &Setting,
@@ -21,7 +22,7 @@ pub fn by_stepping_through_time(
     for step in 0..steps {
         let instant_us = start_us + (step as f64 + 0.5) * STEP_US;
         let into_frame_us = starts_us[0] + (instant_us - starts_us[0]).rem_euclid(timing.period_us());
-        // Rows follow one another, so that the search goes on where it ended.
+        // Rows follow one another, so the search continues where it ended.
         if into_frame_us < starts_us[row] {
             row = 0;
         }

@@ -7,32 +7,32 @@ use crate::dots::sensor::median;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError, FrameShape};
 
-/// Where the dots land on the calibration plane.
+/// The positions of the dots on the calibration plane.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Centroids {
     shape: FrameShape,
-    /// Column and row in pixels, 0 in the middle of the first pixel; none for a dot that was not seen.
+    /// Column and row in pixels, 0 at the centre of the first pixel; `None` for a dot that was not seen.
     pub xy: Vec<Option<[f64; 2]>>,
 }
 
-/// How far the dots of one batch lie from those of another.
+/// The shift of one batch's dots from another's.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Drift {
     /// Median shift to the right.
     pub right_px: f64,
     /// Median shift down.
     pub down_px: f64,
-    /// Root mean square distance of single dots from that shift.
+    /// Root mean square distance of the individual dots from that shift.
     pub rms_px: f64,
-    /// Dots that both have.
+    /// Number of dots seen in both batches.
     pub dots: usize,
 }
 
 impl Centroids {
-    /// Means of the pixels' places within the footprints, weighted by their light.
+    /// Means of the pixel positions within the footprints, weighted by light.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if the footprints are another batch's.
+    /// [`DotsError::Shape`] if the footprints belong to another batch.
     pub fn new(batch: &Batch, footprints: &Footprints) -> Result<Self, DotsError> {
         check_shape("footprints", "[dots]", &[footprints.dots()], &[batch.dots()])?;
         let shape = batch.shape();
@@ -55,15 +55,15 @@ impl Centroids {
         Ok(Self { shape, xy: (0..batch.dots()).map(centroid).collect() })
     }
 
-    /// Size of the frames.
+    /// Shape of the frames.
     pub fn shape(&self) -> FrameShape {
         self.shape
     }
 
-    /// How the dots moved from `earlier` to here. Both must show the plane, or the same part of a scene at rest.
+    /// The shift of the dots from `earlier` to these. Both must show the plane, or the same part of a static scene.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if there are not as many dots, [`DotsError::TooFew`] if none is seen in both.
+    /// [`DotsError::Shape`] if the numbers of dots differ, [`DotsError::TooFew`] if no dot is seen in both.
     pub fn drift_from(&self, earlier: &Self) -> Result<Drift, DotsError> {
         check_shape("centroids", "[dots]", &[self.xy.len()], &[earlier.xy.len()])?;
         let both = self.xy.iter().zip(&earlier.xy).filter_map(|(now, then)| Some(((*now)?, (*then)?)));
@@ -73,7 +73,7 @@ impl Centroids {
             let what = "dots that both batches show: calibrate again with the plane in place";
             return Err(DotsError::TooFew { what, given: 0, needed: 1 });
         }
-        // The sum of squares comes first, because the median brings the values out of their order.
+        // The sum of squares is computed first, because the median reorders the values.
         let shifts = right.clone().into_iter().zip(down.clone());
         let (right_px, down_px) = (median(&mut right), median(&mut down));
         let squares: f64 =

@@ -2,8 +2,9 @@ use rayon::prelude::*;
 
 use super::Footprints;
 
-/// How many pixels each two dots share: the calibration confusion matrix M, symmetric, with the dots' areas on its
-/// diagonal. Rows hold only what is not 0; stored as compressed sparse rows, as `scipy.sparse.csr_matrix` takes them.
+/// The number of pixels that each pair of dots shares: the calibration confusion matrix M, symmetric, with the dots'
+/// areas on its diagonal. Only nonzero entries are stored, as compressed sparse rows in the layout of
+/// `scipy.sparse.csr_matrix`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Confusion {
     offsets: Vec<u64>,
@@ -46,23 +47,23 @@ impl Confusion {
         confusion
     }
 
-    /// How many dots.
+    /// Number of dots.
     pub fn dots(&self) -> usize {
         self.offsets.len().saturating_sub(1)
     }
 
-    /// The dots that share pixels with one, itself among them, ascending.
+    /// The dots that share pixels with `dot`, including itself, in ascending order.
     ///
     /// # Panics
-    /// Where there is no such dot.
+    /// If the dot does not exist.
     pub fn neighbours(&self, dot: usize) -> &[u32] {
         &self.neighbours[self.offsets[dot] as usize..self.offsets[dot + 1] as usize]
     }
 
-    /// Pixels that two dots share.
+    /// Number of pixels that two dots share.
     ///
     /// # Panics
-    /// Where there is no such first dot.
+    /// If `dot` does not exist.
     pub fn overlap_px(&self, dot: usize, other: usize) -> u32 {
         let at = self.neighbours(dot).binary_search(&(other as u32));
         at.map_or(0, |at| self.overlaps_px[self.offsets[dot] as usize + at])
@@ -74,7 +75,7 @@ impl Confusion {
     }
 }
 
-/// All dots' masks, sorted by word: dots that share no word are never compared.
+/// All dots' masks, sorted by word, so that dots without a common word are never compared.
 struct Buckets {
     offsets: Vec<u32>,
     dots: Vec<(u32, u32)>,
@@ -86,7 +87,7 @@ impl Buckets {
         let all =
             || dots.clone().flat_map(|dot| footprints.words(dot).map(move |(word, mask)| (word, dot, mask)));
         let mut offsets = vec![0_u32; footprints.shape().words() + 2];
-        // Counted two places on, so that filling moves each offset to its place.
+        // Counted two entries ahead, so that filling moves each offset to its final value.
         all().for_each(|(word, ..)| offsets[word + 2] += 1);
         (2..offsets.len()).for_each(|at| offsets[at] += offsets[at - 1]);
         let mut sorted = vec![(0, 0); offsets.last().map_or(0, |&count| count as usize)];

@@ -9,18 +9,18 @@ use crate::dots::{Batch, DotsError, FrameShape};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Footprints {
     shape: FrameShape,
-    /// Where each dot's words begin, `[dots + 1]`.
+    /// Start of each dot's words, `[dots + 1]`.
     offsets: Vec<u32>,
     words: Vec<u32>,
     masks: Vec<u32>,
 }
 
 impl Footprints {
-    /// The pixels of each column that have at least `level` of its largest value; colours count by their luminance.
-    /// 0.5 gives a dot's width at half its height.
+    /// The pixels of each column that reach at least `level` times its largest value, by luminance for colours. 0.5
+    /// gives a dot's width at half its height.
     ///
     /// # Errors
-    /// [`DotsError::OutOfRange`] for a level that is not above 0 and at most 1.
+    /// [`DotsError::OutOfRange`] for a level outside 0..=1 or equal to 0.
     pub fn new(batch: &Batch, level: f64) -> Result<Self, DotsError> {
         check_range("level", level, level > 0.0 && level <= 1.0, "above 0 and at most 1, as 0.5")?;
         let channels = batch.shape().channels();
@@ -49,12 +49,12 @@ impl Footprints {
         Ok(footprints)
     }
 
-    /// Size of the frames.
+    /// Shape of the frames.
     pub fn shape(&self) -> FrameShape {
         self.shape
     }
 
-    /// How many dots.
+    /// Number of dots.
     pub fn dots(&self) -> usize {
         self.offsets.len() - 1
     }
@@ -66,10 +66,10 @@ impl Footprints {
     }
 }
 
-/// Largest luminance of some pixels, `[pixels, channels]`; 0 if none is above.
+/// Largest luminance of pixels `[pixels, channels]`; at least 0.
 fn brightest(values: &[f32], channels: usize) -> f32 {
     let larger = |most: f32, light: f32| if light > most { light } else { most };
-    // Side by side: one comparison after another would wait for each.
+    // In parallel lanes: in a single maximum, each comparison would wait for the previous one.
     let mut most = [0.0; 8];
     for pixels in values.chunks(8 * channels) {
         for (most, pixel) in most.iter_mut().zip(pixels.chunks_exact(channels)) {
@@ -79,7 +79,7 @@ fn brightest(values: &[f32], channels: usize) -> f32 {
     most.into_iter().fold(0.0, larger)
 }
 
-/// Luminance of a pixel's values: itself, or (R + 2 G + B) / 4.
+/// Luminance of a pixel's values: the value itself, or (R + 2 G + B) / 4.
 pub(crate) fn luminance(value: &[f32]) -> f32 {
     match value {
         [red, green, blue] => (red + 2.0 * green + blue) / 4.0,

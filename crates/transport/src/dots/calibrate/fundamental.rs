@@ -3,38 +3,40 @@ use nalgebra::{Dyn, Matrix3, OMatrix, U9, Vector3};
 use crate::dots::DotsError;
 use crate::dots::error::check_range;
 
-/// Least ratio of the seventh singular value of the eight-point system to the first. Correspondences of one plane
-/// determine six of the nine entries and leave only noise here (3e-4), two planes of the working volume about 0.05.
+/// Smallest accepted ratio of the seventh singular value of the eight-point system to the first. Correspondences on
+/// one plane determine six of the nine entries and leave only noise here (3e-4); two planes of the working volume
+/// give about 0.05.
 pub const LEAST_RATIO: f64 = 4e-3;
 
-/// A dot as the mirror and the camera see it.
+/// A dot as seen by the mirror and by the camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Correspondence {
-    /// Where its ray meets the plane at unit distance from the mirror; see [`mirror_plane`].
+    /// Intersection of its ray with the plane at unit distance from the mirror; see [`mirror_plane`].
     pub mirror: [f64; 2],
     /// Its centroid in the camera's pixels, (column, row).
     pub camera: [f64; 2],
 }
 
-/// The epipolar geometry of mirror and camera: `m' F c = 0` for every point that a dot lights, whatever its depth.
+/// The epipolar geometry of mirror and camera: `m' F c = 0` for every point lit by a dot, at any depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fundamental {
     matrix: Matrix3<f64>,
 }
 
-/// Where a ray meets the plane at unit distance in front of the mirror: the tangents of its horizontal and vertical
-/// angles from the mirror's resting direction. (The paper's products of sines and cosines are no projection onto a plane.)
+/// The intersection of a ray with the plane at unit distance in front of the mirror: the tangents of its horizontal
+/// and vertical angles from the mirror's resting direction. (The paper's products of sines and cosines are not a
+/// projection onto a plane.)
 pub fn mirror_plane(horizontal_rad: f64, vertical_rad: f64) -> [f64; 2] {
     [horizontal_rad.tan(), vertical_rad.tan()]
 }
 
 impl Fundamental {
-    /// By the normalised eight-point algorithm (Hartley 1997) from dots at two depths or more, or with calibrated
-    /// mirror angles.
+    /// Computes it by the normalised eight-point algorithm (Hartley 1997) from dots at two or more depths, or with
+    /// calibrated mirror angles.
     ///
     /// # Errors
-    /// [`DotsError::TooFew`] below eight correspondences, [`DotsError::OutOfRange`] for ones that are not finite,
-    /// [`DotsError::Planar`] where they lie on one plane and leave the matrix open.
+    /// [`DotsError::TooFew`] below eight correspondences, [`DotsError::OutOfRange`] for values that are not finite,
+    /// [`DotsError::Planar`] if they lie on one plane and do not determine the matrix.
     pub fn from_correspondences(correspondences: &[Correspondence]) -> Result<Self, DotsError> {
         const NEEDED: usize = 8;
         let given = correspondences.len();
@@ -68,7 +70,7 @@ impl Fundamental {
         let right = svd.v_t.filter(|_| ratio >= LEAST_RATIO).ok_or(planar)?;
         let full = Matrix3::from_fn(|row, column| right[(8, 3 * row + column)]);
 
-        // All epipolar lines of one image meet in a point: the smallest singular value is 0.
+        // All epipolar lines of one image meet in a point, so the smallest singular value is 0.
         let mut svd = full.svd(true, true);
         svd.singular_values[2] = 0.0;
         let of_rank_2 = svd.recompose().unwrap_or(full);
@@ -76,7 +78,7 @@ impl Fundamental {
         Ok(Self { matrix: matrix / matrix.norm() })
     }
 
-    /// From its nine entries, row by row: known from elsewhere, or read from a file.
+    /// From its nine entries, row by row, for example from a file.
     pub fn from_rows(rows: [[f64; 3]; 3]) -> Self {
         Self { matrix: Matrix3::from_fn(|row, column| rows[row][column]) }
     }
@@ -86,13 +88,14 @@ impl Fundamental {
         std::array::from_fn(|row| std::array::from_fn(|column| self.matrix[(row, column)]))
     }
 
-    /// The line `(l1, l2, l3)` of the camera's image on which everything lies that a dot lights directly.
+    /// The line `(l1, l2, l3)` in the camera's image that contains everything lit directly by the dot.
     pub fn epipolar_line(&self, mirror: [f64; 2]) -> [f64; 3] {
         let line = self.matrix.transpose() * Vector3::new(mirror[0], mirror[1], 1.0);
         [line[0], line[1], line[2]]
     }
 
-    /// Where all these lines meet, the mirror's image in the camera, as homogeneous coordinates of length 1.
+    /// The intersection of all these lines, which is the mirror's image in the camera, as homogeneous coordinates of
+    /// length 1.
     pub fn epipole(&self) -> [f64; 3] {
         let svd = self.matrix.svd(false, true);
         let last = svd.v_t.map_or_else(Vector3::zeros, |v_t| v_t.row(2).transpose());
@@ -100,7 +103,7 @@ impl Fundamental {
     }
 }
 
-/// Moves the points' centre to 0 and scales their mean distance from it to the root of 2.
+/// Moves the points' centroid to 0 and scales their mean distance from it to the square root of 2.
 fn normalising(points: impl Iterator<Item = [f64; 2]> + Clone) -> Matrix3<f64> {
     let count = points.clone().count() as f64;
     let (x, y) =
@@ -118,7 +121,7 @@ mod tests {
 
     use super::*;
 
-    /// Dots of a mirror beside a camera of 1024 pixels on planes at these distances, centroids with noise.
+    /// Dots of a mirror beside a camera with 1024 pixels, on planes at these distances, with noisy centroids.
     fn scan(distances: &[f64], noise_px: f64) -> Vec<Correspondence> {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(3);
         let noise = Normal::new(0.0, noise_px).unwrap();
@@ -134,7 +137,7 @@ mod tests {
         pairs
     }
 
-    /// A point of the mirror's space in the camera's pixels: 15 units to the side, turned by 0.15.
+    /// A point in the mirror's coordinates, projected to the camera's pixels: 15 units to the side, turned by 0.15.
     fn seen([x, y, z]: [f64; 3]) -> [f64; 2] {
         let (sin, cos) = 0.15_f64.sin_cos();
         let (x, z) = (x - 15.0, z);
@@ -169,7 +172,7 @@ mod tests {
 
     #[test]
     fn noise_does_not_pass_for_depth_nor_depth_for_noise() {
-        // How far both sides of the limit are.
+        // Distance of both cases from the limit.
         for (distances, noise_px) in [(&[100.0][..], 0.5), (&[95.0, 110.0][..], 0.5)] {
             let pairs = scan(distances, noise_px);
             assert_eq!(Fundamental::from_correspondences(&pairs).is_ok(), distances.len() == 2);

@@ -1,5 +1,5 @@
-//! What the calibration plane tells of the dots: where they land, what they cover, how they overlap, and how the mirror
-//! sees the camera.
+//! Calibration from images of the calibration plane: the dots' positions, footprints and overlaps, and the geometry
+//! of mirror and camera.
 
 mod centroid;
 mod confusion;

@@ -8,33 +8,33 @@ use crate::dots::sensor::median;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, BatchArrays, DotsError, FrameShape, SparseColumn};
 
-/// Pixels with less than this share of the peak are none of the dot's.
+/// Pixels below this share of the peak are not part of the dot.
 const TAIL: f32 = 0.02;
 
-/// Where a dot whose estimate is not unimodal is taken to be evenly bright.
+/// A dot whose estimate is not unimodal is taken to be evenly bright down to this share of the peak.
 const PILLBOX: f32 = 0.5;
 
-/// Shares of the peak at which a unimodal dot is one piece.
+/// Shares of the peak at which the contour of a unimodal dot must be one piece.
 const LEVELS: [f32; 3] = [0.25, 0.5, 0.75];
 
-/// A piece may have crumbs of up to this share of its pixels, from noise.
+/// Share of a piece's pixels that may lie outside it, because of noise.
 const CRUMBS: f64 = 0.05;
 
-/// How the light of each dot is spread over the pixels, its peak 1: a column of one channel without residual.
+/// The spread of each dot's light over the pixels, with peak 1: columns of one channel without residual.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PointSpreads {
     /// The dots' spreads.
     pub columns: Batch,
-    /// Whether each is its own estimate; the others, such as dots on a boundary of textures, are pillboxes.
+    /// Whether each dot has its own estimate. The others, such as dots on a boundary of textures, are pillboxes.
     pub unimodal: Vec<bool>,
 }
 
 impl PointSpreads {
-    /// Of each dot's column, the discs around its brightest pixel: as they are where all contours are one piece, and
-    /// evenly 1 down to half of the peak elsewhere. The peak is that of the mean of 3 x 3 pixels, for the noise.
+    /// From the discs around the brightest pixel of each dot's column: the measured values where all contours are one
+    /// piece, otherwise 1 down to half of the peak. The peak is that of the mean of 3 x 3 pixels, to reduce noise.
     ///
     /// # Errors
-    /// [`DotsError::Damaged`] if there are more pixels than a batch can have.
+    /// [`DotsError::Damaged`] if there are more pixels than a batch can contain.
     pub fn new(batch: &Batch) -> Result<Self, DotsError> {
         let shape = FrameShape::new(batch.shape().height(), batch.shape().width(), 1)?;
         let spreads: Vec<(SparseColumn, bool)> = (0..batch.dots())
@@ -47,8 +47,8 @@ impl PointSpreads {
         Ok(Self { columns: Batch::new(shape, arrays)?, unimodal })
     }
 
-    /// Radius of a dot down to a fiftieth of its peak: that of a disc as large, the median over the dots with an estimate of
-    /// their own; none if there is no such dot.
+    /// Radius of a dot down to a fiftieth of its peak: that of a disc of equal area, the median over the dots with
+    /// their own estimate; `None` if there is no such dot.
     pub fn radius_px(&self) -> Option<f64> {
         let own = self.unimodal.iter().enumerate().filter(|(_, unimodal)| **unimodal).map(|(dot, _)| dot);
         let mut radii: Vec<f64> =
@@ -57,11 +57,11 @@ impl PointSpreads {
     }
 }
 
-/// A column laid out in the frame; outside of its mask, where it is clean between dots, it has no light.
+/// A column as an image. Outside its mask it has no light, so that it is clean between dots.
 struct Plane {
     shape: FrameShape,
     light: Vec<f32>,
-    /// Means of 3 x 3 pixels; NaN, which is never bright enough, outside of the mask.
+    /// Means of 3 x 3 pixels; NaN, which fails every threshold, outside the mask.
     smooth: Vec<f32>,
     seen: Vec<bool>,
 }
@@ -112,7 +112,7 @@ impl Plane {
         (spread, unimodal)
     }
 
-    /// The pixels around `start` that are connected with it and at least as bright as `least`.
+    /// The pixels connected to `start` that are at least as bright as `least`.
     fn piece(&mut self, start: usize, least: f32) -> Vec<usize> {
         let mut piece = Vec::new();
         let mut next = VecDeque::from([start]);
@@ -130,7 +130,7 @@ impl Plane {
         piece
     }
 
-    /// The 3 x 3 pixels around one, fewer at the frame's border.
+    /// The 3 x 3 pixels around `pixel`, fewer at the frame's border.
     fn around(&self, pixel: usize) -> impl Iterator<Item = usize> + use<> {
         let (width, height) = (self.shape.width(), self.shape.height());
         let (row, column) = (pixel / width, pixel % width);

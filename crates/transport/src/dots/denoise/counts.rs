@@ -1,4 +1,5 @@
-//! Passes over raw counts minus background: once over the whole frame, then over what a disc has touched.
+//! Passes over raw counts minus background: first over the whole frame, then over the segments that a disc has
+//! touched.
 
 use super::lanes::Lanes;
 use crate::dots::background::NARROW_LIMIT;
@@ -6,14 +7,14 @@ use crate::dots::column::bits;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Background, Correction, FrameShape};
 
-/// Words of a segment: 1024 pixels in a row, whatever the frame's width. Segments that follow memory read faster than
-/// tiles.
+/// Words per segment: 1024 consecutive pixels, whatever the frame's width. Segments that follow memory are read
+/// faster than tiles.
 pub(super) const SEGMENT_WORDS: usize = 32;
 
-/// The maximum of a segment with nothing left in it.
+/// The maximum of a segment with no pixels left.
 pub(super) const NOTHING: i32 = i32::MIN;
 
-/// What the first pass finds out; its arrays are those of the scratch memory.
+/// The results of the first pass. Its arrays belong to the scratch memory.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Survey {
     /// Largest difference in each segment.
@@ -22,7 +23,7 @@ pub(super) struct Survey {
     pub block_sums: Vec<i32>,
     /// Sum of squared differences.
     pub squares: u64,
-    /// Sums of pairs of the columns of a row of blocks.
+    /// Sums of column pairs within a row of blocks.
     lanes: Vec<[i32; 16]>,
 }
 
@@ -37,9 +38,9 @@ impl Survey {
     }
 }
 
-/// Raw counts minus background of one frame, hot pixels left out.
+/// Raw counts minus background of one frame, without hot pixels.
 pub(super) trait Differences {
-    /// Looks at each pixel once. False if the counts are beyond what this can take.
+    /// Visits each pixel once. Returns false if the counts exceed what the implementation supports.
     fn survey(&self, survey: &mut Survey) -> bool;
 
     /// Largest difference of a segment's pixels that are not taken.
@@ -74,14 +75,14 @@ impl<'a, L: Lanes> Narrow<'a, L> {
         self.lanes.subtract(self.lanes.load(&self.raw[word]), self.lanes.load(&self.background[word]))
     }
 
-    /// The largest lane; what only a hot pixel can have is nothing.
+    /// The largest lane; [`NOTHING`] if only hot pixels can have its value.
     #[inline(always)]
     fn largest_lane(&self, largest: L::I16) -> i32 {
         let largest = self.lanes.to_array(largest).into_iter().fold(i16::MIN, i16::max).into();
         if largest <= -i32::from(NARROW_LIMIT) { NOTHING } else { largest }
     }
 
-    /// Takes hot pixels out of sums that they are in.
+    /// Subtracts the hot pixels from the sums.
     fn leave_out_hot(&self, survey: &mut Survey) {
         let shape = self.correction.shape();
         for &pixel in self.correction.hot() {
@@ -108,7 +109,7 @@ impl<L: Lanes> Differences for Narrow<'_, L> {
             survey.lanes.fill([0; 16]);
             let (mut raw, mut background) = (raw, background);
             while !raw.is_empty() {
-                // As far as both the row and the segment reach.
+                // To the end of the row or of the segment, whichever comes first.
                 let column = word % columns;
                 let run = (columns - column).min(SEGMENT_WORDS - word % SEGMENT_WORDS);
                 let (raw_run, raw_rest) = raw.split_at(run);

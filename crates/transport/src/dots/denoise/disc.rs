@@ -2,10 +2,10 @@ use std::ops::Range;
 
 use crate::dots::FrameShape;
 
-/// A disc of pixels strictly nearer than its radius to the centre.
+/// A disc: all pixels strictly nearer to the centre than its radius.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Disc {
-    /// How far the disc's rows reach to either side, by distance from the centre's row.
+    /// Half-widths of the disc's rows, by distance from the centre's row.
     reach: Vec<usize>,
 }
 
@@ -19,7 +19,7 @@ impl Disc {
         Self { reach: reach.collect() }
     }
 
-    /// The disc's pixels around one, row by row from the top, cut off at the frame's borders.
+    /// The pixels of the disc around `centre`, row by row from the top, clipped at the frame's borders.
     pub fn rows_around(&self, shape: FrameShape, centre: usize) -> impl Iterator<Item = Range<usize>> + '_ {
         let (row, column) = (centre / shape.width(), centre % shape.width());
         let reach = self.reach.len() - 1;
@@ -32,7 +32,7 @@ impl Disc {
     }
 }
 
-/// The largest whole number below `value`.
+/// The largest integer below `value`.
 fn below(value: f64) -> f64 {
     value.ceil() - 1.0
 }

@@ -1,9 +1,9 @@
-//! The vector instructions that the pass over a frame uses, 32 pixels at a time.
+//! The vector instructions of the pass over a frame, 32 pixels at a time.
 
-/// 32 pixels side by side in registers.
+/// 32 adjacent pixels in registers.
 ///
-/// Benefit: plain loops over the same arrays, left to the compiler, take 2 to 4 times as long (`cargo xtask bench
-/// dots`).
+/// Benefit: plain loops over the same arrays, vectorised by the compiler, take 2 to 4 times as long
+/// (`cargo xtask bench dots`).
 pub(super) trait Lanes: Copy {
     /// 32 signed 16-bit numbers.
     type I16: Copy;
@@ -15,21 +15,21 @@ pub(super) trait Lanes: Copy {
     fn subtract(self, a: Self::I16, b: Self::I16) -> Self::I16;
     fn or(self, a: Self::I16, b: Self::I16) -> Self::I16;
     fn max(self, a: Self::I16, b: Self::I16) -> Self::I16;
-    /// `max` where the bit is 0, `a` where it is 1.
+    /// `max(a, b)` where the bit is 0, `a` where it is 1.
     fn max_except(self, a: Self::I16, b: Self::I16, except: u32) -> Self::I16;
-    /// A bit for each that equals `value`.
+    /// One bit per lane, set where it equals `value`.
     fn equal(self, a: Self::I16, value: i16) -> u32;
     fn to_array(self, a: Self::I16) -> [i16; 32];
-    /// Sums of neighbours.
+    /// Sums of adjacent pairs.
     fn pair_sums(self, a: Self::I16) -> Self::I32;
-    /// Sums of neighbours' squares, modulo 2^32.
+    /// Sums of the squares of adjacent pairs, modulo 2^32.
     fn pair_squares(self, a: Self::I16) -> Self::I32;
     fn load_sums(self, sums: &[i32; 16]) -> Self::I32;
     fn add(self, a: Self::I32, b: Self::I32) -> Self::I32;
     fn to_sums(self, a: Self::I32) -> [i32; 16];
 }
 
-/// Plain arrays, for machines without the others.
+/// Plain arrays, for machines without the vector instructions.
 #[derive(Clone, Copy)]
 pub(super) struct Portable;
 

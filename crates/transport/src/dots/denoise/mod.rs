@@ -21,18 +21,18 @@ use super::shape::BLOCK_PX;
 use super::{Background, Batch, BatchArrays, Correction, DotsError, NoiseFloor, Outcome, SparseColumn};
 use crate::plane::SimdLevel;
 
-/// Frames that one thread takes at a time.
+/// Number of frames that one thread takes at a time.
 const FRAMES_AT_A_TIME: usize = 32;
 
 /// Turns raw frames into sparse columns.
 ///
-/// The brightest pixel above the background is found, the disc around it is taken out, and so on until the
-/// [`StopRule`] is met; what was taken is the column, and what is left is kept as the mean of each block of 32 x 32
-/// pixels. Pixels that were taken count no more for maximum and statistics. Ties go to the first pixel in reading
-/// order. Values are raw minus background times the flat field's gain; hot pixels, which are never the maximum, have
-/// the mean of their neighbours. Nothing is clamped at 0: the bias would add up over all dots.
+/// The brightest pixel above the background is found and the disc around it is taken out, until the [`StopRule`] is
+/// met. The pixels taken form the column; the rest is kept as the mean of each block of 32 x 32 pixels. Pixels that
+/// were taken no longer count for maximum and statistics. Ties go to the first pixel in reading order. Values are raw
+/// minus background times the flat field's gain. Hot pixels, which are never the maximum, get the mean of their
+/// neighbours. Nothing is clamped at 0: the bias would add up over all dots.
 ///
-/// Frames in colour are searched in their luminance, (R + 2 G + B) / 4 in whole counts; values stay per colour.
+/// Colour frames are searched by their luminance, (R + 2 G + B) / 4 in whole counts; values are kept per colour.
 #[derive(Debug, Clone)]
 pub struct Denoiser {
     correction: Correction,
@@ -43,19 +43,19 @@ pub struct Denoiser {
     level: SimdLevel,
 }
 
-/// Memory that [`Denoiser::column`] works in, to be kept from frame to frame.
+/// Working memory of [`Denoiser::column`], to be reused from frame to frame.
 #[derive(Debug, Clone)]
 pub struct Scratch {
     survey: Survey,
-    /// Pixels that are taken; all 0 between frames.
+    /// Mask of the pixels taken so far; all 0 between frames.
     taken: Vec<u32>,
-    /// Words with any of them.
+    /// Words with pixels taken.
     touched: Vec<u32>,
-    /// Luminance of a frame in colour.
+    /// Luminance of a colour frame.
     luminance: Vec<u16>,
-    /// Sum of each block's values, background subtracted, that were taken, `[blocks, channels]`.
+    /// Sum of the values taken from each block, background subtracted, `[blocks, channels]`.
     taken_sums: Vec<f64>,
-    /// Sound pixels that were taken from each block.
+    /// Number of sound pixels taken from each block.
     taken_pixels: Vec<u32>,
     /// Sums of colours over blocks, `[blocks, channels]`.
     colour_sums: Vec<i32>,
@@ -63,7 +63,7 @@ pub struct Scratch {
 
 impl Denoiser {
     /// # Errors
-    /// [`DotsError::OutOfRange`] for settings that cannot be.
+    /// [`DotsError::OutOfRange`] for invalid settings.
     pub fn new(correction: Correction, settings: DenoiseSettings) -> Result<Self, DotsError> {
         settings.check()?;
         let shape = correction.shape();
@@ -75,18 +75,18 @@ impl Denoiser {
         Ok(Self { correction, settings, disc, sigmas, level: SimdLevel::best() })
     }
 
-    /// With other instructions than the fastest; the result is the same.
+    /// Selects other instructions than the fastest; the result is the same.
     pub fn at_level(mut self, level: SimdLevel) -> Self {
         self.level = level;
         self
     }
 
-    /// What is known of the sensor.
+    /// The correction of the sensor.
     pub fn correction(&self) -> &Correction {
         &self.correction
     }
 
-    /// Memory for one thread.
+    /// Scratch memory for one thread.
     pub fn scratch(&self) -> Scratch {
         let shape = self.correction.shape();
         let in_colour = |size: usize| if shape.channels() > 1 { size } else { 0 };
@@ -101,11 +101,11 @@ impl Denoiser {
         }
     }
 
-    /// Denoises one raw frame, `[height, width, channels]`, into `column`. Takes no memory once `column` has held the
-    /// largest.
+    /// Denoises one raw frame, `[height, width, channels]`, into `column`. Does not allocate once `column` has held
+    /// the largest column.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if the frame is not of the correction's shape.
+    /// [`DotsError::Shape`] if the frame does not have the correction's shape.
     pub fn column(
         &self,
         frame: &[u16],
@@ -128,10 +128,11 @@ impl Denoiser {
         OnLanes(Portable, task).call()
     }
 
-    /// Denoises the frames of one batch in the order of their dots. The same columns for any number of threads.
+    /// Denoises the frames of one batch, in the order of their dots. The columns do not depend on the number of
+    /// threads.
     ///
     /// # Errors
-    /// [`DotsError::Shape`] if a frame is not of the correction's shape.
+    /// [`DotsError::Shape`] if a frame does not have the correction's shape.
     pub fn batch(
         &self,
         frames: &[&[u16]],
@@ -158,7 +159,7 @@ impl Denoiser {
     }
 }
 
-/// One frame to be denoised.
+/// A frame to denoise.
 struct FrameTask<'a> {
     denoiser: &'a Denoiser,
     frame: &'a [u16],
@@ -168,7 +169,7 @@ struct FrameTask<'a> {
     column: &'a mut SparseColumn,
 }
 
-/// What is run with the instructions of `L` switched on.
+/// A computation that runs with the instructions of `L` enabled.
 struct OnLanes<'a, L>(L, FrameTask<'a>);
 
 impl<L: Lanes> NullaryFnOnce for OnLanes<'_, L> {
@@ -202,7 +203,7 @@ impl<L: Lanes> NullaryFnOnce for OnLanes<'_, L> {
     }
 }
 
-/// Mean and standard deviation of what is left of a frame.
+/// Mean and standard deviation of the rest of a frame.
 struct Left {
     count: usize,
     sum: i64,
@@ -210,7 +211,7 @@ struct Left {
 }
 
 impl FrameTask<'_> {
-    /// Takes discs until the rule is met.
+    /// Takes discs until the stop rule is met.
     #[inline(always)]
     fn take_discs(&mut self, differences: &impl Differences) -> Result<Outcome, DotsError> {
         let Self { denoiser, frame, background, floor, scratch, .. } = self;
@@ -221,7 +222,7 @@ impl FrameTask<'_> {
                 Some((NoiseFloor::of_frame(frame, &denoiser.correction, background, patch)?, *tolerance))
             }
         };
-        // Of the printed rule any maximum is high enough.
+        // For the printed rule any maximum is high enough.
         let least = match printed {
             None => (floor.mean + denoiser.sigmas * floor.sigma).ceil().clamp(-65536.0, 65536.0) as i32,
             Some(_) => counts::NOTHING + 1,
@@ -267,7 +268,7 @@ impl FrameTask<'_> {
             for row in denoiser.disc.rows_around(shape, centre) {
                 let pixels = counts::SEGMENT_WORDS * BLOCK_PX;
                 for segment in next.max(row.start / pixels)..=(row.end - 1) / pixels {
-                    // Maxima only fall: what was too low stays so.
+                    // Maxima only decrease: a segment that was too low stays too low.
                     if scratch.survey.maxima[segment] >= least {
                         scratch.survey.maxima[segment] = differences.largest(segment, &scratch.taken);
                     }
@@ -280,7 +281,7 @@ impl FrameTask<'_> {
         }
     }
 
-    /// Reads out what was taken and what is left, and clears the scratch memory.
+    /// Reads out the pixels taken and the rest, and clears the scratch memory.
     #[inline(always)]
     fn extract(&mut self) {
         let Self { denoiser, frame, background, scratch, column, .. } = self;
@@ -342,7 +343,7 @@ impl FrameTask<'_> {
     }
 }
 
-/// Marks the pixels of a row of a disc; tells of each word which of its pixels were not marked before.
+/// Marks the pixels of one row of a disc. Calls back for each word with the pixels that were not marked before.
 #[inline(always)]
 fn take(
     row: std::ops::Range<usize>,
@@ -363,9 +364,9 @@ fn take(
     }
 }
 
-/// Adds `raw - mean` of some pixels in a row to their block's sums, `[channels]`.
+/// Adds `raw - mean` of consecutive pixels to their block's sums, `[channels]`.
 ///
-/// In eight partial sums, so that any instructions give the same bits and most can work side by side.
+/// Uses eight partial sums, so that all instruction levels give the same bits and most can add in parallel.
 #[inline(always)]
 fn add_run(sums: &mut [f64], raw: &[u16], mean: &[f32]) {
     if let [sum] = sums {
@@ -409,7 +410,7 @@ fn sum_colours(frame: &[u16], correction: &Correction, sums: &mut [i32]) {
 }
 
 impl Left {
-    /// Takes the pixels of a word out of the statistics.
+    /// Removes pixels of a word from the statistics.
     #[inline(always)]
     fn lose(&mut self, word: usize, pixels: u32, difference: impl Fn(usize) -> i64) {
         for bit in bits(pixels) {
@@ -420,7 +421,8 @@ impl Left {
         }
     }
 
-    /// Whether mean and standard deviation are those of the patch, to a share of its standard deviation.
+    /// Whether mean and standard deviation equal those of the patch, within `tolerance` standard deviations of the
+    /// patch.
     fn equals(&self, patch: NoiseFloor, tolerance: f64) -> bool {
         if self.count == 0 {
             return true;

@@ -1,4 +1,4 @@
-//! Algorithm 1 as plainly as it can be written, which [`Denoiser`](super::Denoiser) must equal.
+//! The simplest possible implementation of Algorithm 1, which [`Denoiser`](super::Denoiser) must equal.
 
 use super::rule::false_alarm_sigmas;
 use super::{DenoiseSettings, StopRule};
@@ -7,7 +7,7 @@ use crate::dots::error::check_shape;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Background, Correction, DotsError, NoiseFloor, Outcome, SparseColumn};
 
-/// Denoises one raw frame, `[height, width, channels]`: the frame is searched anew from end to end for every disc.
+/// Denoises one raw frame, `[height, width, channels]`: for every disc the whole frame is searched again.
 ///
 /// # Errors
 /// As [`Denoiser::column`](super::Denoiser::column).
@@ -29,7 +29,7 @@ pub fn column(
         };
         i64::from(raw) - i64::from(background.counts[pixel])
     };
-    // `None` for what is hot, and later for what is taken.
+    // `None` for hot pixels, and later for pixels that are taken.
     let mut left: Vec<Option<i64>> =
         (0..shape.pixels()).map(|pixel| (!is_hot(pixel)).then(|| difference(pixel))).collect();
     let mut taken = vec![false; shape.pixels()];
@@ -103,7 +103,7 @@ pub fn column(
     Ok(column)
 }
 
-/// Whether what is left has the statistics of the patch, to `tolerance` of the patch's standard deviation.
+/// Whether the rest has the statistics of the patch, within `tolerance` standard deviations of the patch.
 fn equals(left: &[Option<i64>], patch: NoiseFloor, tolerance: f64) -> bool {
     let values: Vec<i64> = left.iter().flatten().copied().collect();
     let rest = NoiseFloor::of_sums(

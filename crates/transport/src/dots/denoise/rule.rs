@@ -4,19 +4,19 @@ use crate::dots::{DotsError, Region};
 /// When Algorithm 1 has taken enough discs from a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub enum StopRule {
-    /// When the largest count left is below `mean + k sigma` of the noise floor, with `k` such that noise alone gives
-    /// a frame a false disc with this probability.
+    /// When the largest count left is below `mean + k sigma` of the noise floor, with `k` such that noise alone
+    /// causes a false disc in a frame with this probability.
     FalseAlarms {
-        /// False discs a frame without light, as 0.05.
+        /// Expected false discs per frame without light, for example 0.05.
         per_frame: f64,
     },
-    /// As the paper prints it: when mean and standard deviation of what is left equal those of a background patch of
-    /// the same frame, here to `tolerance` of the patch's standard deviation. At least one disc is taken. On real
-    /// frames this mostly ends at the cap or after the first disc.
+    /// As printed in the paper: when mean and standard deviation of the rest equal those of a background patch of the
+    /// same frame, here within `tolerance` standard deviations of the patch. At least one disc is taken. On real
+    /// frames this mostly stops at the limit on discs or after the first disc.
     Printed {
         /// The background patch.
         patch: Region,
-        /// In standard deviations of the patch; the paper says equal.
+        /// In standard deviations of the patch; the paper requires equality.
         tolerance: f64,
     },
 }
@@ -27,14 +27,15 @@ impl Default for StopRule {
     }
 }
 
-/// What Algorithm 1 is run with.
+/// Settings of Algorithm 1.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenoiseSettings {
-    /// Radius of the discs: pixels strictly nearer to the brightest one are taken with it. As large as the dot.
+    /// Radius of the discs, which should be that of the dot: pixels strictly nearer to the brightest pixel are taken
+    /// with it.
     pub radius_px: f64,
     /// When to stop.
     pub stop: StopRule,
-    /// Most discs a frame; frames that end here are counted.
+    /// Largest number of discs per frame; frames that stop here are counted.
     pub max_discs: u32,
 }
 
@@ -66,7 +67,7 @@ impl DenoiseSettings {
     }
 }
 
-/// How many standard deviations the largest of `pixels` independent normal values exceeds with probability
+/// The number of standard deviations that the largest of `pixels` independent normal values exceeds with probability
 /// `per_frame`, by Bonferroni's bound: 5.3 for 0.05 and a million pixels.
 pub fn false_alarm_sigmas(per_frame: f64, pixels: usize) -> f64 {
     let tail = per_frame / pixels as f64;
@@ -79,8 +80,8 @@ pub fn false_alarm_sigmas(per_frame: f64, pixels: usize) -> f64 {
     high
 }
 
-/// Probability that a normal value exceeds `x >= 1`: Laplace's continued fraction for Mills' ratio (Abramowitz and
-/// Stegun 26.2.14).
+/// Probability that a normal value exceeds `x >= 1`, from Laplace's continued fraction for Mills' ratio (Abramowitz
+/// and Stegun 26.2.14).
 fn normal_tail(x: f64) -> f64 {
     let ratio = (1..200).rev().fold(x, |below, n| x + f64::from(n) / below);
     (-x * x / 2.0).exp() / (2.0 * std::f64::consts::PI).sqrt() / ratio

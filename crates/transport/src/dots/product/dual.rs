@@ -6,17 +6,17 @@ use crate::dots::calibrate::Centroids;
 use crate::dots::error::{check_range, check_shape};
 use crate::dots::{Batch, DotsError};
 
-/// The scene as the mirror would see it, lit from the camera.
+/// The scene as seen from the mirror and lit from the camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DualImage {
     /// `[height, width, channels]`; 1 is the calibration plane.
     pub image: Array3<f32>,
-    /// Which pixels are dots of their own, `[height, width]`; the others are filled in.
+    /// Which pixels contain a dot, `[height, width]`; the others are interpolated.
     pub known: Array2<bool>,
 }
 
-/// All light of each column, those outside the mask by their blocks' means; the mean of the channels. On the
-/// calibration plane, what [`dual`] divides by.
+/// The total light of each column, with the blocks' means outside the mask, averaged over the channels. For the
+/// calibration plane, this is the divisor of [`dual`].
 pub fn column_energies(batch: &Batch) -> Vec<f64> {
     let channels = batch.shape().channels() as f64;
     energies_of_channels(batch).iter().map(|energy| energy.iter().sum::<f64>() / channels).collect()
@@ -26,15 +26,16 @@ fn energies_of_channels(batch: &Batch) -> Vec<[f64; 3]> {
     (0..batch.dots()).into_par_iter().map(|dot| batch.column(dot).energy()).collect()
 }
 
-/// Dual image by Helmholtz reciprocity: each dot's place on the calibration plane has the light of its whole column,
-/// over what the plane gave there (`plane_energies`, by [`column_energies`] of the plane's batch), holes filled. Both
-/// are sums over the same pixels, whose number drops out. `size` is (height, width); the frame is scaled to it.
+/// Dual image by Helmholtz reciprocity: the pixel at each dot's position on the calibration plane gets the light of
+/// the dot's whole column, divided by that on the plane (`plane_energies`, from [`column_energies`] of the plane's
+/// batch). Holes are filled. Both are sums over the same pixels, so their number cancels. `size` is (height, width);
+/// the frame is scaled to it.
 ///
-/// Dots without a centroid or without light on the plane are left out; those that share a pixel are averaged.
+/// Dots without a centroid or without light on the plane are left out. Dots that share a pixel are averaged.
 ///
 /// # Errors
-/// [`DotsError::Shape`] if centroids or energies are not those of the batch's dots, [`DotsError::OutOfRange`] for an
-/// image without pixels.
+/// [`DotsError::Shape`] if the numbers of centroids or energies differ from the number of dots,
+/// [`DotsError::OutOfRange`] for an image without pixels.
 pub fn dual(
     batch: &Batch,
     centroids: &Centroids,

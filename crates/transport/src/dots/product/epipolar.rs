@@ -11,31 +11,32 @@ use crate::dots::error::{check_range, check_shape};
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError, FrameShape};
 
-/// Width of the frames that distances of masks are given for, in pixels.
+/// Frame width in pixels to which the distances of masks refer.
 pub const REFERENCE_WIDTH_PX: f64 = 1024.0;
 
-/// A block's share of the mask is the mean over this many points a side.
+/// A block's share of the mask is the mean over this many points per side.
 const POINTS: usize = 4;
 
-/// Farther out than this many sigmas the mask is 0; there a Gaussian is 4e-6.
+/// Beyond this many sigmas the mask is 0; a Gaussian is 4e-6 there.
 const REACH_SIGMAS: f64 = 5.0;
 
 /// How the mask falls off around an epipolar line.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum MaskRule {
-    /// 1 up to the distance, beyond it a Gaussian: the dot's whole width is direct.
+    /// 1 up to the distance, then falling off as a Gaussian: the dot's whole width is direct.
     #[default]
     Plateau,
-    /// Eq. 7 as printed: a Gaussian around the line itself, cut off at the distance. Keeps a fifth of the paper's dot.
+    /// Eq. 7 as printed: a Gaussian around the line itself, cut off at the distance. Keeps a fifth of the paper's
+    /// dot.
     Printed,
 }
 
 /// Which light counts as direct, by its distance from the dot's epipolar line.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EpipolarMask {
-    /// The paper's d_thresh, in pixels of a frame that is 1024 wide, as 19.
+    /// The paper's d_thresh, in pixels of a frame that is 1024 pixels wide; for example 19.
     pub distance_px: f64,
-    /// Softness, in the same pixels, as 2; 0 cuts sharply.
+    /// Softness, in the same pixels, for example 2; 0 gives a sharp edge.
     pub sigma_px: f64,
     /// The shape of the mask.
     pub rule: MaskRule,
@@ -50,12 +51,12 @@ struct Falloff {
 }
 
 impl Falloff {
-    /// Nothing farther away is direct.
+    /// Beyond this distance no light is direct.
     fn reach_px(&self) -> f64 {
         self.distance_px + REACH_SIGMAS * self.sigma_px
     }
 
-    /// Share that is direct at this distance from the line.
+    /// Share of direct light at this distance from the line.
     fn at(&self, px: f64) -> f64 {
         let gaussian = |px: f64| (-0.5 * (px / self.sigma_px).powi(2)).exp();
         if px > self.reach_px() {
@@ -73,8 +74,8 @@ impl Falloff {
 }
 
 impl Falloff {
-    /// Shares of pixels side by side from (x, y) on. The distance from a line is largest at an end of them, and smallest
-    /// too where the line does not cross, so that mostly one share serves all.
+    /// Shares of adjacent pixels starting at (x, y). Their distance from a line is largest at one end, and smallest
+    /// at the other unless the line crosses them, so that mostly one share serves all of them.
     #[inline(always)]
     fn along(&self, line: &Line, x: f64, y: f64, shares: &mut [f64]) {
         let (first, last) = (line.signed(x, y), line.signed(x + (shares.len() - 1) as f64, y));
@@ -94,7 +95,7 @@ impl Falloff {
     }
 }
 
-/// A dot's epipolar line, scaled so that it gives distances in pixels.
+/// A dot's epipolar line, scaled to give distances in pixels.
 #[derive(Clone, Copy)]
 struct Line {
     x: f64,
@@ -103,7 +104,7 @@ struct Line {
 }
 
 impl Line {
-    /// None where all of the image is as far away: the dot's line is the one at infinity.
+    /// `None` for the line at infinity, to which all points of the image are equally far.
     fn new([x, y, constant]: [f64; 3]) -> Option<Self> {
         let length = x.hypot(y);
         (length > 0.0 && length.is_finite()).then(|| Self {
@@ -113,16 +114,16 @@ impl Line {
         })
     }
 
-    /// Positive on one side of it, negative on the other.
+    /// Signed distance in pixels: positive on one side of the line, negative on the other.
     fn signed(&self, x: f64, y: f64) -> f64 {
         self.x * x + self.y * y + self.constant
     }
 
-    /// Those blocks of a row that the mask may reach into; all others have none of it.
+    /// The blocks of a row that the mask may reach; the share of all other blocks is 0.
     fn blocks_near(&self, falloff: &Falloff, band: usize, shape: FrameShape) -> Range<usize> {
         let reach = falloff.reach_px() + (HALF_PX + 0.5) * std::f64::consts::SQRT_2;
         let columns = shape.block_columns();
-        // Distance of the block's middle: a linear function of its column.
+        // Distance of the block's centre, a linear function of its column.
         let at_0 = self.signed(HALF_PX, (band * BLOCK_PX) as f64 + HALF_PX);
         let step = self.x * BLOCK_PX as f64;
         let (one, other) = ((-reach - at_0) / step, (reach - at_0) / step);
@@ -141,14 +142,16 @@ impl Line {
     }
 }
 
-/// Separates direct from global light by the epipolar constraint (after O'Toole et al. 2014): of each column, what lies
-/// near its dot's epipolar line is direct. `mirror` has each dot's place on the plane before the mirror, none for dots that
-/// were not calibrated; their light counts as global. Direct plus global is `light`, the floodlit image.
+/// Separates direct from global light by the epipolar constraint (after O'Toole et al. 2014): the part of each column
+/// near its dot's epipolar line is direct. `mirror` has each dot's position on the plane in front of the mirror,
+/// `None` for dots that were not calibrated, whose light counts as global. Direct plus global is `light`, the
+/// floodlit image.
 ///
-/// The mask of the residual, whose light has no place within its block, is the mean over the block.
+/// Light of the residual has no position within its block, so its mask is the mean over the block.
 ///
 /// # Errors
-/// [`DotsError::Shape`] unless `mirror` has all dots and `light` the batch's shape, [`DotsError::OutOfRange`] for a mask that cannot be.
+/// [`DotsError::Shape`] unless `mirror` has all dots and `light` the batch's shape, [`DotsError::OutOfRange`] for an
+/// invalid mask.
 pub fn epipolar(
     batch: &Batch,
     light: &Array3<f32>,
@@ -188,7 +191,7 @@ pub fn epipolar(
         let mut weights = [0.0; BLOCK_PX];
         for (dot, column) in batch.in_band(band) {
             let Some(line) = &lines[dot] else { continue };
-            // Each row of a disc goes through the same few blocks.
+            // Each row of a disc touches the same few blocks.
             let mut shares = [(usize::MAX, 0.0); 2];
             for Word { word, mask, mut values } in column.words() {
                 let block = shape.block_of_word(word);
@@ -208,7 +211,8 @@ pub fn epipolar(
                     for channel in 0..channels {
                         let place = channel * pixels + first;
                         let sums = sums[place + run.start..place + run.end].iter_mut();
-                        // The block's mean goes to all pixels in the end; here it is not the light.
+                        // The block's mean is added to all its pixels at the end; it does not apply to pixels of the
+                        // mask.
                         let mean = share * f64::from(column.residual()[block * channels + channel]);
                         let light = of_run[channel..].iter().step_by(channels).zip(&*weights);
                         sums.zip(light)
@@ -225,7 +229,7 @@ pub fn epipolar(
     Ok(Separation { direct, global })
 }
 
-/// From the middle of a block to its first pixel.
+/// Distance from the first pixel of a block to its centre, along one axis.
 const HALF_PX: f64 = (BLOCK_PX as f64 - 1.0) / 2.0;
 
 /// Mean of the mask over a block.

@@ -3,25 +3,26 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use ndarray::{Array2, Array3, Axis};
 use rayon::prelude::*;
 
-/// Rows whose pixels are sorted together.
+/// Number of rows whose pixels are sorted together.
 const BAND_ROWS: usize = 64;
 
-/// Fills the pixels of an image `[height, width, channels]` that are not known, from the known ones outwards: each has
-/// the mean of its horizontal and vertical neighbours that were known or filled a step before. Without any known pixel
-/// the image stays as it is.
+/// Fills the unknown pixels of an image `[height, width, channels]` from the known ones outwards: each gets the mean
+/// of its horizontal and vertical neighbours that were known or filled one step earlier. Without any known pixel the
+/// image is left unchanged.
 ///
 /// # Panics
-/// If `known` is not of the image's height and width.
+/// If `known` does not have the image's height and width.
 pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     let (height, width, channels) = image.dim();
     assert_eq!(known.dim(), (height, width), "known must be as large as the image");
     if !known.iter().any(|&known| known) {
         return;
     }
-    // With a border that is reached by no step, so that every pixel has four neighbours.
+    // With a border that no step reaches, so that every pixel has four neighbours.
     let stride = width + 2;
     let steps = steps_from(known);
-    // Atomic because a step's pixels are written while those of the step before, always others, are read.
+    // Atomic because the pixels of one step are written while those of the previous step, which are always others,
+    // are read.
     let values: Vec<AtomicU32> =
         (0..steps.len() * channels).into_par_iter().map(|_| AtomicU32::new(0)).collect();
     let row_of = |row: usize| &values[((row + 1) * stride + 1) * channels..][..width * channels];
@@ -33,7 +34,7 @@ pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     });
     let fill = |pixel: usize, step: u32| {
         let neighbours = [pixel - 1, pixel + 1, pixel - stride, pixel + stride];
-        // All bits of one that is filled, none of one that is not: which it is cannot be predicted, so nothing branches on it.
+        // All bits set for a filled neighbour, none for an unfilled one: branches here would be unpredictable.
         let mut mask = [0; 4];
         for (mask, near) in mask.iter_mut().zip(neighbours) {
             *mask = u32::from(steps[near] < step).wrapping_neg();
@@ -62,8 +63,8 @@ pub fn fill_holes(image: &mut Array3<f32>, known: &Array2<bool>) {
     });
 }
 
-/// Steps across rows and columns from each pixel to the nearest known one, `[height + 2, width + 2]`; `u32::MAX` on the
-/// border.
+/// Distance in horizontal and vertical steps from each pixel to the nearest known one, `[height + 2, width + 2]`;
+/// `u32::MAX` on the border.
 fn steps_from(known: &Array2<bool>) -> Vec<u32> {
     let (height, width) = known.dim();
     let stride = width + 2;
@@ -71,7 +72,7 @@ fn steps_from(known: &Array2<bool>) -> Vec<u32> {
     for (row, known) in steps.chunks_exact_mut(stride).skip(1).zip(known.outer_iter()) {
         row[1..].iter_mut().zip(known).filter(|(_, known)| **known).for_each(|(steps, _)| *steps = 0);
     }
-    // City-block distance, one axis after the other: first the nearest of the column, then the nearest of the row.
+    // City-block distance, one axis at a time: first the nearest in the column, then the nearest in the row.
     let nearer = |steps: u32, beside: u32| steps.min(beside.saturating_add(1));
     for row in 1..height {
         let (above, below) = steps[row * stride..].split_at_mut(stride);
@@ -89,10 +90,10 @@ fn steps_from(known: &Array2<bool>) -> Vec<u32> {
     steps
 }
 
-/// Some rows' pixels by their steps.
+/// The pixels of some rows, sorted by step.
 struct Band {
     pixels: Vec<u32>,
-    /// Where each step's end.
+    /// End of each step's pixels.
     ends: Vec<u32>,
 }
 
@@ -104,7 +105,7 @@ impl Band {
         inside().for_each(|pixel| ends[steps[pixel] as usize + 1] += 1);
         (1..ends.len()).for_each(|step| ends[step] += ends[step - 1]);
         let mut sorted = vec![0; ends[last as usize + 1] as usize];
-        // Each step's begin moves on to its end.
+        // The start of each step moves to its end.
         for pixel in inside() {
             let place = &mut ends[steps[pixel] as usize];
             sorted[*place as usize] = pixel as u32;

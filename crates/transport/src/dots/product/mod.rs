@@ -1,7 +1,7 @@
-//! Images made of a batch's columns. All are `[height, width, channels]`, in the columns' counts.
+//! Images computed from a batch's columns. All are `[height, width, channels]`, in the columns' counts.
 //!
-//! A column's light at a pixel is its value where the mask has the pixel, and its block's mean elsewhere. Every pixel is
-//! summed in the order of the dots, in f64, whatever the number of threads.
+//! A column's light at a pixel is its value if the mask contains the pixel, otherwise its block's mean. Every pixel
+//! is summed in the order of the dots, in f64, whatever the number of threads.
 
 mod dual;
 mod epipolar;
@@ -23,12 +23,12 @@ pub use overlap::{compensate, coverage};
 pub use relight::{floodlit, pattern_weights, relight, relight_sequence};
 pub use shadow::{shadow_dot, shadow_neighbours};
 
-/// The values of a floodlit image, if it is of the batch's shape.
+/// The values of a floodlit image, if it has the batch's shape.
 fn check_light<'a>(batch: &Batch, light: &'a Array3<f32>) -> Result<&'a [f32], DotsError> {
     let shape = batch.shape();
     let expected = [shape.height(), shape.width(), shape.channels()];
     check_shape("light", "[height, width, channels]", light.shape(), &expected)?;
-    // An image in another order of axes than ours is not the floodlit image that we made.
+    // An image with another memory order cannot be the floodlit image computed here.
     light.as_slice().ok_or_else(|| DotsError::Shape {
         array: "light",
         axes: "[height, width, channels] in this order in memory",
@@ -37,7 +37,7 @@ fn check_light<'a>(batch: &Batch, light: &'a Array3<f32>) -> Result<&'a [f32], D
     })
 }
 
-/// Light that came straight from the mirror, and all other light.
+/// Light that came directly from the mirror, and all other light.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Separation {
     /// `[height, width, channels]`.

@@ -5,20 +5,20 @@ use crate::dots::DotsError;
 use crate::dots::calibrate::PointSpreads;
 use crate::dots::error::check_shape;
 
-/// Coverage below this is not divided by: no dot shone there, and only noise would grow.
+/// Least coverage that is divided by: below it no dot shone there, and division would only amplify noise.
 const LEAST_COVERAGE: f32 = 0.1;
 
-/// How strongly the dots together covered each pixel, `[height, width, 1]`: the sum of their spreads. Their count, the
-/// paper's first choice, leaves the ripple of the dots' edges.
+/// The total coverage of each pixel by the dots, `[height, width, 1]`: the sum of their spreads. The number of dots,
+/// which the paper tried first, leaves ripple from the dots' edges.
 pub fn coverage(spreads: &PointSpreads) -> Array3<f32> {
     floodlit(&spreads.columns)
 }
 
-/// Divides direct light `[height, width, channels]` by the coverage, so that pixels under one dot and under several are
-/// equally bright.
+/// Divides direct light `[height, width, channels]` by the coverage, so that pixels under one dot and under several
+/// are equally bright.
 ///
 /// # Errors
-/// [`DotsError::Shape`] if the coverage is of another size.
+/// [`DotsError::Shape`] if the coverage has another size.
 pub fn compensate(direct: &Array3<f32>, coverage: &Array3<f32>) -> Result<Array3<f32>, DotsError> {
     let (height, width, _) = direct.dim();
     check_shape("coverage", "[height, width, 1]", coverage.shape(), &[height, width, 1])?;

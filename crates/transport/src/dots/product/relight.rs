@@ -13,8 +13,8 @@ pub fn floodlit(batch: &Batch) -> Array3<f32> {
     weighted(batch, Array2::ones((batch.dots(), batch.shape().channels())).view())
 }
 
-/// The scene under dots of these weights, `[dots, colours]`: one for each channel of the batch, or three for a batch of
-/// one channel. Gives `[height, width, colours]`.
+/// The scene lit by dots with these weights, `[dots, colours]`, where the number of colours is that of the batch's
+/// channels, or three for a batch with one channel. The result is `[height, width, colours]`.
 ///
 /// # Errors
 /// [`DotsError::Shape`] if the weights do not fit the batch.
@@ -27,11 +27,11 @@ pub fn relight(batch: &Batch, weights: ArrayView2<f32>) -> Result<Array3<f32>, D
     Ok(weighted(batch, weights))
 }
 
-/// The scene under a film of lighting patterns, each `[height, width, 3]` of any size, frame by frame. See
+/// The scene lit by a sequence of lighting patterns, each `[height, width, 3]` of any size, frame by frame. See
 /// [`pattern_weights`].
 ///
 /// # Errors
-/// As [`pattern_weights`] and [`relight`], for the pattern that is due.
+/// As [`pattern_weights`] and [`relight`], for the current pattern.
 pub fn relight_sequence<'a>(
     batch: &'a Batch,
     centroids: &'a Centroids,
@@ -40,9 +40,9 @@ pub fn relight_sequence<'a>(
     patterns.into_iter().map(|pattern| relight(batch, pattern_weights(centroids, pattern)?.view()))
 }
 
-/// The weights of the dots under a lighting pattern `[height, width, colours]` that is stretched over the frame: its
-/// bicubic interpolation (Keys 1981, a = -0.5) at the dots' centroids, beyond its border the nearest pixel. Linear in
-/// the pattern, so not clamped. Dots that were not seen have the weight 0.
+/// The weights of the dots for a lighting pattern `[height, width, colours]` stretched over the frame: its bicubic
+/// interpolation (Keys 1981, a = -0.5) at the dots' centroids, with the nearest pixel beyond its border. Linear in
+/// the pattern, so not clamped. Dots that were not seen have weight 0.
 ///
 /// # Errors
 /// [`DotsError::OutOfRange`] for a pattern without pixels.
@@ -65,7 +65,7 @@ pub fn pattern_weights(centroids: &Centroids, pattern: ArrayView3<f32>) -> Resul
     Ok(weights)
 }
 
-/// The four pixels of a line around a place, and their shares.
+/// The four pixels of a line around a position, and their weights.
 fn cubic(at: f64, size: usize) -> [(usize, f64); 4] {
     let first = at.floor();
     let near = |distance: f64| (1.5 * distance - 2.5) * distance * distance + 1.0;
@@ -81,7 +81,7 @@ fn cubic(at: f64, size: usize) -> [(usize, f64); 4] {
 fn weighted(batch: &Batch, weights: ArrayView2<f32>) -> Array3<f32> {
     let (shape, colours) = (batch.shape(), weights.ncols());
     let (channels, blocks) = (shape.channels(), shape.blocks());
-    // One channel serves all colours.
+    // One channel is used for all colours.
     let channel_of = |colour: usize| colour.min(channels - 1);
     let residual = sum_blocks(batch, colours, |dot, sums| {
         let means = batch.column(dot).residual();
@@ -105,7 +105,8 @@ fn weighted(batch: &Batch, weights: ArrayView2<f32>) -> Array3<f32> {
                     values = rest;
                     for colour in 0..colours {
                         let weight = f64::from(weights[[dot, colour]]);
-                        // The block's mean goes to all pixels in the end; here it is not the light.
+                        // The block's mean is added to all its pixels at the end; it does not apply to pixels of the
+                        // mask.
                         let mean = f64::from(column.residual()[block * channels + channel_of(colour)]);
                         let place = colour * pixels + first;
                         let sums = &mut sums[place + run.start..place + run.end];

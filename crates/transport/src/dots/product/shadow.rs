@@ -12,17 +12,17 @@ use crate::dots::error::{check_range, check_shape};
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, DotsError};
 
-/// The dot that no pixel has.
+/// Marks a pixel without a dot.
 const NONE: u32 = u32::MAX;
 
-/// Separates direct from global light by the extremes over images that are lit by all dots but one, as Nayar et al. (2006)
-/// do with patterns: `direct = L_max - L_min`, `global = L_min N / (N - 1)` for N dots. `light` is the floodlit image.
+/// Separates direct from global light by the extremes over images lit by all dots but one, as Nayar et al. (2006) do
+/// with patterns: `direct = L_max - L_min`, `global = L_min N / (N - 1)` for N dots. `light` is the floodlit image.
 ///
-/// A dot's shadow is where its mask is; beyond it the light stays. Where several dots cover a pixel, one of them missing does
-/// not make it dark: see [`shadow_neighbours`].
+/// Switching a dot off removes its light only where its mask is. Where several dots cover a pixel, switching off one
+/// of them does not make it dark: see [`shadow_neighbours`].
 ///
 /// # Errors
-/// [`DotsError::OutOfRange`] below two dots, [`DotsError::Shape`] if `light` is not of the batch's shape.
+/// [`DotsError::OutOfRange`] below two dots, [`DotsError::Shape`] if `light` does not have the batch's shape.
 pub fn shadow_dot(batch: &Batch, light: &Array3<f32>) -> Result<Separation, DotsError> {
     let dots = batch.dots();
     check_range("dots", dots as f64, dots >= 2, "at least 2")?;
@@ -32,7 +32,7 @@ pub fn shadow_dot(batch: &Batch, light: &Array3<f32>) -> Result<Separation, Dots
     let [direct, global] = by_bands(batch.shape(), channels, |band, sums| {
         let pixels = sums.len() / (2 * channels);
         let mut covering = vec![0_u32; pixels];
-        // Largest and least light that one dot takes away.
+        // Largest and smallest light that a single dot removes.
         let (most, least) = sums.split_at_mut(channels * pixels);
         most.fill(f64::NEG_INFINITY);
         least.fill(f64::INFINITY);
@@ -62,7 +62,7 @@ pub fn shadow_dot(batch: &Batch, light: &Array3<f32>) -> Result<Separation, Dots
             let extremes = most[at.clone()].iter_mut().zip(&mut least[at]);
             let light = light[channel..].iter().step_by(channels);
             for (((most, least), &light), &covering) in extremes.zip(light).zip(&covering) {
-                // A dot that does not cover the pixel takes nothing away.
+                // A dot that does not cover the pixel removes no light.
                 let none = if (covering as usize) < dots { 0.0 } else { *most };
                 let (largest, smallest) = (most.max(none), least.min(none));
                 (*most, *least) = (largest - smallest, (f64::from(light) - largest) * share);
@@ -77,15 +77,15 @@ fn of_band<'a>(light: &'a [f32], band: usize, values: usize, batch: &Batch) -> &
     &light[band * BLOCK_PX * batch.shape().width() * batch.shape().channels()..][..values]
 }
 
-/// Separates direct from global light where dots overlap: at each pixel, all dots are switched off that share pixels of the
-/// calibration plane with the one that is brightest there, `S = {j : M_ij > 0}`. What is left is global light from the
-/// other dots: `global = L_min N / (N - |S|)`, `direct = floodlit - global`. `light` is the floodlit image.
+/// Separates direct from global light where dots overlap: at each pixel, all dots are switched off that share pixels
+/// of the calibration plane with the one that is brightest there, `S = {j : M_ij > 0}`. What remains is global light
+/// from the other dots: `global = L_min N / (N - |S|)`, `direct = floodlit - global`. `light` is the floodlit image.
 ///
-/// The neighbours hold off the plane as well, where the dots' places on it do not. Pixels that no mask has are global.
+/// The same neighbours are used off the plane, where the dots' positions differ. Pixels outside all masks are global.
 ///
 /// # Errors
-/// [`DotsError::Shape`] if the confusion matrix is not of the batch's dots or `light` not of its shape,
-/// [`DotsError::OutOfRange`] if a dot has all others for neighbours.
+/// [`DotsError::Shape`] if the confusion matrix does not have the batch's dots or `light` not its shape,
+/// [`DotsError::OutOfRange`] if a dot has all others as neighbours.
 pub fn shadow_neighbours(
     batch: &Batch,
     light: &Array3<f32>,
@@ -105,7 +105,7 @@ pub fn shadow_neighbours(
     let is_neighbour = Neighbours::new(confusion);
     let [direct, global] = by_bands(shape, channels, |band, sums| {
         let pixels = sums.len() / (2 * channels);
-        // First what the dots that are switched off would give, then direct and global light.
+        // First the light of the dots that are switched off, then direct and global light.
         let (off, global) = sums.split_at_mut(channels * pixels);
         let (mut brightest, mut dot_of) = (vec![f32::NEG_INFINITY; pixels], vec![NONE; pixels]);
         for (dot, column) in batch.in_band(band) {
@@ -147,7 +147,7 @@ pub fn shadow_neighbours(
                 }
             }
         }
-        // The neighbours' residual too is switched off; one sum serves all pixels of a block with the same dot.
+        // The neighbours' residual is switched off too; one sum serves all pixels of a block with the same dot.
         let light = of_band(light, band, pixels * channels, batch);
         let mut residuals: Vec<Option<[f64; 3]>> = vec![None; dots];
         let mut met = Vec::new();
@@ -158,7 +158,7 @@ pub fn shadow_neighbours(
                 let (residual, count) = match dot_of[pixel] {
                     NONE => ([0.0; 3], 0),
                     _ => {
-                        // The calibration may not have seen the dot.
+                        // The dot may be missing from the calibration.
                         let itself = [dot as u32];
                         let neighbours = match confusion.neighbours(dot) {
                             [] => &itself,
@@ -185,7 +185,7 @@ pub fn shadow_neighbours(
     Ok(Separation { direct, global })
 }
 
-/// Sum of some dots' residual at one block.
+/// Sum of the residuals of `dots` in one block.
 fn residual_of(batch: &Batch, dots: &[u32], block: usize) -> [f64; 3] {
     let channels = batch.shape().channels();
     let mut sum = [0.0; 3];
@@ -196,7 +196,7 @@ fn residual_of(batch: &Batch, dots: &[u32], block: usize) -> [f64; 3] {
     sum
 }
 
-/// The confusion matrix as bits, each dot its own neighbour even where the calibration has not seen it.
+/// The confusion matrix as bits. Each dot is its own neighbour, even if the calibration did not see it.
 struct Neighbours {
     dots: usize,
     bits: Vec<u64>,
@@ -214,7 +214,7 @@ impl Neighbours {
         Self { dots, bits }
     }
 
-    /// A bit for each dot that shares pixels with this one.
+    /// One bit per dot, set if it shares pixels with `dot`.
     fn of(&self, dot: usize) -> &[u64] {
         &self.bits[dot * self.dots.div_ceil(64)..][..self.dots.div_ceil(64)]
     }

@@ -5,12 +5,12 @@ use rayon::prelude::*;
 use crate::dots::shape::BLOCK_PX;
 use crate::dots::{Batch, FrameShape};
 
-/// Dots whose residuals are summed one after another; such sums are then added in order, so the number of threads
-/// changes no bit.
+/// Number of dots whose residuals are summed sequentially. These partial sums are then added in order, so that the
+/// result is the same to the bit for any number of threads.
 const DOTS_AT_A_TIME: usize = 128;
 
-/// Makes images by rows of blocks, in parallel: `draw` has the number of the row of blocks and an accumulator of its
-/// pixels, `[images, channels, rows, width]`, which is 0.
+/// Computes images by rows of blocks, in parallel. `draw` gets the index of the row of blocks and a zeroed
+/// accumulator of its pixels, `[images, channels, rows, width]`.
 pub(super) fn by_bands<const IMAGES: usize>(
     shape: FrameShape,
     channels: usize,
@@ -29,7 +29,7 @@ pub(super) fn by_bands<const IMAGES: usize>(
         |sums, (band, images)| {
             let size: usize = images.iter().map(|values| values.len()).sum();
             let sums = &mut sums[..size];
-            // With the widest instructions; they round as all others do.
+            // With the widest instructions; all of them round alike.
             Arch::new().dispatch(|| {
                 sums.fill(0.0);
                 draw(band, &mut *sums);
@@ -42,7 +42,7 @@ pub(super) fn by_bands<const IMAGES: usize>(
     images
 }
 
-/// `[channels, pixels]` to `[pixels, channels]`.
+/// Converts `[channels, pixels]` to `[pixels, channels]`.
 #[inline(always)]
 fn interleave(values: &mut [f32], sums: &[f64], channels: usize) {
     if channels == 1 {
@@ -58,7 +58,7 @@ fn interleave(values: &mut [f32], sums: &[f64], channels: usize) {
     }
 }
 
-/// Sums over all dots of what `add` puts into an accumulator of blocks, `[planes, blocks]`.
+/// Sums over all dots what `add` adds to an accumulator of blocks, `[planes, blocks]`.
 pub(super) fn sum_blocks(batch: &Batch, planes: usize, add: impl Fn(usize, &mut [f64]) + Sync) -> Vec<f64> {
     let size = planes * batch.shape().blocks();
     let parts: Vec<Vec<f64>> = (0..batch.dots().div_ceil(DOTS_AT_A_TIME))
@@ -77,7 +77,7 @@ pub(super) fn sum_blocks(batch: &Batch, planes: usize, add: impl Fn(usize, &mut 
     sums
 }
 
-/// Adds the blocks of one row, `[block columns]`, to all their pixels, `[rows, width]`.
+/// Adds the values of a row of blocks, `[block columns]`, to all their pixels, `[rows, width]`.
 #[inline(always)]
 pub(super) fn add_blocks(sums: &mut [f64], blocks: &[f64]) {
     for row in sums.chunks_exact_mut(blocks.len() * BLOCK_PX) {

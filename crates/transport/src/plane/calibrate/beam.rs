@@ -9,24 +9,25 @@ use super::holdout::{folds, held_out, log_residuals};
 use super::spike::MIN_PIXELS;
 use super::{CalibrateError, Optics, Sample, SpikeMap, spike_offset};
 
-/// Widths that the search starts from, in rows; between neighbours the residual has one minimum.
+/// Initial widths of the search, in rows; between neighbours the residual has one minimum.
 const COARSE_ROWS: [f64; 7] = [0.0, 0.3, 0.45, 0.7, 1.05, 1.55, 2.3];
 
-/// Below this width a Gaussian sampled at the rows' centres leaves 96 % of the light in its own row, and a cusp of
-/// subsurface light about u = 0 cannot be told from it: the beam counts as ideal.
+/// Below this width a Gaussian sampled at the rows' centres leaves 96 % of the light in its own row and cannot be
+/// distinguished from a cusp of subsurface light around u = 0: the beam counts as ideal.
 const NARROWEST_ROWS: f64 = 0.36;
 const WIDEST_ROWS: f64 = 3.0;
 
-/// Golden sections of the interval between the neighbours of the best coarse width: they leave 7 % of the width.
+/// Golden-section steps in the interval between the neighbours of the best coarse width; they leave 7 % of the width.
 const GOLDEN_STEPS: usize = 5;
 const GOLDEN_RATIO: f64 = 0.618_033_988_75;
 
-/// Factor between the widths that the parabola of held-out residuals joins, and how often it may be moved.
+/// Ratio of the widths through which the parabola of held-out residuals runs, and how often it may be moved.
 const FINE_STEP: f64 = 1.06;
 const FINE_ROUNDS: usize = 3;
 
-/// The width counts as determined when beams wider and narrower by this factor, or one of twice the narrowest in
-/// place of an ideal one, raise the mean squared held-out residual by this share and by so many standard errors.
+/// The width counts as determined if changing it by this factor in either direction, or replacing an ideal beam by
+/// one of twice the narrowest width, raises the mean squared held-out residual by this share and by this many
+/// standard errors.
 const OTHER_WIDTH: f64 = 1.5;
 const MIN_RISE: f64 = 0.03;
 const MIN_STANDARD_ERRORS: f64 = 2.0;
@@ -34,29 +35,29 @@ const MIN_STANDARD_ERRORS: f64 = 2.0;
 /// The width of the projector's beam across rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BeamEstimate {
-    /// Standard deviation of a Gaussian profile sampled at the rows' centres, in rows; 0 for rows that light only
-    /// themselves.
+    /// Standard deviation in rows of a Gaussian profile sampled at the rows' centres; 0 if each row lights only
+    /// itself.
     pub sigma_rows: f64,
     /// Its standard error, in rows.
     pub standard_error_rows: f64,
-    /// Sampled pixels with direct light, which say it.
+    /// Number of sampled pixels with direct light, on which the estimate is based.
     pub pixels: usize,
 }
 
-/// The beam's width and the place of direct light, or why the stack does not say them.
+/// The beam's width and the position of direct light, or why the stack does not determine them.
 #[derive(Debug, Clone)]
 pub struct OpticsEstimate {
-    /// What to solve with: the estimates, and an ideal beam or `u = 0` where there is none.
+    /// The optics to solve with: the estimates, or an ideal beam and `u = 0` where there is none.
     pub optics: Optics,
-    /// The width, unless it was given.
+    /// The width; `None` if it was given.
     pub beam: Option<Result<BeamEstimate, CalibrateError>>,
-    /// The place.
+    /// The position.
     pub spike: Result<SpikeMap, CalibrateError>,
 }
 
-/// Estimates the width of the beam, unless it is known, and the place of direct light. They hardly interfere, because
-/// a beam spreads light to both sides and an offset to one: the place is measured once with a rough width, and again
-/// with the fine one.
+/// Estimates the beam's width, unless it is known, and the position of direct light. They hardly interfere, because a
+/// beam spreads light to both sides and an offset moves it to one: the position is measured once with a rough width,
+/// and again with the fine one.
 ///
 /// # Errors
 /// [`PlaneError::NotConvex`].
@@ -68,7 +69,7 @@ pub fn estimate_optics(
         Some(_) => None,
         None => {
             let thinned = sample.thinned();
-            // A place that is free within a row keeps an offset from being taken for a width.
+            // A free position within a row prevents an offset from being mistaken for a width.
             let rough_rows = best_coarse(|sigma_rows| {
                 Ok(direct_light(&thinned, sigma_rows)?.iter().map(|light| log(light.objective)).sum())
             })?;
@@ -83,12 +84,12 @@ pub fn estimate_optics(
     Ok(OpticsEstimate { optics, beam, spike })
 }
 
-/// Estimates the beam's width: roughly as the one under which the split prior's objective is least, and then as the
-/// one under which held-out settings are predicted best, because the objective alone takes a width for smoothness.
+/// Estimates the beam's width: first roughly, by the smallest objective of the split prior, then by the best
+/// prediction of held-out settings, because the objective alone mistakes a width for smoothness.
 ///
 /// # Errors
 /// [`CalibrateError::NoDirectLight`], [`CalibrateError::BeamUndetermined`] and [`CalibrateError::BeamTooWide`] if the
-/// stack does not say it; [`CalibrateError::TooFewSettings`]; [`PlaneError::NotConvex`].
+/// stack does not determine it; [`CalibrateError::TooFewSettings`]; [`PlaneError::NotConvex`].
 pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstimate, CalibrateError> {
     let sample = sample.thinned();
     let folds = folds(&sample)?;
@@ -111,7 +112,7 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
         let (sigma_rows, standard_error_rows) =
             refine(rough, |sigma_rows| Ok(held_out_log(sigma_rows)?.by_pixel))?;
         let residuals = held_out_log(sigma_rows)?;
-        // An ideal beam stays unless the width predicts better by more than one standard error.
+        // The ideal beam is kept unless the width predicts better by more than one standard error.
         let (log_ratio, standard_error) = residuals.ratio_to(&best);
         if sigma_rows >= NARROWEST_ROWS && log_ratio < -standard_error {
             estimate = BeamEstimate { sigma_rows, standard_error_rows, pixels };
@@ -121,7 +122,8 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
     if estimate.sigma_rows >= WIDEST_ROWS {
         return Err(CalibrateError::BeamTooWide { widest_rows: WIDEST_ROWS });
     }
-    // Where the plan cannot tell, the least residual means nothing: clearly other widths must predict worse.
+    // If the plan cannot determine the width, the smallest residual is meaningless: clearly different widths must
+    // predict worse.
     let others_rows = match estimate.sigma_rows {
         0.0 => vec![2.0 * NARROWEST_ROWS],
         sigma_rows => vec![sigma_rows / OTHER_WIDTH, sigma_rows * OTHER_WIDTH],
@@ -141,8 +143,8 @@ pub fn beam_sigma(sample: &Sample, spike: Option<&SpikeMap>) -> Result<BeamEstim
     Ok(estimate)
 }
 
-/// The minimum of held-out residuals about a rough width and its standard error, by a parabola over the logarithm of
-/// the width that moves until it holds its minimum.
+/// The minimum of held-out residuals around a rough width and its standard error, from a parabola over the logarithm
+/// of the width, which is moved until it contains its minimum.
 fn refine(
     rough_rows: f64,
     log_residual: impl Fn(f64) -> Result<Array1<f64>, PlaneError> + Sync,
@@ -170,13 +172,13 @@ fn refine(
     Ok((sigma_rows, relative_error * sigma_rows))
 }
 
-/// Index of the coarse width of the least score.
+/// Index of the coarse width with the smallest score.
 fn best_coarse(score: impl Fn(f64) -> Result<f64, PlaneError> + Sync) -> Result<usize, PlaneError> {
     let scores: Vec<f64> = COARSE_ROWS.into_par_iter().map(&score).collect::<Result<_, _>>()?;
     Ok((0..scores.len()).min_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0))
 }
 
-/// The middle of what a few golden sections leave of an interval about a minimum.
+/// The middle of the interval around a minimum that remains after a few golden-section steps.
 fn golden_section(
     mut from: f64,
     mut to: f64,
@@ -200,7 +202,7 @@ fn golden_section(
     Ok(if f_low < f_high { low } else { high })
 }
 
-/// The split prior's objective at the minimum, for each pixel.
+/// The minimum of the split prior's objective for each pixel.
 fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
     let by_class: Vec<Vec<f64>> = sample
         .classes
@@ -219,12 +221,12 @@ fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
     Ok(by_class.concat())
 }
 
-/// The logarithm lets each pixel count by its own noise.
+/// The logarithm makes each pixel count relative to its own noise.
 fn log(objective: f64) -> f64 {
     objective.max(f64::MIN_POSITIVE).ln()
 }
 
-/// Only the pixels in which direct light stands out: the others say nothing of the beam, but have noise.
+/// Only the pixels in which direct light stands out: the others do not depend on the beam but add noise.
 fn with_direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Sample, CalibrateError> {
     let light = direct_light(sample, beam_sigma_rows)?;
     let direct: HashSet<(usize, usize)> =

@@ -6,28 +6,28 @@ use super::Sample;
 use super::problem::RowProblem;
 use super::sample::SampledClass;
 
-/// Direct light counts where it exceeds the light of the neighbouring rows by so many standard errors.
+/// Direct light is used if it exceeds the light of the neighbouring rows by this many standard errors.
 const STANDS_OUT: f64 = 5.0;
 
-/// The direct light of one sampled pixel, when it is free to lie in rows -1, 0 and 1.
+/// The direct light of one sampled pixel, estimated with freedom to lie in rows -1, 0 and 1.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DirectLight {
     pub t: usize,
     pub s: usize,
-    /// Whether the direct row is brighter than its neighbours beyond doubt.
+    /// Whether the direct row is significantly brighter than its neighbours.
     pub stands_out: bool,
-    /// Its mean place, and the standard error that the samples' noise gives it.
+    /// Its mean position, and the standard error due to the samples' noise.
     pub u0_rows: f64,
     pub standard_error_rows: f64,
-    /// Variance of the place for light and noise of 1: what the plan alone says. Where no setting tells the rows
-    /// apart, only rounding keeps it finite.
+    /// Variance of the position for unit light and noise, which depends on the plan alone. If no setting
+    /// distinguishes the rows, only rounding keeps it finite.
     pub plan_variance: f64,
     /// Minimum of the objective.
     pub objective: f64,
 }
 
-/// Estimates the direct light of all pixels of the sample under a beam, each with two more unknowns than the split
-/// prior has: light in rows 1 and -1 that no smoothness binds. Pixels at the border, whose row 1 or -1 does not exist,
+/// Estimates the direct light of all pixels of the sample for a given beam. Each has two more unknowns than with the
+/// split prior: light in rows 1 and -1 that is not smoothed. Pixels at the border, whose row 1 or -1 does not exist,
 /// are left out.
 pub(super) fn direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Vec<DirectLight>, PlaneError> {
     let by_class: Vec<Vec<DirectLight>> =
@@ -53,7 +53,7 @@ fn of_class(class: &SampledClass, beam_sigma_rows: f64) -> Result<Vec<DirectLigh
     let x = problem.minimise(class.intensities.view(), None);
 
     let moment = combination(slots + 2, &[(slots, -1.0), (slots + 1, 1.0)]);
-    // What lies at u = 0 is direct light on top of indirect light, which is about that of the neighbours.
+    // The light at u = 0 is direct light plus indirect light, which is about that of the neighbours.
     let amount =
         combination(slots + 2, &[(slots, 1.0), (own, 1.0), (slots + 1, 1.0), (above, -0.5), (below, -0.5)]);
     let plan_variance = moment.dot(&problem.inverse().dot(&moment));

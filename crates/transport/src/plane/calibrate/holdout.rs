@@ -4,29 +4,29 @@ use rayon::prelude::*;
 use super::super::{PlaneError, Prior, Setting, reach};
 use super::{CalibrateError, Optics, Sample};
 
-/// Groups that the settings are divided into; each is predicted from the others.
+/// Number of groups into which the settings are divided; each is predicted from the others.
 const FOLDS: usize = 5;
 
-/// Smallest mean squared residual, that of a millionth of white light: far below any camera's noise, so it only keeps
+/// Smallest mean squared residual, that of a millionth of white light: far below any camera's noise. It only keeps
 /// the logarithm of a perfect prediction finite.
 const LEAST_SQUARE: f64 = 1e-12;
 
-/// A prior and how well it predicts images that it has not seen.
+/// A prior and its error in predicting images that were held out.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Candidate {
     /// The prior.
     pub prior: Prior,
-    /// Root mean square of the held-out residuals of a typical pixel (geometric mean over pixels), 1.0 for the light
+    /// Root mean square of the held-out residuals of a typical pixel (geometric mean over pixels); 1.0 is the light
     /// of a white surface per row dwell.
     pub residual: f64,
-    /// Mean over pixels of `ln(squared residual / squared residual under the default)`. Each pixel counts by its own
-    /// noise, so neither bright pixels nor those that no prior fits decide alone.
+    /// Mean over pixels of `ln(squared residual / squared residual under the default)`. Each pixel counts relative to
+    /// its own noise, so neither bright pixels nor those that no prior fits dominate.
     pub log_ratio: f64,
-    /// Standard error of `log_ratio`, of the pixels and of the settings that happened to be chosen together.
+    /// Standard error of `log_ratio`, due to the choice of pixels and to the choice of settings in each fold.
     pub standard_error: f64,
 }
 
-/// The held-out error of all candidates, and the prior that it speaks for.
+/// The held-out errors of all candidates, and the prior that they favour.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Choice {
     /// All candidates in the order given, the default first.
@@ -36,7 +36,7 @@ pub struct Choice {
 }
 
 impl Choice {
-    /// The best candidate, unless the default comes within one standard error of it.
+    /// The best candidate, unless the default is within one standard error of it.
     fn new(curve: Vec<Candidate>) -> Self {
         let mut choice = Self { curve, chosen: 0 };
         let best = choice.best();
@@ -51,7 +51,7 @@ impl Choice {
         self.curve[self.chosen].prior
     }
 
-    /// What was chosen and why, in a sentence for the report.
+    /// The choice and its reason, as a sentence for the report.
     pub fn reason(&self) -> String {
         let name =
             |prior: Prior| format!("{} (alpha {}, beta {})", prior.name(), prior.alpha(), prior.beta());
@@ -84,8 +84,8 @@ impl Choice {
     }
 }
 
-/// The priors compared when a plan names none: the default first, then split priors over two decades of `alpha` and
-/// one of `beta`, and the paper's.
+/// The priors compared if a plan names none: the default first, then split priors over two decades of `alpha` and one
+/// of `beta`, and the paper's.
 pub fn candidates() -> Vec<Prior> {
     let split = |alpha, beta| Prior::Split { alpha, beta };
     vec![
@@ -101,14 +101,14 @@ pub fn candidates() -> Vec<Prior> {
 }
 
 /// Chooses between priors by held-out settings: each fifth of the settings, spread over the plan's delays and
-/// exposures, is predicted from the transport that the others give. Settings that alone see some row are never
-/// held out.
+/// exposures, is predicted from the transport estimated from the others. Settings that are the only ones to see some
+/// row are never held out.
 ///
-/// The first candidate is the default, and another is chosen only if it predicts better by more than one standard
+/// The first candidate is the default. Another one is chosen only if it predicts better by more than one standard
 /// error.
 ///
 /// # Errors
-/// [`CalibrateError::NoCandidates`], [`CalibrateError::TooFewSettings`], [`Prior::check`]'s, and
+/// [`CalibrateError::NoCandidates`], [`CalibrateError::TooFewSettings`], those of [`Prior::check`], and
 /// [`PlaneError::NotConvex`].
 pub fn choose_prior(
     sample: &Sample,
@@ -137,13 +137,13 @@ pub fn choose_prior(
     Ok(Choice::new(curve))
 }
 
-/// Logarithms of mean squared held-out residuals: of each pixel, and of each fold's typical pixel.
+/// Logarithms of mean squared held-out residuals: for each pixel, and for the typical pixel of each fold.
 pub(super) struct LogResiduals {
     pub by_pixel: Array1<f64>,
     by_fold: Array1<f64>,
 }
 
-/// From what [`held_out`] returns.
+/// From the result of [`held_out`].
 pub(super) fn log_residuals(errors: &Array2<f64>) -> LogResiduals {
     let log = |error: f64| error.max(LEAST_SQUARE).ln();
     LogResiduals {
@@ -153,8 +153,8 @@ pub(super) fn log_residuals(errors: &Array2<f64>) -> LogResiduals {
 }
 
 impl LogResiduals {
-    /// Mean over pixels of the logarithm of the ratio to `other`, and its standard error: that of the pixels and that
-    /// of the folds, because neither are all there could be.
+    /// Mean over pixels of the logarithm of the ratio to `other`, and its standard error. This includes the scatter
+    /// of pixels and that of folds, because both are samples.
     pub fn ratio_to(&self, other: &Self) -> (f64, f64) {
         let by_pixel = &self.by_pixel - &other.by_pixel;
         let by_fold = &self.by_fold - &other.by_fold;
@@ -167,8 +167,8 @@ fn standard_error(values: ArrayView1<f64>) -> f64 {
     if values.len() < 2 { 0.0 } else { values.std(1.0) / (values.len() as f64).sqrt() }
 }
 
-/// Indices of the settings of each fold. Neighbouring delays lie in different folds, and so do neighbouring exposures
-/// of one delay.
+/// Indices of the settings of each fold. Neighbouring delays lie in different folds, as do neighbouring exposures of
+/// one delay.
 pub(super) fn folds(sample: &Sample) -> Result<Vec<Vec<usize>>, CalibrateError> {
     let settings = &sample.settings;
     let mean_delay_us =
@@ -206,7 +206,7 @@ pub(super) fn folds(sample: &Sample) -> Result<Vec<Vec<usize>>, CalibrateError> 
     }
 }
 
-/// Mean squared residual of each pixel in the settings of each fold when it is estimated from all others, shape
+/// Mean squared residual of each pixel in the settings of each fold if it is estimated from all other folds, shape
 /// `[pixels, folds]`.
 pub(super) fn held_out(
     sample: &Sample,
@@ -300,7 +300,7 @@ mod tests {
         }
         let mut held: Vec<usize> = folds.concat();
         held.sort_unstable();
-        // The longest exposures at the ends of the sweep alone see the outermost rows.
+        // Only the longest exposures at the ends of the sweep see the outermost rows.
         assert_eq!(held, (0..75).filter(|n| ![60, 74].contains(n)).collect::<Vec<_>>());
     }
 }

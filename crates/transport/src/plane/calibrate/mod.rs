@@ -1,10 +1,11 @@
-//! What a stack says of its own making: which prior predicts it, how wide the beam is, where direct light arrives.
+//! Calibrates the model from the stack itself: the best prior, the width of the beam, and the position of direct
+//! light.
 //!
-//! All of it is computed on a [`Sample`] of pixels by the same two means. Settings that an estimate has not seen are
-//! predicted from it: [`choose_prior`] compares priors that way, and [`beam_sigma`] widths. And direct light, which
-//! geometry makes a spike, is let free to move: [`spike_offset`] measures its place. Residuals are compared pixel by
-//! pixel in logarithms, so no model of the camera's noise is needed. Where a stack does not say something, a
-//! [`CalibrateError`] says why.
+//! Everything is computed on a [`Sample`] of pixels, by two methods. The first predicts settings that an estimate has
+//! not used: [`choose_prior`] compares priors this way, and [`beam_sigma`] widths. The second lets direct light,
+//! which by geometry is a spike, move freely: [`spike_offset`] measures its position. Residuals are compared pixel by
+//! pixel as logarithms, so that no model of the camera's noise is needed. If a stack does not determine a quantity, a
+//! [`CalibrateError`] explains why.
 //!
 //! [`settings_on_direct_row`] and [`spike_weights`] are for projectors that draw their rows with a flying spot.
 

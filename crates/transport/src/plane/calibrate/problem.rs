@@ -5,7 +5,7 @@ use super::super::pivot::{RUN_PX, Start, minimise};
 use super::super::quadratic::Quadratic;
 use super::super::{PlaneError, Prior, SimdLevel, cholesky};
 
-/// The objective of one camera row, for weights that calibration varies.
+/// The objective of one camera row, for weights that vary during calibration.
 pub(super) struct RowProblem {
     /// `A`, shape `[settings, slots]`.
     pub weights: Array2<f64>,
@@ -22,7 +22,7 @@ impl RowProblem {
         Ok(Self { weights, differences, prior: *prior, quadratic })
     }
 
-    /// The same problem for some of the settings only: those whose indices are in `kept`; `held` are the others.
+    /// The same problem for the settings with indices in `kept` only; `held` are the others.
     pub fn without(&self, kept: &[usize], held: &[usize]) -> Result<Self, PlaneError> {
         let weights = self.weights.select(Axis(0), kept);
         let quadratic = match self.quadratic.without(self.weights.select(Axis(0), held).view()) {
@@ -37,11 +37,11 @@ impl RowProblem {
         self.quadratic.inverse()
     }
 
-    /// Minimisers of several pixels, shape `[pixels, slots]`, from `samples`, `[pixels, settings]`, started from the
-    /// free slots of `near`, minimisers of like problems.
+    /// Minimisers of several pixels, shape `[pixels, slots]`, from `samples`, `[pixels, settings]`. The search starts
+    /// from the free slots of `near`, the minimisers of a similar problem.
     pub fn minimise(&self, samples: ArrayView2<f64>, near: Option<&Array2<f64>>) -> Array2<f64> {
         let mut pixels = self.quadratic.linear(self.weights.view(), samples);
-        // A sample has few classes, which alone would leave processors without work.
+        // A sample has few classes, too few to keep all processors busy by themselves.
         pixels.axis_chunks_iter_mut(Axis(0), RUN_PX).into_par_iter().enumerate().for_each(
             |(run, mut pixels)| {
                 let (first, lengths) = (run * RUN_PX, [pixels.nrows()]);
@@ -56,7 +56,7 @@ impl RowProblem {
 
     /// Value of `||A x - I||^2 + alpha ||D x||^2 + beta sum(x)` for each pixel at its minimiser.
     pub fn minima(&self, x: ArrayView2<f64>, samples: ArrayView2<f64>) -> Array1<f64> {
-        // There x'(Hx - c) = 0, so of x'Hx - 2 c'x + I'I only I'I - c'x is left.
+        // At the minimiser x'(Hx - c) = 0, so x'Hx - 2 c'x + I'I reduces to I'I - c'x.
         let linear = self.quadratic.linear(self.weights.view(), samples);
         (&samples * &samples).sum_axis(Axis(1)) - (&linear * &x).sum_axis(Axis(1))
     }

@@ -7,22 +7,22 @@ use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, 
 use super::problem::RowProblem;
 use super::{CalibrateError, SpikeMap};
 
-/// Camera rows and pixels in each that a sample holds at most.
+/// Largest number of camera rows in a sample, and of pixels per row.
 const ROWS: usize = 16;
 const PIXELS_PER_ROW: usize = 64;
 
-/// Smaller samples are used whole.
+/// Samples with fewer pixels are not thinned.
 const MIN_PIXELS_TO_THIN: usize = 256;
 
-/// A Gaussian beam is followed this far, as the tails beyond hold less than a millionth.
+/// A Gaussian beam is cut off here, as the tails beyond contain less than a millionth of the light.
 const BEAM_REACH_SIGMAS: f64 = 5.0;
 
-/// Places of direct light are told apart to this many rows; a finer step would only cost time.
+/// Resolution of the position of direct light in rows; a finer step would only cost time.
 const U0_STEP_ROWS: f64 = 1.0 / 32.0;
 
 /// Pixels spread evenly over a stack, from which calibration is computed: at most 64 in each of 16 camera rows.
 ///
-/// The choice depends on the image's size and the mask alone. Pixels with masked samples are left out.
+/// The choice depends only on the image's size and the mask. Pixels with masked samples are left out.
 #[derive(Debug, Clone)]
 pub struct Sample {
     pub(super) timing: RowTiming,
@@ -32,7 +32,7 @@ pub struct Sample {
     pub(super) classes: Vec<SampledClass>,
 }
 
-/// Pixels of neighbouring rows of the sample that share a model, so that it is factored once for all of them.
+/// Pixels of neighbouring rows of the sample that share a model, which is factored once for all of them.
 #[derive(Debug, Clone)]
 pub(super) struct SampledClass {
     /// Camera row and column, ascending.
@@ -40,17 +40,17 @@ pub(super) struct SampledClass {
     /// Shape `[pixels, settings]`.
     pub intensities: Array2<f64>,
     pub slots: Vec<Slot>,
-    /// Weight of every row of the projector for the first pixel under an ideal beam, shape `[settings, projector rows]`.
+    /// Weight of every projector row for the first pixel with an ideal beam, shape `[settings, projector rows]`.
     ideal: Array2<f64>,
     own_row: usize,
 }
 
-/// What is known, or supposed, of the light that the projector's rows send.
+/// What is known or assumed about the light of the projector's rows.
 #[derive(Debug, Clone, Default)]
 pub struct Optics {
-    /// Standard deviation of the beam's Gaussian profile over rows; 0 for rows that light only themselves.
+    /// Standard deviation in rows of the beam's Gaussian profile; 0 if each row lights only itself.
     pub beam_sigma_rows: f64,
-    /// Where direct light arrives; `None` for `u = 0` everywhere.
+    /// Position of direct light; `None` for `u = 0` everywhere.
     pub spike: Option<SpikeMap>,
 }
 
@@ -61,7 +61,7 @@ impl Optics {
 }
 
 impl Sample {
-    /// The camera rows that a sample of an image with so many is taken from.
+    /// The camera rows from which an image with `camera_rows` rows is sampled.
     pub fn rows_of(camera_rows: usize) -> impl Iterator<Item = usize> {
         strata(camera_rows, ROWS).map(|rows| (rows.start + rows.end) / 2)
     }
@@ -71,7 +71,7 @@ impl Sample {
     ///
     /// # Errors
     /// Those of [`reach`]; [`PlaneError::Shape`]; [`PlaneError::NotFinite`] for a chosen sample;
-    /// [`CalibrateError::NoPixels`] if masks leave no whole pixel.
+    /// [`CalibrateError::NoPixels`] if no pixel is free of masked samples.
     pub fn new(
         timing: RowTiming,
         settings: Vec<Setting>,
@@ -82,7 +82,7 @@ impl Sample {
         Self::of_rows(timing, settings, &rows, stack, valid)
     }
 
-    /// [`Self::new`] from a stack that holds only some camera rows, ascending: at least those of [`Self::rows_of`].
+    /// [`Self::new`] for a stack with only some camera rows, ascending: at least those of [`Self::rows_of`].
     ///
     /// # Errors
     /// Those of [`Self::new`]; [`PlaneError::Rows`] for a row that is missing.
@@ -119,7 +119,8 @@ impl Sample {
             .map(|(index, t)| {
                 let missing = |_| PlaneError::Rows { row: t, camera_rows: held.len() };
                 let at = held.binary_search(&t).map_err(missing)?;
-                // Golden-ratio places in the strata: no two rows sample the same columns, and no pattern is aliased.
+                // Golden-ratio positions in the strata: no two rows sample the same columns, and no pattern is
+                // aliased.
                 let place = (index as f64 * 0.618_033_988_75).fract();
                 let columns: Vec<usize> = strata(columns, PIXELS_PER_ROW)
                     .filter_map(|columns| {
@@ -159,8 +160,8 @@ impl Sample {
         Ok(Self { timing, settings, reach, columns, classes })
     }
 
-    /// A quarter of the rows and half the pixels of each, unless that leaves few: enough where every pixel is solved
-    /// many times.
+    /// A quarter of the rows and half the pixels of each, unless that leaves too few: enough where every pixel is
+    /// solved many times.
     pub(super) fn thinned(&self) -> Self {
         if self.pixels().count() <= MIN_PIXELS_TO_THIN {
             return self.clone();
@@ -175,7 +176,7 @@ impl Sample {
         })
     }
 
-    /// The sample with only those of its pixels, asked for in order, that are kept.
+    /// The sample reduced to the pixels for which `kept` returns true; it is called in order.
     pub(super) fn keep(&self, mut kept: impl FnMut((usize, usize)) -> bool) -> Self {
         let classes = self.classes.iter().map(|class| class.keep(&mut kept));
         let classes = classes.filter(|class| !class.pixels.is_empty()).collect();
@@ -203,13 +204,12 @@ impl SampledClass {
         }
     }
 
-    /// Index of the slot of relative row `u` of the projector's own frame.
+    /// Index of the slot of relative row `u` in the projector's own frame.
     pub fn slot(&self, u: i32) -> Option<usize> {
         self.slots.iter().position(|slot| slot.u == u)
     }
 
-    /// `A`, shape `[settings, slots]`, under a Gaussian beam: a row's light is that of the rows about it while they
-    /// are drawn.
+    /// `A`, shape `[settings, slots]`, with a Gaussian beam: a row receives light while the rows around it are drawn.
     pub fn weights(&self, beam_sigma_rows: f64) -> Array2<f64> {
         let beam = beam_shares(beam_sigma_rows);
         let projector_rows = self.ideal.ncols();
@@ -227,8 +227,8 @@ impl SampledClass {
         weights
     }
 
-    /// The pixels by what they must be solved with: one problem for each place of direct light, with the
-    /// indices of its pixels. The paper's prior knows no direct light, so it has one.
+    /// Groups the pixels by problem: one problem for each position of direct light, with the indices of its pixels.
+    /// The paper's prior does not model direct light, so it has a single problem.
     pub fn problems(
         &self,
         prior: &Prior,
@@ -251,7 +251,7 @@ impl SampledClass {
         places.into_iter().map(problem).collect()
     }
 
-    /// `weights` with the light of the direct row split between row 0 and its neighbour on the side of `u0_rows`.
+    /// `weights` with the light of the direct row divided between row 0 and its neighbour on the side of `u0_rows`.
     fn with_spike_at(&self, weights: &Array2<f64>, u0_rows: f64) -> Array2<f64> {
         let mut placed = weights.clone();
         let neighbour = self.slot(if u0_rows < 0.0 { -1 } else { 1 });
@@ -264,7 +264,7 @@ impl SampledClass {
     }
 }
 
-/// Shares of a row's light that reach the rows `offset` away; they sum to 1.
+/// Shares of a row's light that reach the row `offset` away; they sum to 1.
 fn beam_shares(sigma_rows: f64) -> Vec<(i64, f64)> {
     if sigma_rows <= 0.0 {
         return vec![(0, 1.0)];
@@ -275,7 +275,7 @@ fn beam_shares(sigma_rows: f64) -> Vec<(i64, f64)> {
     (-reach..=reach).map(|offset| (offset, share(offset) / total)).collect()
 }
 
-/// `0..length` cut into at most `count` ranges of nearly the same length, none empty.
+/// `0..length` divided into at most `count` non-empty ranges of nearly the same length.
 fn strata(length: usize, count: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
     let count = count.min(length);
     (0..count).map(move |index| index * length / count..(index + 1) * length / count)

@@ -3,47 +3,47 @@ use ndarray::{Array1, Array2};
 use super::direct::{DirectLight, direct_light};
 use super::{CalibrateError, Sample};
 
-/// Pixels with direct light that it takes to place it, and to let its place vary over the image.
+/// Number of pixels with direct light needed to measure its position, and to let the position vary over the image.
 pub(super) const MIN_PIXELS: usize = 16;
 const MIN_PIXELS_TO_VARY: usize = 60;
 
-/// Camera rows and columns below which the place is taken as the same all over the image.
+/// Number of camera rows and columns below which the position is assumed to be the same everywhere in the image.
 const MIN_EXTENT_TO_VARY: usize = 8;
 
-/// Variance of a pixel's place under unit light and noise from which the plan does not tell rows -1, 0 and 1 apart.
+/// If a pixel's position has this variance for unit light and noise, the plan does not distinguish rows -1, 0 and 1.
 const MAX_PLAN_VARIANCE: f64 = 1e4;
 
-/// Largest standard error of a pixel's place that is worth using.
+/// Largest usable standard error of a pixel's position.
 const MAX_PIXEL_ERROR_ROWS: f64 = 0.25;
 
-/// Scatter of single pixels about a smooth map, from shading within a row; keeps bright pixels from deciding alone.
+/// Scatter of single pixels around a smooth map, from shading within a row; keeps bright pixels from dominating.
 const PIXEL_SCATTER_ROWS: f64 = 0.02;
 
-/// Steps of reweighting, and the residual in units of the scatter at which a pixel's weight halves (Cauchy's, 95 %
-/// efficient on Gaussian noise).
+/// Number of reweighting steps, and the residual in units of the scatter at which a pixel's weight halves (Cauchy's,
+/// 95 % efficient on Gaussian noise).
 const ROBUST_STEPS: usize = 12;
 const CAUCHY: f64 = 2.385;
 
-/// Where direct light arrives, in rows relative to the pixel's own; 0 under perfect rectification.
+/// Position of direct light, in rows relative to the pixel's own; 0 with perfect rectification.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SpikeMap {
-    /// `u0[t, s]` in rows, from -1 to 1: a polynomial of second order over the image.
+    /// `u0[t, s]` in rows, from -1 to 1: a second-order polynomial over the image.
     pub u0: Array2<f32>,
-    /// Its standard error in rows, `[t, s]`: that of the pixels' scatter. Indirect light with a cusp at `u = 0` adds a
+    /// Its standard error in rows, `[t, s]`, from the pixels' scatter. Indirect light with a cusp at `u = 0` adds a
     /// bias of up to a few per cent of `u0`, towards 0.
     pub standard_error: Array2<f32>,
-    /// Sampled pixels with direct light.
+    /// Number of sampled pixels with direct light.
     pub pixels: usize,
 }
 
-/// Measures where direct light arrives, under a beam of the given width. Each sampled pixel gives the centre of
-/// gravity of the light that stands out in rows -1, 0 and 1; a robust polynomial joins them.
+/// Measures the position of direct light, for a beam of the given width. Each sampled pixel gives the centroid of the
+/// light that stands out in rows -1, 0 and 1; a robust polynomial is fitted to them.
 ///
-/// Direct light farther than a row from its place is a matter for rectification: the map ends at 1 and -1.
+/// Direct light that is off by more than a row must be corrected by rectification: the map ends at 1 and -1.
 ///
 /// # Errors
-/// [`CalibrateError::NoEdge`] if the settings cannot tell; [`CalibrateError::NoDirectLight`] if there is none to see;
-/// [`super::super::PlaneError::NotConvex`].
+/// [`CalibrateError::NoEdge`] if the settings do not determine it; [`CalibrateError::NoDirectLight`] if there is no
+/// direct light; [`super::super::PlaneError::NotConvex`].
 pub fn spike_offset(sample: &Sample, beam_sigma_rows: f64) -> Result<SpikeMap, CalibrateError> {
     let light = direct_light(sample, beam_sigma_rows)?;
     if !light.is_empty() && light.iter().all(|light| light.plan_variance > MAX_PLAN_VARIANCE) {
@@ -74,19 +74,19 @@ pub fn spike_offset(sample: &Sample, beam_sigma_rows: f64) -> Result<SpikeMap, C
     })
 }
 
-/// -1 at the first of `length` places, 1 at the last.
+/// Maps the first of `length` indices to -1, the last to 1.
 fn centred(index: usize, length: usize) -> f64 {
     (2.0 * index as f64 + 1.0) / length as f64 - 1.0
 }
 
-/// Coefficients of the basis by iteratively reweighted least squares, and their covariance from the residuals as they
-/// are, whatever their cause.
+/// Coefficients of the basis by iteratively reweighted least squares, and their covariance from the actual residuals,
+/// whatever their cause.
 fn fit(light: &[&DirectLight], basis: impl Fn(usize, usize) -> Array1<f64>) -> (Array1<f64>, Array2<f64>) {
     let rows: Vec<Array1<f64>> = light.iter().map(|light| basis(light.t, light.s)).collect();
     let terms = rows[0].len();
     let precision = |light: &DirectLight| light.standard_error_rows.hypot(PIXEL_SCATTER_ROWS).recip();
     let mut coefficients = Array1::zeros(terms);
-    // A start that outliers cannot pull away: the median place, the same everywhere.
+    // A starting point that outliers cannot shift: the median position, the same everywhere.
     coefficients[0] = median(light.iter().map(|light| light.u0_rows).collect());
     let mut covariance = Array2::zeros((terms, terms));
     for _ in 0..ROBUST_STEPS {
@@ -108,7 +108,7 @@ fn fit(light: &[&DirectLight], basis: impl Fn(usize, usize) -> Array1<f64>) -> (
                 }
             }
         }
-        // Pixels that do not span the polynomial still give the terms that they determine.
+        // If the pixels do not span the polynomial, the terms that they determine are still fitted.
         normal.diag_mut().mapv_inplace(|diagonal| diagonal * (1.0 + 1e-9) + f64::MIN_POSITIVE);
         let Ok(inverse) = super::problem::invert(&normal) else { break };
         coefficients += &inverse.dot(&right);

@@ -2,35 +2,35 @@ use ndarray::ArrayView1;
 
 use super::super::{PlaneError, RowTiming, Setting};
 
-/// How a flying spot draws its rows.
+/// The direction in which a flying spot draws its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scan {
-    /// Every row from column 0 on.
+    /// Every row starting at column 0.
     OneWay,
-    /// Even rows of the projector from column 0 on, odd rows backwards.
+    /// Even rows of the projector starting at column 0, odd rows in the opposite direction.
     Bidirectional,
 }
 
-/// A flying spot whose way over the scene is known.
+/// A flying spot with a known path over the scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlyingSpot {
-    /// How it draws.
+    /// The direction of its rows.
     pub scan: Scan,
-    /// The projector column that each column of the camera sees, 0..=1 over the projector's width.
+    /// The projector column that each camera column sees, in 0..=1 over the projector's width.
     pub columns: Vec<f64>,
 }
 
-/// Parts of the projector's width that are told apart: finer ones would cost more time than they save error.
+/// Number of distinguished parts of the projector's width; more would cost more time than they reduce the error.
 const SPOT_PARTS: usize = 64;
 
 impl FlyingSpot {
-    /// Which part of the projector's width a camera column sees.
+    /// The part of the projector's width that a camera column sees.
     pub(in super::super) fn part(&self, column: usize) -> usize {
         ((self.columns[column] * SPOT_PARTS as f64) as usize).min(SPOT_PARTS - 1)
     }
 
-    /// Weights of direct light in each setting for the pixels of camera row `t` that see each part, where they differ
-    /// from those of a row that is lit evenly, `even`.
+    /// Weights of direct light in each setting for the pixels of camera row `t` that see each part, if they differ
+    /// from `even`, those of an evenly lit row.
     pub(in super::super) fn weights(
         &self,
         timing: &RowTiming,
@@ -48,14 +48,14 @@ impl FlyingSpot {
     }
 }
 
-/// Settings that a flying spot makes unreliable when a pixel's projector column is unknown: those with an edge within
-/// half a row time and half the jitter of the centre of the direct row, where the spot may or may not have passed.
-/// Their indices ascend.
+/// Settings that a flying spot makes unreliable if a pixel's projector column is unknown: those with an edge within
+/// half a row time plus half the jitter of the centre of the direct row, where the spot may or may not have passed.
+/// Indices in ascending order.
 ///
-/// A projector that lights its rows uniformly needs none of them dropped.
+/// With a projector that lights its rows uniformly, no settings need to be dropped.
 ///
 /// # Errors
-/// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] for a jitter that is negative or not finite.
+/// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] if the jitter is negative or not finite.
 pub fn settings_on_direct_row(
     timing: &RowTiming,
     settings: &[Setting],
@@ -70,7 +70,7 @@ pub fn settings_on_direct_row(
     let on_row = |setting: &Setting| {
         setting.delays_us.iter().any(|delay_us| {
             [delay_us - setting.exposure_us / 2.0, delay_us + setting.exposure_us / 2.0]
-                // The direct row is drawn again in each period, which long exposures reach.
+                // The direct row is drawn again in each period, and long exposures reach it.
                 .map(|edge_us| (edge_us - timing.period_us() * (edge_us / timing.period_us()).round()).abs())
                 .iter()
                 .any(|distance_us| *distance_us < half_width_us)
@@ -79,12 +79,12 @@ pub fn settings_on_direct_row(
     Ok((0..settings.len()).filter(|&n| on_row(&settings[n])).collect())
 }
 
-/// Weight of the direct light of a pixel in camera row `t` in each setting, under a flying spot: the share of the
-/// frames averaged whose exposure holds the moment when the spot passes the pixel's projector column, counted once per
-/// period. It stands for the column of `A` at `u = 0`.
+/// Weight of the direct light of a pixel in camera row `t` in each setting, for a flying spot: the share of the
+/// averaged frames whose exposure contains the moment when the spot passes the pixel's projector column, counted once
+/// per period. It replaces the column of `A` at `u = 0`.
 ///
-/// `projector_column` is the column that the pixel sees, 0..1 over the projector's width. Direct light arrives
-/// `tau (projector_column - 1/2)` after the centre of its row, or as much before it where the row is drawn backwards.
+/// `projector_column` is the column that the pixel sees, in 0..1 over the projector's width. Direct light arrives
+/// `tau (projector_column - 1/2)` after the centre of its row, or as much before it if the row is drawn backwards.
 ///
 /// # Errors
 /// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] for a column outside 0..=1.
@@ -105,7 +105,7 @@ pub fn spike_weights(
     let moment_us = timing.row_time_us() * (column - 0.5);
     let weight = |setting: &Setting| {
         let passes = setting.delays_us.iter().map(|delay_us| {
-            // Moments lie a period apart; those from the start on, less those from the end on.
+            // The moments are a period apart: count those after the start, minus those after the end.
             let periods_to = |edge_us: f64| ((edge_us - moment_us) / timing.period_us()).ceil();
             periods_to(delay_us + setting.exposure_us / 2.0)
                 - periods_to(delay_us - setting.exposure_us / 2.0)
@@ -129,9 +129,9 @@ mod tests {
             Setting::new(300.0, 600.0),  // starts at 0
             Setting::new(-309.0, 600.0), // ends at -9
             Setting::new(311.0, 600.0),  // starts at 11: only with jitter
-            Setting::new(0.0, 600.0),    // holds the row whole
+            Setting::new(0.0, 600.0),    // contains the whole row
             Setting::new(600.0, 600.0),  // starts after it
-            Setting::new(0.0, 32_000.0), // ends a whole period away, on the row of the next frame
+            Setting::new(0.0, 32_000.0), // ends one period later, on the row of the next frame
             Setting { delays_us: vec![320.0, 330.0, 305.0], exposure_us: 600.0 },
         ];
         assert_eq!(settings_on_direct_row(&timing(), &settings, 0.0), Ok(vec![0, 1, 5, 6]));
