@@ -1,5 +1,6 @@
-//! The driver `aravis` beside `arv-camera-test-0.8` on the same simulated camera in the same run: frames a second, processor
-//! time of a frame, and how long after its last packet a frame is in the pool. `cargo xtask bench camera` runs it.
+//! Compares the driver `aravis` with `arv-camera-test-0.8` on the same simulated camera in the same run:
+//! frames per second, processor time per frame, and the delay from a frame's last packet to its arrival in
+//! the pool. Run it with `cargo xtask bench camera`.
 
 #[path = "../tests/support/mod.rs"]
 mod support;
@@ -20,17 +21,17 @@ use support::{ADDRESS, own_network};
 
 type Done<T> = Result<T, Box<dyn Error>>;
 
-/// Columns, rows, format and frames a second.
+/// Columns, rows, format and frames per second.
 const CASES: [(usize, usize, &str, u32); 3] =
     [(512, 512, "Mono8", 120), (1024, 1024, "Mono12p", 60), (1600, 1200, "Mono12p", 60)];
 const PACKET_BYTES: [u32; 2] = [1_500, 9_000];
-/// More than any client takes.
+/// More than any client can take.
 const FLAT_OUT_HZ: u32 = 10_000;
-/// Seconds that are measured one by one in each turn, after the first, in which the client starts.
+/// Seconds measured one by one in each turn, after the first, in which the client starts.
 const SECONDS: usize = 4;
-/// Turns of the driver and of the peer.
+/// Turns of the driver and of the other client.
 const TURNS: usize = 3;
-/// Frames whose way is timed.
+/// Number of frames whose latency is measured.
 const TIMED_FRAMES: usize = 600;
 
 /// One camera and how it is read.
@@ -43,7 +44,7 @@ struct Case {
     packet_bytes: u32,
 }
 
-/// What streaming cost and gave, second by second.
+/// Cost and yield of streaming, second by second.
 #[derive(Default)]
 struct Streamed {
     cpu_us_per_frame: Vec<f64>,
@@ -65,7 +66,7 @@ impl Streamed {
     }
 }
 
-/// The median of some seconds, and how far they lie apart.
+/// Median and spread of some seconds.
 struct Spread {
     lowest: f64,
     median: f64,
@@ -87,13 +88,14 @@ impl fmt::Display for Spread {
     }
 }
 
-/// Frames before those that are timed: more than wait in buffers while the camera is opened.
+/// Frames before the timed ones: more than can wait in buffers while the camera is opened.
 const WARM_UP_FRAMES: usize = 100;
 
-/// The camera has noted by then that a frame has left, and the next has not: less than a period.
+/// Within this time the camera has recorded that a frame has left, and the next one has not left yet: less
+/// than a period.
 const NOTED_WITHIN: Duration = Duration::from_millis(2);
 
-/// A simulated camera of test pictures in a process of its own.
+/// A simulated camera with test pictures in its own process.
 struct Simulated(Child);
 
 impl Simulated {
@@ -116,7 +118,7 @@ impl Drop for Simulated {
     }
 }
 
-/// What a process has taken of the processors.
+/// Processor time used by a process.
 fn cpu_us(clock: ClockId) -> Done<f64> {
     Ok(Duration::from(clock.now()?).as_secs_f64() * 1e6)
 }
@@ -156,7 +158,7 @@ impl Case {
         format!("{}x{} {}, packets of {}", self.width, self.height, self.format, self.packet_bytes)
     }
 
-    /// Streams for a while with the driver.
+    /// Streams with our driver.
     fn ours(self, streamed: &mut Streamed) -> Done<()> {
         let (mut camera, pool) = self.open()?;
         let mut buf = pool.take();
@@ -173,11 +175,12 @@ impl Case {
         Ok(())
     }
 
-    /// The same with the library's own client, on the same kind of socket. It says each second how many frames it had.
+    /// The same with the library's own client, on the same kind of socket. It prints the number of frames
+    /// each second.
     fn theirs(self, streamed: &mut Streamed) -> Done<()> {
         let features = format!("PixelFormat={} AcquisitionFrameRate={}", self.format, self.rate_hz);
         let (width, height) = (self.width.to_string(), self.height.to_string());
-        // The first second is its start, in the last it ends.
+        // It starts in the first second and ends in the last.
         let duration_s = (SECONDS + 2).to_string();
         let mut client = Command::new("stdbuf")
             .args(["-oL", "arv-camera-test-0.8", "-n", ADDRESS, "--auto", "--no-packet-socket"])
@@ -211,8 +214,8 @@ impl Case {
         }
     }
 
-    /// From the moment when a frame's last packet leaves until the frame is in the pool, in us, in rising order. The
-    /// camera lives in this process, because nobody else knows when its packets left.
+    /// Times from the departure of a frame's last packet to the frame's arrival in the pool, in us,
+    /// ascending. The camera runs in this process, because only the camera knows when its packets left.
     fn latencies_us(self) -> Done<Vec<f64>> {
         let setup = GigeSetup {
             address: ADDRESS.parse()?,
@@ -226,11 +229,11 @@ impl Case {
         let mut buf = pool.take();
         let clock = Clock::real();
         let mut latencies_us = Vec::with_capacity(TIMED_FRAMES);
-        // The first frames may come late.
+        // The first frames may be late.
         for _ in 0..WARM_UP_FRAMES {
             camera.next_frame(&mut buf, Duration::from_secs(1))?;
         }
-        // A frame's id, and how many had left by then.
+        // A frame's id, and how many frames had left by then.
         let mut first = None;
         while latencies_us.len() < TIMED_FRAMES {
             let Some(stamp) = camera.next_frame(&mut buf, Duration::from_secs(1))? else { continue };
@@ -240,7 +243,7 @@ impl Case {
                 (stamp.seq, device.truth().frames)
             });
             let number = stamp.seq - first_seq + left;
-            // The camera notes a frame when all of it has left.
+            // The camera records a frame when all of it has left.
             let truth = loop {
                 let truth = device.truth();
                 if truth.frames >= number {
@@ -257,10 +260,10 @@ impl Case {
     }
 }
 
-/// What the command line asks for.
+/// The arguments of the command line.
 struct Arguments {
     camera: String,
-    /// A part of the names of the cases to measure.
+    /// Part of the names of the cases to measure.
     only: String,
     json: bool,
 }
@@ -273,7 +276,7 @@ fn arguments() -> Done<Arguments> {
             "--camera" => camera = words.next(),
             "--only" => only = words.next().ok_or("--only takes a part of a case's name")?,
             "--json" => json = true,
-            // Cargo's own.
+            // Passed by cargo itself.
             "--bench" => {}
             unknown => {
                 let what = format!("no option `{unknown}`: there are --camera, --only and --json");
@@ -300,7 +303,7 @@ fn main() -> Done<()> {
     Ok(())
 }
 
-/// Measures one case and prints what it gave.
+/// Measures one case and prints the results.
 fn measure(case: Case, camera: &str, json: bool) -> Done<()> {
     let flat_out = Case { rate_hz: FLAT_OUT_HZ, ..case };
     let (mut ours, mut theirs) = (Streamed::default(), Streamed::default());

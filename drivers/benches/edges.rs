@@ -1,5 +1,5 @@
-//! The logic analyser's edge scan on one core against the 24 million samples a second that the fastest analyser sends.
-//! `cargo xtask bench edges` runs it.
+//! Benchmark of the logic analyser's edge scan on one core, compared with the 24 million samples per second
+//! of the fastest analyser. Run it with `cargo xtask bench edges`.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot go on may panic")]
 
@@ -14,12 +14,12 @@ use raysweep_sim::usb::Signal;
 const RATE_HZ: u32 = 24_000_000;
 /// Half a second, 30 edges of the line.
 const SAMPLES: usize = RATE_HZ as usize / 2;
-/// As many transfers a second as the driver asks for.
+/// As many transfers per second as the driver requests.
 const TRANSFER: usize = RATE_HZ as usize / 250;
-/// The fastest of the repetitions counts: the others had to share the machine.
+/// The fastest repetition counts: the others had to share the machine.
 const REPETITIONS: usize = 10;
 
-/// Samples that are there already, one transfer a call.
+/// A link with recorded samples, one transfer per call.
 struct Recorded<'a> {
     transfers: std::slice::Chunks<'a, u8>,
     arrived_ns: i64,
@@ -36,7 +36,7 @@ impl Link for Recorded<'_> {
 }
 
 fn main() {
-    // Cargo's own.
+    // Passed by cargo itself.
     if let Some(unknown) = std::env::args().skip(1).find(|argument| argument != "--bench") {
         eprintln!("no option `{unknown}`: there are none");
         std::process::exit(2);
@@ -51,7 +51,7 @@ fn main() {
     }
 }
 
-/// What an analyser sees, from quiet to the worst.
+/// Signals as an analyser sees them, from quiet to the worst case.
 fn signals() -> [(&'static str, Vec<u8>); 3] {
     let step_ns = 1e9 / f64::from(RATE_HZ);
     let signal = Signal {
@@ -86,7 +86,7 @@ fn measure(name: &str, samples: &[u8]) {
     let [mut plain, mut scanned, mut driven] = [Duration::MAX; 3];
     let mut changes = 0_u64;
     for _ in 0..REPETITIONS {
-        // In turn, so that whatever else the machine does hits all alike.
+        // Interleaved, so that other load on the machine affects all alike.
         fastest(&mut plain, || {
             black_box(black_box(samples).windows(2).filter(|pair| (pair[0] ^ pair[1]) & 7 != 0).count());
         });

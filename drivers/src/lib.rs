@@ -1,4 +1,5 @@
-//! Drivers for real devices behind the traits of `raysweep-core`. Whoever needs a C library does so behind a feature.
+//! Drivers for real devices behind the traits of `raysweep-core`. Drivers that need a C library are behind a
+//! feature.
 
 pub mod camera;
 pub mod mirror;

@@ -1,7 +1,8 @@
-//! What a frame costs in allocations: none of the driver's, from the library's buffer to the pool's, and few of the
-//! library's own, which it gives back.
+//! Allocations per frame: none by the driver, from the library's buffer to the pool's, and a few by the library,
+//! which it frees again.
 //!
-//! All of the process's are seen: a program's own `malloc` takes the place of the C library's for every library in it.
+//! All allocations of the process are counted: a program's own `malloc` replaces the C library's for all libraries in
+//! it.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 #![allow(unsafe_code, reason = "an allocator that counts")]
@@ -20,28 +21,28 @@ use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, Region, RigFa
 
 use support::{ADDRESS, FakeCamera, own_network};
 
-/// Of the whole process.
+/// Allocations of the whole process.
 static ALLOCATED: AtomicU64 = AtomicU64::new(0);
 static FREED: AtomicU64 = AtomicU64::new(0);
 
 thread_local! {
-    /// Of the thread that takes frames, by Rust code.
+    /// Allocations by Rust code in the thread that takes frames.
     static OURS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// Tells what Rust code allocates from what libraries do.
+/// Counts the allocations of Rust code, to separate them from those of libraries.
 struct Counting;
 
-// SAFETY: every call goes to the system's allocator as it came; the counter is a plain number of the thread.
+// SAFETY: every call is passed on to the system's allocator unchanged; the counter is a plain thread-local number.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         let _ = OURS.try_with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller's guarantee is passed on.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promise is passed on.
+        // SAFETY: the caller's guarantee is passed on.
         unsafe { System.dealloc(memory, layout) }
     }
 }
@@ -72,18 +73,18 @@ extern "C" fn calloc(items: usize, bytes: usize) -> *mut c_void {
 #[unsafe(no_mangle)]
 unsafe extern "C" fn free(memory: *mut c_void) {
     FREED.fetch_add(u64::from(!memory.is_null()), Ordering::Relaxed);
-    // SAFETY: the caller's promise is passed on.
+    // SAFETY: the caller's guarantee is passed on.
     unsafe { __libc_free(memory) }
 }
 
-/// GLib keeps small pieces of memory in a store of its own, unless it is told not to before it starts.
+/// GLib caches small pieces of memory itself, unless this is set before it starts.
 const GLIB: (&str, &str) = ("G_SLICE", "always-malloc");
 const FRAMES: u64 = 1000;
-/// What libaravis 0.8.26 allocates for a frame, 5 pieces for its stream's thread and its queue of buffers, and some more for
+/// Allocations of libaravis 0.8.26 per frame: 5 for its stream's thread and its queue of buffers, and some more for
 /// its heartbeat.
 const LIBRARYS: u64 = 6;
 
-/// The test proper, in a process whose GLib hides nothing.
+/// The actual test, in a process in which GLib does not cache memory.
 #[test]
 fn a_frame_costs_no_allocation_of_ours_and_few_of_the_librarys() {
     let output = Command::new(std::env::current_exe().unwrap())
@@ -135,7 +136,7 @@ fn stream() {
     let (ours, allocated, freed) = (after.0 - before.0, after.1 - before.1, after.2 - before.2);
     println!("{FRAMES} frames: {ours} allocations of ours, {allocated} in the process, {freed} given back");
     assert_eq!(ours, 0);
-    // The library is seen at all, costs what we know, and keeps nothing.
+    // The library's allocations are visible, have the known number, and are all freed.
     assert!((FRAMES..LIBRARYS * FRAMES).contains(&allocated));
     assert!(allocated.abs_diff(freed) < FRAMES / 10);
 }

@@ -1,4 +1,4 @@
-//! The driver against `arv-fake-gv-camera-0.8`, a device that we did not write.
+//! The driver with `arv-fake-gv-camera-0.8`, a device that we did not write.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -27,7 +27,7 @@ const FACTS: RigFacts = RigFacts {
     reopen: Duration::from_secs(20),
 };
 
-/// Runs freely at a frame each `period_us`, by the register that the camera has for it.
+/// Runs freely with one frame per `period_us`, set by the camera's register.
 fn config(period_us: u32, size: u32) -> AravisConfig {
     AravisConfig {
         address: Some(ADDRESS.into()),
@@ -69,7 +69,7 @@ fn frames_come_whole_and_in_order_with_their_times() {
     let (mut stamps, mut first_offset) = (Vec::new(), None);
     while stamps.len() < 200 {
         let stamp = camera.next_frame(&mut buf, Duration::from_secs(2)).unwrap().expect("a frame every 4 ms");
-        // Its picture is a slope that wanders with the frame's number, at full contrast for its default exposure.
+        // Its picture is a ramp that shifts with the frame number, at full contrast for its default exposure.
         let offset = u64::from(buf[0]);
         assert_eq!((offset + 255 - *first_offset.get_or_insert(offset)) % 255, (stamp.seq - 1) % 255);
         let picture = (0..256_u64 * 256).map(|pixel| ((pixel % 256 + pixel / 256 + offset) % 255) as u8);
@@ -114,7 +114,7 @@ fn frames_are_not_copied_and_stay_as_they_came_while_they_are_kept() {
         kept.push((buf.to_vec(), buf));
     }
     kept.truncate(4);
-    // The others go to and fro, more often than the driver has buffers.
+    // The others are exchanged back and forth, more often than the driver has buffers.
     for _ in 0..300 {
         take(&pool);
     }
@@ -161,7 +161,7 @@ fn what_it_lacks_or_does_not_take_is_refused_by_name() {
 #[test]
 fn ten_thousand_frames_and_every_lost_one_has_its_cause() {
     own_network();
-    // One packet of a thousand is lost, and the device cannot send it again.
+    // One packet in a thousand is lost, and the device cannot send it again.
     let _device = FakeCamera::start(&["-r", "1"]);
     let mut camera = AravisCamera::open(&config(1_000, 128), FACTS).unwrap();
     camera.configure(ID, &SETTINGS).unwrap();
@@ -185,7 +185,7 @@ fn ten_thousand_frames_and_every_lost_one_has_its_cause() {
     eprintln!("{received} frames, lost: {lost:?}");
 }
 
-/// Takes frames until `enough`; none is an answer, too.
+/// Takes frames until `enough` returns true; also calls it if there is no frame.
 fn watch(camera: &mut AravisCamera, mut enough: impl FnMut(&AravisCamera, Option<FrameStamp>) -> bool) {
     let pool = FramePool::new(1, 128 * 128);
     let mut buf = pool.take();
@@ -234,7 +234,7 @@ fn a_camera_that_died_is_noticed_and_goes_on_when_it_is_back() {
     });
     let (newest, after) = (newest.unwrap(), after.unwrap());
     assert!(newest.seq >= before.seq);
-    // About as many ids have passed as there were triggers: some about its death and its return are not known.
+    // About as many ids have passed as there were triggers; the number around its loss and its return is uncertain.
     let away_ns = after.exposure_start_ns - newest.exposure_start_ns;
     let passed = away_ns as f64 / (FACTS.trigger_period_us * 1e3);
     assert!((passed - (after.seq - newest.seq) as f64).abs() <= 10.0, "{passed} {newest:?} {after:?}");

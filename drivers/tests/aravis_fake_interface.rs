@@ -1,5 +1,5 @@
-//! The way of a camera that is not GigE Vision, as USB3 Vision cameras go, on the library's own camera within this process:
-//! found by discovery, opened by name, and no packets, sockets or addresses anywhere.
+//! Tests the code path of cameras other than GigE Vision, such as USB3 Vision, with the library's own camera within
+//! this process: found by discovery, opened by name, without packets, sockets or addresses.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 #![allow(unsafe_code, reason = "the bindings have no word for it")]
@@ -24,7 +24,7 @@ const FACTS: RigFacts = RigFacts {
 #[test]
 fn a_camera_that_is_not_on_the_network_is_found_opened_by_name_and_streams() {
     own_network();
-    // SAFETY: the text lives for ever, and no other thread uses the library yet.
+    // SAFETY: the text is static, and no other thread uses the library yet.
     unsafe { aravis_sys::arv_enable_interface(c"Fake".as_ptr()) };
     let found = discover();
     let [camera] = found.as_slice() else { panic!("{found:?}") };
@@ -33,7 +33,7 @@ fn a_camera_that_is_not_on_the_network_is_found_opened_by_name_and_streams() {
         name: Some(camera.name.clone()),
         region: Some(Region { x: 0, y: 0, width: 64, height: 32 }),
         trigger_source: "off".into(),
-        // Of a camera on the network alone.
+        // Applies only to cameras on the network.
         packet_size: Some(9000),
         ..AravisConfig::default()
     };

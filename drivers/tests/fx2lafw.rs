@@ -1,4 +1,4 @@
-//! The analyser's driver on samples of a line whose truth is known, in time that the test makes.
+//! The analyser's driver with samples of a line whose true edges are known, in simulated time.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -10,13 +10,13 @@ use raysweep_drivers::vsync::fx2lafw::scan::Scanner;
 use raysweep_drivers::vsync::fx2lafw::{Change, Fx2Lafw, Fx2LafwConfig, Link, Slope};
 use raysweep_sim::usb::Signal;
 
-/// Host's time of the first sample.
+/// Host time of the first sample.
 const START_NS: i64 = 4_000_000_000_000;
 const LATENCY_NS: i64 = 100_000;
-/// The analyser's clock is slow by this.
+/// The analyser's clock is slow by this amount.
 const RATE_PPM: f64 = 35.0;
 
-/// An analyser whose transfers of 4 ms arrive late by the bus's latency and more.
+/// An analyser whose 4 ms transfers arrive late, by at least the bus's latency.
 struct Scripted {
     signal: Signal,
     step_ns: f64,
@@ -71,7 +71,7 @@ fn analyser(sample_rate_hz: u32, seconds: u64) -> (Fx2Lafw<Scripted>, Fx2LafwCon
     (Fx2Lafw::new(script(sample_rate_hz, seconds), &config).unwrap(), config)
 }
 
-/// Every edge that the line has in this time.
+/// The times of all edges of the line in this time.
 fn truth(seconds: i64) -> Vec<i64> {
     let signal = signal();
     let periods =
@@ -82,7 +82,7 @@ fn truth(seconds: i64) -> Vec<i64> {
     edges
 }
 
-/// All changes until the script is over.
+/// All changes until the end of the script.
 fn changes(analyser: &mut Fx2Lafw<Scripted>) -> Vec<Change> {
     let next = || analyser.next_change(Duration::from_secs(1)).ok().flatten();
     std::iter::from_fn(next).collect()
@@ -96,11 +96,11 @@ fn every_edge_is_seen_once_when_it_was() {
     let rising = |channel| seen.iter().filter(move |c| c.channel == channel && c.slope == Slope::Rising);
     let truth = truth(30);
     let vsync: Vec<&Change> = rising(1).collect();
-    // Those of the first moments, before the clock is known, are numbered and not told.
+    // Edges of the first moments, before the clock is known, are numbered but not reported.
     assert!(vsync.len() > truth.len() - 10, "{} of {}", vsync.len(), truth.len());
     for change in &vsync {
         let off_ns = change.host_ns - truth[change.seq as usize - 1];
-        // A sample's length, and what late transfers leave of the fit.
+        // The length of a sample, and the remaining effect of late transfers on the fit.
         assert!((-5_000..12_000).contains(&off_ns), "{change:?}: {off_ns} ns");
     }
     for pair in vsync.iter().zip(rising(0).skip_while(|c| c.seq < vsync[0].seq)) {
@@ -115,7 +115,7 @@ fn every_edge_is_seen_once_when_it_was() {
 fn at_24_mhz_changes_are_those_of_one_sample_after_the_other() {
     let (mut analyser, config) = analyser(24_000_000, 1);
     let seen = changes(&mut analyser);
-    // The plain reference: every sample by itself, each change of an input counted if the input was quiet before.
+    // Reference implementation: sample by sample, each change of an input counts if the input was quiet before.
     let mut link = script(24_000_000, 1);
     let step_ns = link.step_ns;
     let (mut samples, mut scanned) = (Vec::new(), Vec::new());
@@ -145,7 +145,7 @@ fn at_24_mhz_changes_are_those_of_one_sample_after_the_other() {
         }
     }
     expected.sort_unstable_by_key(|(index, channel, ..)| (*index, *channel));
-    // Those before the clock is known are numbered and not told.
+    // Changes before the clock is known are numbered but not reported.
     let untold = expected.len() - seen.len();
     assert!(seen.len() > 200 && untold < 20, "{} of {}", seen.len(), expected.len());
     for (change, (index, channel, slope, seq)) in seen.iter().zip(&expected[untold..]) {
@@ -168,7 +168,7 @@ fn the_line_s_edges_are_the_vsync_alone() {
     assert!(last as usize > truth.len() - 2, "{last} of {}", truth.len());
 }
 
-/// A link that gives bytes as they are.
+/// A link that delivers given bytes.
 struct Bytes(Vec<Vec<u8>>, i64);
 
 impl Link for Bytes {
@@ -184,7 +184,7 @@ impl Link for Bytes {
 
 #[test]
 fn a_line_that_rings_has_one_edge() {
-    // Two quiet blocks for the clock, then a pulse that rings at both of its ends.
+    // Two quiet blocks for the clock, then a pulse that rings at both edges.
     let mut ringing = vec![0_u8; 100];
     ringing.extend([1, 0, 1, 1, 0, 1]);
     ringing.extend([1; 200]);

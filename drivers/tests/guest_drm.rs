@@ -1,4 +1,4 @@
-//! The projector on a virtual display: what QEMU's screen dump shows is the pattern, pixel for pixel.
+//! The projector on a virtual display: QEMU's screen dump shows the pattern, pixel for pixel.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -20,7 +20,7 @@ fn config() -> DrmConfig {
     DrmConfig { card, connector: None, timing: Timing::HD_720P60, settle_frames: 2 }
 }
 
-/// Red, green and blue of a screen dump, with its size.
+/// Size of a screen dump and the red, green and blue values of its pixels.
 fn read_ppm(path: &Path) -> (usize, usize, Vec<[u8; 3]>) {
     let bytes = fs::read(path).unwrap();
     let mut fields = bytes.splitn(4, |&byte| byte == b'\n' || byte == b' ');
@@ -31,7 +31,7 @@ fn read_ppm(path: &Path) -> (usize, usize, Vec<[u8; 3]>) {
     (columns, rows, pixels.as_chunks::<3>().0.to_vec())
 }
 
-/// Waits until the screen shows `expected`: the display takes a moment to follow a flip.
+/// Waits until the screen shows `expected`: the display follows a flip after a moment.
 fn screen_shows(monitor: &mut Monitor, what: &str, expected: impl Fn(usize, usize) -> [u8; 3]) {
     let began = Instant::now();
     loop {
@@ -58,7 +58,7 @@ fn each_pattern_is_on_the_screen_pixel_for_pixel() {
     let mut show = |pattern: Pattern, expected: &dyn Fn(usize, usize) -> [u8; 3]| {
         let asked_ns = Clock::real().now_ns();
         let shown = projector.show(&pattern).unwrap();
-        // Two video frames of 16.667 ms after a flip that cannot have been before it was asked for.
+        // Two video frames of 16.667 ms after a flip, which cannot have been before the request.
         assert!(shown.not_before_ns >= asked_ns + 33_333_333, "{pattern:?}");
         screen_shows(&mut monitor, &format!("{pattern:?}"), expected);
     };

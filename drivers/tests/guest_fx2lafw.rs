@@ -1,5 +1,5 @@
-//! The logic analyser behind the kernel's USB stack (`vhci-hcd`): order and numbers of edges, silence, a halted endpoint,
-//! unplugging within a stream, and the firmware of an analyser that has none.
+//! The logic analyser behind the kernel's USB stack (`vhci-hcd`): order and numbers of edges, silence, a halted
+//! endpoint, unplugging while streaming, and an analyser without firmware.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -30,14 +30,14 @@ fn plug() -> (Plugged, Fx2Faults) {
     (Plugged::new(analyser).unwrap(), faults)
 }
 
-/// A rate that software emulation keeps up with.
+/// A sample rate that software emulation can sustain.
 fn config() -> Fx2LafwConfig {
     let channels = [("vsync".to_owned(), 0), ("exposure".to_owned(), 1)];
     Fx2LafwConfig { sample_rate_hz: 100_000, channels: channels.into(), ..Fx2LafwConfig::default() }
 }
 
 fn open() -> Fx2Lafw<Usb> {
-    // The bus knows of it a moment after it was plugged in.
+    // The bus detects it a moment after it was plugged in.
     wait_for("the analyser", || Fx2Lafw::open(&config()).ok())
 }
 
@@ -54,7 +54,7 @@ fn edges(vsync: &mut dyn Vsync, count: usize) -> Vec<Edge> {
 fn end(vsync: &mut dyn Vsync) -> DeviceErrorKind {
     let began = Instant::now();
     loop {
-        // Edges from before may still be there.
+        // Earlier edges may still be queued.
         if let Err(error) = vsync.next_edge(PATIENCE) {
             println!("{error}");
             return error.kind;
@@ -72,7 +72,7 @@ fn every_edge_comes_once_and_in_order() {
     assert!(edges.windows(2).all(|pair| pair[1].seq == pair[0].seq + 1), "{edges:?}");
     let (first, last) = (edges[0], edges[edges.len() - 1]);
     let period_us = (last.host_ns - first.host_ns) as f64 / (last.seq - first.seq) as f64 / 1e3;
-    // The guest's busy moments move the fit of its clock from one window to the next.
+    // Whenever the guest is busy, its clock fit shifts from one window to the next.
     assert!((period_us / 16_666.667 - 1.0).abs() < 0.1, "{period_us} us");
     println!("{:?}", vsync.clock());
     drop(vsync);

@@ -1,5 +1,6 @@
-//! A PlayzerX behind the kernel's `ftdi_sio`: the suite of all mirrors' drivers, a stream of batches bit for bit, and a cable that
-//! is pulled out while the mirror plays. The simulated controller sits at the far end of the line, a port of the guest itself.
+//! A PlayzerX behind the kernel's `ftdi_sio`: the suite for all mirror drivers, a stream of batches bit for bit, and
+//! a cable that is unplugged while the mirror plays. The simulated controller runs at the far end of the line, a port
+//! of the guest itself.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -26,11 +27,12 @@ use tempfile::TempDir;
 const PIPE: &str = "serial";
 const PORT: &str = "/dev/ttyUSB0";
 const LIMITS: MirrorLimits = MirrorLimits::A7B2_3_3600AL;
-/// What the simulated controller, in software emulation itself, keeps up with; the line carries sixteen times as much.
+/// A rate that the simulated controller, itself in software emulation, can sustain; the line carries sixteen times as
+/// much.
 const RATE_HZ: f64 = 5_000.0;
 const SAMPLES: usize = 650;
 
-/// The converter in its socket, the controller behind it, and a folder for the driver's state.
+/// The plugged-in converter, the controller behind it, and a folder for the driver's state.
 struct Lab {
     monitor: Monitor,
     controller: MirrorPty,
@@ -76,7 +78,7 @@ impl Lab {
             state: self.state(),
             light: self.light(),
         };
-        // The node is there a moment before it can be opened.
+        // The node appears a moment before it can be opened.
         wait_for("the controller", || PlayzerX::open(config()).map_err(|error| println!("{error}")).ok())
     }
 
@@ -97,7 +99,7 @@ impl Drop for Lab {
     }
 }
 
-/// A lit batch.
+/// A batch with light.
 fn batch() -> MirrorPath {
     MirrorPath::lissajous(Tilt::new(2.3, 1.3), [3, 2], SAMPLES, RATE_HZ, &LIMITS).unwrap()
 }
@@ -186,11 +188,11 @@ fn a_cable_pulled_out_within_a_path_is_told_and_the_next_driver_parks_the_mirror
     assert_eq!(error.kind, DeviceErrorKind::Disconnected);
     assert!(error.to_string().contains(PORT) && error.to_string().contains("cable"), "{error}");
     drop(mirror);
-    // The controller has power of its own and plays on: that is known, and so is what to do.
+    // The controller has its own power supply and plays on: the report says so, and what to do.
     let report = MirrorReport::read(&lab.state(), &lab.light());
     assert!(report.laser && !report.parked, "{report:?}");
 
-    // What was on the wire is lost, so nobody knows where the mirror is: light and drive are taken away.
+    // The samples on the wire are lost, so the mirror's position is unknown: light and drive are switched off.
     lab.plug();
     let mut mirror = lab.open();
     lab.await_parked();

@@ -1,4 +1,4 @@
-//! VSYNC at 60 Hz on the DCD line of a simulated converter behind the kernel's `ftdi_sio`: by `TIOCMIWAIT` and as
+//! VSYNC at 60 Hz on the DCD line of a simulated converter behind the kernel's `ftdi_sio`: with `TIOCMIWAIT` and as
 //! pulse-per-second source.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
@@ -21,7 +21,7 @@ use raysweep_sim::usb::{Ftdi, FtdiLine, Plugged};
 const PORT: &str = "/dev/ttyUSB0";
 const SOURCE: &str = "/dev/pps0";
 const PERIOD: Duration = Duration::from_nanos(16_666_667);
-/// Long enough for a guest under load to see most pulses.
+/// Long enough that a guest under load sees most pulses.
 const PULSE: Duration = Duration::from_millis(8);
 
 fn plug() -> (Plugged, FtdiLine) {
@@ -31,7 +31,7 @@ fn plug() -> (Plugged, FtdiLine) {
 fn plug_with(period: Duration, pulse: Duration) -> (Plugged, FtdiLine) {
     let (converter, line) = Ftdi::new(period, pulse);
     let plugged = Plugged::new(converter).unwrap();
-    // The port's file is there a moment before it can be opened.
+    // The port's file appears a moment before it can be opened.
     let nonblocking = nix::fcntl::OFlag::O_NONBLOCK.bits();
     wait_for(PORT, || fs::File::options().read(true).custom_flags(nonblocking).open(PORT).ok());
     (plugged, line)
@@ -42,7 +42,7 @@ fn unplug(plugged: Plugged) {
     wait_for("the port's end", || (!Path::new(PORT).exists()).then_some(()));
 }
 
-/// Watches 60 edges: their numbers are the line's own to the last pulse, whether or not all were seen.
+/// Watches 60 edges: their numbers match the line's pulses exactly, whether or not all were seen.
 fn numbers_are_the_line_s_own(vsync: &mut dyn Vsync, line: &FtdiLine) {
     line.start();
     let began = Instant::now();
@@ -81,7 +81,7 @@ fn modem_line_tells_of_an_unplugged_port_and_opens_again() {
         assert!(vsync.next_edge(PATIENCE).unwrap().is_some());
         drop(plugged);
         let error = loop {
-            // Edges from before may still be there.
+            // Earlier edges may still be queued.
             if let Err(error) = vsync.next_edge(PATIENCE) {
                 break error;
             }
@@ -104,7 +104,7 @@ fn a_line_that_does_not_change_gives_no_edge() {
     unplug(plugged);
 }
 
-/// `ldattach`, which stays in the foreground when it is to tell what it does.
+/// `ldattach`, which stays in the foreground when asked to print messages.
 struct LineDiscipline(Child);
 
 impl LineDiscipline {
@@ -145,7 +145,7 @@ fn pulse_per_second_source_has_the_kernel_s_stamps_and_numbers() {
 #[ignore = "needs the kernel guest: cargo xtask guest"]
 fn the_polarity_says_which_change_is_the_edge() {
     for edge in [Polarity::Assert, Polarity::Clear] {
-        // After an edge the line stays for longer than a guest takes to notice.
+        // After an edge, the line stays unchanged for longer than a guest takes to notice it.
         let (plugged, line) = plug_with(Duration::from_secs(2), Duration::from_secs(1));
         let mut vsync = ModemLine::open(Path::new(PORT), Line::Dcd, edge).unwrap();
         line.start();

@@ -1,5 +1,6 @@
-//! A serial device behind the kernel's `ftdi_sio`, plugged and unplugged: what drivers of mirrors and trigger boxes
-//! meet. The far end of the line is a port of the guest itself, so that a simulated controller can sit in the test.
+//! A serial device behind the kernel's `ftdi_sio`, plugged and unplugged: the conditions for drivers of mirrors and
+//! trigger boxes. The far end of the line is a port of the guest itself, so that a simulated controller can run in
+//! the test.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -33,7 +34,7 @@ fn a_serial_line_carries_bytes_and_survives_a_replug() {
         assert_eq!(&bytes, b"pong");
 
         monitor.unplug_serial(PIPE);
-        // A read that waits ends: with an error or as the end of the file, by what the kernel notices first.
+        // A pending read ends with an error or as the end of the file, depending on what the kernel notices first.
         assert!(matches!(near.read(&mut bytes), Ok(0) | Err(_)));
         drop(near);
         wait_for("the port's end", || (!Path::new(PORT).exists()).then_some(()));

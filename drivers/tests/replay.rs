@@ -1,4 +1,4 @@
-//! The replay camera against files that are written here by their formats' definitions.
+//! The replay camera with files written here according to their formats' definitions.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -83,7 +83,7 @@ fn unsized_config(path: PathBuf) -> ReplayConfig {
     ReplayConfig { width: None, height: None, ..config(path) }
 }
 
-/// All frames of a recording, unpacked; makes sure that ids and times go on evenly and that it ends.
+/// All frames of a recording, unpacked; checks that ids and times advance evenly and that the recording ends.
 fn replayed(config: &ReplayConfig, format: PixelFormat) -> Vec<Vec<u16>> {
     let mut camera = ReplayCamera::open(config, format, RATE_HZ).unwrap();
     assert_eq!((camera.capabilities().height, camera.capabilities().width), (ROWS, COLUMNS));
@@ -230,7 +230,7 @@ fn what_is_cut_short_or_is_something_else_is_refused_with_its_file() {
     fs::create_dir(at("empty")).unwrap();
     refused(unsized_config(at("empty")), mono12, "is in this folder");
     refused(unsized_config(folder.path().into()), mono12, "several kinds");
-    // What a picture holds is known when it is read.
+    // The content of a picture is known only when it is read.
     for (depth, colour, expected) in [
         (BitDepth::Eight, ColorType::Grayscale, "of Eight bits"),
         (BitDepth::Sixteen, ColorType::Rgb, "a Rgb picture"),

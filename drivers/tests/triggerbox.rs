@@ -1,4 +1,4 @@
-//! The driver of the triggerbox against a simulated box on a pseudo-terminal.
+//! The driver of the triggerbox with a simulated box on a pseudo-terminal.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -34,7 +34,8 @@ fn edges(vsync: &mut dyn Vsync, count: usize) -> Vec<Edge> {
     edges
 }
 
-/// Every pulse once, in order, at the multiples of the line's period: to what a busy machine's round trips tell.
+/// Every pulse once, in order, at multiples of the line's period, within the accuracy of round trips on a busy
+/// machine.
 fn assert_on_grid(edges: &[Edge]) {
     assert!(edges.windows(2).all(|pair| pair[1].seq == pair[0].seq + 1), "{edges:?}");
     for edge in edges {
@@ -80,7 +81,8 @@ fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
     assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
 }
 
-/// Uniform bytes and bytes that replies are made of, in pieces; every byte is in a reply, garbage, or waits for more.
+/// Uniform bytes and bytes that occur in replies, in pieces; every byte is part of a reply, garbage, or waits for
+/// more.
 #[test]
 fn ten_million_bytes_of_noise_are_accounted_for() {
     let mut state = 5_u64;

@@ -6,9 +6,9 @@
 //! RAYSWEEP_V4L2_DEVICE=/dev/video0 cargo test -p raysweep-drivers --features v4l2 --test v4l2_vivid -- --ignored --test-threads 1
 //! ```
 //!
-//! vivid's only input is such that it takes any size (HDMI). It has no exposure control: its brightness stands for one.
-//! Its controls are set from outside by `v4l2-ctl`. Order, counts and values are looked at, never times: the guest's clock
-//! jitters by a tenth of a second.
+//! vivid uses an HDMI input, because that allows any frame size. It has no exposure control: its brightness stands
+//! for one. `v4l2-ctl` sets its controls from outside. The tests check order, counts and values, but no times: the
+//! guest's clock jitters by a tenth of a second.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -24,7 +24,7 @@ use raysweep_drivers::camera::v4l2::{self, TimeControl, V4l2Camera, V4l2Config, 
 
 const WIDTH: u32 = 320;
 const HEIGHT: u32 = 180;
-/// A frame comes within this, or never.
+/// A frame arrives within this time or never.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 struct Device {
@@ -38,7 +38,7 @@ impl Device {
     }
 
     fn setup(&self, format: PixelFormat, controls: &[(&str, i64)]) -> V4l2Setup {
-        // Stamps at the start of exposure: vivid's others lie in the future.
+        // Timestamps at the start of exposure: vivid's others lie in the future.
         let controls = [("timestamp_source", 1)].iter().chain(controls);
         V4l2Setup {
             config: V4l2Config {
@@ -85,7 +85,7 @@ impl Feed {
         }
     }
 
-    /// Presses one of vivid's buttons or sets one of its controls, from outside, as `v4l2-ctl` would.
+    /// Presses one of vivid's buttons or sets one of its controls, from outside, with `v4l2-ctl`.
     fn press(&self, device: &Device, control: &str, value: i64) {
         let status = Command::new("v4l2-ctl")
             .arg("--device")
@@ -106,7 +106,7 @@ fn frames_come_in_every_format_that_the_kernel_has() {
         let name = format.to_string();
         let mut camera = match v4l2::open(device.setup(format, &[])) {
             Ok(camera) => camera,
-            // vivid makes no MIPI packings.
+            // vivid does not support MIPI packings.
             Err(refused) if name.ends_with("g40") || name.ends_with("g24") => {
                 assert_eq!(refused.kind, DeviceErrorKind::OutOfRange, "{refused}");
                 continue;
@@ -152,7 +152,7 @@ fn controls_are_set_and_read_back() {
 fn frame_rates_that_the_driver_clamps_are_refused() {
     let device = &Device::named();
     let mut setup = device.setup(PixelFormat::Mono8, &[]);
-    // An HDMI input has one rate.
+    // An HDMI input has only one rate.
     setup.config.frames_per_s = Some(60.0);
     v4l2::open(setup.clone()).unwrap();
     setup.config.frames_per_s = Some(30.0);
@@ -176,7 +176,7 @@ fn a_second_program_is_told_that_the_camera_is_busy() {
 #[ignore = "needs vivid: cargo xtask guest"]
 fn ids_rise_over_a_wrap_of_the_kernels_count() {
     let device = &Device::named();
-    // The kernel's count begins 128 before its end.
+    // The kernel's count starts 128 before its maximum.
     let mut feed = device.streaming(PixelFormat::Mono8, &[("wrap_sequence_number", 1)]);
     let seqs: Vec<u64> = (0..200).map(|_| feed.next().seq).collect();
     assert!(seqs.is_sorted_by(|a, b| a < b), "{seqs:?}");
@@ -188,7 +188,7 @@ fn ids_rise_over_a_wrap_of_the_kernels_count() {
 #[ignore = "needs vivid: cargo xtask guest"]
 fn damaged_frames_are_left_out_and_counted() {
     let device = &Device::named();
-    // Some percent of the frames are flagged, the others come.
+    // Some percent of the frames are flagged; the others arrive.
     let mut feed = device.streaming(PixelFormat::Mono8, &[("percentage_of_dropped_buffers", 50)]);
     let first = feed.next().seq;
     let last = (0..30).map(|_| feed.next().seq).last().unwrap();
@@ -203,7 +203,7 @@ fn damaged_frames_are_left_out_and_counted() {
 #[ignore = "needs vivid: cargo xtask guest"]
 fn a_stream_that_fails_is_built_anew() {
     let device = &Device::named();
-    // The last is a node that stays and says ENODEV until all have closed it.
+    // After the last one, the node stays and returns ENODEV until all processes have closed it.
     for button in ["inject_vidioc_qbuf_error", "inject_fatal_streaming_error", "disconnect"] {
         let mut feed = device.streaming(PixelFormat::Mono8, &[]);
         let before = feed.next().seq;

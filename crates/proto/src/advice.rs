@@ -1,20 +1,20 @@
-//! What `check` expects of a sweep's results, and what it advises instead.
+//! What `check` expects of a sweep's results, and the sweep that it recommends instead.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What errors a sweep must expect, and a better sweep of the same length. Light is in white units: 1 is what a white
-/// pixel collects from its own row.
+/// Expected errors of a sweep, and a better sweep of the same length. Light is in white units: 1 is the light
+/// that a white pixel receives from its own row.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SweepAdvice {
-    /// Of the camera.
+    /// Noise of the camera.
     pub noise: NoiseEstimate,
-    /// The prior that is taken, with its weights; where the plan leaves it open, the one that is taken in doubt.
+    /// The prior, with its weights. If the plan does not choose one, the default.
     pub prior: String,
-    /// Of the plan's sweep.
+    /// Expected errors of the plan's sweep.
     pub expected: ExpectedError,
-    /// A sweep that takes no more frames and no longer, whose profiles are expected to err by a tenth less and none of
-    /// whose bands by a tenth more; nothing if none was found.
+    /// A sweep with no more frames and no longer duration, whose expected profile error is at least 10 %
+    /// smaller and whose bands are each at most 10 % worse; `None` if none was found.
     pub better: Option<BetterSweep>,
 }
 
@@ -23,47 +23,47 @@ pub struct SweepAdvice {
 pub struct NoiseEstimate {
     /// Standard deviation of a dark sample, quantisation included.
     pub dark: f64,
-    /// Standard deviation by which the light of a white pixel's row adds to that.
+    /// Additional standard deviation due to the light of a white pixel's own row.
     pub shot: f64,
-    /// How it is known.
+    /// Where the values come from.
     pub source: NoiseSource,
 }
 
-/// How the camera's noise is known.
+/// Source of the camera's noise values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseSource {
     /// The rig file states `camera.electrons_per_dn` and `camera.read_noise_e`.
     Stated,
-    /// What the rig file does not state of it is as simulated.
+    /// Values missing in the rig file are those of the simulation.
     Simulated,
-    /// What the rig file does not state of it is assumed to be typical.
+    /// Values missing in the rig file are assumed to be typical.
     Assumed,
 }
 
-/// Errors of a white pixel in the middle of the frame, in white units, before spatial coupling: what noise and
-/// smoothing do if timing, beam and white level are true.
+/// Errors of a white pixel in the middle of the frame, in white units, before spatial coupling: the effect of
+/// noise and smoothing if timing, beam and white level are correct.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ExpectedError {
     /// Standard deviation of the light from the pixel's own row.
     pub epipolar: f64,
-    /// Of the light from the ten rows on each side, in all.
+    /// Standard deviation of the total light from the ten rows on each side.
     pub short_range: f64,
-    /// Of the light from all rows beyond, in all.
+    /// Standard deviation of the total light from all rows beyond those.
     pub long_range: f64,
     /// Root of the sum of the squared errors of all rows.
     pub profile: f64,
 }
 
-/// A sweep to take instead; it reaches as many rows as the plan's.
+/// A recommended sweep; it covers as many rows as the plan's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BetterSweep {
-    /// Its points.
+    /// Number of points.
     pub points: usize,
     /// Frames to average over all points, dark and regular images included.
     pub frames: u64,
-    /// What to expect of it.
+    /// Expected errors.
     pub expected: ExpectedError,
-    /// The table `[sweep]` of its plan, in TOML.
+    /// The `[sweep]` table of its plan, in TOML.
     pub sweep: String,
 }

@@ -16,36 +16,36 @@ use crate::{
     ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
 };
 
-/// How long an answer may take. No call waits for a run, so that a longer wait means a daemon that hangs.
+/// Maximum time for an answer. No call waits for a run, so a longer wait means that the daemon hangs.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Why a call did not succeed.
+/// Why a call failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// Nobody listens there.
+    /// No process listens on the socket.
     #[error("no raysweepd listens on {}: start it, or name its socket with --socket or RAYSWEEP_SOCKET", path.display())]
     NotRunning {
         /// The socket.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// The socket may not be used by this user.
+    /// This user may not use the socket.
     #[error("{} may not be used by this user: {advice}", path.display())]
     Permission {
         /// The socket.
         path: PathBuf,
         /// Which group to join.
         advice: String,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// Connecting failed in another way.
+    /// Connecting failed for another reason.
     #[error("cannot connect to {}: {source}", path.display())]
     Connect {
         /// The socket.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
     /// The connection broke.
@@ -53,20 +53,20 @@ pub enum ClientError {
     Lost {
         /// The socket.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// No answer came.
+    /// No answer arrived.
     #[error("raysweepd at {} has not answered `{method}` for {} s; see its log", path.display(), after.as_secs())]
     Timeout {
         /// The socket.
         path: PathBuf,
-        /// What was called.
+        /// The method called.
         method: &'static str,
-        /// How long it was waited for.
+        /// How long the client waited.
         after: Duration,
     },
-    /// What came is not what a daemon of this version sends.
+    /// The daemon sent something that a daemon of this version does not send.
     #[error("what listens on {} does not speak as this version's raysweepd does: {what}", path.display())]
     Protocol {
         /// The socket.
@@ -74,7 +74,7 @@ pub enum ClientError {
         /// What was wrong.
         what: String,
     },
-    /// The daemon refused, or failed.
+    /// The daemon refused the call or failed.
     #[error(transparent)]
     Rpc(#[from] RpcError),
 }
@@ -84,13 +84,13 @@ pub enum ClientError {
 pub struct Client {
     path: PathBuf,
     stream: BufReader<UnixStream>,
-    /// The part of a line that had come when a time limit was reached.
+    /// The part of a line that was received before a timeout.
     partial: Vec<u8>,
     next_id: u64,
 }
 
 impl Client {
-    /// Connects to the daemon that listens on a socket.
+    /// Connects to the daemon that listens on this socket.
     ///
     /// # Errors
     /// [`ClientError::NotRunning`], [`ClientError::Permission`], [`ClientError::Connect`].
@@ -110,15 +110,15 @@ impl Client {
         }
     }
 
-    /// What can be asked.
+    /// Returns the methods, events, errors and limits of the daemon.
     ///
     /// # Errors
-    /// As every call here: the daemon's own [`ClientError::Rpc`], or a connection that does not carry.
+    /// As for every call: an error of the daemon ([`ClientError::Rpc`]) or of the connection.
     pub fn describe(&mut self) -> Result<Description, ClientError> {
         self.call(Method::Describe, &Empty {})
     }
 
-    /// What the daemon is doing.
+    /// Returns what the daemon is doing.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -126,7 +126,7 @@ impl Client {
         self.call(Method::Status, &Empty {})
     }
 
-    /// What a plan would do.
+    /// Returns what a plan would do.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -134,7 +134,7 @@ impl Client {
         self.call(Method::Check, &CheckParams { plan: plan.into() })
     }
 
-    /// Begins a run.
+    /// Starts a run.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -142,7 +142,7 @@ impl Client {
         self.call(Method::Run, params)
     }
 
-    /// Begins to acquire what a session lacks.
+    /// Starts to acquire what a session lacks.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -150,7 +150,7 @@ impl Client {
         self.call(Method::Resume, &ResumeParams { session: session.into() })
     }
 
-    /// Holds the run before its next point.
+    /// Pauses the run before its next point.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -158,7 +158,7 @@ impl Client {
         self.call(Method::Pause, &Empty {}).map(|Empty {}| ())
     }
 
-    /// Goes on after [`Client::pause`].
+    /// Continues after [`Client::pause`].
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -166,7 +166,7 @@ impl Client {
         self.call(Method::Continue, &Empty {}).map(|Empty {}| ())
     }
 
-    /// Ends the run in order.
+    /// Ends the run in an orderly way.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -182,7 +182,7 @@ impl Client {
         self.call(Method::ArmLight, &Empty {}).map(|Empty {}| ())
     }
 
-    /// The sessions of the daemon's data folder, oldest first.
+    /// Lists the sessions in the daemon's data folder, oldest first.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -190,7 +190,7 @@ impl Client {
         self.call(Method::Sessions, &Empty {})
     }
 
-    /// Everything that happens from now on. The connection carries nothing else then; make another for calls.
+    /// Streams all events from now on. The connection then carries nothing else; open another one for calls.
     ///
     /// # Errors
     /// As [`Client::describe`].
@@ -219,7 +219,7 @@ impl Client {
             return Err(self.protocol(format!("an event came instead of the answer to `{}`", method.name())));
         };
         match response.outcome {
-            // An error without an id is about the connection: too many clients, or a line that is too long.
+            // An error without an id concerns the connection: too many clients, or a line that is too long.
             Outcome::Error(error) => Err(error.into()),
             Outcome::Result(_) if response.id != Id::Number(id.into()) => {
                 Err(self.protocol(format!("the answer to `{}` has the id of another request", method.name())))
@@ -238,7 +238,8 @@ impl Client {
             .set_write_timeout(Some(ANSWER_TIMEOUT))
             .and_then(|()| self.stream.get_mut().write_all(&line));
         match sent {
-            // A daemon that hangs up while it is being written to has said why: the reason waits to be read.
+            // A daemon that closes the connection while the client writes has sent the reason before: read
+            // it.
             Err(error) if !matches!(error.kind(), ErrorKind::BrokenPipe | ErrorKind::ConnectionReset) => {
                 Err(self.lost(error))
             }
@@ -246,7 +247,7 @@ impl Client {
         }
     }
 
-    /// The next message, or nothing if none has come within the time.
+    /// The next message, or `None` if none arrived within `timeout`.
     fn receive(&mut self, timeout: Option<Duration>) -> Result<Option<Incoming>, ClientError> {
         self.stream.get_ref().set_read_timeout(timeout).map_err(|error| self.lost(error))?;
         match self.stream.read_until(b'\n', &mut self.partial) {
@@ -271,18 +272,18 @@ impl Client {
     }
 }
 
-/// Events as they happen. As an iterator it waits for each as long as it takes and ends with an error when the
-/// daemon goes.
+/// Events as they happen. The iterator blocks until the next event and ends with an error when the daemon
+/// exits.
 #[derive(Debug)]
 pub struct Subscription {
     client: Client,
 }
 
 impl Subscription {
-    /// The next event, or nothing if none has come within `timeout`, which must not be zero.
+    /// The next event, or `None` if none arrived within `timeout`, which must not be zero.
     ///
     /// # Errors
-    /// [`ClientError::Lost`] when the daemon goes, [`ClientError::Protocol`].
+    /// [`ClientError::Lost`] when the daemon exits, [`ClientError::Protocol`].
     pub fn next_within(&mut self, timeout: Duration) -> Result<Option<Event>, ClientError> {
         self.receive(Some(timeout))
     }
@@ -307,7 +308,7 @@ impl Iterator for Subscription {
     }
 }
 
-/// Who may use the socket, told to somebody who may not.
+/// Tells a user without permission who may use the socket.
 fn advice(path: &Path) -> String {
     let Ok(metadata) = std::fs::metadata(path) else {
         return "its folder is closed to this user; ask who runs the daemon".into();
@@ -331,7 +332,7 @@ mod tests {
     use super::*;
     use crate::ErrorCode;
 
-    /// A daemon that reads one line, sends `answer` as it is, and hangs up.
+    /// A daemon that reads one line, sends `answer` verbatim, and closes the connection.
     fn peer(answer: &'static str) -> (tempfile::TempDir, PathBuf, thread::JoinHandle<String>) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("socket");

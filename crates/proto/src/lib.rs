@@ -1,7 +1,7 @@
-//! What travels over the daemon's socket: JSON-RPC 2.0, one message a line, and a small blocking client.
+//! The protocol on the daemon's socket: JSON-RPC 2.0, one message per line, and a small blocking client.
 //!
-//! [`Method`] is the one table of what can be asked; `describe` returns it with JSON Schemas. A request is one line of
-//! at most [`MAX_MESSAGE_BYTES`]; answers and events are one line each, of any length.
+//! [`Method`] lists all methods; `describe` returns them with JSON Schemas. A request is one line of at most
+//! [`MAX_MESSAGE_BYTES`]; answers and events are one line each, of any length.
 
 mod advice;
 mod client;
@@ -16,8 +16,8 @@ pub use messages::*;
 pub use methods::{Description, Empty, ErrorInfo, LimitsInfo, Method, MethodInfo, Role, describe};
 pub use rpc::{EventNotice, Id, Incoming, Outcome, Request, Response, params};
 
-/// The longest request, without its line feed.
+/// Maximum length of a request, without its line feed.
 pub const MAX_MESSAGE_BYTES: usize = 1 << 20;
 
-/// How many clients may be connected at once.
+/// Maximum number of connected clients.
 pub const MAX_CLIENTS: usize = 32;

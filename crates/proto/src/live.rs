@@ -1,61 +1,62 @@
 //! The layout of the live file: the newest images of a run, in memory that clients map.
 //!
-//! All numbers are little-endian. The file starts with a header ([`HEADER`]), then come slots of equal size, each with
-//! one image behind a header of its own ([`SLOT`]). `docs/reference/socket.md` says what the fields mean.
+//! All numbers are little-endian. The file consists of a header ([`HEADER`]) and slots of equal size. Each
+//! slot holds one image after a header of its own ([`SLOT`]). `docs/reference/socket.md` explains the fields.
 //!
-//! A reader takes the slot of the name with the largest sequence, copies it, and keeps the copy if the lock was even
-//! and the same before and after and the checksum holds; otherwise it tries again.
+//! A reader takes the slot with the wanted name and the largest sequence number and copies it. The copy is
+//! valid if the lock was even and had the same value before and after, and the checksum matches; otherwise
+//! the reader tries again.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What a live file begins with.
+/// First bytes of a live file.
 pub const MAGIC: [u8; 8] = *b"RAYSLIVE";
-/// The layout's version.
+/// Version of the layout.
 pub const VERSION: u32 = 1;
-/// Bytes of the file's header.
+/// Size of the file header.
 pub const HEADER_BYTES: usize = 64;
-/// Bytes of a slot's header.
+/// Size of a slot header.
 pub const SLOT_HEADER_BYTES: usize = 128;
-/// Most axes of an image.
+/// Maximum number of axes of an image.
 pub const MAX_AXES: usize = 4;
-/// Longest name of an image.
+/// Maximum bytes of an image's name.
 pub const NAME_BYTES: usize = 40;
-/// Longest metadata of an image.
+/// Maximum bytes of an image's metadata.
 pub const METADATA_BYTES: usize = 4096 - SLOT_HEADER_BYTES;
-/// The only type of pixels.
+/// The only pixel type.
 pub const DTYPE: [u8; 4] = *b"<f4\0";
 
-/// A number or text of the layout.
+/// A number or text field of the layout.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LiveField {
     /// Its name.
     pub name: String,
-    /// Bytes from the start of the header that it is in.
+    /// Offset in bytes from the start of its header.
     pub offset: usize,
-    /// Its type as NumPy writes it.
+    /// Its type in NumPy notation.
     pub dtype: String,
-    /// How many of them.
+    /// Number of elements.
     pub count: usize,
 }
 
-/// The layout of the live file, in `describe`.
+/// The layout of the live file, as returned by `describe`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LiveLayout {
-    /// What the file begins with.
+    /// First bytes of the file.
     pub magic: String,
-    /// The layout's version.
+    /// Version of the layout.
     pub version: u32,
-    /// The file's header.
+    /// Fields of the file header.
     pub header: Vec<LiveField>,
-    /// A slot's header.
+    /// Fields of a slot header.
     pub slot: Vec<LiveField>,
 }
 
-/// Name, offset in the header, type, count.
+/// Name, offset in the header, type, number of elements.
 pub type Field = (&'static str, usize, &'static str, usize);
 
-/// The file's header.
+/// Fields of the file header.
 pub const HEADER: [Field; 5] = [
     ("magic", 0, "|S8", 1),
     ("version", 8, "<u4", 1),
@@ -64,7 +65,7 @@ pub const HEADER: [Field; 5] = [
     ("slot_bytes", 24, "<u8", 1),
 ];
 
-/// A slot's header.
+/// Fields of a slot header.
 pub const SLOT: [Field; 11] = [
     ("lock", 0, "<u8", 1),
     ("sequence", 8, "<u8", 1),
@@ -79,7 +80,7 @@ pub const SLOT: [Field; 11] = [
     ("name", 88, "|S40", 1),
 ];
 
-/// What `describe` says of the live file.
+/// What `describe` returns about the live file.
 pub(crate) fn layout() -> LiveLayout {
     let fields = |fields: &[Field]| {
         let field = |&(name, offset, dtype, count): &Field| LiveField {

@@ -1,4 +1,5 @@
-//! Parameters, results and events. Field names are stable; times are seconds or, where `_us` says so, microseconds.
+//! Parameters, results and events. Field names are stable. Times are in seconds, or in microseconds if the
+//! name ends in `_us`.
 
 use std::path::PathBuf;
 
@@ -12,19 +13,19 @@ use crate::SweepAdvice;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RunState {
-    /// Nothing; ready for a run.
+    /// Idle; ready for a run.
     Idle,
-    /// Opening devices and the session.
+    /// Opening the devices and the session.
     Preparing,
-    /// The camera is armed, no point has begun.
+    /// The camera is armed; no point has begun.
     Armed,
     /// Acquiring.
     Running,
     /// Holding between two points.
     Paused,
-    /// Acquisition is over; results are being made and written.
+    /// Acquisition is over; computing and writing the results.
     Draining,
-    /// The last run ended with an error; ready for another.
+    /// The last run ended with an error; ready for another run.
     Faulted,
 }
 
@@ -44,25 +45,25 @@ impl RunState {
     }
 }
 
-/// How far a run is.
+/// Progress of a run.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Progress {
-    /// Points stored, of this run and of those before it that it resumes.
+    /// Points stored by this run and by the earlier runs that it resumes.
     pub points_stored: usize,
-    /// Points that the run needs: the sweep's, its dark images and the regular image.
+    /// Points that the run needs: those of the sweep, its dark images and the regular image.
     pub points_planned: usize,
-    /// Where this run's triggers have gone so far.
+    /// What became of this run's triggers so far.
     #[schemars(schema_with = "counts_schema")]
     pub counts: Counts,
     /// Seconds since the run began.
     pub elapsed_s: f64,
-    /// Seconds that it will still take at its present pace, if that can be said yet.
+    /// Estimated seconds left at the present pace; `None` while there is no estimate.
     pub left_s: Option<f64>,
     /// Frames averaged per second.
     pub frames_per_s: f64,
 }
 
-/// `core` knows no schemas, so those of its accounts are written out here.
+/// `core` has no schemas, so those of its counts and statistics are written out here.
 fn counts_schema(_: &mut SchemaGenerator) -> Schema {
     let frames = json_schema!({ "type": "integer", "minimum": 0 });
     json_schema!({
@@ -144,117 +145,118 @@ fn film_schema(_: &mut SchemaGenerator) -> Schema {
     })
 }
 
-/// An estimate of the light transport during a film; the images themselves are not in it.
+/// A light transport estimated during a film; the images themselves are not included.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FilmEstimate {
-    /// The cycle that its newest frame belongs to, counted from 0.
+    /// Cycle of its newest frame, counted from 0.
     pub cycle: u32,
-    /// Whether it is made of the newest frame of each setting rather than of one cycle: published, not stored.
+    /// Whether it uses the newest frame of each setting instead of one complete cycle. Such estimates are
+    /// published, not stored.
     pub sliding: bool,
-    /// Start of its oldest exposure, in seconds after that of the film's first.
+    /// Start of its oldest exposure, in seconds after the film's first.
     pub start_s: f64,
-    /// From the end of its newest exposure to its publication; nothing on a virtual clock.
+    /// From the end of its newest exposure to its publication, in ms; `None` on a virtual clock.
     pub latency_ms: Option<f64>,
-    /// Time that the solver took.
+    /// Solver time in ms.
     pub solve_ms: f64,
     /// Mean over all pixels of the light from the pixel's own projector row, 1 = white.
     pub epipolar: f64,
-    /// The same of the light from all other rows.
+    /// The same for the light from all other rows.
     pub non_epipolar: f64,
-    /// The film so far.
+    /// Summary of the film so far.
     #[schemars(schema_with = "film_schema")]
     pub film: FilmSummary,
 }
 
-/// What `check` says of a film.
+/// Result of `check` for a film.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FilmCheck {
-    /// Settings of a cycle.
+    /// Settings per cycle.
     pub settings: usize,
-    /// Cycles.
+    /// Planned cycles.
     pub cycles: usize,
-    /// VSYNC periods that a cycle takes on this camera.
+    /// VSYNC periods per cycle on this camera.
     pub periods_per_cycle: u32,
-    /// Light transports a second, at the most.
+    /// Maximum number of light transports per second.
     pub transports_per_s: f64,
-    /// Disk space that a minute takes, uncompressed.
+    /// Disk space for one minute, uncompressed.
     pub disk_bytes_per_minute: u64,
-    /// What the pace hangs on.
+    /// What limits the pace.
     pub reason: String,
 }
 
-/// A batch of a flying dot was stored; its floodlit image is in the live file.
+/// A stored batch of a flying dot; its floodlit image is in the live file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BatchStored {
     /// Its index in `dots.zarr`.
     pub batch: usize,
-    /// The calibration plane that it shows, from 0; nothing: the scene.
+    /// The calibration plane that it shows, counted from 0; `None` for the scene.
     pub plane: Option<usize>,
     /// Start of its first exposure, in seconds after that of the run's first batch.
     pub start_s: f64,
     /// Dots of the scene without a frame.
     pub missing: usize,
-    /// Dots in whose frames nothing stood out of the background.
+    /// Dots whose frames show nothing above the background.
     pub empty: usize,
-    /// Dots whose frames ended at the cap on discs.
+    /// Dots whose denoising stopped at the maximum number of discs.
     pub capped: usize,
-    /// Frames that came twice.
+    /// Frames received twice.
     pub duplicates: u64,
     /// Mean over all pixels of the floodlit image, in counts.
     pub floodlit: f64,
-    /// Of that image in the live file, where there is one.
+    /// Sequence number of that image in the live file, if there is a live file.
     pub sequence: Option<u64>,
 }
 
-/// What `check` says of a plan of batches.
+/// Result of `check` for a plan of batches.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BatchesCheck {
     /// Batches of the scene.
     pub scene: u32,
     /// Batches of each calibration plane.
     pub planes: Vec<u32>,
-    /// Frames of a batch.
+    /// Frames per batch.
     pub dots: u32,
-    /// Frames a second.
+    /// Frames per second.
     pub camera_rate_hz: f64,
-    /// Seconds of a batch.
+    /// Duration of a batch in seconds.
     pub batch_s: f64,
     /// Frames without light before the first batch.
     pub dark_frames: u32,
-    /// Samples of the mirror's path.
+    /// Samples of the mirror path.
     pub samples: usize,
-    /// Samples a second.
+    /// Samples per second.
     pub rate_hz: f64,
-    /// What the camera sends.
+    /// Data rate of the camera.
     pub raw_bytes_per_s: u64,
-    /// What a batch takes on the disk.
+    /// Disk space per batch.
     pub disk_bytes_per_batch: u64,
 }
 
-/// What `check` says of a plan of a mirror's chirps, one of each axis.
+/// Result of `check` for a plan of mirror chirps, one per axis.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ResponseCheck {
-    /// Where a chirp begins and ends.
+    /// Start and end frequency of a chirp.
     pub band_hz: [f64; 2],
-    /// Its amplitude, of the mirror.
+    /// Amplitude of the mirror's mechanical angle.
     pub amplitude_deg: f64,
-    /// Seconds of a chirp.
+    /// Duration of a chirp in seconds.
     pub chirp_s: f64,
-    /// Seconds after it.
+    /// Rest after a chirp in seconds.
     pub rest_s: f64,
-    /// Frames of each axis.
+    /// Frames per axis.
     pub frames: usize,
-    /// Frames a second.
+    /// Frames per second.
     pub camera_rate_hz: f64,
     /// Frames without light before the first chirp.
     pub dark_frames: u32,
-    /// Samples of the mirror's path.
+    /// Samples of the mirror path.
     pub samples: usize,
-    /// Samples a second.
+    /// Samples per second.
     pub rate_hz: f64,
 }
 
-/// `status`
+/// Result of `status`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Status {
     /// Version of the daemon.
@@ -263,34 +265,35 @@ pub struct Status {
     pub rig: String,
     /// What the daemon is doing.
     pub state: RunState,
-    /// What an operator is to do before `continue`, where the run is held for that.
+    /// What the operator has to do before `continue`, if the run waits for that.
     #[serde(default)]
     pub question: Option<String>,
-    /// The session of the present or the last run.
+    /// The session of the current or the last run.
     pub session: Option<PathBuf>,
-    /// How far that run is, or was.
+    /// Progress of that run.
     pub progress: Option<Progress>,
-    /// Its VSYNC line, renewed once a second.
+    /// Statistics of its VSYNC line, updated once per second.
     #[schemars(schema_with = "vsync_schema")]
     pub vsync: Option<VsyncStats>,
-    /// How well the clock of the device that watches the line is known.
+    /// Quality of the clock fit of the device that watches the VSYNC line.
     #[serde(default)]
     #[schemars(schema_with = "clock_schema")]
     pub vsync_clock: Option<ClockQuality>,
-    /// The film, where the run is one.
+    /// Summary of the film, if the run is a film.
     #[serde(default)]
     #[schemars(schema_with = "film_schema")]
     pub film: Option<FilmSummary>,
-    /// How many frames later than the next the camera's settings take effect, as the run's probe found it.
+    /// How many frames after a change the camera's settings take effect (0: the next frame), as measured by
+    /// the run's probe.
     #[serde(default)]
     #[schemars(schema_with = "latency_schema")]
     pub settings_latency: Option<SettingsLatency>,
     /// Why the last run faulted.
     pub error: Option<String>,
-    /// The file with the newest live images, if there is one; `describe` has its layout.
+    /// The file with the newest live images, if there is one; `describe` returns its layout.
     #[serde(default)]
     pub live: Option<PathBuf>,
-    /// The mirror, where the rig has ever moved one.
+    /// The mirror, if the rig has ever moved one.
     #[serde(default)]
     pub mirror: Option<MirrorStatus>,
 }
@@ -298,7 +301,7 @@ pub struct Status {
 /// A mirror and its light.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct MirrorStatus {
-    /// Whether it is at the origin with the light off.
+    /// Whether the mirror is at the origin with the light off.
     pub parked: bool,
     /// Whether samples with light may be playing.
     pub laser: bool,
@@ -314,43 +317,43 @@ pub struct CheckParams {
     pub plan: String,
 }
 
-/// Result of `check`: what a plan would do, before anything moves.
+/// Result of `check`: what a plan would do. Nothing moves.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CheckReport {
-    /// Points of the sweep; of a film, its cycles.
+    /// Points of the sweep; for a film, its cycles.
     pub points: usize,
     /// Further points: dark images and the regular image.
     pub extra_points: usize,
     /// Frames to average over all points.
     pub frames: u64,
-    /// Shortest time that the light takes.
+    /// Minimum time with the light on, in seconds.
     pub light_s: f64,
-    /// Memory for the images and the results; where it does not suffice to make them in one piece, for some camera rows
-    /// at a time.
+    /// Memory for the images and the results. If they do not fit as a whole, memory for processing some
+    /// camera rows at a time.
     pub memory_bytes: u64,
-    /// Memory that the daemon may use for it: what it is limited to, or else what the system can still give.
+    /// Memory that the daemon may use: its limit if there is one, otherwise what the system has available.
     pub memory_free_bytes: u64,
     /// Disk space for the session.
     pub disk_bytes: u64,
-    /// Disk space that is free.
+    /// Free disk space.
     pub disk_free_bytes: u64,
-    /// First and last relative row that the sweep reaches.
+    /// First and last relative row that the sweep covers.
     pub reach_rows: (i32, i32),
-    /// Condition number of the demultiplexing of a camera row in the middle, with its prior.
+    /// Condition number of the demultiplexing of a middle camera row, including its prior.
     pub condition: f64,
-    /// What error to expect of a sweep, and what to do better; nothing where a warning says why, and for films.
+    /// Expected errors of the sweep and a better sweep; `None` for films, or if a warning says why.
     #[serde(default)]
     pub advice: Option<SweepAdvice>,
-    /// Where the plan is a film.
+    /// Details if the plan is a film.
     #[serde(default)]
     pub film: Option<FilmCheck>,
-    /// Where the plan is one of batches; reach and condition then mean nothing.
+    /// Details if the plan consists of batches; `reach_rows` and `condition` are then meaningless.
     #[serde(default)]
     pub batches: Option<BatchesCheck>,
-    /// Where the plan is one of a mirror's chirps; reach and condition then mean nothing.
+    /// Details if the plan measures a mirror's response; `reach_rows` and `condition` are then meaningless.
     #[serde(default)]
     pub response: Option<ResponseCheck>,
-    /// What an operator should know; none of it stops the run.
+    /// Warnings for the operator; none of them prevents the run.
     pub warnings: Vec<String>,
 }
 
@@ -363,13 +366,13 @@ pub struct RunParams {
     /// Who runs it.
     #[serde(default)]
     pub operator: Option<String>,
-    /// What stands before the camera.
+    /// What is in front of the camera.
     #[serde(default)]
     pub sample: Option<String>,
-    /// Anything else.
+    /// Free text.
     #[serde(default)]
     pub note: Option<String>,
-    /// Words to find the session by.
+    /// Labels for finding the session.
     #[serde(default)]
     pub tags: Vec<String>,
 }
@@ -378,11 +381,11 @@ pub struct RunParams {
 #[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ResumeParams {
-    /// The session's folder, or its name within the daemon's data folder.
+    /// The session's folder, or its name in the daemon's data folder.
     pub session: PathBuf,
 }
 
-/// Result of `run` and `resume`: the run has begun.
+/// Result of `run` and `resume`: the run has started.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Started {
     /// The session's folder.
@@ -396,57 +399,57 @@ pub struct SessionInfo {
     pub session: PathBuf,
     /// The plan's name.
     pub name: String,
-    /// When it was made (RFC 3339).
+    /// When it was created (RFC 3339).
     pub created: String,
-    /// Points of the sweep that are stored.
+    /// Sweep points stored.
     pub stored: usize,
-    /// Points of the sweep.
+    /// Sweep points planned.
     pub points: usize,
-    /// `complete`, `cancelled`, `faulted`; `unfinished` where no run has ended; `unreadable`.
+    /// `complete`, `cancelled` or `faulted`; `unfinished` if no run has ended; `unreadable`.
     pub state: String,
 }
 
-/// What `subscribe` streams, as notifications of method `event`.
+/// What `subscribe` streams, as notifications of the method `event`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
-    /// The daemon went to another state.
+    /// The daemon has entered another state.
     State {
         /// The new state.
         state: RunState,
-        /// The session it concerns.
+        /// The session, if any.
         session: Option<PathBuf>,
     },
     /// A point was stored or given up.
     Progress(Progress),
-    /// An attempt at a point failed; the point is taken again. In a film a frame is lost, and is not.
+    /// An attempt at a point failed and will be repeated. In a film: a frame was lost, which is not repeated.
     Lost {
-        /// Ordinal of the point in the order of acquisition.
+        /// Position of the point in the order of acquisition.
         point: u32,
-        /// Counted from 0; in a film the cycle.
+        /// Counted from 0; in a film, the cycle.
         attempt: u32,
-        /// Where its triggers went.
+        /// What became of its triggers.
         #[schemars(schema_with = "counts_schema")]
         counts: Counts,
     },
-    /// The VSYNC line so far: once a second and at the end of a pass.
+    /// Statistics of the VSYNC line so far: once per second and at the end of a pass.
     Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
     /// The light transport was estimated during a film.
     Film(FilmEstimate),
     /// A batch of a flying dot was stored.
     Batch(BatchStored),
-    /// The run waits for an operator, who is to do this; where the run is over, nobody waits.
+    /// The run waits for an operator to do this. Obsolete when the run is over.
     Ask {
-        /// What to do.
+        /// What the operator has to do.
         text: String,
     },
-    /// A running estimate is in the live file, made from the points stored so far.
+    /// A live estimate from the points stored so far is in the live file.
     Live {
-        /// Of its last image in the live file.
+        /// Sequence number of its last image in the live file.
         sequence: u64,
-        /// Points of the sweep that went into it.
+        /// Sweep points used.
         points: usize,
-        /// How long the estimate took.
+        /// Computing time of the estimate.
         seconds: f64,
     },
     /// A run has ended.
@@ -459,32 +462,34 @@ pub enum Event {
         error: Option<String>,
         /// The report, if one was made.
         report: Option<PathBuf>,
-        /// Points of the sweep, or cycles of the film, stored.
+        /// Sweep points or film cycles stored.
         stored: usize,
-        /// Points of the sweep missing.
+        /// Sweep points missing.
         missing: usize,
-        /// How the film went, where the run was one.
+        /// Summary of the film, if the run was a film.
         #[serde(default)]
         #[schemars(schema_with = "film_schema")]
         film: Option<FilmSummary>,
-        /// What makes the results worse than they look.
+        /// Reasons why the results may be worse than they look.
         #[serde(default)]
         warnings: Vec<String>,
-        /// Seconds from the end of the last frame's exposure to the transport on disk; nothing where none was made.
+        /// Seconds from the end of the last frame's exposure to the transport on disk; `None` if no transport
+        /// was computed.
         #[serde(default)]
         final_s: Option<f64>,
-        /// Seconds from the first frame with light to the end of the last: without the probe and the dark points.
+        /// Seconds from the first frame with light to the end of the last, without the probe and the dark
+        /// points.
         #[serde(default)]
         light_s: Option<f64>,
     },
-    /// This many events were left out because the subscriber read too slowly.
+    /// Events were dropped because the subscriber read too slowly.
     Skipped {
-        /// How many.
+        /// Number of dropped events.
         events: u64,
     },
 }
 
-/// Stable codes of what can go wrong; the number is the JSON-RPC error's `code`.
+/// Stable error codes; the number is the `code` of the JSON-RPC error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ErrorCode {
@@ -518,7 +523,7 @@ pub enum ErrorCode {
     TooManyClients = 9,
 }
 
-/// An error as a JSON-RPC error object carries it.
+/// An error in the form of a JSON-RPC error object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, thiserror::Error)]
 #[error("{message}")]
 pub struct RpcError {
@@ -526,20 +531,20 @@ pub struct RpcError {
     pub code: i64,
     /// What happened: field, value, what is allowed, what to do.
     pub message: String,
-    /// More, for programs.
+    /// Details for programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub data: Option<ErrorData>,
 }
 
-/// What a program may want to know of an error.
+/// Machine-readable details of an error.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ErrorData {
-    /// The code by name.
+    /// The code's name.
     pub name: ErrorCode,
-    /// The offending field, `sweep.delay_us.count` for example.
+    /// The offending field, for example `sweep.delay_us.count`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub field: Option<String>,
-    /// Bytes from..to of the plan's text that the error is about.
+    /// Byte range (from, to) in the plan's text that the error is about.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub span: Option<(usize, usize)>,
     /// What to do.
@@ -548,13 +553,13 @@ pub struct ErrorData {
 }
 
 impl RpcError {
-    /// An error with its code and nothing more.
+    /// An error with a code and a message only.
     pub fn new(code: ErrorCode, message: impl Into<String>) -> Self {
         let data = ErrorData { name: code, field: None, span: None, help: None };
         Self { code: code as i64, message: message.into(), data: Some(data) }
     }
 
-    /// The same, about a field of what was sent.
+    /// Adds the field that the error is about.
     #[must_use]
     pub fn of_field(mut self, field: impl Into<String>) -> Self {
         if let Some(data) = &mut self.data {
@@ -563,7 +568,7 @@ impl RpcError {
         self
     }
 
-    /// The same, with what to do.
+    /// Adds what to do.
     #[must_use]
     pub fn with_help(mut self, help: impl Into<String>) -> Self {
         if let Some(data) = &mut self.data {
@@ -572,7 +577,7 @@ impl RpcError {
         self
     }
 
-    /// The error's code by name, if it is one of ours.
+    /// The name of the error's code, if it is one of [`ErrorCode`].
     pub fn name(&self) -> Option<ErrorCode> {
         self.data.as_ref().map(|data| data.name)
     }
@@ -588,7 +593,7 @@ mod tests {
         let all = [Idle, Preparing, Armed, Running, Paused, Draining, Faulted];
         for state in [Preparing, Armed, Running, Paused] {
             assert!(state.may_become(Draining) && state.may_become(Faulted), "{state:?}");
-            // Only a run that was refused before it began leaves no trace.
+            // Only a run that was refused before it started leaves no trace.
             assert_eq!(state.may_become(Idle), state == Preparing, "{state:?}");
         }
         for state in all {

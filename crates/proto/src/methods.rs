@@ -1,4 +1,4 @@
-//! The one table of what can be asked, and its description for programs.
+//! The table of all methods, and its description for programs.
 
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::{Deserialize, Serialize};
@@ -9,45 +9,45 @@ use crate::{
     SessionInfo, Started, Status,
 };
 
-/// What a caller may do.
+/// Role of a caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Read.
+    /// May read.
     Observer,
-    /// Read, and drive the rig.
+    /// May read and operate the rig.
     Operator,
 }
 
-/// No parameters, or nothing to say beyond that it was done: `{}`.
+/// No parameters, or a result without content: `{}`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Empty {}
 
-/// What can be asked.
+/// The methods of the daemon.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Method {
-    /// This table.
+    /// Returns this table.
     Describe,
-    /// What the daemon is doing.
+    /// Returns what the daemon is doing.
     Status,
-    /// What a plan would do.
+    /// Returns what a plan would do.
     Check,
-    /// Begins a run.
+    /// Starts a run.
     Run,
-    /// Goes on with a session.
+    /// Acquires what a session lacks.
     Resume,
-    /// Holds a run.
+    /// Pauses the run.
     Pause,
-    /// Goes on after a pause.
+    /// Continues after a pause.
     Continue,
     /// Ends a run.
     Cancel,
     /// Permits light until the next boot.
     ArmLight,
-    /// The sessions on disk.
+    /// Lists the sessions on disk.
     Sessions,
-    /// Events from now on.
+    /// Streams all events from now on.
     Subscribe,
 }
 
@@ -133,12 +133,12 @@ impl Method {
         self.row().name
     }
 
-    /// The method of a name.
+    /// The method with this name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|method| method.name() == name)
     }
 
-    /// What a caller must be to call it.
+    /// The role that a caller needs.
     pub const fn role(self) -> Role {
         self.row().role
     }
@@ -149,24 +149,24 @@ impl Method {
 pub struct Description {
     /// Version of the daemon.
     pub version: String,
-    /// What can be called.
+    /// The methods.
     pub methods: Vec<MethodInfo>,
     /// JSON Schema of the `params` of the notification `event`.
     pub event: Schema,
-    /// What can go wrong.
+    /// The error codes.
     pub errors: Vec<ErrorInfo>,
-    /// What is bounded.
+    /// The limits.
     pub limits: LimitsInfo,
-    /// How to read the live file that `status` names.
+    /// Layout of the live file that `status` names.
     pub live: LiveLayout,
 }
 
-/// A method for programs.
+/// Description of a method.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MethodInfo {
     /// Its name on the wire.
     pub name: String,
-    /// What a caller must be to call it.
+    /// The role that a caller needs.
     pub role: Role,
     /// What it does.
     pub about: String,
@@ -176,7 +176,7 @@ pub struct MethodInfo {
     pub result: Schema,
 }
 
-/// An error code for programs.
+/// Description of an error code.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ErrorInfo {
     /// `error.data.name`
@@ -187,16 +187,16 @@ pub struct ErrorInfo {
     pub meaning: String,
 }
 
-/// What the daemon bounds.
+/// Limits of the daemon.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LimitsInfo {
-    /// The longest request, without its line feed; a longer one ends the connection.
+    /// Maximum bytes of a request, without its line feed; a longer one ends the connection.
     pub message_bytes: usize,
-    /// How many clients may be connected at once.
+    /// Maximum number of connected clients.
     pub clients: usize,
 }
 
-/// What `describe` answers, for a daemon of this version.
+/// The result of `describe` for a daemon of this version.
 pub fn describe(version: &str) -> Description {
     let methods = Method::ALL.map(|method| {
         let Row { name, role, about, params, result } = method.row();
@@ -212,7 +212,7 @@ pub fn describe(version: &str) -> Description {
     }
 }
 
-/// Names and meanings are those of the schema that the type derives, so that no code can be forgotten here.
+/// Names and meanings come from the schema that the type derives, so that no code can be missing here.
 fn error_codes() -> Vec<ErrorInfo> {
     let schema = schema::<ErrorCode>();
     let variants = schema.get("oneOf").and_then(|variants| variants.as_array());

@@ -1,5 +1,5 @@
-//! JSON-RPC 2.0 (<https://www.jsonrpc.org/specification>) as it travels here: one object a line, parameters by name,
-//! no batches.
+//! JSON-RPC 2.0 (<https://www.jsonrpc.org/specification>) as used here: one object per line, parameters by
+//! name, no batches.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -7,7 +7,7 @@ use serde_json::{Map, Number, Value};
 
 use crate::{ErrorCode, Event, RpcError};
 
-/// The only version of JSON-RPC that is spoken here.
+/// The only supported version of JSON-RPC.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 enum Version {
     #[default]
@@ -15,15 +15,15 @@ enum Version {
     V2,
 }
 
-/// What ties an answer to its request; the caller chooses it.
+/// Links an answer to its request; chosen by the caller.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Id {
-    /// A number, sent back as it came.
+    /// A number, returned unchanged.
     Number(Number),
     /// A string.
     String(String),
-    /// In an answer: the request was too broken to have one.
+    /// Only in answers: the id of the request could not be read.
     Null,
 }
 
@@ -31,7 +31,7 @@ pub enum Id {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Request {
     jsonrpc: Version,
-    /// Absent in a notification, which is carried out and not answered.
+    /// Absent in a notification, which is executed but not answered.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub id: Option<Id>,
     /// The method's name.
@@ -42,7 +42,7 @@ pub struct Request {
 }
 
 impl Request {
-    /// A call that wants an answer.
+    /// A call that expects an answer.
     pub fn new(id: u64, method: impl Into<String>, params: Map<String, Value>) -> Self {
         let id = Some(Id::Number(id.into()));
         Self { jsonrpc: Version::V2, id, method: method.into(), params }
@@ -143,25 +143,25 @@ pub fn params<T: DeserializeOwned>(params: Map<String, Value>) -> Result<T, RpcE
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Response {
     jsonrpc: Version,
-    /// The request's.
+    /// The id of the request.
     pub id: Id,
-    /// What came of it.
+    /// Result or error.
     #[serde(flatten)]
     pub outcome: Outcome,
 }
 
-/// What came of a request.
+/// The outcome of a request.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Outcome {
-    /// It was carried out.
+    /// The request succeeded.
     Result(Value),
-    /// It was not.
+    /// The request failed.
     Error(RpcError),
 }
 
 impl Response {
-    /// An answer to the request of this id.
+    /// The answer to the request with this id.
     pub fn new(id: Id, outcome: Result<Value, RpcError>) -> Self {
         let outcome = match outcome {
             Ok(value) => Outcome::Result(value),
@@ -170,7 +170,7 @@ impl Response {
         Self { jsonrpc: Version::V2, id, outcome }
     }
 
-    /// The answer that the request of this id failed.
+    /// An error answer to the request with this id.
     pub fn error(id: Id, error: RpcError) -> Self {
         Self::new(id, Err(error))
     }
@@ -181,7 +181,7 @@ impl Response {
 pub struct EventNotice {
     jsonrpc: Version,
     method: EventMethod,
-    /// What happened.
+    /// The event.
     pub params: Event,
 }
 
@@ -192,7 +192,7 @@ enum EventMethod {
 }
 
 impl EventNotice {
-    /// The notification of an event.
+    /// The notification for an event.
     pub fn new(event: Event) -> Self {
         Self { jsonrpc: Version::V2, method: EventMethod::Event, params: event }
     }

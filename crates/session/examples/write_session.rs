@@ -1,9 +1,11 @@
-//! Writes a whole session of a 15 x 5 delay-exposure sweep without noise into a data folder and prints its path:
+//! Writes a complete session of a 15 x 5 delay-exposure sweep without noise into a data folder and prints its
+//! path:
 //!
 //! `cargo run -p raysweep-session --example write_session -- DATA_FOLDER [SCENE.npy]`
 //!
-//! SCENE is float32 `[v, t, s]`, the image under each projector row alone; without it a small analytic scene is used.
-//! It shows how the parts of the crate belong together, and gives the readers in other languages something to read.
+//! SCENE is float32 `[v, t, s]`, the image under each single projector row; without it, a small analytic
+//! scene is used. The example shows how the parts of the crate work together, and creates test data for
+//! readers in other languages.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -114,7 +116,8 @@ fn acquire(
     Ok(session)
 }
 
-/// The image of one setting: each projector row with the share of its dwell that lies within the exposure.
+/// The image of one setting: each projector row, weighted with the share of its dwell time within the
+/// exposure.
 fn expose(scene: ArrayView3<f32>, delay_us: f64, exposure_us: f64) -> Array2<f32> {
     let (_, rows, columns) = scene.dim();
     let mut image = Array2::zeros((rows, columns));
@@ -197,7 +200,7 @@ fn process(
     Ok(())
 }
 
-/// `[v, t, s]` to `[u, t, s]` with u = v - t; rows that do not exist stay 0.
+/// Converts `[v, t, s]` to `[u, t, s]` with u = v - t; rows that do not exist stay 0.
 fn relative_rows(scene: &Array3<f32>) -> Array3<f32> {
     let (projector_rows, rows, columns) = scene.dim();
     let mut transport = Array3::zeros((projector_rows + rows - 1, rows, columns));

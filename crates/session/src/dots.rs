@@ -1,19 +1,20 @@
-//! `dots.zarr`: the sparse columns of a flying dot, a Zarr v3 group with one group `bNNNN` a batch.
+//! `dots.zarr`: the sparse columns of a flying dot, a Zarr v3 group with one subgroup `bNNNN` per batch.
 //!
 //! | array | type | axes | what |
 //! | --- | --- | --- | --- |
 //! | `word_offsets` | uint64 | `[dot + 1]` | where each dot's words begin |
-//! | `words` | uint32 | `[word]` | pixel / 32 of 32 pixels in a row of the frame, ascending in each dot |
-//! | `masks` | uint32 | `[word]` | which of them the dot has: bit `b` is pixel `32 word + b` |
+//! | `words` | uint32 | `[word]` | pixel / 32 of 32 consecutive pixels of the frame, ascending within each dot |
+//! | `masks` | uint32 | `[word]` | which of these pixels the dot has: bit `b` is pixel `32 word + b` |
 //! | `values` | float32 | `[pixel]` | their light, in the order of dots, words and bits |
 //! | `residual` | float32 | `[dot, block row, block column]` | mean light of the other pixels of each 32 x 32 block |
-//! | `discs` | uint32 | `[dot]` | discs that the denoising took; 0: nothing stood out of the background |
-//! | `capped` | bool | `[dot]` | whether it ended at the cap on discs |
+//! | `discs` | uint32 | `[dot]` | discs used by the denoising; 0: nothing above the background |
+//! | `capped` | bool | `[dot]` | whether the denoising stopped at the maximum number of discs |
 //! | `seen` | bool | `[dot]` | whether the dot has a frame that shows the scene; the others have no light |
 //!
-//! Light is in camera counts above the background, times the flat field's gain; signed. A pixel is `row * width + column`.
-//! Where the run knew a flat field, `flat` has it: `gain`, float32, and `repaired`, bool, `[t, s]`. A batch appears as a whole: its folder is written beside, synced, and renamed. One without a line in the ledger is not
-//! stored.
+//! Light is in camera counts above the background, times the flat field's gain; signed. A pixel is
+//! `row * width + column`. If the run had a flat field, `flat` contains it: `gain`, float32, and `repaired`,
+//! bool, `[t, s]`. A batch is written atomically: its folder is written next to its final place, synced, and
+//! renamed. A batch without a line in the ledger is not stored.
 
 mod flat;
 
@@ -33,7 +34,7 @@ use crate::{Error, Result};
 
 pub use self::flat::FlatArrays;
 
-/// Side of a residual's block in pixels.
+/// Side length of a residual block in pixels.
 const BLOCK_PX: usize = 32;
 
 /// The columns of one batch; the fields are the arrays of its group.
@@ -51,7 +52,7 @@ pub struct BatchColumns {
 }
 
 impl BatchColumns {
-    /// CRC-32 (the one of zip and PNG) of all arrays, little-endian, in the order of the fields.
+    /// CRC-32 (as in zip and PNG) of all arrays, little-endian, in the order of the fields.
     pub fn crc32(&self) -> u32 {
         let mut hasher = crc32fast::Hasher::new();
         self.word_offsets.iter().for_each(|value| hasher.update(&value.to_le_bytes()));
@@ -69,26 +70,26 @@ impl BatchColumns {
     }
 }
 
-/// A stored batch, as the ledger says it.
+/// A stored batch, as recorded in the ledger.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BatchEntry {
     /// Its index in `dots.zarr`.
     pub batch: usize,
-    /// The calibration plane that it shows, from 0; none: the scene.
+    /// The calibration plane that it shows, counted from 0; `None` for the scene.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plane: Option<usize>,
     /// Start of its first exposure, in seconds after that of the run's first batch.
     pub start_s: f64,
-    /// Dots of the scene that have no frame.
+    /// Dots of the scene without a frame.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub missing: Vec<usize>,
-    /// Dots of the scene in whose frames nothing stood out of the background.
+    /// Dots of the scene whose frames show nothing above the background.
     pub empty: usize,
-    /// Dots whose frames ended at the cap on discs.
+    /// Dots whose denoising stopped at the maximum number of discs.
     pub capped: usize,
-    /// Frames that came twice.
+    /// Frames received twice.
     pub duplicates: u64,
-    /// Where its triggers went.
+    /// What became of its triggers.
     pub counts: raysweep_core::Counts,
     /// See [`BatchColumns::crc32`].
     pub crc32: u32,
@@ -97,17 +98,17 @@ pub struct BatchEntry {
 /// `dots.zarr` of a session.
 pub struct Dots {
     dir: PathBuf,
-    /// Frames of a batch.
+    /// Frames per batch.
     dots: usize,
-    /// Rows and columns of blocks.
+    /// Number of block rows and block columns.
     blocks: [usize; 2],
 }
 
 impl Dots {
-    /// Makes the group without any batch at `dir`.
+    /// Creates the group at `dir`, without batches.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Zarr`] if the file system refuses.
     pub fn create(dir: &Path, shape: &StackShape) -> Result<Self> {
         let attributes = json!({
             "height": shape.rows,
@@ -120,7 +121,7 @@ impl Dots {
         Ok(Self::open(dir, shape))
     }
 
-    /// The group at `dir`.
+    /// Uses the existing group at `dir`.
     pub fn open(dir: &Path, shape: &StackShape) -> Self {
         let blocks = [shape.rows.div_ceil(BLOCK_PX), shape.columns.div_ceil(BLOCK_PX)];
         Self { dir: dir.to_owned(), dots: shape.dots, blocks }
@@ -130,11 +131,12 @@ impl Dots {
         self.dir.join(format!("b{batch:04}"))
     }
 
-    /// Writes a batch, replacing what was there; when this returns, it is durable. `attributes` become its group's.
+    /// Writes a batch, replacing any existing one; when this returns, it is durable. `attributes` become its
+    /// group's.
     ///
     /// # Errors
-    /// [`Error::Shape`] for arrays that are not those of so many dots and blocks; [`Error::Io`] or [`Error::Zarr`] where
-    /// the file system refuses.
+    /// [`Error::Shape`] if the arrays do not match the number of dots and blocks; [`Error::Io`] or
+    /// [`Error::Zarr`] if the file system refuses.
     pub fn write(&self, batch: usize, columns: &BatchColumns, attributes: Map<String, Value>) -> Result<()> {
         let (dots, [rows, across]) = (self.dots, self.blocks);
         let lengths = [
@@ -176,10 +178,10 @@ impl Dots {
         draft.commit()
     }
 
-    /// Reads a batch; that its arrays fit each other is for the reader to check.
+    /// Reads a batch; the caller has to check that its arrays are consistent.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where there is none or it is damaged.
+    /// [`Error::Zarr`] if it is missing or damaged.
     pub fn read(&self, batch: usize) -> Result<BatchColumns> {
         let path = self.path_of(batch);
         if !path.is_dir() {
@@ -200,10 +202,10 @@ impl Dots {
     }
 }
 
-/// `raw.npy` and `raw.csv`: the raw frames of a flying dot in the order in which they came, uint16 `[frame, t, s]`, and
-/// a line for each with its number in the file, the camera's id, and its batch and dot, both empty where it has none.
-/// Lines come when that is certain, so not quite in order. A file that a crash cut short says that it has no frames; its
-/// length tells how many there are.
+/// `raw.npy` and `raw.csv`: the raw frames of a flying dot in order of arrival, uint16 `[frame, t, s]`, and
+/// one line per frame with its number in the file, the camera's id, and its batch and dot, both empty if it
+/// belongs to none. Lines are written once that is certain, so they are not strictly in order. The header of
+/// a file that a crash cut short states 0 frames; its length tells how many there are.
 pub struct RawFrames {
     path: PathBuf,
     frames: BufWriter<File>,
@@ -212,14 +214,14 @@ pub struct RawFrames {
     count: u64,
 }
 
-/// Bytes of the header of `raw.npy`, whatever the number of frames.
+/// Bytes of the header of `raw.npy`, for any number of frames.
 const HEADER_BYTES: usize = 128;
 
 impl RawFrames {
-    /// Makes both files, without frames; `path` is that of `raw.npy`.
+    /// Creates both files, without frames; `path` is that of `raw.npy`.
     ///
     /// # Errors
-    /// [`Error::Io`] where the file system refuses.
+    /// [`Error::Io`] if the file system refuses.
     pub fn create(path: &Path, rows: usize, columns: usize) -> Result<Self> {
         let make = |path: &Path| File::create(path).map(BufWriter::new).map_err(Error::io("create", path));
         let table = path.with_extension("csv");
@@ -230,7 +232,7 @@ impl RawFrames {
         Ok(Self { path: path.to_owned(), frames, lines, size, count: 0 })
     }
 
-    /// Frames so far.
+    /// Number of frames so far.
     pub fn len(&self) -> u64 {
         self.count
     }
@@ -243,7 +245,7 @@ impl RawFrames {
     /// Appends a frame, row by row.
     ///
     /// # Errors
-    /// [`Error::Shape`] for a frame of another size, [`Error::Io`] where the file system refuses.
+    /// [`Error::Shape`] for a frame of another size, [`Error::Io`] if the file system refuses.
     pub fn push(&mut self, frame: &[u16]) -> Result<()> {
         let [rows, columns] = self.size;
         if frame.len() != rows * columns {
@@ -263,10 +265,10 @@ impl RawFrames {
         written.map_err(Error::io("write", &self.path))
     }
 
-    /// Notes which dot of which batch a frame shows.
+    /// Records which dot of which batch a frame shows.
     ///
     /// # Errors
-    /// [`Error::Io`] where the file system refuses.
+    /// [`Error::Io`] if the file system refuses.
     pub fn note(&mut self, frame: u64, id: u64, place: Option<(usize, usize)>) -> Result<()> {
         let written = match place {
             Some((batch, dot)) => writeln!(self.lines, "{frame},{id},{batch},{dot}"),
@@ -275,10 +277,10 @@ impl RawFrames {
         written.map_err(Error::io("write", &self.path.with_extension("csv")))
     }
 
-    /// Ends the files; when this returns, they are durable.
+    /// Completes the files; when this returns, they are durable.
     ///
     /// # Errors
-    /// [`Error::Io`] where the file system refuses.
+    /// [`Error::Io`] if the file system refuses.
     pub fn finish(self) -> Result<()> {
         let Self { path, frames, lines, size, count } = self;
         for (file, header) in [(frames, Some(header(count, size))), (lines, None)] {
@@ -299,7 +301,7 @@ fn header(count: u64, [rows, columns]: [usize; 2]) -> [u8; HEADER_BYTES] {
     let text = format!("{{'descr': '<u2', 'fortran_order': False, 'shape': ({count}, {rows}, {columns}), }}");
     let mut header = [b' '; HEADER_BYTES];
     header[..10].copy_from_slice(b"\x93NUMPY\x01\x00\x76\x00");
-    // At most 20 digits a length: it always fits.
+    // A length has at most 20 digits, so the text always fits.
     header[10..10 + text.len()].copy_from_slice(text.as_bytes());
     header[HEADER_BYTES - 1] = b'\n';
     header
@@ -310,7 +312,7 @@ struct Put<'a> {
 }
 
 impl Put<'_> {
-    /// One array of one chunk.
+    /// Writes an array as a single chunk.
     fn array<T: Element>(
         &self,
         name: &str,
@@ -328,7 +330,7 @@ impl Put<'_> {
             return Ok(());
         }
         let path = self.store.root().join(name);
-        // One thread: batches are written while frames of the next arrive, and they need the others.
+        // One thread only: the next frames arrive while batches are written, and need the other threads.
         let options = zarr::codec_options().with_concurrent_target(1);
         array.store_chunk_opt(&vec![0; shape.len()], values, &options).map_err(Error::zarr("write", &path))
     }
@@ -351,7 +353,7 @@ impl Get {
     }
 }
 
-/// Makes files and folders of a folder durable, all at once.
+/// Makes all files and subfolders of a folder durable at once.
 fn sync_all(dir: &Path) -> Result<()> {
     for entry in fs::read_dir(dir).map_err(Error::io("list", dir))? {
         let path = entry.map_err(Error::io("list", dir))?.path();

@@ -1,7 +1,7 @@
-//! Writes that survive a power cut: either the old content or the new one is there, never a part.
+//! Writes that survive a power cut: afterwards either the old or the new content exists, never a part.
 //!
-//! The order is: temporary file in the same folder, data, fsync, rename, fsync of the folder (the rename itself is
-//! only durable with the last step).
+//! The order is: temporary file in the same folder, data, fsync, rename, fsync of the folder (which makes the
+//! rename durable).
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -14,30 +14,31 @@ use nix::sys::statvfs::statvfs;
 
 use crate::{Error, Result};
 
-/// How the name of every temporary file and folder ends.
+/// Suffix of the names of all temporary files and folders.
 pub const TEMPORARY_SUFFIX: &str = ".raysweep-tmp";
 
-/// Replaces the file at `path` by `bytes`, durably and atomically. A stale temporary file is overwritten.
+/// Replaces the file at `path` with `bytes`, durably and atomically. Overwrites a stale temporary file.
 ///
 /// # Errors
-/// [`Error::Io`] where the file system refuses; the file at `path` is then as before.
+/// [`Error::Io`] if the file system refuses; the file at `path` is then unchanged.
 pub fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     write_with(path, |file| write_in_pieces(file, bytes))
 }
 
-/// A kernel without preemption (common in virtual machines) runs nothing else on the core while it takes one write,
-/// and needs 5 ms for 2 MiB of fresh pages: a camera's settings would come too late for their trigger.
+/// Bytes per write. A kernel without preemption (common in virtual machines) runs nothing else on the core
+/// during one write, and needs 5 ms for 2 MiB of new pages: a camera's settings would arrive too late for
+/// their trigger.
 const PIECE_BYTES: usize = 128 << 10;
 
-/// Writes all bytes, and leaves the core to real-time threads in between.
+/// Writes all bytes in small pieces, so that real-time threads can run in between.
 pub(crate) fn write_in_pieces(file: &mut File, bytes: &[u8]) -> io::Result<()> {
     bytes.chunks(PIECE_BYTES).try_for_each(|piece| file.write_all(piece))
 }
 
-/// As [`write`], with what `fill` writes into the temporary file.
+/// As [`write`], with the content that `fill` writes into the temporary file.
 ///
 /// # Errors
-/// What `fill` gives, or [`Error::Io`]; the file at `path` is then as before.
+/// The error of `fill`, or [`Error::Io`]; the file at `path` is then unchanged.
 pub fn write_with(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<()>) -> Result<()> {
     let mut draft = DraftFile::create(path)?;
     let filled = fill(&mut draft.file);
@@ -45,19 +46,19 @@ pub fn write_with(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<()>) -
     draft.commit()
 }
 
-/// Makes a new folder, durably. Its existence is the lock: it fails where something has this name.
+/// Creates a new folder, durably. It can serve as a lock: this fails if the name exists.
 ///
 /// # Errors
-/// [`Error::Io`], of the kind `AlreadyExists` where something has this name.
+/// [`Error::Io`], of the kind `AlreadyExists` if the name exists.
 pub fn create_dir(path: &Path) -> Result<()> {
     fs::create_dir(path).map_err(Error::io("create folder", path))?;
     sync_dir(parent(path))
 }
 
-/// Makes a folder and those above it where they are missing, durably.
+/// Creates a folder and its missing parents, durably.
 ///
 /// # Errors
-/// [`Error::Io`] where the file system refuses.
+/// [`Error::Io`] if the file system refuses.
 pub fn create_dir_all(path: &Path) -> Result<()> {
     if path.as_os_str().is_empty() || path.is_dir() {
         return Ok(());
@@ -71,27 +72,28 @@ pub fn create_dir_all(path: &Path) -> Result<()> {
     }
 }
 
-/// Replaces the folder at `path` by one that `fill` writes, durably. `fill` gets the temporary folder and must write
-/// its files durably. Readers see the old folder or the new one: the two are exchanged in one step where the file
-/// system can (all local Linux ones can); where it cannot, a crash between two renames leaves neither.
+/// Replaces the folder at `path` with one that `fill` writes, durably. `fill` gets the temporary folder and
+/// must write its files durably. Readers see either the old or the new folder: they are exchanged atomically
+/// if the file system supports it (all local Linux ones do). Otherwise, a crash between the two renames
+/// leaves neither in place.
 ///
 /// # Errors
-/// What `fill` gives, or [`Error::Io`]; the folder at `path` is then as before.
+/// The error of `fill`, or [`Error::Io`]; the folder at `path` is then unchanged.
 pub fn replace_dir(path: &Path, fill: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let draft = DraftDir::create(path)?;
     fill(draft.path())?;
     draft.commit()
 }
 
-/// A folder that is written over some time beside the one that it will replace; as [`replace_dir`]. Dropped without
-/// [`DraftDir::commit`], it is removed.
+/// A folder that is written gradually next to the one that it will replace, as in [`replace_dir`]. Removed if
+/// dropped without [`DraftDir::commit`].
 pub(crate) struct DraftDir {
     target: PathBuf,
     path: PathBuf,
 }
 
 impl DraftDir {
-    /// Makes the temporary folder, in place of one that a crash left.
+    /// Creates the temporary folder, replacing one that a crash left behind.
     pub(crate) fn create(target: &Path) -> Result<DraftDir> {
         let path = temporary_path(target);
         if path.exists() {
@@ -106,7 +108,7 @@ impl DraftDir {
         &self.path
     }
 
-    /// Puts the folder in its place.
+    /// Moves the folder to its final place.
     pub(crate) fn commit(self) -> Result<()> {
         let DraftDir { target, path } = &self;
         sync_dir(path)?;
@@ -125,13 +127,13 @@ impl DraftDir {
 
 impl Drop for DraftDir {
     fn drop(&mut self) {
-        // After a commit nothing is there; what cannot be removed is removed by the next writer.
+        // Nothing is left after a commit. What cannot be removed here is removed by the next writer.
         let _ = fs::remove_dir_all(&self.path);
     }
 }
 
-/// A file that is written over some time beside the one that it will replace; as [`write`]. Dropped without
-/// [`DraftFile::commit`], it is removed.
+/// A file that is written gradually next to the one that it will replace, as in [`write`]. Removed if dropped
+/// without [`DraftFile::commit`].
 pub(crate) struct DraftFile {
     target: PathBuf,
     path: PathBuf,
@@ -139,7 +141,7 @@ pub(crate) struct DraftFile {
 }
 
 impl DraftFile {
-    /// Makes the temporary file; a stale one is overwritten.
+    /// Creates the temporary file; overwrites a stale one.
     pub(crate) fn create(target: &Path) -> Result<DraftFile> {
         let path = temporary_path(target);
         let file = File::create(&path).map_err(Error::io("write", &path))?;
@@ -151,12 +153,12 @@ impl DraftFile {
         &self.file
     }
 
-    /// For `map_err` of writes to [`DraftFile::file`].
+    /// For `map_err` on writes to [`DraftFile::file`].
     pub(crate) fn failed(&self) -> impl FnOnce(io::Error) -> Error {
         Error::io("write", &self.path)
     }
 
-    /// Puts the file in its place.
+    /// Moves the file to its final place.
     pub(crate) fn commit(self) -> Result<()> {
         self.file.sync_all().map_err(self.failed())?;
         fs::rename(&self.path, &self.target).map_err(Error::io("replace", &self.target))?;
@@ -166,16 +168,16 @@ impl DraftFile {
 
 impl Drop for DraftFile {
     fn drop(&mut self) {
-        // After a commit nothing is there; what cannot be removed is removed by the next writer.
+        // Nothing is left after a commit. What cannot be removed here is removed by the next writer.
         let _ = fs::remove_file(&self.path);
     }
 }
 
-/// Removes the temporary files and folders that a crash left anywhere below `dir`; gives their number. Only for the
-/// one process that writes there.
+/// Removes the temporary files and folders that crashes left anywhere below `dir`; returns how many. Only the
+/// single process that writes there may call it.
 ///
 /// # Errors
-/// [`Error::Io`] where the file system refuses.
+/// [`Error::Io`] if the file system refuses.
 pub fn remove_leftovers(dir: &Path) -> Result<usize> {
     let mut removed = 0;
     for entry in fs::read_dir(dir).map_err(Error::io("list", dir))? {
@@ -193,21 +195,21 @@ pub fn remove_leftovers(dir: &Path) -> Result<usize> {
     Ok(removed)
 }
 
-/// Bytes that an unprivileged process may still write to the file system that holds `dir`.
+/// Free bytes for an unprivileged process on the file system that contains `dir`.
 ///
 /// # Errors
-/// [`Error::Io`] where `dir` does not exist.
+/// [`Error::Io`] if `dir` does not exist.
 pub fn available_bytes(dir: &Path) -> Result<u64> {
     let stat = statvfs(dir).map_err(|errno| Error::io("examine", dir)(errno.into()))?;
     Ok(stat.blocks_available() * stat.fragment_size())
 }
 
-/// Whether a path is one of a temporary file or folder.
+/// Whether a path is that of a temporary file or folder.
 pub(crate) fn is_temporary(path: &Path) -> bool {
     path.as_os_str().as_encoded_bytes().ends_with(TEMPORARY_SUFFIX.as_bytes())
 }
 
-/// Makes the entries of a folder durable.
+/// Makes the directory entries of a folder durable.
 pub(crate) fn sync_dir(dir: &Path) -> Result<()> {
     File::open(dir).and_then(|folder| folder.sync_all()).map_err(Error::io("sync folder", dir))
 }

@@ -1,4 +1,4 @@
-//! What can go wrong with a session's files.
+//! Errors of a session's files.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,17 +6,17 @@ use std::path::{Path, PathBuf};
 /// A result of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// What can go wrong with a session's files. Each message names the path and what to do.
+/// Errors of a session's files. Each message names the path and what to do.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The file system refused.
+    /// The file system refused an operation.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
-        /// What was tried, as a verb.
+        /// The operation, as a verb.
         action: &'static str,
-        /// On what.
+        /// The file or folder.
         path: PathBuf,
-        /// What the file system said.
+        /// The file system's error.
         source: io::Error,
     },
     /// The folder is not a session.
@@ -46,7 +46,7 @@ pub enum Error {
         /// What is wrong with it.
         why: String,
     },
-    /// An entry would not read back as it was meant, so it was not written.
+    /// An entry would not read back unchanged, so it was not written.
     #[error("{}: an entry was refused: {why}", path.display())]
     Entry {
         /// The ledger.
@@ -57,72 +57,72 @@ pub enum Error {
     /// The session was written by a newer raysweep.
     #[error("{} has format {found}, this raysweep knows formats up to {known}; use a newer raysweep", path.display())]
     NewerFormat {
-        /// The file that says so.
+        /// The file with that format.
         path: PathBuf,
-        /// The format that it states.
+        /// Its format.
         found: u32,
-        /// The newest format known here.
+        /// The newest supported format.
         known: u32,
     },
     /// Data of the wrong shape.
     #[error("{what} has the shape {found:?}, allowed is {allowed}")]
     Shape {
-        /// What was given.
+        /// The data.
         what: String,
         /// Its shape.
         found: Vec<usize>,
-        /// What is allowed.
+        /// The allowed shape.
         allowed: String,
     },
-    /// A point that the array does not have.
+    /// An index that the array does not have.
     #[error("index {index} is outside of array `{array}`, which has {len} points (0 to {})", len.saturating_sub(1))]
     Index {
         /// The array.
         array: &'static str,
-        /// The index asked for.
+        /// The requested index.
         index: usize,
-        /// How many there are.
+        /// The array's length.
         len: usize,
     },
-    /// A point's data are not in the stack.
+    /// The data of a point are not in the stack.
     #[error("{}: array `{array}` holds no data at index {index}; acquire the point again with `raysweep resume`", path.display())]
     NotStored {
         /// The stack.
         path: PathBuf,
         /// The array.
         array: &'static str,
-        /// The point.
+        /// The point's index.
         index: usize,
     },
     /// A Zarr hierarchy could not be read or written.
     #[error("cannot {action} {}: {source}", path.display())]
     Zarr {
-        /// What was tried, as a verb.
+        /// The operation, as a verb.
         action: &'static str,
         /// The hierarchy or array.
         path: PathBuf,
-        /// What the library said.
+        /// The library's error.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// A file could not be encoded or decoded.
     #[error("cannot {action} {what}: {why}")]
     Codec {
-        /// What was tried, as a verb.
+        /// The operation, as a verb.
         action: &'static str,
         /// The file or part.
         what: String,
-        /// What the library said.
+        /// The library's error.
         why: String,
     },
 }
 
 impl Error {
-    /// For `map_err`: what was tried on which path.
+    /// For `map_err`: the operation and its path.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
         move |source| Error::Io { action, path: path.to_owned(), source }
     }
 
-    /// For `map_err`: what was tried on which hierarchy.
+    /// For `map_err`: the operation and its hierarchy.
     pub(crate) fn zarr<E>(action: &'static str, path: &Path) -> impl FnOnce(E) -> Error
     where
         E: std::error::Error + Send + Sync + 'static,
@@ -130,7 +130,7 @@ impl Error {
         move |source| Error::Zarr { action, path: path.to_owned(), source: Box::new(source) }
     }
 
-    /// For `map_err`: which file could not be encoded or decoded.
+    /// For `map_err`: the operation and its file.
     pub(crate) fn codec<E: ToString>(action: &'static str, what: impl ToString) -> impl FnOnce(E) -> Error {
         move |why| Error::Codec { action, what: what.to_string(), why: why.to_string() }
     }

@@ -12,16 +12,16 @@ use serde_json::{Map, Value};
 
 use crate::{Error, Result};
 
-/// What stands before each attribute's name, so that none can meet one of OpenEXR's own.
+/// Prefix of each attribute's name, so that none clashes with OpenEXR's own.
 const ATTRIBUTE_PREFIX: &str = "raysweep.";
-/// Magic number and version, which precede the attributes.
+/// Bytes of magic number and version, which precede the attributes.
 const PREAMBLE_BYTES: usize = 8;
 
-/// Encodes channels of one size `[row, column]`. A string of `metadata` becomes a text attribute as it is, anything
-/// else one of JSON.
+/// Encodes channels `[row, column]` of one size. Strings in `metadata` become text attributes as they are;
+/// other values are written as JSON text.
 ///
 /// # Errors
-/// [`Error::Codec`] for an empty image or an attribute's name of more than 246 bytes.
+/// [`Error::Codec`] for an empty image or an attribute name of more than 246 bytes.
 pub(crate) fn encode(channels: &[(&str, ArrayView2<f32>)], metadata: &Map<String, Value>) -> Result<Vec<u8>> {
     let (rows, columns) = channels.first().map_or((0, 0), |(_, values)| values.dim());
     if rows == 0 || columns == 0 {
@@ -53,7 +53,7 @@ pub(crate) fn encode(channels: &[(&str, ArrayView2<f32>)], metadata: &Map<String
     sort_attributes(file.into_inner())
 }
 
-/// The library keeps attributes in a hash map and so writes them in random order.
+/// Sorts the attributes: the library keeps them in a hash map and writes them in random order.
 fn sort_attributes(file: Vec<u8>) -> Result<Vec<u8>> {
     let torn = || Error::codec("encode", "an EXR image")("its header is not as expected");
     let mut attributes = Vec::new();
@@ -68,7 +68,7 @@ fn sort_attributes(file: Vec<u8>) -> Result<Vec<u8>> {
     Ok([&file[..PREAMBLE_BYTES], &attributes.concat(), rest].concat())
 }
 
-/// Length of the attribute that starts here: name, 0, type, 0, length of the value as int32, value.
+/// Length of the attribute at the start of `header`: name, 0, type, 0, length of the value as int32, value.
 fn attribute_bytes(header: &[u8]) -> Option<usize> {
     let end_of_string =
         |from: usize| Some(from + header.get(from..)?.iter().position(|&byte| byte == 0)? + 1);
@@ -78,7 +78,7 @@ fn attribute_bytes(header: &[u8]) -> Option<usize> {
     Some(value_at + usize::try_from(value_len).ok()?)
 }
 
-/// OpenEXR's strings are UTF-8, which the library's own conversion refuses beyond Latin-1.
+/// Converts to UTF-8, which OpenEXR uses; the library's own conversion refuses characters beyond Latin-1.
 fn utf8(text: &str) -> Text {
     Text::from_slice_unchecked(text.as_bytes())
 }

@@ -1,12 +1,14 @@
-//! `film.zarr` and `transport_film.zarr`: what a film saw and what was made of it, Zarr v3 groups.
+//! `film.zarr` and `transport_film.zarr`: the frames of a film and the transports computed from them, Zarr v3
+//! groups.
 //!
 //! | array | type | axes | what |
 //! | --- | --- | --- | --- |
 //! | `film.zarr/film` | uint16 | `[cycle, setting, t, s]` | raw frames in camera counts (DN), settings in the plan's order |
 //! | `transport_film.zarr/transport` | float32 | `[cycle, u, t, s]` | light transport of each cycle, as in [`crate::transport`] |
 //!
-//! One shard is one cycle, so that a cycle costs one fsync of a file and one of a folder. A cycle without a line in
-//! the ledger is not stored, whatever `film` holds there; in `transport` a cycle that was not estimated is NaN.
+//! One shard is one cycle, so that a cycle costs one fsync of a file and one of a folder. A cycle without a
+//! line in the ledger is not stored, whatever `film` contains; in `transport`, a cycle that was not estimated
+//! is NaN.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -22,11 +24,11 @@ use crate::stack::StackShape;
 use crate::zarr::{self, CHUNK_PX, DurableStore};
 use crate::{Error, Result};
 
-/// A series of volumes in time: one array of four axes, one shard a cycle.
+/// A time series of volumes: one array of four axes, one shard per cycle.
 pub struct CycleArray<T> {
     path: PathBuf,
     array: Array<DurableStore>,
-    /// `[depth, t, s]` of a cycle.
+    /// Shape of a cycle, `[depth, t, s]`.
     shape: [usize; 3],
     element: std::marker::PhantomData<T>,
 }
@@ -37,21 +39,21 @@ pub type Film = CycleArray<u16>;
 /// `transport_film.zarr/transport` `[cycle, u, t, s]`.
 pub type TransportFilm = CycleArray<f32>;
 
-/// What a cycle array is in its group.
+/// Layout of a cycle array in its group.
 struct Layout {
     name: &'static str,
     axes: [&'static str; 4],
-    /// Settings or relative rows in an inner chunk.
+    /// Number of settings or relative rows in an inner chunk.
     chunk_depth: usize,
     data_type: DataType,
     fill: FillValue,
 }
 
 impl Film {
-    /// Makes an empty film at `dir`.
+    /// Creates an empty film at `dir`.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Zarr`] if the file system refuses.
     pub fn create(dir: &Path, shape: &StackShape) -> Result<Self> {
         let cycle = [shape.settings, shape.rows, shape.columns];
         let attributes = Map::from_iter([("units".to_owned(), Value::from("DN"))]);
@@ -61,7 +63,7 @@ impl Film {
     /// Opens the film at `dir`.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where it cannot be read, [`Error::Shape`] where it has another shape.
+    /// [`Error::Zarr`] if it cannot be read, [`Error::Shape`] if it has another shape.
     pub fn open(dir: &Path, shape: &StackShape) -> Result<Self> {
         let opened = Self::open_array(dir, &film_layout())?;
         let expected = [shape.points, shape.settings, shape.rows, shape.columns];
@@ -75,11 +77,11 @@ impl Film {
 }
 
 impl TransportFilm {
-    /// Makes an empty series of `cycles` transports `[u, t, s]` at `dir`, in place of what is there. `attributes` become
-    /// the array's: `u_min`, `row_time_us`, the prior and whatever made it.
+    /// Creates an empty series of `cycles` transports `[u, t, s]` at `dir`, replacing any existing one.
+    /// `attributes` become those of the array: `u_min`, `row_time_us`, the prior and how it was computed.
     ///
     /// # Errors
-    /// [`Error::Zarr`] or [`Error::Io`] where the file system refuses.
+    /// [`Error::Zarr`] or [`Error::Io`] if the file system refuses.
     pub fn create(
         dir: &Path,
         cycles: usize,
@@ -95,12 +97,12 @@ impl TransportFilm {
     /// Opens the series at `dir`.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where there is none or it is damaged.
+    /// [`Error::Zarr`] if it is missing or damaged.
     pub fn open(dir: &Path) -> Result<Self> {
         Self::open_array(dir, &transport_layout(1))
     }
 
-    /// The attributes that it was made with.
+    /// The attributes that it was created with.
     pub fn attributes(&self) -> &Map<String, Value> {
         self.array.attributes()
     }
@@ -129,7 +131,7 @@ impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
         zarr::create_group(&store, Map::new())?;
         let [depth, rows, columns] = cycle;
         let chunk = [1, layout.chunk_depth, rows.min(CHUNK_PX), columns.min(CHUNK_PX)];
-        // A shard must be a whole number of inner chunks, so it may reach beyond the frame; what lies there is 0.
+        // A shard must consist of whole inner chunks, so it may extend beyond the frame; the excess is 0.
         let shard = [1, depth, rows.next_multiple_of(chunk[2]), columns.next_multiple_of(chunk[3])];
         let to_u64 = |axes: [usize; 4]| axes.map(|len| len as u64).to_vec();
         let mut builder = ArrayBuilder::new(
@@ -162,15 +164,15 @@ impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
         }
     }
 
-    /// How many cycles it has room for.
+    /// Number of cycles that it can hold.
     pub fn cycles(&self) -> usize {
         zarr::shape_of(&self.array)[0]
     }
 
-    /// Writes a cycle, replacing what was there; when this returns, it is durable.
+    /// Writes a cycle, replacing any existing one; when this returns, it is durable.
     ///
     /// # Errors
-    /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] if the file system refuses.
     pub fn write(&self, cycle: usize, data: ArrayView3<T>) -> Result<()> {
         self.check(cycle)?;
         if data.shape() != self.shape {
@@ -188,7 +190,7 @@ impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
         self.array.store_chunk_opt(&place, padded, &options()).map_err(Error::zarr("write", &self.path))
     }
 
-    /// Reads a cycle; nothing where none was written.
+    /// Reads a cycle; `None` if it was never written.
     ///
     /// # Errors
     /// [`Error::Index`], or [`Error::Zarr`] for damaged data.
@@ -211,12 +213,12 @@ impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
     }
 }
 
-/// One thread: a film is written while its next frames arrive, and they need the others.
+/// One thread only: the next frames arrive while a film is written, and need the other threads.
 fn options() -> CodecOptions {
     zarr::codec_options().with_concurrent_target(1)
 }
 
-/// CRC-32 (the one of zip and PNG) of a cycle's frames as little-endian uint16 in C order.
+/// CRC-32 (as in zip and PNG) of a cycle's frames as little-endian uint16 in C order.
 pub fn crc32(data: ArrayView3<u16>) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
     let mut row_bytes = Vec::with_capacity(data.len_of(ndarray::Axis(2)) * 2);
@@ -228,18 +230,18 @@ pub fn crc32(data: ArrayView3<u16>) -> u32 {
     hasher.finalize()
 }
 
-/// A stored cycle of a film, as the ledger says it.
+/// A stored cycle of a film, as recorded in the ledger.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CycleEntry {
     /// Its index in `film.zarr`.
     pub cycle: usize,
-    /// Start of the first exposure of its frames, in seconds after that of the film's first.
+    /// Start of the first exposure of its frames, in seconds after the film's first.
     pub start_s: f64,
-    /// The exposure time that the camera applied.
+    /// The exposure time that the camera applied, in us.
     pub exposure_us: f64,
-    /// The true delay of each setting's frame, from its exposure start and its VSYNC edge.
+    /// The true delay of each setting's frame in us, from its exposure start and its VSYNC edge.
     pub delays_us: Vec<f64>,
-    /// Where its triggers went.
+    /// What became of its triggers.
     pub counts: raysweep_core::Counts,
     /// CRC-32 of the stored frames, see [`crc32`].
     pub crc32: u32,

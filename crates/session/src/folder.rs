@@ -1,4 +1,4 @@
-//! The folder of a session, and the sessions of a data folder.
+//! The folder of a session, and listing the sessions of a data folder.
 
 use std::fs;
 use std::io;
@@ -14,7 +14,7 @@ use crate::products::Products;
 use crate::stack::Stack;
 use crate::{Error, Result, durable};
 
-/// Bytes of a session's name that go into its folder's name.
+/// Maximum bytes of a session's name that are used in its folder's name.
 const NAME_MAX_BYTES: usize = 64;
 
 /// A session's folder.
@@ -24,16 +24,18 @@ pub struct Session {
 }
 
 impl Session {
-    /// Makes the folder of a new session in `root` (made where it is missing), with `plan.toml` and `rig.toml` as
-    /// given, an empty stack (of a dot rig none) and the ledger's first line, which comes last: without it there is no session.
+    /// Creates the folder of a new session in `root` (which is created if it is missing): `plan.toml` and
+    /// `rig.toml` as given, an empty stack (not for a dot rig) and the ledger with its first line. The ledger
+    /// is written last: without it there is no session.
     ///
-    /// The folder is named `YYYYMMDD-HHMMSS_name` after `session.created` in UTC. Of the name, letters and digits of
-    /// any script, `-`, `_` and `.` stay, every run of anything else becomes one `-`, `-` and `.` at the ends go, and
-    /// it is cut to 64 bytes; a name of which nothing stays becomes `session`. Where the folder exists, `-2`, `-3`,
-    /// ... is appended: the making of the folder is the lock, and nothing is ever overwritten.
+    /// The folder is named `YYYYMMDD-HHMMSS_name` after `session.created` in UTC. In the name, letters and
+    /// digits of any script, `-`, `_` and `.` are kept; every run of other characters becomes one `-`; `-`
+    /// and `.` at the ends are removed; and the result is cut to 64 bytes. An empty result becomes `session`.
+    /// If the folder exists, `-2`, `-3`, ... is appended: creating the folder is the lock, and nothing is
+    /// ever overwritten.
     ///
     /// # Errors
-    /// [`Error::Io`] where the file system refuses, [`Error::Shape`] for an empty stack.
+    /// [`Error::Io`] if the file system refuses, [`Error::Shape`] for an empty stack.
     pub fn create(root: &Path, session: SessionEntry, plan: &str, rig: &str) -> Result<(Session, Ledger)> {
         session.shape.check()?;
         durable::create_dir_all(root)?;
@@ -55,10 +57,10 @@ impl Session {
         Ok((created, ledger))
     }
 
-    /// A session that exists, to read it or to go on with it ([`Session::resume`]).
+    /// Opens an existing session, to read it or to continue it ([`Session::resume`]).
     ///
     /// # Errors
-    /// [`Error::NotASession`] where there is no ledger.
+    /// [`Error::NotASession`] if there is no ledger.
     pub fn open(dir: &Path) -> Result<Session> {
         let session = Session { dir: dir.to_owned() };
         match fs::metadata(session.ledger_path()) {
@@ -73,18 +75,19 @@ impl Session {
         }
     }
 
-    /// Opens the session for writing (to acquire what is missing, or to make its products again), for this process
-    /// alone as long as the ledger is open: removes what a crash left and cuts a torn last line off the ledger.
+    /// Opens the session for writing (to acquire what is missing, or to compute its products again). While
+    /// the ledger is open, no other process can do so. Removes what a crash left behind and truncates a torn
+    /// last line of the ledger.
     ///
     /// # Errors
-    /// As [`Ledger::open`], [`Error::Io`] where a left-over cannot be removed.
+    /// As [`Ledger::open`], [`Error::Io`] if a leftover cannot be removed.
     pub fn resume(&self) -> Result<Ledger> {
         let ledger = Ledger::open(&self.ledger_path())?;
         durable::remove_leftovers(&self.dir)?;
         Ok(ledger)
     }
 
-    /// What the ledger says, read without locking it.
+    /// The state according to the ledger, read without locking it.
     ///
     /// # Errors
     /// As [`ledger::read_state`].
@@ -92,26 +95,26 @@ impl Session {
         ledger::read_state(&self.ledger_path())
     }
 
-    /// The stack, to read it and to add to it.
+    /// Opens the stack for reading and writing.
     ///
     /// # Errors
-    /// As [`Stack::open`]: it must be the stack that the ledger speaks of.
+    /// As [`Stack::open`]: its shape must match the ledger.
     pub fn stack(&self) -> Result<Stack> {
         Stack::open(&self.stack_path(), &self.state()?.session.shape)
     }
 
-    /// The frames of a film, to read them and to add to them.
+    /// Opens the frames of a film for reading and writing.
     ///
     /// # Errors
-    /// As [`Film::open`]: it must be the film that the ledger speaks of.
+    /// As [`Film::open`]: its shape must match the ledger.
     pub fn film(&self) -> Result<Film> {
         Film::open(&self.film_path(), &self.state()?.session.shape)
     }
 
-    /// The batches of a flying dot, to read them and to add to them.
+    /// Opens the batches of a flying dot for reading and writing.
     ///
     /// # Errors
-    /// Where the ledger cannot be read.
+    /// If the ledger cannot be read.
     pub fn dots(&self) -> Result<Dots> {
         Ok(Dots::open(&self.dots_path(), &self.state()?.session.shape))
     }
@@ -166,17 +169,18 @@ impl Session {
         self.dir.join("dots.zarr")
     }
 
-    /// `raw.npy`, the raw frames of a flying dot, where they are kept; see [`crate::dots::RawFrames`].
+    /// `raw.npy`, the raw frames of a flying dot, if they are kept; see [`crate::dots::RawFrames`].
     pub fn raw_path(&self) -> PathBuf {
         self.dir.join("raw.npy")
     }
 
-    /// Where the lighting pattern of a product is kept.
+    /// Path of a product's lighting pattern.
     pub fn pattern_path(&self, product: &str) -> PathBuf {
         self.dir.join("patterns").join(format!("{product}.npy"))
     }
 
-    /// `mirror-response.json`: how a mirror was found to answer, or which such finding its path was distorted by.
+    /// `mirror-response.json`: the measured response of a mirror, or the one that its path was predistorted
+    /// with.
     pub fn mirror_response_path(&self) -> PathBuf {
         self.dir.join("mirror-response.json")
     }
@@ -197,20 +201,20 @@ impl Session {
     }
 }
 
-/// What a list of sessions shows of one.
+/// A session in a list of sessions.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SessionSummary {
     /// Its folder.
     pub dir: PathBuf,
-    /// As given.
+    /// The session's name as given.
     pub name: String,
     /// The plan's kind.
     pub kind: String,
-    /// UTC.
+    /// Creation time, UTC.
     pub created: Timestamp,
-    /// Points of the sweep, cycles of the film, batches, or axes of a mirror that are planned.
+    /// Planned points: of a sweep, cycles of a film, batches, or axes of a mirror.
     pub points: usize,
-    /// Those of them that are stored.
+    /// Stored points of those planned.
     pub stored: usize,
     /// How its latest run ended; `None` while one is running and after a crash.
     pub end: Option<EndState>,
@@ -219,16 +223,17 @@ pub struct SessionSummary {
 /// The sessions of a data folder.
 #[derive(Debug, Default)]
 pub struct Listing {
-    /// By the folder's name, and so by age.
+    /// Sorted by folder name, and so by age.
     pub sessions: Vec<SessionSummary>,
-    /// The folders whose ledger cannot be read, with the reason.
+    /// Folders whose ledger cannot be read, with the reason.
     pub unreadable: Vec<(PathBuf, Error)>,
 }
 
-/// The sessions in a data folder; only their ledgers are read. Folders without a ledger are not sessions.
+/// Lists the sessions in a data folder; only their ledgers are read. Folders without a ledger are not
+/// sessions.
 ///
 /// # Errors
-/// [`Error::Io`] where `root` cannot be listed; what is wrong with one session stands in [`Listing::unreadable`].
+/// [`Error::Io`] if `root` cannot be listed. Errors of single sessions are in [`Listing::unreadable`].
 pub fn list(root: &Path) -> Result<Listing> {
     let mut dirs = fs::read_dir(root)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>())

@@ -1,8 +1,8 @@
-//! The ledger of a session: `ledger.jsonl`, one JSON object a line, append-only.
+//! The ledger of a session: `ledger.jsonl`, one JSON object per line, append-only.
 //!
-//! The ledger is what knows: a point is stored when its line says so. Each line is appended by one write and made
-//! durable before [`Ledger::append`] returns, so a crash can tear the last line only; a torn line is dropped, since
-//! nobody was told that it was written.
+//! The ledger is the source of truth: a point is stored if and only if the ledger has its line. Each line is
+//! appended with one write and made durable before [`Ledger::append`] returns, so a crash can tear only the
+//! last line. A torn line is dropped, since its write was never acknowledged.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -21,11 +21,11 @@ use crate::{Error, Result};
 /// The format of the session folder that this version writes.
 pub const FORMAT: u32 = 1;
 
-/// One line of the ledger, told apart by its key `event`.
+/// One line of the ledger; the key `event` tells the kinds apart.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Entry {
-    /// The first line, and only the first: what the session is.
+    /// The first line, and only the first: describes the session.
     Session(SessionEntry),
     /// An acquisition run begins.
     Run {
@@ -36,78 +36,79 @@ pub enum Entry {
     },
     /// A point's data are durable in the stack. A later line for the same point replaces the earlier one.
     Point(PointEntry),
-    /// An attempt at a point was given up.
+    /// An attempt at a point failed.
     AttemptFailed {
         /// The array of the stack.
         array: ArrayName,
-        /// Its first index.
+        /// The point's index in that array.
         index: usize,
         /// Counted from 0.
         attempt: u32,
-        /// What became of its frames.
+        /// What became of the attempt's frames.
         counts: Counts,
     },
-    /// An attempt at a point ended before its last frame, by no fault of its own: it is made again under its number.
+    /// An attempt at a point was interrupted through no fault of its own; it is repeated with the same
+    /// number.
     AttemptInterrupted {
         /// The array of the stack.
         array: ArrayName,
-        /// Its first index.
+        /// The point's index in that array.
         index: usize,
         /// Counted from 0.
         attempt: u32,
-        /// What became of its frames.
+        /// What became of the attempt's frames.
         counts: Counts,
     },
-    /// A point is stored, and a stage failed on it: the results of this run lack it.
+    /// A point is stored, but a processing stage failed on it: the results of this run lack it.
     StageFailed {
         /// The array of the stack.
         array: ArrayName,
-        /// Its first index.
+        /// The point's index in that array.
         index: usize,
         /// Counted from 0.
         attempt: u32,
-        /// Which stage, and what it said.
+        /// The stage and its error.
         error: String,
     },
     /// A cycle of a film is durable in `film.zarr`.
     Cycle(CycleEntry),
-    /// A cycle of a film lacks frames and is not stored: a film does not take them again.
+    /// A cycle of a film lacks frames and is not stored; a film does not repeat frames.
     CycleLost {
         /// Counted from 0.
         cycle: usize,
-        /// The settings without a sound frame.
+        /// The settings without a usable frame.
         missing: Vec<usize>,
-        /// What became of its frames.
+        /// What became of the cycle's frames.
         counts: Counts,
     },
     /// A batch of a flying dot is durable in `dots.zarr`.
     Batch(BatchEntry),
-    /// A batch lacks too many frames, or could not be written, and is not stored: it is not taken again.
+    /// A batch lacks too many frames or could not be written, and is not stored; it is not repeated.
     BatchLost {
         /// Counted from 0.
         batch: usize,
-        /// What became of its frames.
+        /// What became of the batch's frames.
         counts: Counts,
     },
-    /// The record of a mirror's axis under its chirp is durable in `products`.
+    /// The record of a mirror axis during its chirp is durable in `products`.
     Axis(AxisEntry),
-    /// A film is over; its cycles have lines of their own.
+    /// A film has ended; its cycles have lines of their own.
     Film(FilmSummary),
-    /// Frames outside any point: drained, in a pause, after a cancel.
+    /// Frames outside any point: drained, during a pause, or after a cancel.
     Outside {
-        /// What became of them.
+        /// What became of these frames.
         counts: Counts,
     },
     /// An acquisition run has ended.
     End(EndEntry),
 }
 
-/// What a session is.
+/// Description of a session.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SessionEntry {
-    /// [`FORMAT`].
+    /// Format version, [`FORMAT`].
     pub format: u32,
-    /// As given, before it was made fit for a folder's name.
+    /// The name as given, before it was adapted for the folder's name.
     pub name: String,
     /// The plan's kind, for example `sweep`.
     pub kind: String,
@@ -117,13 +118,13 @@ pub struct SessionEntry {
     /// What was in front of the camera.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sample: Option<String>,
-    /// Anything else.
+    /// Free text.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub note: Option<String>,
-    /// Labels to find it by.
+    /// Labels for finding the session.
     #[serde(default)]
     pub tags: Vec<String>,
-    /// Wall-clock time, UTC.
+    /// Creation time, UTC.
     pub created: Timestamp,
     /// Name and version of the software.
     pub software: String,
@@ -138,18 +139,19 @@ pub struct SessionEntry {
 pub struct PointEntry {
     /// The array of the stack.
     pub array: ArrayName,
-    /// Its first index: for `sum`, `exposure_index * delays + delay_index`; for `dark`, `exposure_index`.
+    /// The point's index in that array: for `sum`, `exposure_index * delays + delay_index`; for `dark`,
+    /// `exposure_index`.
     pub index: usize,
-    /// Counted from 0.
+    /// Attempt, counted from 0.
     pub attempt: u32,
     /// Frames summed.
     pub frames: u32,
-    /// The exposure time that the camera applied.
+    /// The exposure time that the camera applied, in us.
     pub exposure_us: f64,
-    /// The delay that was asked for and applied (centre of exposure minus centre of illumination).
+    /// The requested and applied delay in us (centre of exposure minus centre of illumination).
     pub delay_us: f64,
-    /// The true delay of each summed frame, from its exposure start and its VSYNC edge; empty where delays mean
-    /// nothing (dark and regular frames).
+    /// The true delay of each summed frame in us, from its exposure start and its VSYNC edge; empty for dark
+    /// and regular frames, for which delays are meaningless.
     pub delays_us: Vec<f64>,
     /// What became of the attempt's frames.
     pub counts: Counts,
@@ -158,32 +160,32 @@ pub struct PointEntry {
 }
 
 impl PointEntry {
-    /// The mean of the true delays, where there are any.
+    /// The mean of the true delays, if there are any.
     pub fn mean_delay_us(&self) -> Option<f64> {
         let frames = self.delays_us.len();
         (frames > 0).then(|| self.delays_us.iter().sum::<f64>() / frames as f64)
     }
 }
 
-/// The stored record of a mirror's axis.
+/// The stored record of a mirror axis.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AxisEntry {
     /// 0: x, 1: y.
     pub axis: usize,
-    /// Frames of the record: those of its chirp.
+    /// Frames of the record, which covers the axis's chirp.
     pub frames: usize,
-    /// Those of them that never came.
+    /// Frames of these that were lost.
     pub lost: usize,
-    /// Those of them that came and show no dot.
+    /// Frames of these that arrived but show no dot.
     pub empty: usize,
-    /// Where its triggers went.
+    /// What became of its triggers.
     pub counts: Counts,
 }
 
 /// How an acquisition run ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct EndEntry {
-    /// In which state.
+    /// Final state.
     pub state: EndState,
     /// Why it faulted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -192,44 +194,44 @@ pub struct EndEntry {
     pub stored: usize,
     /// Sweep points planned and not stored.
     pub missing: usize,
-    /// The VSYNC line during the run, where it was watched.
+    /// Statistics of the VSYNC line during the run, if it was watched.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vsync: Option<VsyncStats>,
-    /// Seconds from the end of the last frame's exposure to the transport on disk, where both were.
+    /// Seconds from the end of the last frame's exposure to the transport on disk, if the run had both.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub final_s: Option<f64>,
     /// Seconds from the first frame with light to the end of the last, without the probe and the dark points.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub light_s: Option<f64>,
-    /// How late the camera's settings took effect, where a probe has found out.
+    /// Latency of the camera's settings, if a probe measured it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub settings_latency: Option<SettingsLatency>,
 }
 
-/// In which state a run ended.
+/// Final state of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EndState {
     /// Everything planned is stored.
     Complete,
-    /// Somebody ended it.
+    /// The operator ended it.
     Cancelled,
     /// A device or the disk failed.
     Faulted,
 }
 
-/// What the lines of a ledger amount to.
+/// The state that results from the lines of a ledger.
 #[derive(Debug, Clone, PartialEq)]
 pub struct State {
-    /// What the session is.
+    /// Description of the session.
     pub session: SessionEntry,
-    /// Acquisition runs begun.
+    /// Number of acquisition runs begun.
     pub runs: u32,
-    /// All frames of all runs, of repeated and failed attempts too.
+    /// All frames of all runs, including repeated and failed attempts.
     pub counts: Counts,
     /// How the latest run ended; `None` before the first, while one is running and after a crash.
     pub end: Option<EndEntry>,
-    /// How the film went, once it is over.
+    /// Summary of the film, once it is over.
     pub film: Option<FilmSummary>,
     stored: BTreeMap<(ArrayName, usize), PointEntry>,
     cycles: BTreeMap<usize, CycleEntry>,
@@ -239,10 +241,10 @@ pub struct State {
 }
 
 impl State {
-    /// What these entries, from a ledger's first line on, amount to.
+    /// Computes the state from entries, starting with the ledger's first line.
     ///
     /// # Errors
-    /// [`Replay`] names the entry (counted from 0) that cannot follow the ones before.
+    /// [`Replay`] names the entry (counted from 0) that contradicts the ones before it.
     pub fn replay(entries: &[Entry]) -> std::result::Result<State, Replay> {
         let Some((Entry::Session(session), rest)) = entries.split_first() else {
             return Err(Replay { entry: 0, why: "the first line is not a `session` entry".into() });
@@ -265,7 +267,7 @@ impl State {
         Ok(state)
     }
 
-    /// The stored points of an array, by index: the latest line of each.
+    /// The stored points of an array, by index; for repeated points the latest entry.
     pub fn stored(&self, array: ArrayName) -> impl Iterator<Item = &PointEntry> {
         self.stored.range((array, 0)..=(array, usize::MAX)).map(|(_, point)| point)
     }
@@ -285,13 +287,13 @@ impl State {
         self.axes.values()
     }
 
-    /// How many of the plan's points are stored: of a sweep's points, of a film's cycles, of a flying dot's batches, or
-    /// of a mirror's axes.
+    /// Number of stored points of the plan: points of a sweep, cycles of a film, batches of a flying dot, or
+    /// axes of a mirror.
     pub fn stored_points(&self) -> usize {
         self.stored(ArrayName::Sum).count() + self.cycles.len() + self.batches.len() + self.axes.len()
     }
 
-    /// A stored point.
+    /// A point, if it is stored.
     pub fn point(&self, array: ArrayName, index: usize) -> Option<&PointEntry> {
         self.stored.get(&(array, index))
     }
@@ -301,8 +303,8 @@ impl State {
         (0..self.session.shape.len(array)).filter(move |&index| self.point(array, index).is_none())
     }
 
-    /// The number of the next attempt at a point: attempts that were stored or failed are never repeated, those that were
-    /// interrupted, or cut short by a crash, are.
+    /// The number of the next attempt at a point. Numbers of stored or failed attempts are never reused;
+    /// those of attempts that were interrupted, or cut short by a crash, are.
     pub fn next_attempt(&self, array: ArrayName, index: usize) -> u32 {
         self.next_attempts.get(&(array, index)).copied().unwrap_or(0)
     }
@@ -396,17 +398,17 @@ impl State {
     }
 }
 
-/// An entry that cannot follow the ones before it.
+/// An entry that contradicts the ones before it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("entry {entry}: {why}")]
 pub struct Replay {
-    /// Counted from 0.
+    /// Index of the entry, counted from 0.
     pub entry: usize,
     /// What is wrong.
     pub why: String,
 }
 
-/// A ledger open for appending. Only one can be, over all processes: the file is locked.
+/// A ledger opened for appending. The file is locked, so only one process can do so at a time.
 #[derive(Debug)]
 pub struct Ledger {
     path: PathBuf,
@@ -417,10 +419,11 @@ pub struct Ledger {
 }
 
 impl Ledger {
-    /// Makes the ledger of a new session with its first line.
+    /// Creates the ledger of a new session with its first line.
     ///
     /// # Errors
-    /// [`Error::Io`] where a ledger exists or the file system refuses; [`Error::Entry`] as for [`Ledger::append`].
+    /// [`Error::Io`] if a ledger exists or the file system refuses; [`Error::Entry`] as for
+    /// [`Ledger::append`].
     pub fn create(path: &Path, session: SessionEntry) -> Result<Ledger> {
         let first = Entry::Session(session);
         let state = State::replay(std::slice::from_ref(&first)).map_err(refused(path))?;
@@ -438,10 +441,10 @@ impl Ledger {
         Ok(ledger)
     }
 
-    /// Opens a ledger to append to it. A torn last line is cut off.
+    /// Opens a ledger for appending. Truncates a torn last line.
     ///
     /// # Errors
-    /// [`Error::InUse`] where another process has it open for appending; otherwise as [`read`].
+    /// [`Error::InUse`] if another process has it open for appending; otherwise as [`read`].
     pub fn open(path: &Path) -> Result<Ledger> {
         let file =
             OpenOptions::new().read(true).append(true).open(path).map_err(Error::io("open ledger", path))?;
@@ -457,16 +460,16 @@ impl Ledger {
         Ok(Ledger { path: path.to_owned(), file, len, broken: false, state })
     }
 
-    /// What the ledger says by now.
+    /// The state so far.
     pub fn state(&self) -> &State {
         &self.state
     }
 
-    /// Appends a line; when this returns, it is durable. Where it fails, the ledger is as before.
+    /// Appends a line; when this returns, it is durable. On failure the ledger is unchanged.
     ///
     /// # Errors
-    /// [`Error::Entry`] where the entry would not read back as it is (a number that is not finite) or cannot follow
-    /// the ones before (an index outside the plan); [`Error::Io`] where the file system refuses.
+    /// [`Error::Entry`] if the entry would not read back unchanged (a number that is not finite) or
+    /// contradicts the ones before it (an index outside the plan); [`Error::Io`] if the file system refuses.
     pub fn append(&mut self, entry: &Entry) -> Result<()> {
         self.state.check(entry).map_err(refused(&self.path))?;
         self.append_line(entry)?;
@@ -475,7 +478,7 @@ impl Ledger {
 
     fn append_line(&mut self, entry: &Entry) -> Result<()> {
         let mut line = serde_json::to_vec(entry).map_err(refused(&self.path))?;
-        // JSON has no NaN and no infinity: they would be written as `null`, which no later reader accepts.
+        // JSON has no NaN or infinity: they would be written as `null`, which later readers reject.
         if serde_json::from_slice::<Entry>(&line).ok().as_ref() != Some(entry) {
             return Err(refused(&self.path)("it would not read back as it is; every number must be finite"));
         }
@@ -486,7 +489,7 @@ impl Ledger {
         }
         line.push(b'\n');
         if let Err(error) = self.file.write_all(&line).and_then(|()| self.file.sync_data()) {
-            // Half a line before the next one would damage the ledger for good.
+            // Half a line followed by another line would damage the ledger permanently.
             self.broken = self.file.set_len(self.len).is_err();
             return Err(Error::io("append to", &self.path)(error));
         }
@@ -498,8 +501,8 @@ impl Ledger {
 /// Reads a ledger's entries without locking it; a torn last line is left out.
 ///
 /// # Errors
-/// [`Error::Io`] where it cannot be read, [`Error::Ledger`] names a corrupt line, [`Error::NewerFormat`] a ledger of
-/// the future.
+/// [`Error::Io`] if it cannot be read, [`Error::Ledger`] for a corrupt line, [`Error::NewerFormat`] for a
+/// newer format.
 pub fn read(path: &Path) -> Result<Vec<Entry>> {
     let file = File::open(path).map_err(Error::io("open ledger", path))?;
     let text = read_bytes(&file, path)?;
@@ -509,7 +512,7 @@ pub fn read(path: &Path) -> Result<Vec<Entry>> {
 /// Reads a ledger and replays it.
 ///
 /// # Errors
-/// As [`read`], and [`Error::Ledger`] where a line cannot follow the ones before.
+/// As [`read`], and [`Error::Ledger`] if a line contradicts the ones before it.
 pub fn read_state(path: &Path) -> Result<State> {
     replay(&read(path)?, path)
 }
@@ -528,18 +531,18 @@ fn read_bytes(mut file: &File, path: &Path) -> Result<Vec<u8>> {
     Ok(text)
 }
 
-/// The whole entries, and the bytes that they take.
+/// The complete entries, and their total length in bytes.
 fn parse(text: &[u8], path: &Path) -> Result<(Vec<Entry>, u64)> {
     let mut entries = Vec::new();
     let mut whole = 0;
     for (line, number) in text.split_inclusive(|&byte| byte == b'\n').zip(1..) {
         let is_last = whole + line.len() == text.len();
         let entry = match serde_json::from_slice(line) {
-            // Without its newline a line was never acknowledged, even where it happens to parse.
+            // A line without its newline was never acknowledged, even if it happens to parse.
             Ok(_) if !line.ends_with(b"\n") => break,
             Ok(entry) => entry,
-            // Blocks of the last line may have reached the disk in any order, but never as valid JSON that says
-            // something else.
+            // The blocks of the last line may have reached the disk in any order, but what is there is never
+            // valid JSON with another meaning.
             Err(_) if is_last && serde_json::from_slice::<serde_json::Value>(line).is_err() => break,
             Err(error) => {
                 check_format(line, path)?;

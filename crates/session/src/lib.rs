@@ -3,7 +3,7 @@
 //! | path | what |
 //! | --- | --- |
 //! | `plan.toml`, `rig.toml` | as used, verbatim |
-//! | `ledger.jsonl` | what was acquired: one JSON object a line, append-only ([`ledger`]) |
+//! | `ledger.jsonl` | what was acquired: one JSON object per line, append-only ([`ledger`]) |
 //! | `stack.zarr` | the summed frames, Zarr v3 ([`stack`]) |
 //! | `transport.zarr` | the light transport, Zarr v3 ([`transport`]) |
 //! | `film.zarr`, `transport_film.zarr` | of a film: the frames and the light transport of each cycle, Zarr v3 ([`film`]) |
@@ -12,8 +12,8 @@
 //! | `report.html` | one self-contained page ([`report`]) |
 //! | `manifest.json` | versions, settings, counts and checksums ([`manifest`]) |
 //!
-//! The ledger is what knows, and nothing else does: data without its line does not exist. So the order of a write is
-//! data, fsync, rename, fsync of the folder ([`durable`]), and only then the ledger's line, fsync.
+//! The ledger is the source of truth: data without a line in the ledger do not count. So the order of a write
+//! is data, fsync, rename, fsync of the folder ([`durable`]), then the ledger's line, fsync.
 
 pub mod dots;
 pub mod durable;
@@ -33,6 +33,6 @@ mod zarr;
 pub use error::{Error, Result};
 pub use folder::{Listing, Session, SessionSummary, list};
 
-/// Camera rows of a strip: the unit in which [`stack`] and [`transport`] are stored, and so the cheapest in which what is
-/// larger than the memory is read and written.
+/// Camera rows per strip: the unit in which [`stack`] and [`transport`] are stored, and so the cheapest unit
+/// for reading and writing data that do not fit in memory.
 pub const STRIP_ROWS: usize = zarr::CHUNK_PX;

@@ -1,4 +1,4 @@
-//! `manifest.json`: what made the session, and the checksum of each of its files.
+//! `manifest.json`: the software that made the session, and the checksum of each file.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -18,62 +18,62 @@ use crate::{Error, Result, durable};
 /// The content of `manifest.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// The format of the session folder.
+    /// Format version of the session folder.
     pub format: u32,
-    /// Name and version of each program and library that had a part.
+    /// Name and version of each program and library involved.
     pub software: BTreeMap<String, String>,
-    /// The settings as the devices took them.
+    /// The settings as the devices applied them.
     pub settings: Map<String, Value>,
-    /// Sweep points.
+    /// Counts of sweep points.
     pub points: PointCounts,
-    /// Frames.
+    /// Counts of frames.
     pub counts: Counts,
-    /// Every file of the session but the manifest, by its path with `/`.
+    /// All files of the session except the manifest, by path with `/` separators.
     pub files: BTreeMap<String, FileRecord>,
 }
 
-/// Sweep points, or cycles of a film: planned = stored + missing.
+/// Counts of sweep points or film cycles: planned = stored + missing.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PointCounts {
-    /// In the plan.
+    /// Number in the plan.
     pub planned: usize,
-    /// In the stack, and the ledger says so.
+    /// Number stored, according to the ledger.
     pub stored: usize,
-    /// The others.
+    /// Number not stored.
     pub missing: usize,
 }
 
 /// Size and checksum of a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileRecord {
-    /// Its size.
+    /// Size in bytes.
     pub bytes: u64,
     /// SHA-256, hexadecimal.
     pub sha256: String,
 }
 
-/// How a session's files differ from its manifest; paths with `/`, sorted.
+/// Differences between a session's files and its manifest; paths with `/` separators, sorted.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Differences {
-    /// Files whose content is another.
+    /// Files whose content differs.
     pub changed: Vec<String>,
-    /// Files that are gone.
+    /// Files that no longer exist.
     pub missing: Vec<String>,
-    /// Files that the manifest does not know.
+    /// Files that are not in the manifest.
     pub added: Vec<String>,
 }
 
 impl Differences {
-    /// Whether there are none.
+    /// Whether there are no differences.
     pub fn is_empty(&self) -> bool {
         self.changed.is_empty() && self.missing.is_empty() && self.added.is_empty()
     }
 }
 
-/// Writes the manifest of a session, durably. It comes last: whatever is written later makes it stale.
+/// Writes the manifest of a session, durably. Write it last: any later change makes it stale.
 ///
 /// # Errors
-/// [`Error::Io`] where a file cannot be read or the manifest not be written.
+/// [`Error::Io`] if a file cannot be read or the manifest cannot be written.
 pub fn write(
     session: &Session,
     state: &State,
@@ -100,7 +100,7 @@ pub fn write(
 /// Reads the manifest of a session.
 ///
 /// # Errors
-/// [`Error::Io`] where there is none, [`Error::Codec`] where it is damaged, [`Error::NewerFormat`].
+/// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged, [`Error::NewerFormat`].
 pub fn read(session: &Session) -> Result<Manifest> {
     let path = session.manifest_path();
     let text = fs::read(&path).map_err(Error::io("read", &path))?;
@@ -114,7 +114,7 @@ pub fn read(session: &Session) -> Result<Manifest> {
 /// Compares the files of a session with its manifest.
 ///
 /// # Errors
-/// As [`read`], and [`Error::Io`] where a file cannot be read.
+/// As [`read`], and [`Error::Io`] if a file cannot be read.
 pub fn verify(session: &Session) -> Result<Differences> {
     let expected = read(session)?.files;
     let found = scan(session)?;

@@ -8,12 +8,14 @@ use ndarray::{Array4, ArrayD, Axis, Ix4};
 
 use crate::{Error, Result, durable};
 
-/// Reads lighting patterns `[k, row, column, channels]`, with one channel or three: of a PNG file one, decoded from sRGB
-/// to linear light from 0 to 1 (a gamma of its own and transparency are not looked at); of an NPY file, float32 and taken
-/// as it is, one (`[row, column]`, `[row, column, 3]`) or a sequence (`[k, row, column, 3]`).
+/// Reads lighting patterns `[k, row, column, channels]` with one or three channels.
+///
+/// A PNG file holds one pattern, which is decoded from sRGB to linear light from 0 to 1 (its gamma and
+/// transparency are ignored). An NPY file (float32, used as is) holds one (`[row, column]`,
+/// `[row, column, 3]`) or a sequence (`[k, row, column, 3]`).
 ///
 /// # Errors
-/// [`Error::Io`] where it cannot be read, [`Error::Codec`] for other files, [`Error::Shape`] for other axes.
+/// [`Error::Io`] if it cannot be read, [`Error::Codec`] for other files, [`Error::Shape`] for other axes.
 pub fn read(path: &Path) -> Result<Array4<f32>> {
     let patterns = match path.extension().and_then(|extension| extension.to_str()) {
         Some("png") => read_png(path)?,
@@ -28,7 +30,7 @@ pub fn read(path: &Path) -> Result<Array4<f32>> {
     Ok(patterns)
 }
 
-/// Writes patterns that [`read`] gives back as they are.
+/// Writes patterns so that [`read`] returns them unchanged.
 ///
 /// # Errors
 /// [`Error::Io`].

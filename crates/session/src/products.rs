@@ -1,10 +1,11 @@
-//! `products/`: what was made from the stack, as files that other programs open.
+//! `products/`: the results, as files that other programs can open.
 //!
-//! An image `NAME` is `NAME.exr` (channel Y, or R, G, B, metadata as text attributes `raysweep.KEY`) and `NAME.npy`
-//! (float32 `[t, s]`, or `[t, s, 3]`); a volume is `NAME.npy` alone. A sequence of images is `NAME.npy` (`[k, t, s]`) and
-//! one `NAME.exr` with a layer for each; a table is `NAME.npy` (`[row, column]`) and `NAME.csv`. Beside each lies
-//! `NAME.json` with the metadata.
-//! A video is described at [`VideoWriter`].
+//! An image `NAME` is `NAME.exr` (channel Y, or R, G, B; metadata as text attributes `raysweep.KEY`) and
+//! `NAME.npy` (float32 `[t, s]`, or `[t, s, 3]`); a volume is only `NAME.npy`. A sequence of images is
+//! `NAME.npy` (`[k, t, s]`) and one `NAME.exr` with a layer per image; a table is `NAME.npy`
+//! (`[row, column]`) and `NAME.csv`. Each has a `NAME.json` with its metadata. For videos see
+//! [`VideoWriter`].
+//!
 //! Values are linear. Every file is written durably, and the same input gives the same bytes.
 
 use std::io::{self, BufWriter};
@@ -28,7 +29,7 @@ pub struct Products {
 }
 
 impl Products {
-    /// The products in `dir`, which is made where it is missing.
+    /// The products in `dir`, which is created if it is missing.
     pub fn new(dir: impl Into<PathBuf>) -> Products {
         Products { dir: dir.into() }
     }
@@ -50,7 +51,7 @@ impl Products {
     /// Writes a colour image `[t, s, 3]` (R, G, B) as `name.exr`, `name.npy` and `name.json`.
     ///
     /// # Errors
-    /// [`Error::Shape`] where the last axis is not 3; otherwise as [`Products::image`].
+    /// [`Error::Shape`] if the last axis is not 3; otherwise as [`Products::image`].
     pub fn rgb(&self, name: &str, values: ArrayView3<f32>, metadata: &Map<String, Value>) -> Result<()> {
         let channels: Vec<_> = ["R", "G", "B"].into_iter().zip(values.axis_iter(Axis(2))).collect();
         if values.shape()[2] != 3 {
@@ -71,8 +72,8 @@ impl Products {
         writer.commit()
     }
 
-    /// Begins a volume of this shape `[u, t, s]` that is written in strips of its middle axis, from top to bottom:
-    /// [`Products::volume`] for one that is larger than the memory.
+    /// Begins a volume of shape `[u, t, s]` that is written in strips of its middle axis, from top to bottom:
+    /// a replacement for [`Products::volume`] if it does not fit in memory.
     ///
     /// # Errors
     /// As [`Products::image`].
@@ -87,11 +88,11 @@ impl Products {
         VolumeWriter::create(&path, shape, (self.path(name, "json")?, sidecar(name, metadata)?))
     }
 
-    /// Writes images `[k, t, s]` as `name.npy`, `name.json` and one `name.exr` whose layer `k` has the channel
-    /// `layers[k].Y`; layers are named in ascending order.
+    /// Writes images `[k, t, s]` as `name.npy`, `name.json` and one `name.exr` whose layer `k` has the
+    /// channel `layers[k].Y`; layer names should ascend.
     ///
     /// # Errors
-    /// [`Error::Shape`] where there are not as many layers as images; otherwise as [`Products::image`].
+    /// [`Error::Shape`] if the numbers of layers and images differ; otherwise as [`Products::image`].
     pub fn sequence(
         &self,
         name: &str,
@@ -109,11 +110,11 @@ impl Products {
         self.write_array(name, &values, metadata)
     }
 
-    /// Writes columns of one length as `name.csv`, `name.npy` (`[row, column]`) and `name.json`. The first line of the
-    /// CSV file has the headers.
+    /// Writes columns of equal length as `name.csv`, `name.npy` (`[row, column]`) and `name.json`. The first
+    /// line of the CSV file contains the headers.
     ///
     /// # Errors
-    /// [`Error::Shape`] where a column is shorter than the first; otherwise as [`Products::image`].
+    /// [`Error::Shape`] if the columns differ in length; otherwise as [`Products::image`].
     pub fn table(
         &self,
         name: &str,
@@ -139,10 +140,10 @@ impl Products {
         self.write_array(name, &values.view(), metadata)
     }
 
-    /// Reads back an image that [`Products::image`] wrote.
+    /// Reads back an image written by [`Products::image`].
     ///
     /// # Errors
-    /// [`Error::Io`] where there is none, [`Error::Codec`] where it is damaged.
+    /// [`Error::Io`] if it is missing, [`Error::Codec`] if it is damaged.
     pub fn read_image(&self, name: &str) -> Result<Array2<f32>> {
         let path = self.path(name, "npy")?;
         let bytes = std::fs::read(&path).map_err(Error::io("read", &path))?;
@@ -158,7 +159,7 @@ impl Products {
         let path = self.path(name, "npy")?;
         durable::create_dir_all(&self.dir)?;
         durable::write_with(&path, |file| {
-            // An array in Fortran order would be written as such.
+            // Without this, an array in Fortran order would be written in that order.
             values.as_standard_layout().write_npy(BufWriter::new(file)).map_err(io::Error::other)
         })?;
         self.write(name, "json", &sidecar(name, metadata)?)

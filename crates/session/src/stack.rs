@@ -6,11 +6,11 @@
 //! | `dark` | uint32 | `[exposure, t, s]` | projector off, one per exposure |
 //! | `regular` | uint32 | `[1, t, s]` | all rows lit by a long exposure |
 //!
-//! The stack of a film has `dark` alone: its frames are in `film.zarr`, see [`crate::film`].
+//! The stack of a film has only `dark`: its frames are in `film.zarr`, see [`crate::film`].
 //!
-//! t is the camera row (the top one is 0), s the camera column. Values are camera counts (DN), summed over the frames
-//! that the ledger names. One shard is one point, with inner chunks of 64 x 64 pixels. A point without a line in the
-//! ledger is not stored, whatever the array holds there.
+//! t is the camera row (the top one is 0), s the camera column. Values are camera counts (DN), summed over
+//! the frames listed in the ledger. One shard is one point, with inner chunks of 64 x 64 pixels. A point
+//! without a line in the ledger is not stored, whatever the array contains.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -39,7 +39,7 @@ pub enum ArrayName {
 }
 
 impl ArrayName {
-    /// All of them.
+    /// All arrays.
     pub const ALL: [ArrayName; 3] = [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular];
 
     /// The name in the Zarr group and in the ledger.
@@ -63,18 +63,18 @@ impl ArrayName {
 /// The shapes of the stack's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct StackShape {
-    /// Planned points of the sweep; of a film, its cycles; of a flying dot, its batches; of a mirror, its axes.
+    /// Planned points of a sweep, cycles of a film, batches of a flying dot, or axes of a mirror.
     pub points: usize,
-    /// Exposures, each with a dark frame; none of a dot rig.
+    /// Number of exposures, each with a dark frame; 0 for a dot rig.
     pub exposures: usize,
     /// Camera rows, axis t.
     pub rows: usize,
     /// Camera columns, axis s.
     pub columns: usize,
-    /// Settings of a film's cycle; 0 where it is a sweep.
+    /// Settings per cycle of a film; 0 for other kinds.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub settings: usize,
-    /// Frames of a flying dot's batch; 0 for the other kinds.
+    /// Frames per batch of a flying dot; 0 for other kinds.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub dots: usize,
 }
@@ -84,7 +84,7 @@ fn is_zero(count: &usize) -> bool {
 }
 
 impl StackShape {
-    /// Points of an array.
+    /// Number of points of an array.
     pub fn len(&self, array: ArrayName) -> usize {
         match array {
             ArrayName::Sum => self.points * usize::from(self.is_sweep()),
@@ -93,17 +93,17 @@ impl StackShape {
         }
     }
 
-    /// Whether the points are cycles, whose frames are in `film.zarr`.
+    /// Whether the points are cycles, with frames in `film.zarr`.
     pub fn is_film(&self) -> bool {
         self.settings > 0
     }
 
-    /// Whether the points are batches, whose columns are in `dots.zarr`; there is no stack then.
+    /// Whether the points are batches, with columns in `dots.zarr`; there is then no stack.
     pub fn is_batches(&self) -> bool {
         self.dots > 0
     }
 
-    /// Whether the points are axes of a mirror, whose records are products; there is no stack then.
+    /// Whether the points are axes of a mirror, with records in `products`; there is then no stack.
     pub fn is_axes(&self) -> bool {
         self.exposures == 0 && !self.is_film() && !self.is_batches()
     }
@@ -112,7 +112,7 @@ impl StackShape {
         !self.is_film() && !self.is_batches() && !self.is_axes()
     }
 
-    /// The arrays of the stack.
+    /// The arrays that exist for this kind of session.
     fn arrays(&self) -> &'static [ArrayName] {
         if self.is_film() { &[ArrayName::Dark] } else { &ArrayName::ALL }
     }
@@ -134,7 +134,7 @@ impl StackShape {
         [1, self.rows.min(CHUNK_PX), self.columns.min(CHUNK_PX)]
     }
 
-    /// A shard must be a whole number of inner chunks, so it may reach beyond the frame; what lies there is 0.
+    /// A shard must consist of whole inner chunks, so it may extend beyond the frame; the excess is 0.
     fn shard(&self) -> [usize; 3] {
         let [_, rows, columns] = self.chunk();
         [1, self.rows.next_multiple_of(rows), self.columns.next_multiple_of(columns)]
@@ -149,10 +149,10 @@ pub struct Stack {
 }
 
 impl Stack {
-    /// Makes an empty stack at `dir`; `kind` is the plan's kind.
+    /// Creates an empty stack at `dir`; `kind` is the plan's kind.
     ///
     /// # Errors
-    /// [`Error::Shape`] for an axis of length 0, [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Shape`] for an axis of length 0, [`Error::Zarr`] if the file system refuses.
     pub fn create(dir: &Path, shape: &StackShape, kind: &str) -> Result<Stack> {
         shape.check()?;
         let store = DurableStore::new(dir)?;
@@ -170,7 +170,7 @@ impl Stack {
     /// Opens the stack at `dir`, which must have this shape.
     ///
     /// # Errors
-    /// [`Error::Zarr`] where it cannot be read, [`Error::Shape`] where it is another stack.
+    /// [`Error::Zarr`] if it cannot be read, [`Error::Shape`] if its shape differs.
     pub fn open(dir: &Path, shape: &StackShape) -> Result<Stack> {
         shape.check()?;
         let store = DurableStore::new(dir)?;
@@ -198,11 +198,11 @@ impl Stack {
         &self.shape
     }
 
-    /// Writes one point `[t, s]`, replacing what was there; when this returns, it is durable. Gives the data's
-    /// CRC-32, which belongs into the ledger's line.
+    /// Writes one point `[t, s]`, replacing any existing one; when this returns, it is durable. Returns the
+    /// data's CRC-32 for the ledger's line.
     ///
     /// # Errors
-    /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Index`], [`Error::Shape`], or [`Error::Zarr`] if the file system refuses.
     pub fn write(&self, array: ArrayName, index: usize, data: ArrayView2<u32>) -> Result<u32> {
         let stored = self.array(array, index)?;
         if data.dim() != (self.shape.rows, self.shape.columns) {
@@ -216,10 +216,11 @@ impl Stack {
         Ok(crc32(data))
     }
 
-    /// Reads one point `[t, s]`. Whether it is to be believed, the ledger knows (compare [`crc32`]).
+    /// Reads one point `[t, s]`. Whether the data are valid must be checked against the ledger (compare
+    /// [`crc32`]).
     ///
     /// # Errors
-    /// [`Error::NotStored`] where nothing was written, [`Error::Index`], or [`Error::Zarr`] for damaged data.
+    /// [`Error::NotStored`] if nothing was written, [`Error::Index`], or [`Error::Zarr`] for damaged data.
     pub fn read_point(&self, array: ArrayName, index: usize) -> Result<Array2<u32>> {
         let shard = self
             .array(array, index)?
@@ -233,18 +234,18 @@ impl Stack {
         Ok(frame.as_standard_layout().into_owned())
     }
 
-    /// Reads some rows of a point, `[rows, s]`, and of its shard no more than the inner chunks that hold them:
-    /// 64 rows from a multiple of 64 on cost least. The checksums of the shard's index and of these chunks are verified.
-    /// That of the ledger is one of the whole point: to hold the point against it, read it once with
+    /// Reads some rows of a point, `[rows, s]`, and only those inner chunks of its shard that contain them:
+    /// 64 rows starting at a multiple of 64 cost least. Verifies the checksums of the shard's index and of
+    /// these chunks. The ledger's checksum covers the whole point; to verify it, read the point once with
     /// [`Stack::read_point`].
     ///
     /// # Errors
-    /// [`Error::NotStored`] where nothing was written, [`Error::Index`], [`Error::Shape`] for rows that the camera does
-    /// not have, or [`Error::Zarr`] for damaged data.
+    /// [`Error::NotStored`] if nothing was written, [`Error::Index`], [`Error::Shape`] for rows that the
+    /// camera does not have, or [`Error::Zarr`] for damaged data.
     pub fn read_rows(&self, array: ArrayName, index: usize, rows: Range<usize>) -> Result<Array2<u32>> {
         let zarr = self.array(array, index)?;
         let stored = zarr.storage().size_key(&zarr.chunk_key(&[index as u64, 0, 0]));
-        // Zarr itself takes a missing chunk for zeros.
+        // Zarr itself treats a missing chunk as zeros.
         if stored.map_err(Error::zarr("read", &self.dir.join(array.as_str())))?.is_none() {
             return Err(Error::NotStored { path: self.dir.clone(), array: array.as_str(), index });
         }
@@ -267,7 +268,7 @@ impl Stack {
     }
 }
 
-/// CRC-32 (the one of zip and PNG) of an image as little-endian uint32 in C order.
+/// CRC-32 (as in zip and PNG) of an image as little-endian uint32 in C order.
 pub fn crc32(data: ArrayView2<u32>) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
     let mut row_bytes = Vec::with_capacity(data.ncols() * 4);

@@ -1,8 +1,9 @@
 //! `transport.zarr`: the light transport of a plane rig, a Zarr v3 group with the array `transport`.
 //!
-//! float32 `[u, t, s]`: u = v - t is the projector row relative to the camera row t, s the camera column; the first
-//! plane is u = `u_min` of the array's attributes. Values are in the scene's units (1 is a white Lambertian at the
-//! reference distance). Rows that do not exist on the projector are 0. Chunks hold all of u for 64 x 64 pixels.
+//! float32 `[u, t, s]`: u = v - t is the projector row relative to the camera row t, s the camera column. The
+//! first plane is u = `u_min` of the array's attributes. Values are in the scene's units (1 is a white
+//! Lambertian surface at the reference distance). Rows that the projector does not have are 0. Chunks contain
+//! all of u for 64 x 64 pixels.
 
 use std::path::Path;
 
@@ -17,30 +18,30 @@ use crate::{Error, Result};
 
 const NAME: &str = "transport";
 
-/// Writes `transport [u, t, s]` to the group at `dir`, replacing the one that is there in one step. `attributes`
-/// become the array's: `u_min`, `u_max`, `row_time_us`, the prior and whatever made it.
+/// Writes `transport [u, t, s]` to the group at `dir`, replacing any existing one atomically. `attributes`
+/// become those of the array: `u_min`, `u_max`, `row_time_us`, the prior and how it was computed.
 ///
 /// # Errors
-/// [`Error::Shape`] for an axis of length 0; [`Error::Zarr`] or [`Error::Io`] where the file system refuses, and then
-/// the group is as before.
+/// [`Error::Shape`] for an axis of length 0; [`Error::Zarr`] or [`Error::Io`] if the file system refuses; the
+/// group is then unchanged.
 pub fn write(dir: &Path, transport: ArrayView3<f32>, attributes: &Map<String, Value>) -> Result<()> {
     let mut writer = Writer::create(dir, transport.dim(), attributes)?;
     writer.append(transport)?;
     writer.commit()
 }
 
-/// Writes a transport in strips of camera rows, from top to bottom: [`write()`] for one that is larger than the memory.
-/// Nothing is seen of it before [`Writer::commit`], and nothing stays of it without.
+/// Writes a transport in strips of camera rows, from top to bottom: a replacement for [`write()`] if it does
+/// not fit in memory. Nothing is visible before [`Writer::commit`], and nothing is kept without it.
 pub struct Writer {
     draft: DraftDir,
     array: Array<DurableStore>,
-    /// `[u, t, s]`
+    /// Shape, `[u, t, s]`.
     shape: (usize, usize, usize),
     next_row: usize,
 }
 
 impl Writer {
-    /// Begins a transport of this shape `[u, t, s]`, with the attributes of [`write()`].
+    /// Begins a transport of shape `[u, t, s]`, with the attributes of [`write()`].
     ///
     /// # Errors
     /// As [`write()`].
@@ -72,10 +73,11 @@ impl Writer {
         Ok(Writer { draft, array, shape, next_row: 0 })
     }
 
-    /// Writes the next camera rows, durably: a multiple of [`STRIP_ROWS`](crate::STRIP_ROWS), or all that are left.
+    /// Writes the next camera rows, durably: a multiple of [`STRIP_ROWS`](crate::STRIP_ROWS), or all
+    /// remaining ones.
     ///
     /// # Errors
-    /// [`Error::Shape`] for other rows; [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Shape`] for other rows; [`Error::Zarr`] if the file system refuses.
     pub fn append(&mut self, strip: ArrayView3<f32>) -> Result<()> {
         let (depth, all_rows, columns) = self.shape;
         let (first_row, rows) = (self.next_row, strip.len_of(Axis(1)));
@@ -106,10 +108,10 @@ impl Writer {
         Ok(())
     }
 
-    /// Puts the transport in its place.
+    /// Moves the transport to its final place.
     ///
     /// # Errors
-    /// [`Error::Shape`] while rows are lacking; [`Error::Io`] where the file system refuses.
+    /// [`Error::Shape`] if rows are missing; [`Error::Io`] if the file system refuses.
     pub fn commit(self) -> Result<()> {
         let (depth, rows, columns) = self.shape;
         if self.next_row < rows {
@@ -127,10 +129,10 @@ fn chunk_of((depth, rows, columns): (usize, usize, usize)) -> [usize; 3] {
     [depth, rows.min(CHUNK_PX), columns.min(CHUNK_PX)]
 }
 
-/// Reads the profiles over u of some pixels `[t, s]`, without the rest.
+/// Reads only the profiles over u of some pixels `[t, s]`.
 ///
 /// # Errors
-/// [`Error::Shape`] for pixels that it does not have; as [`read`].
+/// [`Error::Shape`] for pixels outside the image; otherwise as [`read`].
 pub fn read_profiles(dir: &Path, pixels: &[[usize; 2]]) -> Result<Vec<Array1<f32>>> {
     let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
     let depth = array.shape()[0] as usize;
@@ -143,7 +145,7 @@ pub fn read_profiles(dir: &Path, pixels: &[[usize; 2]]) -> Result<Vec<Array1<f32
 /// Reads `transport [u, t, s]` and its attributes.
 ///
 /// # Errors
-/// [`Error::Zarr`] or [`Error::Shape`] where there is none or it is damaged.
+/// [`Error::Zarr`] or [`Error::Shape`] if it is missing or damaged.
 pub fn read(dir: &Path) -> Result<(Array3<f32>, Map<String, Value>)> {
     let array = zarr::open_array(&DurableStore::new(dir)?, NAME, 3)?;
     Ok((zarr::read_all(&array)?, array.attributes().clone()))
@@ -195,7 +197,7 @@ mod tests {
         assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1);
     }
 
-    /// All files below a folder, with their bytes.
+    /// All files below a folder, with their content.
     fn files(dir: &Path) -> Vec<(String, Vec<u8>)> {
         let mut files: Vec<_> = ["zarr.json", "transport/zarr.json"].map(str::to_owned).into();
         let chunks = fs::read_dir(dir.join("transport")).unwrap();

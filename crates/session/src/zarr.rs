@@ -1,4 +1,4 @@
-//! What `stack.zarr` and `transport.zarr` share: a durable store, and chunks at the edge of an array.
+//! Shared by `stack.zarr` and `transport.zarr`: a durable store, and chunks at the edge of an array.
 
 use std::fs::File;
 use std::ops::Range;
@@ -23,15 +23,15 @@ use zarrs::storage::{
 
 use crate::{Error, Result, durable};
 
-/// Rows and columns of a chunk, at most.
+/// Maximum rows and columns of a chunk.
 pub(crate) const CHUNK_PX: usize = 64;
 
-/// A file system store whose every write is durable. zarrs' own store writes in place, and its atomic adapter does
-/// not sync the folder.
+/// A file system store in which every write is durable. zarrs' own store writes in place, and its atomic
+/// adapter does not sync the folder.
 pub(crate) struct DurableStore {
     root: PathBuf,
     files: FilesystemStore,
-    /// Whether the folder is a draft, which is made durable as a whole.
+    /// Whether the folder is a draft, which is made durable as a whole later.
     draft: bool,
 }
 
@@ -41,7 +41,8 @@ impl DurableStore {
         Ok(Arc::new(DurableStore { root: root.to_owned(), files, draft: false }))
     }
 
-    /// A store in a folder that nobody reads yet: whoever puts it in its place makes all its files durable before.
+    /// A store in a folder without readers so far: all its files are made durable when it is moved to its
+    /// final place.
     pub(crate) fn draft(root: &Path) -> Result<Arc<DurableStore>> {
         let files = FilesystemStore::new(root).map_err(Error::zarr("open", root))?;
         Ok(Arc::new(DurableStore { root: root.to_owned(), files, draft: true }))
@@ -116,7 +117,7 @@ pub(crate) fn create_group(store: &Arc<DurableStore>, attributes: Map<String, Va
         .map_err(Error::zarr("create", store.root()))
 }
 
-/// Codecs of all data: little-endian, Zstandard level 1 with its checksum. Chunks are files of one folder
+/// Codecs of all data: little-endian, Zstandard level 1 with checksum. Chunks are files in one folder
 /// (`c.0.0.0`), so that a point costs one fsync of a file and one of a folder.
 pub(crate) fn with_codecs(builder: &mut ArrayBuilder) -> &mut ArrayBuilder {
     let zstd: Arc<dyn BytesToBytesCodecTraits> = Arc::new(ZstdCodec::new(1, true));
@@ -142,7 +143,7 @@ pub(crate) fn create_array(
     Ok(array)
 }
 
-/// Opens an array of so many axes.
+/// Opens an array that must have this number of axes.
 pub(crate) fn open_array(store: &Arc<DurableStore>, name: &str, axes: usize) -> Result<Array<DurableStore>> {
     let path = store.root().join(name);
     let array = Array::open(store.clone(), &format!("/{name}")).map_err(Error::zarr("open", &path))?;
@@ -161,7 +162,7 @@ pub(crate) fn shape_of(array: &Array<DurableStore>) -> Vec<usize> {
     array.shape().iter().map(|&len| usize::try_from(len).unwrap_or(usize::MAX)).collect()
 }
 
-/// Writes one chunk; where the array ends within the chunk, the rest is filled with zeros.
+/// Writes one chunk; the part beyond the end of the array is filled with zeros.
 pub(crate) fn write_chunk<T: Element + Clone + Default>(
     array: &Array<DurableStore>,
     indices: [u64; 3],
@@ -175,8 +176,8 @@ pub(crate) fn write_chunk<T: Element + Clone + Default>(
     array.store_chunk_opt(&indices, chunk, &options).map_err(Error::zarr("write", &path_of(array)))
 }
 
-/// Reads a part of an array, and of its shards no more than the inner chunks that hold it. Parts of chunks that were
-/// never written are 0.
+/// Reads a part of an array, and only the inner chunks of its shards that contain it. Chunks that were never
+/// written read as 0.
 pub(crate) fn read_part<T: ElementOwned>(
     array: &Array<DurableStore>,
     part: [Range<usize>; 3],
@@ -200,13 +201,13 @@ pub(crate) fn read_all<T: ElementOwned>(array: &Array<DurableStore>) -> Result<A
         .map_err(Error::zarr("read", &path_of(array)))
 }
 
-/// A chunk that is all zeros is stored like any other: a stored point has a file.
+/// Chunks that are all zeros are stored like any other: every stored point has a file.
 pub(crate) fn codec_options() -> CodecOptions {
     CodecOptions::default().with_store_empty_chunks(true)
 }
 
-/// In any other order the bytes of a shard would depend on the threads. This is not part of the metadata, so an array
-/// that is opened needs it as much as a new one.
+/// Writes shards in a fixed order; otherwise their bytes would depend on the threads. The metadata do not
+/// contain this, so it applies to opened arrays as well as to new ones.
 fn in_fixed_order() -> CodecSpecificOptions {
     let order = ShardingCodecOptions::default().with_subchunk_write_order(SubchunkWriteOrder::C);
     CodecSpecificOptions::default().with_option(order)

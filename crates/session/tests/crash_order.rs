@@ -1,4 +1,4 @@
-//! A session goes through a crash at every step of storing a point; only the ledger decides what is stored.
+//! Crashes a session at every step of storing a point; only the ledger decides what is stored.
 
 #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
 

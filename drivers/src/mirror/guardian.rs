@@ -1,4 +1,4 @@
-//! A process that outlives the one that drives a mirror, to park what a SIGKILL leaves.
+//! A separate process that parks the mirror if the driving process is killed, even by SIGKILL.
 
 use std::io::{self, Read};
 use std::os::unix::process::CommandExt;
@@ -7,20 +7,20 @@ use std::process::{Child, Command, Stdio};
 
 use super::park::{ParkError, Parked, park};
 
-/// Watches over this process as long as it lives. The guardian's input is a pipe whose other end only this process
-/// holds, so it is closed whatever ends this process; the guardian then parks the mirror and ends.
+/// Guards this process for as long as it lives. The guardian's input is a pipe whose other end only this process
+/// holds, so it closes however this process ends. The guardian then parks the mirror and exits.
 pub struct Guardian {
     child: Child,
 }
 
 impl Guardian {
     /// Starts a guardian: `command` must call [`park_when_closed`] on its standard input, as
-    /// `raysweep park --when-closed --state FILE` does. To be started before the mirror is opened and dropped after it.
+    /// `raysweep park --when-closed --state FILE` does. Start it before the mirror is opened and drop it afterwards.
     ///
     /// # Errors
-    /// When the process cannot be started.
+    /// If the process cannot be started.
     pub fn start(mut command: Command) -> io::Result<Self> {
-        // A group of its own: a Ctrl-C for the daemon must not end its guardian too.
+        // Own process group: a Ctrl-C for the daemon must not end its guardian.
         let child = command.stdin(Stdio::piped()).process_group(0).spawn()?;
         Ok(Self { child })
     }
@@ -35,7 +35,7 @@ impl Drop for Guardian {
     }
 }
 
-/// The guardian's whole life: waits for `input` to be closed, then parks.
+/// Main function of the guardian: waits until `input` is closed, then parks.
 ///
 /// # Errors
 /// As [`park()`].

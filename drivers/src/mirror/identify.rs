@@ -1,9 +1,9 @@
-//! What resonance a mirror has, from a chirp that it was commanded and the angles that were measured.
+//! Determines the resonance of a mirror from a commanded chirp and the measured angles.
 //!
-//! Per axis: the ratio of the two spectra is fitted with `g exp(-i 2 pi f delay) / (1 - r^2 + i r / Q)`, r = f / f0. The
-//! start comes from a straight problem, `1 / |H|^2 = (1 + (1/Q^2 - 2) r^2 + r^4) / g^2`; Gauss-Newton does the rest.
-//! A controller's low-pass bends the response over a wide band; where the whole band is refused, the neighbourhood of
-//! the largest movement is tried, in which the low-pass is little more than a gain and a delay.
+//! Per axis, the ratio of the two spectra is fitted with `g exp(-i 2 pi f delay) / (1 - r^2 + i r / Q)`, r = f / f0.
+//! The initial values come from a linear problem, `1 / |H|^2 = (1 + (1/Q^2 - 2) r^2 + r^4) / g^2`; Gauss-Newton
+//! refines them. A controller's low-pass distorts the response over a wide band. If the fit fails for the whole band,
+//! it is repeated near the largest movement, where the low-pass is little more than a gain and a delay.
 
 use std::f64::consts::{PI, TAU};
 use std::ops::RangeInclusive;
@@ -11,48 +11,48 @@ use std::ops::RangeInclusive;
 use num_complex::Complex64;
 use raysweep_core::SecondOrder;
 
-/// Frequencies at which the spectra are compared.
+/// Number of frequencies at which the spectra are compared.
 const FREQUENCIES: usize = 400;
-/// Steps of Gauss-Newton; five are enough from a good start.
+/// Maximum number of Gauss-Newton steps; five suffice from good initial values.
 const STEPS: usize = 30;
-/// Share of the measured movement that the model may leave unexplained.
+/// Maximum fraction of the measured movement that the model may leave unexplained.
 const LARGEST_RESIDUAL: f64 = 0.2;
-/// By how many half periods of the resonance the delay is tried to be another than the phases' slope says.
+/// Corrections, in half periods of the resonance, that are tried for the delay from the slope of the phase.
 const HALF_PERIODS: [i32; 5] = [0, -1, 1, -2, 2];
-/// Parts of its frequency to either side of the largest movement that are tried after the whole band.
+/// Half widths, relative to the frequency of the largest movement, of the bands that are tried after the whole band.
 const NEIGHBOURHOODS: [f64; 3] = [0.4, 0.2, 0.1];
 
-/// What an axis answers to its command.
+/// Identified response of an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Identified {
-    /// Its resonance.
+    /// The resonance.
     pub response: SecondOrder,
-    /// Measured angle over commanded angle at rest, as the band shows it; negative where they run against each other.
+    /// Measured angle over commanded angle at rest, extrapolated from the band; negative if they have opposite signs.
     pub gain: f64,
-    /// How late it answers: the controller's filter, and the measurement.
+    /// Delay of the controller's filter and of the measurement.
     pub delay_s: f64,
-    /// Share of the measured movement, in the band and by amplitude, that this does not explain.
+    /// Fraction of the measured movement (amplitude, within the band) that the model does not explain.
     pub residual: f64,
-    /// The band in which it holds, lower and upper end.
+    /// The band in which the model holds, lower and upper end.
     pub band_hz: [f64; 2],
 }
 
 impl Identified {
-    /// What it makes of a command of this frequency.
+    /// The response to a command of this frequency.
     pub fn at(&self, hz: f64) -> Transfer {
         let Self { response: SecondOrder { f0_hz, q }, gain, delay_s, .. } = *self;
         Transfer::new(hz, Model { gain, f0_hz, q, delay_s }.at(hz))
     }
 }
 
-/// What becomes of a command of one frequency.
+/// Response to a command of one frequency.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Transfer {
     /// The frequency.
     pub hz: f64,
     /// Measured amplitude over commanded amplitude.
     pub amplitude: f64,
-    /// By how much the measured angle is ahead, -pi to pi.
+    /// Phase by which the measured angle leads, -pi to pi.
     pub phase_rad: f64,
 }
 
@@ -65,17 +65,17 @@ impl Transfer {
 /// Why nothing could be identified.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum IdentifyError {
-    /// The two records do not belong together.
+    /// The two records do not match.
     #[error(
         "{commanded} angles commanded, {measured} measured: give one measured angle for each sample, 100 at least"
     )]
     Lengths {
-        /// How many were commanded.
+        /// Number of commanded angles.
         commanded: usize,
-        /// How many were measured.
+        /// Number of measured angles.
         measured: usize,
     },
-    /// The band makes no sense.
+    /// The band is invalid.
     #[error("band = {low_hz} to {high_hz} Hz: allowed is from above 0 to half the rate, low before high")]
     Band {
         /// Its lower end.
@@ -83,7 +83,7 @@ pub enum IdentifyError {
         /// Its upper end.
         high_hz: f64,
     },
-    /// The angles are no numbers, or nothing moves.
+    /// The angles are not finite, or nothing moves.
     #[error(
         "nothing moves between {low_hz} and {high_hz} Hz: command a chirp over that band and measure its angles"
     )]
@@ -93,7 +93,7 @@ pub enum IdentifyError {
         /// The band's upper end.
         high_hz: f64,
     },
-    /// It resonates elsewhere, or not at all.
+    /// The resonance is outside the band, or there is none.
     #[error(
         "no resonance between {low_hz} and {high_hz} Hz: command a chirp over a band in which it lies, and see that the controller's filter lets it through"
     )]
@@ -103,17 +103,18 @@ pub enum IdentifyError {
         /// The band's upper end.
         high_hz: f64,
     },
-    /// It is no resonator.
+    /// The response is not that of a resonator.
     #[error(
         "a resonator leaves {residual:.2} of the movement unexplained: {LARGEST_RESIDUAL} is allowed; measure with less noise, a wider band, or a smaller amplitude"
     )]
     NoResonator {
-        /// Share of it.
+        /// The unexplained fraction of the movement.
         residual: f64,
     },
 }
 
-/// A sine that sweeps `band` once in `seconds`, with soft ends, then stands for `rest_s` so that the ringing is in the record.
+/// A sine sweep over `band` in `seconds` with smooth ends, followed by a rest of `rest_s`, so that the record
+/// includes the ringing.
 pub fn chirp(
     band: &RangeInclusive<f64>,
     amplitude_deg: f64,
@@ -126,18 +127,18 @@ pub fn chirp(
     let sweep = (0..samples).map(|n| {
         let t = n as f64 / rate_hz;
         let phase = TAU * (band.start() * t + (band.end() - band.start()) * t * t / (2.0 * seconds));
-        // A twentieth at each end rises and falls as half a cosine.
+        // At each end, a twentieth of the samples fades with half a cosine.
         let edge = (n.min(samples - n) as f64 / (0.05 * samples as f64)).min(1.0);
         amplitude_deg * phase.sin() * (1.0 - (PI * edge).cos()) / 2.0
     });
     sweep.chain(std::iter::repeat_n(0.0, rest)).collect()
 }
 
-/// Fits one axis. `commanded` and `measured` are degrees of the same kind, sample by sample, at rest at both ends and
-/// 0 there; of another unit, the gain is by so much another.
+/// Fits one axis. `commanded` and `measured` are angles in degrees, sample by sample, starting and ending at rest at
+/// 0. If the measured angles have another unit, the gain includes the conversion.
 ///
 /// # Errors
-/// When the records, the band or the movement make no resonator.
+/// If the records or the band are invalid, or the movement is not that of a resonator.
 pub fn identify(
     commanded: &[f64],
     measured: &[f64],
@@ -154,7 +155,7 @@ pub fn identify(
     };
     for share in NEIGHBOURHOODS {
         let near = peak.hz * (1.0 - share)..=peak.hz * (1.0 + share);
-        // A movement that is largest at the band's end is no resonance within it.
+        // A movement that is largest at the end of the band is not a resonance within it.
         if band.contains(near.start())
             && band.contains(near.end())
             && let Ok(found) = fit(&self::points(commanded, measured, rate_hz, &near)?, &near)
@@ -165,10 +166,10 @@ pub fn identify(
     Err(refused)
 }
 
-/// What the records say of frequencies over the band, evenly spaced, without a model.
+/// The response at evenly spaced frequencies over the band, without a model.
 ///
 /// # Errors
-/// When the records or the band make no spectra.
+/// If spectra cannot be computed from the records or the band.
 pub fn transfer(
     commanded: &[f64],
     measured: &[f64],
@@ -179,8 +180,8 @@ pub fn transfer(
     Ok(points.iter().map(|point| Transfer::new(point.hz, point.ratio)).collect())
 }
 
-/// The direction in which a track in a plane moves most within the band, as a unit vector. What is slower, as drift,
-/// has no say.
+/// The direction in which a track in a plane moves most within the band, as a unit vector. Slower movement, such as
+/// drift, has no influence.
 pub fn direction(track: [&[f64]; 2], rate_hz: f64, band: &RangeInclusive<f64>) -> [f64; 2] {
     let mut moments = [0.0; 3];
     for hz in frequencies(band) {
@@ -198,7 +199,7 @@ fn frequencies(band: &RangeInclusive<f64>) -> impl Iterator<Item = f64> + use<> 
     (0..FREQUENCIES).map(move |k| low_hz + (high_hz - low_hz) * k as f64 / (FREQUENCIES - 1) as f64)
 }
 
-/// The spectra over the band, where there are any.
+/// The spectra over the band.
 fn points(
     commanded: &[f64],
     measured: &[f64],
@@ -228,7 +229,8 @@ fn fit(points: &[Point], band: &RangeInclusive<f64>) -> Result<Identified, Ident
     let [low_hz, high_hz] = [*band.start(), *band.end()];
     let elsewhere = IdentifyError::NoResonance { low_hz, high_hz };
     let Some(start) = Model::start(points) else { return Err(elsewhere) };
-    // A low-pass turns the phase by a line that misses 0: the delay may lack half periods of the resonance.
+    // A low-pass shifts the phase by a line that does not pass through 0, so the delay may be off by half periods of
+    // the resonance.
     let refined = HALF_PERIODS.map(|halves| start.late_by(halves).refined(points));
     let [first, others @ ..] = refined;
     let better = |a: Model, b: Model| if b.error(points) < a.error(points) { b } else { a };
@@ -278,14 +280,15 @@ struct Model {
 }
 
 impl Model {
-    /// From the magnitudes, then the delay from how the phases that they leave turn with frequency.
+    /// Initial values: first from the magnitudes, then the delay from the slope of the remaining phase over
+    /// frequency.
     fn start(points: &[Point]) -> Option<Self> {
         let mut normal = [[0.0; 4]; 3];
         let scale = points.last()?.hz;
         for point in points {
             let squared = point.ratio.norm_sqr();
             let f2 = (point.hz / scale).powi(2);
-            // An error of H counts in 1/|H|^2 by |H|^-3.
+            // An error of H affects 1/|H|^2 by |H|^-3.
             let weight = point.command.powi(2) * squared.powi(3);
             accumulate(&mut normal, [1.0, f2, f2 * f2], 1.0 / squared, weight);
         }
@@ -311,7 +314,7 @@ impl Model {
         Some(model)
     }
 
-    /// The same near the resonance, by half periods of it later.
+    /// The same response near the resonance, later by this number of half periods of the resonance.
     fn late_by(self, halves: i32) -> Self {
         let gain = if halves % 2 == 0 { self.gain } else { -self.gain };
         Self { gain, delay_s: self.delay_s + f64::from(halves) / (2.0 * self.f0_hz), ..self }
@@ -330,7 +333,7 @@ impl Model {
         points.iter().map(|p| (p.ratio - self.at(p.hz)).norm_sqr() * p.command * p.command).sum()
     }
 
-    /// Gauss-Newton on relative parameters; a step that does not help is halved.
+    /// Gauss-Newton on relative parameters; a step without improvement is halved.
     fn refined(self, points: &[Point]) -> Self {
         let mut model = self;
         for _ in 0..STEPS {
@@ -368,7 +371,7 @@ impl Model {
     }
 }
 
-/// Adds an equation `row . x = value` to the normal equations, whose last column is the right side.
+/// Adds an equation `row . x = value` to the normal equations, whose last column is the right-hand side.
 fn accumulate<const N: usize, const M: usize>(
     normal: &mut [[f64; M]; N],
     row: [f64; N],
@@ -411,7 +414,7 @@ mod tests {
     const RATE_HZ: f64 = 39_000.0;
     const BAND: RangeInclusive<f64> = 100.0..=900.0;
 
-    /// What a simulated mirror measures when it is commanded a chirp, x and y.
+    /// What a simulated mirror measures for a commanded chirp, x and y.
     fn measure(config: MechanicsConfig, noise_deg: f64) -> (Vec<f64>, [Vec<f64>; 2]) {
         let commanded = chirp(&BAND, 0.1, 0.8, 0.3, RATE_HZ);
         let mut mechanics = Mechanics::new(config, RATE_HZ);
@@ -454,7 +457,7 @@ mod tests {
 
     #[test]
     fn a_low_filter_hides_no_resonance_and_a_mirrored_axis_has_a_negative_gain() {
-        // The filter takes nine tenths of the movement at the resonance, and bends the rest of the band.
+        // The filter removes nine tenths of the movement at the resonance and distorts the rest of the band.
         let config = MechanicsConfig { filter_hz: 200.0, q: [30.0, 20.0], ..Default::default() };
         let (commanded, measured) = measure(config, 0.002);
         for (axis, measured) in measured.iter().enumerate() {
@@ -498,7 +501,7 @@ mod tests {
         ));
         let wrong = 900.0..=100.0;
         assert!(matches!(identify(&commanded, &commanded, RATE_HZ, &wrong), Err(IdentifyError::Band { .. })));
-        // A mirror that is where it is commanded to be, and one whose resonance lies above the band.
+        // A mirror that follows its command exactly, and one whose resonance lies above the band.
         let exact = identify(&commanded, &commanded, RATE_HZ, &BAND);
         assert!(matches!(exact, Err(IdentifyError::NoResonance { .. })), "{exact:?}");
         let config = MechanicsConfig { filter_hz: 5000.0, f0_hz: [1500.0, 1500.0], ..Default::default() };

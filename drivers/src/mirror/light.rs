@@ -1,37 +1,37 @@
-//! Who permits light: an interlock, or an operator's word given since this boot.
+//! Permission for light: an interlock, or the permission of an operator since this boot.
 
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Identifies this boot of the machine.
+/// File with the id of this boot.
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 
-/// Why there is no light.
+/// Why light is not permitted.
 #[derive(Debug, thiserror::Error)]
 pub enum NoLight {
     /// The interlock is open.
     #[error("the interlock {} is open: close the enclosure", path.display())]
     Open {
-        /// Where it is read.
+        /// Path of the interlock.
         path: PathBuf,
     },
     /// The interlock cannot be read.
     #[error("the interlock {} cannot be read: {source}: check its wiring and the rig file", path.display())]
     Unreadable {
-        /// Where it should be read.
+        /// Path of the interlock.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// Nobody has given the word.
+    /// No operator has permitted light.
     #[error(
         "nobody has permitted light since this boot: make sure that it is safe, then `raysweep arm-light`"
     )]
     NotArmed,
 }
 
-/// What `status` says of the light's permission.
+/// Permission for light as reported by `status`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LightState {
@@ -41,25 +41,24 @@ pub enum LightState {
     InterlockOpen,
     /// No interlock; an operator has armed the light since this boot.
     Armed,
-    /// No interlock and no operator's word.
+    /// No interlock, and no operator has armed the light.
     NotArmed,
 }
 
-/// Decides, each time anew, whether there may be light.
+/// Decides whether light is permitted, each time it is asked.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LightGuard {
-    /// Where [`arm_light`] leaves the operator's word.
+    /// File in which [`arm_light`] records the operator's permission.
     pub armed_file: PathBuf,
-    /// A file that begins with `1` while the interlock is closed, such as a GPIO's value; where there is one, it alone
-    /// decides.
+    /// A file that begins with `1` while the interlock is closed, such as a GPIO's value. If given, it alone decides.
     pub interlock: Option<PathBuf>,
 }
 
 impl LightGuard {
-    /// Whether there may be light now.
+    /// Whether light is permitted now.
     ///
     /// # Errors
-    /// Why not, and what to do about it.
+    /// Why it is not, and what to do about it.
     pub fn permits(&self) -> Result<(), NoLight> {
         let Some(path) = &self.interlock else {
             return if is_armed(&self.armed_file) { Ok(()) } else { Err(NoLight::NotArmed) };
@@ -82,15 +81,15 @@ impl LightGuard {
     }
 }
 
-/// Takes the operator's word, for this boot.
+/// Records the operator's permission for this boot.
 ///
 /// # Errors
-/// When the file cannot be written.
+/// If the file cannot be written.
 pub fn arm_light(armed_file: &Path) -> io::Result<()> {
     fs::write(armed_file, boot_id()?)
 }
 
-/// This boot.
+/// The id of this boot.
 pub(super) fn boot_id() -> io::Result<String> {
     Ok(fs::read_to_string(BOOT_ID)?.trim().to_owned())
 }

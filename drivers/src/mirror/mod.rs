@@ -1,8 +1,8 @@
 //! MEMS mirrors over serial lines: Mirrorcle's PlayzerX and MTI controllers, Optotune's MR-E-2.
 //!
-//! A driver keeps a [`StateFile`]: what it is about to send is on disk before the first sample leaves, and how much of
-//! it was sent beside it. Whoever comes after a crash ([`park()`], a [`Guardian`], the next run) knows from it where the
-//! mirror is and takes it to the origin, light off first.
+//! A driver keeps a [`StateFile`]: what it is going to send is on disk before the first sample is sent, and how much
+//! of it was sent is recorded next to it. After a crash, [`park()`], a [`Guardian`] or the next run can therefore
+//! determine the mirror's position and move it to the origin, light off first.
 
 mod guardian;
 pub mod identify;

@@ -1,4 +1,4 @@
-//! Mirrorcle's MTI controllers in their ASCII mode: one line a command, `MTI-OK` or `MTI-ERR ...` back.
+//! Mirrorcle's MTI controllers in their ASCII mode: one line per command, answered by `MTI-OK` or `MTI-ERR ...`.
 
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
@@ -14,26 +14,28 @@ use super::wire::{Parsed, line};
 
 const BAUD: u32 = 115_200;
 const REPLY_WAIT: Duration = Duration::from_millis(300);
-/// The high voltage takes its time.
+/// Maximum wait for switching the high voltage.
 const ENABLE_WAIT: Duration = Duration::from_secs(2);
 
-/// What the controller drives the mirror with. Too much of it destroys the mirror.
+/// Drive settings of the controller. Too high values destroy the mirror.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MtiDrive {
     /// Bias, 0..=100 V.
     pub bias_v: u32,
-    /// Largest difference between the electrodes of an axis, 0..=200 V.
+    /// Maximum voltage difference between the electrodes of an axis, 0..=200 V.
     pub difference_v: u32,
     /// -3 dB frequency of the controller's low-pass, 50..=15,000 Hz.
     pub bandwidth_hz: u32,
 }
 
 impl MtiDrive {
-    /// The most that Mirrorcle's A7B2.3-3600AL takes.
+    /// Maximum drive of Mirrorcle's A7B2.3-3600AL.
     pub const A7B2_3_3600AL: Self = Self { bias_v: 80, difference_v: 150, bandwidth_hz: 200 };
 
+    /// Checks the drive settings.
+    ///
     /// # Errors
-    /// The first value beyond `most` or beyond what the controller takes.
+    /// The first value above `most` or outside the controller's range.
     fn check(&self, most: &Self) -> Result<(), DeviceError> {
         let rules = [
             ("bias_v", self.bias_v, 0, most.bias_v.min(100)),
@@ -50,57 +52,57 @@ impl MtiDrive {
     }
 }
 
-/// Which MTI controller and mirror.
+/// Configuration of an MTI controller and its mirror.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MtiConfig {
     /// Its serial port.
     pub port: PathBuf,
-    /// What to drive the mirror with.
+    /// The drive settings.
     pub drive: MtiDrive,
-    /// The most that the mirror takes, from its data sheet.
+    /// The mirror's maximum drive, from its data sheet.
     pub most: MtiDrive,
-    /// Tilt of the mirror at the controller's full scale, under this drive.
+    /// Tilt of the mirror at the controller's full scale, with this drive.
     pub full_scale: MechanicalDeg,
-    /// What the mirror survives.
+    /// Limits of the mirror.
     pub limits: MirrorLimits,
-    /// Where the driver keeps what a crash must not lose.
+    /// File for the state that must survive a crash.
     pub state: PathBuf,
-    /// Who permits light.
+    /// Permission for light.
     pub light: LightGuard,
 }
 
-/// What the controller can be told.
+/// A command to the controller.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum MtiCommand {
     /// Enters the command mode.
     Enter,
-    /// Bias in volts; only while the high voltage is off.
+    /// Sets the bias in volts; only while the high voltage is off.
     Bias(u32),
-    /// Largest difference in volts; only while the high voltage is off.
+    /// Sets the maximum voltage difference; only while the high voltage is off.
     Difference(u32),
-    /// Bandwidth in hertz; only while the high voltage is off.
+    /// Sets the bandwidth in hertz; only while the high voltage is off.
     Bandwidth(u32),
-    /// High voltage on.
+    /// Switches the high voltage on.
     Enable,
-    /// High voltage off.
+    /// Switches the high voltage off.
     Disable,
-    /// Goes to a place, -1..=1 of the full scale, with light 0..=255.
+    /// Goes to a position, -1..=1 of full scale, with light 0..=255.
     GoTo {
-        /// Part of the full scale.
+        /// Fraction of full scale.
         x: f64,
-        /// Part of the full scale.
+        /// Fraction of full scale.
         y: f64,
         /// 0: off, 255: full.
         light: u8,
     },
-    /// Answers to commands, please.
+    /// Switches on answers to commands.
     Echo,
     /// Leaves the command mode.
     Exit,
 }
 
 impl MtiCommand {
-    /// Appends the command as it goes over the wire.
+    /// Appends the bytes of the command.
     pub fn to_bytes(self, out: &mut Vec<u8>) {
         let text = match self {
             Self::Enter => "$MTI$".into(),
@@ -118,18 +120,18 @@ impl MtiCommand {
     }
 }
 
-/// What the controller says.
+/// A reply from the controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum MtiReply {
-    /// Done.
+    /// The command was executed.
     Done,
-    /// Not done, and why.
+    /// The command was refused, with the reason.
     Refused(String),
-    /// Who it is, on entering or leaving the command mode.
+    /// The device's description, on entering or leaving the command mode.
     Device(String),
 }
 
-/// Reads the reply that `bytes` begin with.
+/// Parses the reply at the start of `bytes`.
 pub fn parse_mti(bytes: &[u8]) -> Parsed<MtiReply> {
     let (text, used) = match line(bytes) {
         Ok(Some(line)) => line,
@@ -175,7 +177,7 @@ impl MtiLine {
         }
     }
 
-    /// Ends whatever line is begun and enters the command mode, or finds itself in it already.
+    /// Completes any partial line and enters the command mode, or detects that the controller is already in it.
     fn enter(port: &std::path::Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
         let mut line = Self { port: Port::open(port, BAUD)?, full_scale };
         line.port.send(b"\n")?;
@@ -190,7 +192,7 @@ impl MtiLine {
 }
 
 impl PointController for MtiLine {
-    /// At 115,200 baud a point and its answer take 3 ms.
+    /// At 115,200 baud, a point and its answer take 3 ms.
     const RATE_HZ: RangeInclusive<f64> = 1.0..=300.0;
 
     fn go(&mut self, point: MirrorPoint) -> Result<(), DeviceError> {
@@ -204,12 +206,12 @@ impl PointController for MtiLine {
     }
 }
 
-/// A mirror behind an MTI controller.
+/// A mirror driven by an MTI controller.
 pub type Mti = PointMirror<MtiLine>;
 
 impl PointMirror<MtiLine> {
-    /// Opens the controller, sets the drive and switches the high voltage on. A mirror that a crashed process has left
-    /// somewhere is parked first.
+    /// Opens the controller, sets the drive and switches the high voltage on. If a crashed process left the mirror
+    /// away from rest, it is parked first.
     ///
     /// # Errors
     /// `OutOfRange` for a drive that would destroy the mirror, `Busy`, `Disconnected`, `Timeout`, `Protocol`.
@@ -231,7 +233,7 @@ impl PointMirror<MtiLine> {
     }
 }
 
-/// Parks a mirror that a process has left behind. `None`: its drive was off, so it is at rest.
+/// Parks a mirror that a process left behind. `None`: its drive was off, so it is at rest.
 pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
     let Reach::Mti { port, full_scale } = &state.reach else { return Ok(None) };
     let (mut line, _) = MtiLine::enter(port, *full_scale)?;

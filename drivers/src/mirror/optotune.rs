@@ -1,5 +1,5 @@
-//! Optotune's MR-E-2 in its simple mode: one line a command, `OK`, `NO`, `OL` or `OU` back. It has no output for a
-//! light, so the light hangs on a [`Laser`] of its own.
+//! Optotune's MR-E-2 in its simple mode: one line per command, answered by `OK`, `NO`, `OL` or `OU`. It has no output
+//! for a light, so the light is controlled by a separate [`Laser`].
 
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -15,28 +15,28 @@ use super::wire::{Parsed, line};
 
 const BAUD: u32 = 256_000;
 const REPLY_WAIT: Duration = Duration::from_millis(300);
-/// The controller's coordinates are tangents of the optical angle over that of this one.
+/// The controller's coordinates are tan(optical angle) / tan(this angle).
 const FULL_SCALE_OPTICAL_DEG: f64 = 50.0;
 
-/// A light that is switched apart from the mirror.
+/// A light that is switched separately from the mirror.
 pub trait Laser: Send {
-    /// On or off; returns when it is so.
+    /// Switches the light on or off; returns when that is done.
     ///
     /// # Errors
-    /// `Disconnected` when it cannot be told.
+    /// `Disconnected` if the light cannot be reached.
     fn switch(&mut self, on: bool) -> Result<(), DeviceError>;
 }
 
-/// A laser whose enable input hangs on the RTS line of a serial port: it goes off by itself when the process ends.
+/// A laser whose enable input is wired to the RTS line of a serial port: it goes off by itself when the process ends.
 pub struct RtsLaser {
     port: Port,
 }
 
 impl RtsLaser {
-    /// Opens the port, light off.
+    /// Opens the port with the light off.
     ///
     /// # Errors
-    /// When the port cannot be opened or has no RTS line.
+    /// If the port cannot be opened or has no RTS line.
     pub fn open(port: &Path) -> Result<Self, DeviceError> {
         let mut laser = Self { port: Port::open(port, 9600)? };
         laser.switch(false)?;
@@ -50,38 +50,38 @@ impl Laser for RtsLaser {
     }
 }
 
-/// Which MR-E-2.
+/// Configuration of an MR-E-2.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OptotuneConfig {
     /// Its serial port.
     pub port: PathBuf,
-    /// The port whose RTS line enables the laser, for [`super::park()`] after a crash; none where the laser needs
-    /// something else.
+    /// The port whose RTS line enables the laser, for [`super::park()`] after a crash; `None` if the laser is
+    /// controlled differently.
     pub laser_port: Option<PathBuf>,
-    /// What the mirror survives.
+    /// Limits of the mirror.
     pub limits: MirrorLimits,
-    /// Where the driver keeps what a crash must not lose.
+    /// File for the state that must survive a crash.
     pub state: PathBuf,
-    /// Who permits light.
+    /// Permission for light.
     pub light: LightGuard,
 }
 
-/// What the controller can be told.
+/// A command to the controller.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum OptotuneCommand {
-    /// Are you there?
+    /// Requests a sign of life.
     Start,
-    /// Goes to tan(optical angle) / tan 50 degrees, -1..=1, both axes.
+    /// Goes to a position; both coordinates are tan(optical angle) / tan 50 degrees, -1..=1.
     GoTo {
-        /// Of the x axis.
+        /// Coordinate of the x axis.
         x: f64,
-        /// Of the y axis.
+        /// Coordinate of the y axis.
         y: f64,
     },
 }
 
 impl OptotuneCommand {
-    /// Appends the command as it goes over the wire.
+    /// Appends the bytes of the command.
     pub fn to_bytes(self, out: &mut Vec<u8>) {
         let text = match self {
             Self::Start => "START".into(),
@@ -92,20 +92,20 @@ impl OptotuneCommand {
     }
 }
 
-/// What the controller says.
+/// A reply from the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum OptotuneReply {
-    /// Done.
+    /// The command was executed.
     Ok,
-    /// Not understood.
+    /// The command was not understood.
     No,
-    /// Below the lowest value.
+    /// The value is below the minimum.
     TooLow,
-    /// Above the highest value.
+    /// The value is above the maximum.
     TooHigh,
 }
 
-/// Reads the reply that `bytes` begin with.
+/// Parses the reply at the start of `bytes`.
 pub fn parse_optotune(bytes: &[u8]) -> Parsed<OptotuneReply> {
     let (text, used) = match line(bytes) {
         Ok(Some(line)) => line,
@@ -126,7 +126,7 @@ pub fn parse_optotune(bytes: &[u8]) -> Parsed<OptotuneReply> {
     Parsed::Reply { reply, used }
 }
 
-/// The controller and the laser beside it.
+/// The controller and its separate laser.
 pub struct OptotuneLine {
     port: Port,
     laser: Box<dyn Laser>,
@@ -137,7 +137,7 @@ impl OptotuneLine {
     fn open(port: &Path, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
         let mut line = Self { port: Port::open(port, BAUD)?, laser, lit: true };
         line.light(false)?;
-        // Ends whatever line is begun; what is said to that is no answer to us.
+        // Completes any partial line; the reply to that is discarded.
         line.port.send(b"\r\n")?;
         line.port.await_silence(parse_optotune)?;
         line.tell(OptotuneCommand::Start)?;
@@ -171,11 +171,11 @@ impl OptotuneLine {
 }
 
 impl PointController for OptotuneLine {
-    /// At 256,000 baud a point and its answer take 1 ms.
+    /// At 256,000 baud, a point and its answer take 1 ms.
     const RATE_HZ: RangeInclusive<f64> = 1.0..=500.0;
 
     fn go(&mut self, point: MirrorPoint) -> Result<(), DeviceError> {
-        // Off before the mirror moves, on after it has been told to.
+        // Off before the mirror moves; on after it was commanded to move.
         if point.light == 0 {
             self.light(false)?;
         }
@@ -190,11 +190,11 @@ impl PointController for OptotuneLine {
     }
 }
 
-/// An MR-E-2.
+/// A mirror driven by an MR-E-2.
 pub type Optotune = PointMirror<OptotuneLine>;
 
 impl PointMirror<OptotuneLine> {
-    /// Opens the controller. A mirror that a crashed process has left somewhere is parked first.
+    /// Opens the controller. If a crashed process left the mirror away from rest, it is parked first.
     ///
     /// # Errors
     /// `Busy`, `Disconnected`, `Timeout`, `Protocol`.
@@ -209,7 +209,7 @@ impl PointMirror<OptotuneLine> {
     }
 }
 
-/// A laser that nobody but the lab can reach.
+/// A laser that this process cannot reach; only the lab can switch it.
 struct NoLaser;
 
 impl Laser for NoLaser {
@@ -218,7 +218,7 @@ impl Laser for NoLaser {
     }
 }
 
-/// Parks a mirror that a process has left behind. `None`: nobody knew whether it was where it was left.
+/// Parks a mirror that a process left behind. `None`: it may not have been where it was left.
 pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, DeviceError> {
     let Reach::Optotune { port, node, laser_port } = &state.reach else { return Ok(None) };
     let laser: Box<dyn Laser> = match laser_port {
@@ -227,7 +227,7 @@ pub(super) fn recover(state: &MirrorState, sent: Sent) -> Result<Option<Tilt>, D
     };
     let mut line = OptotuneLine::open(port, laser)?;
     if !state.is_plugged_in_since(port, *node) {
-        // Without power it has sprung back; with it, its own loop brings it back as it takes any step.
+        // Without power, it has sprung back. With power, its own control loop follows a step of any size.
         line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
         return Ok(None);
     }

@@ -1,4 +1,4 @@
-//! Parking what a process has left behind.
+//! Parking a mirror that a process left moving or away from the origin.
 
 use std::path::Path;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use raysweep_core::{DeviceError, Tilt};
 use super::state::{MirrorState, Reach, StateError, StateFile};
 use super::{mti, optotune, playzerx};
 
-/// Longest time to wait for a process that dies to let go of the mirror.
+/// Maximum wait for a dying process to release the mirror.
 const LOCK_WAIT: Duration = Duration::from_secs(2);
 
 /// Why a mirror could not be parked.
@@ -17,7 +17,7 @@ pub enum ParkError {
     /// Its state cannot be read or written.
     #[error(transparent)]
     State(#[from] StateError),
-    /// Its controller cannot be told.
+    /// Its controller cannot be reached.
     #[error("{0}: if the light is on, switch it off by hand")]
     Device(#[from] DeviceError),
 }
@@ -27,27 +27,27 @@ pub enum ParkError {
 pub enum Parked {
     /// It was parked already, or has never been moved.
     Already,
-    /// It was found there, and taken to the origin with the light off.
+    /// It was found at this tilt and moved to the origin with the light off.
     From(Tilt),
-    /// Nobody could say where it was, so its controller was started anew, which takes light and drive away, or told to be at the
-    /// origin.
+    /// Its position was unknown. Its controller was restarted, which switches off light and drive, or was commanded
+    /// to the origin.
     ByReset,
 }
 
-/// Parks the mirror whose driver kept its state in `state`, after the driver's process has ended in whatever way. Light
-/// off first, then a ramp from where the controller says that it is.
+/// Parks the mirror whose driver kept its state in `state`, however the driver's process ended. Switches the light
+/// off first, then moves on a ramp from the position that the controller reports.
 ///
 /// # Errors
-/// `Locked` when a process still drives the mirror; `Device` when the controller cannot be reached.
+/// `Locked` if a process still drives the mirror; `Device` if the controller cannot be reached.
 pub fn park(state: &Path) -> Result<Parked, ParkError> {
-    // Where no mirror was ever moved, nothing is written either.
+    // If no mirror was ever moved, do not create files.
     if matches!(state.try_exists(), Ok(false)) {
         return Ok(Parked::Already);
     }
     park_left(&StateFile::open(state, LOCK_WAIT)?)
 }
 
-/// The same with the lock in hand.
+/// As [`park()`], with the lock already held.
 pub(super) fn park_left(file: &StateFile) -> Result<Parked, ParkError> {
     let Some((state, sent)) = file.read()? else { return Ok(Parked::Already) };
     if state.playing.is_none() {

@@ -1,4 +1,4 @@
-//! A mirror that takes one point at a time and acknowledges it: the host's clock is the sample clock.
+//! Mirrors that take one point at a time and acknowledge it: the host's clock is the sample clock.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -16,32 +16,32 @@ use super::rules;
 use super::sequence::Sequence;
 use super::state::{MirrorState, Reach, Sent, StateFile, of_state};
 
-/// Longest time to wait for whoever drives the mirror to let go of it.
+/// Maximum wait for another process to release the mirror.
 const LOCK_WAIT: Duration = Duration::from_secs(1);
-/// How often the light's permission is looked at.
+/// Interval of checking the light's permission.
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
-/// Longest time that a lit point may stand because the host is late [A].
+/// Maximum time that the light may stay on one point because the host is late [A].
 const LONGEST_LATE: Duration = Duration::from_millis(100);
 
 /// A controller that takes one point at a time.
 pub trait PointController: Send {
-    /// Points per second that it takes.
+    /// Supported range of points per second.
     const RATE_HZ: RangeInclusive<f64>;
 
     /// Goes to a point; returns when the controller has acknowledged it.
     ///
     /// # Errors
-    /// Of the wire, or what the controller says against it.
+    /// Errors of the connection, or a refusal of the controller.
     fn go(&mut self, point: MirrorPoint) -> Result<(), DeviceError>;
 
-    /// Lets go of a mirror at rest: drive off where there is one.
+    /// Releases a mirror at rest: switches the drive off if there is one.
     ///
     /// # Errors
-    /// Of the wire.
+    /// Errors of the connection.
     fn release(&mut self) -> Result<(), DeviceError>;
 }
 
-/// The driver of such a mirror.
+/// Driver of a mirror that takes one point at a time.
 pub struct PointMirror<C: PointController> {
     controller: C,
     reach: Reach,
@@ -63,7 +63,7 @@ struct Pace {
     period: Duration,
     sent: u64,
     due: Instant,
-    /// When the path's first point was acknowledged.
+    /// Time of the acknowledgement of the path's first point.
     first: Option<Instant>,
     last: Instant,
     light_checked: Instant,
@@ -76,7 +76,7 @@ impl Pace {
         Self { sequence, period, sent: 0, due: now, first: None, last: now, light_checked: now }
     }
 
-    /// Sends the point that is due; a late one delays all that follow, so that none is skipped.
+    /// Sends the point that is due; a late point delays all following ones, so that none is skipped.
     fn step<C: PointController>(
         &mut self,
         controller: &mut C,
@@ -127,8 +127,8 @@ impl Pace {
 }
 
 impl<C: PointController> PointMirror<C> {
-    /// Takes the lock, parks what a crashed process has left, then opens the controller with `open`, which returns it
-    /// with its name.
+    /// Takes the lock, parks a mirror that a crashed process left behind, then opens the controller with `open`,
+    /// which returns it with its name.
     pub(super) fn open_with(
         state: &Path,
         limits: MirrorLimits,
@@ -241,7 +241,7 @@ impl<C: PointController> Mirror for PointMirror<C> {
         };
         self.controller.go(MirrorPoint { tilt: place, light: 0 })?;
         let sequence = Sequence::travel(place, Tilt::ORIGIN, rate_hz, &self.capabilities.limits);
-        // A disk that is full keeps no mirror from being parked.
+        // A full disk must not prevent parking.
         let recorded = self.record(rate_hz, Some(&sequence));
         self.play_out(sequence, rate_hz, recorded.is_ok())?;
         self.phase = Phase::Parked;
@@ -257,14 +257,15 @@ impl<C: PointController> Drop for PointMirror<C> {
     }
 }
 
-/// Takes a mirror that a process has left behind to the origin, dark. Returns where it was found.
+/// Moves a mirror that a process left behind to the origin, dark. Returns where it was found.
 pub(super) fn recover<C: PointController>(
     controller: &mut C,
     state: &MirrorState,
     sent: Sent,
 ) -> Result<Option<Tilt>, DeviceError> {
     let Some(sequence) = &state.playing else { return Ok(None) };
-    // The last point may have been taken or not: they are one step apart, which any mirror survives.
+    // The controller may or may not have taken the last point; the two cases are one step apart, which is safe for
+    // any mirror.
     let place = sequence.after(sent.possibly);
     controller.go(MirrorPoint { tilt: place, light: 0 })?;
     let sequence = Sequence::travel(place, Tilt::ORIGIN, state.rate_hz, &state.limits);

@@ -1,4 +1,4 @@
-//! A serial port to a controller.
+//! The serial port of a controller.
 
 use std::io::{self, Read, Write};
 use std::path::Path;
@@ -10,14 +10,14 @@ use serialport::{DataBits, FlowControl, Parity, SerialPort, StopBits, TTYPort};
 
 use super::wire::{Parsed, Receiver};
 
-/// How long one call waits for the port to take bytes: a feeding loop must come back to read.
+/// Maximum time for the port to accept bytes in one call: a feeding loop must return to reading.
 const WRITE_WAIT: Duration = Duration::from_millis(5);
-/// How long the port's other end may take no byte at all before a whole message is given up.
+/// Sending a message fails if the port accepts no byte for this long.
 const SEND_WAIT: Duration = Duration::from_millis(500);
 
-/// After so long without a reply none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are shorter.
+/// After this long without a reply, none is on its way: a line at 115,200 baud and a USB adapter's 16 ms are faster.
 const SILENCE: Duration = Duration::from_millis(50);
-/// A device that says more than this without being asked never falls silent.
+/// A device that sends more unrequested replies than this never falls silent.
 const MOST_STALE: usize = 16;
 
 /// An error of the mirror.
@@ -25,7 +25,7 @@ pub(super) fn fault(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceErr
     DeviceError::new("mirror", kind, what.into())
 }
 
-/// An open port, exclusively ours, and what came over it.
+/// An open port in exclusive use, and the bytes received from it.
 pub(crate) struct Port {
     device: &'static str,
     tty: TTYPort,
@@ -62,7 +62,7 @@ impl Port {
         Ok(Self { device, tty, name, received: Receiver::default() })
     }
 
-    /// Writes what the port takes now; how much that was.
+    /// Writes what the port accepts now; returns the number of bytes.
     pub fn write_some(&mut self, bytes: &[u8]) -> Result<usize, DeviceError> {
         match self.tty.write(bytes) {
             Ok(written) => Ok(written),
@@ -71,7 +71,7 @@ impl Port {
         }
     }
 
-    /// Writes all of it.
+    /// Writes all bytes.
     pub fn send(&mut self, mut bytes: &[u8]) -> Result<(), DeviceError> {
         let mut last = Instant::now();
         while !bytes.is_empty() {
@@ -88,7 +88,7 @@ impl Port {
         Ok(())
     }
 
-    /// Waits until bytes are there, for `timeout` at the most: the caller's clock is read right after.
+    /// Waits until bytes are available, for up to `timeout`; the caller reads its clock right afterwards.
     pub fn wait(&mut self, timeout: Duration) -> Result<(), DeviceError> {
         let mut buffer = [0; 64];
         self.tty.set_timeout(timeout).map_err(|error| self.lost(&error.into()))?;
@@ -105,7 +105,7 @@ impl Port {
         }
     }
 
-    /// The next reply that is there, without waiting.
+    /// The next received reply, without waiting.
     pub fn reply<R>(&mut self, parse: impl Fn(&[u8]) -> Parsed<R>) -> Result<Option<R>, DeviceError> {
         let mut buffer = [0; 1024];
         loop {
@@ -126,7 +126,7 @@ impl Port {
         }
     }
 
-    /// The next reply that `pick` takes; `None` when it does not come within `timeout`.
+    /// The next reply that `pick` accepts; `None` if there was none within `timeout`.
     pub fn await_reply<R, T>(
         &mut self,
         timeout: Duration,
@@ -135,7 +135,7 @@ impl Port {
     ) -> Result<Option<T>, DeviceError> {
         let deadline = Instant::now() + timeout;
         loop {
-            // Looked at first: a reply that came while this thread was not run is not late.
+            // Evaluated first: a reply that arrived while this thread did not run is not late.
             let is_over = Instant::now() >= deadline;
             while let Some(reply) = self.reply(&parse)? {
                 if let Some(picked) = pick(reply) {
@@ -149,7 +149,7 @@ impl Port {
         }
     }
 
-    /// Reads replies until no more come: they answer what was said before, perhaps by a process that was killed.
+    /// Reads replies until no more arrive: they answer earlier commands, perhaps of a process that was killed.
     pub fn await_silence<R>(&mut self, parse: impl Fn(&[u8]) -> Parsed<R>) -> Result<(), DeviceError> {
         for _ in 0..MOST_STALE {
             if self.await_reply(SILENCE, &parse, Some)?.is_none() {
@@ -159,7 +159,7 @@ impl Port {
         Ok(())
     }
 
-    /// Bytes so far that belonged to no reply.
+    /// Number of received bytes that belonged to no reply.
     pub fn garbage_bytes(&self) -> u64 {
         self.received.garbage_bytes()
     }

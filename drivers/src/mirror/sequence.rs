@@ -1,18 +1,18 @@
-//! All that is sent to a controller between two stops, in the order in which it is played.
+//! Everything that is sent to a controller between two stops, in playing order.
 
 use raysweep_core::{MirrorLimits, MirrorPath, MirrorPoint, Tilt};
 use serde::{Deserialize, Serialize};
 
-/// How long the mirror stands, dark, before and after a movement: what the host sends late in this time does no harm.
+/// How long the mirror rests, dark, before and after a movement: late samples of the host do no harm in this time.
 const DWELL_S: f64 = 0.01;
-/// The same before a path: time to fill the controller's FIFO, and to see at which rate it drains.
+/// The same before a path: time to fill the controller's FIFO and to measure its rate.
 const LEAD_S: f64 = 0.25;
 
-/// Points once, points over and over, points once.
+/// Points played once, then points played repeatedly, then points played once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Sequence {
-    /// Where the mirror is when it begins.
+    /// Position of the mirror at the beginning.
     from: Tilt,
     lead: Vec<MirrorPoint>,
     path: Vec<MirrorPoint>,
@@ -25,7 +25,7 @@ fn dark(tilt: Tilt) -> MirrorPoint {
 }
 
 fn dwell(tilt: Tilt, rate_hz: f64, seconds: f64) -> impl Iterator<Item = MirrorPoint> {
-    // Two at least: one to get there, one to stand.
+    // At least two points: one to get there and one to rest.
     std::iter::repeat_n(dark(tilt), ((rate_hz * seconds).ceil() as usize).max(2))
 }
 
@@ -35,13 +35,13 @@ fn ramp(from: Tilt, to: Tilt, rate_hz: f64, limits: &MirrorLimits) -> Vec<Mirror
 }
 
 impl Sequence {
-    /// From where the mirror stands to another place, dark.
+    /// From one position to another, dark.
     pub fn travel(from: Tilt, to: Tilt, rate_hz: f64, limits: &MirrorLimits) -> Self {
         let lead = dwell(from, rate_hz, DWELL_S).chain(ramp(from, to, rate_hz, limits)).collect();
         Self { from, lead, path: Vec::new(), batches: 0, tail: Vec::new() }
     }
 
-    /// The same, with a longer stand at the end.
+    /// The same, with a longer rest at the end.
     pub fn approach(from: Tilt, to: Tilt, rate_hz: f64, limits: &MirrorLimits) -> Self {
         let mut sequence = Self::travel(from, to, rate_hz, limits);
         sequence.tail = dwell(to, rate_hz, LEAD_S).collect();
@@ -72,7 +72,7 @@ impl Sequence {
         self.lead_len() + self.path_len() + self.tail.len() as u64
     }
 
-    /// The sample with this index; the last one from the end on.
+    /// The sample with this index; beyond the end, the last sample.
     pub fn at(&self, index: u64) -> MirrorPoint {
         let (lead, path) = (self.lead_len(), self.path_len());
         let point = if index < lead {
@@ -85,7 +85,7 @@ impl Sequence {
         point.copied().unwrap_or(dark(self.from))
     }
 
-    /// Where the mirror is when `played` samples have been played.
+    /// Position of the mirror after `played` samples.
     pub fn after(&self, played: u64) -> Tilt {
         match played {
             0 => self.from,
@@ -93,12 +93,12 @@ impl Sequence {
         }
     }
 
-    /// Whether any sample of it has light.
+    /// Whether any sample has light.
     pub fn is_lit(&self) -> bool {
         self.path.iter().any(|point| point.light > 0)
     }
 
-    /// How many samples of the path are among the first `samples`.
+    /// Number of path samples among the first `samples`.
     pub fn of_path(&self, samples: u64) -> u64 {
         samples.saturating_sub(self.lead_len()).min(self.path_len())
     }

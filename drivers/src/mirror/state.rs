@@ -1,9 +1,9 @@
-//! What is on disk while a mirror is away from rest: enough to know where it is when the process is gone.
+//! State on disk while a mirror is away from rest: enough to know its position after the process is gone.
 //!
-//! `NAME` holds the sequence, written, fsynced and renamed before its first sample leaves. `NAME.sent` holds two
-//! numbers: samples that have certainly left the process, and samples that may have. It is written before and after
-//! each write to the port, without fsync: it must outlive the process, and a machine that went down as well is told by
-//! its boot id. `NAME.lock` is locked by whoever drives the mirror.
+//! `NAME` contains the sequence; it is written, fsynced and renamed before the first sample is sent. `NAME.sent`
+//! contains two numbers: samples that have certainly left the process, and samples that may have left it. It is
+//! written before and after each write to the port, without fsync: it only has to survive the process, and a crash of
+//! the machine is detected by the boot id. `NAME.lock` is locked by the process that drives the mirror.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -19,34 +19,34 @@ use serde::{Deserialize, Serialize};
 use super::light::{LightGuard, LightState, boot_id};
 use super::sequence::Sequence;
 
-/// Characters of `NAME.sent`: two numbers of 20 digits, a space and a line's end.
+/// Characters of `NAME.sent`: two numbers of 20 digits, a space and a newline.
 const SENT_BYTES: usize = 42;
 
-/// Why a mirror's state cannot be kept or read.
+/// Why a mirror's state cannot be stored or read.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
     /// A file cannot be written or read.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// The file is no state.
+    /// The file is not a valid state.
     #[error("{} is not the state of a mirror: {source}: switch the mirror's controller off and on, then delete the file", path.display())]
     Damaged {
-        /// Which file.
+        /// The file.
         path: PathBuf,
         /// What is wrong with it.
         source: serde_json::Error,
     },
-    /// Somebody drives the mirror.
+    /// Another process drives the mirror.
     #[error("{} is locked: another process drives the mirror and parks it itself; stop that process", path.display())]
     Locked {
-        /// The lock's file.
+        /// The lock file.
         path: PathBuf,
     },
 }
@@ -64,7 +64,7 @@ impl StateError {
 pub(super) enum Reach {
     PlayzerX {
         port: PathBuf,
-        /// [`node_of`] the port while it was open.
+        /// [`node_of`] the port when it was opened.
         node: Option<u64>,
         full_scale: MechanicalDeg,
     },
@@ -74,13 +74,13 @@ pub(super) enum Reach {
     },
     Optotune {
         port: PathBuf,
-        /// As of a PlayzerX.
+        /// As for a PlayzerX.
         node: Option<u64>,
         laser_port: Option<PathBuf>,
     },
 }
 
-/// What `NAME` holds.
+/// The content of `NAME`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct MirrorState {
@@ -88,11 +88,11 @@ pub(super) struct MirrorState {
     pub reach: Reach,
     pub limits: MirrorLimits,
     pub rate_hz: f64,
-    /// What is being played; none when the mirror is at rest.
+    /// The sequence being played; `None` if the mirror is at rest.
     pub playing: Option<Sequence>,
 }
 
-/// How many samples of a sequence have left the process.
+/// Number of samples of a sequence that have left the process.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Sent {
     pub certainly: u64,
@@ -107,10 +107,10 @@ pub struct StateFile {
 }
 
 impl StateFile {
-    /// Takes the lock; waits `patience` for whoever has it.
+    /// Takes the lock; waits up to `patience` for another process to release it.
     ///
     /// # Errors
-    /// `Locked`, or when the folder cannot be written.
+    /// `Locked`, or an error if the folder is not writable.
     pub fn open(path: &Path, patience: Duration) -> Result<Self, StateError> {
         let lock_path = beside(path, "lock");
         let deadline = Instant::now() + patience;
@@ -142,12 +142,12 @@ impl StateFile {
         Ok(Self { path: path.to_owned(), sent, _lock: lock })
     }
 
-    /// Where the state is kept.
+    /// Path of the state file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Puts a state on disk, with nothing of it sent.
+    /// Writes a state to disk, with no samples sent.
     pub(super) fn write(&self, state: &MirrorState) -> Result<(), StateError> {
         self.note_sent(Sent { certainly: 0, possibly: 0 })?;
         let temporary = beside(&self.path, "new");
@@ -162,15 +162,15 @@ impl StateFile {
         write().map_err(StateError::io("write", &self.path))
     }
 
-    /// Notes how much was sent.
+    /// Records how much was sent.
     pub(super) fn note_sent(&self, sent: Sent) -> Result<(), StateError> {
         let mut line = [0; SENT_BYTES];
-        // 20 digits hold any u64, so the line has its length always.
+        // 20 digits fit any u64, so the line has a constant length.
         let _ = writeln!(&mut line[..], "{:020} {:020}", sent.certainly, sent.possibly);
         self.sent.write_all_at(&line, 0).map_err(StateError::io("write", &beside(&self.path, "sent")))
     }
 
-    /// The state, and how much of it was sent; none when there never was one.
+    /// The state and how much of it was sent; `None` if there never was one.
     pub(super) fn read(&self) -> Result<Option<(MirrorState, Sent)>, StateError> {
         read(&self.path)
     }
@@ -190,7 +190,7 @@ fn read(path: &Path) -> Result<Option<(MirrorState, Sent)>, StateError> {
     Ok(Some((state, Sent { certainly: next(), possibly: next() })))
 }
 
-/// `NAME.extension`: appended, so that two mirrors' files never meet.
+/// `NAME.extension`: appended, so that the files of two mirrors never clash.
 fn beside(path: &Path, extension: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".");
@@ -198,21 +198,21 @@ fn beside(path: &Path, extension: &str) -> PathBuf {
     name.into()
 }
 
-/// What `status` says of a mirror and its light.
+/// What `status` reports about a mirror and its light.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct MirrorReport {
-    /// Whether the mirror is at the origin with the light off, as far as the files tell.
+    /// Whether the mirror is at the origin with the light off, according to the files.
     pub parked: bool,
     /// Whether samples with light may be playing.
     pub laser: bool,
-    /// Whether a process drives the mirror.
+    /// Whether a process is driving the mirror.
     pub driven: bool,
-    /// Whether there may be light, and by whose word.
+    /// Whether light is permitted, and by what.
     pub light: LightState,
 }
 
 impl MirrorReport {
-    /// Reads the files of a mirror, whoever drives it. A file that cannot be read is not a parked mirror.
+    /// Reads the files of a mirror, even while a process drives it. A file that cannot be read counts as not parked.
     pub fn read(state: &Path, guard: &LightGuard) -> Self {
         let driven = matches!(StateFile::open(state, Duration::ZERO), Err(StateError::Locked { .. }));
         let (parked, laser) = match read(state) {
@@ -228,7 +228,7 @@ impl MirrorReport {
 }
 
 impl MirrorState {
-    /// A state of this boot.
+    /// A state of the current boot.
     pub fn new(
         reach: Reach,
         limits: MirrorLimits,
@@ -239,24 +239,25 @@ impl MirrorState {
         Ok(Self { boot_id, reach, limits, rate_hz, playing })
     }
 
-    /// Whether what was noted without fsync is still true.
+    /// Whether data written without fsync are still valid.
     fn is_of_this_boot(&self) -> bool {
         boot_id().is_ok_and(|boot_id| boot_id == self.boot_id)
     }
 
-    /// Whether the cable at `port` has been in its place since `node` was noted, and with it what was sent and perhaps
-    /// the controller's power.
+    /// Whether the cable at `port` has stayed plugged in since `node` was recorded. If not, sent samples, and perhaps
+    /// the controller's power, were lost.
     pub fn is_plugged_in_since(&self, port: &Path, node: Option<u64>) -> bool {
         self.is_of_this_boot() && node.is_some() && node == node_of(port)
     }
 }
 
-/// Which device node a port's name leads to: the kernel makes a new one whenever a cable is plugged in.
+/// Inode of the device node that a port's name leads to: the kernel creates a new node whenever a cable is plugged
+/// in.
 pub(super) fn node_of(port: &Path) -> Option<u64> {
     fs::metadata(port).ok().map(|node| node.ino())
 }
 
-/// As an error of the mirror.
+/// Converts to a device error of the mirror.
 pub(super) fn of_state(error: StateError) -> DeviceError {
     let kind = match error {
         StateError::Locked { .. } => DeviceErrorKind::Busy,

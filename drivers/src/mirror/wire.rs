@@ -1,28 +1,28 @@
-//! Bytes as they come from a controller: cut into replies, and what is none counted as garbage.
+//! Splits the bytes from a controller into replies, and counts all other bytes as garbage.
 
-/// What the bytes at hand begin with.
+/// Result of parsing the received bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Parsed<R> {
     /// A reply in the first `used` bytes.
     Reply {
-        /// It.
+        /// The reply.
         reply: R,
-        /// Its bytes; at least 1.
+        /// Length of the reply in bytes; at least 1.
         used: usize,
     },
     /// The first `used` bytes belong to no reply.
     Garbage {
-        /// How many; at least 1.
+        /// Number of bytes; at least 1.
         used: usize,
     },
-    /// More bytes are needed; never said of [`LONGEST_REPLY`] bytes or more.
+    /// More bytes are needed; never returned for [`LONGEST_REPLY`] bytes or more.
     Incomplete,
 }
 
-/// No reply of any controller is longer.
+/// Maximum length of a reply from any controller.
 pub const LONGEST_REPLY: usize = 256;
 
-/// Collects what a controller says. It never holds more than one reply that is not yet whole and the bytes pushed last.
+/// Collects the bytes from a controller. It holds at most one incomplete reply and the bytes pushed last.
 #[derive(Debug, Default)]
 pub struct Receiver {
     bytes: Vec<u8>,
@@ -30,12 +30,12 @@ pub struct Receiver {
 }
 
 impl Receiver {
-    /// Takes bytes off the wire.
+    /// Appends received bytes.
     pub fn push(&mut self, bytes: &[u8]) {
         self.bytes.extend_from_slice(bytes);
     }
 
-    /// The next reply that is whole; `None` when more bytes are needed.
+    /// The next complete reply; `None` if more bytes are needed.
     pub fn next<R>(&mut self, parse: impl Fn(&[u8]) -> Parsed<R>) -> Option<R> {
         let mut start = 0;
         let reply = loop {
@@ -55,24 +55,24 @@ impl Receiver {
         reply
     }
 
-    /// Bytes so far that belonged to no reply.
+    /// Number of bytes so far that belonged to no reply.
     pub fn garbage_bytes(&self) -> u64 {
         self.garbage_bytes
     }
 
-    /// Bytes that wait for more.
+    /// Number of bytes that wait for more.
     pub fn waiting_bytes(&self) -> usize {
         self.bytes.len()
     }
 }
 
-/// A line that ends with CR LF or LF, without its end, and how many bytes it takes with it. `Err` is how many bytes
-/// cannot begin a line; `Ok(None)` asks for more.
+/// The line at the start of `bytes` without its CR LF or LF, and its length in bytes including that. `Err` is the
+/// number of bytes that cannot begin a line; `Ok(None)` means that more bytes are needed.
 pub(super) fn line(bytes: &[u8]) -> Result<Option<(&str, usize)>, usize> {
     let end = bytes.iter().take(LONGEST_REPLY).position(|byte| *byte == b'\n');
     let shown = &bytes[..end.unwrap_or(bytes.len().min(LONGEST_REPLY))];
     let text = shown.strip_suffix(b"\r").unwrap_or(shown);
-    // Whatever came before a byte that no line has is no line either.
+    // A byte that cannot occur in a line invalidates everything before it.
     if let Some(bad) = text.iter().rposition(|byte| !(b' '..=b'~').contains(byte)) {
         return Err(bad + 1);
     }

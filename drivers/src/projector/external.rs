@@ -1,7 +1,7 @@
-//! A projector that the operator works: on another computer, or with a lens cap.
+//! A projector operated by a person: on another computer, or with a lens cap.
 //!
-//! The driver asks, whoever talks to the operator (a terminal, the daemon's socket) answers. What is shown already is not
-//! asked for again, so a sweep of many passes needs one answer.
+//! The driver sends requests; the component that talks to the operator (a terminal, the daemon's socket) answers. The
+//! driver does not ask again for what is already shown, so a sweep of many passes needs one answer.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::time::Duration;
@@ -10,7 +10,7 @@ use raysweep_core::{Clock, DeviceError, DeviceErrorKind, Pattern, Projector, Sho
 
 use super::DEVICE;
 
-/// What the operator is to show.
+/// What the operator should show.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Wanted {
     /// This pattern.
@@ -19,27 +19,27 @@ pub enum Wanted {
     Dark,
 }
 
-/// A question to the operator. Dropped without an answer, it counts as refused.
+/// A request to the operator. If dropped without an answer, it counts as refused.
 pub struct Request {
-    /// What is to be shown.
+    /// What to show.
     pub wanted: Wanted,
     answer: SyncSender<Result<(), String>>,
 }
 
 impl Request {
-    /// The operator says that it is shown.
+    /// Confirms that it is shown.
     pub fn done(self) {
-        // Nobody listens once the driver has lost patience.
+        // The driver no longer listens after its timeout.
         let _ = self.answer.send(Ok(()));
     }
 
-    /// The operator says that it cannot be shown, and why.
+    /// Reports that it cannot be shown, and why.
     pub fn refuse(self, why: impl Into<String>) {
         let _ = self.answer.send(Err(why.into()));
     }
 }
 
-/// Why the operator's answer is none to go on with.
+/// Why the run cannot continue with the operator's answer.
 #[derive(Debug, thiserror::Error)]
 enum ExternalError {
     #[error("no operator is there to show {0:?}")]
@@ -50,7 +50,7 @@ enum ExternalError {
     Refused { wanted: Wanted, why: String },
 }
 
-/// The projector.
+/// An externally operated projector.
 pub struct External {
     requests: SyncSender<Request>,
     patience: Duration,
@@ -59,7 +59,7 @@ pub struct External {
 }
 
 impl External {
-    /// The projector, and where its questions come out.
+    /// Returns the projector and the receiver of its requests.
     pub fn new(patience: Duration) -> (Self, Receiver<Request>) {
         let (requests, receiver) = sync_channel(1);
         (Self { requests, patience, shown: None, clock: Clock::real() }, receiver)
@@ -67,7 +67,7 @@ impl External {
 
     fn ask(&mut self, wanted: Wanted) -> Result<Shown, DeviceError> {
         if self.shown.as_ref() != Some(&wanted) {
-            // Until the answer comes, anything may be in the light.
+            // Until the answer arrives, anything may be shown.
             self.shown = None;
             self.answer(&wanted).map_err(|error| {
                 let kind = match error {
@@ -85,7 +85,7 @@ impl External {
     fn answer(&self, wanted: &Wanted) -> Result<(), ExternalError> {
         let (answer, answers) = sync_channel(1);
         let request = Request { wanted: wanted.clone(), answer };
-        // A full channel holds a question that nobody has read: the operator is no nearer for another one.
+        // A full channel holds a request that nobody has read; another request would not help.
         self.requests.try_send(request).map_err(|_error| ExternalError::Nobody(wanted.clone()))?;
         let refused = |why| ExternalError::Refused { wanted: wanted.clone(), why };
         match answers.recv_timeout(self.patience) {
@@ -115,7 +115,7 @@ mod tests {
 
     const LONG: Duration = Duration::from_secs(60);
 
-    /// Answers as many questions as there are answers and returns them.
+    /// Answers one request per entry of the given answers and returns the requests.
     fn operator(
         requests: Receiver<Request>,
         answers: Vec<Result<(), &'static str>>,

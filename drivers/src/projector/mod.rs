@@ -1,4 +1,4 @@
-//! Projectors: what shows patterns.
+//! Projectors: devices that show patterns.
 
 pub mod drm;
 pub mod external;

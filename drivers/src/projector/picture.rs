@@ -1,4 +1,4 @@
-//! Patterns as pixels.
+//! Renders patterns as pixels.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use png::{ColorType, Decoder, Transformations};
 use raysweep_core::{Pattern, PatternError};
 
-/// Why a pattern is no picture of the projector's.
+/// Why a pattern cannot be rendered for the projector.
 #[derive(Debug, thiserror::Error)]
 pub enum PictureError {
-    /// The pattern does not fit.
+    /// The pattern does not fit the projector.
     #[error(transparent)]
     Pattern(#[from] PatternError),
     /// The file cannot be opened.
@@ -18,10 +18,10 @@ pub enum PictureError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// The file is no PNG.
+    /// The file is not a valid PNG.
     #[error("{} is not a PNG picture: {source}", path.display())]
     Png {
         /// The file.
@@ -29,7 +29,7 @@ pub enum PictureError {
         /// What is wrong with it.
         source: png::DecodingError,
     },
-    /// A picture of another size.
+    /// A picture whose size differs from the projector's.
     #[error("{} has {}x{} pixels, the projector {}x{}: give a picture of that size", path.display(), given.0, given.1, size.0, size.1)]
     Size {
         /// The file.
@@ -41,7 +41,7 @@ pub enum PictureError {
     },
 }
 
-/// Red, green and blue codes of each pixel, row by row. A code is in proportion to the weight, 255 for 1.
+/// Red, green and blue codes of each pixel, row by row. A code is proportional to the weight, with 255 for weight 1.
 pub fn render(pattern: &Pattern, (columns, rows): (usize, usize)) -> Result<Vec<[u8; 3]>, PictureError> {
     let weights = pattern.row_weights(rows)?;
     let code = |weight: f32| [(weight * 255.0).round() as u8; 3];
@@ -51,7 +51,7 @@ pub fn render(pattern: &Pattern, (columns, rows): (usize, usize)) -> Result<Vec<
         }
         (None, Pattern::Checkerboard { cell_px, shift_px }) => {
             let cell = *cell_px as usize;
-            // The board repeats after two cells, so a shift is the same as one by less than that.
+            // The checkerboard repeats after two cells, so shifts are taken modulo two cells.
             let lit_half = |at: usize, shift: u32| {
                 ((at + 2 * cell - shift as usize % (2 * cell)) / cell).is_multiple_of(2)
             };
@@ -60,7 +60,7 @@ pub fn render(pattern: &Pattern, (columns, rows): (usize, usize)) -> Result<Vec<
             Ok(pixels.map(|(x, y)| code(if pixel(x, y) { 1.0 } else { 0.0 })).collect())
         }
         (None, Pattern::Image(path)) => read_png(path, (columns, rows)),
-        // Every other pattern has row weights.
+        // All other patterns have row weights.
         (None, _) => Ok(vec![[0; 3]; columns * rows]),
     }
 }
@@ -75,7 +75,7 @@ fn read_png(path: &Path, size: (usize, usize)) -> Result<Vec<[u8; 3]>, PictureEr
     if given != size {
         return Err(PictureError::Size { path: path.to_owned(), given, size });
     }
-    // At most four bytes a pixel, of a size that is the projector's.
+    // At most four bytes per pixel, for a picture of the projector's size.
     let mut bytes = vec![0; reader.output_buffer_size().unwrap_or(4 * size.0 * size.1)];
     let info = reader.next_frame(&mut bytes).map_err(broken)?;
     let bytes = &bytes[..info.buffer_size()];
@@ -83,7 +83,7 @@ fn read_png(path: &Path, size: (usize, usize)) -> Result<Vec<[u8; 3]>, PictureEr
         ColorType::Grayscale => bytes.iter().map(|&grey| [grey; 3]).collect(),
         ColorType::GrayscaleAlpha => bytes.as_chunks::<2>().0.iter().map(|pixel| [pixel[0]; 3]).collect(),
         ColorType::Rgba => bytes.as_chunks::<4>().0.iter().map(|&[r, g, b, _]| [r, g, b]).collect(),
-        // Palettes are expanded to this.
+        // Palettes are expanded to RGB.
         ColorType::Rgb | ColorType::Indexed => bytes.as_chunks::<3>().0.to_vec(),
     })
 }

@@ -1,4 +1,4 @@
-//! The kernel's requests for modem lines (`tty_ioctl(4)`) and pulse-per-second sources (RFC 2783, `linux/pps.h`), which
+//! The kernel's ioctls for modem lines (`tty_ioctl(4)`) and pulse-per-second sources (RFC 2783, `linux/pps.h`), which
 //! no crate offers.
 
 #![allow(unsafe_code, reason = "system calls; what each is handed is checked here")]
@@ -11,7 +11,7 @@ use nix::libc;
 
 use super::modemline::Line;
 
-/// `struct serial_icounter_struct`: transitions of each line since the port came up.
+/// `struct serial_icounter_struct`: transitions of each line since the port appeared.
 #[repr(C)]
 #[derive(Default)]
 struct SerialCounters {
@@ -32,7 +32,7 @@ struct PpsTime {
     flags: u32,
 }
 
-/// `struct pps_fdata`: the last event of each kind, and how long to wait for a newer one.
+/// `struct pps_fdata`: the last event of each kind, and the timeout for waiting for a newer one.
 #[repr(C)]
 #[derive(Default)]
 struct PpsFetch {
@@ -47,7 +47,7 @@ struct PpsFetch {
 nix::ioctl_write_int_bad!(tiocmiwait, libc::TIOCMIWAIT);
 nix::ioctl_read_bad!(tiocgicount, libc::TIOCGICOUNT, SerialCounters);
 nix::ioctl_read_bad!(tiocmget, libc::TIOCMGET, libc::c_int);
-// The kernel's header gives the size of a pointer here, not that of the structure.
+// The kernel's header encodes the size of a pointer here, not that of the structure.
 nix::ioctl_readwrite_bad!(
     pps_fetch,
     nix::request_code_readwrite!(b'p', 0xa4, size_of::<*const PpsFetch>()),
@@ -61,16 +61,17 @@ fn bit(line: Line) -> libc::c_int {
     }
 }
 
-/// Blocks until the line changes. There is no timeout; a hang-up ends it.
+/// Blocks until the line changes. There is no timeout, but a hang-up ends the wait.
 pub fn wait_for_change(port: impl AsFd, line: Line) -> Result<(), Errno> {
-    // SAFETY: the request takes an integer and touches no memory of ours; the descriptor is open for as long as `port`.
+    // SAFETY: the ioctl takes an integer and does not access our memory; the descriptor is open for as long as
+    // `port`.
     unsafe { tiocmiwait(port.as_fd().as_raw_fd(), bit(line)) }.map(drop)
 }
 
-/// How often the line has changed since the port came up, wrapping.
+/// Number of transitions of the line since the port appeared, wrapping.
 pub fn transitions(port: impl AsFd, line: Line) -> Result<u32, Errno> {
     let mut counters = SerialCounters::default();
-    // SAFETY: the request writes one `serial_icounter_struct`, whose layout `SerialCounters` has.
+    // SAFETY: the ioctl writes one `serial_icounter_struct`, whose layout `SerialCounters` has.
     unsafe { tiocgicount(port.as_fd().as_raw_fd(), &mut counters) }?;
     let count = match line {
         Line::Dcd => counters.carrier,
@@ -82,7 +83,7 @@ pub fn transitions(port: impl AsFd, line: Line) -> Result<u32, Errno> {
 /// Whether the line is asserted.
 pub fn is_asserted(port: impl AsFd, line: Line) -> Result<bool, Errno> {
     let mut lines = 0;
-    // SAFETY: the request writes one `int`.
+    // SAFETY: the ioctl writes one `int`.
     unsafe { tiocmget(port.as_fd().as_raw_fd(), &mut lines) }?;
     Ok(lines & bit(line) != 0)
 }
@@ -90,19 +91,19 @@ pub fn is_asserted(port: impl AsFd, line: Line) -> Result<bool, Errno> {
 /// An event of a pulse-per-second source.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PpsEvent {
-    /// Counts events of its kind, wrapping.
+    /// Count of events of this kind, wrapping.
     pub sequence: u32,
-    /// When it was, on `CLOCK_REALTIME`.
+    /// Time of the event on `CLOCK_REALTIME`.
     pub realtime_ns: i64,
 }
 
-/// The last event of each kind, the line becoming asserted and clear; waits up to `timeout` for one of either kind that
-/// is newer than this call (not at all for zero). `ETIMEDOUT` if none came.
+/// The last assert event and the last clear event. Waits up to `timeout` for an event of either kind newer than this
+/// call (not at all for zero). `ETIMEDOUT` if there is none.
 pub fn fetch(source: impl AsFd, timeout: Duration) -> Result<[PpsEvent; 2], Errno> {
     let (s, ns) =
         (timeout.as_secs().min(i32::MAX as u64).cast_signed(), timeout.subsec_nanos().cast_signed());
     let mut fetch = PpsFetch { timeout: PpsTime { s, ns, flags: 0 }, ..PpsFetch::default() };
-    // SAFETY: the request reads and writes one `pps_fdata`, whose layout `PpsFetch` has.
+    // SAFETY: the ioctl reads and writes one `pps_fdata`, whose layout `PpsFetch` has.
     unsafe { pps_fetch(source.as_fd().as_raw_fd(), &mut fetch) }?;
     let event = |sequence, time: PpsTime| PpsEvent {
         sequence,
@@ -118,7 +119,7 @@ mod tests {
 
     #[test]
     fn structures_have_the_kernel_s_layout() {
-        // linux/serial.h: 20 ints. linux/pps.h: pps_kinfo is 48 bytes long, of which mode is at 40.
+        // linux/serial.h: 20 ints. linux/pps.h: pps_kinfo is 48 bytes long, with mode at offset 40.
         assert_eq!((size_of::<SerialCounters>(), offset_of!(SerialCounters, carrier)), (80, 12));
         assert_eq!((size_of::<PpsTime>(), size_of::<PpsFetch>()), (16, 64));
         assert_eq!((offset_of!(PpsFetch, mode), offset_of!(PpsFetch, timeout)), (40, 48));

@@ -14,7 +14,7 @@ use raysweep_core::{DeviceError, DeviceErrorKind};
 
 const DEVICE: &str = "vsync";
 
-/// Which change of the line is the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
+/// The change of the line that is the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Polarity {
@@ -25,7 +25,7 @@ pub enum Polarity {
     Clear,
 }
 
-/// What the system said of a device file, and what to do about it.
+/// The operating system's error about a device file, and what to do about it.
 #[derive(Debug, thiserror::Error)]
 #[error("{path}: {call}: {errno}: {advice}")]
 struct SystemError {

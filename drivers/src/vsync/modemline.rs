@@ -1,11 +1,11 @@
-//! VSYNC on a modem line of a serial port: waiting by `TIOCMIWAIT`, counting by `TIOCGICOUNT`.
+//! VSYNC on a modem line of a serial port: waits with `TIOCMIWAIT`, counts with `TIOCGICOUNT`.
 //!
-//! Stamps are taken when the waiting thread wakes: about 10 us late on a port of the mainboard, up to a millisecond on
-//! a USB converter. Where the line is DCD, the kernel's own stamps ([`super::pps`]) are better.
+//! Timestamps are taken when the waiting thread wakes: about 10 us late on an on-board port, up to a millisecond with
+//! a USB converter. If the line is DCD, the kernel's own timestamps ([`super::pps`]) are better.
 //!
-//! The kernel counts transitions, not edges of one direction, and a level that is read after a wait may have changed
-//! since, and over USB it does not arrive together with the count. So edges are told by parity, and while the caller
-//! waits for an edge, in the quiet between two pulses, parity and level are compared.
+//! The kernel counts transitions, not edges of one direction. A level read after a wait may have changed in between,
+//! and over USB it does not arrive together with the count. So edges are identified by the parity of the count. While
+//! the caller waits for an edge, in the quiet time between two pulses, parity and level are compared.
 
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
@@ -23,17 +23,17 @@ use raysweep_core::{Clock, DeviceError, DeviceErrorKind, Edge, Vsync};
 
 use super::{DEVICE, Polarity, ioctl, system_error};
 
-/// Edges that may wait for the reader: 4 s at 60 Hz. More are lost, and their numbers show it.
+/// Maximum number of edges that wait for the reader: 4 s at 60 Hz. Any more are lost, which shows in their numbers.
 const QUEUE: usize = 256;
 
-/// Parity and level are compared so often while no edge comes: a VSYNC is quiet for longer between its pulses.
+/// Interval of comparing parity and level while no edge arrives; a VSYNC is quiet for longer between its pulses.
 const QUIET: Duration = Duration::from_millis(4);
 
-/// So many differences in a row, without one agreement, mean a transition that went uncounted. Fewer may come of a count
-/// that is late, over USB or on a busy machine.
+/// This many mismatches in a row mean an uncounted transition. Fewer can be caused by a late count, over USB or on a
+/// busy machine.
 const DOUBTS: u8 = 8;
 
-/// How long closing waits for the thread, which wakes at the next transition.
+/// How long closing waits for the thread, which wakes up at the next transition.
 const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
 
 /// `[vsync.modemline]`
@@ -45,12 +45,12 @@ pub struct ModemLineConfig {
     /// The line that carries the VSYNC.
     #[serde(default)]
     pub line: Line,
-    /// Which change of it is the edge.
+    /// The change of the line that is the edge.
     #[serde(default)]
     pub edge: Polarity,
 }
 
-/// A modem line that the VSYNC may be wired to.
+/// A modem line that can carry the VSYNC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Line {
@@ -77,10 +77,10 @@ struct Watch {
 }
 
 impl ModemLine {
-    /// Opens the port and begins to watch. Edges are numbered from 1 on.
+    /// Opens the port and starts watching. Edges are numbered from 1.
     ///
     /// # Errors
-    /// `Disconnected` if there is no such port, `Unsupported` if it has no modem lines that can be waited for.
+    /// `Disconnected` if the port is missing, `Unsupported` if it has no modem lines that can be waited for.
     pub fn open(path: &Path, line: Line, edge: Polarity) -> Result<Self, DeviceError> {
         let failed = |call| move |errno| system_error(path, call, errno);
         // Without NONBLOCK, open waits for a carrier, which is the very line that toggles here.
@@ -88,13 +88,13 @@ impl ModemLine {
         let port = open(path, flags, Mode::empty()).map_err(failed("open"))?;
         let mut terminal = tcgetattr(&port).map_err(failed("tcgetattr"))?;
         cfmakeraw(&mut terminal);
-        // Otherwise the end of each pulse on DCD would hang up.
+        // Otherwise the end of each pulse on DCD would cause a hang-up.
         terminal.control_flags.insert(ControlFlags::CLOCAL);
         terminal.control_flags.remove(ControlFlags::CRTSCTS | ControlFlags::HUPCL);
         tcsetattr(&port, SetArg::TCSANOW, &terminal).map_err(failed("tcsetattr"))?;
         let count = ioctl::transitions(&port, line).map_err(failed("TIOCGICOUNT"))?;
         let asserted = ioctl::is_asserted(&port, line).map_err(failed("TIOCMGET"))?;
-        // Taken in the middle of a pulse, these two may disagree; the first quiet moment mends it.
+        // Read during a pulse, these two may disagree; the first quiet moment corrects that.
         let state = Mutex::new(Transitions { count, asserted, edges: 0, edge, doubts: 0 });
         let watch = Arc::new(Watch { port, state, closing: AtomicBool::new(false) });
         let (sender, edges) = sync_channel(QUEUE);
@@ -108,7 +108,7 @@ impl ModemLine {
         Ok(Self { path: path.to_owned(), line, watch, edges, thread: Some(thread) })
     }
 
-    /// Compares the level with what the count says.
+    /// Compares the level with the parity of the count.
     fn check_level(&self) -> Result<(), Errno> {
         let asserted = ioctl::is_asserted(&self.watch.port, self.line)?;
         let count = ioctl::transitions(&self.watch.port, self.line)?;
@@ -156,13 +156,13 @@ impl Drop for ModemLine {
             self.edges.recv_timeout(deadline.saturating_duration_since(Instant::now()))
         {
             if Instant::now() >= deadline {
-                // Nothing ends TIOCMIWAIT but a transition: on a line without any, the thread is left to wait for the
-                // next or for the port's end. It holds nothing but the port.
+                // Only a transition ends TIOCMIWAIT. On a line without transitions, the thread is left waiting for
+                // the next one or for the port to disappear. It holds nothing but the port.
                 return;
             }
         }
         if let Some(thread) = self.thread.take() {
-            // Its panic would have been reported when it happened.
+            // A panic of the thread has already been reported.
             let _ = thread.join();
         }
     }
@@ -173,7 +173,7 @@ impl Watch {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Hands on edges until the port ends or nobody wants them.
+    /// Passes on edges until the port disappears or the receiver is dropped.
     fn follow(&self, path: &Path, line: Line, edges: &SyncSender<Result<Edge, DeviceError>>) {
         let clock = Clock::real();
         while !self.closing.load(Ordering::Relaxed) {
@@ -182,12 +182,12 @@ impl Watch {
             match waited.and_then(|()| ioctl::transitions(&self.port, line)) {
                 Ok(count) => {
                     let seq = self.lock().advance(count);
-                    // A full queue loses the edge, which the next one's number tells.
+                    // If the queue is full, the edge is lost, which shows in the next one's number.
                     seq.map(|seq| edges.try_send(Ok(Edge { seq, host_ns })));
                 }
                 Err(Errno::EINTR) => {}
                 Err(errno) => {
-                    // Blocks no longer than the reader lets the queue stay full; on its end there is nobody to tell.
+                    // Blocks only while the queue is full. If the receiver is gone, nobody needs the error.
                     let _ = edges.send(Err(system_error(path, "TIOCMIWAIT", errno)));
                     return;
                 }
@@ -196,20 +196,20 @@ impl Watch {
     }
 }
 
-/// What a count of transitions says of a line.
+/// The state of a line, derived from its count of transitions.
 struct Transitions {
     count: u32,
     asserted: bool,
     edges: u64,
     edge: Polarity,
-    /// How often in a row the level was not what the count says.
+    /// Number of consecutive mismatches between level and count.
     doubts: u8,
 }
 
 impl Transitions {
-    /// Takes a new count. Gives the number of the last edge unless the line has turned back since, so that the stamp of
-    /// an edge is late by less than the pulse is long; and not in doubt, when it might be the pulse's other end. An
-    /// edge that is not given is lost, as the next one's number tells.
+    /// Takes a new count. Returns the number of the last edge unless the line has changed back since; so an edge's
+    /// timestamp is late by less than the pulse length. In doubt, it returns `None`, because the edge might be the
+    /// pulse's other end. Edges that are not returned are lost, which shows in the next one's number.
     fn advance(&mut self, count: u32) -> Option<u64> {
         let transitions = count.wrapping_sub(self.count);
         let was_after_edge = self.is_after_edge();
@@ -220,8 +220,8 @@ impl Transitions {
         (edges > 0 && self.is_after_edge() && self.doubts == 0).then_some(self.edges)
     }
 
-    /// Compares with the level read at a count. Once it has differed often enough, takes it that one transition went
-    /// uncounted, and with it an edge; tells if so.
+    /// Compares the state with the level read at a count. After enough consecutive mismatches, assumes that one
+    /// transition, and with it an edge, went uncounted; returns whether it did.
     fn compare(&mut self, count: u32, asserted: bool) -> bool {
         if count != self.count {
             return false;
@@ -266,7 +266,8 @@ mod tests {
     fn an_edge_that_is_over_is_lost_and_counted() {
         let mut line = line(false, Polarity::Assert);
         let base = line.count;
-        // A whole pulse at once; the next one's rise; then a fall, two pulses and a rise at once.
+        // A whole pulse at once; the next one's rising edge; then its falling edge, two pulses and a rising edge at
+        // once.
         assert_eq!(line.advance(base.wrapping_add(2)), None);
         assert_eq!(line.advance(base.wrapping_add(3)), Some(2));
         assert_eq!(line.advance(base.wrapping_add(9)), Some(5));
@@ -277,13 +278,14 @@ mod tests {
     fn an_uncounted_transition_costs_edges_and_never_shows_a_pulse_s_end_as_one() {
         let mut line = line(false, Polarity::Assert);
         let mut count = line.count;
-        // Rise and fall counted as one: the line seems asserted until it is quiet and seen not to be.
+        // Rising and falling edge counted as one transition: the line seems asserted until its level is compared
+        // while quiet.
         count = count.wrapping_add(1);
         assert_eq!(line.advance(count), Some(1));
         for k in 1..DOUBTS {
             assert!(!line.compare(count, false));
             if k == 4 {
-                // A pulse while in doubt: its fall would look like an edge.
+                // A pulse while in doubt: its falling edge would look like an edge.
                 assert_eq!(line.advance(count.wrapping_add(1)), None);
                 assert_eq!(line.advance(count.wrapping_add(2)), None);
                 count = count.wrapping_add(2);

@@ -1,5 +1,5 @@
 //! VSYNC as a pulse-per-second source of the kernel: DCD of a serial port with `ldattach PPS /dev/ttyS0`, or a GPIO.
-//! Stamps are taken in the kernel's interrupt, so no thread's wake-up enters them.
+//! The kernel's interrupt takes the timestamps, so they do not include the wake-up time of a thread.
 
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -12,24 +12,24 @@ use raysweep_core::{Clock, DeviceError, Edge, Vsync};
 use super::ioctl::{self, PpsEvent};
 use super::{Polarity, system_error};
 
-/// A source may vanish without waking who waits for it: so often is looked whether it is there.
+/// A source may vanish without waking the waiting thread, so its presence is checked at this interval.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// The kernel counts waits in ticks of up to 10 ms and does not wait at all for less than one.
+/// The kernel counts waits in ticks of up to 10 ms and does not wait at all for less than one tick.
 const TICK: Duration = Duration::from_millis(10);
 
 /// `[vsync.pps]`
 #[derive(Debug, Clone, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PpsConfig {
-    /// The source, `/dev/pps0`.
+    /// The source, for example `/dev/pps0`.
     pub source: PathBuf,
-    /// Which change of the line is the edge.
+    /// The change of the line that is the edge.
     #[serde(default)]
     pub edge: Polarity,
 }
 
-/// A VSYNC line that the kernel stamps.
+/// A VSYNC line with timestamps from the kernel.
 pub struct Pps {
     path: PathBuf,
     source: File,
@@ -40,10 +40,10 @@ pub struct Pps {
 }
 
 impl Pps {
-    /// Opens a source, `/dev/pps0`. Edges are numbered from 1 on.
+    /// Opens a source, for example `/dev/pps0`. Edges are numbered from 1.
     ///
     /// # Errors
-    /// `Disconnected` if there is none, `Unsupported` if the file is something else.
+    /// `Disconnected` if it is missing, `Unsupported` if the file is something else.
     pub fn open(path: &Path, edge: Polarity) -> Result<Self, DeviceError> {
         let source = File::options().read(true).write(true).open(path).map_err(|error| {
             system_error(path, "open", Errno::from_raw(error.raw_os_error().unwrap_or_default()))
@@ -53,7 +53,7 @@ impl Pps {
         Ok(pps)
     }
 
-    /// The last edge; with a timeout, waits for any event first.
+    /// The last edge; with a non-zero timeout, waits for any event first.
     fn fetch(&self, timeout: Duration) -> Result<Option<PpsEvent>, DeviceError> {
         match ioctl::fetch(&self.source, timeout) {
             Ok([assert, clear]) => Ok(Some(if self.edge == Polarity::Assert { assert } else { clear })),
@@ -71,12 +71,12 @@ impl Pps {
             .then(|| Edge { seq: self.seq, host_ns: event.realtime_ns + self.monotonic_minus_realtime_ns() })
     }
 
-    /// The stamps' clock may be set at any time, so the distance is measured for each edge.
+    /// The clock of the timestamps may be set at any time, so the offset is measured for each edge.
     fn monotonic_minus_realtime_ns(&self) -> i64 {
         let before_ns = self.clock.now_ns();
         let realtime = clock_gettime(ClockId::CLOCK_REALTIME);
         let after_ns = self.clock.now_ns();
-        // The clock exists on every Linux.
+        // The clock exists on every Linux system.
         realtime.map_or(0, |time| {
             before_ns + (after_ns - before_ns) / 2 - (time.tv_sec() * 1_000_000_000 + time.tv_nsec())
         })
@@ -86,7 +86,7 @@ impl Pps {
 impl Vsync for Pps {
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
         let deadline = Instant::now() + timeout;
-        // An edge since the last call is there without waiting; what is waited for may be the other kind of event.
+        // An edge since the last call is returned without waiting. A wait may end with an event of the other kind.
         let mut wait = Duration::ZERO;
         loop {
             if let Some(edge) = self.fetch(wait)?.and_then(|event| self.take(event)) {

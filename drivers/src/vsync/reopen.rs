@@ -1,24 +1,24 @@
-//! A watcher whose device may be unplugged and plugged in again while it is used.
+//! A watcher whose device may be unplugged and plugged in again during use.
 
 use std::time::{Duration, Instant};
 
 use raysweep_core::{ClockQuality, DeviceError, DeviceErrorKind, DeviceState, Edge, Vsync};
 
-/// How often is looked whether the device is back.
+/// Interval of checking whether the device is back.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// Opens a device anew.
+/// Opens a device again.
 pub type Opener<V> = Box<dyn FnMut() -> Result<V, DeviceError> + Send>;
 
-/// A watcher that is opened again when its device comes back. Edges keep on being numbered; at least one number is left
-/// out where edges may have been lost.
+/// A watcher that is opened again when its device comes back. The numbering of edges continues; it skips at least one
+/// number if edges may have been lost.
 pub struct Reopened<V> {
     open: Opener<V>,
     patience: Duration,
     device: Option<V>,
-    /// From when it was lost until it tells an edge again.
+    /// Set when the device was lost, until it reports an edge again.
     lost: Option<Lost>,
-    /// What is added to the device's own numbers.
+    /// Added to the device's own edge numbers.
     base: u64,
     last_seq: u64,
 }
@@ -30,12 +30,12 @@ struct Lost {
 }
 
 impl<V: Vsync> Reopened<V> {
-    /// Watches by `device`, which `open` opens again when it is lost, for up to `patience`.
+    /// Watches with `device`. If it is lost, `open` opens it again, for up to `patience`.
     pub fn new(device: V, open: Opener<V>, patience: Duration) -> Self {
         Self { open, patience, device: Some(device), lost: None, base: 0, last_seq: 0 }
     }
 
-    /// Looks whether the device is back.
+    /// Checks whether the device is back.
     fn look(&mut self, timeout: Duration) -> Result<(), DeviceError> {
         let Some(lost) = &mut self.lost else { return Ok(()) };
         std::thread::sleep(timeout.min(LOOK.saturating_sub(lost.looked.elapsed())));
@@ -55,10 +55,10 @@ impl<V: Vsync> Reopened<V> {
         }
     }
 
-    /// Lets the device go after an error that opening it again may mend; gives the error back when patience is at its end.
+    /// Closes the device after an error that reopening may fix; returns the error when `patience` is exhausted.
     fn lose(&mut self, error: DeviceError) -> Result<(), DeviceError> {
         let now = Instant::now();
-        // A device that can be opened and then tells nothing is as lost as before.
+        // A device that can be opened but reports no edge is still lost.
         let since = self.lost.map_or(now, |lost| lost.since);
         let passing = matches!(
             error.kind,
@@ -107,7 +107,7 @@ mod tests {
 
     use super::*;
 
-    /// Tells a few edges and is then unplugged.
+    /// Reports a few edges and is then unplugged.
     struct Brief(u64);
 
     impl Vsync for Brief {
@@ -130,7 +130,7 @@ mod tests {
         let opener = {
             let looks = looks.clone();
             Box::new(move || {
-                // Away at the first two looks.
+                // Missing at the first two attempts.
                 if looks.fetch_add(1, Ordering::Relaxed) < 2 { Err(gone()) } else { Ok(Brief(0)) }
             })
         };

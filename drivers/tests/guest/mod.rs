@@ -1,4 +1,4 @@
-//! What tests in the kernel guest have at hand: QEMU's monitor, and patience.
+//! Tools for tests in the kernel guest: QEMU's monitor, and waiting.
 //!
 //! `crates/xtask/src/guest` starts the guest and names the devices of each test.
 
@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-/// Emulation under load takes its time; only what never comes may fail a test.
+/// Emulation under load is slow; only something that never happens may fail a test.
 pub const PATIENCE: Duration = Duration::from_secs(20);
 
 /// QEMU's monitor. One may be open at a time.
@@ -25,12 +25,12 @@ impl Monitor {
     pub fn open() -> Self {
         let port = File::options().read(true).write(true).open("/dev/virtio-ports/qmp").unwrap();
         let mut monitor = Self { port: BufReader::new(port), commands: u64::from(std::process::id()) << 32 };
-        // Refused if an earlier test did it already: QEMU sees one session over all tests.
+        // Refused if an earlier test already did this: QEMU sees one session for all tests.
         let _ = monitor.try_execute("qmp_capabilities", json!({}));
         monitor
     }
 
-    /// Executes a QMP command; fails the test if QEMU refuses it.
+    /// Executes a QMP command; the test fails if QEMU refuses it.
     pub fn execute(&mut self, command: &str, arguments: Value) -> Value {
         self.try_execute(command, arguments).unwrap_or_else(|error| panic!("QMP {command}: {error}"))
     }
@@ -42,7 +42,7 @@ impl Monitor {
         loop {
             let mut line = String::new();
             self.port.read_line(&mut line).unwrap();
-            // Greetings, events and answers to earlier tests carry no such id.
+            // Greetings, events and answers to earlier tests lack this id.
             let mut answer: Value = serde_json::from_str(&line).unwrap();
             if answer["id"] == self.commands {
                 return if answer["error"].is_null() {
@@ -57,16 +57,16 @@ impl Monitor {
     /// Plugs in a USB serial converter (the kernel's `ftdi_sio`) whose far end is `/dev/virtio-ports/{pipe}`.
     pub fn plug_serial(&mut self, pipe: &str) {
         let device = json!({ "driver": "usb-serial", "id": format!("{pipe}-usb"), "chardev": pipe });
-        // A converter that was just pulled out may hold the pipe for a moment.
+        // A converter that was just unplugged may still hold the pipe for a moment.
         wait_for("QMP device_add", || self.try_execute("device_add", device.clone()).ok());
     }
 
-    /// Pulls it out.
+    /// Unplugs the converter.
     pub fn unplug_serial(&mut self, pipe: &str) {
         self.execute("device_del", json!({ "id": format!("{pipe}-usb") }));
     }
 
-    /// What the guest's screen shows, as a PPM file.
+    /// The content of the guest's screen, as a PPM file.
     pub fn screen_dump(&mut self, name: &str) -> PathBuf {
         // QEMU runs in the folder that the guest sees as /share.
         self.execute("screendump", json!({ "filename": name }));
@@ -74,7 +74,7 @@ impl Monitor {
     }
 }
 
-/// Waits until `what` gives something.
+/// Waits until `probe` returns a value.
 pub fn wait_for<T>(what: &str, mut probe: impl FnMut() -> Option<T>) -> T {
     let began = Instant::now();
     loop {

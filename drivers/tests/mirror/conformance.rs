@@ -1,4 +1,4 @@
-//! One suite for every driver of a mirror, on simulated controllers and their wires' faults.
+//! One suite for all mirror drivers, with simulated controllers and faults of their wires.
 
 use raysweep_core::{Mirror, MirrorPath};
 use raysweep_drivers::mirror::{Mti, Optotune, OptotuneConfig};
@@ -12,7 +12,7 @@ use crate::suite::{BATCHES, mirror_conforms};
 
 const FAULTS: WireFaults = WireFaults { seed: 5, garbage: 0.05, stalls: 0.0, stall_ms: 0 };
 
-/// Runs the suite; the mirror ends parked, and was dark all the time.
+/// Runs the suite; the mirror must end parked and stay dark all the time.
 fn conforms(rig: &Rig, mut mirror: impl Mirror) -> (MirrorPath, Vec<Held>) {
     let path = mirror_conforms(&mut mirror);
     drop(mirror);

@@ -1,4 +1,4 @@
-//! The mirrors' drivers against simulated controllers on pseudo-terminals.
+//! The mirror drivers with simulated controllers on pseudo-terminals.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 

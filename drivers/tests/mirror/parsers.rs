@@ -1,4 +1,4 @@
-//! Parsers of replies under 10 million bytes of seeded noise and of replies with noise between them.
+//! The parsers of replies with 10 million bytes of seeded noise, and with replies between noise.
 
 use raysweep_drivers::mirror::playzerx::protocol::{Reply, parse_response};
 use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Parsed, Receiver};
@@ -18,14 +18,14 @@ impl Noise {
         z ^ (z >> 31)
     }
 
-    /// Uniform bytes, or bytes that replies are made of: these get further into a parser.
+    /// Uniform bytes, or bytes that occur in replies: these get further into a parser.
     fn byte(&mut self, alphabet: &[u8]) -> u8 {
         let random = self.next();
         if random & 0x300 == 0 { random as u8 } else { alphabet[(random >> 16) as usize % alphabet.len()] }
     }
 }
 
-/// Feeds noise in pieces of every size; every byte must be accounted for, and none may pile up.
+/// Feeds noise in pieces of every size; every byte must be accounted for, and no bytes may accumulate.
 fn survives<R>(parse: impl Fn(&[u8]) -> Parsed<R> + Copy, alphabet: &[u8], length: impl Fn(&R) -> usize) {
     let mut noise = Noise(alphabet.len() as u64);
     let mut receiver = Receiver::default();
@@ -44,7 +44,7 @@ fn survives<R>(parse: impl Fn(&[u8]) -> Parsed<R> + Copy, alphabet: &[u8], lengt
     assert!(receiver.garbage_bytes() > 0);
 }
 
-/// Replies with garbage between them: all replies come out, all garbage is counted.
+/// Replies with garbage in between: all replies are found, all garbage is counted.
 fn finds<R: PartialEq + std::fmt::Debug>(
     parse: impl Fn(&[u8]) -> Parsed<R> + Copy,
     replies: &[(&[u8], R)],

@@ -1,5 +1,5 @@
-//! A PlayzerX's stream, frame by frame as the maker documents it, against a FIFO of a few lines: streaming, the count of samples
-//! left, parking, health. Nothing of the driver's or the simulator's encoding is used here.
+//! A PlayzerX's stream, frame by frame as documented by the maker, with a simple model of the FIFO: streaming, the
+//! count of samples left, parking, health. Uses no encoding code of the driver or the simulator.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -10,10 +10,10 @@ use raysweep_drivers::mirror::{self, PlayzerX};
 use crate::rig::LIMITS;
 use crate::scripts::{Script, frame, play};
 
-/// The controller's words: what it is, and what it says to a ping.
+/// The controller's description, and its answer to a ping.
 const INFO: &[u8] = b"pl-info\nPX1\nPLX-2.1.0.0\nXYM\n";
 const ALIVE: &[u8] = b"pl-ok\n";
-/// Samples that a monochrome controller holds.
+/// FIFO size of a monochrome controller in samples.
 const FIFO_SAMPLES: u64 = 125_000;
 
 /// The origin, dark: X = Y = 2048.
@@ -22,28 +22,28 @@ const LEFT: &[u8] = b"plg\x05\n";
 const CLEAR: &[u8] = b"plc\x05\n";
 const PING: &[u8] = b"plp\x05\n";
 
-/// How the controller takes its samples out of the FIFO.
+/// How the controller takes samples from the FIFO.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Drain {
-    /// So many a second.
+    /// This many per second.
     ByClock(f64),
-    /// One between any two questions.
+    /// One between any two queries.
     ByQuestion,
-    /// None, and the last so many are left.
+    /// None; this many samples are left.
     Holds(u64),
 }
 
-/// What the script remembers.
+/// State of the script.
 struct Desk {
     drain: Drain,
     frames: Vec<Vec<u8>>,
     sent: u64,
-    /// Samples played when the FIFO was empty last, and when the next came.
+    /// Samples played when the FIFO was last empty, and the time of the next sample.
     base: u64,
     began_ns: i64,
     asked: u64,
     most_held: u64,
-    /// Said before each answer.
+    /// Sent before each answer.
     noise: &'static [u8],
 }
 
@@ -140,7 +140,7 @@ fn is_sample(frame: &[u8]) -> bool {
     frame.starts_with(b"pld\x09")
 }
 
-/// A dark turn that takes seconds.
+/// A dark path that takes seconds.
 fn turn(samples: usize, rate_hz: f64) -> MirrorPath {
     let path = MirrorPath::lissajous(Tilt::new(1.0, 0.5), [1, 1], samples, rate_hz, &LIMITS).unwrap();
     path.with_light(|_| 0)
@@ -178,7 +178,7 @@ fn the_fifo_is_filled_and_never_overfilled_by_the_controllers_own_count() {
     let most = |lab: &Lab| lab.desk.lock().unwrap().most_held;
     let began = Instant::now();
     let mut full = None;
-    // Some time beyond, in which it would be overfilled.
+    // Continues for a while in which the FIFO could overflow.
     while full.is_none_or(|full: Instant| full.elapsed() < Duration::from_millis(300)) {
         mirror.feed().unwrap();
         if most(&lab) > FIFO_SAMPLES - 2000 {
@@ -203,7 +203,7 @@ fn a_host_that_stands_still_is_no_fault_of_the_controller() {
         assert!(began.elapsed() < Duration::from_secs(60));
         std::thread::sleep(Duration::from_millis(1));
     }
-    // The FIFO has more than a second, and longer than that no answer may be awaited.
+    // The FIFO contains more than a second of samples, and no answer may be pending for longer than that.
     for _ in 0..5 {
         std::thread::sleep(Duration::from_millis(400));
         mirror.feed().unwrap();
@@ -224,7 +224,7 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
         assert!(began.elapsed() < Duration::from_secs(60));
         std::thread::sleep(Duration::from_millis(1));
     }
-    // It stops where 3000 samples are left.
+    // The controller stops with 3000 samples left.
     lab.drain(Drain::Holds(3000));
     let parking = std::thread::spawn(move || mirror.park().map(|()| mirror));
     let began = Instant::now();
@@ -240,7 +240,7 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     }
     parking.join().unwrap().unwrap();
     let frames = lab.frames();
-    // The count is asked for thrice, since an answer may be lost; the ping tells that all of it has arrived.
+    // The count is queried three times, since an answer may be lost; the ping shows that all queries have arrived.
     assert_eq!(frames[clearing - 3..clearing], [LEFT, LEFT, LEFT]);
     assert_eq!(frames[clearing + 1], PING);
     let samples = |frames: &[Vec<u8>]| -> Vec<Vec<u8>> {
@@ -257,7 +257,7 @@ fn parking_empties_the_fifo_and_ramps_from_the_sample_that_the_count_tells() {
     };
     for pair in after.windows(2) {
         let (a, b) = (code(&pair[0]), code(&pair[1]));
-        // What the mirror survives, and the rounding of both ends.
+        // The mirror's limit, and rounding at both ends.
         let allowed = (LIMITS.max_step.0 / 6.5 * 2047.0) as i32 + 2;
         assert!((0..2).all(|axis| (a[axis] - b[axis]).abs() <= allowed), "{a:?} then {b:?}");
     }
@@ -270,7 +270,7 @@ fn a_controller_that_plays_nothing_is_told_by_its_count() {
     mirror.load(&turn(2000, 1000.0)).unwrap();
     mirror.start(2).unwrap();
     mirror.feed().unwrap();
-    // Of about 4000 samples as many stay, whenever it is asked.
+    // The count stays at about 4000 samples in all answers.
     let began = Instant::now();
     while mirror.feed().unwrap().played < 100 {
         assert!(began.elapsed() < Duration::from_secs(60));
@@ -293,7 +293,7 @@ fn a_controller_that_plays_nothing_is_told_by_its_count() {
         };
         (error, mirror)
     });
-    // Parking after the error finds it alive again.
+    // When the driver parks after the error, the controller works again.
     while !lab.frames().iter().any(|frame| frame == CLEAR) {
         assert!(began.elapsed() < Duration::from_secs(60));
         std::thread::sleep(Duration::from_millis(1));
@@ -309,14 +309,14 @@ fn a_controller_that_plays_nothing_is_told_by_its_count() {
 #[test]
 fn noise_before_each_answer_is_counted_and_costs_nothing() {
     let lab = Lab::new(100.0);
-    // The beginning of an answer that is none, and half a word.
+    // The beginning of an invalid answer, and half a word.
     lab.desk.lock().unwrap().noise = b"pl-ixpl";
     let mut mirror = lab.open();
     play(&mut mirror);
     let questions =
         lab.frames().iter().filter(|frame| [LEFT, b"pln\x05\n" as &[u8]].contains(&frame.as_slice())).count();
     assert!(questions > 3);
-    // An answer that is under way when the path is over has not been read.
+    // The last answer may still be on its way when the path ends, and is then not read.
     let unread = questions as u64 * 7 - mirror.garbage_bytes();
     assert!(unread <= 7, "{unread} of {questions} times 7 bytes were not counted");
 }

@@ -37,7 +37,7 @@ pub fn circle(points: usize) -> MirrorPath {
     MirrorPath::lissajous(Tilt::new(3.0, 2.0), [1, 1], points, 100.0, &LIMITS).unwrap()
 }
 
-/// As the wire has it.
+/// Rounded as on the wire.
 fn rounded(value: f64) -> f64 {
     (value * 1e5).round() / 1e5
 }
@@ -69,7 +69,7 @@ fn mti_plays_a_path_and_switches_the_high_voltage_off() {
     drop(mirror);
     rig.assert_parked();
     assert_points(&rig.pty.truth().held, &path, 2, |deg| deg / 6.5, 255);
-    // It comes up again from where it was left: out of the command mode, high voltage off.
+    // It starts from the state in which it was left: out of the command mode, high voltage off.
     drop(Mti::open(config_of(&rig)).unwrap());
 }
 
@@ -165,7 +165,7 @@ fn an_optotune_that_was_plugged_in_again_is_not_told_to_be_where_it_was_left() {
     while mirror.feed().unwrap().played < 15 {
         std::thread::sleep(Duration::from_millis(1));
     }
-    // With the power back it is at rest: told to be where it was left, it would jump.
+    // When the power is back, it is at rest. Commanded to its last position, it would jump.
     let again = optotune_rig(WireFaults::default());
     rig.pty.unplug();
     while mirror.feed().is_ok() {

@@ -61,7 +61,7 @@ impl Rig {
         PlayzerX::open(self.config()).unwrap()
     }
 
-    /// Waits until the controller has played so many samples with light.
+    /// Waits until the controller has played this many samples with light.
     pub fn await_light(&self, samples: usize) {
         let deadline = Instant::now() + Duration::from_secs(30);
         while self.pty.look(|truth| truth.held.iter().filter(|held| held.light > 0).count()) < samples {
@@ -70,7 +70,8 @@ impl Rig {
         }
     }
 
-    /// Waits until the mirror is parked, with the light off before, and without a step on the way; says when.
+    /// Waits until the mirror is parked; checks that the light went off first and that there was no step on the way.
+    /// Returns when that was.
     pub fn assert_parked(&self) -> Timing {
         let deadline = Instant::now() + Duration::from_secs(10);
         loop {
@@ -84,7 +85,7 @@ impl Rig {
         }
         let truth = self.pty.truth();
         let step = largest_step(&truth.held);
-        // Two codes: the rounding of both ends.
+        // Two codes: rounding at both ends.
         let allowed = LIMITS.max_step.0 / 6.5 * 2047.0 + 2.0;
         assert!(step <= allowed, "a step of {step} codes, {allowed} are allowed");
         assert_eq!(truth.overfills, 0);
@@ -96,11 +97,11 @@ impl Rig {
     }
 }
 
-/// When, on the host's monotonic clock.
+/// Times on the host's monotonic clock.
 pub struct Timing {
     pub dark_ns: i64,
     pub parked_ns: i64,
-    /// From one output to the next, in the wire's units.
+    /// Largest step between two outputs, in the wire's units.
     pub largest_step: f64,
 }
 
@@ -131,7 +132,7 @@ pub fn codes(path: &MirrorPath) -> Vec<Held> {
         .collect()
 }
 
-/// Feeds until the path is at its end.
+/// Feeds until the end of the path.
 pub fn play(mirror: &mut dyn Mirror) -> MirrorProgress {
     loop {
         let progress = mirror.feed().unwrap();

@@ -1,4 +1,4 @@
-//! The drivers against scripts: the bytes of the makers' documents on both sides, and no simulator.
+//! The drivers with scripts: both sides follow the makers' documents byte for byte, without a simulator.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -11,7 +11,7 @@ use tempfile::TempDir;
 use crate::points::{Lamp, mti_config};
 use crate::rig::LIMITS;
 
-/// A port whose every message is answered by rules.
+/// A port that answers every message according to rules.
 pub struct Script {
     pub pty: Pty,
     heard: Arc<Mutex<Vec<u8>>>,
@@ -21,8 +21,8 @@ pub struct Script {
 type Answers = &'static [(&'static [u8], &'static [u8])];
 
 impl Script {
-    /// Every message that begins with one of these gets the answer beside it. `message` says how long the message is that
-    /// bytes begin with, if it is whole.
+    /// Every message that begins with one of these prefixes gets the answer next to it. `message` returns the length
+    /// of the message at the start of the bytes, if it is complete.
     fn new(answers: Answers, message: fn(&[u8]) -> Option<usize>) -> Self {
         Self::with(message, move |message, _| {
             let answer = answers.iter().find(|(begins, _)| message.starts_with(begins));
@@ -30,7 +30,7 @@ impl Script {
         })
     }
 
-    /// Every message gets the answer that `answer` has for it at that time.
+    /// Every message gets the answer that `answer` returns at that time.
     pub fn with(
         message: fn(&[u8]) -> Option<usize>,
         mut answer: impl FnMut(&[u8], i64) -> Vec<u8> + Send + 'static,
@@ -58,7 +58,7 @@ impl Script {
         self.folder.path().join("mirror.json")
     }
 
-    /// What was said, line by line, each line once where it was said again and again: a mirror that stands is told so.
+    /// The received lines, without consecutive duplicates: a mirror at rest gets the same command repeatedly.
     fn lines(&self) -> Vec<String> {
         let heard = self.heard.lock().unwrap();
         let mut lines: Vec<String> =
@@ -73,7 +73,7 @@ fn line(bytes: &[u8]) -> Option<usize> {
     bytes.iter().position(|byte| *byte == b'\n').map(|at| at + 1)
 }
 
-/// Two places a step from the origin, dark.
+/// Plays two positions one step from the origin, dark.
 pub fn play(mirror: &mut dyn Mirror) {
     let places = [Tilt::new(0.13, 0.0), Tilt::new(0.13, -0.26)];
     let points = places.map(|tilt| raysweep_core::MirrorPoint { tilt, light: 0 });
@@ -110,7 +110,8 @@ fn mti_says_what_the_maker_documents() {
 
 #[test]
 fn what_a_killed_process_was_answered_is_no_answer_to_us() {
-    // It was told to go somewhere, and half a line more that ours ends; it is in its command mode still.
+    // The killed process sent a movement and a partial line, which our line end completes; the controller is still in
+    // its command mode.
     const STALE: &[u8] = b"MTI-OK\r\nMTI-ERR InvalidCommand\r\n";
     let answers: Answers =
         &[(b"\n", STALE), (b"$MTI$", b"MTI-ERR InvalidCommand\r\n"), (b"MTI+", b"MTI-OK\r\n")];
@@ -179,7 +180,7 @@ fn an_optotune_that_refuses_or_falls_silent_is_quoted() {
     assert!(error.kind == DeviceErrorKind::Timeout && error.to_string().contains("Start"), "{error}");
 }
 
-/// The frames of a PlayzerX: 'p', 'l', command, length; zeros end what a broken-off write has left.
+/// Length of a PlayzerX frame: 'p', 'l', command, length; zeros complete a cut-off write.
 pub fn frame(bytes: &[u8]) -> Option<usize> {
     match bytes {
         [0, ..] => Some(1),

@@ -9,7 +9,7 @@ use raysweep_sim::mirror::{Held, PlayzerXConfig, WireFaults};
 
 use crate::rig::{LIMITS, RATE_HZ, Rig, batch, codes, play};
 
-/// Where the path begins in what the controller held: at the first sample with light.
+/// The played path within everything that the controller held: it begins at the first sample with light.
 fn played(held: &[Held], samples: usize) -> &[Held] {
     let begin = held.iter().position(|held| held.light > 0).unwrap();
     &held[begin..begin + samples]
@@ -115,7 +115,7 @@ fn there_is_no_light_without_an_interlock_or_an_operators_word() {
     let dark = || rig.pty.look(|truth| truth.held.iter().all(|held| held.light == 0));
     assert!(dark());
 
-    // A dark path needs nobody's word.
+    // A dark path needs no permission.
     let light = LightGuard { armed_file: rig.folder.path().join("nobody"), interlock: None };
     let mut mirror = PlayzerX::open(mirror::PlayzerXConfig { light, ..rig.config() }).unwrap();
     mirror.load(&batch().with_light(|_| 0)).unwrap();
@@ -157,7 +157,7 @@ fn an_interlock_that_opens_switches_the_light_off_and_parks() {
 
 #[test]
 fn a_mirror_that_confirms_no_motion_is_not_lit() {
-    // About 18,000 samples are played before the light: the approach and the stand before the path.
+    // About 18,000 samples are played before the light: the approach and the rest before the path.
     let config = PlayzerXConfig { freezes_after: Some(40_000), ..Default::default() };
     let rig = Rig::playzerx(config, WireFaults::default());
     let mut mirror = rig.open();

@@ -1,4 +1,4 @@
-//! Every way out leaves the mirror parked and the light off. How long it took is printed.
+//! However a process ends, the mirror is parked and the light is off. Prints how long it took.
 
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::ExitStatusExt;
@@ -103,7 +103,7 @@ fn unplug_and_plug_in_again() {
     let mut rig = Rig::good();
     let mut mirror = playing(&rig);
     let since_ns = now_ns();
-    // The power goes with the plug: the light is off and the mirror springs back.
+    // The controller loses its power with the plug: the light is off and the mirror springs back.
     rig.pty.unplug();
     let error = loop {
         if let Err(error) = mirror.feed() {
@@ -114,7 +114,7 @@ fn unplug_and_plug_in_again() {
     assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
     println!("unplug: noticed after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
     drop(mirror);
-    // Its state still says that it was left somewhere, so whoever comes next does not take it for parked.
+    // Its state still says that it was left away from rest, so nobody assumes that it is parked.
     assert!(matches!(park(&rig.state()), Err(ParkError::Device(_))));
 }
 
@@ -131,7 +131,7 @@ fn a_controller_that_was_plugged_in_again_is_not_taken_for_the_one_that_was_left
         mirror.feed().unwrap();
         std::thread::sleep(Duration::from_millis(2));
     }
-    // With the power back it is at rest: told to be where it was left, it would jump.
+    // When the power is back, it is at rest. Commanded to its last position, it would jump.
     let again = Rig::playzerx(PlayzerXConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
     rig.pty.unplug();
     while mirror.feed().is_ok() {}
@@ -143,7 +143,7 @@ fn a_controller_that_was_plugged_in_again_is_not_taken_for_the_one_that_was_left
     assert_eq!(held.largest_step, 0.0);
 }
 
-/// The process that the tests below end: plays until it is told otherwise.
+/// The process that the tests below end: plays until it is told to stop.
 #[test]
 #[ignore = "run by the other tests, as a process of its own"]
 fn child() {
@@ -206,7 +206,7 @@ fn start_child(rig: &Rig, driver: &str, guarded: bool) -> Child {
     let mut child = command.spawn().unwrap();
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     assert!(lines.any(|line| line.unwrap().contains("playing")), "the child ended early");
-    // What it still says goes nowhere.
+    // Discards its remaining output.
     std::thread::spawn(move || lines.for_each(drop));
     child
 }
@@ -219,7 +219,7 @@ fn end(child: &mut Child, signal: Signal) {
 #[test]
 fn sigkill_then_park() {
     let rig = Rig::good();
-    // Several times, so that the process dies at different places of the path and of its loop.
+    // Several times, so that the process dies at different points of the path and of its loop.
     for round in 0..5 {
         let held = rig.pty.look(|truth| truth.held.len());
         let mut child = start_child(&rig, "playzerx", false);
@@ -231,7 +231,7 @@ fn sigkill_then_park() {
         assert!(matches!(parked, Parked::From(_)), "{parked:?}");
         rig.assert_parked().print("SIGKILL, then park", since_ns);
         assert_eq!(park(&rig.state()).unwrap(), Parked::Already);
-        // Up to where it was stopped the path was the path.
+        // The path was correct up to where it was stopped.
         let truth = rig.pty.truth();
         let codes = codes(&batch());
         let lit: Vec<&Held> = truth.held[held..].iter().filter(|held| held.light > 0).collect();
@@ -300,7 +300,7 @@ fn a_state_of_another_boot_is_not_trusted() {
     assert!(rig.pty.look(|truth| truth.parked_since_ns.is_some()));
 }
 
-/// A mirror that has never been moved is parked, and parking it needs no controller.
+/// A mirror that has never been moved counts as parked, and parking it needs no controller.
 #[test]
 fn nothing_to_park() {
     let folder = tempfile::tempdir().unwrap();

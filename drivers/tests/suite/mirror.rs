@@ -1,23 +1,23 @@
-//! What every driver of a mirror must do, whatever is behind it: a controller of the simulator, one behind the kernel's drivers,
-//! or that of a lab. Dark throughout: no sample of it has light.
+//! Requirements for every mirror driver, whether its controller is simulated, behind the kernel's drivers, or in a
+//! lab. Dark throughout: no sample has light.
 
 use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceErrorKind, MechanicalDeg, Mirror, MirrorLimits, MirrorPath, MirrorProgress, Tilt};
 
-/// Only what never comes may fail a test.
+/// Long, so that only something that never happens can fail a test.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// How often the path is played to its end.
 pub const BATCHES: u32 = 2;
 
-/// A dark turn about the origin, 20 a second at the most.
+/// A dark closed path around the origin, at most 20 turns per second.
 fn turn(amplitude_deg: f64, rate_hz: f64, limits: &MirrorLimits) -> MirrorPath {
     let samples = (rate_hz / 20.0).ceil().max(100.0) as usize;
     let amplitude = Tilt::new(amplitude_deg, amplitude_deg / 2.0);
     MirrorPath::lissajous(amplitude, [1, 1], samples, rate_hz, limits).unwrap().with_light(|_| 0)
 }
 
-/// Feeds until `enough`.
+/// Feeds until `enough` returns true.
 fn feed(mirror: &mut dyn Mirror, enough: impl Fn(&MirrorProgress) -> bool) -> MirrorProgress {
     let began = Instant::now();
     let mut last = (0, 0);
@@ -34,7 +34,8 @@ fn feed(mirror: &mut dyn Mirror, enough: impl Fn(&MirrorProgress) -> bool) -> Mi
     }
 }
 
-/// Holds a parked mirror to all that [`Mirror`] promises and leaves it parked; the path that it played [`BATCHES`] times.
+/// Checks a parked mirror against everything that [`Mirror`] promises and leaves it parked. Returns the path, which
+/// it played [`BATCHES`] times.
 pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
     let capabilities = mirror.capabilities().clone();
     let limits = capabilities.limits;
@@ -42,13 +43,13 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
     assert!(!capabilities.model.is_empty() && capabilities.fifo_samples > 0, "{capabilities:?}");
     assert!(0.0 < low_hz && low_hz < high_hz, "{capabilities:?}");
 
-    // Nothing is loaded, nothing is played, and what is parked can be parked.
+    // Nothing is loaded, nothing is playing, and a parked mirror can be parked.
     let kind = |result: Result<(), raysweep_core::DeviceError>| result.unwrap_err().kind;
     assert_eq!(kind(mirror.start(1)), DeviceErrorKind::NotReady);
     assert_eq!(kind(mirror.feed().map(drop)), DeviceErrorKind::NotReady);
     mirror.park().unwrap();
 
-    // What is beyond the mirror or its controller is refused.
+    // Paths beyond the limits of the mirror or its controller are refused.
     let rate_hz = (high_hz / 5.0).min(5_000.0).floor().max(low_hz);
     let amplitude_deg = limits.max_tilt.0 / 4.0;
     let wide = MirrorLimits { max_tilt: MechanicalDeg(2.0 * limits.max_tilt.0), ..limits };
@@ -58,7 +59,7 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
     assert_eq!(kind(mirror.load(&too_fast).map(drop)), DeviceErrorKind::OutOfRange);
     assert_eq!(kind(mirror.start(1)), DeviceErrorKind::NotReady, "a path that was refused is not loaded");
 
-    // A path is played to its end, as often as asked.
+    // A path is played to its end, the requested number of times.
     let path = turn(amplitude_deg, rate_hz, &limits);
     let actual_hz = mirror.load(&path).unwrap();
     assert!((actual_hz / rate_hz - 1.0).abs() < 0.03, "{actual_hz} for {rate_hz}");
@@ -70,7 +71,7 @@ pub fn mirror_conforms(mirror: &mut dyn Mirror) -> MirrorPath {
     assert_eq!(kind(mirror.feed().map(drop)), DeviceErrorKind::NotReady);
     assert_eq!(kind(mirror.start(1)), DeviceErrorKind::NotReady, "each start needs a load");
 
-    // It can be parked within a path, twice, and before one is started; and then it can be used again.
+    // It can be parked during a path, twice, and before a path is started; afterwards it can be used again.
     mirror.load(&path).unwrap();
     mirror.start(1000).unwrap();
     feed(mirror, |progress| progress.played > 0);

@@ -1,4 +1,4 @@
-//! Cameras that others wrote, each on a network of its own.
+//! Third-party simulated cameras, each on its own network.
 
 #![allow(
     dead_code,
@@ -13,8 +13,8 @@ use std::time::Duration;
 
 use nix::sched::{CloneFlags, unshare};
 
-/// Puts the calling thread, and what it starts from now on, on a network of its own: the loopback and nothing else. GigE Vision
-/// has one port for all cameras, and discovery asks on every interface that it finds.
+/// Moves the calling thread, and all threads and processes that it starts later, to a network of its own with only
+/// the loopback interface. GigE Vision uses one port for all cameras, and discovery searches all interfaces.
 pub fn own_network() {
     unshare(CloneFlags::CLONE_NEWNET)
         .expect("a network namespace needs root: run `cargo xtask test` as root");
@@ -22,10 +22,10 @@ pub fn own_network() {
     assert!(done.success());
 }
 
-/// The address of the only camera of a test.
+/// The address of a test's only camera.
 pub const ADDRESS: &str = "127.0.0.1";
 
-/// `arv-fake-gv-camera-0.8`, ended with the test.
+/// `arv-fake-gv-camera-0.8`, terminated at the end of the test.
 pub struct FakeCamera(Child);
 
 impl FakeCamera {
@@ -37,14 +37,14 @@ impl FakeCamera {
             .stderr(Stdio::null())
             .spawn()
             .expect("aravis-tools is installed");
-        // It has no way to say that it is there.
+        // It does not report when it is ready.
         thread::sleep(Duration::from_millis(200));
         Self(child)
     }
 }
 
 impl FakeCamera {
-    /// Stops it as if its cable were pulled, or lets it go on.
+    /// Stops it, as if its cable were unplugged, or continues it.
     pub fn signal(&self, signal: nix::sys::signal::Signal) {
         let id = nix::unistd::Pid::from_raw(self.0.id().try_into().unwrap());
         nix::sys::signal::kill(id, signal).unwrap();

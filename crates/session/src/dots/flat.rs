@@ -1,4 +1,4 @@
-//! `flat` of `dots.zarr`: the flat field that a run's columns were made with.
+//! `flat` in `dots.zarr`: the flat field applied to a run's columns.
 
 use std::sync::Arc;
 
@@ -14,17 +14,17 @@ use crate::{Error, Result};
 /// The arrays of `flat`, both `[t, s]`.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct FlatArrays {
-    /// What counts above the background were multiplied by.
+    /// Factor for counts above the background.
     pub gain: Array2<f32>,
-    /// Pixels, hot or dead, in whose place stand their neighbours.
+    /// Pixels, hot or dead, that are replaced by their neighbours.
     pub repaired: Array2<bool>,
 }
 
 impl Dots {
-    /// Writes the flat field as a whole; when this returns, it is durable.
+    /// Writes the flat field atomically; when this returns, it is durable.
     ///
     /// # Errors
-    /// [`Error::Io`] or [`Error::Zarr`] where the file system refuses.
+    /// [`Error::Io`] or [`Error::Zarr`] if the file system refuses.
     pub fn write_flat(&self, flat: &FlatArrays) -> Result<()> {
         let draft = DraftDir::create(&self.dir.join("flat"))?;
         let store = DurableStore::draft(draft.path())?;
@@ -47,7 +47,8 @@ impl Dots {
     /// Reads the flat field of a camera of `size` (rows, columns).
     ///
     /// # Errors
-    /// [`Error::Io`] where there is none, [`Error::Shape`] for one of another camera, [`Error::Zarr`] where it is damaged.
+    /// [`Error::Io`] if it is missing, [`Error::Shape`] if its size differs, [`Error::Zarr`] if it is
+    /// damaged.
     pub fn read_flat(&self, size: [usize; 2]) -> Result<FlatArrays> {
         let path = self.dir.join("flat");
         if !self.has_flat() {

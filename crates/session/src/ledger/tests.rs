@@ -33,7 +33,7 @@ fn point(index: usize, attempt: u32) -> Entry {
         frames: 8,
         exposure_us: 600.02,
         delay_us: -1500.0 / 7.0,
-        // Sums of decimal fractions need all 17 digits, and a parser that is exact to the last bit.
+        // Sums of decimal fractions need all 17 digits and an exact parser.
         delays_us: vec![0.1 + 0.2, -1e-7 / 3.0, 1_234_567.891_234_567_9, f64::MIN_POSITIVE],
         counts: counts(),
         crc32: 0xdead_beef,
@@ -68,7 +68,7 @@ fn all_kinds() -> Vec<Entry> {
     ]
 }
 
-/// A ledger in a folder of its own with these entries after the first line.
+/// A ledger in its own folder with these entries after the first line.
 fn ledger_with(entries: &[Entry]) -> (tempfile::TempDir, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("ledger.jsonl");

@@ -57,7 +57,7 @@ fn it_names_every_file_and_adds_up() {
             "stack.zarr/zarr.json",
         ]
     );
-    // SHA-256 of the three letters "rig", by another program.
+    // SHA-256 of the three letters "rig", computed by another program.
     let rig = &manifest.files["rig.toml"];
     assert_eq!(rig.bytes, 3);
     assert_eq!(rig.sha256, "c00ae0a63348054ecc8343f23278fe13bfa5c44255e208ff6102ffc2d7910a53");

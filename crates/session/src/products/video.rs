@@ -1,4 +1,4 @@
-//! A video: images of one size in time, written one after the other.
+//! Videos: images of one size, written one after the other.
 
 use std::io;
 use std::os::unix::fs::FileExt;
@@ -13,20 +13,20 @@ use crate::durable::{self, DraftDir, DraftFile};
 use crate::report::{Picture, ToneMap};
 use crate::{Error, Result, exr_file};
 
-/// Percentile of the first image's pixels that its picture does not overexpose, and room above it for the others.
+/// White level: this percentile of the first image's pixels, times some headroom for the other images.
 const PERCENTILE: f64 = 99.5;
 const HEADROOM: f32 = 1.25;
 
-/// Writes a video `NAME`: `NAME.npy` (float32 `[k, t, s]`, or `[k, t, s, 3]`), the folder `NAME` with `0000.exr` (linear)
-/// and `0000.png` (all on one scale, with the transfer function of sRGB) and so on, and `NAME.json`. Nothing is seen of it
-/// before [`VideoWriter::commit`], and nothing stays of it without.
+/// Writes a video `NAME`: `NAME.npy` (float32 `[k, t, s]`, or `[k, t, s, 3]`), a folder `NAME` with
+/// `0000.exr` (linear), `0000.png` (all with one tone map, sRGB transfer function) and so on, and
+/// `NAME.json`. Nothing is visible before [`VideoWriter::commit`], and nothing is kept without it.
 pub struct VideoWriter {
     npy: DraftFile,
     frames: DraftDir,
     sidecar: PathBuf,
     name: String,
     metadata: Map<String, Value>,
-    /// `[images, rows, columns, channels]`.
+    /// Shape, `[images, rows, columns, channels]`.
     shape: [usize; 4],
     header_bytes: u64,
     next: usize,
@@ -34,10 +34,10 @@ pub struct VideoWriter {
 }
 
 impl Products {
-    /// Begins a video of so many images of this size `[t, s, channels]`, with one channel or three.
+    /// Begins a video of `images` images of size `[t, s, channels]`, with one or three channels.
     ///
     /// # Errors
-    /// [`Error::Shape`] for other channels or no image; otherwise as [`Products::image`].
+    /// [`Error::Shape`] for another number of channels or no images; otherwise as [`Products::image`].
     pub fn video(
         &self,
         name: &str,
@@ -78,10 +78,10 @@ impl Products {
 }
 
 impl VideoWriter {
-    /// Writes the next image; returns its picture's scale.
+    /// Writes the next image; returns its picture's tone map.
     ///
     /// # Errors
-    /// [`Error::Shape`] for one of another size, or too many; [`Error::Io`].
+    /// [`Error::Shape`] for an image of another size, or too many; [`Error::Io`].
     pub fn append(&mut self, image: ArrayView3<f32>) -> Result<ToneMap> {
         let [images, rows, columns, channels] = self.shape;
         if image.dim() != (rows, columns, channels) || self.next == images {
@@ -111,10 +111,10 @@ impl VideoWriter {
         Ok(tone_map)
     }
 
-    /// Puts the video in its place.
+    /// Moves the video to its final place.
     ///
     /// # Errors
-    /// [`Error::Shape`] while images are lacking; [`Error::Io`].
+    /// [`Error::Shape`] if images are missing; [`Error::Io`].
     pub fn commit(self) -> Result<()> {
         let [images, ..] = self.shape;
         if self.next < images {

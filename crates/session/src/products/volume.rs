@@ -10,14 +10,14 @@ use ndarray_npy::write_zeroed_npy;
 use crate::durable::{self, DraftFile};
 use crate::{Error, Result};
 
-/// Writes `NAME.npy` (float32 `[u, t, s]`, C order) in strips of t. Nothing is seen of it before
-/// [`VolumeWriter::commit`], and nothing stays of it without.
+/// Writes `NAME.npy` (float32 `[u, t, s]`, C order) in strips of t. Nothing is visible before
+/// [`VolumeWriter::commit`], and nothing is kept without it.
 pub struct VolumeWriter {
     draft: DraftFile,
-    /// Path and content of what belongs beside the volume.
+    /// Path and content of the JSON file next to the volume.
     sidecar: (PathBuf, Vec<u8>),
     shape: (usize, usize, usize),
-    /// Where the values begin.
+    /// Offset of the values.
     header_bytes: u64,
     next_row: usize,
 }
@@ -38,7 +38,7 @@ impl VolumeWriter {
     /// Writes the next rows.
     ///
     /// # Errors
-    /// [`Error::Shape`] for rows beyond the last or of another size; [`Error::Io`].
+    /// [`Error::Shape`] for rows beyond the last, or of another size; [`Error::Io`].
     pub fn append(&mut self, strip: ArrayView3<f32>) -> Result<()> {
         let (depth, all_rows, columns) = self.shape;
         let (first_row, rows) = (self.next_row, strip.len_of(Axis(1)));
@@ -60,10 +60,10 @@ impl VolumeWriter {
         Ok(())
     }
 
-    /// Puts the volume in its place.
+    /// Moves the volume to its final place.
     ///
     /// # Errors
-    /// [`Error::Shape`] while rows are lacking; [`Error::Io`].
+    /// [`Error::Shape`] if rows are missing; [`Error::Io`].
     pub fn commit(self) -> Result<()> {
         let (depth, rows, columns) = self.shape;
         if self.next_row < rows {

@@ -8,16 +8,16 @@ use crate::Result;
 /// Small pictures in a grid over two settings, for example exposure (rows) over delay (columns).
 #[derive(Debug, Clone, Default)]
 pub struct ContactSheet {
-    /// What the columns are, with its unit: `delay / µs`.
+    /// What varies along the columns, with its unit: `delay / µs`.
     pub column_title: String,
-    /// One label a column.
+    /// One label per column.
     pub columns: Vec<String>,
-    /// What the rows are, with its unit.
+    /// What varies along the rows, with its unit.
     pub row_title: String,
-    /// One label a row.
+    /// One label per row.
     pub rows: Vec<String>,
-    /// Row after row, one picture a column ([`Picture::thumbnail`], all on one scale); `None` where a point is
-    /// missing, as where the list ends early.
+    /// Row by row, one picture per column ([`Picture::thumbnail`], all with the same tone map); `None` for a
+    /// missing point. The list may end early.
     pub pictures: Vec<Option<Picture>>,
 }
 

@@ -1,7 +1,7 @@
-//! `report.html`: one self-contained page. No script and nothing from the network; pictures are PNG, plots SVG, and
-//! colours follow the reader's light or dark preference.
+//! `report.html`: one self-contained page without scripts or network access. Pictures are PNG, plots are SVG,
+//! and colours follow the reader's light or dark preference.
 //!
-//! The model is generic: what a plane or a dot rig has to say is put into [`Section`]s by whoever makes the report.
+//! The model is generic: the plane-rig and dot-rig code put their content into [`Section`]s.
 
 mod contact_sheet;
 mod picture;
@@ -17,44 +17,44 @@ use crate::Result;
 
 const STYLE: &str = include_str!("style.css");
 
-/// Colours of series and of the markers that belong to them; mid-tones that stand out on white and on black.
+/// Colours of series and of the corresponding markers: mid-tones that are visible on white and on black.
 const PALETTE: [&str; 8] =
     ["#d9482b", "#2f7fc1", "#3c9d5d", "#a35bc4", "#c98a1b", "#20a0a0", "#d45d95", "#7d8794"];
 
 /// A page.
 #[derive(Debug, Clone, Default)]
 pub struct Report {
-    /// The large line at the top.
+    /// The page's heading.
     pub title: String,
     /// The line below it.
     pub subtitle: String,
-    /// Key and value, shown as a band below the title: the few that matter most.
+    /// Key and value of the most important facts, shown in a band below the title.
     pub facts: Vec<(String, String)>,
-    /// In order.
+    /// Sections, in order.
     pub sections: Vec<Section>,
 }
 
-/// A part of the page under a heading of its own.
+/// A part of the page with its own heading.
 #[derive(Debug, Clone, Default)]
 pub struct Section {
     /// The heading.
     pub title: String,
-    /// A sentence or two on what is to be seen; may be empty.
+    /// One or two sentences about the content; may be empty.
     pub intro: String,
-    /// In order.
+    /// Content, in order.
     pub blocks: Vec<Block>,
 }
 
-/// What a section is made of.
+/// A part of a section.
 #[derive(Debug, Clone)]
 pub enum Block {
-    /// Key and value.
+    /// Pairs of key and value.
     Facts(Vec<(String, String)>),
-    /// Rows and columns.
+    /// A table.
     Table(Table),
     /// Pictures side by side.
     Pictures(Vec<Picture>),
-    /// Small pictures over two settings.
+    /// Small pictures in a grid over two settings.
     ContactSheet(ContactSheet),
     /// Plots side by side.
     Plots(Vec<Plot>),
@@ -62,19 +62,19 @@ pub enum Block {
     Note(NoteLevel, String),
 }
 
-/// Rows and columns; the first column names the row.
+/// A table; the first column names the row.
 #[derive(Debug, Clone, Default)]
 pub struct Table {
-    /// One a column.
+    /// One header per column.
     pub headers: Vec<String>,
-    /// One cell a column.
+    /// One cell per column.
     pub rows: Vec<Vec<String>>,
 }
 
-/// How serious a remark is.
+/// Severity of a remark.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NoteLevel {
-    /// Good to know.
+    /// Information.
     Info,
     /// The result may be worse than it looks.
     Warning,
@@ -83,10 +83,10 @@ pub enum NoteLevel {
 }
 
 impl Report {
-    /// The page as HTML; the same report gives the same bytes. All texts are escaped.
+    /// Renders the page as HTML; the same report gives the same bytes. All texts are escaped.
     ///
     /// # Errors
-    /// [`crate::Error::Codec`] where a picture or a plot cannot be drawn.
+    /// [`crate::Error::Codec`] if a picture or a plot cannot be drawn.
     pub fn to_html(&self) -> Result<String> {
         let mut sections = Vec::new();
         for section in &self.sections {

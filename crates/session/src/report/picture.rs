@@ -1,4 +1,4 @@
-//! Linear images as 8-bit PNG pictures on a stated scale.
+//! Linear images as 8-bit PNG pictures with a stated tone map.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -8,21 +8,21 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use super::PALETTE;
 use crate::{Error, Result};
 
-/// Longer sides are reduced to this, so that a page stays at a few megabytes.
+/// Maximum side length of a picture, so that a page stays within a few megabytes.
 const PICTURE_MAX_PX: usize = 1024;
-/// The same for the pictures of a contact sheet.
+/// Maximum side length of a picture in a contact sheet.
 const THUMBNAIL_MAX_PX: usize = 160;
-/// The same for animations, which have many pictures.
+/// Maximum side length of an animation, which has many pictures.
 const ANIMATION_MAX_PX: usize = 400;
-/// Pictures below this size are shown enlarged, with their pixels as squares.
+/// Pictures smaller than this are shown enlarged, with visible square pixels.
 const PIXELATED_MAX_PX: usize = 512;
-/// Pictures of an animation that are shown in a second.
+/// Frame rate of an animation.
 const ANIMATION_FRAMES_PER_S: u16 = 12;
-/// More values than this do not make a percentile better.
+/// More samples do not improve a percentile noticeably.
 const PERCENTILE_SAMPLES: usize = 1 << 20;
 
-/// How linear values become grey levels: `white` and above is white, 0 and below is black, in between the transfer
-/// function of sRGB (IEC 61966-2-1).
+/// How linear values become grey levels: `white` and above is white, 0 and below is black; in between, the
+/// sRGB transfer function applies (IEC 61966-2-1).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ToneMap {
     /// The value that is shown as white.
@@ -30,8 +30,8 @@ pub struct ToneMap {
 }
 
 impl ToneMap {
-    /// The scale on which `percent` of all pixels of these images are not overexposed; white is 1 where that would be
-    /// 0 or where there are no finite values.
+    /// The tone map in which `percent` of all pixels of these images are not overexposed. `white` is 1 if it
+    /// would otherwise be 0 or if there are no finite values.
     pub fn percentile(images: &[ArrayView2<f32>], percent: f64) -> ToneMap {
         let mut samples = ToneSamples::new(images.iter().map(|image| image.len()).sum());
         images.iter().for_each(|image| samples.add(image.view()));
@@ -42,35 +42,35 @@ impl ToneMap {
         let linear = (value / self.white).clamp(0.0, 1.0);
         let encoded =
             if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
-        // NaN becomes 0 in the conversion, and so black.
+        // The conversion turns NaN into 0, which is black.
         (encoded * 255.0).round() as u8
     }
 }
 
-/// Values for a [`ToneMap`] of images that are not there at once.
+/// Collects samples for a [`ToneMap`] of images that are not all in memory at once.
 #[derive(Debug, Clone)]
 pub struct ToneSamples {
-    /// Every so many pixels one is taken.
+    /// One pixel in `step` is sampled.
     step: usize,
-    /// Pixels of the next image before the first that is taken.
+    /// Pixels to skip in the next image before its first sample.
     skip: usize,
     values: Vec<f32>,
 }
 
 impl ToneSamples {
-    /// For images of so many pixels in all.
+    /// Prepares for images with this total number of pixels.
     pub fn new(pixels: usize) -> ToneSamples {
         ToneSamples { step: pixels.div_ceil(PERCENTILE_SAMPLES).max(1), skip: 0, values: Vec::new() }
     }
 
-    /// Takes values of the next image.
+    /// Samples the next image.
     pub fn add(&mut self, image: ArrayView2<f32>) {
         let values = image.iter().copied().skip(self.skip).step_by(self.step);
         self.values.extend(values.filter(|value| value.is_finite()));
         self.skip = (self.skip + self.step - image.len() % self.step) % self.step;
     }
 
-    /// [`ToneMap::percentile`] of all images.
+    /// [`ToneMap::percentile`] of all images, approximated from the samples.
     pub fn percentile(&mut self, percent: f64) -> ToneMap {
         if self.values.is_empty() {
             return ToneMap { white: 1.0 };
@@ -81,10 +81,10 @@ impl ToneSamples {
     }
 }
 
-/// A numbered cross at a pixel; its colour is that of the series with the same place in a plot.
+/// A numbered cross at a pixel, in the colour of the series at the same position in a plot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Marker {
-    /// What stands beside the cross.
+    /// The label beside the cross.
     pub label: String,
     /// Camera row t of the pixel.
     pub row: usize,
@@ -101,7 +101,7 @@ pub struct Picture {
     tone_map: ToneMap,
     caption: String,
     markers: Vec<Marker>,
-    /// The further pictures of an animation.
+    /// The remaining pictures of an animation.
     next: Vec<Picture>,
 }
 
@@ -111,7 +111,7 @@ impl Picture {
         Picture::new(image.insert_axis(Axis(2)), tone_map, PICTURE_MAX_PX)
     }
 
-    /// A colour picture of a linear image `[t, s, 3]` with the primaries of sRGB.
+    /// A colour picture of a linear image `[t, s, 3]` with sRGB primaries.
     pub fn rgb(image: ArrayView3<f32>, tone_map: ToneMap) -> Picture {
         Picture::new(image, tone_map, PICTURE_MAX_PX)
     }
@@ -121,15 +121,15 @@ impl Picture {
         Picture::new(image.insert_axis(Axis(2)), tone_map, THUMBNAIL_MAX_PX)
     }
 
-    /// An image reduced to the size of a thumbnail, to be kept until its [`ToneMap`] is known: [`Picture::thumbnail`] of
-    /// either is the same.
+    /// Reduces an image to the size of a thumbnail, to keep it until its [`ToneMap`] is known:
+    /// [`Picture::thumbnail`] of the reduced image and of the original are the same.
     pub fn reduced(image: ArrayView2<f32>) -> Array2<f32> {
         let reduction = reduction_of(image.dim(), THUMBNAIL_MAX_PX);
         let size = (image.nrows().div_ceil(reduction), image.ncols().div_ceil(reduction));
         Array2::from_shape_fn(size, |place| mean_of_block(image, reduction, place))
     }
 
-    /// Images `[t, s]` of one size on one scale, shown one after the other in a loop; `None` where there are none.
+    /// Images `[t, s]` of one size with one tone map, shown in a loop; `None` if there are none.
     pub fn animation(images: &[ArrayView2<f32>], tone_map: ToneMap) -> Option<Picture> {
         let frame = |image: &ArrayView2<f32>| {
             Picture::new(image.view().insert_axis(Axis(2)), tone_map, ANIMATION_MAX_PX)
@@ -138,12 +138,12 @@ impl Picture {
         Some(Picture { next: next.iter().map(frame).collect(), ..frame(first) })
     }
 
-    /// With a caption; scale and size are added to it.
+    /// Sets the caption; scale and size are appended to it.
     pub fn with_caption(self, caption: impl Into<String>) -> Picture {
         Picture { caption: caption.into(), ..self }
     }
 
-    /// With crosses at these pixels.
+    /// Adds crosses at these pixels.
     pub fn with_markers(self, markers: Vec<Marker>) -> Picture {
         Picture { markers, ..self }
     }
@@ -225,7 +225,8 @@ impl Picture {
     }
 }
 
-/// Pixels, along each side, that become one of a picture with sides of at most `max_px`.
+/// Side length, in image pixels, of the block that becomes one pixel of a picture with sides of at most
+/// `max_px`.
 fn reduction_of((rows, columns): (usize, usize), max_px: usize) -> usize {
     rows.max(columns).div_ceil(max_px).max(1)
 }
@@ -236,7 +237,8 @@ fn mean_of_block(image: ArrayView2<f32>, reduction: usize, (row, column): (usize
     block.sum() / block.len() as f32
 }
 
-/// A PNG file; with more than one frame an animated one, which programs without animation show the first frame of.
+/// Encodes a PNG file, animated if there is more than one frame; programs without animation show the first
+/// frame.
 fn to_png<'a>(frames: impl Iterator<Item = &'a Picture>) -> Result<Vec<u8>> {
     let frames: Vec<&Array3<u8>> = frames.map(|frame| &frame.levels).collect();
     let (rows, columns, channels) = frames.first().map_or((0, 0, 0), |levels| levels.dim());
@@ -268,7 +270,7 @@ fn to_png<'a>(frames: impl Iterator<Item = &'a Picture>) -> Result<Vec<u8>> {
     encode().map_err(|error: png::EncodingError| Error::codec("draw", failed())(error))
 }
 
-/// Three significant digits.
+/// Formats a value with three significant digits.
 pub(super) fn short(value: impl Into<f64>) -> String {
     let value = value.into();
     if value == 0.0 || !value.is_finite() {

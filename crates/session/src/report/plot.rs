@@ -1,4 +1,4 @@
-//! Plots as inline SVG that takes its ink from the page.
+//! Plots as inline SVG in the page's text colour.
 
 use maud::{Markup, PreEscaped, html};
 use plotters::prelude::*;
@@ -9,7 +9,7 @@ use super::picture::short;
 use crate::{Error, Result};
 
 const SIZE_PX: (u32, u32) = (620, 310);
-/// Stands for the page's text colour until the drawing is done; no series has it.
+/// Placeholder for the page's text colour while drawing; no series has this colour.
 const INK: RGBColor = RGBColor(1, 2, 3);
 const INK_HEX: &str = "\"#010203\"";
 
@@ -18,24 +18,24 @@ const INK_HEX: &str = "\"#010203\"";
 pub struct Plot {
     /// The heading.
     pub title: String,
-    /// With its unit.
+    /// Label of the x axis, with its unit.
     pub x_label: String,
-    /// With its unit.
+    /// Label of the y axis, with its unit.
     pub y_label: String,
-    /// Drawn in order; values that are not finite are left out.
+    /// Drawn in order; non-finite values are left out.
     pub series: Vec<Series>,
-    /// Vertical lines.
+    /// Vertical marker lines.
     pub guides: Vec<Guide>,
 }
 
-/// Values to be drawn.
+/// Values to draw.
 #[derive(Debug, Clone)]
 pub struct Series {
     /// Shown in the legend.
     pub name: String,
     /// How to draw it.
     pub style: SeriesStyle,
-    /// x and y.
+    /// Pairs of x and y.
     pub points: Vec<(f64, f64)>,
 }
 
@@ -53,9 +53,9 @@ pub enum SeriesStyle {
 /// A vertical line that marks a value of x.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Guide {
-    /// Where.
+    /// Position in x.
     pub x: f64,
-    /// What stands at its upper end.
+    /// Label at its upper end.
     pub label: String,
 }
 
@@ -132,7 +132,7 @@ impl Plot {
                 match series.style {
                     SeriesStyle::Line => {
                         chart.draw_series(LineSeries::new(series.points.clone(), colour.stroke_width(2)))?;
-                        // Where the samples are few, the reader should see which values were measured.
+                        // If there are few samples, show which values were measured.
                         if series.points.len() <= 40 {
                             chart.draw_series(dots(series, colour))?;
                         }
@@ -160,7 +160,7 @@ impl Plot {
 }
 
 impl Series {
-    /// A line.
+    /// A series drawn as a line.
     pub fn line(name: impl Into<String>, points: Vec<(f64, f64)>) -> Series {
         Series { name: name.into(), style: SeriesStyle::Line, points }
     }
@@ -184,7 +184,8 @@ struct Bounds {
 }
 
 impl Bounds {
-    /// Around all points, with a margin; y starts at 0 where nothing is below. `None` where there is nothing.
+    /// Bounds of all points, with a margin; y starts at 0 if no value is negative. `None` if there are no
+    /// points.
     fn of(series: &[Series], guides: &[Guide]) -> Option<Bounds> {
         let points = || series.iter().flat_map(|series| &series.points);
         points().next()?;
@@ -202,7 +203,7 @@ impl Bounds {
     }
 }
 
-/// Smallest and largest value; never an empty interval.
+/// Smallest and largest value, widened if the interval would be empty.
 fn span(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let (low, high) = values
         .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)));

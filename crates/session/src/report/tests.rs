@@ -8,7 +8,7 @@ fn page(blocks: Vec<Block>) -> String {
     Report { title: "R".into(), sections: vec![section], ..Report::default() }.to_html().unwrap()
 }
 
-/// The pixels of the pictures of a page, decoded, with their width.
+/// The decoded pixels of the pictures in a page, with their width.
 fn pictures(html: &str) -> Vec<(u32, Vec<u8>)> {
     html.split("data:image/png;base64,")
         .skip(1)
@@ -36,7 +36,7 @@ fn grey_levels_are_those_of_srgb() {
 
 #[test]
 fn images_one_after_the_other_are_toned_and_reduced_as_if_they_were_there_at_once() {
-    // More pixels than samples, and sizes that are no multiple of the step.
+    // More pixels than samples, and sizes that are not multiples of the step.
     let image = |seed: usize| {
         Array2::from_shape_fn((701, 811), |(t, s)| ((t * 811 + s + seed) * 2_654_435_761 % 10_007) as f32)
     };
@@ -200,7 +200,7 @@ fn plots_survive_values_that_are_no_numbers() {
 
 #[test]
 fn a_contact_sheet_of_a_whole_sweep_stays_small() {
-    // Noise is what compresses worst.
+    // Noise compresses worst.
     let noise = |seed: usize| {
         Array2::from_shape_fn((128, 128), |(t, s)| {
             ((t * 128 + s + seed * 16_384).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as f32

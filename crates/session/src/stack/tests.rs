@@ -39,7 +39,7 @@ fn every_array_reads_back_at_sizes_around_a_chunk() {
 
 #[test]
 fn the_checksum_is_that_of_zip_over_little_endian_values() {
-    // CRC-32 of the ASCII digits 1 to 8, and of "123456789" the check value of the standard.
+    // CRC-32 of the ASCII digits 1 to 8, and for "123456789" the check value of the standard.
     let digits = ndarray::array![[0x3433_3231, 0x3837_3635]];
     assert_eq!(crc32(digits.view()), 0x9ae0_daaf);
     assert_eq!(crc32fast::hash(b"123456789"), 0xcbf4_3926);
@@ -163,7 +163,7 @@ fn rows_are_read_without_the_rest_of_their_shard_and_their_damage_is_noticed() {
     let path = dir.path().join("sum/c.0.0.0");
     let whole = fs::read(&path).unwrap();
     let strip = |t: usize| stack.read_rows(ArrayName::Sum, 0, t..t + 64);
-    // Three inner chunks of one size or so follow each other, then comes their index.
+    // Three inner chunks of about equal size, followed by their index.
     for (byte, broken) in [(whole.len() / 6, 0), (whole.len() / 2, 64), (whole.len() * 5 / 6, 128)] {
         let mut damaged = whole.clone();
         damaged[byte] ^= 0x10;

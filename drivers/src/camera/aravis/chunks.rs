@@ -1,4 +1,4 @@
-//! What frames say of themselves: chunk data, read without the allocations of libaravis' Rust bindings.
+//! Chunk data, the metadata in frames, read without the allocations of libaravis' Rust bindings.
 
 #![allow(unsafe_code, reason = "the bindings allocate each chunk's name anew for each frame")]
 
@@ -17,31 +17,31 @@ const SEQUENCER_SET_ACTIVE: &CStr = c"ChunkSequencerSetActive";
 pub struct Chunks {
     parser: ChunkParser,
     on: ChunksOn,
-    /// The newest chunk data, and what they say.
+    /// The latest chunk data and the values parsed from them.
     bytes: Vec<u8>,
     said: Said,
 }
 
-/// What a frame says of itself.
+/// Metadata of a frame.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Said {
-    /// Its exposure.
+    /// Its exposure time.
     pub exposure_us: Option<f64>,
-    /// The set of the camera's sequencer that it had.
+    /// Its sequencer set.
     pub sequencer_set: Option<i64>,
 }
 
-/// Chunk data of more bytes are not remembered.
+/// Longer chunk data are not cached.
 const MOST_BYTES: usize = 256;
 
 impl Chunks {
-    /// `parser` must be of the camera whose frames are read.
+    /// `parser` must belong to the camera whose frames are read.
     pub fn new(parser: ChunkParser, on: ChunksOn) -> Self {
         Self { parser, on, bytes: Vec::with_capacity(MOST_BYTES), said: Said::default() }
     }
 
-    /// What a frame says behind the `image_bytes` of its image. Where its bytes are those of the frame before they are not
-    /// parsed, which would take a tenth of the processor time of a small frame.
+    /// Reads the chunk data after the `image_bytes` of a frame's image. If they equal those of the previous frame,
+    /// they are not parsed again; parsing would take a tenth of the processor time of a small frame.
     pub fn read(&mut self, buffer: &Buffer, image_bytes: usize) -> Said {
         let bytes = behind_image(buffer, image_bytes);
         if bytes.is_empty() || bytes != self.bytes {
@@ -60,12 +60,12 @@ impl Chunks {
         self.said
     }
 
-    /// A number of a frame's chunk data, where it has it.
+    /// A number in a frame's chunk data, if it is there.
     ///
-    /// Benefit: the readers of the bindings allocate the name anew for each frame.
+    /// Benefit: the bindings' functions allocate the name for each frame.
     fn parse<T>(&self, buffer: &Buffer, name: &CStr, reader: Reader<T>) -> Option<T> {
         let mut error = std::ptr::null_mut();
-        // SAFETY: parser, buffer and name live through the call, which keeps none of them; the error, if there is one, is
+        // SAFETY: parser, buffer and name outlive the call, which keeps none of them; the error, if there is one, is
         // ours to free.
         unsafe {
             let value =

@@ -1,4 +1,4 @@
-//! `[camera.aravis]`: which camera, and how it is set once, before a sweep sets what it sweeps.
+//! `[camera.aravis]`: the camera, and settings made once before a sweep.
 
 use raysweep_core::Readout;
 use serde::Deserialize;
@@ -11,33 +11,34 @@ pub struct AravisConfig {
     pub address: Option<String>,
     /// Name of a camera as `raysweep devices` lists it, for USB3 Vision and where addresses change.
     pub name: Option<String>,
-    /// Features set first, in this order, each as `Name=Value`.
+    /// Features to set first, in this order, each as `Name=Value`.
     pub features: Vec<String>,
-    /// Pixels read out; left out: all that there are.
+    /// Pixels to read out; default: all.
     pub region: Option<Region>,
-    /// Sensor columns and rows that make a pixel.
+    /// Sensor columns and rows that form a pixel.
     pub binning: [u32; 2],
-    /// Offset of the analogue-digital converter, in the camera's units; left out: as it is.
+    /// Offset of the analogue-digital converter, in the camera's units; default: unchanged.
     pub black_level: Option<f64>,
-    /// The trigger's input, or `off` for a camera that runs freely.
+    /// The trigger input, or `off` for a free-running camera.
     pub trigger_source: String,
     /// The edge that triggers.
     pub trigger_activation: String,
-    /// From the trigger's edge to the start of row 0's exposure, at a trigger delay of zero.
+    /// From the trigger edge to the start of row 0's exposure, at a trigger delay of zero.
     pub trigger_latency_us: f64,
     /// Whether the next exposure may start during readout.
     pub readout: Readout,
-    /// From the end of row 0's exposure to the camera being ready; left out: as the camera says, or its rows' times.
+    /// From the end of row 0's exposure until the camera is ready; default: the camera's value, or the sum of its row
+    /// times.
     pub readout_us: Option<f64>,
-    /// The moment that a frame's timestamp tells.
+    /// The moment that a frame's timestamp refers to.
     pub timestamp_at: TimestampAt,
-    /// Fewest frames that still have the old settings after a change.
+    /// Minimum number of frames after a change that still have the old settings.
     pub late_frames_min: u32,
-    /// Most frames that still have the old settings after a change.
+    /// Maximum number of frames after a change that still have the old settings.
     pub late_frames_max: u32,
-    /// Bytes of a GigE Vision packet; left out: negotiated.
+    /// Bytes of a GigE Vision packet; default: negotiated.
     pub packet_size: Option<u32>,
-    /// Bytes of the socket's receive buffer; left out: two frames, at least 1 MiB.
+    /// Bytes of the socket's receive buffer; default: two frames, at least 1 MiB.
     pub socket_buffer_bytes: Option<u32>,
 }
 
@@ -57,14 +58,14 @@ pub struct Region {
     pub height: u32,
 }
 
-/// The moment that a camera's timestamps tell; its data sheet says which.
+/// The moment that a camera's timestamps refer to; see its data sheet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TimestampAt {
     /// Start of the exposure of row 0 [A].
     #[default]
     ExposureStart,
-    /// End of the exposure of row 0, which is where its readout starts.
+    /// End of the exposure of row 0, which is the start of its readout.
     ExposureEnd,
 }
 
@@ -91,25 +92,25 @@ impl Default for AravisConfig {
     }
 }
 
-/// A value that no camera can be opened with.
+/// A value with which no camera can be opened.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("camera.aravis.{key}{message}")]
 pub struct ConfigFault {
-    /// The key.
+    /// Its key.
     pub key: &'static str,
     message: String,
 }
 
-/// The largest payload of a UDP packet, which is what a GigE Vision packet is.
+/// Maximum payload of a UDP packet, which carries a GigE Vision packet.
 const MAX_PACKET_BYTES: u32 = 65_507;
-/// What every GigE Vision device must be able to send.
+/// Packet size that every GigE Vision device must support.
 const MIN_PACKET_BYTES: u32 = 576;
 
 impl AravisConfig {
     /// The camera's address or name.
     ///
     /// # Errors
-    /// Unless there is exactly one.
+    /// If not exactly one of them is given.
     pub fn device(&self) -> Result<&str, ConfigFault> {
         match (&self.address, &self.name) {
             (Some(device), None) | (None, Some(device)) => Ok(device),
@@ -125,10 +126,10 @@ impl AravisConfig {
         self.trigger_source != "off"
     }
 
-    /// Checks what can be checked without the camera.
+    /// Checks everything that can be checked without the camera.
     ///
     /// # Errors
-    /// The first key that cannot be.
+    /// The first invalid key.
     pub fn check(&self) -> Result<(), ConfigFault> {
         self.device()?;
         let fault = |key, message: String| Err(ConfigFault { key, message });

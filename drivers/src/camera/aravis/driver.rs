@@ -1,4 +1,4 @@
-//! The camera as the traits of `raysweep-core` have it: the side that takes frames.
+//! The camera behind the traits of `raysweep-core`: the side that takes frames.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -22,28 +22,29 @@ use super::owner::{Command, Done, Opened, Order, Owner, Reply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
 use super::sequencer::Sequence;
 
-/// What the driver must know of the rig that its camera is part of.
+/// Properties of the rig that the camera driver needs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RigFacts {
-    /// How frames are packed.
+    /// Pixel format of the frames.
     pub format: PixelFormat,
-    /// From the start of one row's exposure to the next row's.
+    /// From the start of one row's exposure to the start of the next row's.
     pub row_time_us: f64,
     /// From one trigger to the next.
     pub trigger_period_us: f64,
-    /// By how much a trigger may come too early.
+    /// Maximum amount by which a trigger may be early.
     pub trigger_margin_us: f64,
-    /// How long a camera that was lost may stay away.
+    /// How long a lost camera may stay away.
     pub reopen: Duration,
 }
 
-/// A camera that has neither answered nor given a frame for so long is lost.
+/// A camera that has neither answered nor delivered a frame for this long is lost.
 const SILENCE_NS: i64 = 900_000_000;
-/// Round trips that the clock model keeps: 20 s of them, and 100 s where frames come.
+/// Round trips in the clock model: they cover 20 s, or 100 s while frames arrive.
 const ROUND_TRIPS: usize = 100;
-/// The longest wait on a channel or a stream before the camera's health is looked at.
+/// Maximum wait on a channel or a stream before the camera's health is checked.
 const LOOK: Duration = Duration::from_millis(50);
-/// An owner whose camera is dead may be blocked for longer; it then ends by itself.
+/// Maximum wait for the owner thread on closing. With a dead camera it may be blocked for longer; it then ends by
+/// itself.
 const FAREWELL: Duration = Duration::from_secs(3);
 
 /// A GenICam camera.
@@ -62,7 +63,7 @@ pub struct AravisCamera {
     losses: Losses,
     promises: Promises<CameraSettings>,
     newest: Option<Newest>,
-    /// The number of the first set of the camera's sequencer, while that runs.
+    /// The number of the first set of the camera's sequencer, while the sequencer runs.
     first_set: Option<i64>,
 }
 
@@ -71,13 +72,13 @@ enum Link {
     Lost { since: Instant },
 }
 
-/// The newest frame that came whole.
+/// The newest complete frame.
 #[derive(Clone, Copy)]
 struct Newest {
     seq: u64,
     exposure_start_ns: i64,
     host_ns: i64,
-    /// The sequencer's set, counted from its first, where the frame says it.
+    /// Its sequencer set, counted from the first set, if the frame reports it.
     set: Option<usize>,
 }
 
@@ -90,11 +91,11 @@ fn lost() -> DeviceError {
 }
 
 impl AravisCamera {
-    /// Opens the camera and sets everything that no sweep changes.
+    /// Opens the camera and makes all settings that are the same for all sweeps.
     ///
     /// # Errors
-    /// `Disconnected` when it does not answer, `Busy` when another program holds it, `Unsupported` and `OutOfRange`
-    /// with the feature that it lacks or does not take.
+    /// `Disconnected` if it does not answer, `Busy` if another program holds it, `Unsupported` or `OutOfRange` with
+    /// the feature that it lacks or whose value it rejects.
     pub fn open(config: &AravisConfig, facts: RigFacts) -> Result<Self, DeviceError> {
         config.check().map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
         let clock = Clock::real();
@@ -103,7 +104,7 @@ impl AravisCamera {
             model: Arc::new(Mutex::new(ClockModel::new(ROUND_TRIPS))),
             clock,
         };
-        // At most one order is under way, beside the last two of a camera's life.
+        // At most one order is pending, in addition to the last two when a camera is given up.
         let (orders, todo) = sync_channel(4);
         let (answers, replies) = sync_channel(4);
         let owner = Owner {
@@ -153,12 +154,12 @@ impl AravisCamera {
         self.losses.totals()
     }
 
-    /// How far the round trips of the clock model scatter about it; nothing where the camera has no clock to ask.
+    /// Scatter of the round trips around the clock model; `None` if the camera's clock cannot be read.
     pub fn clock_residual_ns(&self) -> Option<f64> {
         self.shared.with_model(|model| model.residual_ns())
     }
 
-    /// Has the owner do something, for as long as the camera shows any life.
+    /// Lets the owner thread execute a command; gives up if the camera is silent.
     fn ask(&mut self, command: Command) -> Result<Done, DeviceError> {
         if matches!(self.link, Link::Lost { .. }) {
             return Err(lost());
@@ -181,7 +182,7 @@ impl AravisCamera {
                     return Err(error);
                 }
                 Ok(Reply::Done(ticket, done)) if ticket == self.ticket => return done,
-                // Of an order that was given up.
+                // Reply to an order that was given up.
                 Ok(Reply::Done(..) | Reply::Opened(_)) => {}
                 Err(RecvTimeoutError::Timeout) if self.silent_since(asked_ns) => {
                     self.lose();
@@ -198,25 +199,25 @@ impl AravisCamera {
         }
     }
 
-    /// Whether the camera has shown no life since `since_ns`, and that for long.
+    /// Whether the camera has been silent since `since_ns`, and for long enough to be lost.
     fn silent_since(&self, since_ns: i64) -> bool {
         let answered_ns = self.shared.health.answered_ns();
         answered_ns == i64::MIN
             || self.shared.clock.now_ns().saturating_sub(answered_ns.max(since_ns)) > SILENCE_NS
     }
 
-    /// Gives the camera up and has it opened again.
+    /// Gives up the camera and has it opened again.
     fn lose(&mut self) {
         let link = std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() });
         if let (Link::Up { frames, .. }, Some(orders)) = (link, &self.orders) {
             tracing::warn!(camera = self.capabilities.model, "camera lost; opening it again");
             self.ticket += 1;
-            // The channel has room for this and for what was asked before.
+            // The channel has room for this and for the orders before it.
             let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(frames) });
         }
     }
 
-    /// Waits for a lost camera to be back; tells nothing where it still is not.
+    /// Waits up to `timeout` for a lost camera to come back; returns `Ok` also if it is still away.
     fn wait_for_return(&mut self, since: Instant, timeout: Duration) -> Result<(), DeviceError> {
         let until = Instant::now() + timeout;
         loop {
@@ -256,7 +257,7 @@ impl AravisCamera {
         }
     }
 
-    /// Looks at a frame that came, of which `bytes` are wanted; nothing where it is not whole.
+    /// Evaluates a received frame, of which `bytes` are used; `None` if it is incomplete.
     fn look_at(&mut self, from: &Buffer, bytes: usize) -> Result<Option<FrameStamp>, DeviceError> {
         match from.status() {
             BufferStatus::Success => {}
@@ -301,8 +302,8 @@ impl AravisCamera {
         Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
     }
 
-    /// The camera is back and counts its frames anew. As many ids have passed as it would have answered triggers, and the
-    /// next frame is of the settings that were written last, whatever was promised of those before.
+    /// The camera is back and has restarted its frame count. Skips as many ids as it would have answered triggers.
+    /// The next frame has the settings that were written last, whatever was promised for earlier ones.
     fn resume_ids(&mut self) {
         let mut next_seq = self.promises.latest_seq();
         if let Some(newest) = self.newest {
@@ -320,12 +321,12 @@ impl AravisCamera {
         }
     }
 
-    /// What is known of the triggers now.
+    /// What is known about the triggers now.
     fn triggers(&self) -> Triggers {
         let period_us = if self.config.is_triggered() {
             self.facts.trigger_period_us
         } else {
-            // Frames of a camera that runs freely may follow as soon as it can.
+            // The frames of a free-running camera may follow each other as fast as it can deliver them.
             self.promises
                 .newest()
                 .map_or(0.0, |settings| settings.exposure_us)
@@ -351,7 +352,7 @@ impl AravisCamera {
         }
     }
 
-    /// Throws away what has come of frames that nobody asked for.
+    /// Discards received frames that nobody asked for.
     fn drain(&self) {
         if let Link::Up { frames, .. } = &self.link {
             frames.drain();
@@ -399,7 +400,7 @@ impl Camera for AravisCamera {
             self.drain();
             self.ids.restart(0);
         }
-        // What was triggered when is told from the longest delay that a frame may have.
+        // Trigger times are derived from the longest delay that a frame may have.
         let by_delay =
             |a: &&CameraSettings, b: &&CameraSettings| a.trigger_delay_us.total_cmp(&b.trigger_delay_us);
         if let Some(longest) = sequence.iter().flatten().max_by(by_delay) {
@@ -496,7 +497,7 @@ impl Drop for AravisCamera {
             let _ = orders.try_send(Order { ticket: 0, command: Command::Close(frames) });
         }
         drop(orders);
-        // The owner of a dead camera may be blocked in the library: it is waited for, but not for ever.
+        // The owner of a dead camera may be blocked in the library, so the wait is limited.
         let until = Instant::now() + FAREWELL;
         while self.owner.as_ref().is_some_and(|owner| !owner.is_finished()) && Instant::now() < until {
             match self.replies.recv_timeout(LOOK) {

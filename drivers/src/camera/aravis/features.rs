@@ -1,4 +1,4 @@
-//! What the driver asks of a GenICam feature map: the seam at which a scripted camera takes the place of libaravis.
+//! The driver's interface to a GenICam feature map. Tests replace libaravis with a scripted camera here.
 
 use std::ops::RangeInclusive;
 
@@ -8,9 +8,9 @@ use raysweep_core::{DeviceError, DeviceErrorKind};
 #[derive(Debug, thiserror::Error)]
 #[error("feature {feature}: {what}")]
 pub struct FeatureError {
-    /// Its name.
+    /// The feature's name.
     pub feature: String,
-    /// What kind of failure it was.
+    /// The kind of failure.
     pub kind: DeviceErrorKind,
     /// What happened.
     pub what: String,
@@ -32,7 +32,7 @@ pub type Result<T> = std::result::Result<T, FeatureError>;
 
 /// A camera's features by name. Enumerations are read and written as text.
 pub trait Features {
-    /// Whether the feature is there and may be used as the camera is set now.
+    /// Whether the feature exists and is available with the present settings.
     fn has(&self, name: &str) -> bool;
     fn float(&self, name: &str) -> Result<f64>;
     fn set_float(&self, name: &str, value: f64) -> Result<()>;
@@ -42,21 +42,21 @@ pub trait Features {
     fn integer_range(&self, name: &str) -> Result<RangeInclusive<i64>>;
     fn text(&self, name: &str) -> Result<String>;
     fn set_text(&self, name: &str, value: &str) -> Result<()>;
-    /// The entries of an enumeration that may be chosen now.
+    /// The entries of an enumeration that are available now.
     fn choices(&self, name: &str) -> Result<Vec<String>>;
     fn boolean(&self, name: &str) -> Result<bool>;
     fn set_boolean(&self, name: &str, value: bool) -> Result<()>;
     fn execute(&self, name: &str) -> Result<()>;
-    /// Sets a feature, or a register `R[address]`, from `Name=Value`.
+    /// Sets a feature, or a register `R[address]`, given as `Name=Value`.
     fn set_line(&self, line: &str) -> Result<()>;
 }
 
-/// The name under which this camera has a feature that goes by several.
+/// The first of these names under which the camera has the feature.
 pub fn first_present(features: &impl Features, names: &[&'static str]) -> Option<&'static str> {
     names.iter().copied().find(|name| features.has(name))
 }
 
-/// Sets an enumeration and makes sure that it took.
+/// Sets an enumeration and verifies it.
 pub fn put_text(features: &impl Features, name: &str, value: &str) -> Result<()> {
     features.set_text(name, value).map_err(|mut error| {
         if let Ok(choices) = features.choices(name) {
@@ -67,7 +67,7 @@ pub fn put_text(features: &impl Features, name: &str, value: &str) -> Result<()>
     took(name, value, &features.text(name)?)
 }
 
-/// Sets an integer and makes sure that it took.
+/// Sets an integer and verifies it.
 pub fn put_integer(features: &impl Features, name: &str, value: i64) -> Result<()> {
     let range = features.integer_range(name)?;
     if !range.contains(&value) {
@@ -78,7 +78,7 @@ pub fn put_integer(features: &impl Features, name: &str, value: i64) -> Result<(
     took(name, &value, &features.integer(name)?)
 }
 
-/// Sets a boolean and makes sure that it took.
+/// Sets a boolean and verifies it.
 pub fn put_boolean(features: &impl Features, name: &str, value: bool) -> Result<()> {
     features.set_boolean(name, value)?;
     took(name, &value, &features.boolean(name)?)
@@ -94,7 +94,7 @@ fn took<T: PartialEq + std::fmt::Debug + ?Sized>(name: &str, asked: &T, read: &T
 
 #[cfg(test)]
 pub mod scripted {
-    //! A camera of a table: notes what is written, in order.
+    //! A camera made of a table: records all writes in order.
 
     use std::cell::RefCell;
     use std::collections::BTreeMap;
@@ -115,7 +115,7 @@ pub mod scripted {
         pub values: RefCell<BTreeMap<String, Value>>,
         /// Every write, as `Name=Value`, in order.
         pub written: RefCell<Vec<String>>,
-        /// Steps of floats, so that what is read back differs.
+        /// Step size of floats, so that values differ when read back.
         pub step: f64,
     }
 

@@ -1,4 +1,4 @@
-//! A camera's features as a text file: `Name=Value` a line, in an order in which they can be set again.
+//! A camera's features as a text file: one `Name=Value` per line, in an order in which they can be set again.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -11,22 +11,22 @@ use raysweep_core::{Clock, DeviceError, DeviceErrorKind};
 
 use super::library::{Device, Health};
 
-/// A line of a feature file that the camera did not take.
+/// A line of a feature file that the camera rejected.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Refused {
     /// The line.
     pub line: String,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 
-/// What the network and this host make of a camera is no part of how it is set, nor is what it keeps in itself.
+/// Features that depend on the network and this host, or that the camera stores itself, are not part of its settings.
 const LEFT_OUT: [&str; 4] = ["Gev", "TLParamsLocked", "UserSet", "File"];
 
-/// Reads what a camera, by its address or its name, can be set to, as the text of a feature file.
+/// Reads all settings of a camera, given by address or name, as the text of a feature file.
 ///
 /// # Errors
-/// `Disconnected` when it does not answer, `Busy` when another program holds it.
+/// `Disconnected` if it does not answer, `Busy` if another program holds it.
 pub fn save_features(camera: &str) -> Result<String, DeviceError> {
     let device = open(camera)?;
     let genicam = genicam(&device)?;
@@ -45,11 +45,11 @@ pub fn save_features(camera: &str) -> Result<String, DeviceError> {
     Ok(file)
 }
 
-/// Sets a camera, by its address or its name, from the text of a feature file; tells how many lines it took and which
-/// it refused.
+/// Sets a camera, given by address or name, from the text of a feature file. Returns how many lines it accepted and
+/// which it rejected.
 ///
 /// # Errors
-/// `Disconnected` when it does not answer, `Busy` when another program holds it, `OutOfRange` for a line that is none.
+/// `Disconnected` if it does not answer, `Busy` if another program holds it, `OutOfRange` for a malformed line.
 pub fn load_features(camera: &str, text: &str) -> Result<(usize, Vec<Refused>), DeviceError> {
     let mut lines = Vec::new();
     for (number, line) in text.lines().enumerate().map(|(index, line)| (index + 1, line.trim())) {
@@ -65,7 +65,7 @@ pub fn load_features(camera: &str, text: &str) -> Result<(usize, Vec<Refused>), 
     let device = open(camera)?;
     let genicam = genicam(&device)?;
     let mut refused = Vec::new();
-    // Some values are taken only once others further down are there.
+    // Some values are accepted only after others further down are set.
     for _ in 0..2 {
         refused.clear();
         for &(name, value) in &lines {
@@ -90,7 +90,7 @@ fn genicam(device: &Device) -> Result<Gc, DeviceError> {
         .ok_or_else(|| DeviceError::new("camera", DeviceErrorKind::Unsupported, "has no GenICam description"))
 }
 
-/// The names of all features in the order of the camera's description.
+/// Collects the names of all features in the order of the camera's description.
 fn walk(genicam: &Gc, name: &str, names: &mut Vec<String>) {
     let Some(node) = genicam.node(name) else { return };
     match node.downcast_ref::<GcCategory>() {
@@ -112,7 +112,7 @@ fn name_of(node: &impl IsA<GcFeatureNode>) -> String {
     node.as_ref().name().map(String::from).unwrap_or_default()
 }
 
-/// A feature that can be written as the camera is set now.
+/// The feature, if it is writable with the present settings.
 fn writable(genicam: &Gc, name: &str) -> Option<GcFeatureNode> {
     if LEFT_OUT.iter().any(|left_out| name.starts_with(left_out)) {
         return None;
@@ -140,7 +140,7 @@ fn write_feature(genicam: &Gc, name: &str, file: &mut String) {
         line(name, &value);
         return;
     };
-    // A trigger's mode goes last: some cameras take nothing else of it while they wait for triggers.
+    // The trigger mode goes last: some cameras accept no other trigger settings while they wait for triggers.
     selected.sort_by_key(|node| name_of(node).ends_with("Mode"));
     for entry in entries {
         if feature.set_value_from_string(&entry).is_err() {
@@ -171,7 +171,7 @@ fn set(genicam: &Gc, name: &str, value: &str) -> Result<(), String> {
     if is_same(value, &read) { Ok(()) } else { Err(format!("reads {read} afterwards")) }
 }
 
-/// Whether two values are the same, as text or as numbers of a camera's precision.
+/// Whether two values are equal, as text or as numbers at the camera's precision.
 fn is_same(a: &str, b: &str) -> bool {
     match (a.parse::<f64>(), b.parse::<f64>()) {
         (Ok(a), Ok(b)) => (a - b).abs() <= 1e-6 * a.abs().max(b.abs()),

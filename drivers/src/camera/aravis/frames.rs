@@ -1,7 +1,7 @@
-//! The stream of frames, received in memory that goes to the pool as it is: no frame is copied.
+//! The stream of frames, received in memory that goes to the pool without copying.
 //!
-//! Benefit: a copy of 1.5 MB, which the thread that received it has in its own cache, took half as much processor time
-//! as receiving it did (245 of 520 us a frame, 1024 x 1024 Mono12p).
+//! Benefit: copying 1.5 MB that was in the cache of the receiving thread took half as much processor time as
+//! receiving it (245 of 520 us per frame, 1024 x 1024 Mono12p).
 
 #![allow(
     unsafe_code,
@@ -17,72 +17,73 @@ use aravis::prelude::*;
 use aravis::{Buffer, Stream};
 use raysweep_core::FrameBuf;
 
-/// Fewest buffers that frames arrive in: half a second at 60 frames/s.
+/// Minimum number of receive buffers: half a second at 60 frames/s.
 const FEWEST: usize = 32;
-/// As many as lie in so much memory: libaravis waits 100 ms for packets that are missing, and keeps all frames behind.
+/// Memory for receive buffers: libaravis waits 100 ms for missing packets and holds back all later frames.
 const MEMORY_BYTES: usize = 64 << 20;
 pub const MOST_BUFFERS: usize = 128;
-/// Buffers that wait for their memory to come back from the pool.
+/// Maximum number of buffers that wait for their memory to come back from the pool.
 const MOST_IDLE: usize = 128;
 
 /// A stream and the memory that it writes to.
 pub struct Frames {
-    // Dropped first: its thread ends, and nobody writes any more.
+    // Dropped first: this ends its thread, so nothing writes to the memory any more.
     stream: Stream,
     lent: Lent,
-    /// Buffers of the library whose memory is the pool's at present, each with the address of that memory: asking all of
-    /// them for it would fetch each from memory anew, frame by frame.
+    /// The library's buffers whose memory is in the pool, each with the address of that memory. Querying the buffers
+    /// instead would load each of them into the cache for every frame.
     idle: Vec<(NonZeroUsize, Buffer)>,
     payload_bytes: usize,
 }
 
-/// Memory that the stream may write to: each piece was a box, and nobody else has it.
+/// Memory that the stream may write to: each piece was a box and has no other owner.
 struct Lent(Vec<NonNull<[u8]>>);
 
-// SAFETY: the pieces are owned like the boxes that they were.
+// SAFETY: the pieces are owned exclusively, like the boxes that they were.
 unsafe impl Send for Lent {}
 
 impl Frames {
-    /// Gives a stream buffers for frames of `payload_bytes`, in pieces of `memory_bytes` or more.
+    /// Gives a stream buffers for frames of `payload_bytes`, in pieces of at least `memory_bytes`.
     pub fn new(stream: Stream, payload_bytes: usize, memory_bytes: usize) -> Self {
         let buffers = (MEMORY_BYTES / payload_bytes.max(1)).clamp(FEWEST, MOST_BUFFERS);
         let lent = Lent(Vec::with_capacity(buffers));
         let mut frames = Self { stream, lent, idle: Vec::with_capacity(MOST_IDLE), payload_bytes };
         for _ in 0..buffers {
-            // Not zeros, whose pages would be made when the first frames come.
+            // Not zeros: the kernel would allocate their pages only when the first frames arrive.
             frames.lend(vec![u8::MAX; memory_bytes.max(payload_bytes)].into());
         }
         frames
     }
 
-    /// How many buffers there are.
+    /// Number of buffers.
     pub fn buffers(&self) -> usize {
         self.lent.0.len()
     }
 
-    /// Whether none is free.
+    /// Whether no buffer is free.
     pub fn is_full(&self) -> bool {
         self.stream.n_buffers().0 == 0
     }
 
-    /// The next frame, whole or not; give it back or have it taken.
+    /// The next frame, complete or not; must be passed to `give_back` or `take`.
     pub fn pop(&self, timeout_us: u64) -> Option<Buffer> {
         self.stream.timeout_pop_buffer(timeout_us)
     }
 
-    /// A frame that nobody wants.
+    /// Returns the buffer of an unneeded frame to the stream.
     pub fn give_back(&self, buffer: Buffer) {
         self.stream.push_buffer(buffer);
     }
 
-    /// Throws away what has come.
+    /// Discards all received frames.
     pub fn drain(&self) {
         while let Some(buffer) = self.stream.try_pop_buffer() {
             self.give_back(buffer);
         }
     }
 
-    /// Puts a frame's image into `buf`, which is no longer than it: where it has as much memory as the frame, by exchange.
+    /// Puts a frame's image into `buf`, which is not longer than it. Exchanges the memory if `buf` has as much as the
+    /// frame, otherwise copies.
     pub fn take(&mut self, buffer: Buffer, buf: &mut FrameBuf) {
         let image = image_data(&buffer);
         let at = address(&buffer);
@@ -107,17 +108,17 @@ impl Frames {
         self.give_back(buffer);
     }
 
-    /// Gives the stream memory, of `payload_bytes` at least.
+    /// Gives the stream a piece of memory of at least `payload_bytes`.
     fn lend(&mut self, memory: Box<[u8]>) {
         let memory = NonNull::from(Box::leak(memory));
         self.lent.0.push(memory);
         let at = memory.cast::<u8>();
-        // All memory is of one length, so whichever had this address before, the buffer fits.
+        // All pieces have the same length, so the buffer of any earlier piece at this address fits.
         let known = self.idle.iter().position(|(idle_at, _)| *idle_at == at.addr());
         let buffer = match known {
             Some(place) => self.idle.swap_remove(place).1,
-            // SAFETY: the memory has `payload_bytes` and lives as long as it is in `lent`; what is not there is never
-            // given to the stream.
+            // SAFETY: the memory has `payload_bytes` and lives as long as it is in `lent`; memory that is not in
+            // `lent` is never given to the stream.
             None => unsafe {
                 let at = at.as_ptr().cast::<c_void>();
                 from_glib_full(aravis_sys::arv_buffer_new(self.payload_bytes, at))
@@ -136,10 +137,10 @@ impl Drop for Lent {
     }
 }
 
-/// What lies behind the first `image_bytes` of a frame that was popped; libaravis takes it for a part of the image.
+/// The bytes after the first `image_bytes` of a popped frame; libaravis considers them part of the image.
 pub fn behind_image(buffer: &Buffer, image_bytes: usize) -> &[u8] {
     let mut size = 0;
-    // SAFETY: as for `image_data`, of all that was received.
+    // SAFETY: as for `image_data`, for all received bytes.
     let data = unsafe {
         let data = aravis_sys::arv_buffer_get_data(buffer.to_glib_none().0, &mut size);
         if data.is_null() { &[] } else { std::slice::from_raw_parts(data, size) }
@@ -147,21 +148,21 @@ pub fn behind_image(buffer: &Buffer, image_bytes: usize) -> &[u8] {
     data.get(image_bytes..).unwrap_or_default()
 }
 
-/// Where a buffer's memory begins.
+/// Start address of a buffer's memory.
 fn address(buffer: &Buffer) -> NonNull<u8> {
     let mut size = 0;
-    // SAFETY: the buffer lives through the call; the address is compared, not followed.
+    // SAFETY: the buffer outlives the call; the address is compared, not dereferenced.
     let at = unsafe { aravis_sys::arv_buffer_get_data(buffer.to_glib_none().0, &mut size) };
     NonNull::new(at).unwrap_or(NonNull::dangling())
 }
 
-/// The image of a frame that was popped, where it lies.
+/// The image of a popped frame, in place.
 ///
 /// Benefit: `Buffer::image_data` of the bindings allocates and copies each frame: 1.9 MB at 1024 x 1024 Mono12p.
 pub fn image_data(buffer: &Buffer) -> &[u8] {
     let mut size = 0;
-    // SAFETY: the pointer and size describe memory that is lent to the buffer, and null or 0 where it has no image. While
-    // the buffer is borrowed it is not in a stream, so that nobody writes to it.
+    // SAFETY: pointer and size describe memory that is lent to the buffer, or are null or 0 if it has no image. While
+    // the buffer is borrowed it is not in a stream, so nobody writes to it.
     unsafe {
         let data = aravis_sys::arv_buffer_get_image_data(buffer.to_glib_none().0, &mut size);
         if data.is_null() { &[] } else { std::slice::from_raw_parts(data, size) }

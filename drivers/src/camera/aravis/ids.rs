@@ -1,14 +1,14 @@
-//! From the ids that a camera gives its frames to ids that only rise.
+//! Converts a camera's frame ids to ids that only increase.
 
-/// Ids of GigE Vision 1.x: 16 bits, and after 65535 comes 1, because 0 is no frame.
+/// GigE Vision 1.x ids: 16 bits; 65535 is followed by 1, because 0 is not a valid id.
 const SHORT_IDS: u64 = 65_535;
 
-/// Extends frame ids of 16 bits to 64 and carries ids that are long already (USB3 Vision, GigE Vision 2.0) on.
+/// Extends 16-bit frame ids to 64 bits and continues ids that are long already (USB3 Vision, GigE Vision 2.0).
 #[derive(Debug, Default)]
 pub struct FrameIds {
-    /// The newest frame: as the camera counts, and as we do.
+    /// The newest frame: the camera's id and ours.
     last: Option<(u64, u64)>,
-    /// What the next frame gets after a restart.
+    /// Minimum id of the next frame after a restart.
     next: u64,
 }
 
@@ -18,26 +18,27 @@ impl FrameIds {
         self.last.map_or(self.next, |(_, seq)| seq + 1)
     }
 
-    /// The camera counts anew; its first frame shall be `seq` or, if that is taken, the one after the last.
+    /// The camera restarts its count; its first frame gets `seq` or, if that is taken, the id after the last.
     pub fn restart(&mut self, seq: u64) {
         self.next = self.next().max(seq);
         self.last = None;
     }
 
-    /// The id of the frame that the camera calls `raw`; nothing for one that was there already.
+    /// The id of the frame that the camera calls `raw`; `None` for a frame that was already received.
     pub fn extend(&mut self, raw: u64) -> Option<u64> {
         let seq = match self.step_to(raw) {
             Step::First => self.next,
             Step::Same => return None,
             Step::Forward(step) => self.next() - 1 + step,
-            // It began to count anew, how many frames later is unknown.
+            // The camera restarted its count; how many frames were missed is unknown.
             Step::Back => self.next(),
         };
         self.last = Some((raw, seq));
         Some(seq)
     }
 
-    /// The id of a frame of which only a part came, if that part told it: else the library gives an id of long ago.
+    /// The id of an incomplete frame, if the received part contains it; otherwise the library reports an id from long
+    /// ago.
     pub fn of_part(&self, raw: u64) -> Option<u64> {
         match self.step_to(raw) {
             Step::Forward(step) => Some(self.next() - 1 + step),
@@ -61,7 +62,7 @@ impl FrameIds {
     }
 }
 
-/// From the newest frame to another.
+/// Distance from the newest frame to another.
 enum Step {
     First,
     Same,
@@ -77,7 +78,7 @@ mod tests {
     fn short_ids_wrap_past_zero_and_gaps_stay_gaps() {
         let mut ids = FrameIds::default();
         ids.restart(1);
-        // Three times round, every seventh frame lost; a 16-bit counter that skips 0.
+        // Three wraps of a 16-bit counter that skips 0; every seventh frame is lost.
         let mut raw = 0_u16;
         for seq in 1..=3 * 65_535 {
             raw = raw.checked_add(1).unwrap_or(1);

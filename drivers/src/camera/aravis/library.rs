@@ -1,4 +1,4 @@
-//! libaravis: finding cameras, opening one, its features and its clock.
+//! Interface to libaravis: finding and opening cameras, their features and their clock.
 
 use std::ffi::CStr;
 use std::net::IpAddr;
@@ -19,22 +19,22 @@ use super::features::{FeatureError, Features, Result, first_present};
 /// A camera that answered.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Found {
-    /// What to call it in a rig file: `camera.aravis.name`.
+    /// Its name in a rig file: `camera.aravis.name`.
     pub name: String,
-    /// Its maker.
+    /// Manufacturer.
     pub vendor: String,
-    /// Its model.
+    /// Model name.
     pub model: String,
-    /// Where it is: an IP address (`camera.aravis.address`) or a place on the USB.
+    /// Its location: an IP address (`camera.aravis.address`) or a place on the USB.
     pub address: String,
     /// GigEVision or USB3Vision.
     pub protocol: String,
 }
 
-/// The library's list of devices is one for the process.
+/// The library has one list of devices per process.
 static LIBRARY: Mutex<Option<Aravis>> = Mutex::new(None);
 
-/// Asks on every network and on the USB which cameras there are; takes about a second.
+/// Searches all networks and the USB for cameras; takes about a second.
 pub fn discover() -> Vec<Found> {
     let mut library = LIBRARY.lock().unwrap_or_else(PoisonError::into_inner);
     if library.is_none() {
@@ -52,7 +52,7 @@ pub fn discover() -> Vec<Found> {
     found.collect()
 }
 
-/// When a camera last answered on its control channel and last gave a frame: what the threads of the two tell each other.
+/// When a camera last answered on its control channel and last delivered a frame; shared by the two threads.
 pub struct Health {
     clock: Clock,
     answered_ns: AtomicI64,
@@ -65,7 +65,7 @@ impl Health {
         Self { clock, answered_ns: AtomicI64::new(now_ns), gave_frame_ns: AtomicI64::new(i64::MIN) }
     }
 
-    /// A frame was taken.
+    /// Records that a frame was taken.
     pub fn gave_frame(&self, host_ns: i64) {
         self.gave_frame_ns.store(host_ns, Ordering::Relaxed);
     }
@@ -79,7 +79,7 @@ impl Health {
         self.answered_ns.store(self.clock.now_ns(), Ordering::Relaxed);
     }
 
-    /// The camera is known to be gone.
+    /// Records that the camera is gone.
     pub fn gone(&self) {
         self.answered_ns.store(i64::MIN, Ordering::Relaxed);
     }
@@ -97,13 +97,13 @@ pub struct Device {
 }
 
 impl Device {
-    /// Opens a camera by its address or its name.
+    /// Opens a camera by its address or name.
     ///
     /// # Errors
-    /// `Disconnected` when it does not answer, `Busy` when another program controls it.
+    /// `Disconnected` if it does not answer, `Busy` if another program controls it.
     pub fn open(named: &str, health: Arc<Health>) -> std::result::Result<Self, DeviceError> {
         if named.parse::<IpAddr>().is_err() {
-            // Without the list a name is looked for ten times as long.
+            // Without the list, finding a name takes ten times as long.
             discover();
         }
         let no_camera = |what: String| DeviceError::new("camera", DeviceErrorKind::Disconnected, what);
@@ -121,13 +121,13 @@ impl Device {
             );
             return Err(DeviceError::new("camera", DeviceErrorKind::Busy, what));
         }
-        // Off by default: values out of range would go to the camera and come back as puzzling protocol errors.
+        // Off by default: out-of-range values would reach the camera and come back as obscure protocol errors.
         device.set_range_check_policy(aravis::RangeCheckPolicy::Enable);
         health.answered();
         Ok(Self { camera, device, health })
     }
 
-    /// Maker, model and serial number.
+    /// Manufacturer, model and serial number.
     pub fn model(&self) -> String {
         let parts = [self.camera.vendor_name(), self.camera.model_name(), self.camera.device_serial_number()];
         parts.into_iter().filter_map(|part| part.ok().map(String::from)).collect::<Vec<_>>().join(" ")
@@ -137,7 +137,7 @@ impl Device {
         self.device.genicam()
     }
 
-    /// Asks for anything at all, to know whether the camera is there.
+    /// Reads anything to find out whether the camera is there.
     pub fn ping(&self) -> Result<()> {
         self.integer("Width").map(drop)
     }
@@ -146,7 +146,7 @@ impl Device {
         self.device.feature(name)?.downcast::<GcFeatureNode>().ok()
     }
 
-    /// Notes that the camera has answered, be it with an error of its own.
+    /// Records that the camera has answered, even if with an error.
     fn answer<T>(&self, name: &str, result: std::result::Result<T, glib::Error>) -> Result<T> {
         let error = match result {
             Ok(value) => {
@@ -162,7 +162,7 @@ impl Device {
     }
 }
 
-/// An error of libaravis as one of ours.
+/// Converts an error of libaravis.
 pub fn device_error(what: &str, error: &glib::Error) -> DeviceError {
     DeviceError::new("camera", kind_of(error), format!("{what}: {error}"))
 }
@@ -189,7 +189,7 @@ fn kind_of(error: &glib::Error) -> DeviceErrorKind {
 
 impl Features for Device {
     fn has(&self, name: &str) -> bool {
-        // Asked of the node itself: the bindings' short cuts of the device lose the answer.
+        // Queries the node itself: the bindings' shortcuts on the device discard the answer.
         self.node(name).is_some_and(|node| {
             node.is_implemented().unwrap_or(false) && node.is_available().unwrap_or(false)
         })
@@ -250,7 +250,7 @@ impl Features for Device {
     }
 }
 
-/// How a camera tells its time.
+/// Reads a camera's clock.
 #[derive(Debug, Clone, Copy)]
 pub struct DeviceClock {
     latch: &'static str,
@@ -258,13 +258,13 @@ pub struct DeviceClock {
     ticks_per_s: i64,
 }
 
-/// From one look at a clock whose unit is not known to the next, longer where the host was too busy to tell.
+/// Times between two readings of a clock of unknown unit; longer if the host was too busy for a decision.
 const CLOCK_LOOKS_MS: [u64; 5] = [20, 40, 80, 160, 320];
-/// By what part of it a clock may run fast or slow.
+/// Maximum relative error of a clock's rate.
 const CLOCK_ERROR: f64 = 0.1;
 
-/// Whether a clock may count `ticks_per_s`, by two round trips as of one that counts nanoseconds: whatever part of a round
-/// trip was the way there, and what the way back.
+/// Whether a clock may count `ticks_per_s`, given two round trips that assume nanoseconds. Makes no assumption on how
+/// a round trip divides into the way there and the way back.
 fn may_have_unit(begin: RoundTrip, end: RoundTrip, ticks_per_s: i64) -> bool {
     let passed_ns = end.device_ns.saturating_sub(begin.device_ns) as f64 * 1e9 / ticks_per_s as f64;
     let shortest_ns = (end.request_ns - begin.receive_ns) as f64 * (1.0 - CLOCK_ERROR);
@@ -272,16 +272,16 @@ fn may_have_unit(begin: RoundTrip, end: RoundTrip, ticks_per_s: i64) -> bool {
     (shortest_ns..longest_ns).contains(&passed_ns)
 }
 
-/// Times that a camera is asked for its time in a row: each takes as much processor time as half a frame.
+/// Clock readings in a row: each takes as much processor time as half a frame.
 const ASKS: usize = 2;
 
 impl DeviceClock {
-    /// Finds out how the camera tells its time, and in which unit; nothing if it does not, or stands still.
+    /// Determines how to read the camera's clock, and its unit; `None` if it cannot be read or stands still.
     pub fn probe(device: &Device, clock: &Clock) -> Option<Self> {
         let latch = first_present(device, &["TimestampLatch", "GevTimestampControlLatch"])?;
         let value = first_present(device, &["TimestampLatchValue", "GevTimestampValue"])?;
         let nanoseconds = Self { latch, value, ticks_per_s: 1_000_000_000 };
-        // The standards disagree on whether the value counts ticks or nanoseconds, so what it does decides.
+        // The standards disagree on whether the value is in ticks or nanoseconds, so its behaviour decides.
         let gige = device.device.downcast_ref::<GvDevice>();
         let stated = gige.and_then(|device| device.timestamp_tick_frequency().ok());
         let stated = stated.and_then(|hz| i64::try_from(hz).ok());
@@ -299,8 +299,8 @@ impl DeviceClock {
         })
     }
 
-    /// Asks for the camera's time some times in a row and returns the quickest answer, which is the truest: the first is slow
-    /// where a processor had gone to sleep.
+    /// Reads the camera's clock several times in a row and returns the reading with the shortest round trip, which is
+    /// the most accurate. The first one is slow if a processor was asleep.
     pub fn ask(&self, device: &Device, clock: &Clock) -> Result<RoundTrip> {
         let mut quickest = self.ask_once(device, clock)?;
         for _ in 1..ASKS {
@@ -334,7 +334,7 @@ mod tests {
             device_ns: (request_ns + there_ns) * ticks_per_s / 1_000_000_000,
             receive_ns: request_ns + there_ns + back_ns,
         };
-        // The ways there and back of two round trips, the second 20 ms after the first.
+        // Times there and back of two round trips, the second 20 ms after the first.
         let possible = |truth, [there, back]: [i64; 2], [there_again, back_again]: [i64; 2]| {
             let begin = trip(1_000_000_000, there, back, truth);
             let end = trip(begin.receive_ns + 20_000_000, there_again, back_again, truth);

@@ -1,4 +1,4 @@
-//! Frames that never came, by cause. That they are lost, gaps between frame ids tell; why, what was seen meanwhile.
+//! Lost frames by cause. Gaps between frame ids show that frames are lost; other events show why.
 
 use std::ops::Range;
 
@@ -6,28 +6,28 @@ use raysweep_core::LossCause;
 
 use super::frames::MOST_BUFFERS;
 
-/// Frames with missing packets that are remembered within one gap; more than the driver has buffers never are.
+/// Number of incomplete frames remembered within one gap; there are never more than the driver has buffers.
 const REMEMBERED: usize = MOST_BUFFERS;
 
-/// What the driver can tell.
+/// The causes that the driver can distinguish.
 const CAUSES: [LossCause; 4] =
     [LossCause::CameraGap, LossCause::PacketsLost, LossCause::DriverFull, LossCause::CameraLost];
 
-/// Why the frames of the newest gap are lost, and how many were lost so far.
+/// Causes of the frames lost in the newest gap, and totals of lost frames.
 #[derive(Debug)]
 pub struct Losses {
-    /// Frames that came with packets missing, since the newest whole one or in the gap before it.
+    /// Frames with missing packets, since the newest complete frame or in the gap before it.
     incomplete: Vec<u64>,
-    /// Frames that came in part since the newest whole one, and of which that part did not say which they are.
+    /// Incomplete frames since the newest complete one whose received part lacks the id.
     nameless: usize,
-    /// Frames that went by while the camera was away.
+    /// Frames missed while the camera was away.
     away: Range<u64>,
     /// Up to this frame there may have been no free buffer.
     full_until: Option<u64>,
-    /// The gap before the newest whole frame.
+    /// The gap before the newest complete frame.
     gap: Range<u64>,
     newest: Option<u64>,
-    /// Of each of the [`CAUSES`]: counting takes no memory.
+    /// Lost frames for each of the [`CAUSES`]; an array, so that counting allocates no memory.
     totals: [u64; CAUSES.len()],
 }
 
@@ -44,7 +44,7 @@ impl Losses {
         }
     }
 
-    /// A frame came with packets missing; without its id, where the packet that has it is one of them.
+    /// Records a frame with missing packets; `None` if the packet with its id is missing.
     pub fn incomplete(&mut self, seq: Option<u64>) {
         let Some(seq) = seq else {
             self.nameless += 1;
@@ -59,21 +59,22 @@ impl Losses {
         }
     }
 
-    /// All buffers are full, the newest of them with this frame or one before: the next one may have had no place.
+    /// Records that all buffers are full, the newest of them with this frame or an earlier one; the next frame may be
+    /// lost.
     pub fn full(&mut self, seq: u64) {
         self.full_until = Some(seq);
     }
 
-    /// The camera was away for these frames.
+    /// Records that the camera was away for these frames.
     pub fn away(&mut self, seqs: Range<u64>) {
         self.away = seqs;
     }
 
-    /// A frame came whole: it ends the gap before it.
+    /// Records a complete frame, which ends the gap before it.
     pub fn whole(&mut self, seq: u64) {
         self.gap = self.newest.map_or(seq, |newest| newest + 1)..seq;
         self.newest = Some(seq);
-        // The nameless are some of the gap, whichever.
+        // The frames without id are in the gap; which ones does not matter.
         for lost in self.gap.clone() {
             if self.nameless == 0 {
                 break;
@@ -94,7 +95,7 @@ impl Losses {
         }
     }
 
-    /// Why a frame of the gap before the newest whole one is lost.
+    /// Cause of the loss of a frame in the gap before the newest complete one.
     pub fn cause(&self, seq: u64) -> LossCause {
         if self.away.contains(&seq) {
             LossCause::CameraLost
@@ -134,7 +135,7 @@ mod tests {
         assert_eq!(losses.cause(8), LossCause::PacketsLost, "between 6 and 7 there was no place for another");
         let mut losses = Losses::new();
         losses.whole(6);
-        // Two buffers, full with 7 and 8, then two frames without place, later one that the camera lost.
+        // Two buffers, filled with 7 and 8, then two frames without a buffer, later one lost by the camera.
         losses.full(8);
         [7, 8, 11].into_iter().for_each(|seq| losses.whole(seq));
         assert_eq!(losses.cause(9), LossCause::DriverFull);

@@ -1,11 +1,11 @@
 //! GenICam cameras, GigE Vision and USB3 Vision, through libaravis.
 //!
-//! Two threads share a camera. The *owner*, a thread of the driver's, holds the control channel: it opens the camera, sets it, asks
-//! it for its time, and opens it again when it has stopped answering. Whoever calls [`AravisCamera`] holds the stream of
-//! frames. So a call that a dead camera blocks for seconds, as libaravis' calls do, costs nobody but the owner its time.
+//! Two threads share a camera. The *owner*, a thread of the driver, holds the control channel: it opens the camera,
+//! sets it, reads its clock, and opens it again when it has stopped answering. The caller of [`AravisCamera`] holds
+//! the stream of frames. libaravis' calls to a dead camera can block for seconds; this way they block only the owner.
 //!
-//! The configuration is there in every build, so that a rig file can be read without the library; the rest is behind the
-//! feature `aravis`.
+//! The configuration is part of every build, so that a rig file can be read without the library; the rest requires
+//! the feature `aravis`.
 
 mod config;
 

@@ -1,4 +1,4 @@
-//! GigE Vision on this host: packets, resends, and a socket buffer that outlasts a busy moment.
+//! GigE Vision on this host: packet sizes, resends, and a socket buffer large enough for times when the host is busy.
 
 use std::fs;
 
@@ -8,26 +8,26 @@ use aravis::{Camera, GvStream, GvStreamOption, GvStreamSocketBuffer, Stream};
 
 use super::config::AravisConfig;
 
-/// Where the system says how large socket buffers may be.
+/// The system's limit for socket buffers.
 const RMEM_MAX: &str = "/proc/sys/net/core/rmem_max";
-/// What every GigE Vision device sends.
+/// Packet size that every GigE Vision device supports.
 const MIN_PACKET_BYTES: u32 = 576;
-/// Packets of a frame that may always be asked for again.
+/// Packets of a frame that may always be requested again.
 const FEWEST_REQUESTS: f64 = 8.0;
-/// The least that a socket buffer is asked to hold.
+/// Minimum size of the socket buffer.
 const MIN_SOCKET_BUFFER_BYTES: u64 = 1 << 20;
 
-/// What frames need on their way through this host's sockets.
+/// Socket buffer that frames need on this host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SocketBuffer {
-    /// Bytes asked for.
+    /// Requested bytes.
     pub wanted_bytes: u64,
     /// Bytes that the system allows.
     pub allowed_bytes: u64,
 }
 
 impl SocketBuffer {
-    /// Two frames: one that is read while the next arrives.
+    /// Two frames: one is read while the next arrives.
     pub fn of(config: &AravisConfig, payload_bytes: usize) -> Self {
         let wanted = (2 * payload_bytes as u64).max(MIN_SOCKET_BUFFER_BYTES);
         let allowed = fs::read_to_string(RMEM_MAX).ok().and_then(|text| text.trim().parse().ok());
@@ -41,7 +41,7 @@ impl SocketBuffer {
         self.wanted_bytes <= self.allowed_bytes
     }
 
-    /// What is wrong and how it is mended, where it does not suffice.
+    /// What is wrong and how to fix it, if the allowed size is too small.
     pub fn warning(&self) -> Option<String> {
         let Self { wanted_bytes, allowed_bytes } = self;
         (!self.suffices()).then(|| {
@@ -52,13 +52,13 @@ impl SocketBuffer {
     }
 }
 
-/// Before the stream is made: which socket it uses, and how large packets may be.
+/// Call before the stream is created: sets the socket type and the packet size.
 pub fn prepare(camera: &Camera, config: &AravisConfig, socket: SocketBuffer) {
     if !camera.is_gv_device() {
         return;
     }
-    // libaravis takes a packet socket wherever it may, which is slower than a UDP socket with room for a frame or two,
-    // and better than one without.
+    // libaravis uses a packet socket if it may. That is slower than a UDP socket with room for one or two frames, but
+    // better than a UDP socket with less.
     camera.gv_set_stream_options(if socket.suffices() {
         GvStreamOption::PACKET_SOCKET_DISABLED
     } else {
@@ -73,7 +73,7 @@ pub fn prepare(camera: &Camera, config: &AravisConfig, socket: SocketBuffer) {
     }
 }
 
-/// Once the stream is made. Packets are asked for again where the camera can send them again: libaravis finds out.
+/// Call after the stream is created. libaravis detects whether the camera supports resending packets.
 pub fn tune(camera: &Camera, stream: &Stream, socket: SocketBuffer, payload_bytes: usize) {
     if let Some(stream) = stream.downcast_ref::<GvStream>() {
         let packet_bytes = camera.gv_get_packet_size().unwrap_or(MIN_PACKET_BYTES);
@@ -84,8 +84,9 @@ pub fn tune(camera: &Camera, stream: &Stream, socket: SocketBuffer, payload_byte
     }
 }
 
-/// What of a frame's packets may be asked for again. A quarter, libaravis' own limit, is none of a frame that is three jumbo
-/// packets; much more of a large frame would bury a host that is too slow for its camera.
+/// Fraction of a frame's packets that may be requested again. libaravis' own limit of a quarter is less than one
+/// packet for a frame of three jumbo packets; a much higher limit for large frames would overload a host that is too
+/// slow for its camera.
 fn request_ratio(payload_bytes: usize, packet_bytes: u32) -> f64 {
     let packets = payload_bytes as f64 / f64::from(packet_bytes.max(1));
     (FEWEST_REQUESTS / packets.max(1.0)).clamp(0.25, 1.0)

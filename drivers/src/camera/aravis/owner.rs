@@ -20,85 +20,86 @@ use super::sequencer::{self, Sequence};
 use super::settings::Writer;
 use super::setup::set_up;
 
-/// How often a camera that gives no frames is asked for its time, and so whether it is there.
+/// Interval of reading the clock of a camera that delivers no frames, which also checks that it is there.
 const ASK_PERIOD: Duration = Duration::from_millis(200);
-/// The same of one whose frames say that it is there, once its clock has been seen for long.
+/// Maximum interval for a camera whose frames show that it is there, once its clock has been observed for long
+/// enough.
 const LONGEST_ASK_PERIOD: Duration = Duration::from_secs(1);
-/// Its time is never foretold for more than this part of how long its clock has been seen.
+/// Its clock is extrapolated by at most this fraction (1/n) of the time that it has been observed.
 const FORETOLD: u32 = 8;
-/// Times that it is asked at first, so that its first frame has a time.
+/// Clock readings at first, so that the first frame has a time.
 const FIRST_ASKS: usize = 8;
-/// A program that was killed holds a camera until its heartbeat is missed, 3 s.
+/// A killed program keeps the camera until its heartbeat is missed, after 3 s.
 const BUSY_PATIENCE: Duration = Duration::from_secs(5);
-/// The longest pause between two attempts to open a camera again.
+/// Maximum pause between two attempts to open a camera again.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 const SHORTEST_PAUSE: Duration = Duration::from_millis(100);
 
-/// What the owner is told to do.
+/// A command to the owner.
 pub enum Command {
-    /// Begin to answer triggers.
+    /// Start answering triggers.
     Arm,
-    /// Answer no further trigger.
+    /// Stop answering triggers.
     Disarm,
     /// Write settings.
     Configure(CameraSettings),
-    /// Have the camera's sequencer go through settings.
+    /// Let the camera's sequencer step through these settings.
     Sequence(Vec<CameraSettings>),
-    /// The camera is given up: dispose of its stream and open it again.
+    /// The camera is given up: drop its stream and open it again.
     Reopen(Frames),
-    /// The same for good; the channel's end says so, too.
+    /// Drop the stream and close the camera for good, as also when the channel closes.
     Close(Frames),
 }
 
-/// A command with the number that its reply carries.
+/// A command with a number that its reply repeats.
 pub struct Order {
     pub ticket: u64,
     pub command: Command,
 }
 
-/// What the owner has to say.
+/// A message from the owner.
 pub enum Reply {
-    /// The camera is open, for the first time or again.
+    /// The camera was opened, for the first time or again.
     Opened(Result<Opened, DeviceError>),
-    /// An order was carried out.
+    /// An order was executed.
     Done(u64, Result<Done, DeviceError>),
 }
 
-/// What came of an order.
+/// Result of an order.
 pub struct Done {
-    /// When the last register was written, on the host's clock.
+    /// When the last register was written, in host time.
     pub written_ns: i64,
-    /// The settings that the camera has, where some were written.
+    /// The camera's settings, if some were written.
     pub actual: Option<CameraSettings>,
-    /// What its sequencer goes through, where that was started.
+    /// The sequence of its sequencer, if it was started.
     pub sequence: Option<Sequence>,
-    /// Whether it had to stop for them, so that it counts its frames anew.
+    /// Whether the camera had to be stopped, so that its frame count restarted.
     pub restarted: bool,
 }
 
-/// An open camera, as far as whoever takes its frames needs it.
+/// An open camera, for the thread that takes its frames.
 pub struct Opened {
     pub frames: Frames,
     pub chunks: Option<Chunks>,
     pub capabilities: CameraCapabilities,
-    /// Whether its clock can be asked.
+    /// Whether its clock can be read.
     pub tells_time: bool,
-    /// From when on it answers triggers, if it does.
+    /// Since when it answers triggers, if it does.
     pub armed_ns: Option<i64>,
 }
 
-/// How the time with a camera ended.
+/// Why serving a camera ended.
 enum Ended {
     Lost,
     Closed,
 }
 
-/// What the owner thread shares with whoever takes the frames.
+/// Shared by the owner thread and the thread that takes the frames.
 #[derive(Clone)]
 pub struct Shared {
     pub clock: Clock,
     pub health: Arc<Health>,
-    /// From the camera's clock to the host's; locked for as long as a line is fitted.
+    /// Conversion from the camera's clock to the host's; locked while a line is fitted.
     pub model: Arc<Mutex<ClockModel>>,
 }
 
@@ -116,7 +117,7 @@ pub struct Owner {
     pub replies: SyncSender<Reply>,
     pub armed: bool,
     pub settings: Option<CameraSettings>,
-    /// What the camera's sequencer goes through, in the place of `settings`.
+    /// The settings of the camera's sequencer, which replace `settings`.
     pub sequence: Option<Vec<CameraSettings>>,
 }
 
@@ -127,7 +128,7 @@ struct Connection {
 }
 
 impl Owner {
-    /// Opens the camera, serves it, opens it again when it was lost, until nobody wants it any more.
+    /// Opens the camera, serves it, and opens it again when it was lost, until the driver closes it.
     pub fn run(mut self) {
         let begun = Instant::now();
         let mut was_open = false;
@@ -147,7 +148,7 @@ impl Owner {
                 Err(error) => {
                     let is_held = error.kind == DeviceErrorKind::Busy && begun.elapsed() < BUSY_PATIENCE;
                     if !was_open && !is_held {
-                        // Nobody is left who could be told.
+                        // If the receiver is gone, nobody needs the error.
                         let _ = self.replies.send(Reply::Opened(Err(error)));
                         return;
                     }
@@ -161,7 +162,7 @@ impl Owner {
         }
     }
 
-    /// Whether the end came meanwhile.
+    /// Pauses; returns whether the camera was closed meanwhile.
     fn rest(&self, pause: Duration) -> bool {
         let until = Instant::now() + pause;
         loop {
@@ -185,7 +186,7 @@ impl Owner {
             .map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
         let device = Device::open(named, shared.health.clone())?;
         if device.has("AcquisitionStop") {
-            // A client that died may have left it streaming; a camera that is not may refuse.
+            // A client that died may have left it streaming; a camera that is not streaming may refuse this.
             let _ = device.execute("AcquisitionStop");
         }
         let set_up = set_up(&device, config, facts.format)?;
@@ -262,7 +263,7 @@ impl Owner {
                 }
                 Ok(Order { command: Command::Close(frames), .. }) => {
                     let _ = connection.device.execute("AcquisitionStop");
-                    // A camera that is gone is not left with it; one that is there takes it.
+                    // Fails harmlessly if the camera is gone.
                     let _ = self.end_sequence(&mut connection);
                     drop(frames);
                     return Ended::Closed;
@@ -287,7 +288,7 @@ impl Owner {
         }
     }
 
-    /// Asks the camera for its time, and so whether it is there.
+    /// Reads the camera's clock, which also checks that it is there.
     fn ask(&self, Connection { device, clock, .. }: &Connection) {
         let answer = match clock {
             Some(clock) => clock
@@ -303,7 +304,7 @@ impl Owner {
         }
     }
 
-    /// Switches the camera's sequencer off, where it runs, and writes the settings that the camera had before.
+    /// Switches the camera's sequencer off, if it runs, and restores the earlier settings.
     fn end_sequence(
         &mut self,
         Connection { device, writer, .. }: &mut Connection,
@@ -333,7 +334,7 @@ impl Owner {
             Command::Configure(settings) => {
                 self.settings = Some(settings);
                 let sequenced = self.sequence.take().is_some();
-                // Shutter modes are locked while a camera streams, and so may be its sequencer.
+                // Shutter modes are locked while a camera streams, and its sequencer may be, too.
                 done.restarted = self.armed && (sequenced || writer.changes_shutter(&settings));
                 if done.restarted {
                     device.execute("AcquisitionStop")?;

@@ -1,40 +1,41 @@
-//! From which frame on new settings hold, told from what is certain: when they were written, when the newest frame was
-//! triggered, and how soon after it the next trigger can come.
+//! Determines the first frame with new settings from what is certain: when they were written, when the newest frame
+//! was triggered, and how soon after that the next trigger can come.
 
 use std::collections::VecDeque;
 
 use raysweep_core::FirstFrame;
 
-/// How many frames after a change still have the old settings.
+/// Number of frames after a change that still have the old settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Latency {
-    /// At least.
+    /// Minimum number.
     pub min_frames: u32,
-    /// At most.
+    /// Maximum number.
     pub max_frames: u32,
 }
 
-/// What is known of the triggers when settings are written.
+/// What is known about the triggers when settings are written.
 #[derive(Debug, Clone, Copy)]
 pub struct Triggers {
-    /// Id of the frame that the first trigger after the newest known one makes.
+    /// Id of the frame that results from the first trigger after the newest known one.
     pub next_seq: u64,
-    /// The newest known trigger at the earliest; nothing while the camera is not armed and answers none.
+    /// Earliest possible time of the newest known trigger; `None` while the camera is not armed and answers no
+    /// triggers.
     pub last_ns: Option<i64>,
     /// From one trigger to the next.
     pub period_ns: i64,
-    /// By how much a trigger may come too early.
+    /// Maximum amount by which a trigger may be early.
     pub margin_ns: i64,
 }
 
 /// The first frame with settings whose last register was written at `written_ns`.
 ///
-/// While a camera is armed it is never known exactly: each trigger that may have come since the newest known one may have
-/// made a frame or none, before the registers were written or after, and a false edge may have come at any time.
+/// It is never known exactly while a camera is armed: each trigger since the newest known one may or may not have
+/// resulted in a frame, before or after the registers were written, and a false edge may occur at any time.
 pub fn first_frame(triggers: Triggers, written_ns: i64, latency: Latency) -> FirstFrame {
     let Triggers { next_seq, last_ns, period_ns, margin_ns } = triggers;
     let Some(last_ns) = last_ns else {
-        // Nothing is exposed, so that settings may act on the next frame however late they act otherwise.
+        // Nothing is exposed, so the settings may apply to the next frame even if they otherwise take effect late.
         return match latency.max_frames {
             0 => FirstFrame::Exactly(next_seq),
             late => FirstFrame::Within { earliest: next_seq, certain: next_seq + u64::from(late) },
@@ -48,13 +49,13 @@ pub fn first_frame(triggers: Triggers, written_ns: i64, latency: Latency) -> Fir
     }
 }
 
-/// Promises of the recent past: which values a frame may have been exposed with.
+/// Recent promises: the values that a frame may have been exposed with.
 #[derive(Debug)]
 pub struct Promises<T> {
     kept: VecDeque<(FirstFrame, T)>,
 }
 
-/// More settings than this are never on their way at once.
+/// Maximum number of pending settings.
 const KEPT: usize = 16;
 
 impl<T: Copy> Promises<T> {
@@ -69,17 +70,17 @@ impl<T: Copy> Promises<T> {
         self.kept.push_back((first_frame, value));
     }
 
-    /// The newest value, whether or not a frame has it yet.
+    /// The newest value, even if no frame has it yet.
     pub fn newest(&self) -> Option<T> {
         self.kept.back().map(|(_, value)| *value)
     }
 
-    /// The latest frame that is named in a promise.
+    /// The latest frame named in a promise.
     pub fn latest_seq(&self) -> u64 {
         self.kept.iter().map(|(first, _)| first.certain()).max().unwrap_or(0)
     }
 
-    /// The values that the frame `seq` may have been exposed with, newest first.
+    /// The values that frame `seq` may have been exposed with, newest first.
     pub fn possible(&self, seq: u64) -> impl Iterator<Item = T> {
         let mut decided = false;
         self.kept

@@ -1,5 +1,5 @@
-//! The camera's own sequencer (SFNC 2.7, "Sequencer Control"): settings that it goes through by itself, one a frame, while
-//! nobody writes to it.
+//! The camera's own sequencer (SFNC 2.7, "Sequencer Control"): the camera steps through stored settings by itself,
+//! one per frame, without register writes.
 
 use raysweep_core::{CameraSettings, DeviceErrorKind};
 
@@ -7,27 +7,27 @@ use super::features::{FeatureError, Features, Result, first_present, put_boolean
 use super::settings::{Names, Writer};
 use super::setup::require;
 
-/// What the sets are advanced by: any of these comes once a frame.
+/// Events that advance the sets: each occurs once per frame.
 const ADVANCED_BY: [&str; 2] = ["FrameStart", "ExposureStart"];
 
-/// What the camera goes through.
+/// A running sequence of the camera.
 #[derive(Debug, PartialEq)]
 pub struct Sequence {
     /// The number of the first set.
     pub first_set: i64,
-    /// The settings of each set, as the camera took them.
+    /// The settings of each set, as the camera applied them.
     pub settings: Vec<CameraSettings>,
 }
 
-/// Whether the camera says that it has a sequencer.
+/// Whether the camera reports that it has a sequencer.
 pub fn is_offered(features: &impl Features) -> bool {
     features.has("SequencerMode")
 }
 
-/// Switches the sequencer off, where there is one: it may be left over from another program, running or half configured.
+/// Switches the sequencer off, if there is one: another program may have left it running or half configured.
 pub fn stop(features: &impl Features) -> Result<()> {
     for mode in ["SequencerMode", "SequencerConfigurationMode"] {
-        // While one is on, the other may not be written at all.
+        // While one of the modes is on, the other may not be writable.
         if features.has(mode) && features.text(mode)? != "Off" {
             put_text(features, mode, "Off")?;
         }
@@ -35,16 +35,16 @@ pub fn stop(features: &impl Features) -> Result<()> {
     Ok(())
 }
 
-/// Saves settings as sets, in a ring, makes sure that the camera kept them, and switches the sequencer on.
+/// Saves settings as a ring of sets, verifies that the camera kept them, and switches the sequencer on.
 ///
 /// # Errors
-/// A feature that is missing, or a set that was not kept; the sequencer is then off.
+/// A missing feature, or a set that was not kept; the sequencer is then off.
 pub fn start(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<Sequence> {
     stop(features)?;
     require(features, &["SequencerConfigurationMode"], "a way to configure its sequencer")?;
     put_text(features, "SequencerConfigurationMode", "On")?;
     let loaded = load(features, names, settings);
-    // Left on, it would also refuse what is then written in the place of sets.
+    // Left on, this mode would also block the register writes that are used instead of sets.
     put_text(features, "SequencerConfigurationMode", "Off")?;
     let sequence = loaded?;
     put_text(features, "SequencerMode", "On")?;
@@ -98,14 +98,14 @@ fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) ->
     Ok(Sequence { first_set: *sets.start(), settings: actual })
 }
 
-/// Makes exposure and delay a part of the sets, where that can be chosen.
+/// Includes exposure and delay in the sets, if that can be chosen.
 fn enable(features: &impl Features, exposure: &str, delay: &str) -> Result<()> {
     if first_present(features, &["SequencerFeatureSelector"]).is_none() {
         return Ok(());
     }
     for name in [exposure, delay] {
         put_text(features, "SequencerFeatureSelector", name)?;
-        // What is always a part of the sets may be read only.
+        // A feature that is always part of the sets may be read-only.
         if !features.boolean("SequencerFeatureEnable")? {
             put_boolean(features, "SequencerFeatureEnable", true)?;
         }
@@ -146,7 +146,7 @@ mod tests {
     #[test]
     fn settings_are_saved_in_a_ring_between_the_modes() {
         let camera = camera(4);
-        // One set is all that a table can play: it keeps nothing by set.
+        // The table can play only one set: it stores nothing per set.
         let sequence = Sequence { first_set: 0, settings: vec![settings(50.0)] };
         assert_eq!(started(&camera, &[50.0]).unwrap(), sequence);
         let written = camera.take_written();

@@ -1,18 +1,18 @@
-//! What a sweep changes from point to point: written where it differs, read back always.
+//! The settings that a sweep changes from point to point: written if they differ, always read back.
 
 use raysweep_core::{CameraSettings, DeviceErrorKind, Shutter};
 
 use super::features::{FeatureError, Features, Result, first_present, put_text};
 use super::setup::require;
 
-/// The names under which a camera has what sweeps change.
+/// The camera's names of the features that sweeps change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Names {
-    /// Exposure time, us.
+    /// Feature of the exposure time, us.
     pub exposure: &'static str,
-    /// Trigger delay, us.
+    /// Feature of the trigger delay, us.
     pub delay: Option<&'static str>,
-    /// Shutter mode.
+    /// Feature of the shutter mode.
     pub shutter: Option<&'static str>,
 }
 
@@ -25,7 +25,7 @@ impl Names {
         })
     }
 
-    /// The camera's word for a shutter.
+    /// The camera's enumeration entry for a shutter.
     fn shutter_entry(&self, features: &impl Features, name: &str, shutter: Shutter) -> Result<String> {
         let words: &[&str] = match shutter {
             Shutter::Rolling => &["Rolling", "RollingShutter"],
@@ -40,11 +40,11 @@ impl Names {
     }
 }
 
-/// Writes settings to a camera and remembers what it has.
+/// Writes settings to a camera and remembers them.
 #[derive(Debug)]
 pub struct Writer {
     names: Names,
-    /// As they were asked for, and as the camera took them; nothing where it is not known what it has.
+    /// The settings as requested and as applied; `None` if the camera's settings are unknown.
     last: Option<(CameraSettings, CameraSettings)>,
 }
 
@@ -58,17 +58,17 @@ impl Writer {
         &self.names
     }
 
-    /// It is no longer known what the camera has.
+    /// Marks the camera's settings as unknown.
     pub fn forget(&mut self) {
         self.last = None;
     }
 
-    /// Whether these settings need another shutter than the camera has.
+    /// Whether these settings need another shutter than the present one.
     pub fn changes_shutter(&self, settings: &CameraSettings) -> bool {
         self.names.shutter.is_some() && self.last.is_none_or(|(asked, _)| asked.shutter != settings.shutter)
     }
 
-    /// Writes what is new, reads it back and returns what the camera has.
+    /// Writes what has changed, reads it back and returns the camera's settings.
     pub fn write(&mut self, features: &impl Features, settings: &CameraSettings) -> Result<CameraSettings> {
         let last = self.last.take();
         let mut actual = last.map_or(*settings, |(_, actual)| actual);

@@ -1,5 +1,5 @@
-//! What is set once when a camera is opened, in the order that cameras need: formats before sizes, sizes before offsets,
-//! everything of a trigger before its mode.
+//! Settings made once when a camera is opened, in the order that cameras need: formats before sizes, sizes before
+//! offsets, all trigger settings before the trigger mode.
 
 use raysweep_core::{DeviceErrorKind, PixelFormat};
 
@@ -8,39 +8,39 @@ use super::features::{FeatureError, Features, Result, first_present, put_boolean
 use super::sequencer;
 use super::settings::Names;
 
-/// What came of setting a camera up.
+/// Result of setting up a camera.
 #[derive(Debug, PartialEq)]
 pub struct SetUp {
-    /// Under which names it has what sweeps change.
+    /// Its names of the features that sweeps change.
     pub names: Names,
     /// Columns.
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// What frames say of themselves.
+    /// The chunk data in its frames.
     pub chunks: ChunksOn,
-    /// From the end of row 0's exposure to the camera being ready, where it says so.
+    /// From the end of row 0's exposure until the camera is ready, if it reports that.
     pub readout_us: Option<f64>,
-    /// What it lacks, in words.
+    /// Features that it lacks, in words.
     pub lacks: Vec<String>,
 }
 
-/// The chunk data that a camera was told to send.
+/// The chunk data that a camera was set to send.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ChunksOn {
-    /// `ChunkExposureTime`: the exposure.
+    /// `ChunkExposureTime`: the exposure time.
     pub exposure: bool,
-    /// `ChunkSequencerSetActive`: the set of the camera's sequencer.
+    /// `ChunkSequencerSetActive`: the active sequencer set.
     pub sequencer_set: bool,
 }
 
-/// Sets a camera up as the rig file wants it.
+/// Sets a camera up according to the rig file.
 ///
 /// # Errors
-/// A feature that sweeps cannot do without, or a value that the camera does not take.
+/// A missing feature that sweeps require, or a value that the camera rejects.
 pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelFormat) -> Result<SetUp> {
     let mut lacks = Vec::new();
-    // While it runs, cameras take no settings.
+    // While the sequencer runs, cameras accept no settings.
     sequencer::stop(features)?;
     for line in &config.features {
         features.set_line(line)?;
@@ -70,7 +70,7 @@ pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelForm
     let (width, height) = set_region(features, config, &mut lacks)?;
     if let Some(black_level) = config.black_level {
         let name = require(features, &["BlackLevel", "BlackLevelRaw"], "a black level")?;
-        // A float by the standard, an integer where the name is an old one.
+        // A float by the standard, but an integer under some old names.
         if features.float_range(name).is_ok() {
             features.set_float(name, black_level)?;
         } else {
@@ -103,7 +103,7 @@ pub fn set_up(features: &impl Features, config: &AravisConfig, format: PixelForm
     Ok(SetUp { names, width, height, chunks, readout_us, lacks })
 }
 
-/// The first of the names that is there.
+/// The first of the names that exists.
 pub fn require(features: &impl Features, names: &[&'static str], what: &str) -> Result<&'static str> {
     first_present(features, names).ok_or_else(|| {
         let message = format!("is not there, nor any other name of it: the camera lacks {what}");
@@ -127,7 +127,7 @@ fn set_region(
             require(features, &[name], "binning")?;
         }
     }
-    // An offset limits the size, so it goes first and comes back last.
+    // An offset limits the size, so it is reset first and set last.
     for name in ["OffsetX", "OffsetY"] {
         if features.has(name) {
             features.set_integer(name, *features.integer_range(name)?.start())?;
@@ -156,12 +156,12 @@ fn set_region(
     Ok((pixels("Width")?, pixels("Height")?))
 }
 
-/// Asks for the exposure with every frame, and for the sequencer's set where there is a sequencer.
+/// Enables chunk data: the exposure time, and the sequencer set if there is a sequencer.
 fn set_chunks(features: &impl Features) -> Result<ChunksOn> {
     if !features.has("ChunkModeActive") || !features.has("ChunkSelector") {
         return Ok(ChunksOn::default());
     }
-    // Only while chunk mode is on can chunks be chosen on some cameras.
+    // On some cameras, chunks can be selected only while chunk mode is on.
     put_boolean(features, "ChunkModeActive", true)?;
     let offered = features.choices("ChunkSelector")?;
     let enable = |chunk: &str| -> Result<bool> {
@@ -183,7 +183,7 @@ fn set_chunks(features: &impl Features) -> Result<ChunksOn> {
 }
 
 fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
-    // A frame rate of the camera's own would hold triggers back.
+    // A frame rate set in the camera would delay triggers.
     if config.is_triggered() && features.has("AcquisitionFrameRateEnable") {
         put_boolean(features, "AcquisitionFrameRateEnable", false)?;
     }
@@ -204,7 +204,7 @@ fn set_trigger(features: &impl Features, config: &AravisConfig) -> Result<()> {
     if features.has("TriggerActivation") {
         put_text(features, "TriggerActivation", &config.trigger_activation)?;
     }
-    // Last, because some cameras take nothing of the above while they wait for triggers (aravis#1045).
+    // Last, because some cameras accept none of the above while they wait for triggers (aravis#1045).
     put_text(features, "TriggerMode", "On")
 }
 
@@ -259,7 +259,7 @@ mod tests {
         let camera = sfnc();
         let set_up = set_up(&camera, &config(), PixelFormat::Mono12p).unwrap();
         assert_eq!((set_up.width, set_up.height), (640, 480));
-        // There is no sequencer whose set could be told.
+        // There is no sequencer, so no set to report.
         assert_eq!(set_up.chunks, ChunksOn { exposure: true, sequencer_set: false });
         assert_eq!((set_up.readout_us, set_up.lacks), (Some(16_100.0), vec![]));
         let written = camera.take_written();

@@ -1,4 +1,4 @@
-//! `[camera.replay]`: which recording, and how fast it comes.
+//! `[camera.replay]`: the recording and its playback speed.
 
 use std::path::PathBuf;
 
@@ -8,42 +8,42 @@ use serde::Deserialize;
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReplayConfig {
-    /// A file of raw frames one after the other, an `.npy` file `[frames, rows, columns]`, or a folder of such files or
-    /// of PNG pictures, taken by name with numbers in their order.
+    /// A file of consecutive raw frames, an `.npy` file `[frames, rows, columns]`, or a folder of such files or PNG
+    /// pictures, sorted by name with numbers in numeric order.
     pub path: PathBuf,
-    /// Columns of raw frames; other files say it themselves.
+    /// Columns of raw frames; other formats contain their size.
     pub width: Option<usize>,
     /// Rows of raw frames.
     pub height: Option<usize>,
-    /// Bytes at the beginning of each raw file that are no frame.
+    /// Bytes at the beginning of each raw file to skip.
     #[serde(default)]
     pub header_bytes: u64,
-    /// How pixels lie in raw files, where that is none of the camera's pixel formats.
+    /// Packing of pixels in raw files, if it is none of the camera's pixel formats.
     #[serde(default)]
     pub packing: RawPacking,
-    /// How fast frames come.
+    /// Playback speed.
     #[serde(default)]
     pub pace: ReplayPace,
 }
 
-/// How pixels lie in raw files.
+/// Packing of pixels in raw files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RawPacking {
-    /// As the pixel format says.
+    /// As in the pixel format.
     #[default]
     PixelFormat,
     /// Two 12-bit pixels in three bytes, most significant bits first, as in Photron's `.mraw`.
     Mraw12,
 }
 
-/// How fast frames come.
+/// Playback speed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ReplayPace {
-    /// As fast as they are taken.
+    /// As fast as the frames are taken.
     #[default]
     Pipeline,
-    /// As fast as they were recorded, whether there is room or not.
+    /// As fast as they were recorded, even if there is no room for them.
     Recorded,
 }

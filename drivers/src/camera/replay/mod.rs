@@ -1,5 +1,5 @@
-//! A camera that gives frames that were recorded before: high-speed cameras record into their own memory first and are
-//! downloaded later.
+//! A camera that plays back recorded frames: high-speed cameras record into their own memory first and are downloaded
+//! later.
 
 mod config;
 mod npy;
@@ -15,7 +15,7 @@ use raysweep_core::{
 pub use self::config::{RawPacking, ReplayConfig, ReplayPace};
 use self::recording::Recording;
 
-/// A recording as a camera. It is [`DeviceState::Ready`] again, although armed, when all frames have been given.
+/// A recording as a camera. After the last frame, it is [`DeviceState::Ready`] again, although armed.
 pub struct ReplayCamera {
     recording: Recording,
     capabilities: CameraCapabilities,
@@ -24,16 +24,16 @@ pub struct ReplayCamera {
     clock: Clock,
     armed: bool,
     given: u64,
-    /// When frame 0 was exposed, as it is played now.
+    /// When frame 0 was exposed, in terms of the playback.
     start_ns: Option<i64>,
 }
 
 impl ReplayCamera {
-    /// Opens a recording of frames of `format` that was made with `frame_rate_hz` frames a second.
+    /// Opens a recording of frames of `format` made at `frame_rate_hz` frames per second.
     ///
     /// # Errors
-    /// `OutOfRange` with file and key when a file is cut short or is not what the configuration says, `Disconnected`
-    /// when one cannot be read.
+    /// `OutOfRange` with file and key if a file is truncated or does not match the configuration, `Disconnected` if
+    /// one cannot be read.
     pub fn open(config: &ReplayConfig, format: PixelFormat, frame_rate_hz: f64) -> Result<Self, DeviceError> {
         let recording = Recording::open(config, format)?;
         let (height, width) = recording.size();
@@ -46,7 +46,7 @@ impl ReplayCamera {
             trigger_latency_us: 0.0,
             readout_us: 0.0,
             readout: Readout::Overlapped,
-            // Whatever it was: the recording does not say.
+            // Any exposure: the recording does not contain it.
             exposure_us: 0.0..=f64::MAX,
             trigger_delay_us: 0.0..=0.0,
         };
@@ -62,7 +62,7 @@ impl ReplayCamera {
         })
     }
 
-    /// Frames of the recording.
+    /// Number of frames in the recording.
     pub fn frames(&self) -> u64 {
         self.recording.frames()
     }

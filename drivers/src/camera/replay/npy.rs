@@ -1,28 +1,28 @@
-//! The header of NumPy's `.npy` files (NEP 1): all that is needed to read frames out of one by their place.
+//! The header of NumPy's `.npy` files (NEP 1): everything needed to find the frames in a file.
 
 use std::io::{self, Read};
 
 use py_literal::Value;
 
-/// What an array is.
+/// Type and shape of an array.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NpyHeader {
     /// NumPy's name of the element type, such as `<u2`.
     pub dtype: String,
     /// Lengths of its axes, in C order.
     pub shape: Vec<usize>,
-    /// Where its data begin.
+    /// Offset of its data.
     pub data_at: u64,
 }
 
-/// Longest header that is believed.
+/// Maximum accepted header length.
 const LONGEST_HEADER: usize = 1 << 16;
 
 impl NpyHeader {
-    /// Reads it from the beginning of a file.
+    /// Reads the header at the beginning of a file.
     ///
     /// # Errors
-    /// Of the file, or `InvalidData` with what is wrong.
+    /// An error of the file, or `InvalidData` with what is wrong.
     pub fn read(mut file: impl Read) -> io::Result<Self> {
         let bad = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_owned());
         let mut magic = [0; 8];

@@ -1,4 +1,4 @@
-//! Recorded frames in files: which there are, what they are, and one after the other.
+//! Recorded frames in files: finding the files, their formats, and reading frame by frame.
 
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
@@ -10,7 +10,7 @@ use raysweep_core::{DeviceError, DeviceErrorKind, Packing, PixelFormat};
 use super::config::{RawPacking, ReplayConfig};
 use super::npy::NpyHeader;
 
-/// How the frames lie in the files of a recording.
+/// Format of the files of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Raw,
@@ -29,16 +29,16 @@ impl Kind {
     }
 }
 
-/// One file of it.
+/// One file of a recording.
 #[derive(Debug)]
 struct Part {
     path: PathBuf,
     frames: u64,
-    /// Where its first frame begins.
+    /// Offset of its first frame.
     data_at: u64,
 }
 
-/// A recording, and how far it was read.
+/// A recording and the reading position.
 pub struct Recording {
     kind: Kind,
     parts: Vec<Part>,
@@ -46,7 +46,7 @@ pub struct Recording {
     size: (usize, usize),
     format: PixelFormat,
     mraw: bool,
-    /// The part that is read, where it is open, and how many of its frames were read.
+    /// The part being read, its file if open, and the number of its frames read.
     part: usize,
     open: Option<File>,
     read: u64,
@@ -70,7 +70,7 @@ fn unreadable(path: &Path, error: &io::Error) -> DeviceError {
 }
 
 impl Recording {
-    /// Finds the files and makes sure that each is whole.
+    /// Finds the files and verifies that each is complete.
     pub fn open(config: &ReplayConfig, format: PixelFormat) -> Result<Self, DeviceError> {
         let (kind, paths) = files(&config.path)?;
         let mraw = config.packing == RawPacking::Mraw12;
@@ -119,7 +119,7 @@ impl Recording {
         self.size
     }
 
-    /// Frames in all.
+    /// Total number of frames.
     pub fn frames(&self) -> u64 {
         self.parts.iter().map(|part| part.frames).sum()
     }
@@ -162,10 +162,10 @@ impl Recording {
     }
 }
 
-/// The files of a recording, in order, and what they are.
+/// The files of a recording, in order, and their format.
 fn files(path: &Path) -> Result<(Kind, Vec<PathBuf>), DeviceError> {
     if !path.is_dir() {
-        // A single file of any other name is raw.
+        // A single file with any other extension is raw.
         return Ok((Kind::of(path).unwrap_or(Kind::Raw), vec![path.to_owned()]));
     }
     let entries = fs::read_dir(path).and_then(Iterator::collect::<io::Result<Vec<_>>>);
@@ -185,7 +185,7 @@ fn files(path: &Path) -> Result<(Kind, Vec<PathBuf>), DeviceError> {
     Ok((kind, found.into_iter().map(|(_, path)| path).collect()))
 }
 
-/// A name cut into text and numbers, so that `frame10` comes after `frame9`.
+/// Splits a name into text and numbers, so that `frame10` sorts after `frame9`.
 fn natural(name: &str) -> Vec<(String, u64)> {
     let mut parts = vec![(String::new(), 0_u64)];
     let mut in_number = false;
@@ -306,7 +306,7 @@ fn read_png(
     }
     reader.next_frame(out).map_err(|error| refused(path, format!("it is cut short or damaged: {error}")))?;
     if wanted == BitDepth::Sixteen {
-        // PNG has the high byte first.
+        // PNG stores the high byte first.
         out.as_chunks_mut::<2>().0.iter_mut().for_each(|bytes| bytes.swap(0, 1));
     }
     let most = format.max_value();

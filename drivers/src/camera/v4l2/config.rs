@@ -6,32 +6,32 @@ use std::time::Duration;
 use raysweep_core::{PixelFormat, Readout};
 use serde::Deserialize;
 
-/// How to open and set a V4L2 camera. Controls are called by their names, as `v4l2-ctl --list-ctrls` spells them.
+/// How to open and set a V4L2 camera. Controls are identified by name, as spelt by `v4l2-ctl --list-ctrls`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct V4l2Config {
-    /// The node: better a link of `/dev/v4l/by-id`, which stays the same camera's, than `/dev/video0`.
+    /// The node. Prefer a link in `/dev/v4l/by-id`, which always refers to the same camera, to `/dev/video0`.
     pub device: PathBuf,
     /// Columns of a frame.
     pub width: u32,
     /// Rows of a frame.
     pub height: u32,
-    /// Controls with their values, written in this order: automatic functions off, gain, blanking, trigger mode.
+    /// Control values, written in this order: automatic functions off, gain, blanking, trigger mode.
     #[serde(default)]
     pub controls: Vec<(String, i64)>,
-    /// The control of the exposure; left out: whichever of the kernel's the camera has.
+    /// The exposure control; default: whichever of the kernel's the camera has.
     pub exposure: Option<TimeControl>,
-    /// The control of a trigger delay, which only some makers offer; left out: none.
+    /// The trigger delay control, which only some makers provide; default: none.
     pub trigger_delay: Option<TimeControl>,
-    /// Frame rate to ask for; left out: the driver's.
+    /// Frame rate to request; default: the driver's.
     pub frames_per_s: Option<f64>,
-    /// Buffers that the driver fills in turn.
+    /// Number of buffers for the driver to fill.
     #[serde(default = "default_buffers")]
     pub buffers: u32,
-    /// Frames that may still have the old settings after a change, with the one in progress [A].
+    /// Maximum number of frames after a change that still have the old settings, including the one in progress [A].
     #[serde(default = "default_late_frames")]
     pub late_frames: u32,
-    /// From the trigger's edge to the start of row 0's exposure [A].
+    /// From the trigger edge to the start of row 0's exposure [A].
     #[serde(default)]
     pub trigger_latency_us: f64,
     /// Whether readout overlaps the next exposure.
@@ -39,13 +39,14 @@ pub struct V4l2Config {
     pub readout: Readout,
 }
 
-/// A control that holds a time.
+/// A control that contains a time.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TimeControl {
     /// Its name.
     pub control: String,
-    /// Its unit; left out: of the kernel's absolute exposures 100 us, of other exposures the row time, of delays 1 us.
+    /// Its unit; default: 100 us for the kernel's absolute exposures, the row time for other exposures, 1 us for
+    /// delays.
     pub unit_us: Option<f64>,
 }
 
@@ -56,19 +57,19 @@ pub struct V4l2Setup {
     pub config: V4l2Config,
     /// `camera.pixel_format`
     pub format: PixelFormat,
-    /// From the start of one row's exposure to the next row's, as the rig needs it.
+    /// From the start of one row's exposure to the start of the next row's, as the rig requires it.
     pub row_time_us: f64,
     /// From one trigger to the next.
     pub trigger_period_us: f64,
-    /// How long a camera that is lost may stay away.
+    /// How long a lost camera may stay away.
     pub reopen: Duration,
 }
 
 impl V4l2Config {
-    /// The first value that makes no sense: its key, and why.
+    /// Checks the values.
     ///
     /// # Errors
-    /// With the key's path within `[camera.v4l2]`, value and what is allowed.
+    /// The key of the first invalid value within `[camera.v4l2]`, and the value with what is allowed.
     pub fn check(&self) -> Result<(), (&'static str, String)> {
         let unit = |control: &Option<TimeControl>| control.as_ref().and_then(|c| c.unit_us).unwrap_or(1.0);
         let rules = [
@@ -97,7 +98,7 @@ impl V4l2Config {
 fn default_buffers() -> u32 {
     8
 }
-/// The sensors of Linux's camera drivers take new exposures for the second frame after the one in progress at the latest.
+/// In Linux's sensor drivers, a new exposure applies at the latest to the second frame after the one in progress.
 fn default_late_frames() -> u32 {
     3
 }

@@ -1,4 +1,4 @@
-//! Controls by name, and those that hold times.
+//! Controls by name, including those that contain times.
 
 use std::io;
 use std::ops::RangeInclusive;
@@ -8,8 +8,8 @@ use nix::libc::ERANGE;
 use super::config::TimeControl;
 use super::node::{Control, ControlKind, Node};
 
-/// Exposures of the kernel's own, in the order in which they are looked for; those called absolute are in 100 us, the
-/// sensor's in rows. Kernels before 5.13 and after differ in the name.
+/// Exposure controls of the kernel, in order of preference. The absolute ones are in units of 100 us, that of a
+/// sensor is in rows. The name changed with kernel 5.13.
 const EXPOSURES: [&str; 3] = ["exposure_time_absolute", "exposure_absolute", "exposure"];
 /// Unit of the absolute exposures (`V4L2_CID_EXPOSURE_ABSOLUTE`).
 const ABSOLUTE_UNIT_US: f64 = 100.0;
@@ -17,9 +17,9 @@ const ABSOLUTE_UNIT_US: f64 = 100.0;
 /// Why a control could not be set.
 #[derive(Debug)]
 pub(super) enum ControlError {
-    /// There is none of the name, or none with that value.
+    /// The control does not exist, or does not have that value.
     Value(String),
-    /// The kernel said so.
+    /// The kernel refused.
     Kernel(String, io::Error),
 }
 
@@ -45,7 +45,7 @@ impl Controls {
         })
     }
 
-    /// Writes a control and makes sure that it has the value.
+    /// Writes a control and verifies its value.
     pub(super) fn write(&self, node: &mut dyn Node, name: &str, value: i64) -> Result<(), ControlError> {
         let control = self.named("controls", name)?;
         let refused = |found: &str| {
@@ -69,7 +69,8 @@ impl Controls {
         if actual == value { Ok(()) } else { Err(refused(&format!(" reads back as {actual}"))) }
     }
 
-    /// From the start of one row to the next, where the sensor says: (width + horizontal blanking) / pixel rate.
+    /// From the start of one row to the start of the next, if the sensor reports it: (width + horizontal blanking) /
+    /// pixel rate.
     pub(super) fn row_time_us(&self, node: &dyn Node, width: u32) -> io::Result<Option<f64>> {
         let (Some(blanking), Some(rate)) = (self.find("horizontal_blanking"), self.find("pixel_rate")) else {
             return Ok(None);
@@ -78,7 +79,7 @@ impl Controls {
         Ok((rate > 0).then(|| (f64::from(width) + blanking as f64) / rate as f64 * 1e6))
     }
 
-    /// The control of the exposure: as the rig names it, else whichever there is.
+    /// The exposure control: the one named in the rig file, otherwise one of the kernel's.
     pub(super) fn exposure(
         &self,
         stated: Option<&TimeControl>,
@@ -96,7 +97,7 @@ impl Controls {
         Ok(Timer::new(control, stated.and_then(|stated| stated.unit_us).unwrap_or(of_its_name)))
     }
 
-    /// The control of a trigger delay, where the rig names one.
+    /// The trigger delay control, if the rig file names one.
     pub(super) fn trigger_delay(&self, stated: Option<&TimeControl>) -> Result<Option<Timer>, ControlError> {
         let Some(stated) = stated else { return Ok(None) };
         let control = self.named("trigger_delay", &stated.control)?;
@@ -104,7 +105,7 @@ impl Controls {
     }
 }
 
-/// A control that holds a time.
+/// A control that contains a time.
 pub(super) struct Timer {
     control: Control,
     unit_us: f64,
@@ -119,7 +120,7 @@ impl Timer {
         self.control.minimum as f64 * self.unit_us..=self.control.maximum as f64 * self.unit_us
     }
 
-    /// The time that the control comes nearest to.
+    /// The nearest time that the control can have.
     pub(super) fn nearest_us(&self, time_us: f64) -> f64 {
         self.value(time_us) as f64 * self.unit_us
     }
@@ -134,14 +135,14 @@ impl Timer {
         Ok(node.control(&self.control)? as f64 * self.unit_us)
     }
 
-    /// Writes the nearest value and says which the camera took.
+    /// Writes the nearest value and returns the time that the camera applied.
     pub(super) fn write_us(&self, node: &mut dyn Node, time_us: f64) -> io::Result<f64> {
         node.set_control(&self.control, self.value(time_us))?;
         self.read_us(node)
     }
 }
 
-/// A name as `v4l2-ctl` spells it: small letters and digits, and a line for whatever stands between them.
+/// A name as `v4l2-ctl` spells it: lower-case letters and digits, with an underscore for all characters in between.
 fn spelt(name: &str) -> String {
     let words = name.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty());
     words.collect::<Vec<_>>().join("_").to_ascii_lowercase()

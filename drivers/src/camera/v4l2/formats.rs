@@ -1,8 +1,8 @@
-//! Pixel formats by the four characters that V4L2 calls them by.
+//! V4L2's four-character codes of pixel formats.
 
 use raysweep_core::{Mosaic, Packing, PixelFormat};
 
-/// The four-character code of a format (`linux/videodev2.h`), where V4L2 has one.
+/// The four-character code of a format (`linux/videodev2.h`), if V4L2 has one.
 pub fn fourcc(format: PixelFormat) -> Option<[u8; 4]> {
     // In the order of the mosaics: none, GR, RG, GB, BG.
     let codes: [&[u8; 4]; 5] = match format.packing {
@@ -39,7 +39,7 @@ mod tests {
         for (name, code) in cases {
             assert_eq!(fourcc(name.parse().unwrap()), Some(*code), "{name}");
         }
-        // GenICam's packed formats are other bits than MIPI's.
+        // The bit layout of GenICam's packed formats differs from MIPI's.
         assert_eq!(fourcc(PixelFormat::Mono12p), None);
         let mut codes: Vec<_> = PixelFormat::all().filter_map(fourcc).collect();
         codes.sort_unstable();

@@ -1,9 +1,9 @@
-//! A node of the kernel, over the ioctls of the crate `v4l`. Its own streams are not used: they queue a buffer twice
-//! after a time-out and panic where the kernel reports an error on the way out; nor are its queries, which panic on
-//! names that are not UTF-8 and on kinds of controls newer than they are.
+//! A node of the kernel, based on the ioctls of the crate `v4l`. Its streams are not used: they queue a buffer twice
+//! after a timeout and panic if the kernel reports an error during cleanup. Its queries are not used either: they
+//! panic on names that are not UTF-8 and on kinds of controls that they do not know.
 
-// SAFETY of the module: the kernel writes into what an ioctl points to, and its memory is mapped. `ioctl` allows only
-// structures of the size that the request itself states, and a `Mapping` is read within its bounds alone.
+// SAFETY of the module: the kernel writes into the argument of an ioctl and into the mapped memory. `ioctl` allows
+// only structures of the size that the request itself states, and a `Mapping` is only read within its bounds.
 #![allow(unsafe_code)]
 
 use std::io;
@@ -46,7 +46,7 @@ impl Opener for Kernel {
 }
 
 struct KernelNode {
-    // Dropped first: the buffers' memory outlives no handle.
+    // Dropped first: the mapped buffers must not outlive the handle.
     mappings: Vec<Mapping>,
     streaming: bool,
     handle: Arc<Handle>,
@@ -56,13 +56,13 @@ struct KernelNode {
 /// A structure of `linux/videodev2.h` without pointers.
 ///
 /// # Safety
-/// Every pattern of bits, all zeros too, is a value of it.
+/// Every bit pattern, including all zeros, is a valid value.
 unsafe trait Argument: Copy {}
 
 macro_rules! arguments {
     ($($name:ty),*) => {
         $(
-            // SAFETY: integers, arrays of them, unions of these; the pointers within unions are never followed.
+            // SAFETY: integers, arrays of them, unions of these; pointers within unions are never dereferenced.
             unsafe impl Argument for $name {}
         )*
     };
@@ -79,19 +79,19 @@ arguments!(
 );
 
 fn blank<T: Argument>() -> T {
-    // SAFETY: all zeros are a value, by the trait's contract.
+    // SAFETY: all zeros is a valid value, by the trait's contract.
     unsafe { zeroed() }
 }
 
 impl KernelNode {
     fn ioctl<T: Argument>(&self, request: vidioc::_IOC_TYPE, argument: &mut T) -> io::Result<()> {
-        // Bits 16 to 29 of a request are the size of what it points to (linux/ioctl.h).
+        // Bits 16 to 29 of a request are the size of its argument (linux/ioctl.h).
         let stated = (request >> 16 & 0x3FFF) as usize;
         if stated != size_of::<T>() {
             return Err(io::Error::from_raw_os_error(EINVAL));
         }
-        // SAFETY: the kernel reads and writes at most the size that the request states, which is the argument's own,
-        // and leaves values, as every pattern of bits is one.
+        // SAFETY: the kernel reads and writes at most the size stated in the request, which is that of the argument,
+        // and every bit pattern that it leaves is a valid value.
         unsafe { v4l2::ioctl(self.handle.fd(), request, (&raw mut *argument).cast()) }
     }
 
@@ -102,10 +102,10 @@ impl KernelNode {
     fn map(&self, index: u32) -> io::Result<Mapping> {
         let mut buffer = Self::buffer(index);
         self.ioctl(vidioc::VIDIOC_QUERYBUF, &mut buffer)?;
-        // SAFETY: of memory-mapped buffers the union holds the offset; any bits are an integer.
+        // SAFETY: for memory-mapped buffers, the union contains the offset; any bits are a valid integer.
         let offset = unsafe { buffer.m.offset };
         let length = buffer.length as usize;
-        // SAFETY: a new mapping at an address of the kernel's choice touches no memory that is in use.
+        // SAFETY: a new mapping at an address chosen by the kernel does not overlap memory in use.
         let start = unsafe {
             v4l2::mmap(null_mut(), length, PROT_READ, MAP_SHARED, self.handle.fd(), offset.into())?
         };
@@ -117,7 +117,7 @@ impl Node for KernelNode {
     fn identity(&self) -> io::Result<Identity> {
         let mut found: v4l2_capability = blank();
         self.ioctl(vidioc::VIDIOC_QUERYCAP, &mut found)?;
-        // A device with several nodes has capabilities of its own and those of each node.
+        // A device with several nodes reports its own capabilities and those of each node.
         let has_own = found.capabilities & CAP_DEVICE_CAPS != 0;
         let capabilities = if has_own { found.device_caps } else { found.capabilities };
         let needed = CAP_VIDEO_CAPTURE | CAP_STREAMING;
@@ -136,7 +136,7 @@ impl Node for KernelNode {
             found.id |= CTRL_NEXT;
             match self.ioctl(vidioc::VIDIOC_QUERY_EXT_CTRL, &mut found) {
                 Ok(()) => {}
-                // The end, or a driver without controls.
+                // The end of the list, or a driver without controls.
                 Err(error) if error.raw_os_error() != Some(ENODEV) => return Ok(controls),
                 Err(error) => return Err(error),
             }
@@ -196,14 +196,14 @@ impl Node for KernelNode {
     fn set_format(&mut self, wanted: Format) -> io::Result<Format> {
         let mut format: v4l2_format = blank();
         format.type_ = VIDEO_CAPTURE;
-        // Reading or writing the union's picture is sound: of every member any bits are a value.
+        // Accessing the union's `pix` is sound: any bits are valid for every member.
         format.fmt.pix.width = wanted.width;
         format.fmt.pix.height = wanted.height;
         format.fmt.pix.pixelformat = u32::from_le_bytes(wanted.fourcc);
         format.fmt.pix.field = FIELD_NONE;
         format.fmt.pix.bytesperline = wanted.bytes_per_line;
         self.ioctl(vidioc::VIDIOC_S_FMT, &mut format)?;
-        // SAFETY: of a capture format the kernel has filled the picture; any bits are integers.
+        // SAFETY: for a capture format, the kernel has filled `pix`; any bits are valid integers.
         let pix = unsafe { format.fmt.pix };
         Ok(Format {
             fourcc: pix.pixelformat.to_le_bytes(),
@@ -219,7 +219,7 @@ impl Node for KernelNode {
         parameters.parm.capture.timeperframe.numerator = 1000;
         parameters.parm.capture.timeperframe.denominator = (frames_per_s * 1000.0).round() as u32;
         self.ioctl(vidioc::VIDIOC_S_PARM, &mut parameters)?;
-        // SAFETY: of a capture stream the kernel has filled this member; any bits are integers.
+        // SAFETY: for a capture stream, the kernel has filled this member; any bits are valid integers.
         let interval = unsafe { parameters.parm.capture }.timeperframe;
         Ok(f64::from(interval.denominator) / f64::from(interval.numerator))
     }
@@ -286,7 +286,7 @@ impl Drop for KernelNode {
     }
 }
 
-/// A buffer of the driver's, mapped for reading.
+/// A buffer of the driver, mapped for reading.
 struct Mapping {
     start: *const u8,
     length: usize,
@@ -296,14 +296,14 @@ struct Mapping {
 unsafe impl Send for Mapping {}
 
 impl Mapping {
-    /// Copies as many bytes as `into` holds.
+    /// Fills `into` from `offset` on.
     fn copy(&self, offset: usize, into: &mut [u8]) -> io::Result<()> {
         if offset.checked_add(into.len()).is_none_or(|end| end > self.length) {
             return Err(io::Error::from_raw_os_error(EINVAL));
         }
-        // SAFETY: source and target are in bounds and apart, as the mapping is nobody's slice. A device that writes
-        // at the same time could only spoil the picture: bytes have no invalid values. Copying straight from the mapping
-        // is what makes it one copy a frame.
+        // SAFETY: source and target are in bounds and do not overlap, as no slice refers to the mapping. If the
+        // device writes at the same time, only the picture is affected: bytes have no invalid values. Copying
+        // directly from the mapping means one copy per frame.
         unsafe { copy_nonoverlapping(self.start.add(offset), into.as_mut_ptr(), into.len()) };
         Ok(())
     }
@@ -311,13 +311,13 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: start and length are those that `mmap` gave, and nothing refers to the memory. It can only fail for
-        // other arguments.
+        // SAFETY: start and length are those returned by `mmap`, and nothing refers to the memory. It can only fail
+        // for other arguments.
         let _ = unsafe { v4l2::munmap(self.start.cast_mut().cast(), self.length) };
     }
 }
 
-/// What stands before the first zero.
+/// The text before the first zero byte.
 fn text(bytes: &[u8]) -> String {
     let end = bytes.iter().position(|&byte| byte == 0).unwrap_or(bytes.len());
     String::from_utf8_lossy(&bytes[..end]).into_owned()

@@ -1,8 +1,8 @@
-//! Cameras of the Linux kernel: Video4Linux2 with single-planar, memory-mapped buffers.
+//! Cameras supported by the Linux kernel: Video4Linux2 with single-planar, memory-mapped buffers.
 //!
-//! All calls return at once, also those to a device that is gone, so that the thread that asks for frames owns the device.
-//! Any error of a stream loses the device and opens it again: with a node that went and came back, and with one whose
-//! stream has to be built anew, the same happens.
+//! All calls return at once, even if the device is gone, so the thread that asks for frames owns the device. Any
+//! streaming error is handled by closing the device and opening it again, whether its node disappeared or its stream
+//! has to be set up again.
 
 mod config;
 mod controls;
@@ -30,23 +30,23 @@ pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, Opene
 use self::session::{Layout, Session};
 use self::timing::{Exposures, Ids, exposure_start_ns, is_monotonic};
 
-/// Pause before the second attempt to open a lost camera again, the first being made at once; it doubles from attempt to
-/// attempt.
+/// Pause before the second attempt to open a lost camera again; the first is made at once. The pause doubles from
+/// attempt to attempt.
 const FIRST_PAUSE_NS: i64 = 100_000_000;
-/// The longest pause between attempts.
+/// Maximum pause between attempts.
 const LONGEST_PAUSE_NS: i64 = 2_000_000_000;
 
 /// Opens a camera of this machine's kernel.
 ///
 /// # Errors
-/// `Busy` when another process streams from it, `Disconnected` when there is none, `OutOfRange` or `Unsupported` when it
-/// cannot do what the rig file asks for.
+/// `Busy` if another process streams from it, `Disconnected` if there is none, `OutOfRange` or `Unsupported` if it
+/// cannot do what the rig file requires.
 #[cfg(feature = "v4l2")]
 pub fn open(setup: V4l2Setup) -> Result<V4l2Camera, DeviceError> {
     V4l2Camera::open(setup, Box::new(kernel::Kernel), Clock::real())
 }
 
-/// Says that this build cannot open V4L2 cameras.
+/// Reports that this build cannot open V4L2 cameras.
 ///
 /// # Errors
 /// Always `Unsupported`.
@@ -65,31 +65,31 @@ pub struct V4l2Camera {
     layout: Layout,
     armed: bool,
     link: Link,
-    /// Before the next attempt, should the device be lost; nothing as long as frames come.
+    /// Pause before the next attempt if the device is lost; 0 as long as frames arrive.
     pause_ns: i64,
-    /// The settings that were written last, and what the camera made of them.
+    /// The settings written last: requested and applied.
     settings: (CameraSettings, CameraSettings),
     /// The first frame that is certain to have them.
     certain: u64,
     ids: Ids,
-    /// When the newest frame was exposed.
+    /// Start of the newest frame's exposure.
     newest_ns: Option<i64>,
-    /// Frames that went by while the camera was lost.
+    /// Frames missed while the camera was lost.
     away: Range<u64>,
     exposures: Exposures,
-    /// Frames that were there when settings were written, oldest first.
+    /// Frames that were already complete when settings were written, oldest first.
     waiting: VecDeque<(u64, Filled, i64)>,
     warned_of_clock: bool,
 }
 
-/// The way to the device.
+/// The connection to the device.
 enum Link {
     Open(Box<Session>),
     Lost { since_ns: i64, next_attempt_ns: i64 },
 }
 
 impl V4l2Camera {
-    /// Opens a camera through any opener, on any clock.
+    /// Opens a camera with any opener and any clock.
     ///
     /// # Errors
     /// As [`open`].
@@ -118,7 +118,7 @@ impl V4l2Camera {
         })
     }
 
-    /// The device has failed: lets it go, to be opened again.
+    /// Closes the failed device, to be opened again.
     fn lose(&mut self, cause: &io::Error) {
         tracing::warn!(%cause, device = %self.setup.config.device.display(), "camera lost; opening it again");
         self.waiting.clear();
@@ -130,7 +130,7 @@ impl V4l2Camera {
         self.pause_ns = (2 * self.pause_ns).clamp(FIRST_PAUSE_NS, LONGEST_PAUSE_NS);
     }
 
-    /// Opens the device as it was: same formats, same settings, streaming if it was.
+    /// Opens the device in its earlier state: same formats, same settings, and streaming if it was.
     fn reopened(&mut self) -> Result<Box<Session>, DeviceError> {
         let mut session = Session::open(self.opener.as_mut(), &self.setup)?;
         let found = session.capabilities(&self.setup);
@@ -150,7 +150,7 @@ impl V4l2Camera {
         Ok(session)
     }
 
-    /// Tries to open a lost device, at most once, and not before it is time.
+    /// Tries to open a lost device, at most once, and not before the next attempt is due.
     fn reopen(&mut self, now_ns: i64) {
         let Link::Lost { since_ns, next_attempt_ns } = self.link else { return };
         if now_ns < next_attempt_ns {
@@ -169,7 +169,7 @@ impl V4l2Camera {
         }
     }
 
-    /// Ids go on as if the camera had counted the triggers that it missed.
+    /// Continues the ids as if the camera had counted the triggers that it missed.
     fn resume_ids(&mut self) {
         let next = self.ids.next();
         let missed = self.newest_ns.map_or(0, |newest_ns| {
@@ -182,14 +182,14 @@ impl V4l2Camera {
         self.ids.stream_begins(self.away.end);
     }
 
-    /// Takes a filled buffer off the kernel, with its id and when that was.
+    /// Takes a filled buffer from the kernel, with its id and the time of taking it.
     fn dequeue(&mut self) -> io::Result<Option<(u64, Filled, i64)>> {
         let Link::Open(session) = &mut self.link else { return Ok(None) };
         let Some(filled) = session.node.dequeue()? else { return Ok(None) };
         Ok(Some((self.ids.take(filled.sequence), filled, self.clock.now_ns())))
     }
 
-    /// Takes what is filled already, so that the newest frame's id is known.
+    /// Takes all filled buffers, so that the newest frame's id is known.
     fn drain(&mut self) -> io::Result<()> {
         if !self.armed {
             return Ok(());
@@ -200,7 +200,7 @@ impl V4l2Camera {
         Ok(())
     }
 
-    /// A frame that has come, copied into `into`; `None` when none has, or it is damaged.
+    /// Copies the next frame into `into`; `None` if there is none, or if it is damaged.
     fn take(&mut self, into: &mut [u8]) -> io::Result<Option<FrameStamp>> {
         let frame = match self.waiting.pop_front() {
             Some(frame) => Some(frame),
@@ -212,7 +212,7 @@ impl V4l2Camera {
         let sound = session.copy(&filled, into)?;
         session.node.queue(filled.index)?;
         if !sound {
-            // Its id is missing from now on, and so it is counted as lost.
+            // Its id is skipped, so it is counted as lost.
             tracing::debug!(id, flags = filled.flags, bytes = filled.bytes_used, "damaged frame");
             return Ok(None);
         }
@@ -229,7 +229,7 @@ impl V4l2Camera {
         self.newest_ns = Some(start_ns);
         Ok(Some(FrameStamp {
             seq: id,
-            // The kernel's clock is the host's.
+            // The kernel and the host use the same clock.
             device_ns: start_ns,
             exposure_start_ns: start_ns,
             host_ns: dequeued_ns,
@@ -237,7 +237,7 @@ impl V4l2Camera {
         }))
     }
 
-    /// Waits for a buffer or the deadline; with a lost device, for the next attempt to open it.
+    /// Waits for a buffer or the deadline; if the device is lost, for the next attempt to open it.
     fn wait(&mut self, now_ns: i64, deadline_ns: i64) -> io::Result<()> {
         match &mut self.link {
             Link::Open(session) => {
@@ -250,7 +250,7 @@ impl V4l2Camera {
         }
     }
 
-    /// Writes settings; where the camera refuses them, the old ones stay.
+    /// Writes settings; if the camera refuses them, the old ones are kept.
     fn write(&mut self, wanted: &CameraSettings) -> Result<CameraSettings, DeviceError> {
         let Link::Open(session) = &mut self.link else { return Err(lost()) };
         let cause = match session.write(wanted) {
@@ -261,7 +261,8 @@ impl V4l2Camera {
             self.lose(&cause);
             return Err(kernel_error(cause));
         }
-        // The exposure may be written and the delay refused; should this fail too, the first error tells more.
+        // The exposure may have been written before the delay was refused. If this fails too, the first error is more
+        // useful.
         let _ = session.write(&self.settings.0);
         let what = format!(
             "exposure_us = {}, trigger_delay_us = {}: the camera's driver refuses them{}: {cause}",
@@ -272,7 +273,7 @@ impl V4l2Camera {
         Err(error(DeviceErrorKind::OutOfRange, what))
     }
 
-    /// The settings as the camera will take them.
+    /// The settings that the camera will apply.
     fn nearest(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError> {
         if settings.shutter != Shutter::Rolling {
             let what = "shutter = Global: V4L2 has no control for it; a rig of this camera is swept with a rolling shutter";
@@ -308,7 +309,8 @@ impl Camera for V4l2Camera {
         if wanted != self.settings.0 {
             let actual = self.write(&wanted)?;
             self.settings = (wanted, actual);
-            // V4L2 does not say when a control takes effect: the frame in progress and some after it may be as before.
+            // V4L2 does not tell when a control takes effect: the frame in progress and some after it may have the
+            // old settings.
             self.certain = self.ids.next() + u64::from(self.setup.config.late_frames);
             self.exposures.set(self.certain, actual.exposure_us);
         }
@@ -404,7 +406,7 @@ fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
     DeviceError::new("camera", kind, what.into())
 }
 
-/// What the kernel's number means for whoever has to act on it.
+/// Maps the kernel's error number to a kind that the caller can act on.
 fn kernel_error(cause: io::Error) -> DeviceError {
     kernel_error_at("", cause)
 }

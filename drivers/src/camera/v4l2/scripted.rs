@@ -1,4 +1,5 @@
-//! A node whose answers a test writes. It keeps the kernel's rules, so that a driver that breaks them is found out.
+//! A node with scripted answers for tests. It enforces the kernel's rules, so that violations by the driver are
+//! detected.
 
 use std::collections::VecDeque;
 use std::io;
@@ -11,41 +12,41 @@ use raysweep_core::Clock;
 
 use super::node::*;
 
-/// What a dequeue finds.
+/// Result of a dequeue.
 #[derive(Debug, Clone, Copy)]
 pub enum Step {
-    /// A frame of this count, stamp and flags, all of whose bytes are the count's lowest.
+    /// A frame with this count, timestamp and flags; all its bytes are the lowest byte of the count.
     Frame { sequence: u32, timestamp_ns: i64, flags: u32 },
-    /// A frame with fewer bytes than it should have.
+    /// A frame with fewer bytes than expected.
     Short { sequence: u32 },
-    /// Nothing for a while.
+    /// No frame for a while.
     Nothing,
     /// An error, once.
     Error(i32),
-    /// The device goes: `ENODEV` from every call, until it is opened again.
+    /// The device disappears: every call returns `ENODEV` until it is opened again.
     Gone,
 }
 
-/// How long one `Nothing` lasts.
+/// Duration of one `Nothing`.
 const NOTHING: Duration = Duration::from_millis(1);
 
-/// The device behind the nodes that are opened, one after the other.
+/// The device behind all nodes that are opened in turn.
 pub struct Device {
     pub steps: VecDeque<Step>,
-    /// Errors of the next openings.
+    /// Errors of the next open calls.
     pub refusals: VecDeque<i32>,
     pub identity: Identity,
     pub controls: Vec<(Control, i64)>,
-    /// What the driver makes of a format.
+    /// How the device changes a requested format.
     pub format: fn(Format) -> Format,
     pub frame_rate_max: f64,
     pub buffers_max: u32,
-    /// Errors of the next calls by the call's name.
+    /// Errors of the next calls, by the name of the call.
     pub failures: Vec<(&'static str, i32)>,
-    /// What was called, without what is called for each frame.
+    /// All calls except those made for each frame.
     pub calls: Vec<String>,
     pub opened: u32,
-    /// Where a frame's rows begin; rows are `stride` apart and `0xEE` lies between them.
+    /// Offset of a frame's first row; rows are `stride` apart, with `0xEE` in between.
     pub row_bytes: usize,
 }
 
@@ -56,7 +57,7 @@ pub struct Script {
 }
 
 pub fn control(name: &str, minimum: i64, maximum: i64, step: i64, value: i64) -> (Control, i64) {
-    // Ids of different vendors collide: here all do.
+    // Ids of different vendors collide: here all of them do.
     let kind = if name == "Pixel Rate" { ControlKind::Wide } else { ControlKind::Number };
     (Control { id: 1, name: name.into(), kind, minimum, maximum, step }, value)
 }
@@ -147,7 +148,7 @@ impl ScriptedNode {
     }
 
     fn rule(kept: bool, what: &str) -> io::Result<()> {
-        // The kernel answers EINVAL; a test that does not expect that should see why.
+        // The kernel returns EINVAL; a test that does not expect the error should show the reason.
         if kept { Ok(()) } else { Err(io::Error::other(format!("against the kernel's rules: {what}"))) }
     }
 }
@@ -171,7 +172,7 @@ impl Node for ScriptedNode {
         let mut device = self.call(format!("set_control {} {value}", control.name))?;
         let found = device.controls.iter_mut().find(|(known, _)| known.name == control.name);
         let (_, held) = found.ok_or_else(|| io::Error::from_raw_os_error(EINVAL))?;
-        // A control with steps the driver does not tell of rounds down by itself.
+        // A control with steps that the driver does not know about rounds down by itself.
         *held = if control.name == "Coarse" { value / 4 * 4 } else { value };
         Ok(())
     }
@@ -205,7 +206,7 @@ impl Node for ScriptedNode {
         Self::rule(self.streaming, "dequeue without streaming")?;
         let step = {
             let mut device = self.script.device();
-            // Time passes in waits alone.
+            // Time passes only in waits.
             if matches!(device.steps.front(), Some(Step::Nothing)) { None } else { device.steps.pop_front() }
         };
         let filled = |sequence: u32, timestamp_ns, flags, bytes_used| Filled {
@@ -234,7 +235,7 @@ impl Node for ScriptedNode {
                 filled(sequence, timestamp_ns, flags, size)
             }
         };
-        // Buffers are filled in turn, not in the order of their numbers.
+        // Fills the queued buffer with the highest number, so that buffers are not filled in order of their numbers.
         let queued = self.buffers.iter().rposition(|buffer| *buffer == Buffer::Queued);
         let index = queued.expect("the driver starves: no buffer is queued");
         self.buffers[index] = Buffer::Ours(frame.sequence as u8);
@@ -243,7 +244,7 @@ impl Node for ScriptedNode {
 
     fn wait(&mut self, timeout: Duration) -> io::Result<()> {
         if self.gone {
-            // A poll tells of a device that is gone by being ready.
+            // For a missing device, poll returns at once.
             return Ok(());
         }
         let lasts = {

@@ -1,4 +1,4 @@
-//! One opening of a node: from the path to mapped buffers, with all that the rig file asks for.
+//! One opening of a node: from the path to mapped buffers, with all settings of the rig file.
 
 use std::io;
 
@@ -10,22 +10,22 @@ use super::controls::{ControlError, Controls, Timer};
 use super::node::{FLAG_ERROR, Filled, Format, Identity, Node, Opener};
 use super::{error, fourcc, kernel_error, kernel_error_at};
 
-/// Part by which row times may differ, as elsewhere between camera and projector.
+/// Maximum relative deviation of row times, the same as elsewhere between camera and projector.
 const ROW_TIME_TOLERANCE: f64 = 0.01;
-/// Part by which frame rates may differ by rounding.
+/// Maximum relative deviation of frame rates due to rounding.
 const FRAME_RATE_TOLERANCE: f64 = 1e-3;
 
-/// How a frame lies in a buffer.
+/// Layout of a frame in a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     row_bytes: usize,
-    /// From one row to the next.
+    /// Bytes from one row to the next.
     stride: usize,
     rows: usize,
 }
 
 impl Layout {
-    /// Bytes of a frame without gaps.
+    /// Bytes of a frame without gaps between rows.
     pub(super) fn frame_bytes(&self) -> usize {
         self.row_bytes * self.rows
     }
@@ -80,7 +80,7 @@ impl Session {
             );
             return Err(error(DeviceErrorKind::OutOfRange, what));
         }
-        // Ranges may hang on the controls before.
+        // Ranges may depend on the controls written before.
         let controls = Controls::of(node.as_ref()).map_err(at)?;
         let exposure = controls.exposure(config.exposure.as_ref(), row_time_us).map_err(control_error)?;
         let trigger_delay = controls.trigger_delay(config.trigger_delay.as_ref()).map_err(control_error)?;
@@ -115,7 +115,7 @@ impl Session {
         }
     }
 
-    /// The settings that the camera has.
+    /// The present settings of the camera.
     pub(super) fn settings(&self) -> io::Result<CameraSettings> {
         let delay = self.trigger_delay.as_ref();
         Ok(CameraSettings {
@@ -125,7 +125,7 @@ impl Session {
         })
     }
 
-    /// The settings that the camera comes nearest to.
+    /// The nearest settings that the camera supports.
     pub(super) fn nearest(&self, settings: &CameraSettings) -> CameraSettings {
         let delay = self.trigger_delay.as_ref();
         CameraSettings {
@@ -135,7 +135,7 @@ impl Session {
         }
     }
 
-    /// Writes settings and says what the camera took.
+    /// Writes settings and returns those that the camera applied.
     pub(super) fn write(&mut self, settings: &CameraSettings) -> io::Result<CameraSettings> {
         let node = self.node.as_mut();
         let exposure_us = self.exposure.write_us(node, settings.exposure_us)?;
@@ -145,16 +145,16 @@ impl Session {
         Ok(CameraSettings { shutter: settings.shutter, exposure_us, trigger_delay_us })
     }
 
-    /// Gives all buffers to the driver and starts.
+    /// Passes all buffers to the driver and starts.
     pub(super) fn start(&mut self) -> io::Result<()> {
         let queued = (0..self.buffers).try_for_each(|index| self.node.queue(index));
         queued.and_then(|()| self.node.start()).inspect_err(|_| {
-            // Takes the buffers back; of the two errors the first tells more.
+            // Takes the buffers back. If this fails too, the first error is more useful.
             let _ = self.node.stop();
         })
     }
 
-    /// Copies a frame out of its buffer, without gaps between rows, unless it is damaged.
+    /// Copies a frame from its buffer, without gaps between rows; returns `false` if it is damaged.
     pub(super) fn copy(&self, filled: &Filled, into: &mut [u8]) -> io::Result<bool> {
         let Layout { row_bytes, stride, .. } = self.layout;
         if filled.flags & FLAG_ERROR != 0 || (filled.bytes_used as usize) < self.layout.reach() {
@@ -210,7 +210,7 @@ fn set_format(node: &mut dyn Node, setup: &V4l2Setup) -> Result<Layout, DeviceEr
     Ok(Layout { row_bytes, stride, rows: height as usize })
 }
 
-/// Drivers take the nearest rate that they have, without a word.
+/// Drivers silently use the nearest rate that they support.
 fn set_frame_rate(node: &mut dyn Node, wanted: f64) -> Result<(), DeviceError> {
     let found = node.set_frame_rate(wanted).map_err(|cause| match cause.raw_os_error() {
         Some(ENOTTY) => error(

@@ -26,7 +26,7 @@ fn open(script: &Script, setup: V4l2Setup) -> Result<V4l2Camera, DeviceError> {
     V4l2Camera::open(setup, Box::new(script.clone()), script.clock.clone())
 }
 
-/// A frame at the start of whose exposure the clock reads a millisecond for each count.
+/// A frame whose exposure starts when the clock reads a millisecond per count.
 fn frame(sequence: u32) -> Step {
     Step::Frame {
         sequence,
@@ -230,7 +230,8 @@ fn settings_are_promised_from_a_frame_that_surely_has_them() {
     let script = Script::new([frame(0), frame(1), frame(2), Step::Nothing]);
     let mut feed = Feed::new(&script, setup(""));
     assert_eq!(feed.seqs(1), [0]);
-    // Frames 1 and 2 are done already and wait; frame 3 is in progress, and 3 and 4 may be late.
+    // Frames 1 and 2 are already complete and wait; frame 3 is in progress, and 3 and 4 may still have the old
+    // settings.
     let applied = feed.camera.configure(ID, &exposed(700.0)).unwrap();
     assert_eq!(applied.first_frame, FirstFrame::Within { earliest: 3, certain: 5 });
     assert_eq!(feed.seqs(2), [1, 2]);
@@ -265,7 +266,7 @@ fn stamps_at_the_end_of_a_frame_are_taken_back_by_its_own_exposure() {
     };
     let script = Script::new([]);
     let mut feed = Feed::new(&script, setup(""));
-    // At first 1000 us, as the camera was; frame 0 is in progress, and 0 and 1 may still have them.
+    // At first 1000 us, the camera's initial value. Frame 0 is in progress, and 0 and 1 may still have it.
     let applied = feed.camera.configure(ID, &exposed(500.0)).unwrap();
     assert_eq!(applied.first_frame, FirstFrame::Within { earliest: 0, certain: 2 });
     script.device().steps.extend([end(0), end(1), end(2)]);
@@ -309,7 +310,7 @@ fn rows_with_gaps_between_them_are_put_together() {
 #[test]
 fn a_camera_that_is_pulled_out_and_plugged_in_goes_on_as_it_was() {
     let script = Script::new([]);
-    // The frame before is exposed at 5 ms.
+    // The frame before the loss is exposed at 5 ms.
     let keys = "controls = [[\"trigger_mode\", 1]]";
     let mut feed = Feed::new(&script, setup(keys));
     feed.camera.configure(ID, &exposed(700.0)).unwrap();
@@ -320,7 +321,7 @@ fn a_camera_that_is_pulled_out_and_plugged_in_goes_on_as_it_was() {
     assert_eq!(feed.camera.state(), DeviceState::Lost);
     let refused = feed.camera.configure(ID, &exposed(800.0)).unwrap_err();
     assert_eq!(refused.kind, DeviceErrorKind::Disconnected);
-    // It comes back with its controls as they are after power-on.
+    // It comes back with the control values that it has after power-on.
     script.device().controls[0].1 = 10;
     script.device().controls[2].1 = 0;
     script.device().steps = [frame(0), frame(1)].into();
@@ -328,9 +329,9 @@ fn a_camera_that_is_pulled_out_and_plugged_in_goes_on_as_it_was() {
     let waits = (0..20).take_while(|_| feed.next().is_none()).count();
     assert!(waits < 20, "it never came back");
     assert_eq!(feed.camera.state(), DeviceState::Streaming);
-    // Attempts at once, after 100, 200 and 400 ms.
+    // Attempts at once and after 100, 200 and 400 ms.
     assert!(feed.camera.clock.now_ns() - began_ns <= 700_000_000);
-    // The time away in periods of 10 ms, from the exposure of frame 0 on; the frame after the gap came above.
+    // The time away in periods of 10 ms, from the exposure of frame 0; the first frame after the gap was taken above.
     let seq = feed.seqs(1)[0];
     let first = seq - 1;
     assert_eq!(first, 1 + (feed.camera.clock.now_ns() as u64 - 5_000_000) / 10_000_000);

@@ -1,4 +1,4 @@
-//! Frame ids that never wrap, and when a frame's exposure began.
+//! Frame ids that never wrap, and the start of a frame's exposure.
 
 use std::collections::VecDeque;
 
@@ -8,7 +8,7 @@ use super::node::{
     FLAG_CLOCK_MASK, FLAG_CLOCK_MONOTONIC, FLAG_MOMENT_MASK, FLAG_MOMENT_START_OF_EXPOSURE, Filled,
 };
 
-/// Turns the kernel's 32-bit count into an id that rises for as long as the camera object lives.
+/// Converts the kernel's 32-bit count to an id that increases for as long as the camera object lives.
 #[derive(Debug, Default)]
 pub(super) struct Ids {
     newest: Option<u64>,
@@ -17,7 +17,7 @@ pub(super) struct Ids {
 }
 
 impl Ids {
-    /// A stream begins: its count says nothing about frames before. Its first frame is taken for this one.
+    /// Begins a stream, whose count is unrelated to earlier frames. Its first frame gets the id `first`.
     pub(super) fn stream_begins(&mut self, first: u64) {
         self.newest = first.checked_sub(1);
         self.count = None;
@@ -31,7 +31,7 @@ impl Ids {
     /// The id of a frame of this stream.
     pub(super) fn take(&mut self, count: u32) -> u64 {
         let since = self.count.map_or(1, |last| count.wrapping_sub(last));
-        // A driver that does not count, or counts anew, says nothing about gaps.
+        // A driver that does not count, or restarts its count, gives no information about gaps.
         let since = if since == 0 || since > u32::MAX / 2 { 1 } else { since };
         let id = self.next() + u64::from(since - 1);
         self.count = Some(count);
@@ -40,7 +40,7 @@ impl Ids {
     }
 }
 
-/// Which exposure a frame has: settings are written while frames before them are still on their way.
+/// The exposure time of each frame: settings are written while earlier frames are still pending.
 #[derive(Debug)]
 pub(super) struct Exposures(VecDeque<(u64, f64)>);
 
@@ -49,12 +49,12 @@ impl Exposures {
         Self([(0, exposure_us)].into())
     }
 
-    /// From this frame on it is certain.
+    /// Sets the exposure from the first frame that is certain to have it.
     pub(super) fn set(&mut self, first_frame: u64, exposure_us: f64) {
         self.0.push_back((first_frame, exposure_us));
     }
 
-    /// Of frames in the order of their ids; those before are forgotten.
+    /// The exposure of a frame; must be called in the order of ids.
     pub(super) fn of(&mut self, id: u64) -> f64 {
         while self.0.get(1).is_some_and(|(first_frame, _)| *first_frame <= id) {
             self.0.pop_front();
@@ -63,8 +63,8 @@ impl Exposures {
     }
 }
 
-/// Start of the exposure of row 0 on the host's clock, as exactly as the stamp's flags allow: a frame ends when its last
-/// row, which starts `readout_us` less one row after the first, is exposed and read.
+/// Start of the exposure of row 0 on the host's clock, as exactly as the timestamp's flags allow: a frame ends when
+/// its last row, which starts `readout_us` less one row after the first, is exposed and read.
 pub(super) fn exposure_start_ns(filled: &Filled, exposure_us: f64, readout_us: f64, dequeued_ns: i64) -> i64 {
     let whole_frame_ns = ns_from_us(exposure_us + readout_us);
     if !is_monotonic(filled) {
@@ -76,7 +76,7 @@ pub(super) fn exposure_start_ns(filled: &Filled, exposure_us: f64, readout_us: f
     }
 }
 
-/// Whether the stamp is of the host's clock.
+/// Whether the timestamp is on the host's clock.
 pub(super) fn is_monotonic(filled: &Filled) -> bool {
     filled.flags & FLAG_CLOCK_MASK == FLAG_CLOCK_MONOTONIC
 }

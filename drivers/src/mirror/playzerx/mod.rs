@@ -1,8 +1,9 @@
 //! The driver of Mirrorcle's PlayzerX: streams samples into the controller's FIFO.
 //!
-//! FIFO accounting: one question `g` for the samples left is on the wire at a time. The controller takes its input in
-//! order, so its answer counts every sample that was sent before the question, and the FIFO holds at most that many plus
-//! those sent since: the bound that keeps it from overfilling. Samples played = sent before the question - left.
+//! FIFO accounting: at most one query `g` for the samples left is on the wire. The controller processes its input in
+//! order, so its answer counts every sample sent before the query, and the FIFO holds at most that many plus those
+//! sent since. This bound keeps the FIFO from overflowing. Samples played = samples sent before the query - samples
+//! left.
 
 pub mod protocol;
 mod stream;
@@ -27,46 +28,46 @@ use super::state::{MirrorState, Reach, Sent, StateFile, node_of, of_state};
 
 /// The controller's baud rate; a virtual serial port ignores it.
 const BAUD: u32 = 921_600;
-/// Rates that the controller takes.
+/// Sample rates that the controller supports.
 const RATE_HZ: RangeInclusive<f64> = 50.0..=50_000.0;
-/// How long an answer may take.
+/// Maximum time for an answer.
 const REPLY_WAIT: Duration = Duration::from_millis(300);
-/// How long the controller is deaf after a reset.
+/// Time during which the controller ignores input after a reset.
 const RESET_WAIT: Duration = Duration::from_millis(2500);
-/// How often the light's permission is looked at.
+/// Interval of checking the light's permission.
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
-/// Longest time to wait for whoever drives the mirror to let go of it.
+/// Maximum wait for another process to release the mirror.
 const LOCK_WAIT: Duration = Duration::from_secs(1);
-/// How far the rate that the controller keeps may be from the one it was given; measuring it takes as much.
+/// Maximum relative deviation of the controller's actual rate from the requested one; includes the measurement error.
 const RATE_TOLERANCE: f64 = 0.03;
 
 /// How the controller is connected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
-    /// Over USB, as a virtual serial port: faster than any rate needs.
+    /// USB, as a virtual serial port: faster than any sample rate requires.
     VirtualCom,
-    /// Over a UART at 921,600 baud: 10 bits a byte, 9 bytes a sample, 10,240 samples/s at most.
+    /// UART at 921,600 baud: 10 bits per byte and 9 bytes per sample, so at most 10,240 samples/s.
     Uart,
 }
 
-/// Which PlayzerX, and what it may do.
+/// Configuration of a PlayzerX and its limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlayzerXConfig {
     /// Its serial port.
     pub port: PathBuf,
-    /// How it is connected.
+    /// Its connection.
     pub link: Link,
     /// Tilt of the mirror at the controller's full scale.
     pub full_scale: MechanicalDeg,
-    /// What its mirror survives.
+    /// Limits of its mirror.
     pub limits: MirrorLimits,
-    /// Where the driver keeps what a crash must not lose.
+    /// File for the state that must survive a crash.
     pub state: PathBuf,
-    /// Who permits light.
+    /// Permission for light.
     pub light: LightGuard,
 }
 
-/// A PlayzerX.
+/// A PlayzerX controller with its mirror.
 pub struct PlayzerX {
     port: Port,
     node: Option<u64>,
@@ -76,22 +77,22 @@ pub struct PlayzerX {
     phase: Phase,
 }
 
-/// Where the mirror is in its life.
+/// State of the mirror's use.
 enum Phase {
-    /// At the origin, dark, nothing in the FIFO.
+    /// At the origin, dark, FIFO empty.
     Parked,
-    /// Dark on the first point of this path, nothing in the FIFO.
+    /// At the first point of this path, dark, FIFO empty.
     Ready(MirrorPath),
-    /// Samples are under way.
+    /// Samples are being played.
     Moving(Box<Stream>),
 }
 
 impl PlayzerX {
-    /// Opens the controller. A mirror that a crashed process has left somewhere is parked first.
+    /// Opens the controller. If a crashed process left the mirror away from rest, it is parked first.
     ///
     /// # Errors
-    /// `Busy` when another process has it, `Disconnected` and `Timeout` when it is not there, `Unsupported` when it is
-    /// another device, `NotReady` when it plays samples that nobody here has sent.
+    /// `Busy` if another process has it, `Disconnected` or `Timeout` if it is missing, `Unsupported` if it is another
+    /// device, `NotReady` if it plays samples that this driver did not send.
     pub fn open(config: PlayzerXConfig) -> Result<Self, DeviceError> {
         let state = StateFile::open(&config.state, LOCK_WAIT).map_err(of_state)?;
         park_left(&state).map_err(|error| fault(DeviceErrorKind::NotReady, error.to_string()))?;
@@ -121,7 +122,7 @@ impl PlayzerX {
         Ok(Self { port, node, config, capabilities, state, phase: Phase::Parked })
     }
 
-    /// Bytes from the controller so far that made no reply: a measure of the wire's health.
+    /// Number of received bytes that belonged to no reply: a measure of the connection's quality.
     pub fn garbage_bytes(&self) -> u64 {
         self.port.garbage_bytes()
     }
@@ -132,7 +133,7 @@ impl PlayzerX {
         MirrorState::new(reach, *limits, rate_hz, playing).map_err(of_state)
     }
 
-    /// Puts a sequence on disk: only then a sample of it may leave.
+    /// Writes a sequence to disk, which must happen before any of its samples is sent.
     fn record(&self, sequence: &Sequence, rate_hz: f64) -> Result<(), DeviceError> {
         self.state.write(&self.state(rate_hz, Some(sequence.clone()))?).map_err(of_state)
     }
@@ -141,7 +142,7 @@ impl PlayzerX {
         Box::new(Stream::new(sequence, rate_hz, self.config.full_scale))
     }
 
-    /// Sends a sequence and waits until it is played; at which rate it was.
+    /// Sends a sequence and waits until it is played; returns the measured rate.
     fn play_out(
         &mut self,
         sequence: Sequence,
@@ -154,7 +155,7 @@ impl PlayzerX {
         Ok(stream.rate_hz())
     }
 
-    /// Notes that the mirror is at the origin, dark.
+    /// Records that the mirror is at the origin, dark.
     fn note_parked(&mut self) -> Result<(), DeviceError> {
         self.phase = Phase::Parked;
         self.state.write(&self.state(*RATE_HZ.start(), None)?).map_err(of_state)
@@ -218,7 +219,7 @@ impl PlayzerX {
         Ok(progress)
     }
 
-    /// Parks after an error, and says what went wrong first.
+    /// Parks after an error and returns that error.
     fn park_after(&mut self, error: DeviceError) -> DeviceError {
         if let Err(second) = self.park() {
             tracing::error!(error = %second, "the mirror could not be parked");
@@ -259,7 +260,7 @@ impl Mirror for PlayzerX {
         };
         darken(&mut self.port, place, self.config.full_scale)?;
         let sequence = Sequence::travel(place, Tilt::ORIGIN, rate_hz, &self.config.limits);
-        // A disk that is full keeps no mirror from being parked.
+        // A full disk must not prevent parking.
         let recorded = self.record(&sequence, rate_hz);
         self.play_out(sequence, rate_hz, recorded.is_ok())?;
         self.note_parked().and(recorded)
@@ -274,7 +275,7 @@ impl Drop for PlayzerX {
     }
 }
 
-/// Ends what a broken-off write may have left on the wire, and asks who is there.
+/// Completes a frame that a cut-off write may have left on the wire, and asks for the controller's description.
 fn hello(port: &mut Port) -> Result<String, DeviceError> {
     let mut bytes = PADDING.to_vec();
     Command::SetReport(0).to_bytes(&mut bytes);
@@ -304,7 +305,7 @@ fn hello(port: &mut Port) -> Result<String, DeviceError> {
     ))
 }
 
-/// Asks until an answer comes, `timeout` each time, three times at most.
+/// Queries the samples left up to three times, waiting `timeout` each time.
 fn samples_left(port: &mut Port, timeout: Duration) -> Result<Option<u32>, DeviceError> {
     let mut question = Vec::new();
     Command::SamplesLeft.to_bytes(&mut question);
@@ -324,7 +325,7 @@ fn left_of(reply: Reply) -> Option<u32> {
     }
 }
 
-/// Light off where the mirror stands. The FIFO is empty, so the sample is played at once.
+/// Switches the light off at the mirror's position. The FIFO is empty, so the sample is played at once.
 fn darken(port: &mut Port, place: Tilt, full_scale: MechanicalDeg) -> Result<(), DeviceError> {
     let mut bytes = Vec::new();
     let point = raysweep_core::MirrorPoint { tilt: place, light: 0 };
@@ -332,8 +333,8 @@ fn darken(port: &mut Port, place: Tilt, full_scale: MechanicalDeg) -> Result<(),
     port.send(&bytes)
 }
 
-/// Parks a mirror that a process has left behind. Returns where it was found; `None` if that could not be known and the
-/// controller was started anew instead.
+/// Parks a mirror that a process left behind. Returns where it was found; `None` if that was unknown and the
+/// controller was restarted instead.
 pub(super) fn recover(
     file: &StateFile,
     state: &MirrorState,
@@ -346,14 +347,14 @@ pub(super) fn recover(
     let mut port = Port::open(name, BAUD)?;
     let left = if state.is_plugged_in_since(name, *node) { stream::halt(&mut port, 0)? } else { None };
     let Some(left) = left else {
-        // The light and the drive go off with the controller; the mirror springs back through the drive's own filter.
+        // The reset switches off light and drive; the mirror springs back, damped by the drive's own filter.
         let mut bytes = PADDING.to_vec();
         Command::Reset.to_bytes(&mut bytes);
         port.send(&bytes)?;
         std::thread::sleep(RESET_WAIT);
         return Ok(None);
     };
-    // Where the process died within a write, the middle of what may have left is within a write of the truth.
+    // If the process died during a write, the midpoint of what may have been sent is within one write of the truth.
     let gone = u64::midpoint(sent.certainly, sent.possibly);
     let place = sequence.after(gone.saturating_sub(u64::from(left)));
     darken(&mut port, place, *full_scale)?;
@@ -365,7 +366,7 @@ pub(super) fn recover(
     Ok(Some(place))
 }
 
-/// Sends and reads until all samples are played.
+/// Sends samples and reads replies until all are played.
 fn play_out(stream: &mut Stream, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
     loop {
         stream.step(port, record)?;

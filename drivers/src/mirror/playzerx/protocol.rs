@@ -1,36 +1,36 @@
-//! The PlayzerX serial protocol as Mirrorcle publishes it: frames 'p' 'l' command length data 0x0A, without checksum and
-//! without acknowledgement.
+//! The PlayzerX serial protocol as published by Mirrorcle: frames 'p' 'l' command length data 0x0A, without checksum
+//! or acknowledgement.
 
 use raysweep_core::{MechanicalDeg, MirrorPoint};
 
 use crate::mirror::wire::Parsed;
 
-/// Samples of the FIFO of a monochrome controller: no count of samples left is larger.
+/// FIFO size of a monochrome controller in samples: the maximum count of samples left.
 pub const FIFO_SAMPLES: u32 = 125_000;
-/// Bytes of a sample with its light.
+/// Bytes of a sample including its light.
 pub const SAMPLE_BYTES: usize = 9;
 /// The code of the origin.
 const ORIGIN: u16 = 2048;
-/// Codes from the origin to the full scale.
+/// Codes from the origin to full scale.
 const HALF_SCALE: f64 = 2047.0;
-/// Longest line of the controller's description that is taken for one.
+/// Maximum length of a line of the controller's description.
 const LONGEST_LINE: usize = 64;
-/// Zeros that end whatever frame a broken-off write has begun: no frame ends with a zero, so it moves nothing.
+/// Zeros that complete any frame cut off in a write: no frame ends with a zero, so nothing moves.
 pub const PADDING: [u8; 11] = [0; 11];
 
-/// A sample as the controller takes it: 12 bits an axis, 8 bits of light.
+/// A sample in the controller's format: 12 bits per axis, 8 bits of light.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sample {
     /// 0..=4095; 2048 is the origin.
     pub x: u16,
-    /// The same of the other axis.
+    /// As `x`, for the other axis.
     pub y: u16,
     /// 0: off, 255: full.
     pub light: u8,
 }
 
 impl Sample {
-    /// A point on a controller whose codes reach `full_scale` at -1 and +1. Beyond that it is clamped.
+    /// Converts a point for a controller whose codes reach `full_scale` at -1 and +1. Values beyond that are clamped.
     pub fn of(point: MirrorPoint, full_scale: MechanicalDeg) -> Self {
         let code = |deg: f64| {
             let part = (deg / full_scale.0).clamp(-1.0, 1.0);
@@ -41,29 +41,29 @@ impl Sample {
     }
 }
 
-/// What the controller can be told.
+/// A command to the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
-    /// One sample with its light, to the end of the FIFO.
+    /// Appends one sample with its light to the FIFO.
     Sample(Sample),
-    /// Samples per second, 50..=50,000.
+    /// Sets the sample rate, 50..=50,000 samples per second.
     SetRate(u32),
-    /// Period in milliseconds of unasked counts of samples left; 0: none.
+    /// Sets the period in ms of unrequested reports of the samples left; 0: none.
     SetReport(u16),
-    /// Empties the FIFO; the outputs stay where they are.
+    /// Empties the FIFO; the outputs keep their values.
     Clear,
-    /// Asks for a sign of life.
+    /// Requests a sign of life.
     Ping,
-    /// Asks for its description.
+    /// Requests its description.
     Info,
-    /// Asks how many samples are left.
+    /// Requests the number of samples left.
     SamplesLeft,
-    /// Starts the controller anew; it is deaf for 2.5 s.
+    /// Restarts the controller, which ignores input for 2.5 s.
     Reset,
 }
 
 impl Command {
-    /// Appends the command as it goes over the wire.
+    /// Appends the bytes of the command.
     pub fn to_bytes(self, out: &mut Vec<u8>) {
         let mut frame = |command: u8, data: &[u8]| {
             out.extend_from_slice(&[b'p', b'l', command, data.len() as u8 + 5]);
@@ -86,30 +86,30 @@ impl Command {
     }
 }
 
-/// What the controller says.
+/// A reply from the controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Reply {
-    /// It is there.
+    /// Answer to a ping.
     Alive,
-    /// Who it is.
+    /// Its description.
     Info {
         /// The device's name.
         device: String,
-        /// Its firmware.
+        /// The firmware version.
         firmware: String,
-        /// `XYM`, or `XYRGB` if it has colours.
+        /// `XYM`, or `XYRGB` for a colour controller.
         format: String,
     },
     /// Samples left in its FIFO.
     Left(u32),
 }
 
-/// Reads the reply that `bytes` begin with.
+/// Parses the reply at the start of `bytes`.
 pub fn parse_response(bytes: &[u8]) -> Parsed<Reply> {
     const PREFIX: &[u8] = b"pl-";
     let begun = bytes.len().min(PREFIX.len());
     if bytes[..begun] != PREFIX[..begun] {
-        // All up to the next byte that a reply can begin with.
+        // Everything up to the next byte that can begin a reply.
         let used = bytes.iter().skip(1).position(|byte| *byte == b'p').map_or(bytes.len(), |at| at + 1);
         return Parsed::Garbage { used };
     }
@@ -120,7 +120,7 @@ pub fn parse_response(bytes: &[u8]) -> Parsed<Reply> {
         let common = said.len().min(text.len());
         said[..common] == text[..common]
     };
-    // Three bytes of a count are never these words: its last is at most 1 (125,000 is 0x01E848).
+    // A 3-byte count is never one of these words: its last byte is at most 1 (125,000 is 0x01E848).
     if said.len() < 3 {
         return Parsed::Incomplete;
     }
@@ -139,7 +139,7 @@ pub fn parse_response(bytes: &[u8]) -> Parsed<Reply> {
     }
 }
 
-/// The three lines after `pl-info`, which took `before` bytes.
+/// Parses the three lines after `pl-info`, which took `before` bytes.
 fn description(mut bytes: &[u8], before: usize) -> Parsed<Reply> {
     let mut lines = [const { String::new() }; 3];
     let mut used = before;

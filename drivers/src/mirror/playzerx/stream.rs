@@ -1,4 +1,4 @@
-//! One sequence on its way into the controller's FIFO.
+//! Streams one sequence into the controller's FIFO.
 
 use std::time::{Duration, Instant};
 
@@ -10,22 +10,22 @@ use crate::mirror::port::{Port, fault};
 use crate::mirror::sequence::Sequence;
 use crate::mirror::state::{Sent, StateFile, of_state};
 
-/// Samples in one write: what may be uncertain after a crash, 1.6 ms at 39,000 samples/s, less than any mirror's filter
-/// lets through.
+/// Samples per write, which is the uncertainty after a crash: 1.6 ms at 39,000 samples/s, too short for any mirror's
+/// filter to pass.
 const WRITE_SAMPLES: u64 = 64;
-/// Writes in one step, so that the caller comes back to look at its other duties.
+/// Writes per step, so that the caller can attend to its other duties.
 const WRITES_PER_STEP: usize = 64;
-/// Room that is never used, should the controller keep some of its FIFO for itself [A].
+/// Part of the FIFO that is never used, in case the controller reserves some of it [A].
 const SPARE_SAMPLES: u64 = 1000;
-/// How often the controller is asked how many samples are left.
+/// Interval of querying the samples left.
 const ASK_EVERY: Duration = Duration::from_millis(10);
-/// Answers that took longer say too little about when they were true.
+/// The time of an answer with a longer round trip is too uncertain.
 const LONGEST_ROUND_TRIP: Duration = Duration::from_millis(5);
-/// How long a controller may stand still before it takes an order.
+/// Maximum time that a controller may pause before it processes a command.
 const HALT_WAIT: Duration = Duration::from_secs(1);
-/// How long after an answer to wait for the others that were asked for with it.
+/// How long to wait after an answer for the answers to the other queries sent with it.
 const QUIET: Duration = Duration::from_millis(3);
-/// How many times the place is asked for: an answer may be lost in garbage, and the FIFO can be emptied only once.
+/// Number of position queries: an answer may be lost in garbage, and the FIFO can be emptied only once.
 const QUESTIONS: usize = 3;
 
 /// A sequence being played.
@@ -33,29 +33,29 @@ pub struct Stream {
     sequence: Sequence,
     asked_rate_hz: f64,
     full_scale: MechanicalDeg,
-    /// What is being written: samples from `certain` to `next`, then perhaps a question.
+    /// Bytes being written: samples from `certain` to `next`, then perhaps a query.
     out: Vec<u8>,
     written: usize,
-    /// Samples that are wholly on the wire, before `out`.
+    /// Samples sent completely before `out`.
     certain: u64,
     next: u64,
-    /// When it was asked, and the samples sent before.
+    /// The pending query: its time, and the samples sent before it.
     question: Option<(Instant, u64)>,
     asked: Instant,
-    /// Samples sent before the question that was answered last, and how many of them were left.
+    /// Samples sent before the query answered last, and the samples left at that time.
     answer: (u64, u64),
-    /// When that question was asked.
+    /// Time of that query.
     answer_asked: Instant,
     played: u64,
     moved: Instant,
     began: Option<Instant>,
     rate: RateFit,
-    /// When the light's permission was looked at last.
+    /// Last time that the light's permission was checked.
     pub light_checked: Instant,
 }
 
 impl Stream {
-    /// To be called with an empty FIFO.
+    /// The FIFO must be empty.
     pub fn new(sequence: Sequence, rate_hz: f64, full_scale: MechanicalDeg) -> Self {
         let now = Instant::now();
         Self {
@@ -78,7 +78,7 @@ impl Stream {
         }
     }
 
-    /// Reads what has come and sends what there is room for; notes in `record` what was sent.
+    /// Reads replies and sends as many samples as fit; records in `record` what was sent.
     pub fn step(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
         let looked = Instant::now();
         while let Some(reply) = port.reply(parse_response)? {
@@ -97,13 +97,13 @@ impl Stream {
         self.check_life(looked)
     }
 
-    /// Puts the next samples and questions into `out`; `false` if there is nothing to send now.
+    /// Puts the next samples and queries into `out`; `false` if there is nothing to send now.
     fn fill(&mut self) -> bool {
         self.out.clear();
         self.written = 0;
         let (asked_after, left) = self.answer;
         let held_at_most = left + (self.next - asked_after);
-        // What is sent to a FIFO that ran dry would hide that it did.
+        // Samples sent to a FIFO that ran dry would hide the gap.
         let is_in_doubt = self.may_have_run_dry();
         let room = match is_in_doubt {
             true => 0,
@@ -121,7 +121,7 @@ impl Stream {
         !self.out.is_empty()
     }
 
-    /// Writes of `out` what the port takes; `false` if it takes no more now.
+    /// Writes as much of `out` as the port accepts; `false` if it accepts no more now.
     fn write(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<bool, DeviceError> {
         let note = |sent| record.map_or(Ok(()), |record| record.note_sent(sent).map_err(of_state));
         note(Sent { certainly: self.certain_now(), possibly: self.next })?;
@@ -143,13 +143,13 @@ impl Stream {
         Ok(true)
     }
 
-    /// Samples that are wholly on the wire, those of a broken-off write too.
+    /// Samples sent completely, including those of a partial write.
     fn certain_now(&self) -> u64 {
         (self.certain + (self.written / SAMPLE_BYTES) as u64).min(self.next)
     }
 
     fn take_answer(&mut self, left: u64) -> Result<(), DeviceError> {
-        // An answer to nothing, or one that cannot be true, is garbage that looks like an answer.
+        // An answer without a query, or with an impossible count, is garbage that looks like an answer.
         let Some((asked, sent)) = self.question else { return Ok(()) };
         let possible =
             self.began.map_or(0.0, |began| began.elapsed().as_secs_f64()) * self.asked_rate_hz * 1.1 + 2.0;
@@ -185,7 +185,7 @@ impl Stream {
         self.sequence.path_len() > 0 && sent > self.sequence.lead_len() && sent < self.sequence.len()
     }
 
-    /// Whether the FIFO may have drained since the last answer, by the clock: the host stood still for that long.
+    /// Whether, by the clock, the FIFO may have drained since the last answer because the host was stalled.
     fn may_have_run_dry(&self) -> bool {
         let (asked_after, left) = self.answer;
         let held = left + (self.next - asked_after);
@@ -193,8 +193,9 @@ impl Stream {
         self.is_within_path(self.next) && since.as_secs_f64() * self.asked_rate_hz * 1.1 >= held as f64
     }
 
-    /// A controller that does not answer, or whose FIFO does not drain, does not move the mirror. `looked` is when its answers
-    /// were read: what it says while the host stands still is not late.
+    /// Returns an error if the controller does not answer, or if its FIFO does not drain, in which case the mirror
+    /// does not move. `looked` is when its answers were read: answers that arrive while the host is stalled are not
+    /// late.
     fn check_life(&self, looked: Instant) -> Result<(), DeviceError> {
         let unanswered = |(asked, _)| looked.saturating_duration_since(asked) > REPLY_WAIT;
         if self.question.is_some_and(unanswered) {
@@ -216,8 +217,8 @@ impl Stream {
         Ok(())
     }
 
-    /// Empties the FIFO. Where the mirror stands then: as the controller says, or, if its answers are lost, as
-    /// the clock does.
+    /// Empties the FIFO. Returns the mirror's position according to the controller or, if its answers are lost,
+    /// according to the clock.
     pub fn halt(&mut self, port: &mut Port) -> Result<Tilt, DeviceError> {
         let certain = self.certain_now();
         let unanswered = usize::from(self.question.is_some());
@@ -245,7 +246,7 @@ impl Stream {
         self.asked_rate_hz
     }
 
-    /// The rate at which the FIFO drains.
+    /// The measured rate at which the FIFO drains.
     pub fn rate_hz(&self) -> Option<f64> {
         self.rate.rate_hz()
     }
@@ -261,11 +262,11 @@ impl Stream {
     }
 }
 
-/// Empties the FIFO; how many samples it held just before, if the controller says so. `unanswered` questions are still
-/// on their way.
+/// Empties the FIFO. Returns how many samples it held just before, if the controller reports it. `unanswered` queries
+/// are still pending.
 ///
-/// A controller that says nothing at all has not taken the order yet, so there is time to wait for it; one that answers
-/// the ping behind the questions has taken them, and its answers are lost.
+/// A controller that sends nothing at all has not processed the command yet, so there is time to wait for it. If it
+/// answers the ping after the queries, it has processed them, and their answers are lost.
 pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
     let mut bytes = PADDING.to_vec();
     (0..QUESTIONS).for_each(|_| Command::SamplesLeft.to_bytes(&mut bytes));
@@ -274,7 +275,7 @@ pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceErr
     port.send(&bytes)?;
     let (mut answers, mut last) = (0, None);
     loop {
-        // The last answer is the one nearest to the clearing.
+        // The last answer is the closest in time to the clearing.
         let known = last.filter(|_| answers > unanswered);
         let wait = if known.is_some() { QUIET } else { HALT_WAIT };
         match port.await_reply(wait, parse_response, Some)? {
@@ -285,7 +286,7 @@ pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceErr
     }
 }
 
-/// A straight line through (seconds, samples).
+/// Fits a straight line through (seconds, samples).
 #[derive(Debug, Default)]
 struct RateFit {
     count: f64,
@@ -296,7 +297,7 @@ struct RateFit {
 }
 
 impl RateFit {
-    /// Fewer points make no rate.
+    /// Minimum number of points for a rate.
     const FEWEST: f64 = 8.0;
 
     fn push(&mut self, seconds: f64, samples: f64) {

@@ -1,8 +1,9 @@
-//! A projector on a display output, driven through the kernel (DRM/KMS) without a desktop: nothing else draws, scales or
-//! corrects what is shown.
+//! A projector on a display output, driven through the kernel (DRM/KMS) without a desktop: nothing else
+//! draws, scales or corrects the picture.
 //!
-//! Two dumb buffers are flipped in turn; the kernel tells when a flip was done. The video timing is forced, since an engine
-//! whose rows are tied to it must not be given another one by what a cable reports; gamma tables are set linear.
+//! Two dumb buffers are flipped alternately; the kernel reports when a flip was done. The video timing is
+//! forced, because a projector whose rows are tied to it must not get another timing from what a cable
+//! reports. Gamma tables are set to linear.
 
 mod screen;
 mod timing;
@@ -16,21 +17,22 @@ use super::picture::{PictureError, render};
 use screen::Screen;
 pub use timing::Timing;
 
-/// Which output, and how it is driven.
+/// Which output to drive, and how.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DrmConfig {
-    /// The graphics card: `/dev/dri/card0`.
+    /// The graphics card, for example `/dev/dri/card0`.
     pub card: PathBuf,
-    /// The output by the kernel's name, `HDMI-A-1`; then it is driven whether or not it reports a display. `None`: the
-    /// first with a display.
+    /// The output by the kernel's name, for example `HDMI-A-1`; it is driven even if it reports no display.
+    /// `None`: the first output with a display.
     pub connector: Option<String>,
-    /// The video timing that is forced.
+    /// The forced video timing.
     pub timing: Timing,
-    /// Video frames from a flip until the picture is certain to be in the light: the engine's own latency, plus one.
+    /// Video frames from a flip until the picture is certain to be in the light: the projector's own latency,
+    /// plus one.
     pub settle_frames: u32,
 }
 
-/// The projector. Who opens it holds the card: no desktop can run on it.
+/// The projector. It holds the card while open: no desktop can run on the card.
 pub struct DrmProjector {
     screen: Screen,
     clock: Clock,
@@ -38,11 +40,11 @@ pub struct DrmProjector {
 }
 
 impl DrmProjector {
-    /// Takes the output and shows black.
+    /// Takes control of the output and shows black.
     ///
     /// # Errors
-    /// `Busy` while a desktop runs on the card, `Disconnected` without card or display, `Unsupported` if the output cannot
-    /// have that timing.
+    /// `Busy` while a desktop runs on the card, `Disconnected` without card or display, `Unsupported` if the
+    /// output does not support the timing.
     pub fn open(config: &DrmConfig) -> Result<Self, DeviceError> {
         let screen = Screen::open(config).map_err(screen::Error::into_device_error)?;
         let settle_ns = (f64::from(config.settle_frames) * config.timing.period_us() * 1e3).ceil() as i64;
@@ -56,7 +58,7 @@ impl Projector for DrmProjector {
             .map_err(|error: PictureError| DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, error))?;
         let asked_ns = self.clock.now_ns();
         let flipped_ns = self.screen.flip(&picture).map_err(screen::Error::into_device_error)?;
-        // Cards without vertical blanking stamp as they like.
+        // Cards without vertical blanking report arbitrary timestamps.
         Ok(Shown { not_before_ns: flipped_ns.max(asked_ns) + self.settle_ns })
     }
 
@@ -67,7 +69,7 @@ impl Projector for DrmProjector {
 
 impl Drop for DrmProjector {
     fn drop(&mut self) {
-        // The card may be gone, and with it the light.
+        // The card may be gone, and the light with it.
         let _ = self.blank();
     }
 }

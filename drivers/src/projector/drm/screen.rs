@@ -1,4 +1,4 @@
-//! An output with two buffers.
+//! A display output with two buffers.
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -16,10 +16,10 @@ use raysweep_core::{DeviceError, DeviceErrorKind};
 
 use super::{DEVICE, DrmConfig, Timing};
 
-/// A flip is done within two video frames; an output that takes this long is stuck.
+/// A flip takes at most two video frames; an output that takes this long is stuck.
 const FLIP_LIMIT: Duration = Duration::from_secs(1);
 
-/// What went wrong on the way to the screen.
+/// Errors of the display output.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     #[error("{}: cannot {call}: {source}", card.display())]
@@ -39,7 +39,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// With the kind that a caller can act on.
+    /// Converts to a device error of a kind that a caller can act on.
     pub fn into_device_error(self) -> DeviceError {
         let kind = match &self {
             Self::System { source, .. } => match source.kind() {
@@ -56,7 +56,7 @@ impl Error {
     }
 }
 
-/// The card; the crate's traits do the rest.
+/// The card; the traits of the crate `drm` provide the functions.
 struct Card {
     path: PathBuf,
     file: File,
@@ -92,7 +92,7 @@ impl Card {
         move |source| Error::System { card, call, source }
     }
 
-    /// The output that is named, or the first with a display.
+    /// The named output, or the first with a display.
     fn connector(&self, name: Option<&str>) -> Result<connector::Info, Error> {
         let handles = self.resource_handles().map_err(self.failed("list its outputs"))?;
         let outputs = handles.connectors().iter().map(|&handle| self.get_connector(handle, true));
@@ -111,7 +111,7 @@ impl Card {
         })
     }
 
-    /// A part of the card that can drive an output.
+    /// Finds a CRTC of the card that can drive this output.
     fn crtc(&self, output: &connector::Info) -> Result<crtc::Handle, Error> {
         let handles = self.resource_handles().map_err(self.failed("list its outputs"))?;
         let encoders = output.encoders().iter().filter_map(|&encoder| self.get_encoder(encoder).ok());
@@ -119,7 +119,7 @@ impl Card {
         crtcs.next().ok_or_else(|| Error::NoCrtc { card: self.path.clone(), connector: output.to_string() })
     }
 
-    /// A code is to be the level: tables that desktops leave behind are replaced.
+    /// Makes codes proportional to light levels: replaces gamma tables left by desktops.
     fn set_linear_gamma(&self, crtc: crtc::Handle) -> Result<(), Error> {
         let entries = self.get_crtc(crtc).map_err(self.failed("look at its gamma table"))?.gamma_length();
         if entries < 2 {
@@ -144,7 +144,7 @@ struct Buffer {
     shown: framebuffer::Handle,
 }
 
-/// An output of a card, driven with a forced timing. The kernel frees all of it when the card is closed.
+/// An output of a card, driven with a forced timing. The kernel releases everything when the card is closed.
 pub struct Screen {
     card: Card,
     crtc: crtc::Handle,
@@ -154,13 +154,13 @@ pub struct Screen {
 }
 
 impl Screen {
-    /// Takes the output and shows black.
+    /// Takes control of the output and shows black.
     pub fn open(config: &DrmConfig) -> Result<Self, Error> {
         let card = Card::open(&config.card)?;
         let output = card.connector(config.connector.as_deref())?;
         let crtc = card.crtc(&output)?;
         let mode = config.timing.mode();
-        // Fresh buffers are zero, which is black.
+        // New buffers are zero, which is black.
         let (front, back) = (card.new_buffer(mode.size())?, card.new_buffer(mode.size())?);
         card.set_crtc(crtc, Some(front.shown), (0, 0), &[output.handle()], Some(mode)).map_err(|source| {
             let (card, connector) = (card.path.clone(), output.to_string());
@@ -171,12 +171,12 @@ impl Screen {
         Ok(Self { card, crtc, size: (columns.into(), rows.into()), front, back })
     }
 
-    /// Columns and rows.
+    /// Number of columns and rows.
     pub fn size(&self) -> (usize, usize) {
         self.size
     }
 
-    /// Shows a picture, a pixel for each of [`Screen::size`] row by row; returns when the flip was, on the kernel's
+    /// Shows a picture of [`Screen::size`], row by row; returns the time of the flip on the kernel's
     /// monotonic clock.
     pub fn flip(&mut self, picture: &[[u8; 3]]) -> Result<i64, Error> {
         let pitch = self.back.memory.pitch() as usize;

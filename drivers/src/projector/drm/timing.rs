@@ -3,14 +3,14 @@
 use drm::control::Mode;
 use drm_ffi::{drm_mode_modeinfo, drm_sys};
 
-/// A video timing, as an X11 modeline gives it.
+/// A video timing, as in an X11 modeline.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timing {
-    /// Pixels, those of the blanking included, in a millisecond.
+    /// Pixels per millisecond, including blanking.
     pub pixel_clock_khz: u32,
-    /// Columns: visible, start of the sync pulse, its end, all.
+    /// Columns: visible, start of the sync pulse, end of the sync pulse, total.
     pub columns: [u16; 4],
-    /// Rows: visible, start of the sync pulse, its end, all.
+    /// Rows: visible, start of the sync pulse, end of the sync pulse, total.
     pub rows: [u16; 4],
     /// Whether the horizontal and the vertical sync pulse are positive.
     pub positive_sync: [bool; 2],
@@ -25,12 +25,12 @@ impl Timing {
         positive_sync: [true, true],
     };
 
-    /// From one VSYNC to the next.
+    /// Time from one VSYNC to the next, in us.
     pub fn period_us(&self) -> f64 {
         f64::from(self.columns[3]) * f64::from(self.rows[3]) / f64::from(self.pixel_clock_khz) * 1e3
     }
 
-    /// As the kernel wants it.
+    /// The timing as a kernel mode.
     pub(super) fn mode(&self) -> Mode {
         let ([hdisplay, hsync_start, hsync_end, htotal], [vdisplay, vsync_start, vsync_end, vtotal]) =
             (self.columns, self.rows);

@@ -1,34 +1,35 @@
-//! When a sample was taken, on the host's clock.
+//! Converts sample times to the host's clock.
 //!
-//! The analyser cannot be asked for its time; samples come in transfers, and a transfer is complete a little after its last sample
-//! was taken: by the bus's own latency at best, by much more where the host was busy. So of each quarter of a second the transfer
-//! that was least late counts, as a round trip that ends where its last sample was taken. Where the host was busy all that time, the
-//! other quarters show by how much even that one was late: so much longer is its round trip, and so much less it says.
+//! The analyser cannot be asked for its time. Samples arrive in transfers, and a transfer completes after its last
+//! sample: by at least the bus's latency, and by much more if the host was busy. So the least late transfer of each
+//! quarter of a second is used, as a round trip that ends when its last sample was taken. If the host was busy for
+//! that whole time, the other quarters show how late even this transfer was: its round trip is lengthened by that
+//! time, and so its weight in the fit is reduced.
 
 use std::collections::VecDeque;
 
 use raysweep_core::{ClockModel, ClockQuality, RoundTrip};
 
-/// Over which time the least late transfer is sought: for the first few times, and from then on.
+/// Window in which the least late transfer is sought: for the first few windows, and from then on.
 const WINDOW_NS: [i64; 2] = [50_000_000, 250_000_000];
 const SHORT_WINDOWS: usize = 8;
-/// How far the least late transfer of a window may be from the bus's latency [A].
+/// Maximum deviation of a window's least late transfer from the bus's latency [A].
 const UNCERTAINTY_NS: i64 = 5_000;
-/// Windows of the fit.
+/// Windows in the fit.
 const WINDOWS: usize = 100;
-/// How far two crystals may drift apart [A].
+/// Maximum relative drift of two crystals [A].
 const MOST_DRIFT: f64 = 100e-6;
 
-/// The relation of samples to the host's clock.
+/// Conversion from samples to the host's clock.
 pub struct SampleClock {
     latency_ns: i64,
-    /// The least late transfers of the newest windows.
+    /// The least late transfers of the latest windows.
     best: VecDeque<Arrival>,
     model: ClockModel,
     window: Option<Window>,
 }
 
-/// Until when the device had sampled, and when the host had that, less the bus's latency.
+/// The device time of a transfer's last sample, and the host time of its arrival less the bus's latency.
 #[derive(Clone, Copy)]
 struct Arrival {
     device_ns: i64,
@@ -36,7 +37,7 @@ struct Arrival {
 }
 
 impl Arrival {
-    /// By how much it was later than another one at least, however the clocks drift.
+    /// Minimum lateness relative to another arrival, for any allowed drift of the clocks.
     fn later_than_ns(&self, other: &Self) -> i64 {
         let apart_ns = self.device_ns - other.device_ns;
         let drift_ns = (apart_ns.abs() as f64 * MOST_DRIFT) as i64;
@@ -46,18 +47,18 @@ impl Arrival {
 
 struct Window {
     began_ns: i64,
-    /// Device's and host's time of the least late transfer.
+    /// Device time and host time of the least late transfer.
     best: (i64, i64),
 }
 
 impl SampleClock {
-    /// A clock whose transfers arrive `latency_ns` after their last sample when nothing delays them.
+    /// A clock whose transfers arrive `latency_ns` after their last sample if nothing delays them.
     pub fn new(latency_ns: i64) -> Self {
         let (best, model) = (VecDeque::with_capacity(WINDOWS), ClockModel::new(WINDOWS));
         Self { latency_ns, best, model, window: None }
     }
 
-    /// Notes that the samples up to `device_ns` had arrived at `host_ns`.
+    /// Records that the samples up to `device_ns` had arrived at `host_ns`.
     pub fn arrived(&mut self, device_ns: i64, host_ns: i64) {
         let lateness = |(device_ns, host_ns): (i64, i64)| {
             host_ns.saturating_sub(self.model.host_ns(device_ns).unwrap_or(device_ns))
@@ -78,7 +79,7 @@ impl SampleClock {
         }
     }
 
-    /// How late each window's best was shows by all of them, so each new one makes the fit anew.
+    /// The lateness of each window's best transfer depends on all others, so each new window repeats the whole fit.
     fn fit(&mut self) {
         self.model.clear();
         for arrival in &self.best {
@@ -90,12 +91,12 @@ impl SampleClock {
         }
     }
 
-    /// The host's time at a moment of the analyser's clock; nothing before the first window.
+    /// The host time of a time on the analyser's clock; `None` before the end of the first window.
     pub fn host_ns(&self, device_ns: i64) -> Option<i64> {
         self.model.host_ns(device_ns)
     }
 
-    /// How well the clock is known.
+    /// Quality of the fit.
     pub fn quality(&self) -> Option<ClockQuality> {
         self.model.quality()
     }
@@ -107,7 +108,7 @@ mod tests {
 
     #[test]
     fn a_busy_host_moves_no_stamp() {
-        // 30 ppm fast, transfers every 4 ms, 100 us late at best and in most cases later, some by 20 ms.
+        // 30 ppm fast, transfers every 4 ms, at least 100 us late and mostly later, some by 20 ms.
         let mut clock = SampleClock::new(100_000);
         let mut state = 1_u64;
         let truth_ns = |device_ns: i64| 7_000_000_000_000 + (device_ns as f64 * (1.0 + 30e-6)) as i64;
@@ -131,7 +132,7 @@ mod tests {
         assert!((quality.rate_ppm - 30.0).abs() < 0.5 && quality.residual_us < 2.0, "{quality:?}");
     }
 
-    /// As when a run begins and opens its devices: for whole windows no transfer is on time.
+    /// As when a run begins and opens its devices: no transfer is on time for whole windows.
     #[test]
     fn a_host_that_was_busy_for_a_second_knows_the_time_two_seconds_later() {
         let mut clock = SampleClock::new(100_000);

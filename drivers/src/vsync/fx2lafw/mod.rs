@@ -1,7 +1,8 @@
-//! VSYNC on an input of a logic analyser with sigrok's firmware fx2lafw: the line is sampled, by 1 MHz unless the rig says
-//! otherwise, and so are other signals beside it (the camera's exposure, a mirror's sync), all on the analyser's one clock.
+//! VSYNC on an input of a logic analyser with sigrok's firmware fx2lafw. The analyser samples the line, at 1 MHz
+//! unless the rig file says otherwise, together with other signals (the camera's exposure, a mirror's sync), all on
+//! its own clock.
 //!
-//! An analyser whose host does not keep up stops by itself: no sample is ever lost within a stream that goes on.
+//! If the host does not keep up, the analyser stops: samples are never lost within a running stream.
 
 mod clock;
 pub mod protocol;
@@ -22,24 +23,24 @@ pub use usb::Usb;
 
 /// The channel that carries the VSYNC.
 pub const VSYNC: &str = "vsync";
-/// Without a sample for so long the analyser has stopped.
+/// After this long without a sample, the analyser has stopped.
 const STALL: Duration = Duration::from_millis(1000);
 
 /// `[vsync.fx2lafw]`
 #[derive(Debug, Clone, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Fx2LafwConfig {
-    /// Firmware to load into an analyser that has none, as sigrok's packages install it.
+    /// Firmware for analysers without one, as installed by sigrok's packages.
     pub firmware: Option<PathBuf>,
-    /// Samples a second: 48 or 30 MHz over a whole number.
+    /// Samples per second: 48 or 30 MHz divided by an integer.
     pub sample_rate_hz: u32,
-    /// Inputs, 0 to 7, by the names of their signals; `vsync` is one of them.
+    /// Inputs, 0 to 7, by signal name; `vsync` is one of them.
     pub channels: BTreeMap<String, u8>,
-    /// Which change of the VSYNC is its edge.
+    /// The change of the VSYNC signal that is its edge.
     pub edge: Slope,
-    /// A signal must have been quiet for so long before a change counts: lines ring.
+    /// A change counts only after the signal was quiet for this long, because lines ring.
     pub quiet_us: f64,
-    /// From a sample to its transfer's arrival when nothing delays it.
+    /// From a sample to its transfer's arrival if nothing delays it.
     pub latency_us: f64,
 }
 
@@ -67,10 +68,10 @@ pub enum Slope {
 }
 
 impl Fx2LafwConfig {
-    /// Whether the values can be; else the key and what is wrong.
+    /// Checks the values.
     ///
     /// # Errors
-    /// Key, value and what is allowed.
+    /// The key, and its value with what is allowed.
     pub fn check(&self) -> Result<SampleRate, (&'static str, String)> {
         let Self { sample_rate_hz, channels, quiet_us, latency_us, .. } = self;
         let Some(rate) = SampleRate::from_hz(*sample_rate_hz) else {
@@ -98,30 +99,31 @@ impl Fx2LafwConfig {
     }
 }
 
-/// The way to an analyser that samples.
+/// The connection to a sampling analyser.
 pub trait Link: Send {
-    /// Hands the next samples, with when they had arrived on the host's clock, to `take`; nothing if none came within
-    /// `timeout`.
+    /// Passes the next samples to `take`, with their arrival time on the host's clock. Does nothing if none arrived
+    /// within `timeout`.
     ///
     /// # Errors
-    /// `Disconnected` when the analyser is gone.
+    /// `Disconnected` if the analyser is gone.
     fn receive(&mut self, timeout: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError>;
 }
 
 /// A change of one of the analyser's signals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Change {
-    /// Which, in the alphabetical order of names.
+    /// Index of the signal, in alphabetical order of names.
     pub channel: usize,
     /// Its direction.
     pub slope: Slope,
-    /// Changes of this signal in this direction so far, this one with them.
+    /// Number of this change among the signal's changes in this direction, counted from 1.
     pub seq: u64,
-    /// When it was.
+    /// Time of the change.
     pub host_ns: i64,
 }
 
-/// Changes that wait for the reader. More in one transfer are lost, and their numbers show it.
+/// Maximum number of changes that wait for the reader. Any more in one transfer are lost, which shows in their
+/// numbers.
 const QUEUE: usize = 4096;
 
 /// A logic analyser that watches the VSYNC line.
@@ -133,7 +135,7 @@ pub struct Fx2Lafw<L> {
     edge: Slope,
 }
 
-/// What is made of the samples.
+/// Processing of the samples.
 struct Signals {
     rate: SampleRate,
     scanner: Scanner,
@@ -145,18 +147,18 @@ struct Signals {
 
 struct Channel {
     bit: u8,
-    /// When it changed last, whether that counted or not, on the analyser's clock.
+    /// Its last change, whether it counted or not, on the analyser's clock.
     changed_ns: i64,
-    /// Rising and falling changes that counted.
+    /// Number of rising and falling changes that counted.
     counts: [u64; 2],
 }
 
 impl Fx2Lafw<Usb> {
-    /// Opens the analyser, loads its firmware if it has none, and begins to sample. Edges are numbered from 1 on.
+    /// Opens the analyser, loads its firmware if it has none, and starts sampling. Edges are numbered from 1.
     ///
     /// # Errors
-    /// `Disconnected` if there is none, `NotReady` if it needs a firmware that the rig does not name, `Unsupported` if it is
-    /// another device, `OutOfRange` for a configuration that cannot be.
+    /// `Disconnected` if there is none, `NotReady` if it needs a firmware that the rig file does not name,
+    /// `Unsupported` for another device, `OutOfRange` for an invalid configuration.
     pub fn open(config: &Fx2LafwConfig) -> Result<Self, DeviceError> {
         let rate = checked(config)?;
         Self::new(Usb::open(config.firmware.as_deref(), rate)?, config)
@@ -168,14 +170,14 @@ fn checked(config: &Fx2LafwConfig) -> Result<SampleRate, DeviceError> {
 }
 
 impl<L: Link> Fx2Lafw<L> {
-    /// An analyser that has begun to sample as `config` says.
+    /// Uses an analyser that samples according to `config`.
     ///
     /// # Errors
-    /// `OutOfRange` for a configuration that cannot be.
+    /// `OutOfRange` for an invalid configuration.
     pub fn new(link: L, config: &Fx2LafwConfig) -> Result<Self, DeviceError> {
         let rate = checked(config)?;
         let quiet_ns = ns_from_us(config.quiet_us);
-        // Before the first sample nothing is known; it counts as quiet.
+        // The state before the first sample is unknown; it counts as quiet.
         let channel = |&input| Channel { bit: 1_u8 << input, changed_ns: -quiet_ns, counts: [0; 2] };
         let channels: Vec<Channel> = config.channels.values().map(channel).collect();
         Ok(Self {
@@ -199,10 +201,10 @@ impl<L: Link> Fx2Lafw<L> {
         &self.names
     }
 
-    /// The next change of any signal; `None` when none came within `timeout`.
+    /// The next change of any signal; `None` if there was none within `timeout`.
     ///
     /// # Errors
-    /// `Disconnected` when the analyser is gone, `Timeout` when it has stopped.
+    /// `Disconnected` if the analyser is gone, `Timeout` if it has stopped.
     pub fn next_change(&mut self, timeout: Duration) -> Result<Option<Change>, DeviceError> {
         let deadline = Instant::now() + timeout;
         loop {
@@ -238,7 +240,7 @@ impl Signals {
                 }
                 let slope = if levels & channel.bit != 0 { Slope::Rising } else { Slope::Falling };
                 channel.counts[slope as usize] += 1;
-                // Before the clock is known a change has no time: it is numbered, and lost.
+                // Before the clock is known, a change has no time: it is numbered but dropped.
                 if let Some(host_ns) = clock.host_ns(device_ns)
                     && changes.len() < QUEUE
                 {

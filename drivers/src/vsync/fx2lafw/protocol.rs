@@ -1,27 +1,27 @@
-//! The analyser's words (sigrok's firmware fx2lafw 1.x): requests of the vendor on endpoint 0, samples on bulk endpoint 0x82,
-//! one byte a sample, bit k for input k.
+//! The analyser's protocol (sigrok's firmware fx2lafw 1.x): vendor requests on endpoint 0, samples on bulk endpoint
+//! 0x82, one byte per sample, bit k for input k.
 
-/// Asks for the firmware's version: two bytes, major and minor.
+/// Requests the firmware version: two bytes, major and minor.
 pub const VERSION: u8 = 0xB0;
-/// Starts to sample; the data are [`SampleRate::start_command`].
+/// Starts sampling; the data are [`SampleRate::start_command`].
 pub const START: u8 = 0xB1;
-/// Where samples come from.
+/// Endpoint of the samples.
 pub const SAMPLES: u8 = 0x82;
-/// Writes (in the chip's own loader) to the address in `wValue`.
+/// Writes to the address in `wValue` (request of the chip's own loader).
 pub const WRITE_RAM: u8 = 0xA0;
 /// The register that holds the chip's processor in reset.
 pub const CPUCS: u16 = 0xE600;
-/// The version that is spoken.
+/// The supported major version.
 pub const MAJOR: u8 = 1;
-/// Most bytes in one write to the chip's memory.
+/// Maximum bytes per write to the chip's memory.
 pub const WRITE_BYTES: usize = 4096;
-/// Largest firmware: the chip's program memory.
+/// Maximum size of a firmware: the chip's program memory.
 pub const FIRMWARE_BYTES: usize = 16 * 1024;
 
-/// Largest delay between samples, in clocks.
+/// Maximum delay between samples, in clock periods.
 const MAX_DELAY: u32 = 6 * 256;
 
-/// How fast the analyser samples: one of its two clocks, divided.
+/// A sample rate: one of the analyser's two clocks, divided.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SampleRate {
     hz: u32,
@@ -30,7 +30,7 @@ pub struct SampleRate {
 }
 
 impl SampleRate {
-    /// The rate, if the analyser can have exactly that one: 48 or 30 MHz over a whole number, up to 24 MHz.
+    /// The rate, if the analyser supports it exactly: 48 or 30 MHz divided by an integer, up to 24 MHz.
     pub fn from_hz(hz: u32) -> Option<Self> {
         let clocks = [(48_000_000, 0x40), (30_000_000, 0)];
         clocks.into_iter().find_map(|(clock_hz, flags): (u32, u8)| {
@@ -40,17 +40,17 @@ impl SampleRate {
         })
     }
 
-    /// Samples a second.
+    /// Samples per second.
     pub fn hz(self) -> u32 {
         self.hz
     }
 
-    /// Nanoseconds, on the analyser's clock, from the first sample to the one with this number.
+    /// Time in ns, on the analyser's clock, from the first sample to the sample with this number.
     pub fn device_ns(self, sample: u64) -> i64 {
         (i128::from(sample) * 1_000_000_000 / i128::from(self.hz)) as i64
     }
 
-    /// The data of [`START`]: flags, and the delay with its high byte first.
+    /// The data of [`START`]: flags, and the delay, high byte first.
     pub fn start_command(self) -> [u8; 3] {
         let [high, low] = self.delay.to_be_bytes();
         [self.flags, high, low]

@@ -1,30 +1,31 @@
-//! Edges in a stream of samples.
+//! Finds edges in a stream of samples.
 
-/// Samples looked at together: the compiler makes a few vector instructions of each chunk.
+/// Samples processed together: the compiler turns each chunk into a few vector instructions.
 const CHUNK: usize = 64;
 
-/// Finds where inputs change. Keeps the last sample, so that blocks join without a seam.
+/// Finds changes of inputs. Keeps the last sample, so that changes between blocks are found.
 #[derive(Debug, Clone)]
 pub struct Scanner {
     mask: u8,
-    /// The last sample; none before the first, which is no change whatever it is.
+    /// The last sample; `None` before the first, which is never a change.
     last: Option<u8>,
-    /// Samples so far.
+    /// Number of samples so far.
     samples: u64,
 }
 
 impl Scanner {
-    /// Looks at the inputs of `mask`.
+    /// Watches the inputs in `mask`.
     pub fn new(mask: u8) -> Self {
         Self { mask, last: None, samples: 0 }
     }
 
-    /// Samples so far.
+    /// Number of samples so far.
     pub fn samples(&self) -> u64 {
         self.samples
     }
 
-    /// Takes a block; `change` is told the sample's number from the start, the levels from it on, and which inputs changed.
+    /// Scans a block and calls `change` with the sample's number from the start, the new levels, and the changed
+    /// inputs.
     pub fn scan(&mut self, block: &[u8], mut change: impl FnMut(u64, u8, u8)) {
         let Some(&first) = block.first() else { return };
         let mut last = self.last.unwrap_or(first);

@@ -1,4 +1,4 @@
-//! The analyser on the bus.
+//! The analyser on the USB.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -13,18 +13,18 @@ use super::protocol::{
 };
 use crate::vsync::DEVICE;
 
-/// Vendor and product of analysers with the firmware.
+/// Vendor and product ids of analysers with the firmware.
 const READY: (u16, u16) = (0x1D50, 0x608C);
-/// Those of the chip and of clones without it.
+/// Vendor and product ids of the chip and of clones without the firmware.
 const BLANK: [(u16, u16); 3] = [(0x0925, 0x3881), (0x04B4, 0x8613), (0x08A9, 0x0014)];
-/// How long an analyser may take to come back with its firmware.
+/// Maximum time for an analyser to reappear with its firmware.
 const RENUMERATION: Duration = Duration::from_secs(3);
 const CONTROL: Duration = Duration::from_millis(500);
-/// What one transfer holds, and how many are under way: an eighth of a second that the host may sleep.
+/// Duration of one transfer, and number of pending transfers: together the host may sleep for an eighth of a second.
 const TRANSFER_MS: u32 = 4;
 const TRANSFERS: usize = 32;
 
-/// Why an analyser cannot be used, or no longer.
+/// Why an analyser cannot be used, or cannot be used any longer.
 #[derive(Debug, thiserror::Error)]
 enum UsbError {
     #[error("no fx2lafw analyser on the bus: plug it in")]
@@ -72,11 +72,11 @@ impl From<UsbError> for DeviceError {
     }
 }
 
-/// An analyser that samples, with its transfers under way.
+/// A sampling analyser with its pending transfers.
 pub struct Usb {
     endpoint: Endpoint<Bulk, In>,
     clock: Clock,
-    /// Held for as long as the endpoint is.
+    /// Keeps the interface claimed for as long as the endpoint exists.
     _interface: Interface,
 }
 
@@ -104,11 +104,11 @@ impl Usb {
         let mut endpoint = interface
             .endpoint::<Bulk, In>(SAMPLES)
             .map_err(|source| UsbError::System { call: "samples", source })?;
-        // An endpoint that halted stays so also for whoever opens it next, unless it is told.
+        // A halted endpoint stays halted for the next process that opens it, unless cleared.
         endpoint.clear_halt().wait().map_err(|source| UsbError::System { call: "clear", source })?;
         let packet = endpoint.max_packet_size().max(1);
         let bytes = (rate.hz() as usize * TRANSFER_MS as usize / 1000).next_multiple_of(packet);
-        // Under way before the first sample is taken: the analyser stops at once where nobody takes it.
+        // Submitted before the first sample is taken: the analyser stops at once if nobody receives its samples.
         for _ in 0..TRANSFERS {
             let buffer = endpoint.allocate(bytes);
             endpoint.submit(buffer);
@@ -135,7 +135,7 @@ fn transfer(call: &'static str) -> impl Fn(TransferError) -> UsbError {
     move |source| UsbError::Transfer { call, source }
 }
 
-/// The one device on the bus that is one of these.
+/// Finds the only device on the bus with one of these ids.
 fn find(identities: &[(u16, u16)]) -> Result<Option<nusb::DeviceInfo>, UsbError> {
     let devices = nusb::list_devices().wait().map_err(|source| UsbError::System { call: "list", source })?;
     let mut found: Vec<_> =
@@ -164,7 +164,7 @@ fn write(interface: &Interface, request: u8, value: u16, data: &[u8]) -> Result<
     interface.control_out(out, CONTROL).wait().map_err(transfer("control"))
 }
 
-/// Loads the firmware and waits for the analyser that it makes.
+/// Loads the firmware and waits for the analyser to reappear.
 fn load(blank: nusb::DeviceInfo, firmware: Option<&Path>) -> Result<nusb::DeviceInfo, UsbError> {
     let path = firmware.ok_or(UsbError::NoFirmware)?;
     let refused = |what: String| UsbError::Firmware { path: path.display().to_string(), what };
@@ -177,7 +177,7 @@ fn load(blank: nusb::DeviceInfo, firmware: Option<&Path>) -> Result<nusb::Device
     for (part, address) in image.chunks(WRITE_BYTES).zip((0..).step_by(WRITE_BYTES)) {
         write(&interface, WRITE_RAM, address, part)?;
     }
-    // The chip starts the firmware and leaves the bus, at times before it has answered.
+    // The chip starts the firmware and leaves the bus, sometimes before it has answered.
     if let Err(error) = write(&interface, WRITE_RAM, CPUCS, &[0]) {
         tracing::debug!(%error, "the analyser left the bus to start its firmware");
     }

@@ -1,8 +1,9 @@
-//! A box that makes the VSYNC: strawlab's triggerbox, an Arduino whose timer pulses at the rig's period.
+//! A box that generates the VSYNC: strawlab's triggerbox, an Arduino whose timer pulses with the rig's period.
 //!
-//! The box tells nothing of its pulses by itself. The host asks it for its time, fits a line to the answers
-//! ([`ClockModel`]), and knows from that line when each pulse began. On a UART the bytes of question and answer take known times, of
-//! which the box reads its clock between the two; without them the line would be off by a third of a millisecond.
+//! The box does not report its pulses by itself. The host requests the box's time, fits a line to the replies
+//! ([`ClockModel`]), and computes from that line when each pulse began. On a UART, the bytes of request and reply
+//! take known times, and the box reads its clock between the two; without this correction the line would be off by a
+//! third of a millisecond.
 
 pub mod protocol;
 
@@ -18,22 +19,23 @@ use super::DEVICE;
 use crate::mirror::port::Port;
 
 const BAUD: u32 = 115_200;
-/// Opening the port resets an Arduino, whose loader and handshake then take up to 7 s.
+/// Opening the port resets an Arduino; its bootloader and handshake then take up to 7 s.
 const HELLO_PATIENCE: Duration = Duration::from_secs(10);
 const HELLO_EVERY: Duration = Duration::from_millis(500);
-/// Round trips of the fit.
+/// Round trips in the fit.
 const ROUND_TRIPS: usize = 100;
-/// From so many on the fit is used.
+/// Minimum number of round trips before the fit is used.
 const MIN_ROUND_TRIPS: usize = 8;
-/// Until there are `MIN_ROUND_TRIPS`, and from then on: no multiple of a usual period, so that answers come at all of its phases.
+/// Request interval before and after `MIN_ROUND_TRIPS`: no multiple of a usual period, so that replies cover all its
+/// phases.
 const ASK_EVERY: [Duration; 2] = [Duration::from_millis(13), Duration::from_millis(97)];
-/// An answer that has not come by then is not waited for.
+/// Maximum wait for a reply.
 const ANSWER_WAIT: Duration = Duration::from_millis(200);
-/// Without a good answer for so long, nothing is known of the box's pulses any more.
+/// After this long without a good reply, the times of the box's pulses are unknown.
 const SILENCE: Duration = Duration::from_secs(3);
-/// An answer further from the line than this, and than its own round trip allows, is no time of this clock.
+/// A reply further from the line than this, beyond what its own round trip allows, is an outlier.
 const STRAY_NS: i64 = 1_000_000;
-/// So many of them in a row mean that the clock is another one: the box was reset.
+/// This many outliers in a row mean that the clock has changed: the box was reset.
 const STRAYS: u32 = 5;
 
 /// `[vsync.triggerbox]`
@@ -42,33 +44,33 @@ const STRAYS: u32 = 5;
 pub struct TriggerBoxConfig {
     /// Its serial port.
     pub port: PathBuf,
-    /// What lies between the port and the box.
+    /// The connection between the port and the box.
     #[serde(default)]
     pub link: Link,
 }
 
-/// How bytes get to the box.
+/// How the box is connected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Link {
     /// A UART (Arduino Uno and Nano): each byte takes 87 us.
     #[default]
     Uart,
-    /// The box's own USB (Raspberry Pi Pico): bytes take no time.
+    /// The box's own USB (Raspberry Pi Pico): transmission takes no time.
     Usb,
 }
 
 impl Link {
     fn bytes_ns(self, bytes: usize) -> i64 {
         match self {
-            // Ten bits a byte.
+            // Ten bits per byte.
             Self::Uart => bytes as i64 * 10 * 1_000_000_000 / i64::from(BAUD),
             Self::Usb => 0,
         }
     }
 }
 
-/// Why a box cannot be used, or no longer.
+/// Why a box cannot be used, or cannot be used any longer.
 #[derive(Debug, thiserror::Error)]
 enum TriggerBoxError {
     #[error("vsync.period_us = {0}: a triggerbox makes 2000 to 262144; choose another period or driver")]
@@ -95,7 +97,7 @@ pub struct TriggerBox {
 }
 
 enum Stage {
-    /// It has not said its version yet.
+    /// The box has not reported its version yet.
     Greeting {
         asked: Option<Instant>,
     },
@@ -106,23 +108,23 @@ struct Running {
     model: ClockModel,
     trips: usize,
     number: u8,
-    /// The question under way: when it was asked.
+    /// When the pending request was sent, if there is one.
     asked_ns: Option<i64>,
     next_question: Instant,
     last_good: Instant,
     strays: u32,
-    /// Of the last answer.
+    /// Pulse count of the last reply.
     pulses: i64,
-    /// The last pulse that was told, or that began before the fit could tell when.
+    /// The last pulse that was reported, or that began before the fit was usable.
     told: i64,
 }
 
 impl TriggerBox {
-    /// Opens the box and lets it pulse with the nearest period that it can. Edges have the numbers of its pulses.
+    /// Opens the box and starts pulses with the nearest possible period. Edges have the numbers of the box's pulses.
     ///
     /// # Errors
-    /// `Disconnected` or `Busy` if the port cannot be had, `Timeout` if no box answers, `Unsupported` if its firmware is
-    /// another one, `OutOfRange` for a period that it cannot make.
+    /// `Disconnected` or `Busy` if the port cannot be opened, `Timeout` if no box answers, `Unsupported` for another
+    /// firmware, `OutOfRange` for an impossible period.
     pub fn open(config: TriggerBoxConfig, period_us: f64) -> Result<Self, DeviceError> {
         let mut device = Self::connect(config, period_us)?;
         let deadline = Instant::now() + HELLO_PATIENCE;
@@ -138,10 +140,11 @@ impl TriggerBox {
         Ok(device)
     }
 
-    /// Opens the port and leaves the greeting to [`Vsync::next_edge`]: a box that comes back takes its time.
+    /// Opens the port and leaves the handshake to [`Vsync::next_edge`]: a box that was plugged in again takes its
+    /// time.
     ///
     /// # Errors
-    /// As [`Self::open`], but for a box that does not answer.
+    /// As [`Self::open`], except for a box that does not answer.
     pub fn connect(config: TriggerBoxConfig, period_us: f64) -> Result<Self, DeviceError> {
         let Some(timer) = Timer::with_period_us(period_us) else {
             let error = TriggerBoxError::Period(period_us);
@@ -155,7 +158,7 @@ impl TriggerBox {
         DeviceError::new(DEVICE, kind, what(self.config.port.display().to_string()))
     }
 
-    /// Asks for the version until it comes, for `timeout` at the most, and then sets the timer going.
+    /// Requests the version and waits for it for up to `timeout`, then starts the timer.
     fn greet(&mut self, timeout: Duration) -> Result<(), DeviceError> {
         let Stage::Greeting { asked } = &mut self.stage else { return Ok(()) };
         if asked.is_none_or(|asked| asked.elapsed() >= HELLO_EVERY) {
@@ -182,7 +185,7 @@ impl TriggerBox {
         }
     }
 
-    /// Takes what answers there are, waits for them until `until_ns`, and asks again when it is time.
+    /// Processes replies, waiting for them until `until_ns`, and sends the next request when it is due.
     fn converse(&mut self, until_ns: i64) -> Result<(), DeviceError> {
         let Stage::Running(running) = &mut self.stage else { return Ok(()) };
         let now_ns = self.clock.now_ns();
@@ -244,12 +247,12 @@ impl Running {
         }
     }
 
-    /// Takes an answer into the fit, if it says what time it was for certain.
+    /// Adds a reply to the fit if its time is unambiguous.
     fn take(&mut self, timer: Timer, pulses: u32, ticks: u16, (request_ns, receive_ns): (i64, i64)) {
         if !timer.is_counted(ticks) || receive_ns < request_ns {
             return;
         }
-        // Pulses are counted with 32 bits.
+        // The box counts pulses with 32 bits.
         let since = pulses.wrapping_sub(self.pulses as u32).cast_signed();
         let pulses = self.pulses + i64::from(since);
         let trip = RoundTrip { request_ns, device_ns: timer.device_ns(pulses, ticks), receive_ns };
@@ -268,7 +271,7 @@ impl Running {
         self.last_good = Instant::now();
     }
 
-    /// The next pulse to be told and when it began, or will begin.
+    /// The next pulse to report and when it began, or will begin.
     fn next_edge(&self, timer: Timer) -> Option<Edge> {
         if self.trips < MIN_ROUND_TRIPS {
             return None;

@@ -1,37 +1,37 @@
-//! The box's words (firmware 14 of github.com/strawlab/triggerbox), 115200 8N1.
+//! The box's protocol (firmware 14 of github.com/strawlab/triggerbox), 115200 8N1.
 //!
-//! The host says `V?`, `P` and a number, `S0`, `S1`, or `T=` with TOP as a little-endian word and the prescaler's key. The box
-//! answers `V` and `P` with that letter, the payload's length 7, the payload (version or the question's number, pulses as a
-//! little-endian u32, timer as a little-endian u16) and the sum of the payload's bytes.
+//! The host sends `V?`, `P` and a number, `S0`, `S1`, or `T=` with TOP as a little-endian word and the prescaler's
+//! key. The box answers `V` and `P` with that letter, the payload's length 7, the payload (version or the request's
+//! number, pulses as a little-endian u32, timer as a little-endian u16) and the sum of the payload's bytes.
 
 use crate::mirror::wire::Parsed;
 
-/// The version of the firmware that is spoken to.
+/// The supported firmware version.
 pub const VERSION: u8 = 14;
-/// Bytes of a question for the time.
+/// Bytes of a time request.
 pub const QUESTION_BYTES: usize = 2;
-/// Bytes of an answer.
+/// Bytes of a reply.
 pub const REPLY_BYTES: usize = 10;
 
 const PAYLOAD_BYTES: u8 = 7;
 
-/// What the host says.
+/// A command from the host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
-    /// Which firmware?
+    /// Requests the firmware version.
     Version,
-    /// What time is it? The number comes back with the answer.
+    /// Requests the time. The reply repeats the number.
     Time(u8),
-    /// Stop the timer; time and count of pulses are zero.
+    /// Stops the timer and sets time and pulse count to zero.
     Stop,
-    /// Start the timer.
+    /// Starts the timer.
     Start,
-    /// Count so far in each period.
+    /// Sets the timer's period.
     Period(Timer),
 }
 
 impl Command {
-    /// The command's bytes.
+    /// The bytes of the command.
     pub fn to_bytes(self) -> Vec<u8> {
         match self {
             Self::Version => b"V?".to_vec(),
@@ -46,21 +46,21 @@ impl Command {
     }
 }
 
-/// How the box's timer counts: from 0 to `top`, then again.
+/// The box's timer: it counts from 0 to `top` and starts again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Timer {
     /// The last value.
     pub top: u16,
-    /// How fast it counts.
+    /// The counting rate.
     pub prescaler: Prescaler,
 }
 
-/// By what the 16 MHz of the box's crystal are divided.
+/// Divisor of the box's 16 MHz crystal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Prescaler {
-    /// 0.5 us a tick.
+    /// 0.5 us per tick.
     By8,
-    /// 4 us a tick.
+    /// 4 us per tick.
     By64,
 }
 
@@ -72,7 +72,7 @@ impl Prescaler {
         }
     }
 
-    /// What a tick takes.
+    /// Duration of a tick.
     pub fn tick_ns(self) -> i64 {
         match self {
             Self::By8 => 500,
@@ -82,53 +82,54 @@ impl Prescaler {
 }
 
 impl Timer {
-    /// The timer whose period is nearest; `None` if it cannot be so short or so long.
+    /// The timer with the nearest period; `None` if the period is too short or too long.
     pub fn with_period_us(period_us: f64) -> Option<Self> {
         let timer = |prescaler: Prescaler| {
             let ticks = (period_us * 1e3 / prescaler.tick_ns() as f64).round();
-            // Four times the pulse at least, so that most of a period lies after it.
+            // At least four times the pulse, so that most of a period lies after it.
             let allowed = f64::from(4 * PULSE_TICKS)..=65_536.0;
             allowed.contains(&ticks).then_some(Self { top: (ticks - 1.0) as u16, prescaler })
         };
         timer(Prescaler::By8).or_else(|| timer(Prescaler::By64))
     }
 
-    /// Ticks of a period.
+    /// Ticks per period.
     pub fn period_ticks(self) -> i64 {
         i64::from(self.top) + 1
     }
 
-    /// A moment of the box's clock: ticks since pulse `pulses` began, which was counted at its end.
+    /// A time on the box's clock, from the number of counted pulses (each counted at its end) and the ticks of the
+    /// timer.
     pub fn device_ns(self, pulses: i64, ticks: u16) -> i64 {
         (pulses * self.period_ticks() + i64::from(ticks)) * self.prescaler.tick_ns()
     }
 
-    /// Whether a pulse, counted at its end, is certain to be counted at this moment of its period.
+    /// Whether the pulse of the current period, counted at its end, is certain to be counted at this tick.
     pub fn is_counted(self, ticks: u16) -> bool {
         i64::from(ticks) > 2 * i64::from(PULSE_TICKS) && ticks <= self.top
     }
 }
 
-/// How long a pulse is (`OCR1A`).
+/// Length of a pulse (`OCR1A`).
 const PULSE_TICKS: u16 = 1000;
 
-/// What the box answers.
+/// A reply from the box.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reply {
-    /// Its firmware's version.
+    /// Its firmware version.
     Version(u8),
-    /// What time it was.
+    /// Its time.
     Time {
-        /// The question's number.
+        /// The number of the request.
         number: u8,
         /// Pulses that have ended since the start.
         pulses: u32,
-        /// The timer.
+        /// The timer's value.
         ticks: u16,
     },
 }
 
-/// What the bytes begin with.
+/// Parses the reply at the start of `bytes`.
 pub fn parse_reply(bytes: &[u8]) -> Parsed<Reply> {
     let is_head = |bytes: &[u8]| matches!(bytes, [b'P' | b'V', PAYLOAD_BYTES, ..] | [b'P' | b'V'] | []);
     if !is_head(bytes) {
