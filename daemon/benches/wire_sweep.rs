@@ -1,6 +1,6 @@
-//! The paper's sweep over a real wire in real time, 75 points of 8 frames at 128 x 128 pixels and 60 edges a second, each
-//! image held against the scene: what it takes from the first frame with light to the last, and what is lost.
-//! `cargo xtask bench camera --sweep` runs it.
+//! The paper's sweep over a real network connection in real time: 75 points of 8 frames at 128 x 128 pixels and 60
+//! edges per second, with each image compared with the scene. Measures the time from the first to the last frame with
+//! light, and the losses. `cargo xtask bench camera --sweep` runs it.
 
 #![allow(clippy::unwrap_used, reason = "a benchmark that cannot go on may panic")]
 

@@ -1,4 +1,4 @@
-//! The real daemon in a process of its own: killed at any moment, asked to end, activated by a socket.
+//! The real daemon in a separate process: killed at any moment, asked to terminate, activated by a socket.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -14,7 +14,7 @@ use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::ArrayName;
 use tempfile::TempDir;
 
-/// 8 x 8 pixels, 9 points, and every fault whose traces could differ after a crash.
+/// 8 x 8 pixels, 9 points, and all faults whose effects could differ after a crash.
 const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
                    [projector]\ndriver = \"sim\"\nrows = 8\n\
                    [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\nseed = 11\n\
@@ -35,7 +35,7 @@ impl Daemon {
         Self::start_with_threads(folder, 2)
     }
 
-    /// Simulator, stages and solver all take their number of threads from rayon's variable.
+    /// Simulator, stages and solver all take their number of threads from rayon's environment variable.
     fn start_with_threads(folder: &Path, threads: u32) -> Self {
         let socket = folder.join("socket");
         let process = Command::new(env!("CARGO_BIN_EXE_raysweepd"))
@@ -75,7 +75,7 @@ impl Daemon {
 }
 
 impl Drop for Daemon {
-    /// SIGKILL, also where a test fails: a daemon left behind would hold the test's output open.
+    /// SIGKILL, also when a test fails: a remaining daemon would hold the test's output open.
     fn drop(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();
@@ -96,7 +96,7 @@ fn plan(text: &str) -> RunParams {
     RunParams { plan: text.into(), ..RunParams::default() }
 }
 
-/// Waits for the run's end.
+/// Starts a run and waits for its end.
 fn end(daemon: &mut Daemon, begin: impl FnOnce(&mut Client)) -> (PathBuf, String) {
     let events = daemon.client().subscribe().unwrap();
     begin(&mut daemon.client());
@@ -108,8 +108,8 @@ fn end(daemon: &mut Daemon, begin: impl FnOnce(&mut Client)) -> (PathBuf, String
     panic!("the daemon ended before the run");
 }
 
-/// What must be the same after a crash: each point's attempt, settings, delays and data, and all products. What became of
-/// frames that still had the settings before is the run's history, not the point's.
+/// What must be the same after a crash: each point's attempt, settings, delays and data, and all products. The fate of
+/// frames that still had the previous settings belongs to the run's history, not to the point.
 #[derive(PartialEq)]
 struct Outcome {
     points: Vec<String>,
@@ -132,7 +132,7 @@ fn outcome(session: &Path) -> Outcome {
     Outcome { points, files }
 }
 
-/// Waits until the ledger has so many lines, or, bounded, until it is plain that the run has ended with fewer.
+/// Waits until the ledger has a given number of lines, or 5 s, in case the run has ended with fewer.
 fn wait_for_line(session: &Path, line: usize) {
     let began = Instant::now();
     while ledger_lines(session) < line && began.elapsed() < Duration::from_secs(5) {}
@@ -160,7 +160,7 @@ fn fifty_kills_and_resumes_end_like_a_run_without_any() {
     let mut seed = 0x1234_5678_9ABC_DEF0_u64;
     let (mut killed_within, mut resumed_points) = (0, Vec::new());
     for _ in 0..50 {
-        // Xorshift. The moment lies anywhere in the run: up to 3 ms after any line of its ledger.
+        // Xorshift. The time of the kill is anywhere in the run: up to 3 ms after any line of its ledger.
         seed ^= seed << 13;
         seed ^= seed >> 7;
         seed ^= seed << 17;
@@ -186,7 +186,8 @@ fn fifty_kills_and_resumes_end_like_a_run_without_any() {
     assert!(killed_within >= 25, "the moments do not lie within the run: only {killed_within} did");
 }
 
-/// Kills a run after `line` lines of its ledger, resumes it, and compares with a run that nobody killed.
+/// Kills a run after `line` lines of its ledger, resumes it, and compares the outcome with that of an uninterrupted
+/// run.
 fn resumes_to_the_same_bits(rig: &str, plan_text: &str, line: usize) {
     let (whole, crashed) = (folder(rig), folder(rig));
     let mut daemon = Daemon::start(whole.path());
@@ -206,14 +207,14 @@ fn resumes_to_the_same_bits(rig: &str, plan_text: &str, line: usize) {
     assert!(resumed.files == expected.files, "killed after line {line}: the products differ");
 }
 
-/// Each fault oftener than in [`RIG`], so that attempts fail, and are interrupted, in every way.
+/// Faults are more frequent than in [`RIG`], so that attempts fail, and are interrupted, in every way.
 fn faulty_rig(seed: u64) -> String {
     RIG.replace("0.02", "0.06").replace("seed = 11", &format!("seed = {seed}"))
 }
 
 const OVERLAPPED: &str = "overlapped readout";
 
-/// Cameras that differ in when settings act and in what frames say of them.
+/// Cameras that differ in when settings take effect and in what frames report about them.
 fn cameras(rig: &str) -> [(&'static str, String); 5] {
     let late = "late_frames_max = 3";
     let silent = format!("{late}\nchunk_exposure = false");
@@ -228,15 +229,16 @@ fn cameras(rig: &str) -> [(&'static str, String); 5] {
     ]
 }
 
-/// The same points with exposures so long that they begin before the edge of their light: another edge triggers them.
+/// The same points with exposures so long that they start before the edge of their light: an earlier edge triggers
+/// them.
 fn light_after_the_trigger() -> String {
     PLAN.replace("[50, 100, 150]", "[1200, 1500, 1800]")
 }
 
-/// Runs a plan, then resumes its session from every line of its ledger, as if the run had been killed right after it;
-/// each outcome with the line, the uninterrupted run's first.
+/// Runs a plan, then resumes its session from every line of its ledger, as if the run had been killed just after that
+/// line. Returns each outcome with its line; the first is that of the uninterrupted run.
 fn outcomes_from_every_line(rig: &str, plan_text: &str) -> Vec<(usize, Outcome)> {
-    // In memory: no process is killed here, and a disk would take ten times as long to sync each line.
+    // In memory: no process is killed here, and syncing each line to a disk would take ten times as long.
     let folder = folder_in(Path::new("/dev/shm"), rig);
     let mut daemon = Daemon::start(folder.path());
     let (session, state) = end(&mut daemon, |client| drop(client.run(&plan(plan_text)).unwrap()));
@@ -254,7 +256,7 @@ fn outcomes_from_every_line(rig: &str, plan_text: &str) -> Vec<(usize, Outcome)>
     outcomes
 }
 
-/// What to try: every camera, with seeds that have found faults. `RAYSWEEP_SEEDS=40` tries so many more with each.
+/// Cases to try: every camera, with seeds that have found bugs. `RAYSWEEP_SEEDS=40` adds 40 seeds for each camera.
 fn trials() -> Vec<(&'static str, String, u64)> {
     let (short, long) = (PLAN.to_owned(), light_after_the_trigger());
     let mut trials = vec![
@@ -268,7 +270,7 @@ fn trials() -> Vec<(&'static str, String, u64)> {
     for seed in 100..100 + more {
         for (camera, _) in cameras("") {
             trials.push((camera, short.clone(), seed));
-            // With overlapped readout there is the exception below.
+            // Overlapped readout is the exception tested below.
             if camera != OVERLAPPED {
                 trials.push((camera, long.clone(), seed));
             }
@@ -292,9 +294,9 @@ fn a_session_resumed_from_any_line_of_its_ledger_ends_with_the_same_bits() {
     }
 }
 
-/// The one exception: with overlapped readout the edge that lights a point's last frame may already trigger the next
-/// point's first frame, and which point is next depends on the interruption. As long as no such edge is missed, attempts
-/// and frames are the same all the same, and so is the delay of every frame but the last.
+/// The only exception: with overlapped readout, the edge that lights a point's last frame may already trigger the next
+/// point's first frame, and which point is next depends on the interruption. If no such edge is missed, attempts and
+/// frames are nevertheless the same, and so is the delay of every frame but the last.
 #[test]
 fn light_that_the_next_point_triggers_changes_the_last_delay_of_a_point_and_no_more() {
     let points = |outcome: &Outcome| -> Vec<PointEntry> {
@@ -325,10 +327,10 @@ fn light_that_the_next_point_triggers_changes_the_last_delay_of_a_point_and_no_m
 
 #[test]
 fn cameras_that_are_busy_at_the_edge_resume_to_the_same_bits_too() {
-    // Overlapped readout: triggers are answered while the frame before is still on its way.
+    // Overlapped readout: triggers are accepted while the previous frame is still being read out.
     let overlapped =
         RIG.replace("[sim.camera]\n", "[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 9000\n");
-    // The scene at the end of the frame: exposures end, and settings are written, just before the next edge.
+    // The scene at the end of the projector frame: exposures end, and settings are written, just before the next edge.
     let late = RIG
         .replace("late_frames_max = 3", "late_frames_max = 0")
         .replace("rows = 8\n[sim]", "rows = 720\n[sim]")
@@ -343,7 +345,7 @@ fn cameras_that_are_busy_at_the_edge_resume_to_the_same_bits_too() {
 
 #[test]
 fn cameras_that_say_nothing_of_the_exposure_resume_to_the_same_bits_too() {
-    // Which of a point's frames count must not hang on the point before it, which a resumed run may not have taken.
+    // Which of a point's frames count must not depend on the previous point, which a resumed run may not have acquired.
     let late = "late_frames_max = 3\nchunk_exposure = false";
     let varying = RIG.replace("late_frames_max = 3", late);
     let constant = RIG.replace("late_frames_max = 3", &format!("late_frames_min = 3\n{late}"));
@@ -412,7 +414,7 @@ fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
 fn a_socket_passed_by_the_service_manager_is_served() {
     let folder = folder(RIG);
     let path = folder.path().join("activated");
-    // The service manager's own helper passes the socket and LISTEN_FDS, and starts the daemon at the first client.
+    // The service manager's own helper passes the socket and LISTEN_FDS, and starts the daemon on the first connection.
     let process = Command::new("systemd-socket-activate")
         .arg("--listen")
         .arg(&path)

@@ -1,4 +1,5 @@
-//! The whole sweep over a real wire, see [`wire`]. `cargo xtask bench camera --sweep` runs it at full size.
+//! Complete sweeps over a real network connection, see [`wire`]. `cargo xtask bench camera --sweep` runs one at full
+//! size.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -17,7 +18,7 @@ const SWEEP: Sweep = Sweep {
     then: None,
 };
 
-/// By the camera's sequencer, which [`wire`] makes sure of.
+/// A film by the camera's sequencer, as checked by [`wire`].
 const FILM: Sweep = Sweep {
     kind: "film",
     plan: "cycles = 40\ndelay_us = [-300, -200, -100, 0, 120, 200, 350]\nexposure_us = 400\n",
@@ -34,7 +35,7 @@ fn a_sweep_over_the_wire_stores_what_the_scene_gives() {
 fn packets_that_are_sent_again_cost_nothing() {
     let swept = Sweep { faults: &["packet_loss=0.01", "reordering=0.01"], ..SWEEP }.run();
     assert!(swept.wire.packets_lost > 0 && swept.wire.packets_resent > 0, "{:?}", swept.wire);
-    // Frames that are held up by it are taken for those that they are.
+    // Frames delayed by resending are still attributed correctly.
     assert!(!swept.counts.lost.contains_key(&LossCause::SettingsMismatch), "{:?}", swept.counts);
 }
 
@@ -59,7 +60,7 @@ fn settings_that_act_three_frames_late_mislabel_nothing() {
 
 #[test]
 fn a_camera_that_dies_in_the_middle_costs_the_frames_of_its_absence() {
-    // While points wait for frames: between two passes nobody does.
+    // During a pass, while points wait for frames; between two passes none do.
     let counts = Sweep { then: Some((8, Then::Dies)), ..SWEEP }.run().counts;
     assert!(counts.lost[&LossCause::CameraLost] > 0, "{counts:?}");
 }
@@ -92,7 +93,7 @@ fn a_camera_that_dies_within_a_film_has_its_sets_again_when_it_is_back() {
 
 #[test]
 fn a_film_whose_sets_stamps_cannot_tell_goes_by_what_frames_say_of_them() {
-    // Half a period apart: either set might be the first.
+    // Half a period apart: by its stamp, a frame could belong to either set.
     let plan = "cycles = 60\ndelay_us = [-500, 7833]\nexposure_us = 400\n";
     Sweep { plan, ..FILM }.run();
 }

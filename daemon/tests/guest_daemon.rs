@@ -1,6 +1,7 @@
-//! The daemon with a logic analyser on its VSYNC line, behind the kernel's USB stack (`vhci-hcd`): every frame that counts is
-//! tied to an edge that the analyser saw, whatever befalls the line and the analyser meanwhile. The camera is the daemon's simulated
-//! one, the analyser is in the test's process; the line's edges stand on the multiples of its period on the guest's clock for both.
+//! The daemon with a logic analyser on its VSYNC line, through the kernel's USB stack (`vhci-hcd`): every frame that
+//! counts is matched to an edge seen by the analyser, whatever happens to the line and the analyser. The camera is the
+//! daemon's simulated one, the analyser runs in the test's process; for both, the line's edges lie on multiples of its
+//! period on the guest's clock.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -27,12 +28,12 @@ use thread_priority::{
     set_thread_priority_and_policy, thread_native_id,
 };
 
-/// A line and a sample rate that software emulation keeps up with, also on a busy host.
+/// Period and sample rate that software emulation can handle even on a busy host.
 const PERIOD_NS: i64 = 50_000_000;
 const SAMPLE_RATE_HZ: u32 = 100_000;
 const POINTS: usize = 12;
 const FRAMES: u32 = 2;
-/// Frames are tied to edges within 200 us.
+/// Below the 200 us within which frames are matched to edges.
 const MAX_JITTER_US: f64 = 180.0;
 
 fn plan() -> String {
@@ -42,7 +43,7 @@ fn plan() -> String {
     )
 }
 
-/// The line as the analyser sees it: the simulated camera's own, but for edges that it misses and false ones.
+/// The line as seen by the analyser: that of the simulated camera, with edges that the analyser misses and false ones.
 fn signal(missing: f64, false_edges: f64) -> Signal {
     Signal {
         seed: 3,
@@ -56,20 +57,20 @@ fn signal(missing: f64, false_edges: f64) -> Signal {
     }
 }
 
-/// Plugs an analyser in whose own thread, as it is a device, goes before all that the guest computes.
+/// Plugs in an analyser whose thread, since it represents a device, has priority over the guest's computations.
 fn plug(signal: Signal) -> (Plugged, Fx2Faults) {
     let (analyser, faults) = Analyser::new(signal, 20.0);
     let plugged = std::thread::spawn(|| {
         let priority = ThreadPriorityValue::try_from(80).map(ThreadPriority::Crossplatform).unwrap();
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
         set_thread_priority_and_policy(thread_native_id(), priority, policy).unwrap();
-        // Its thread inherits the priority.
+        // The analyser's thread inherits the priority.
         Plugged::new(analyser).unwrap()
     });
     (plugged.join().unwrap(), faults)
 }
 
-/// How late the driver's stamps are here: emulation takes its time over every transfer. A lab measures its own.
+/// Delay of the driver's stamps in this guest: emulation slows down every transfer. A lab measures its own value.
 fn lateness_us() -> f64 {
     static MEASURED: OnceLock<f64> = OnceLock::new();
     *MEASURED.get_or_init(|| {
@@ -83,7 +84,7 @@ fn lateness_us() -> f64 {
             late.extend(vsync.next_edge(Duration::from_millis(100)).unwrap().map(late_ns));
         }
         println!("{:?}", vsync.clock());
-        // The first seconds are spent on the fit of the clock.
+        // The clock fit needs the first seconds to settle.
         let late = &mut late[80..];
         late.sort_unstable();
         println!("stamps are late by {} to {} ns", late[0], late[late.len() - 1]);
@@ -91,7 +92,7 @@ fn lateness_us() -> f64 {
     })
 }
 
-/// A daemon with its analyser, in a folder of its own.
+/// A daemon with its analyser, in a temporary folder.
 struct Lab {
     folder: TempDir,
     daemon: Child,
@@ -105,7 +106,7 @@ impl Drop for Lab {
 }
 
 impl Lab {
-    /// Starts the daemon. The analyser must be plugged in.
+    /// Starts the daemon. The analyser must be plugged in already.
     fn new(latency_us: f64) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let rig = format!(
@@ -134,7 +135,7 @@ impl Lab {
         self.folder.path().join(name)
     }
 
-    /// Runs the plan to its end, which is complete; `meanwhile` is told how many points are stored.
+    /// Runs the plan and expects it to complete; `meanwhile` is called with the number of stored points.
     fn sweep(&self, mut meanwhile: impl FnMut(usize)) -> State {
         let client = || wait_for("the daemon", || Client::connect(self.path("socket")).ok());
         let events = client().subscribe().unwrap();
@@ -156,7 +157,7 @@ impl Lab {
     }
 }
 
-/// Every frame of every point was tied to an edge, and measured by it has the delay that its point asks for.
+/// Every frame of every point was matched to an edge, and its measured delay is the requested one.
 fn assert_tied(state: &State) {
     let delays: Vec<f64> = (0..POINTS).map(|k| -750.0 + 1500.0 * k as f64 / (POINTS - 1) as f64).collect();
     let mut worst_us = 0.0_f64;
@@ -191,8 +192,8 @@ fn an_analyser_that_halts_stops_or_is_unplugged_within_a_sweep_costs_the_frames_
     let latency_us = lateness_us();
     let (first, faults) = plug(signal(0.0, 0.0));
     let mut plugged = Some(first);
-    // How often it had been started before each of them. Points whose frames were exposed before a fault are stored after
-    // it, so that the next one waits until the analyser has been started again.
+    // Number of times that sampling had been started before each fault. Points exposed before a fault may be stored
+    // after it, so the next fault waits until sampling has been restarted.
     let mut starts = vec![0];
     let state = Lab::new(latency_us).sweep(|stored| match starts.len() {
         _ if starts.last() == Some(&faults.starts()) => {}

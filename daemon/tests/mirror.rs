@@ -1,5 +1,5 @@
-//! A run on a rig whose mirror hangs on a serial line: the path reaches the mirror bit for bit, and every way out of the
-//! daemon leaves the mirror parked with the light off. How long that took is printed.
+//! Runs on a rig with a mirror on a serial line: the path reaches the mirror bit for bit, and however the daemon ends,
+//! it leaves the mirror parked with the light off. The time that takes is printed.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -25,7 +25,7 @@ use raysweep_sim::mirror::{Held, Link, MirrorPty, PlayzerXConfig, PlayzerXContro
 use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
 use tempfile::TempDir;
 
-/// 6500 samples and 50 dots a batch: few enough frames for any machine.
+/// 6500 samples and 50 dots per batch: few enough frames for any machine.
 fn plan(count: u32) -> String {
     format!(
         "kind = \"batches\"\nname = \"mirror\"\n[batches]\ncount = {count}\ndots = 50\nexposure_us = 70\n\
@@ -42,7 +42,7 @@ struct Lab {
 struct Daemon(Child);
 
 impl Drop for Daemon {
-    /// SIGKILL, also where a test fails: a daemon left behind would hold the test's output open.
+    /// SIGKILL, also when a test fails: a remaining daemon would hold the test's output open.
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
@@ -108,7 +108,7 @@ impl Lab {
         }
     }
 
-    /// Begins a run and waits until the mirror has played so many samples with light.
+    /// Starts a run and waits until the mirror has played a number of samples with light.
     fn play(&self, count: u32, samples: usize) -> Daemon {
         let daemon = self.daemon();
         let params = RunParams { plan: plan(count), ..RunParams::default() };
@@ -125,7 +125,7 @@ impl Lab {
         self.pty.look(|truth| truth.held.iter().filter(|held| held.light > 0).count())
     }
 
-    /// Waits until the run has ended, and says how.
+    /// Waits until the run has ended; returns state and error.
     fn ended(&self) -> (RunState, Option<String>) {
         let mut client = self.client();
         let began = Instant::now();
@@ -139,7 +139,7 @@ impl Lab {
         }
     }
 
-    /// Waits until the mirror is parked, with the light off before, and without a step on the way; prints when.
+    /// Waits until the light is off and then the mirror is parked, without any step on the way; prints the times.
     fn assert_parked(&self, way: &str, since_ns: i64) {
         let began = Instant::now();
         let (dark_ns, parked_ns) = loop {
@@ -163,7 +163,7 @@ impl Lab {
         println!("{way}: light off after {:.1} ms, mirror parked after {:.1} ms", ms(dark_ns), ms(parked_ns));
     }
 
-    /// Waits until whoever had the mirror has noted that it is parked.
+    /// Waits until the mirror's previous user has recorded that it is parked.
     fn assert_noted(&self) {
         let began = Instant::now();
         loop {
@@ -186,7 +186,7 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
     let lab = Lab::new();
     let _daemon = lab.daemon();
     let events = lab.client().subscribe().unwrap();
-    // Two batches more are played than are wanted: the first has no beginning.
+    // Two more batches are played than requested, because the first one has no beginning.
     let text = plan(58);
     lab.client().run(&RunParams { plan: text.clone(), ..RunParams::default() }).unwrap();
     let finished = events.into_iter().find_map(|event| match event.unwrap() {
@@ -244,7 +244,7 @@ fn interlock() {
     assert_eq!((status.light.as_str(), status.parked), ("interlock_open", true));
 }
 
-/// A host that is too slow: the daemon stands still for longer than the controller's 125,000 samples last.
+/// A host that is too slow: the daemon is stopped for longer than the controller's 125,000 samples last.
 #[test]
 fn underrun() {
     let lab = Lab::new();
@@ -269,7 +269,7 @@ fn unplug() {
     let mut lab = Lab::new();
     let _daemon = lab.play(1000, 20_000);
     let since_ns = now_ns();
-    // The power goes with the plug: the light is off and the mirror springs back.
+    // Unplugging cuts the power: the light goes off and the mirror springs back.
     lab.pty.unplug();
     let (state, error) = lab.ended();
     assert_eq!(state, RunState::Faulted);
@@ -324,7 +324,7 @@ impl ColumnWorker for Panicking {
     }
 }
 
-/// It costs its frames and nothing else: the run goes on, and at its end the mirror is parked.
+/// A panicking stage costs only its frames: the run continues, and the mirror is parked at its end.
 #[test]
 fn panic_in_a_stage() {
     let lab = Lab::new();

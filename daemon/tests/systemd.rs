@@ -1,4 +1,4 @@
-//! The units in `deploy/` as systemd itself judges them, in a staged root that has the programs where they will be.
+//! Checks the units in `deploy/` with systemd's own tools, in a staged root with the programs at their installed paths.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -19,7 +19,7 @@ fn systemd_accepts_the_units_and_finds_what_they_start() {
     for unit in ["raysweepd.service", "raysweepd.socket"] {
         put(&deploy.join("systemd").join(unit), &format!("usr/lib/systemd/system/{unit}"));
     }
-    // Units that ours name and that every system has.
+    // Units that ours refer to and that every system has.
     for unit in ["sysinit.target", "basic.target", "sockets.target", "multi-user.target", "shutdown.target"] {
         let path = root.path().join("usr/lib/systemd/system").join(unit);
         std::fs::write(path, "[Unit]\nDescription=stands for the system's own\n").unwrap();

@@ -1,5 +1,5 @@
 #![no_main]
-//! Bytes from a controller, in pieces: the first byte of each says how long it is.
+//! Feeds bytes from a controller in chunks; the first byte of each chunk is its length.
 
 use libfuzzer_sys::fuzz_target;
 use raysweep_drivers::mirror::parse_optotune;

@@ -1,6 +1,6 @@
 #![no_main]
-//! Samples of an analyser, in blocks: the first byte of each says how long it is. Changes must be those of one sample after
-//! the other.
+//! Feeds samples of an analyser in blocks; the first byte of each block is its length. The changes must be those
+//! between successive samples.
 
 use libfuzzer_sys::fuzz_target;
 use raysweep_drivers::vsync::fx2lafw::scan::Scanner;

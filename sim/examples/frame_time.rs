@@ -1,4 +1,4 @@
-//! How long a simulated frame takes on one core, and which part of it is the sensor's noise.
+//! Measures the time for a simulated frame on one core, and how much of it is sensor noise.
 //!
 //!     RAYON_NUM_THREADS=1 cargo run --release -p raysweep-sim --example frame_time
 

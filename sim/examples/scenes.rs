@@ -1,8 +1,8 @@
-//! Renders the built-in scenes to PNG, for looking at, and writes their truth as the `.npz` that rig files name:
+//! Renders the built-in scenes to PNG for viewing, and writes their ground truth as `.npz` files for rig files:
 //! `cargo run -p raysweep-sim --example scenes -- FOLDER [ROWS COLUMNS SEED]`.
 //!
-//! One picture per scene, in colour, left to right: floodlit, direct (v = t), |v - t| > 2 (four
-//! times brighter), and a projected checkerboard. Times on standard output are for one mono scene.
+//! One colour image per scene, left to right: floodlit, direct (v = t), |v - t| > 2 (four times brighter), and a
+//! projected checkerboard. Times printed to standard output are for one mono scene.
 
 use std::error::Error;
 use std::fs::File;

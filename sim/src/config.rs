@@ -1,5 +1,5 @@
-//! The `[sim]` table of a rig file: what the simulated rig is made of. Every key has a default; those that no
-//! measurement or data sheet backs are assumptions (marked [A]) to be replaced by a lab's own values.
+//! The `[sim]` table of a rig file, which describes the simulated rig. Every key has a default. Defaults without a
+//! measurement or data sheet behind them are assumptions (marked [A]); replace them with your lab's own values.
 
 use std::path::PathBuf;
 
@@ -10,20 +10,20 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimConfig {
-    /// An `.npz` file with `T` (relative to the rig file), or the name of a built-in scene.
+    /// An `.npz` file with `T` (path relative to the rig file), or the name of a built-in scene.
     pub scene: PathBuf,
-    /// Rows of a built-in scene, 8..=720; a file brings its own.
+    /// Rows of a built-in scene, 8..=720; ignored for a scene file.
     pub scene_rows: usize,
-    /// Columns of a built-in scene; a file brings its own.
+    /// Columns of a built-in scene; ignored for a scene file.
     pub scene_columns: usize,
-    /// Seeds everything that is random: the same seed gives the same bits.
+    /// Seed of all random numbers: the same seed gives the same bits.
     pub seed: u64,
-    /// Time in which a built-in scene that moves goes there and back, 0.1..=1e6.
+    /// Period of a moving built-in scene (there and back), 0.1..=1e6.
     pub motion_period_s: f64,
-    /// Pace by the host's clock instead of as fast as it can.
+    /// Run in real time on the host's clock instead of as fast as possible.
     pub realtime: bool,
-    /// Socket (relative to the rig file) of the process that simulates VSYNC line and projector beside a camera that is
-    /// reached by its own driver; left out: everything is simulated in this process.
+    /// Socket (relative to the rig file) of the process that simulates VSYNC line and projector for a camera with a
+    /// driver of its own. Default: everything is simulated in this process.
     pub bench: Option<PathBuf>,
     /// `[sim.projector]`
     pub projector: SimProjector,
@@ -56,19 +56,19 @@ impl Default for SimConfig {
     }
 }
 
-/// How the projector draws.
+/// Projector properties.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimProjector {
-    /// When each row is lit.
+    /// Time at which each row is lit.
     pub row_table: RowTable,
     /// How a row's light spreads over its neighbours.
     pub beam: Beam,
-    /// Whether the spot's flight along the row shows in the time of direct light.
+    /// Whether the spot's movement along the row affects the timing of direct light.
     pub spot: Spot,
-    /// Uniform error, to either side, of the light against the VSYNC edge: nothing measures it.
+    /// Timing error of the light relative to the VSYNC edge: uniform, plus or minus this. No device measures it.
     pub phase_jitter_us: f64,
-    /// VSYNC edges from a new picture to its light.
+    /// Number of VSYNC edges between setting a new picture and its light.
     pub video_latency_frames: u32,
 }
 
@@ -84,22 +84,22 @@ impl Default for SimProjector {
     }
 }
 
-/// Row -> time within the frame. Rows keep the nominal time of the whole sweep.
+/// Maps rows to times within the frame. The sweep as a whole keeps its nominal duration.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum RowTable {
     /// Every row takes the same time.
     Linear,
-    /// A sweep that starts fast and ends slow, as a quadratic: mid-sweep is early by this share of the sweep.
+    /// Quadratic: the sweep starts fast and ends slow; mid-sweep is early by this percentage of the sweep.
     Quadratic {
         /// Largest deviation from linear, in percent of the sweep; within -20..=20.
         percent: f64,
     },
-    /// Straight pieces between seeded knots, as measured tables look.
+    /// Piecewise linear between seeded knots, similar to measured tables.
     Kinked {
-        /// Pieces.
+        /// Number of pieces.
         pieces: usize,
-        /// Largest deviation of a knot to either side.
+        /// Largest deviation of a knot, in either direction.
         amplitude_us: f64,
     },
 }
@@ -108,45 +108,45 @@ pub enum RowTable {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Beam {
-    /// All light in the row itself.
+    /// All light falls in the row itself.
     Ideal,
     /// A Gaussian, sampled at the rows' centres.
     Gaussian {
-        /// Standard deviation.
+        /// Standard deviation in rows.
         sigma_rows: f64,
     },
     /// Uniform from `up_rows` above the row's centre to `down_rows` below it.
     FlatTop {
-        /// Reach towards row 0.
+        /// Extent towards row 0.
         up_rows: f64,
-        /// Reach towards the last row.
+        /// Extent towards the last row.
         down_rows: f64,
     },
 }
 
-/// When within its row a pixel's direct light arrives.
+/// Time within its row at which a pixel's direct light arrives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Spot {
-    /// Spread over the row's whole time.
+    /// Spread evenly over the row's dwell.
     Uniform,
-    /// At the moment the spot passes the pixel's projector column, left to right.
+    /// When the spot passes the pixel's projector column, left to right.
     OneWay,
-    /// The same, odd rows right to left.
+    /// Like `OneWay`, but odd rows run right to left.
     Bidirectional,
 }
 
-/// The VSYNC line and the device that watches it.
+/// VSYNC line and its monitor.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimVsync {
-    /// Standard deviation of the edges, and of the light with them, about the nominal period.
+    /// Standard deviation of the edges, and of the light that follows them, about their nominal times.
     pub jitter_us: f64,
-    /// Share of edges that never reach the line: the camera is not triggered.
+    /// Fraction of edges that never reach the line and so do not trigger the camera.
     pub missing: f64,
-    /// Share of periods with a false edge on the line: the camera is triggered by it.
+    /// Fraction of periods with a false edge on the line, which triggers the camera.
     pub false_edges: f64,
-    /// Share of edges that trigger the camera and that the watching device misses.
+    /// Fraction of edges that trigger the camera but are missed by the monitor.
     pub unseen: f64,
 }
 
@@ -156,27 +156,28 @@ impl Default for SimVsync {
     }
 }
 
-/// The camera's timing and its faults.
+/// Camera timing and faults.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimCamera {
-    /// From the trigger's edge to the start of row 0's exposure.
+    /// Time from the trigger edge to the start of row 0's exposure.
     pub trigger_latency_us: f64,
-    /// From the end of row 0's exposure until the next trigger is answered; left out: the rows' own time.
+    /// Time from the end of row 0's exposure until the camera accepts the next trigger. Default: the readout time of
+    /// all rows.
     pub readout_us: Option<f64>,
-    /// Whether exposure may overlap the readout of the frame before.
+    /// Whether an exposure may overlap the readout of the previous frame.
     pub readout: Readout,
     /// Exposures are rounded to multiples of this.
     pub exposure_step_us: f64,
     /// Trigger delays are rounded to multiples of this.
     pub delay_step_us: f64,
-    /// Fewest frames that still have the old settings after a change.
+    /// Minimum number of frames after a change that still use the old settings.
     pub late_frames_min: u32,
-    /// Most frames that still have the old settings after a change.
+    /// Maximum number of frames after a change that still use the old settings.
     pub late_frames_max: u32,
     /// Whether each frame carries its own exposure (chunk data).
     pub chunk_exposure: bool,
-    /// Share of frames that are exposed and then lost on the way.
+    /// Fraction of frames that are exposed and then lost in transit.
     pub dropped: f64,
 }
 
@@ -196,33 +197,33 @@ impl Default for SimCamera {
     }
 }
 
-/// The sensor after EMVA 1288; figures of the EV76C570.
+/// Sensor after EMVA 1288; defaults of the EV76C570.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimSensor {
-    /// `false`: no temporal noise, no pattern, no hot pixels; quantisation and saturation stay.
+    /// `false`: no temporal noise, no fixed pattern, no hot pixels; quantisation and saturation remain.
     pub noise: bool,
-    /// Electrons per count of a 12-bit scale.
+    /// Electrons per count on a 12-bit scale.
     pub electrons_per_dn: f64,
     /// Electrons at which a pixel saturates.
     pub full_well_e: f64,
-    /// Temporal dark noise.
+    /// Temporal dark noise, in electrons.
     pub read_noise_e: f64,
-    /// Spread of the pixels' offsets.
+    /// Spread of the pixels' offsets, in electrons.
     pub dsnu_e: f64,
-    /// Spread of the columns' offsets.
+    /// Spread of the columns' offsets, in electrons.
     pub column_e: f64,
     /// Spread of the pixels' gains, in percent.
     pub prnu_percent: f64,
-    /// Share of hot pixels.
+    /// Fraction of hot pixels.
     pub hot_pixels: f64,
     /// Dark current of a hot pixel, electrons per second.
     pub hot_pixel_e_per_s: f64,
-    /// Dark current of the others, electrons per second.
+    /// Dark current of all other pixels, electrons per second.
     pub dark_current_e_per_s: f64,
-    /// Real bits of the converter; its codes are spread over the pixel format's scale.
+    /// Actual resolution of the converter in bits; its codes are spread over the pixel format's scale.
     pub adc_bits: u32,
-    /// Loss of light in the corners of the picture, in percent.
+    /// Loss of light in the corners of the image, in percent.
     pub vignetting_percent: f64,
 }
 
@@ -245,15 +246,15 @@ impl Default for SimSensor {
     }
 }
 
-/// Light that does not come from the projector.
+/// Ambient light, which does not come from the projector.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimAmbient {
-    /// What it adds to a pixel in one row time, in the scene's units (1 = a white pixel's row).
+    /// Light added to a pixel in one row time, in the scene's units (1 = a white pixel's row).
     pub level: f64,
-    /// Share of it that flickers, 0..=1.
+    /// Fraction of the ambient light that flickers, 0..=1.
     pub flicker: f64,
-    /// Frequency of the flicker: twice the mains'.
+    /// Frequency of the flicker: twice the mains frequency.
     pub flicker_hz: f64,
 }
 

@@ -1,4 +1,4 @@
-//! The simulated devices: the traits of `raysweep-core` over one [`Line`] and one clock.
+//! Simulated devices: the traits of `raysweep-core` over one [`Line`] and one clock.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -14,38 +14,38 @@ use crate::line::{Exposure, Light, Line, LineTruth};
 use crate::rig::{Bench, SimError};
 use crate::sensor::Exposed;
 
-/// The devices of one rig, all on one clock.
+/// The devices of one rig, sharing one clock.
 pub struct Devices {
     /// The camera.
     pub camera: Box<dyn Camera>,
-    /// The watcher of the VSYNC line.
+    /// The VSYNC monitor.
     pub vsync: Box<dyn Vsync>,
-    /// The projector; dark at first.
+    /// The projector, initially dark.
     pub projector: Box<dyn Projector>,
-    /// The clock that they live by.
+    /// The devices' clock.
     pub clock: Clock,
-    /// What really happens on the line. A real rig has no such thing: it is for tests alone.
+    /// Ground truth of the line, for tests only; real rigs have none.
     pub truth: TruthProbe,
 }
 
-/// The devices of one rig, by the host's clock, with the camera behind a wire.
+/// The devices of one rig on the host's clock, with the camera behind a network connection.
 pub struct WireDevices {
-    /// What the camera looks at.
+    /// The simulated scene as the camera's picture source.
     pub camera: Look,
-    /// The watcher of the VSYNC line.
+    /// The VSYNC monitor.
     pub vsync: Box<dyn Vsync>,
-    /// The projector; dark at first.
+    /// The projector, initially dark.
     pub projector: Box<dyn Projector>,
-    /// What really happens on the line, for tests alone.
+    /// Ground truth of the line, for tests only.
     pub truth: TruthProbe,
 }
 
-/// Looks behind the devices, for tests alone.
+/// Access to the ground truth behind the devices, for tests only.
 #[derive(Clone)]
 pub struct TruthProbe(SharedLine);
 
 impl TruthProbe {
-    /// What has really happened so far.
+    /// Ground truth so far.
     pub fn read(&self) -> LineTruth {
         self.0.lock().truth()
     }
@@ -56,11 +56,11 @@ struct SharedLine(Arc<Mutex<Line>>);
 
 impl SharedLine {
     fn lock(&self) -> MutexGuard<'_, Line> {
-        // A device that panicked has ended its own thread; the line itself is never left half changed.
+        // A panic in a device ends only that device's thread; the line is never left half changed.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until `ready` gives something or `timeout` has passed.
+    /// Waits until `ready` returns a value or `timeout` has passed.
     fn wait<T>(
         &self,
         clock: &ClockHandle,
@@ -77,7 +77,7 @@ impl SharedLine {
                 if let Some(found) = ready(&mut line, now_ns) {
                     return Some(found);
                 }
-                // A frame that is there already wakes nobody: whoever waits is not the one who takes it.
+                // A frame that has already arrived wakes nobody: the waiting thread is not the one that takes it.
                 let frame_ns = line.next_frame_ns().filter(|at_ns| *at_ns > now_ns);
                 line.next_event_ns().min(frame_ns.unwrap_or(i64::MAX)).max(now_ns + 1)
             };
@@ -100,7 +100,7 @@ pub fn open(bench: &Arc<Bench>, line: Line, clock: Clock) -> Devices {
     }
 }
 
-/// The devices of [`open`], with two handles of the camera: one writes its settings while the other waits for frames.
+/// The devices of [`open`], with two handles to the camera: one writes settings while the other waits for frames.
 pub fn open_for_wire(bench: &Arc<Bench>, line: Line) -> WireDevices {
     let (line, clock) = (SharedLine(Arc::new(Mutex::new(line))), Clock::real());
     let camera = || SimCamera::new(bench.clone(), line.clone(), clock.register());
@@ -144,13 +144,14 @@ impl SimCamera {
         &self.counts
     }
 
-    /// The line that triggers it.
+    /// Calls `work` with the line that triggers the camera, and the current time.
     pub fn with_line<T>(&self, work: impl FnOnce(&mut Line, i64) -> T) -> T {
         let now_ns = self.clock.now_ns();
         work(&mut self.line.lock(), now_ns)
     }
 
-    /// Waits for the next exposure and reads the sensor; the shutter starts at row `first_row` and leaves out those above.
+    /// Waits for the next exposure and reads the sensor; the shutter starts at row `first_row` and skips the rows
+    /// above.
     pub fn next_exposure(&mut self, first_row: usize, timeout: Duration) -> Option<Exposure> {
         let taken = self.line.wait(&self.clock, timeout, |line, now_ns| line.take_frame(now_ns));
         let (exposure, lights) = taken?;
@@ -199,7 +200,7 @@ impl Camera for SimCamera {
             return Err(Self::error(DeviceErrorKind::OutOfRange, what));
         }
         let next_seq = self.line.lock().configure(self.clock.now_ns(), id, actual);
-        // As of a real camera, no more is known than how late it may be.
+        // As with a real camera, only the maximum lateness is known.
         let first_frame = match u64::from(camera.late_frames_max) {
             0 => FirstFrame::Exactly(next_seq),
             late => FirstFrame::Within { earliest: next_seq, certain: next_seq + late },

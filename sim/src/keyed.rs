@@ -1,9 +1,9 @@
-//! Randomness that depends on what it is for and never on when or where it is drawn.
+//! Random numbers that depend only on their purpose, never on when or where they are drawn.
 
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
 
-/// What a random number is for.
+/// What a random number is used for.
 #[derive(Debug, Clone, Copy)]
 pub enum Purpose {
     /// Temporal noise of one row of one frame.
@@ -12,33 +12,33 @@ pub enum Purpose {
     Pattern,
     /// One period of the VSYNC line.
     Line,
-    /// Whether a frame is dropped on the way.
+    /// Whether a frame is lost in transit.
     Drop,
-    /// How late settings take effect.
+    /// How many frames late settings take effect.
     Late,
     /// The phase of ambient flicker.
     Flicker,
     /// Kinks of the row table.
     RowTable,
-    /// What becomes of one packet, or one frame, on the wire.
+    /// Faults of one packet, or one frame, on the wire.
     Wire,
-    /// How a mirror misses the same point another time.
+    /// Repeatability error of a mirror movement.
     MirrorRepeat,
-    /// Faults of a mirror's controller and its wire.
+    /// Faults of a mirror's controller and its serial line.
     MirrorWire,
     /// Offsets of the sensor's columns.
     Columns,
-    /// What becomes of one frame of a dot.
+    /// Faults of one frame of the dot rig.
     DotFrame,
 }
 
-/// A generator for `purpose` under the rig's `seed`, told apart by `key`.
+/// Returns a generator for `purpose` under the rig's `seed`; each `key` has its own stream.
 pub fn keyed(seed: u64, purpose: Purpose, key: &[u64]) -> Xoshiro256PlusPlus {
     let mixed = key.iter().fold(mix(seed) ^ purpose as u64, |state, &part| mix(state) ^ part);
     Xoshiro256PlusPlus::seed_from_u64(mix(mixed))
 }
 
-/// SplitMix64's output function: a bijection, so keys that differ stay different.
+/// SplitMix64's output function: a bijection, so different keys stay different.
 fn mix(value: u64) -> u64 {
     let mut z = value.wrapping_add(0x9E37_79B9_7F4A_7C15);
     z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -46,7 +46,7 @@ fn mix(value: u64) -> u64 {
     z ^ (z >> 31)
 }
 
-/// A number in 0..1.
+/// Returns a number in 0..1.
 pub fn uniform(random: &mut Xoshiro256PlusPlus) -> f64 {
     (random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
 }

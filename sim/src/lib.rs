@@ -1,8 +1,8 @@
 //! Simulated rigs: scenes, projector, camera, sensor and VSYNC line under one clock, with seeded faults.
 //!
-//! A [`PlaneRig`] opens devices that implement the traits of `raysweep-core` and carry nothing that real devices
-//! lack. All randomness is keyed by what it is for (point, attempt, frame), so the same seed gives the same bits
-//! whatever the number of threads and wherever a run was interrupted.
+//! A [`PlaneRig`] opens devices that implement the traits of `raysweep-core` and offer no more than real devices
+//! do. All random numbers are keyed by their purpose (point, attempt, frame), so the same seed gives the same bits
+//! for any number of threads and wherever a run was interrupted.
 
 pub mod bench;
 pub mod config;

@@ -1,5 +1,5 @@
-//! The electrical side of the rig: the VSYNC line, the projector's frames of light behind it, and the camera that its
-//! edges trigger. Events happen in the order of time, whoever looks first.
+//! The electrical side of the rig: the VSYNC line, the projector frames that follow it, and the camera that its edges
+//! trigger. Events are processed in order of time, regardless of which device asks first.
 
 mod camera;
 
@@ -16,21 +16,21 @@ use crate::keyed::{Purpose, keyed, uniform};
 use crate::optics::Optics;
 use crate::scene::Motion;
 
-/// What the projector shows: the scene under its pattern, in each key position of the scene's motion.
+/// What the projector shows: the scene under its pattern, for each key position of the scene's motion.
 pub type Shown = Arc<[Arc<Optics>]>;
 
-/// One frame of the projector: when its edge was and what it shows (`None`: dark).
+/// One projector frame: the time of its edge and what it shows (`None`: dark).
 #[derive(Clone)]
 pub struct Light {
-    /// When its edge was, or should have been.
+    /// Time of its edge, even if the edge is missing from the line.
     pub edge_ns: i64,
-    /// When the light's own clock began: the edge, plus what no edge shows.
+    /// Start of the light: the edge plus a phase error that no device measures.
     pub start_ns: i64,
     /// The scene under the pattern shown.
     pub optics: Option<Arc<Optics>>,
 }
 
-/// Constants of the line.
+/// Parameters of the line.
 pub struct LineConfig {
     pub seed: u64,
     pub period_ns: i64,
@@ -38,39 +38,39 @@ pub struct LineConfig {
     pub projector: SimProjector,
     pub camera: SimCamera,
     pub motion: Motion,
-    /// From the end of row 0's exposure until the last row is read.
+    /// Time from the end of row 0's exposure until the last row is read.
     pub readout_ns: i64,
-    /// From the end of row 0's exposure to the end of the last row's.
+    /// Time from the end of row 0's exposure to the end of the last row's.
     pub rolling_ns: i64,
 }
 
-/// The line's state at one moment.
+/// State of the line.
 pub struct Line {
     config: LineConfig,
-    /// Number of the next period to be drawn.
+    /// Number of the next period to draw.
     next_period: i64,
-    /// What the last period was drawn for, and how many periods were.
+    /// The frame that the last period was drawn for; `draws` counts the periods drawn for it.
     drawn_for: DrawnFor,
     draws: u64,
-    /// When settings were last written: the camera is asked then, not earlier, whether it is ready for what lies ahead.
+    /// When settings were last written: for later periods, the camera's readiness is evaluated no earlier than this.
     configured_ns: i64,
-    /// Edges on the line that lie ahead, in order.
+    /// Future edges on the line, in order.
     pending: VecDeque<PendingEdge>,
-    /// Light of the recent periods and of the one ahead.
+    /// Light of the most recent periods and the next one.
     lights: VecDeque<Light>,
     shown: Option<Shown>,
-    /// What the projector will show from an edge on.
+    /// The next pattern, and the period from which the projector shows it.
     next_shown: Option<(i64, Option<Shown>)>,
     seen: VecDeque<Edge>,
     edges: u64,
     camera: CameraLine,
-    /// In the place of what is configured.
+    /// Overrides the configured number of late frames.
     late_frames: Option<u32>,
     truth: LineTruth,
 }
 
-/// A frame (point, attempt, frames before it under the same settings) and whether the camera is ready for another: the
-/// frame that a period may trigger if it is, and else the frame that sees the period's light.
+/// A frame (point, attempt, number of frames before it under the same settings) and whether the camera is ready: if so,
+/// the next frame, which the period may trigger; otherwise the newest frame, which sees the period's light.
 type DrawnFor = ([u64; 3], bool);
 
 struct PendingEdge {
@@ -87,30 +87,30 @@ enum EdgeKind {
     False,
 }
 
-/// What really happened, for tests alone.
+/// Ground truth of the line, for tests only.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LineTruth {
-    /// Exposures that the camera made while armed.
+    /// Exposures made while armed.
     pub exposures: u64,
-    /// Of those, triggered by false edges.
+    /// Exposures triggered by false edges.
     pub false_triggers: u64,
     /// Edges that never reached the line.
     pub missing_edges: u64,
-    /// Edges that the watching device missed.
+    /// Edges missed by the VSYNC monitor.
     pub unseen_edges: u64,
-    /// Frames lost on the way.
+    /// Frames lost in transit.
     pub dropped_frames: u64,
 }
 
-/// Frames that the camera keeps for a host that does not take them; older ones are lost.
+/// Frames that the camera buffers for the host; on overflow the oldest is lost.
 const CAMERA_BUFFERS: usize = 32;
-/// How soon a free-running camera that was not ready looks again.
+/// Retry interval of a free-running camera that was not ready.
 const FREE_RETRY_NS: i64 = 50_000;
-/// A period is drawn this long before its nominal edge, so that no jitter puts the edge before the draw.
+/// Time before its nominal edge at which a period is drawn; larger than any jitter.
 const GUARD_NS: i64 = 400_000;
 
 impl Line {
-    /// A line at rest at `now_ns`.
+    /// An idle line at `now_ns`.
     pub fn new(config: LineConfig, now_ns: i64) -> Self {
         Self {
             next_period: now_ns / config.period_ns + 1,
@@ -134,7 +134,7 @@ impl Line {
         self.truth
     }
 
-    /// When something happens next.
+    /// Time of the next event.
     pub fn next_event_ns(&self) -> i64 {
         self.next_line_event_ns().min(self.camera.free_run_ns())
     }
@@ -144,7 +144,7 @@ impl Line {
         self.pending.front().map_or(draw_ns, |edge| edge.at_ns.min(draw_ns))
     }
 
-    /// Lets everything happen that happens until `now_ns`.
+    /// Processes all events until `now_ns`.
     pub fn advance(&mut self, now_ns: i64) {
         while self.next_event_ns() <= now_ns {
             if self.camera.free_run_ns() < self.next_line_event_ns() {
@@ -167,8 +167,8 @@ impl Line {
         period * self.config.period_ns
     }
 
-    /// Decides what the next period brings. All that is random is keyed by the frame that it concerns, so that a point
-    /// has the same edges in an uninterrupted run and in a resumed one.
+    /// Draws the events of the next period. All random numbers are keyed by the frame concerned, so that a point has
+    /// the same edges in an uninterrupted run and in a resumed one.
     fn draw_period(&mut self) {
         let nominal_ns = self.nominal_ns(self.next_period);
         let asked_ns = nominal_ns.max(self.configured_ns);
@@ -203,7 +203,7 @@ impl Line {
         };
         self.pending.push_back(PendingEdge { period: self.next_period, at_ns: edge_ns, kind });
         if false_edge {
-            // Anywhere but close to the true edges, where it would be one of them for all purposes.
+            // Not close to a true edge, from which it could not be told apart.
             let offset_ns = (self.config.period_ns as f64 * (0.1 + 0.8 * false_at)) as i64;
             let at_ns = nominal_ns + offset_ns;
             self.pending.push_back(PendingEdge { period: self.next_period, at_ns, kind: EdgeKind::False });
@@ -213,7 +213,7 @@ impl Line {
         self.forget_old_lights(nominal_ns);
     }
 
-    /// Keeps the light that a waiting exposure, or one about to start, can still see.
+    /// Drops light that no waiting or imminent exposure can see.
     fn forget_old_lights(&mut self, nominal_ns: i64) {
         let oldest_ns =
             self.camera.exposures.front().map_or(nominal_ns, |exposure| exposure.start_ns.min(nominal_ns));
@@ -233,8 +233,8 @@ impl Line {
         } else {
             self.seen.push_back(Edge { seq: self.edges, host_ns: edge.at_ns });
         }
-        // False edges are keyed by the frame before them. One that triggered the first frame under new settings would
-        // make a point depend on the point before it, which a resumed run may not have taken; a sequence is never resumed.
+        // False edges are keyed by the frame before them. If one triggered the first frame under new settings, a point
+        // would depend on the previous point, which a resumed run may not have acquired. A sequence is never resumed.
         let is_first = self.camera.due().1 == 0 && self.camera.sequence.is_none();
         let is_heard = edge.kind != EdgeKind::False || !is_first;
         let by_edges = self.camera.triggered_by == TriggeredBy::Edges;
@@ -243,7 +243,7 @@ impl Line {
         }
     }
 
-    /// The trigger of a free-running camera.
+    /// Triggers a free-running camera.
     fn free_run(&mut self) {
         let TriggeredBy::FreeRun { period_ns } = self.camera.triggered_by else { return };
         let at_ns = self.camera.next_free_ns;
@@ -252,7 +252,7 @@ impl Line {
             at_ns + if answered { period_ns.max(FREE_RETRY_NS) } else { FREE_RETRY_NS };
     }
 
-    /// Whether the camera answered.
+    /// Triggers the camera; returns whether it responded.
     fn trigger(&mut self, edge_ns: i64) -> bool {
         let config = &self.config;
         let camera = &mut self.camera;
@@ -298,14 +298,15 @@ impl Line {
             config.camera.late_frames_max
         };
         let first_seq = self.camera.seq + u64::from(self.late_frames.unwrap_or(late));
-        // Registers are read in the order in which they were written: the latest word stands.
+        // Registers are read in the order in which they were written: the latest value counts.
         self.camera.written.retain(|earlier| earlier.first_seq < first_seq);
         self.camera.written.push_back(Written { first_seq, id, settings });
         self.redraw(now_ns);
         self.camera.seq
     }
 
-    /// Has each frame from the next one on, which begins with the set `first`, take the set after that of the frame before.
+    /// Starts a sequence: the next frame uses the set `first`, and each later frame the successor of the previous
+    /// frame's set.
     pub fn set_sequence(&mut self, now_ns: i64, sets: Sets, first: usize) {
         self.advance(now_ns);
         self.camera.written.clear();
@@ -314,14 +315,14 @@ impl Line {
         self.redraw(now_ns);
     }
 
-    /// The set of the newest frame, while a sequence runs and has had one.
+    /// The set of the newest frame, if a sequence is running and has had a frame.
     pub fn active_set(&mut self, now_ns: i64) -> Option<usize> {
         self.advance(now_ns);
         let CameraLine { sequence, in_force, .. } = &self.camera;
         sequence.as_ref().filter(|sequence| sequence.frames > 1).map(|_| in_force.id.point as usize)
     }
 
-    /// What lies ahead was drawn for the settings before: draws it again for the new ones.
+    /// Redraws future periods, which were drawn for the previous settings.
     fn redraw(&mut self, now_ns: i64) {
         self.configured_ns = now_ns;
         while self.lights.back().is_some_and(|light| light.edge_ns > now_ns) {
@@ -333,20 +334,20 @@ impl Line {
         self.pending.retain(|edge| edge.period < next_period);
     }
 
-    /// Triggers the camera by command; whether it answered.
+    /// Triggers the camera by software; returns whether it responded.
     pub fn fire(&mut self, now_ns: i64) -> bool {
         self.advance(now_ns);
         self.camera.triggered_by == TriggeredBy::Software && self.trigger(now_ns)
     }
 
-    /// Chooses what starts exposures.
+    /// Selects what starts exposures.
     pub fn set_triggered_by(&mut self, now_ns: i64, triggered_by: TriggeredBy) {
         self.advance(now_ns);
         self.camera.triggered_by = triggered_by;
         self.camera.next_free_ns = now_ns;
     }
 
-    /// How many frames still have the old settings after a change, from now on; `None`: as configured.
+    /// Sets how many frames after a change still use the old settings; `None`: as configured.
     pub fn set_late_frames(&mut self, frames: Option<u32>) {
         self.late_frames = frames;
     }
@@ -370,12 +371,12 @@ impl Line {
         self.camera.armed
     }
 
-    /// When the oldest exposure's frame is on the host.
+    /// Arrival time of the oldest pending frame at the host.
     pub fn next_frame_ns(&self) -> Option<i64> {
         self.camera.exposures.front().map(|exposure| exposure.done_ns)
     }
 
-    /// The next frame that is on the host at `now_ns`, with the light that it saw.
+    /// The next frame that has arrived at the host by `now_ns`, with the light that it saw.
     pub fn take_frame(&mut self, now_ns: i64) -> Option<(Exposure, Vec<Light>)> {
         while self.next_frame_ns()? <= now_ns {
             let exposure = self.camera.exposures.pop_front()?;
@@ -388,12 +389,12 @@ impl Line {
         None
     }
 
-    /// The next edge that the watching device has seen.
+    /// The next edge seen by the VSYNC monitor.
     pub fn take_edge(&mut self) -> Option<Edge> {
         self.seen.pop_front()
     }
 
-    /// Shows something else (`None`: dark); returns from when on it is in the light.
+    /// Changes what is shown (`None`: dark); returns the time from which the light shows it.
     pub fn show(&mut self, now_ns: i64, shown: Option<Shown>) -> i64 {
         self.advance(now_ns);
         let from_period = self.next_period + i64::from(self.config.projector.video_latency_frames);

@@ -1,7 +1,7 @@
-//! Light onto the sensor: which part of the scene's transport falls into an exposure.
+//! Light on the sensor: the part of the scene's transport that falls into an exposure.
 //!
-//! Light is integrated in time, row by row as the projector draws them, continuously within a row (finer than any
-//! grid of steps). Nothing here knows of demultiplexing or of its matrix: a recovery proves itself against this.
+//! Light is integrated in time, row by row as the projector draws, continuously within a row (finer than any time
+//! grid). This code shares nothing with demultiplexing or its matrix, so that it can serve as an independent check.
 
 use ndarray::{Array2, Array3, Axis, s};
 use rayon::prelude::*;
@@ -12,39 +12,39 @@ use crate::config::{Beam, RowTable, SimProjector, Spot};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::scene::Scene;
 
-/// A scene under a raster projector, prepared so that an exposure costs two look-ups a camera row.
+/// A scene under a raster projector, prepared so that an exposure takes two look-ups per camera row.
 pub struct Optics {
-    /// Start of each drawn row's light after the VSYNC edge, and the last row's end: the scene's rows and those beside
-    /// them whose beam reaches it.
+    /// Start of each drawn row's light after the VSYNC edge, and the last row's end. Drawn rows are the scene's rows
+    /// and those next to them whose beam reaches it.
     row_starts_us: Vec<f64>,
-    /// Light of the drawn rows above `v`, `[t, v, s]` with one entry of v more than rows are drawn.
+    /// Summed light of the drawn rows before `v`, `[t, v, s]`, with one more v than drawn rows.
     cumulative: Array3<f32>,
-    /// Light that arrives at one moment of its row, if the spot's flight is simulated.
+    /// Direct light that arrives at one instant within its row, if the moving spot is simulated.
     flashes: Option<Flashes>,
 }
 
-/// Direct light under a flying spot.
+/// Direct light of a moving spot.
 struct Flashes {
     /// Direct light of each pixel, `[t, s]`.
     direct: Array2<f32>,
     /// Projector column 0..1 that each pixel sees, `[t, s]`.
     column: Array2<f32>,
-    /// Rows away from the pixel's own and the share of the beam that they send.
+    /// Offset in rows from the pixel's own row, and the fraction of the beam that arrives from there.
     beam: Vec<(isize, f32)>,
     bidirectional: bool,
-    /// Row of the projector that is drawn first.
+    /// Projector row of the first drawn row.
     first_drawn: usize,
-    /// Drawn row that is scene row 0.
+    /// Drawn row that corresponds to scene row 0.
     scene_offset: usize,
-    /// What each drawn row shows.
+    /// Weight of each drawn row in the pattern.
     pattern: Vec<f32>,
 }
 
 impl Optics {
-    /// Prepares `scene` under `pattern`, a weight for each of the projector's rows.
+    /// Prepares `scene` under `pattern`, which has one weight per projector row.
     ///
     /// # Errors
-    /// When the scene does not fit the projector or the row table folds back in time.
+    /// When the scene does not fit the projector or the row table is not increasing.
     pub fn new(
         scene: &Scene,
         raster: &Raster,
@@ -80,7 +80,7 @@ impl Optics {
                     let Some(lit) = lit.filter(|&lit| lit < rows) else { continue };
                     let weight = f64::from(share * shown);
                     for (s, sum) in sum.iter_mut().enumerate() {
-                        // Direct light under a flying spot is not spread over its row's time.
+                        // Direct light of a moving spot is not spread over the row's dwell.
                         if direct.is_none() || lit != t {
                             *sum += weight * f64::from(transport[[lit, t, s]]);
                         }
@@ -104,8 +104,8 @@ impl Optics {
         Ok(Self { row_starts_us, cumulative, flashes })
     }
 
-    /// Adds to `light` what camera row `t` receives of one frame of the projector between `from_us` and `to_us` after
-    /// that frame's edge.
+    /// Adds to `light` what camera row `t` receives from one projector frame between `from_us` and `to_us` after that
+    /// frame's edge.
     pub fn expose_row(&self, t: usize, from_us: f64, to_us: f64, light: &mut [f32]) {
         let (from, to) = (self.rows_drawn(from_us), self.rows_drawn(to_us));
         if to > from {
@@ -122,7 +122,7 @@ impl Optics {
         }
     }
 
-    /// How many rows, and which part of the next, have been drawn by `time_us`.
+    /// Number of rows drawn by `time_us`, with the fraction of the row in progress.
     fn rows_drawn(&self, time_us: f64) -> f64 {
         let starts = &self.row_starts_us;
         let begun = starts.partition_point(|&start| start <= time_us);
@@ -137,7 +137,7 @@ impl Optics {
     }
 }
 
-/// A place between two entries of the cumulative light.
+/// A position between two entries of the cumulative light.
 struct Between {
     row: usize,
     share: f32,
@@ -172,8 +172,8 @@ impl Flashes {
     }
 }
 
-/// The transport as the sensor's pixels see it, `[V, H, W]`: through a Bayer mosaic or, on a monochrome
-/// sensor, the mean of the colours.
+/// The transport as seen by the sensor's pixels, `[V, H, W]`: through a Bayer mosaic or, on a monochrome sensor, the
+/// mean of the colours.
 fn filtered(scene: &Scene, mosaic: Mosaic) -> Array3<f32> {
     let transport = &scene.transport;
     let channels = transport.dim().3;
@@ -186,7 +186,7 @@ fn filtered(scene: &Scene, mosaic: Mosaic) -> Array3<f32> {
     let (rows, height, width, _) = transport.dim();
     let mut seen = Array3::zeros((rows, height, width));
     for (first_t, first_s) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-        // Blue lies diagonally from red, green beside both.
+        // Blue is diagonal to red; green is adjacent to both.
         let channel = (first_t ^ red_t) + (first_s ^ red_s);
         seen.slice_mut(s![.., first_t..;2, first_s..;2])
             .assign(&transport.index_axis(Axis(3), channel).slice(s![.., first_t..;2, first_s..;2]));
@@ -194,11 +194,11 @@ fn filtered(scene: &Scene, mosaic: Mosaic) -> Array3<f32> {
     seen
 }
 
-/// Projector row of the scene's first: as given, or such that the scene is a window in the middle of the frame, as far
-/// as the camera's rows, `row_pitch` projector rows each, allow.
+/// Projector row of the scene's first row: `given`, or a value that centres the scene in the frame as far as the
+/// camera's rows, `row_pitch` projector rows each, allow.
 ///
 /// # Errors
-/// When scene or camera do not fit.
+/// When the scene or the camera rows do not fit.
 pub fn first_scene_row(
     raster: &Raster,
     scene: &Scene,
@@ -235,7 +235,7 @@ pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64
             let mut random = keyed(seed, Purpose::RowTable, &[]);
             let mut knots: Vec<f64> =
                 (0..=pieces).map(|_| amplitude_us * (2.0 * uniform(&mut random) - 1.0)).collect();
-            // The sweep as a whole keeps its place: only its inside is bent.
+            // The sweep keeps its start and end; only times in between are shifted.
             (knots[0], knots[pieces]) = (0.0, 0.0);
             (0..=raster.rows)
                 .map(|row| {
@@ -250,7 +250,7 @@ pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64
     if starts.is_sorted_by(|a, b| a < b) { Ok(starts) } else { Err(SimError::RowTable) }
 }
 
-/// The rows that a row's beam reaches and the share that each gets; the shares sum to 1.
+/// Row offsets that a row's beam reaches and the fraction of light at each; the fractions sum to 1.
 fn beam_weights(beam: &Beam) -> Result<Vec<(isize, f32)>, SimError> {
     let weights: Vec<(isize, f64)> = match *beam {
         Beam::Ideal => vec![(0, 1.0)],

@@ -1,4 +1,4 @@
-//! The simulated plane rig: a scene, a projector that draws it and a camera that looks at it.
+//! The simulated plane rig: a scene, a projector and a camera.
 
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
@@ -19,47 +19,47 @@ use crate::sensor::{Scale, Sensor};
 /// Why a simulated rig cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum SimError {
-    /// The scene cannot be read or made.
+    /// The scene cannot be read or computed.
     #[error("sim.scene: {0}")]
     Scene(#[from] SceneError),
-    /// More rows than the projector has.
+    /// The scene has more rows than the projector below its first row.
     #[error(
         "sim.scene has {scene_rows} rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.first_projector_row or take a smaller scene"
     )]
     SceneRows {
-        /// Rows of the scene.
+        /// Scene rows.
         scene_rows: usize,
-        /// Projector row of its first.
+        /// Projector row of the scene's first row.
         first_row: usize,
-        /// Rows of the projector.
+        /// Projector rows.
         projector_rows: usize,
     },
-    /// More camera rows than the projector has.
+    /// The camera rows span more projector rows than there are.
     #[error(
         "the camera rows of sim.scene look along {camera_rows} projector rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.row_pitch or set camera.first_projector_row"
     )]
     CameraRows {
-        /// Projector rows that the scene's camera rows look along.
+        /// Projector rows spanned by the scene's camera rows.
         camera_rows: usize,
-        /// Projector row of its first.
+        /// Projector row of the first camera row.
         first_row: usize,
-        /// Rows of the projector.
+        /// Projector rows.
         projector_rows: usize,
     },
-    /// Times must rise from row to row.
+    /// Row times do not increase from row to row.
     #[error(
         "sim.projector.row_table: rows would be drawn in a different order; take a smaller percent or amplitude_us"
     )]
     RowTable,
-    /// A beam without extent, or wider than any.
+    /// The beam has no extent or is too wide.
     #[error(
         "sim.projector.beam: sigma_rows must lie in 0..=100 (not 0), up_rows + down_rows in 0..=500 (not 0)"
     )]
     Beam,
-    /// A pattern for another projector.
+    /// The pattern does not fit the projector.
     #[error(transparent)]
     Pattern(#[from] PatternError),
-    /// A pattern that the scenes, which know light by its row, cannot be lit with.
+    /// The pattern varies along rows, which the scenes' row transport cannot represent.
     #[error(
         "the simulated projector shows white, black, a line and row weights: a pattern that changes along rows needs a real one"
     )]
@@ -67,17 +67,17 @@ pub enum SimError {
     /// A key of `[sim]` outside its range.
     #[error("sim.{key} = {value}: allowed is {allowed}")]
     Range {
-        /// The key below `[sim]`.
+        /// Key below `[sim]`.
         key: &'static str,
-        /// Its value.
+        /// Given value.
         value: f64,
-        /// What it may be.
+        /// Allowed values.
         allowed: &'static str,
     },
 }
 
 impl SimError {
-    /// The key below `[sim]` that it is about.
+    /// The key below `[sim]` that causes the error.
     pub fn key(&self) -> &'static str {
         match self {
             Self::Scene(_)
@@ -92,35 +92,35 @@ impl SimError {
     }
 }
 
-/// What the rest of the rig file says that the simulation needs.
+/// Parameters from the rest of the rig file that the simulation needs.
 #[derive(Debug, Clone, Copy)]
 pub struct PlaneSetup {
-    /// When the projector lights its rows.
+    /// Raster timing of the projector.
     pub raster: Raster,
     /// Row time of the camera.
     pub camera_row_time_us: f64,
-    /// Projector rows from one camera row to the next, as the scene has them.
+    /// Projector rows from one camera row to the next, as for the scene.
     pub row_pitch: f64,
     /// Counts, above black, of a white pixel in the time of one projector row.
     pub white_dn: f64,
     /// Counts without light.
     pub black_dn: f64,
-    /// How frames are packed.
+    /// Pixel packing of the frames.
     pub format: PixelFormat,
-    /// Projector row that camera row 0 sees; left out: the scene is a window in the middle of the projector's rows.
+    /// Projector row seen by camera row 0. `None`: the scene is centred in the projector's rows.
     pub first_row: Option<usize>,
 }
 
-/// A simulated plane rig whose devices can be opened again and again.
+/// A simulated plane rig, whose devices can be opened repeatedly.
 pub struct PlaneRig {
     bench: Arc<Bench>,
 }
 
-/// Everything about the rig that does not change while it runs.
+/// The parts of the rig that are constant while it runs.
 pub(crate) struct Bench {
     pub config: SimConfig,
     setup: PlaneSetup,
-    /// The scene in each key position of its motion; all of one size.
+    /// The scene in each key position of its motion; all have the same size.
     scenes: Vec<Scene>,
     motion: Motion,
     first_row: usize,
@@ -131,7 +131,7 @@ pub(crate) struct Bench {
 }
 
 impl PlaneRig {
-    /// Builds the rig; a scene file is looked up relative to `folder`.
+    /// Builds the rig; the path of a scene file is relative to `folder`.
     ///
     /// # Errors
     /// When the scene cannot be read or a key is out of range; the message names the key.
@@ -163,55 +163,55 @@ impl PlaneRig {
         Ok(Self { bench: Arc::new(bench) })
     }
 
-    /// The scene, at time zero where it moves: the truth that a recovery is held against.
+    /// The scene, at time zero if it moves: the ground truth for recovered transports.
     pub fn scene(&self) -> &Scene {
         self.scene_at(0)
     }
 
-    /// The scene as it is in the frame of light that begins at a time of the devices' clock.
+    /// The scene during the projector frame that begins at a time of the devices' clock.
     pub fn scene_at(&self, time_ns: i64) -> &Scene {
         &self.bench.scenes[self.bench.motion.key(time_ns)]
     }
 
-    /// Projector row that camera row 0 sees.
+    /// Projector row seen by camera row 0.
     pub fn first_row(&self) -> usize {
         self.bench.first_row
     }
 
-    /// When each projector row is lit in truth, and the last one's end, after the VSYNC edge: `[rows + 1]`. What a
-    /// measured row table is held against.
+    /// True start of each projector row's light, and the last row's end, after the VSYNC edge: `[rows + 1]`. The ground
+    /// truth for measured row tables.
     ///
     /// # Errors
-    /// Never for a rig that was built; kept so that no caller has to trust that.
+    /// None for a rig that was built successfully; returned so that no caller has to rely on that.
     pub fn row_starts_us(&self) -> Result<Vec<f64>, SimError> {
         let Bench { config, setup, .. } = &*self.bench;
         optics::row_table(&setup.raster, &config.projector.row_table, config.seed)
     }
 
-    /// Opens the devices, at time zero of their own clock.
+    /// Opens the devices, starting at time zero of their own clock.
     pub fn open(&self) -> Devices {
         let clock = if self.bench.config.realtime { Clock::real() } else { Clock::simulated() };
         devices::open(&self.bench, Line::new(self.bench.line_config(), clock.now_ns()), clock)
     }
 
-    /// Opens the devices by the host's clock, with the camera as what a wire leads to.
+    /// Opens the devices on the host's clock, with the camera as the picture source of a network camera.
     pub fn open_for_wire(&self) -> WireDevices {
         devices::open_for_wire(&self.bench, Line::new(self.bench.line_config(), Clock::real().now_ns()))
     }
 
-    /// The light of an image without noise or jitter, in the scene's units, `[t, s]`: each camera row exposed for
-    /// `exposure_us`, centred `delay_us` after its own projector row, to one white frame.
+    /// Light of an image without noise or jitter, in the scene's units, `[t, s]`: one white frame, each camera row
+    /// exposed for `exposure_us`, centred `delay_us` after its own projector row.
     ///
     /// # Errors
-    /// Never for a rig that was built; kept so that no caller has to trust that.
+    /// None for a rig that was built successfully; returned so that no caller has to rely on that.
     pub fn noise_free(&self, delay_us: f64, exposure_us: f64) -> Result<Array2<f32>, SimError> {
         self.noise_free_at(0, delay_us, exposure_us)
     }
 
-    /// [`Self::noise_free`] in the frame of light that begins at a time of the devices' clock.
+    /// Like [`Self::noise_free`], for the projector frame that begins at a time of the devices' clock.
     ///
     /// # Errors
-    /// Those of [`Self::noise_free`].
+    /// As for [`Self::noise_free`].
     pub fn noise_free_at(
         &self,
         time_ns: i64,
@@ -254,7 +254,7 @@ impl Bench {
         build(&pattern.row_weights(rows)?.ok_or(SimError::AlongRows)?)
     }
 
-    /// When row `t` starts its exposure, after row 0.
+    /// Start of row `t`'s exposure relative to row 0.
     pub fn row_start_us(&self, shutter: Shutter, t: usize) -> f64 {
         match shutter {
             Shutter::Rolling => t as f64 * self.setup.camera_row_time_us,

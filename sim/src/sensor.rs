@@ -1,4 +1,4 @@
-//! The sensor after EMVA 1288 (release 4.0): light to electrons to counts.
+//! Sensor model after EMVA 1288 (release 4.0): converts light to electrons to counts.
 
 use ndarray::Array2;
 use rand_distr::{Distribution, StandardNormal};
@@ -7,41 +7,41 @@ use rayon::prelude::*;
 use crate::config::SimSensor;
 use crate::keyed::{Purpose, keyed, uniform};
 
-/// What one frame's exposure adds to its light.
+/// One frame's exposure: its light, its duration and its noise key.
 pub struct Exposed<'a> {
     /// Light of each pixel in the scene's units (1 = a white pixel's row), `[t, s]`, row-major.
     pub light: &'a mut [f32],
-    /// How long each row collected dark current.
+    /// Time for which each row collected dark current.
     pub exposure_us: f64,
-    /// What noise is keyed by: point, attempt, frame.
+    /// Noise key: point, attempt, frame.
     pub key: [u64; 3],
 }
 
-/// The scale of the counts that a camera delivers.
+/// Scale of the camera's counts.
 #[derive(Debug, Clone, Copy)]
 pub struct Scale {
-    /// Counts above black of a white pixel's row.
+    /// Counts of a white pixel's row, above black.
     pub white_dn: f64,
     /// Counts without light.
     pub black_dn: f64,
-    /// Bits of a pixel.
+    /// Bits per pixel.
     pub bits: u32,
 }
 
-/// The constant properties of each pixel, drawn once.
+/// Fixed properties of each pixel, drawn once.
 pub struct Sensor {
     config: SimSensor,
     seed: u64,
     width: usize,
     /// Electrons of a white pixel's row, after vignetting and PRNU, `[t, s]` row-major.
     electrons_per_light: Vec<f32>,
-    /// Electrons without any light or time.
+    /// Electrons at zero light and zero exposure time, `[t, s]` row-major.
     offset_e: Vec<f32>,
     electrons_per_dn: f32,
-    /// Electrons per microsecond without light.
+    /// Dark current in electrons per microsecond, `[t, s]` row-major.
     dark_e_per_us: Vec<f32>,
     black_dn: f32,
-    /// Counts between neighbouring codes.
+    /// Distance between neighbouring converter codes, in counts.
     step_dn: f32,
     max_dn: f32,
 }
@@ -50,7 +50,7 @@ impl Sensor {
     /// A sensor of `size` (rows, columns).
     pub fn new(config: &SimSensor, size: (usize, usize), scale: Scale, seed: u64) -> Self {
         let (height, width) = size;
-        // The same light fills the same share of the scale, whatever its bits.
+        // The same light fills the same fraction of the scale at any bit depth.
         let electrons_per_dn = config.electrons_per_dn * 2_f64.powi(12 - scale.bits as i32);
         let mut random = keyed(seed, Purpose::Pattern, &[]);
         let mut spread = |sigma: f64| -> f64 {
@@ -58,7 +58,7 @@ impl Sensor {
             if config.noise { sigma * z } else { 0.0 }
         };
         let gain = Array2::from_shape_fn(size, |(t, s)| {
-            // Light falls off with the square of the distance from the centre, as cos^4 does to first order.
+            // Vignetting: quadratic in the distance from the centre, the first-order term of cos^4.
             let (y, x) = ((t as f64 + 0.5) / height as f64 - 0.5, (s as f64 + 0.5) / width as f64 - 0.5);
             let vignetting = 1.0 - config.vignetting_percent / 100.0 * 2.0 * (x * x + y * y);
             scale.white_dn * electrons_per_dn * vignetting * (1.0 + spread(config.prnu_percent / 100.0))
@@ -93,7 +93,7 @@ impl Sensor {
         }
     }
 
-    /// Turns light into counts, `[t, s]` row-major.
+    /// Converts light to counts, `[t, s]` row-major.
     pub fn read(&self, exposed: Exposed<'_>, counts: &mut [u16]) {
         let Exposed { light, exposure_us, key } = exposed;
         let width = self.width;
@@ -108,8 +108,8 @@ impl Sensor {
                     let collected_e = light * gains[s] + dark[s] * exposure_us as f32;
                     let mut electrons = collected_e;
                     if self.config.noise {
-                        // Shot noise in its Gaussian limit: below some 20 electrons, where it is not Gaussian, the read
-                        // noise hides the difference.
+                        // Shot noise in its Gaussian limit: below about 20 electrons, where it is not Gaussian, read
+                        // noise masks the difference.
                         let variance = collected_e.max(0.0) + (self.config.read_noise_e as f32).powi(2);
                         let z: f32 = StandardNormal.sample(&mut random);
                         electrons += variance.sqrt() * z;
@@ -127,7 +127,7 @@ impl Sensor {
 mod tests {
     use super::*;
 
-    /// Mean and variance over a uniform field of `light`, over pixels and frames.
+    /// Mean and variance over pixels and frames under a uniform `light`.
     fn field(config: &SimSensor, light: f32, frames: u64) -> (f64, f64) {
         let scale = Scale { white_dn: 2500.0, black_dn: 64.0, bits: 12 };
         let sensor = Sensor::new(config, (64, 64), scale, 3);

@@ -1,36 +1,36 @@
-//! A simulated triggerbox (firmware 14) on a pseudo-terminal. Its pulses are the edges of the simulated VSYNC line: both
-//! stand on the multiples of the period on the host's clock.
+//! A simulated triggerbox (firmware 14) on a pseudo-terminal. Its pulses are the edges of the simulated VSYNC line:
+//! both lie on multiples of the period on the host's clock.
 
 use std::io;
 use std::path::Path;
 
 use crate::mirror::{Link, Pty, WireFaults};
 
-/// How long a pulse is, in ticks: it is counted at its end.
+/// Pulse length in ticks; a pulse is counted at its end.
 const PULSE_TICKS: i64 = 1000;
-/// The firmware's version.
+/// Firmware version.
 const VERSION: u8 = 14;
 
-/// A box that is plugged in. Dropping it unplugs it.
+/// A plugged-in triggerbox. Dropping it unplugs it.
 pub struct TriggerBoxPty(Pty);
 
 impl TriggerBoxPty {
-    /// Plugs a box in whose true period is `period_ns`, whatever its crystal takes it for.
+    /// Plugs in a box whose true period is `period_ns`, whatever its crystal measures.
     ///
     /// # Errors
-    /// When there is no pseudo-terminal or no thread.
+    /// When a pseudo-terminal or a thread cannot be created.
     pub fn plug(period_ns: i64, link: Link, faults: WireFaults) -> io::Result<Self> {
         let mut timer = Timer { period_ns, top: 0x2710, started: Some(0), buffer: Vec::new() };
         let run = move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| timer.run(bytes, now_ns, replies);
         Pty::plug(Box::new(run), link, faults).map(Self)
     }
 
-    /// The port that a driver opens.
+    /// The port for the driver to open.
     pub fn path(&self) -> &Path {
         self.0.path()
     }
 
-    /// Pulls the plug.
+    /// Unplugs the box.
     pub fn unplug(&mut self) {
         self.0.unplug();
     }
@@ -39,7 +39,7 @@ impl TriggerBoxPty {
 struct Timer {
     period_ns: i64,
     top: u16,
-    /// The period in which it was started.
+    /// The period in which the timer was started.
     started: Option<i64>,
     buffer: Vec<u8>,
 }
@@ -48,7 +48,7 @@ impl Timer {
     fn run(&mut self, bytes: &[u8], now_ns: i64, replies: &mut Vec<u8>) {
         self.buffer.extend(bytes);
         loop {
-            // Bytes that make no command are read and forgotten in pairs, as the firmware does.
+            // Bytes that are not a command are discarded in pairs, as the firmware does.
             let used = match *self.buffer {
                 [b'P', number, ..] => {
                     replies.extend(self.answer(b'P', number, now_ns));
@@ -59,7 +59,8 @@ impl Timer {
                     2
                 }
                 [b'S', state, ..] => {
-                    // The timer runs on the line's grid, so that a start is the start of the period under way.
+                    // The timer runs on the grid of the line: it counts as started at the beginning of the current
+                    // period.
                     self.started = (state == b'1').then_some(now_ns.div_euclid(self.period_ns));
                     2
                 }

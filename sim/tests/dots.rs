@@ -1,5 +1,5 @@
-//! The simulated dot rig against what is known of it otherwise: the scene's own images, the mirror's mechanics run for
-//! themselves, and the accounting of every frame.
+//! The simulated dot rig checked against independent references: the scene's own images, a separate run of the mirror
+//! mechanics, and a count of all frames.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -23,7 +23,7 @@ const EXPOSURE_US: f64 = 70.0;
 const WHITE_DN: f64 = 2500.0;
 const BLACK_DN: f64 = 64.0;
 
-/// Anything goes: these paths are chosen for what they show, not for a mirror's health.
+/// Permissive limits: these paths are chosen for what they test, not to protect a mirror.
 fn boundless() -> MirrorLimits {
     MirrorLimits {
         max_tilt: MechanicalDeg(40.0),
@@ -59,7 +59,7 @@ fn rig(config: DotsConfig) -> DotsRig {
     DotsRig::new(config, setup(PixelFormat::Mono12), Path::new("")).unwrap()
 }
 
-/// A path that stands still for `samples` samples at each place of the field of view.
+/// A path that stays for `samples` samples at each position in the field of view.
 fn visit(places: &[[f64; 2]], samples: usize, rate_hz: f64, config: &DotsConfig) -> MirrorPath {
     let tilt = |uv: &[f64; 2]| {
         let [x, y] = [0, 1].map(|axis| {
@@ -72,13 +72,13 @@ fn visit(places: &[[f64; 2]], samples: usize, rate_hz: f64, config: &DotsConfig)
     MirrorPath::new(points.collect(), rate_hz, &boundless()).unwrap()
 }
 
-/// A frame as it came: its stamp and its counts.
+/// A received frame: its stamp and its counts.
 struct Seen {
     stamp: FrameStamp,
     counts: Vec<u16>,
 }
 
-/// Plays a path and takes all that the camera gives.
+/// Plays a path and collects all frames.
 fn record(devices: &mut DotsDevices, path: &MirrorPath, batches: u32) -> Vec<Seen> {
     let DotsDevices { camera, mirror, .. } = devices;
     let capabilities = camera.capabilities().clone();
@@ -112,7 +112,7 @@ fn each_frame_of_a_scene_from_a_file_is_the_image_of_its_dot() {
     let folder = tempfile::tempdir().unwrap();
     let (dots, rows, columns) = (12, 10, 32);
     let light = |dot: usize, y: usize, x: usize| ((dot * 7 + y * 3 + x) % 11) as f32 / 11.0;
-    // On a grid, row by row, and strewn about.
+    // On a grid in row order, and at irregular positions.
     let grid: Vec<[f64; 2]> =
         (0..dots).map(|dot| [0.125 + 0.25 * (dot % 4) as f64, 0.2 + 0.3 * (dot / 4) as f64]).collect();
     let strewn: Vec<[f64; 2]> =
@@ -184,7 +184,7 @@ fn a_coloured_scene_is_seen_through_the_mosaic_and_by_a_monochrome_camera_as_its
     }
 }
 
-/// The middle of a frame's light in the scene, (row, column).
+/// Centroid of a frame's light in the scene, (row, column).
 fn centroid(counts: &[u16], rows: usize, columns: usize) -> [f64; 2] {
     let (mut sum, mut y, mut x) = (0.0, 0.0, 0.0);
     for (pixel, &count) in counts[..rows * columns].iter().enumerate() {
@@ -214,14 +214,14 @@ fn dots_are_where_the_mechanics_take_the_beam() {
     let frames = record(&mut devices, &path, 2);
     assert_eq!(frames.len(), 1800, "26/9 samples a frame");
 
-    // The same motion, without the rig's code: each sample held, from rest on the first point.
+    // The same motion without the rig's code: each sample held, starting at rest on the first point.
     let mut mechanics = Mechanics::new(MechanicsConfig { seed: config.seed, ..Default::default() }, 39_000.0);
     (0..19_500).for_each(|_| _ = mechanics.hold(path.at(0).tilt));
     let places: Vec<[f64; 2]> = (0..5200).map(|sample| mechanics.hold(path.at(sample).tilt).deg()).collect();
     let px_per_tangent = columns as f64 / (2.0 * (config.fov_deg[0] / 2.0).to_radians().tan());
     let mut furthest = 0.0_f64;
     for number in (1..1800).step_by(7) {
-        // The mirror in the middle of the exposure.
+        // Mirror position at the middle of the exposure.
         let moment = number as f64 * 26.0 / 9.0 + EXPOSURE_US * 1e-6 * 39_000.0 / 2.0;
         let (before, share) = (moment as usize - 1, moment.fract());
         let place = [0, 1]
@@ -232,7 +232,7 @@ fn dots_are_where_the_mechanics_take_the_beam() {
         furthest = furthest.max((found[0] - expected[0]).abs()).max((found[1] - expected[1]).abs());
     }
     println!("dots are up to {furthest:.3} px from where the mechanics take them");
-    // A plane at the scene's distance lies before the camera pixel by pixel; what is left is rounding of counts.
+    // The camera sees a plane at the scene's distance pixel by pixel; the remaining error is rounding of counts.
     assert!(furthest < 0.15, "{furthest}");
 }
 
@@ -386,7 +386,7 @@ fn built_in_scenes_move_and_have_light_of_both_kinds() {
             "{name}: {sums:?}"
         );
         assert_ne!(frames[1].counts, frames[4].counts, "{name} moves");
-        // What the camera counts is the light that the truth tells.
+        // The camera's counts match the light given by the ground truth.
         let (direct, global) = devices.truth.light(0, EXPOSURE_US).unwrap();
         for (pixel, &count) in frames[0].counts[..72 * 128].iter().enumerate() {
             assert!((f64::from(count) - dn(direct[pixel] + global[pixel])).abs() <= 1.0, "{name}: {pixel}");
@@ -416,7 +416,7 @@ fn by_the_hosts_clock_frames_come_at_their_time_and_late_hosts_lose_some() {
     let since_ns = after.exposure_start_ns - before.exposure_start_ns;
     assert_eq!(since_ns, (after.seq - before.seq) as i64 * 1_000_000, "ids count what was lost");
     mirror.park().unwrap();
-    // Frames that were triggered before still come; then there are no more.
+    // Frames triggered earlier still arrive; then there are no more.
     while let Some(stamp) = camera.next_frame(&mut buffer, Duration::from_millis(20)).unwrap() {
         assert!(truth.frame(stamp.seq).is_some());
     }

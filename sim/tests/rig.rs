@@ -1,4 +1,4 @@
-//! The simulated devices through the traits that real ones implement, on a scene whose every number is known.
+//! The simulated devices through the traits that real ones implement, on a scene with known values.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -20,7 +20,7 @@ const TAU_US: f64 = 20.0;
 const WHITE: f64 = 1000.0;
 const RASTER: Raster = Raster { rows: ROWS, row_time_us: TAU_US, first_row_us: 500.0, period_us: 16_000.0 };
 
-/// Row v lights camera row v with 1 and the row below it with a quarter.
+/// Row v lights camera row v with 1 and the row below it with 1/4.
 fn scene(folder: &Path) -> std::path::PathBuf {
     let transport = Array3::<f32>::from_shape_fn((ROWS, ROWS, COLUMNS), |(v, t, _)| match t.checked_sub(v) {
         Some(0) => 1.0,
@@ -56,7 +56,7 @@ fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
     PlaneRig::new(config, setup, Path::new("")).unwrap()
 }
 
-/// The rig at work: its VSYNC watched on a thread of its own, because virtual time waits for every device.
+/// A running rig, with its VSYNC monitored on a separate thread because virtual time waits for every device.
 struct Bench {
     camera: Option<Box<dyn Camera>>,
     edges: Receiver<Edge>,
@@ -64,7 +64,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// Shows a pattern (`None`: dark) and waits until it is in the light.
+    /// Shows a pattern (`None`: dark) and waits until the light shows it.
     fn lit(rig: &PlaneRig, pattern: Option<&Pattern>) -> Self {
         let Devices { mut camera, mut vsync, mut projector, .. } = rig.open();
         let (seen, edges) = channel();
@@ -89,7 +89,7 @@ impl Bench {
         &mut **self.camera.as_mut().unwrap()
     }
 
-    /// Light of each pixel, `[row][column]`, of the next frame, with its stamp.
+    /// Light of each pixel, `[row][column]`, of the next frame, with the frame's stamp.
     fn frame(&mut self) -> (Vec<Vec<f64>>, FrameStamp) {
         let mut data = self.pool.take();
         let mut pixels = [0; ROWS * COLUMNS];
@@ -99,7 +99,7 @@ impl Bench {
         (rows.collect(), stamp)
     }
 
-    /// The first frame under new settings.
+    /// The light of the first frame under new settings.
     fn expose(&mut self, settings: CameraSettings) -> Vec<Vec<f64>> {
         self.camera().configure(SettingsId { point: 0, attempt: 0 }, &settings).unwrap();
         self.frame().0
@@ -108,7 +108,7 @@ impl Bench {
 
 impl Drop for Bench {
     fn drop(&mut self) {
-        // Without the camera the clock runs on for the watcher, which then finds nobody to tell.
+        // Without the camera the clock continues to run for the monitor, which then finds its receiver gone.
         self.camera = None;
     }
 }
@@ -136,12 +136,12 @@ fn a_rolling_shutter_follows_the_projector_row_by_row() {
         20_000 + 8 * 20_000,
         "exposure, then the rows' readout"
     );
-    // One row earlier each camera row receives the row above its own: a quarter, and nothing for the topmost.
+    // One row earlier, each camera row receives the row above its own: a quarter, and nothing for the top row.
     let above = bench.expose(rolling(480.0, TAU_US));
     assert!(
         above[0].iter().all(|&light| light == 0.0) && above[1..].iter().flatten().all(|&light| light == 0.25)
     );
-    // Half a row early: half of either.
+    // Half a row early: half of each.
     let between = bench.expose(rolling(490.0, TAU_US));
     assert!(between[1..].iter().flatten().all(|&light| (light - 0.625).abs() <= 0.0005), "{between:?}");
 }
@@ -177,7 +177,7 @@ fn a_beam_spreads_a_row_and_keeps_its_light() {
         let rig = rig(|config| config.projector.beam = beam);
         let mut bench = Bench::lit(&rig, Some(&only(3)));
         let rows = bench.expose(rolling(0.0, 16_000.0));
-        // The quarter that each lit row sends to the row below is part of the scene, not of the beam.
+        // The quarter that each lit row sends to the row below belongs to the scene, not to the beam.
         let mut seen = [0.0; 5];
         for (k, share) in seen.iter_mut().enumerate() {
             *share = rows[k + 1][0] - 0.25 * expected.get(k.wrapping_sub(1)).copied().unwrap_or(0.0);
@@ -190,7 +190,7 @@ fn a_beam_spreads_a_row_and_keeps_its_light() {
 
 #[test]
 fn a_flying_spot_lights_each_column_at_its_own_moment() {
-    // Columns are passed at 2.5, 7.5, 12.5 and 17.5 us of a row's 20; an exposure of the row's first half sees two.
+    // The spot passes the columns at 2.5, 7.5, 12.5 and 17.5 us of a row's 20; an exposure of the first half sees two.
     let halves = |spot| {
         let rig = rig(|config| config.projector = SimProjector { spot, ..SimProjector::default() });
         let mut bench = Bench::lit(&rig, Some(&Pattern::White));
@@ -282,7 +282,7 @@ fn a_wait_ends_when_its_time_is_up() {
     let mut devices = rig.open();
     devices.camera.disarm().unwrap();
     let before_ns = devices.clock.now_ns();
-    // No edge lies within the first millisecond of a line whose period is sixteen.
+    // No edge lies within the first millisecond of a line with a period of 16 ms.
     drop(devices.camera);
     assert!(devices.vsync.next_edge(Duration::from_millis(1)).unwrap().is_none());
     assert_eq!(devices.clock.now_ns() - before_ns, 1_000_000);
@@ -290,7 +290,8 @@ fn a_wait_ends_when_its_time_is_up() {
 
 #[test]
 fn rows_beside_the_scenes_window_shine_into_it() {
-    // A long exposure of the scene's first row, which the beam of sigma 0.5 takes 0.1065 + 0.0003 of its light from above.
+    // A long exposure of the scene's first row; with the beam of sigma 0.5, the rows above it contribute 0.1065 +
+    // 0.0003.
     let first_row = |projector_rows: usize, first_row: usize| {
         let folder = tempfile::tempdir().unwrap();
         let config = SimConfig {

@@ -1,6 +1,7 @@
 //! A small dot rig and its plan.
 
-/// A rig file for a moving V-groove of 112 x 128 pixels with 16 rows for the trailing dot below it; `more` is appended.
+/// A rig file for a moving V-groove of 112 x 128 pixels, with a margin of 16 rows for the trailing dot; `more` is
+/// appended.
 pub fn rig(more: &str) -> String {
     format!(
         "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n\
@@ -8,7 +9,7 @@ pub fn rig(more: &str) -> String {
     )
 }
 
-/// A plan of 300 dots a batch, 20 batches a second, with two planes; `more` stands before its tables.
+/// A plan of 300 dots per batch, 20 batches per second, with two planes; `more` is inserted before its tables.
 pub fn plan(more: &str, batches: u32) -> String {
     format!(
         "kind = \"batches\"\n{more}\n[batches]\ncount = {batches}\ndots = 300\nexposure_us = 100\ndark_frames = 64\n\

@@ -1,5 +1,5 @@
-//! What the tests of the whole have in common: a rig and a plan in a folder of their own, run through the daemon's
-//! core, and the session that comes out.
+//! Shared code of the integration tests: runs a plan on a rig in a temporary folder through the daemon's core, and
+//! opens the resulting session.
 
 pub mod dots;
 
@@ -18,15 +18,15 @@ use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 use tempfile::TempDir;
 
-/// The folder of the tests' data.
+/// Path of a test data file.
 pub fn data(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("data").join(file)
 }
 
-/// Waits for something that comes soon.
+/// Waits until `holds` returns true.
 ///
 /// # Panics
-/// If it has not come after a minute.
+/// After a minute.
 pub fn wait_until(mut holds: impl FnMut() -> bool) {
     let began = Instant::now();
     while !holds() {
@@ -35,7 +35,7 @@ pub fn wait_until(mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// A rig file for the simulated plane rig; `more` is appended, `sim` stands at the head of `[sim]`.
+/// A rig file for the simulated plane rig; `more` is appended, and `sim` goes at the start of `[sim]`.
 pub fn rig_text(rows: usize, sim: &str, more: &str) -> String {
     format!(
         "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
@@ -43,13 +43,13 @@ pub fn rig_text(rows: usize, sim: &str, more: &str) -> String {
     )
 }
 
-/// The rig of the rendered corner scene.
+/// A rig file for the corner scene from the independent renderer.
 pub fn corner_rig(more: &str) -> String {
     rig_text(128, &format!("scene = {:?}", data("p2r_corner.npz")), more)
 }
 
-/// Products of every kind that a camera of 24 x 16 pixels and a plan with an exposure of 250 us can have; one line each,
-/// as on the command line.
+/// One product of every kind that is possible for a camera of 24 x 16 pixels and a plan with an exposure of 250 us, one
+/// per line, as on the command line.
 pub const PRODUCTS: [&str; 9] = [
     r#"kind = "regular""#,
     r#"kind = "epipolar""#,
@@ -62,32 +62,32 @@ pub const PRODUCTS: [&str; 9] = [
     r#"kind = "delay-profile", region = [2, 6, 3, 9], exposure_us = 250"#,
 ];
 
-/// A plan with these products at its head.
+/// Puts these products at the start of a plan.
 pub fn with_products(products: &[&str], plan: &str) -> String {
     format!("product = [{{ {} }}]\n{plan}", products.join(" }, { "))
 }
 
-/// A daemon's core over a folder of its own.
+/// A daemon's core with its own temporary folder.
 pub struct Bench {
-    /// Rig file and sessions.
+    /// Folder with the rig file and the sessions.
     pub folder: TempDir,
     /// The daemon's core.
     pub runner: Arc<Runner>,
 }
 
-/// How a run ended.
+/// Result of a run.
 #[derive(Debug, Clone)]
 pub struct Ended {
-    /// Its session.
+    /// The session's folder.
     pub session: PathBuf,
-    /// `complete`, `cancelled`, `faulted`.
+    /// `complete`, `cancelled` or `faulted`.
     pub state: String,
-    /// Why it faulted.
+    /// Error message if the run faulted.
     pub error: Option<String>,
 }
 
 impl Bench {
-    /// A bench with this rig.
+    /// Creates a bench with this rig.
     ///
     /// # Panics
     /// When the rig cannot be built.
@@ -95,7 +95,7 @@ impl Bench {
         Self::with_registry(rig, Registry::default())
     }
 
-    /// A bench with this rig and these stages.
+    /// Creates a bench with this rig and these stages.
     ///
     /// # Panics
     /// When the rig cannot be built.
@@ -106,7 +106,7 @@ impl Bench {
         Self { folder, runner }
     }
 
-    /// A bench with a dot rig.
+    /// Creates a bench with a dot rig.
     ///
     /// # Panics
     /// When the rig cannot be built.
@@ -114,7 +114,7 @@ impl Bench {
         Self::dots_with_registry(rig, Registry::default())
     }
 
-    /// A bench with a dot rig and these stages.
+    /// Creates a bench with a dot rig and these stages.
     ///
     /// # Panics
     /// When the rig cannot be built.
@@ -126,7 +126,7 @@ impl Bench {
         Self { runner: Arc::new(runner.unwrap_or_else(|error| panic!("{error}"))), folder }
     }
 
-    /// Ends the daemon's core and starts another over the same folder.
+    /// Stops the daemon's core and starts another one on the same folder.
     ///
     /// # Panics
     /// When the rig cannot be built.
@@ -135,7 +135,7 @@ impl Bench {
         self.runner = Arc::new(start(self.folder.path(), registry));
     }
 
-    /// As [`Self::restart_with`], with results that may take so much memory.
+    /// Like [`Self::restart_with`], with a memory limit for the results.
     ///
     /// # Panics
     /// When the rig cannot be built.
@@ -156,10 +156,10 @@ impl Bench {
         end_of(&mut events).accounted_for()
     }
 
-    /// Acquires what a session lacks.
+    /// Acquires the missing points of a session.
     ///
     /// # Panics
-    /// When the session is refused.
+    /// When the session cannot be resumed.
     pub fn resume(&self, session: &Path) -> Ended {
         let mut events = self.runner.events();
         let params = ResumeParams { session: session.into() };
@@ -174,10 +174,10 @@ fn start(folder: &Path, registry: Registry) -> Runner {
     runner.unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Waits for the end of the run.
+/// Waits until the run ends.
 ///
 /// # Panics
-/// When the daemon's core ends first.
+/// When the daemon's core stops first.
 pub fn end_of(events: &mut tokio::sync::broadcast::Receiver<Event>) -> Ended {
     use tokio::sync::broadcast::error::RecvError;
     loop {
@@ -190,7 +190,7 @@ pub fn end_of(events: &mut tokio::sync::broadcast::Receiver<Event>) -> Ended {
 }
 
 impl Ended {
-    /// Holds the accounting, whatever the test is about: every trigger in one column, every point stored or missing.
+    /// Checks the accounting in every test: each trigger is in exactly one column, and each point is stored or missing.
     fn accounted_for(self) -> Self {
         let (_, state) = self.open();
         assert!(state.counts.balanced(), "{:?}", state.counts);
@@ -212,7 +212,7 @@ impl Ended {
         self
     }
 
-    /// The session on disk.
+    /// Opens the session.
     ///
     /// # Panics
     /// When it cannot be read.
@@ -222,7 +222,7 @@ impl Ended {
         (session, state)
     }
 
-    /// The mean counts of a stored point, `[t, s]`.
+    /// Mean counts of a stored point, `[t, s]`.
     ///
     /// # Panics
     /// When it is not stored.

@@ -1,5 +1,5 @@
-//! The accounting against what really happened on the simulated line, which no device tells: the frames that the camera
-//! exposed, those lost on the way, those that false edges triggered.
+//! Checks the accounting against the ground truth of the simulated line, which no device reports: the frames that the
+//! camera exposed, those lost in transit, and those triggered by false edges.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -15,7 +15,7 @@ use raysweep_tests::rig_text;
 
 const FRAMES: u32 = 400;
 
-/// Takes frames under one setting and faults; returns the accounts of all of them and the truth.
+/// Acquires frames under one setting and the given faults; returns the combined accounts and the ground truth.
 fn observe(faults: &str) -> (Counts, Truth) {
     let rig = RigFile::parse(&rig_text(16, "scene = \"slab\"\nscene_rows = 16\nscene_columns = 8", faults))
         .unwrap();
@@ -88,7 +88,7 @@ fn observe(faults: &str) -> (Counts, Truth) {
 struct Truth {
     line: raysweep_sim::LineTruth,
     delivered: u64,
-    /// By the last frame taken; later ones are still on their way.
+    /// Exposures up to the last received frame; later ones are still in transit.
     exposed: u64,
 }
 

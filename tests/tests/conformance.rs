@@ -1,7 +1,7 @@
-//! What every driver of a trait must do, whatever is behind it: the simulated rig, a simulated device on its real wire, and with
-//! `RAYSWEEP_HIL=rig.toml` the hardware of a lab: of a plane rig, whose camera must be triggered and whose projector may light up;
-//! of a dot rig the mirror, which moves by a quarter of what it may and stays dark. A projector that an operator works
-//! (`driver = "external"`) is asked for on the terminal.
+//! Requirements on every driver of a device trait, checked on the simulated rig, on simulated devices with their real
+//! protocols, and, with `RAYSWEEP_HIL=rig.toml`, on a lab's hardware. On a plane rig, the camera must be triggered and
+//! the projector may light up. On a dot rig, the mirror moves by a quarter of its range with the light off. A projector
+//! worked by an operator (`driver = "external"`) is operated through prompts on the terminal.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -26,10 +26,10 @@ use raysweep_sim::mirror::{Link, MirrorPty, PlayzerXConfig, PlayzerXController, 
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use raysweep_tests::rig_text;
 
-/// Only what never comes may fail a test.
+/// Generous time limit: only events that never occur may fail a test.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// Edges are numbered and stamped in order, none is of the future, and the most frequent distance is the period.
+/// Edges are numbered and stamped in order, no stamp is in the future, and the median interval is the period.
 fn vsync_conforms(vsync: &mut dyn Vsync, clock: &Clock, period_us: f64) {
     let began = Instant::now();
     let mut edges = Vec::new();
@@ -57,7 +57,7 @@ fn vsync_conforms(vsync: &mut dyn Vsync, clock: &Clock, period_us: f64) {
     }
 }
 
-/// Settings are taken or refused whole, frames are numbered and stamped in order, and disarming can be said twice.
+/// Settings are applied completely or rejected, frames are numbered and stamped in order, and disarming is idempotent.
 fn camera_conforms(camera: &mut dyn Camera) {
     let capabilities = camera.capabilities().clone();
     let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
@@ -102,7 +102,7 @@ fn camera_conforms(camera: &mut dyn Camera) {
     assert_eq!(camera.state(), DeviceState::Ready);
 }
 
-/// What is shown is told when it is certain, which is not before it was asked for; dark can be said twice.
+/// Reported times of certainty are not before the request; blanking is idempotent.
 fn projector_conforms(projector: &mut dyn Projector, clock: &Clock) {
     let asked_ns = clock.now_ns();
     assert!(projector.show(&Pattern::White).unwrap().not_before_ns >= asked_ns);
@@ -110,13 +110,13 @@ fn projector_conforms(projector: &mut dyn Projector, clock: &Clock) {
     assert!(projector.blank().unwrap().not_before_ns >= dark.not_before_ns);
 }
 
-/// Where an operator is asked and answers by a line.
+/// Terminal on which an operator is prompted and answers with a line.
 struct Terminal {
     say: Box<dyn Write + Send>,
     hear: Box<dyn BufRead + Send>,
 }
 
-/// Puts the questions of a projector to an operator, until it is dropped.
+/// Forwards a projector's questions to the operator until the projector is dropped.
 fn ask(questions: Receiver<Request>, terminal: &mut Terminal) {
     for question in questions {
         writeln!(terminal.say, "projector: show {:?}, then press Enter", question.wanted).unwrap();
@@ -127,7 +127,7 @@ fn ask(questions: Receiver<Request>, terminal: &mut Terminal) {
     }
 }
 
-/// A simulated rig has no operator, and needs none.
+/// Checks a rig without an operator.
 fn rig_conforms(path: &Path) {
     rig_conforms_with(path, None);
 }
@@ -139,7 +139,7 @@ fn rig_conforms_with(path: &Path, terminal: Option<Terminal>) {
     }
 }
 
-/// The mirror that a dot rig's file names, by a daemon in whose data folder nobody has armed the light.
+/// Checks the mirror of a dot rig, with a data folder in which the light has not been armed.
 fn mirror_conforms(rig: &DotRig) {
     let data = tempfile::tempdir().unwrap();
     let mirror = rig.open_mirror(data.path()).unwrap();
@@ -158,12 +158,12 @@ fn plane_rig_conforms(rig: &Rig, terminal: Option<Terminal>) {
             drop(projector);
         }),
         (Some(_), None) => {
-            // Not by `println!`, which is kept back where a test passes.
+            // Not with `println!`, whose output is captured when a test passes.
             let words = "projector: SKIPPED: an operator works it (driver = \"external\"), and there is no terminal to ask on\n";
             std::io::stderr().write_all(words.as_bytes()).unwrap();
         }
     }
-    // The watcher lives on its own thread, as in a run: in virtual time, nobody's time goes on without it.
+    // During a run, the monitor has its own thread: virtual time does not advance without it.
     drop(vsync);
     camera_conforms(&mut *camera);
 }
@@ -197,7 +197,7 @@ fn a_projector_that_an_operator_works() {
     let asked: Vec<String> = BufReader::new(operator).lines().map(Result::unwrap).collect();
     assert_eq!(asked.len(), 2, "{asked:?}");
     assert!(asked[0].contains("White") && asked[1].contains("Dark"), "{asked:?}");
-    // Without anybody to ask it is left out; the rest of the rig is not.
+    // Without an operator the projector is skipped, but not the rest of the rig.
     rig_conforms(&path);
 }
 
@@ -228,7 +228,7 @@ fn a_mirror_by_its_rig_file() {
 #[ignore = "needs hardware: RAYSWEEP_HIL=rig.toml cargo test -p raysweep-tests --test conformance -- --ignored"]
 fn the_hardware_of_a_lab() {
     let path = std::env::var_os("RAYSWEEP_HIL").expect("RAYSWEEP_HIL names the lab's rig file");
-    // Not the standard streams, of which the test harness has its own idea.
+    // Not the standard streams, which the test harness captures.
     let terminal = File::options().read(true).write(true).open("/dev/tty").ok();
     let terminal = terminal.map(|terminal| {
         let hear = Box::new(BufReader::new(terminal.try_clone().unwrap()));

@@ -1,4 +1,4 @@
-//! The dot rig from plan to videos through the daemon's core, on the virtual clock.
+//! The dot rig from plan to videos, through the daemon's core in virtual time.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -65,7 +65,7 @@ fn video(ended: &Ended, name: &str) -> Array3<f32> {
     ndarray_npy::read_npy(path).unwrap()
 }
 
-/// The light of the scene's batches without noise, all dots of the scene together, `[k, t, s]` in counts.
+/// Noise-free light of the scene's batches, summed over all dots on the scene, `[k, t, s]` in counts.
 fn true_floodlit(plan: &str, rig_text: &str) -> Array3<f32> {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rig.toml"), rig_text).unwrap();
@@ -86,7 +86,7 @@ fn true_floodlit(plan: &str, rig_text: &str) -> Array3<f32> {
     let mut dots = 0;
     while let Some(stamp) = devices.camera.next_frame(&mut buffer, Duration::from_millis(100)).unwrap() {
         let frame = truth.frame(stamp.seq).unwrap();
-        // The first round is not kept.
+        // The first batch is not stored.
         if frame.batch > 0 && ![0, 299].contains(&frame.index) {
             let (direct, global) = truth.light(stamp.seq, plan.exposure_us).unwrap();
             let mut image = sum.index_axis_mut(Axis(0), frame.batch as usize - 1);
@@ -176,7 +176,7 @@ fn what_a_dot_rig_cannot_do_is_said_before_anything_moves() {
     let report = bench.runner.check(&plan("", 2)).unwrap();
     let batches = report.batches.unwrap();
     assert_eq!((report.points, batches.planes, batches.dots), (6, vec![2, 2], 300));
-    // Two rounds of dark frames, and two to spare of each pass.
+    // Two batches of dark frames, and two spare batches in each pass.
     assert_eq!(report.frames, 300 * (2 + 4 + 4 + 4));
     assert!((batches.batch_s - 0.05).abs() < 1e-12);
 }

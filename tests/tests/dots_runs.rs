@@ -1,5 +1,5 @@
-//! Runs of the dot rig beside the straight way: calibration of the sensor, raw frames, patterns from files, pause and
-//! cancel, video files.
+//! Dot rig runs with additional features: sensor calibration, raw frames, patterns from files, pause and cancel, video
+//! files.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -27,7 +27,7 @@ fn entries(ended: &Ended) -> Vec<BatchEntry> {
     ended.open().1.batches().cloned().collect()
 }
 
-/// Checksums by batch and plane.
+/// Checksums with batch and plane.
 fn checksums(ended: &Ended) -> Vec<(usize, Option<usize>, u32)> {
     entries(ended).iter().map(|entry| (entry.batch, entry.plane, entry.crc32)).collect()
 }
@@ -53,7 +53,7 @@ fn a_flat_field_takes_away_the_fixed_pattern_and_keeps_the_energy() {
         |percent: f64| rig(&format!("[sim.dots.sensor]\nprnu_percent = {percent}\nread_noise_e = 5\n"));
     let with_flat = |plan: String| plan.replace("dark_frames = 64", "dark_frames = 64\nflat_frames = 256");
     let plan = plan(FLOODLIT, 2);
-    // All dots of the scene: the light of an even sensor, of an uneven one, and of an uneven one whose gains are known.
+    // Summed over all dots: a uniform sensor, a non-uniform one, and a non-uniform one with known gains.
     let truth = floodlit(&completed(&Bench::dots(&uneven(0.0)), &plan));
     let raw = floodlit(&completed(&Bench::dots(&uneven(8.0)), &plan));
     let bench = Bench::dots(&uneven(8.0));
@@ -73,7 +73,7 @@ fn a_flat_field_takes_away_the_fixed_pattern_and_keeps_the_energy() {
     assert!(after < before / 4.0, "{after} of {before}");
     assert!((energy - 1.0).abs() < 0.005, "{energy}");
 
-    // A later plan has the same from the session, without another lamp.
+    // A later plan reuses the flat field of the session without acquiring it again.
     let name = corrected.session.file_name().unwrap();
     let stage = format!("[[stage]]\nname = \"correct\"\nflat_field = {name:?}\n");
     let later = completed(&bench, &(plan.clone() + &stage));
@@ -87,7 +87,7 @@ fn a_flat_field_takes_away_the_fixed_pattern_and_keeps_the_energy() {
 #[test]
 fn a_flat_field_that_cannot_be_used_ends_the_run_with_what_to_do() {
     let plan = plan(FLOODLIT, 1).replace("dark_frames = 64", "dark_frames = 64\nflat_frames = 64");
-    // The corners get less than a quarter of the light.
+    // The corners receive less than a quarter of the light.
     let bench = Bench::dots(&rig("[sim.dots.sensor]\nvignetting_percent = 100\n"));
     let ended = bench.run(&plan);
     assert_eq!(ended.state, "faulted");
@@ -119,7 +119,7 @@ fn raw_frames_are_kept_with_the_place_of_each() {
     assert_eq!((frames.dim(), lines.lines().count()), (packed_frames.dim(), packed_lines.lines().count()));
     let differ = Zip::from(&frames).and(&packed_frames).fold(0, |sum, a, b| sum + u32::from(a != b));
     assert_eq!(differ, 0, "12 bits are 16 bits wide in the file, however they came");
-    // How many dark frames came before, which the ids count, is up to the mirror's way to rest.
+    // The ids also count earlier dark frames, whose number depends on how the mirror comes to rest.
     let places_of = |lines: &str| -> Vec<Vec<String>> {
         let fields = |line: &str| line.split(',').map(str::to_owned).collect::<Vec<_>>();
         lines.lines().map(fields).map(|line| [&line[..1], &line[2..]].concat()).collect()
@@ -145,7 +145,8 @@ fn raw_frames_are_kept_with_the_place_of_each() {
     for entry in entries(&ended) {
         let columns = session.dots().unwrap().read(entry.batch).unwrap();
         for dot in (1..299).filter(|&dot| !entry.missing.contains(&dot)) {
-            // The brightest pixel of the column is as bright in the frame that the table names, but for the background.
+            // The column's brightest pixel has the same brightness, apart from the background, in the frame listed in
+            // the table.
             let frame = frames.index_axis(Axis(0), places[&(entry.batch, dot)]);
             let words = columns.word_offsets[dot] as usize..columns.word_offsets[dot + 1] as usize;
             let first: usize =
@@ -176,7 +177,7 @@ fn lighting_patterns_come_from_images_and_sequences() {
     let half = |at: usize, columns: usize| if at < columns / 2 { 1.0_f32 } else { 0.0 };
     let left = Array2::from_shape_fn((4, 8), |(_, column)| half(column, 8));
     let right = left.mapv(|light| 1.0 - light);
-    // Three images, of which the second is red.
+    // Three images; the second is red.
     let sequence = Array4::from_shape_fn((3, 4, 8, 3), |(image, row, column, colour)| match image {
         0 => left[[row, column]],
         1 => {
@@ -222,11 +223,11 @@ fn lighting_patterns_come_from_images_and_sequences() {
             }
         }
     }
-    // The dots of the left half light the left of the groove more than its right.
+    // Dots of the left half light the left half of the groove more than the right half.
     let side = |columns: std::ops::Range<usize>| left_lit.slice(s![.., ..112, columns]).sum();
     assert!(side(0..64) > 2.0 * side(64..128), "{} {}", side(0..64), side(64..128));
 
-    // The session keeps the patterns: its products can be made again when the files are gone.
+    // The session stores the patterns: products can be recomputed when the original files are gone.
     let before = std::fs::read(path("sequence")).unwrap();
     drop(folder);
     std::fs::remove_dir_all(ended.open().0.products_path()).unwrap();
@@ -237,7 +238,7 @@ fn lighting_patterns_come_from_images_and_sequences() {
     assert!(gone.message.contains("left.npy"), "{}", gone.message);
 }
 
-/// Does something when so many frames have been denoised.
+/// Performs an action once a given number of frames have been denoised.
 struct Trap {
     inner: Box<dyn ColumnStage>,
     shared: Arc<Shared>,
@@ -272,7 +273,7 @@ impl ColumnWorker for TrapWorker {
     }
 }
 
-/// A bench whose stage `trap` denoises, and springs at a frame of the passes with light.
+/// A bench whose stage `trap` denoises, and calls `spring` at the given frame of the passes with light.
 fn trapped(rig: &str, frame: usize, spring: fn(&Runner)) -> Bench {
     let shared = Arc::new(Shared { frames_left: AtomicUsize::new(frame), runner: OnceLock::new(), spring });
     let mut registry = Registry::default();
@@ -301,7 +302,7 @@ fn a_pause_in_mid_run_holds_before_the_next_pass_and_costs_nothing() {
     bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
     let stored = || bench.runner.status().progress.map_or(0, |progress| progress.points_stored);
     wait_until(|| stored() == 2);
-    // Time in which a run that does not hold would take the other plane.
+    // Enough time for a run that does not pause to acquire the other plane.
     std::thread::sleep(Duration::from_millis(500));
     assert_eq!((bench.runner.status().state, stored()), (RunState::Paused, 2));
     bench.runner.go_on().unwrap();
@@ -316,7 +317,7 @@ fn a_pause_in_mid_run_holds_before_the_next_pass_and_costs_nothing() {
 fn a_cancelled_run_makes_videos_of_the_batches_that_are_there() {
     let straight = Bench::dots(&rig(""));
     let through = completed(&straight, &plan(FLOODLIT, 6));
-    // Both planes take four rounds each of 300 dots: this is in the fourth batch of the scene.
+    // Both planes take four batches each of 300 dots; this frame is in the fourth batch of the scene.
     let bench = trapped(&rig(""), 2 * 4 * 300 + 4 * 300 + 150, |runner| runner.cancel().unwrap());
     let ended = bench.run(&(plan(FLOODLIT, 6) + TRAP));
     assert_eq!(ended.state, "cancelled", "{:?}", ended.error);
@@ -331,7 +332,7 @@ fn a_cancelled_run_makes_videos_of_the_batches_that_are_there() {
     assert!(video == whole.slice(s![..video.dim().0, .., ..]));
 }
 
-/// What a program says on its standard output.
+/// Returns a program's standard output.
 fn output(program: &str, before: &[&str], file: &Path, after: &[&str]) -> Vec<u8> {
     let output = Command::new(program).args(before).arg(file).args(after).output();
     let output = output.expect("ffmpeg and ffprobe: `cargo xtask test` installs them");
@@ -339,7 +340,7 @@ fn output(program: &str, before: &[&str], file: &Path, after: &[&str]) -> Vec<u8
     output.stdout
 }
 
-/// Pictures of a file, RGB.
+/// Decodes a file to RGB images.
 fn decoded(file: &Path) -> Vec<u8> {
     output("ffmpeg", &["-loglevel", "error", "-i"], file, &["-f", "rawvideo", "-pix_fmt", "rgb24", "-"])
 }
@@ -377,7 +378,7 @@ fn videos_are_the_pictures_of_the_sequence_at_the_rate_of_the_batches() {
             for (row, column) in (0..height).flat_map(|row| (0..width).map(move |column| (row, column))) {
                 let (of_video, of_picture) =
                     (((image * rows + row) * columns + column) * 3, (row * width + column) * 3);
-                // Luminance: colours have half the resolution.
+                // Luminance, because colour is stored at half resolution.
                 let light = |rgb: &[u8]| {
                     0.299 * f64::from(rgb[0]) + 0.587 * f64::from(rgb[1]) + 0.114 * f64::from(rgb[2])
                 };

@@ -1,4 +1,4 @@
-//! Simulated faults: whatever goes wrong with VSYNC, camera and settings, a stored image is the image of its settings.
+//! Simulated faults: whatever goes wrong with VSYNC, camera or settings, each stored image matches its settings.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -11,17 +11,17 @@ use raysweep_session::stack::ArrayName;
 use raysweep_sim::{PlaneRig, PlaneSetup};
 use raysweep_tests::{Bench, Ended, rig_text};
 
-/// Exposures far apart and delays far apart, so that no frame can pass for one of another point.
+/// Exposures and delays are spaced so widely that no frame can be mistaken for one of another point.
 const PLAN: &str = "kind = \"sweep\"\n[sweep]\naverage = 4\n\
                     delay_us = [-900, -300, 150, 450, 1100]\nexposure_us = [300, 800, 1300]\n";
 
-/// A textured scene of 32 x 24 pixels without noise; jitter stays, and so does the line's 720-row frame.
+/// A textured scene of 32 x 24 pixels without noise, but with jitter and a 720-row projector frame.
 fn rig(faults: &str) -> String {
     let sim = "scene = \"v-groove\"\nscene_rows = 32\nscene_columns = 24\nseed = 5";
     rig_text(720, sim, &format!("[sim.sensor]\nnoise = false\n{faults}"))
 }
 
-/// The images that the stored points must be: noise-free light at the delays measured for their frames.
+/// The reference for stored points: noise-free light at the delays measured for their frames.
 fn truth(rig_toml: &str) -> PlaneRig {
     let rig = RigFile::parse(rig_toml).unwrap();
     let setup = PlaneSetup {
@@ -65,7 +65,7 @@ fn assert_true(rig_toml: &str, ended: &Ended) {
     }
 }
 
-/// Runs the plan under faults; returns how often each loss happened.
+/// Runs the plan under faults; returns the number of losses by cause.
 fn survive(faults: &str) -> std::collections::BTreeMap<LossCause, u64> {
     let rig = rig(faults);
     let bench = Bench::new(&rig);
@@ -124,7 +124,7 @@ fn no_frame_of_a_bad_line_is_tied_to_a_wrong_edge_and_its_jitter_is_known() {
     println!("{vsync:?}");
     assert!(vsync.missed > 5 && vsync.false_edges > 5, "{vsync:?}");
     assert!((vsync.jitter_us / 5.0 - 1.0).abs() < 0.1, "{vsync:?}");
-    // Of a normal distribution and of white phase noise.
+    // For a normal distribution and white phase noise.
     assert!((vsync.jitter_p99_us / (2.576 * 5.0) - 1.0).abs() < 0.2, "{vsync:?}");
     assert!((vsync.allan_1s.unwrap() / (3_f64.sqrt() * 5e-6) - 1.0).abs() < 0.2, "{vsync:?}");
 }
@@ -164,7 +164,7 @@ fn a_camera_without_a_trigger_faults_the_run_and_says_so() {
 #[test]
 fn points_that_no_pass_brings_are_given_up_and_the_error_says_what_was_lost() {
     let bench = Bench::new(&rig("[sim.vsync]\njitter_us = 5\n"));
-    // No line is so punctual.
+    // No line has so little jitter.
     let ended = bench.run(&PLAN.replace("average = 4", "average = 4\nmax_jitter_us = 0.001"));
     assert_eq!(ended.state, "faulted");
     let error = ended.error.clone().unwrap();

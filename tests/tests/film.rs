@@ -1,5 +1,5 @@
-//! Films of moving scenes through the daemon's core, on the virtual clock: each frame is the frame of its setting and its
-//! moment, each cycle's transport that of the scene as it then was, and what is lost harms its own cycle alone.
+//! Films of moving scenes, through the daemon's core in virtual time: each frame matches its setting and time, each
+//! cycle's transport matches the scene at that time, and a loss affects only its own cycle.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -30,7 +30,7 @@ fn plan(cycles: u32) -> String {
     format!("kind = \"film\"\n[film]\ncycles = {cycles}\n")
 }
 
-/// A pendulum without sensor noise that needs `swing_s` there and back; jitter stays.
+/// A pendulum with a period of `swing_s` (there and back), without sensor noise but with jitter.
 fn rig(swing_s: f64, more: &str) -> String {
     let sim = format!(
         "scene = \"pendulum\"\nscene_rows = {ROWS}\nscene_columns = {COLUMNS}\nseed = 5\nmotion_period_s = {swing_s}"
@@ -52,8 +52,8 @@ fn truth(rig_toml: &str) -> PlaneRig {
     PlaneRig::new(rig.sim, setup, Path::new("")).unwrap()
 }
 
-/// Every frame of the stored cycles: its place in the film in VSYNC periods after the first frame's, its true delay and
-/// its counts above black. A cycle takes its settings downwards, one a period.
+/// All frames of the stored cycles: time in VSYNC periods after the first frame, true delay, and counts above black. A
+/// cycle steps through its settings in descending order, one per period.
 fn frames(ended: &Ended) -> Vec<(i64, f64, Array2<f32>)> {
     let (session, state) = ended.open();
     let film = session.film().unwrap();
@@ -69,14 +69,14 @@ fn frames(ended: &Ended) -> Vec<(i64, f64, Array2<f32>)> {
     frames
 }
 
-/// How far, in counts, a frame is from the light of a moment.
+/// Largest deviation, in counts, of a frame from the light at a given time.
 fn deviation(truth: &PlaneRig, time_ns: i64, delay_us: f64, frame: &Array2<f32>) -> f32 {
-    // The light's own clock is asked in the middle of its frame: its edge jitters.
+    // Evaluate the light in the middle of its frame, because its edge jitters.
     let light = truth.noise_free_at(time_ns, delay_us, 600.0).unwrap() * 2500.0;
     (frame - &light.mapv(|dn| dn.min(4095.0 - 64.0))).iter().fold(0.0, |most, off| off.abs().max(most))
 }
 
-/// When the film's first frame was lit, on the devices' clock: the only moment that makes all frames true.
+/// Time of the film's first frame on the devices' clock: the only time at which all frames match the scene.
 fn film_start_ns(truth: &PlaneRig, frames: &[(i64, f64, Array2<f32>)]) -> i64 {
     let is_true = |start: i64| {
         frames.iter().all(|(period, delay_us, frame)| {
@@ -93,7 +93,7 @@ fn film_start_ns(truth: &PlaneRig, frames: &[(i64, f64, Array2<f32>)]) -> i64 {
 
 #[test]
 fn every_frame_is_that_of_its_setting_and_its_moment_and_every_trigger_is_answered() {
-    // A key position of the scene lasts 4 frames, and a cycle of 15 frames sees several.
+    // A key position of the scene lasts 4 frames, so a cycle of 15 frames covers several.
     let rig = rig(2.1, "");
     let bench = Bench::new(&rig);
     let ended = bench.run(&plan(6));
@@ -135,7 +135,7 @@ fn settings_that_take_effect_no_one_knows_when_cost_time_and_nothing_else() {
     assert_eq!((state.cycles().count(), state.counts.lost_total()), (2, 0));
     let truth = truth(&rig);
     for (_, delay_us, frame) in frames(&ended) {
-        // The scene is all but at rest; which key it is in does not matter here.
+        // The scene is almost at rest; its key position does not matter here.
         let off = (0..16).map(|key| deviation(&truth, key * 1_900_000_000, delay_us, &frame));
         assert!(off.fold(f32::INFINITY, f32::min) < 2.0, "{delay_us} us");
     }
@@ -143,7 +143,7 @@ fn settings_that_take_effect_no_one_knows_when_cost_time_and_nothing_else() {
 
 #[test]
 fn the_transport_of_a_cycle_is_the_scenes_at_that_time() {
-    // Slow enough for a cycle to see one key position, or two neighbours.
+    // Slow enough that a cycle covers one key position or two neighbouring ones.
     let rig = rig(24.0, "");
     let bench = Bench::new(&rig);
     let ended = bench.run(&plan(40));
@@ -165,7 +165,7 @@ fn the_transport_of_a_cycle_is_the_scenes_at_that_time() {
         let epipolar = transport.slice(s![-u_min as usize, .., ..]).to_owned();
         let middle_ns = start_ns + ((cycle.start_s + 0.12) * 1e9) as i64;
         let own = distance(&epipolar, &direct_at(middle_ns));
-        // Half a swing away the ball is elsewhere.
+        // Half a swing later the ball is elsewhere.
         let other = distance(&epipolar, &direct_at(middle_ns + 6_000_000_000));
         assert!(own < 0.1 && own < other, "cycle {}: {own} of its own time, {other} of another", cycle.cycle);
     }
@@ -204,7 +204,7 @@ fn a_lost_frame_costs_its_own_cycle_and_is_counted_with_its_cause() {
     let incomplete: Vec<&str> = ledger.lines().filter(|line| line.contains("\"cycle_lost\"")).collect();
     assert_eq!(incomplete.len(), film.cycles_incomplete);
     assert!(incomplete.iter().all(|line| !line.contains("\"missing\":[]")), "{incomplete:?}");
-    // The others are as if nothing had happened.
+    // All other cycles are unaffected.
     let truth = truth(&rig);
     for (_, delay_us, frame) in frames(&ended) {
         let off = (0..16).map(|key| deviation(&truth, key * 1_900_000_000, delay_us, &frame));
@@ -317,7 +317,7 @@ fn check_says_how_many_transports_a_second_the_camera_allows() {
     assert_eq!((film.settings, film.cycles, film.periods_per_cycle), (15, 240, 15));
     assert!((film.transports_per_s - 4.0).abs() < 0.001);
     assert_eq!((free.points, free.extra_points, free.frames), (240, 1, 240 * 15 + 32));
-    // 15 frames of 2 bytes and the transport's 4 bytes a row, for each pixel.
+    // Per pixel: 15 frames of 2 bytes, and 4 bytes per row of the transport.
     let reach = (free.reach_rows.1 - free.reach_rows.0 + 1) as f64;
     let minute = 240.0 * (ROWS * COLUMNS) as f64 * (30.0 + 4.0 * reach);
     assert!((film.disk_bytes_per_minute as f64 / minute - 1.0).abs() < 0.001);
@@ -332,7 +332,8 @@ fn check_says_how_many_transports_a_second_the_camera_allows() {
 
 #[test]
 fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
-    // Where a trigger is missed, and frames arrive later than the next trigger, the clock tells which one it was.
+    // If a trigger is missed and frames arrive after the next trigger, the clock tells which trigger a frame belongs
+    // to.
     for (readout_us, periods) in [(16_100, 15), (16_500, 16)] {
         let rig = rig(60.0, &format!("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = {readout_us}\n"));
         let bench = Bench::new(&rig);
@@ -346,7 +347,7 @@ fn a_camera_with_a_long_readout_keeps_the_pace_that_check_foretells() {
     }
 }
 
-/// Waits until the film under way is so far.
+/// Waits until the current film has reached a state.
 fn wait_for(bench: &Bench, is_reached: impl Fn(&FilmSummary) -> bool) {
     let began = Instant::now();
     while !bench.runner.status().film.is_some_and(|film| is_reached(&film)) {
@@ -365,7 +366,7 @@ fn a_film_is_held_between_two_cycles_and_goes_on() {
         for cycles in [3, 9] {
             wait_for(&bench, |film| film.transports >= cycles);
             bench.runner.pause().unwrap();
-            // What is under way comes to its end, however long that takes; then nothing more comes.
+            // Work in progress is completed, however long that takes; then nothing more arrives.
             let mut held = bench.runner.status().film;
             let mut since = Instant::now();
             let under_way = |film: &FilmSummary| film.transports < film.cycles_stored;
@@ -401,8 +402,8 @@ fn a_film_is_held_between_two_cycles_and_goes_on() {
 
 #[test]
 fn between_its_cycles_a_film_shows_sliding_estimates_where_there_is_time() {
-    // A solver that takes some ms, and a line so slow that a cycle takes one and a half seconds of the host's clock: then
-    // there is time on a busy machine, too.
+    // A solver that takes a few ms, and a line so slow that a cycle takes one and a half seconds of real time, so that
+    // there is enough time even on a busy machine.
     let rig = rig(60.0, "")
         .replace("seed = 5", "seed = 5\nrealtime = true")
         .replace("[vsync]\ndriver = \"sim\"\n", "[vsync]\ndriver = \"sim\"\nperiod_us = 100_000\n");

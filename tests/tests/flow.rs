@@ -1,5 +1,5 @@
-//! Runs through the daemon's core: results made again, stages that fail, pause and
-//! cancel, and files that other programs read.
+//! Runs through the daemon's core: recomputed results, failing stages, pause and cancel, and files that other programs
+//! read.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -23,7 +23,7 @@ fn small_rig(more: &str) -> String {
     rig_text(24, "scene = \"mix\"\nscene_rows = 24\nscene_columns = 16\nseed = 9", more)
 }
 
-/// Every file of a session that does not hold a time, with its bytes.
+/// All files of a session that contain no times, with their bytes.
 fn lasting_files(session: &Path) -> BTreeMap<String, Vec<u8>> {
     fn walk(folder: &Path, root: &Path, files: &mut BTreeMap<String, Vec<u8>>) {
         for entry in std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
@@ -59,7 +59,7 @@ fn processing_again_gives_the_same_bits() {
     assert!(std::fs::read(ended.session.join("report.html")).unwrap() == report, "the report differs");
 }
 
-/// Fails on one point by error and on another by panic.
+/// Fails on one point with an error and on another with a panic.
 struct Clumsy;
 
 impl Stage for Clumsy {
@@ -94,7 +94,7 @@ fn a_stage_that_fails_or_panics_costs_its_unit_only() {
     assert!(report.contains("images demultiplexed"), "the other points have their results");
 }
 
-/// Puts a file where the stack's folder is, so that nothing can be stored from point 9 on.
+/// Replaces the stack's folder with a file, so that nothing can be stored from point 9 on.
 struct Saboteur(std::path::PathBuf);
 
 impl Stage for Saboteur {

@@ -1,5 +1,5 @@
-//! Six frames of the rolling-shutter rig that were made outside the project by stepping through time: simulated
-//! camera and daemon must give them too. (The forward matrix is held against them in `raysweep-transport`.)
+//! Six frames of the rolling-shutter rig, computed outside the project by time stepping; simulated camera and daemon
+//! must reproduce them. (The forward matrix is checked against them in `raysweep-transport`.)
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -69,7 +69,7 @@ fn the_daemon_stores_the_references_frames() {
         assert_eq!(ended.state, "complete", "{:?}", ended.error);
         let light = (ended.mean(ArrayName::Sum, 0) - ended.mean(ArrayName::Dark, 0)) / 2500.0;
         let frame = frame.to_owned();
-        // Without noise to dither it, the converter rounds to half a count of 2500.
+        // Without noise as dither, the converter rounds to half a count of 2500.
         let allowed = 1e-3 * largest(&frame) + 0.5 / 2500.0;
         let off = largest(&(light.mapv(|x| x as f32) - &frame));
         assert!(off < allowed, "frame {k} is off by {off}, allowed is {allowed}");

@@ -1,5 +1,5 @@
-//! Sweeps of cameras whose settings take effect late: what the probe finds, and what it costs. That every image is true
-//! all the same, `faults.rs` holds.
+//! Sweeps with cameras whose settings take effect late: the latency found by the probe, and its cost. `faults.rs`
+//! checks that all images are correct nevertheless.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -9,7 +9,7 @@ use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, Ended, rig_text};
 
 const PERIOD_S: f64 = 1.0 / 60.0;
-/// The paper's sweep: 75 points of 8 frames, exposure in the outer loop; before them the regular image, whose 8 frames
+/// The paper's sweep: 75 points of 8 frames, exposure in the outer loop. The regular image precedes it; its 8 frames
 /// take two periods each.
 const PLAN: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
                     exposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\n";
@@ -19,9 +19,9 @@ struct Swept {
     bench: Bench,
     ended: Ended,
     latency: Option<SettingsLatency>,
-    /// VSYNC periods, from the first frame with light to the last, in which no frame of a point was exposed.
+    /// VSYNC periods between the first and the last frame with light in which no frame of a point was exposed.
     spent: f64,
-    /// Frames within points that do not count.
+    /// Unused frames within points.
     unused: u64,
 }
 
@@ -67,7 +67,8 @@ fn settings_that_act_three_frames_late_are_written_ahead() {
     assert_eq!(manifest["settings"]["latency"], serde_json::json!({ "min_frames": 3, "max_frames": 3 }));
     drop(bench);
 
-    // Frames do not tell from which one on a new exposure acts: it is given the time that it may take, five times.
+    // Frames do not report when a new exposure takes effect, so the maximum latency is allowed for after each of
+    // the five exposure changes.
     let Swept { latency, spent, .. } = sweep(&format!("{three}chunk_exposure = false\n"));
     assert_eq!(latency, late(3));
     assert!(spent < 2.0 + 5.0 * 5.0, "{spent}");
@@ -78,7 +79,7 @@ fn settings_that_act_no_one_knows_when_cost_the_frames_that_they_are_late() {
     let vary = "late_frames_min = 0\nlate_frames_max = 3\n";
     let Swept { latency, spent, .. } = sweep(vary);
     assert!(latency.is_some_and(|latency| latency.constant().is_none()), "{latency:?}");
-    // 1.5 frames a point on average, told by the frames' own stamps.
+    // 1.5 frames per point on average, as the frames' own stamps tell when settings take effect.
     assert!(spent < 2.0 + 76.0 * 2.0, "{spent}");
     let Swept { spent, .. } = sweep(&format!("{vary}chunk_exposure = false\n"));
     assert!(spent < 2.0 + 76.0 * 4.0, "{spent}");

@@ -1,4 +1,4 @@
-//! The live estimate of a run: what clients see while a sweep goes on, and that it costs the run nothing.
+//! The live estimate of a run: what clients see during a sweep, and that it does not affect the run.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -27,7 +27,7 @@ fn rig() -> String {
     rig_text(24, "scene = \"mix\"\nscene_rows = 24\nscene_columns = 16\nseed = 9", "")
 }
 
-/// A bench whose runs are seen live, and the file that they are seen in.
+/// A bench with live images, and the file that contains them.
 fn live_bench(registry: impl FnOnce(&Path) -> Registry) -> (Bench, PathBuf) {
     let folder = tempfile::TempDir::new().unwrap();
     std::fs::write(folder.path().join("rig.toml"), rig()).unwrap();
@@ -38,15 +38,15 @@ fn live_bench(registry: impl FnOnce(&Path) -> Registry) -> (Bench, PathBuf) {
     (Bench { folder, runner }, file)
 }
 
-/// Points of the schedule before the sweep: three dark images and the regular one.
+/// Points of the schedule before the sweep: three dark images and the regular image.
 const BEFORE: u32 = 4;
-/// Points of the sweep that wait until all before them are seen in an estimate.
+/// Points of the sweep that wait until all earlier points are included in an estimate.
 const WAITING: [u32; 3] = [6, 11, 17];
 
-/// Estimates by the number of points that went into them: the epipolar image.
+/// Epipolar images of the estimates, with the number of points included.
 type Seen = Arc<Mutex<Vec<(u64, Array2<f32>)>>>;
 
-/// Lets the sweep go on when it has been seen live.
+/// Holds the sweep until its live estimate has been seen.
 struct Patient {
     file: PathBuf,
     seen: Seen,
@@ -148,7 +148,7 @@ fn estimates_appear_while_the_sweep_goes_on_and_come_to_its_result() {
     assert!(!file.exists(), "a daemon that ends leaves nothing");
 }
 
-/// Light from all rows, from the transport on disk.
+/// Light summed over all rows, from the stored transport.
 fn transport(session: &Path) -> Array2<f32> {
     let t: ndarray::Array3<f32> = ndarray_npy::read_npy(session.join("products/transport.npy")).unwrap();
     let sum = t.fold_axis(ndarray::Axis(0), 0.0_f64, |sum, &light| sum + f64::from(light));
@@ -172,7 +172,7 @@ fn the_results_are_the_same_bits_with_live_images_and_without() {
     assert!(compared > 20, "{compared}");
 }
 
-/// What can be wrong with a live estimate.
+/// Faults of a live estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Trouble {
     SnapshotPanics,
@@ -181,7 +181,7 @@ enum Trouble {
     EstimateHangs,
 }
 
-/// The fold `demux` with a live estimate in trouble.
+/// The fold `demux` with a faulty live estimate.
 struct Troubled(Box<dyn Fold>, Trouble);
 
 impl Fold for Troubled {
@@ -240,13 +240,13 @@ fn an_estimate_that_fails_or_hangs_costs_the_run_nothing() {
         assert_eq!(ended.state, "complete", "{trouble:?}: {:?}", ended.error);
         assert_eq!(ended.open().1.stored(ArrayName::Sum).count(), 18, "{trouble:?}");
         assert!(ended.session.join("products/transport.npy").exists(), "{trouble:?}");
-        // The result is shown all the same.
+        // The final result is shown nevertheless.
         let newest = LiveReader::open(&file).unwrap().newest(EPIPOLAR).unwrap().unwrap();
         assert_eq!((newest.sequence, &newest.metadata["last"]), (1, &json!(true)), "{trouble:?}");
     }
 }
 
-/// Reads with the example of `docs/reference/socket.md` while it is written, and checks that each image is whole.
+/// Reads with the example of `docs/reference/socket.md` during writing, and checks that each image is complete.
 const RACE: &str = "
 reads, last = 0, 0
 while last < 3000:
@@ -257,7 +257,7 @@ while last < 3000:
 print('reads', reads)
 ";
 
-/// The value that ends it.
+/// The value at which the reader stops.
 const LAST: usize = 3000;
 
 #[test]

@@ -1,5 +1,5 @@
-//! What the model must know of rows and beam, held against the simulator, which integrates light in time and shares no
-//! code with it.
+//! Checks the model of rows and beam against the simulator, which integrates light over time and shares no code with
+//! the model.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -21,7 +21,7 @@ const TAU_US: f64 = 22.22;
 const RASTER: Raster =
     Raster { rows: 128, row_time_us: TAU_US, first_row_us: 2200.0, period_us: 50_000.0 / 3.0 };
 
-/// Transport of the corner scene, `[v, t, s]`, every fourth column.
+/// Transport of the corner scene, `[v, t, s]`, subsampled to every fourth column.
 fn corner() -> Array3<f32> {
     let mut npz = ndarray_npy::NpzReader::new(std::fs::File::open(data("p2r_corner.npz")).unwrap()).unwrap();
     let scene: Array3<f32> = npz.by_name("T").unwrap();
@@ -36,7 +36,7 @@ fn paper_grid() -> SweepGrid {
     }
 }
 
-/// A simulated rig, and the transport `[v, t, s]` that is its truth.
+/// A simulated rig and its true transport `[v, t, s]`.
 struct Rig {
     sim: PlaneRig,
     scene: Array3<f32>,
@@ -63,7 +63,7 @@ impl Rig {
         Self { sim: PlaneRig::new(config, setup, Path::new("")).unwrap(), scene, setup }
     }
 
-    /// The corner scene under a projector that is not ideal.
+    /// The corner scene with a non-ideal projector.
     fn corner(projector: SimProjector) -> Self {
         Self::new(corner(), 1.0, TAU_US, projector)
     }
@@ -76,7 +76,7 @@ impl Rig {
         Self::corner(SimProjector { beam: SimBeam::Gaussian { sigma_rows }, ..SimProjector::default() })
     }
 
-    /// Rows and camera as the rig has them, the row table left linear and the beam ideal.
+    /// Row and camera timing of the rig, with a linear row table and an ideal beam.
     fn timing(&self) -> RowTiming {
         let PlaneSetup { raster, row_pitch, camera_row_time_us, .. } = self.setup;
         let rows = self.scene.len_of(Axis(1));
@@ -85,20 +85,20 @@ impl Rig {
         timing.with_camera(camera).unwrap()
     }
 
-    /// The same with the rig's true row table.
+    /// Like [`Self::timing`], with the rig's true row table.
     fn timing_with_table(&self) -> RowTiming {
         let starts_us = self.sim.row_starts_us().unwrap();
         let table: Vec<f64> = starts_us.iter().map(|start_us| start_us - RASTER.first_row_us).collect();
         self.timing().with_row_table(&table).unwrap()
     }
 
-    /// The errors of the paper's sweep with 8 frames.
+    /// Errors of the paper's sweep with 8 frames.
     fn recover(&self, timing: &RowTiming) -> Errors {
         self.recover_from(timing, paper_grid().settings(), 8)
     }
 
-    /// Median relative error of the profile and relative error of the u = 0 image, as recovered under `timing` from
-    /// `frames` frames a setting of a sensor with 8000 electrons, 15 of them read noise.
+    /// Median relative error of the profile, and relative error of the u = 0 image, when recovered under `timing` from
+    /// `frames` frames per setting; the sensor has 8000 electrons and a read noise of 15 electrons.
     fn recover_from(&self, timing: &RowTiming, settings: Vec<Setting>, frames: u32) -> Errors {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
         let mut photographed = |light: f32| {
@@ -174,7 +174,8 @@ fn a_beam_is_taken_out_once_it_is_known() {
     for sigma_rows in [0.7, 1.5] {
         let rig = Rig::spread(sigma_rows);
         let known = rig.timing().with_beam(Beam::Gaussian { sigma_rows }).unwrap();
-        // Measured: 0.0139, 0.0149 at 0.7 and 0.0132, 0.0196 at 1.5 rows; 0.30, 0.27 and 0.67, 0.62 without the beam.
+        // Measured: 0.0139, 0.0149 at 0.7 rows and 0.0132, 0.0196 at 1.5 rows; 0.30, 0.27 and 0.67, 0.62 without the
+        // beam.
         rig.recover(&known).assert_at_most(0.04, 0.04);
         let unknown = rig.recover(&rig.timing());
         assert!(unknown.profile > 0.2, "the beam matters: {unknown:?}");
@@ -226,7 +227,7 @@ fn camera_rows_of_two_projector_rows() {
 
 #[test]
 fn camera_rows_of_half_a_projector_row() {
-    // Projector row v lights camera rows 2v - 1 and 2v, whose places v - 1/2 and v are nearest to it.
+    // Projector row v lights camera rows 2v - 1 and 2v, whose positions v - 1/2 and v are closest to it.
     let fine = corner();
     let first = fine.slice(s![..1, .., ..]);
     let pairs = &fine.slice(s![1..127;2, .., ..]) + &fine.slice(s![2..;2, .., ..]);

@@ -1,4 +1,5 @@
-//! A projector that an operator works, on the simulated line: what is asked holds the run, and nothing is taken before the answer.
+//! A projector worked by an operator, on the simulated line: questions pause the run, and nothing is acquired before
+//! the answer.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -15,7 +16,7 @@ fn bench() -> Bench {
     Bench::new(&rig.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\""))
 }
 
-/// Runs the plan with an operator who does what is asked after `answer` has looked at it; what was asked, and how it ended.
+/// Runs the plan with an operator who does what is asked, calling `answer` first; returns the questions and the result.
 fn run(bench: &Bench, answer: impl Fn(usize, &Bench)) -> (Vec<String>, Ended) {
     let mut events = bench.runner.events();
     let mut told = bench.runner.events();
@@ -48,9 +49,10 @@ fn stored(bench: &Bench) -> usize {
 fn points_wait_for_the_picture_that_they_need() {
     let bench = bench();
     let (asked, ended) = run(&bench, |questions_before, bench| {
-        // Long enough for several frames, were they taken for points.
+        // Long enough for several frames, in case they were wrongly taken for points.
         std::thread::sleep(std::time::Duration::from_millis(300));
-        // Nothing before the light is off; before there is light the dark images alone, the sweep's and the regular image's.
+        // Before the light is off, nothing is stored; before it is on, only the dark images of the sweep and the
+        // regular image.
         assert_eq!(stored(bench), [0, 2][questions_before]);
         bench.runner.go_on().unwrap();
     });

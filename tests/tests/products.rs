@@ -1,4 +1,4 @@
-//! Products by name: in the plan and after the fact, held against each other, the transport and the scene.
+//! Products by name, requested in the plan and afterwards, compared with each other, the transport and the scene.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -25,7 +25,7 @@ fn asked(products: &[&str], only: bool) -> Asked {
     Asked { products: products.iter().map(|&product| product.to_owned()).collect(), only, ..Asked::default() }
 }
 
-/// The files of a session's products, by name.
+/// Files of a session's products, by name.
 fn files(session: &Path) -> BTreeMap<String, Vec<u8>> {
     let entries = std::fs::read_dir(session.join("products")).unwrap().map(|entry| entry.unwrap().path());
     let named = |path: std::path::PathBuf| {
@@ -43,7 +43,7 @@ fn products_made_after_the_fact_have_the_bits_of_those_in_the_plan() {
     let planned_bench = bench();
     let planned = planned_bench.run(&with_products(&PRODUCTS, PLAN));
     let expected = files(&planned.session);
-    // Two products have the names of default ones, so of those only the others can be added.
+    // Two products have the same names as default ones, so only the others can be added.
     let late_bench = bench();
     let late = late_bench.run(PLAN);
     let before = files(&late.session);

@@ -1,5 +1,5 @@
-//! Sweeps through the daemon: the transport that comes out is the scene's. One scene was made by an independent renderer,
-//! the others are the simulator's own, of other character: the defaults must suit them all.
+//! Sweeps through the daemon recover the scene's transport. One scene is from an independent renderer, the others are
+//! the simulator's own with different characters: the defaults must suit all of them.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -13,7 +13,7 @@ use raysweep_transport::plane::{RowTiming, Setting, reach, relative_rows};
 use raysweep_transport::quality::{median_profile_error, relative_l2, share_near};
 use serde_json::Value;
 
-/// The sensor of the published figures: 8000 electrons, 15 of them read noise, no fixed pattern.
+/// Sensor of the published figures: 8000 electrons, read noise of 15 electrons, no fixed pattern.
 const SENSOR: &str = "[sim.sensor]\nfull_well_e = 8000.0\nread_noise_e = 15.0\nprnu_percent = 0.0\n";
 
 /// The paper's delays and exposures.
@@ -28,16 +28,16 @@ fn corner() -> Array3<f32> {
     read_scene(&data("p2r_corner.npz"))
 }
 
-/// How far a session's transport is from a scene's.
+/// Errors of a session's transport relative to a scene's.
 #[derive(Debug)]
 struct Errors {
-    /// Median over pixels of the relative error of the profile.
+    /// Median over pixels of the profile's relative error.
     profile: f64,
     /// Relative error of the u = 0 image.
     own_row: f64,
-    /// Of the total light, signed.
+    /// Relative error of the total light, signed.
     total: f64,
-    /// Of the share of |u| <= 2, signed.
+    /// Error of the fraction of light at |u| <= 2, signed.
     near: f64,
     prior: String,
     beam_sigma_rows: f64,
@@ -47,7 +47,7 @@ fn product<D: ndarray::Dimension>(ended: &Ended, name: &str) -> ndarray::Array<f
     ndarray_npy::read_npy(ended.session.join("products").join(name)).unwrap()
 }
 
-/// Runs a plan and compares; `scene` is the truth, `[v, t, s]`.
+/// Runs a plan and compares the result with the true transport `scene`, `[v, t, s]`.
 fn recover(bench: &Bench, plan: &str, scene: ArrayView3<f32>, longest: Setting) -> (Errors, Ended) {
     let ended = bench.run(plan);
     assert_eq!(ended.state, "complete", "{:?}", ended.error);
@@ -74,7 +74,7 @@ fn recover(bench: &Bench, plan: &str, scene: ArrayView3<f32>, longest: Setting) 
     (errors, ended)
 }
 
-/// The corner scene under the paper's delays and exposures.
+/// Recovers the corner scene with the paper's delays and exposures.
 fn recover_corner(rig: &str, plan: &str) -> Errors {
     recover(&Bench::new(rig), plan, corner().view(), Setting::new(1500.0, 1200.0)).0
 }
@@ -127,7 +127,7 @@ fn the_width_of_the_beam_is_found_in_the_images() {
     }
 }
 
-/// A scene of the simulator, 64 x 64, and its file.
+/// A 64 x 64 scene of the simulator, and its file.
 fn built_in(name: &str) -> (tempfile::TempDir, PathBuf, Array3<f32>) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.npz");
@@ -140,7 +140,8 @@ fn built_in(name: &str) -> (tempfile::TempDir, PathBuf, Array3<f32>) {
 fn the_defaults_suit_scenes_of_other_character() {
     for name in ["v-groove", "mirror-ball", "slab", "candle", "mix"] {
         let (_folder, path, scene) = built_in(name);
-        // The rig's beam is known: under the slab's surface light spreads by a row, which no image tells from a beam.
+        // The beam must be known: under the slab's surface light spreads by a row, which images cannot tell from a
+        // beam.
         let rig = rig_text(64, &format!("scene = {path:?}"), SENSOR);
         let bench = Bench::new(&rig.replace("[sim]", "beam_sigma_rows = 0.0\n[sim]"));
         let longest = || Setting::new(1500.0, 1200.0);
@@ -157,7 +158,7 @@ fn the_defaults_suit_scenes_of_other_character() {
 
 #[test]
 fn a_flying_spot_costs_the_settings_that_it_cuts_and_nothing_else() {
-    // Every exposure of the first list begins or ends on the direct row, none of the second.
+    // In the first list, every exposure starts or ends on the direct row; in the second list, none does.
     let delays: Vec<f64> = [-1500.0, -1000.0, -600.0, 600.0, 1000.0, 1500.0]
         .into_iter()
         .chain((-6..=6).map(|k| 300.0 + f64::from(k) * 1.5))
@@ -176,7 +177,7 @@ fn a_flying_spot_costs_the_settings_that_it_cuts_and_nothing_else() {
     let report = |ended: &Ended| std::fs::read_to_string(ended.session.join("report.html")).unwrap();
     assert!(report(&ended).contains("images are left out"));
 
-    // With the spot's way known they all count.
+    // When the spot's path is known, all images are used.
     let modelled = known
         .replace("spot = \"flying\"", "spot = \"flying\"\nscan = \"bidirectional\"\nbeam_sigma_rows = 0.0")
         .replace("[vsync]", "projector_columns = [0, 1]\n[vsync]");
@@ -193,7 +194,7 @@ fn the_sweep_that_check_proposes_errs_less_than_the_papers() {
     let report = bench.runner.check(&plan).unwrap();
     let better = report.advice.unwrap().better.unwrap();
     let proposed = plan.replace("[sweep]\naverage = 1\n", &better.sweep);
-    // What is said of the proposed sweep is what it says of itself.
+    // The prediction for the proposed sweep equals the check of that sweep.
     let again = bench.runner.check(&proposed).unwrap();
     assert_eq!(
         (again.points, again.frames, again.reach_rows),

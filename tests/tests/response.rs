@@ -1,4 +1,4 @@
-//! How a mirror answers, from the plan to the paths of later runs, against what the simulator's mirror is.
+//! Mirror response from its identification to the paths of later runs, compared with the simulated mirror.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -17,7 +17,7 @@ use raysweep_tests::dots::{plan, rig};
 use raysweep_tests::{Bench, Ended, end_of};
 use serde_json::Value;
 
-/// Resonances of the simulated mirror.
+/// Resonant frequencies of the simulated mirror, x and y.
 const F0_HZ: [f64; 2] = [500.0, 480.0];
 const Q: [f64; 2] = [30.0, 22.0];
 
@@ -29,7 +29,7 @@ fn chirps(more: &str) -> String {
     )
 }
 
-/// A mirror with these resonances behind the controller's filter; `more` is appended.
+/// A mirror with these resonances behind a controller with this filter; `more` is appended.
 fn mirror(filter_hz: f64, more: &str) -> String {
     format!("[sim.dots.mirror]\nf0_hz = {F0_HZ:?}\nq = {Q:?}\nfilter_hz = {filter_hz}\n{more}")
 }
@@ -44,7 +44,7 @@ fn completed(bench: &Bench, plan: &str) -> Ended {
     ended
 }
 
-/// Holds what was identified against the simulator's mirror.
+/// Compares the identified response with the simulated mirror.
 fn assert_identified(bench: &Bench) {
     let kept: Value = serde_json::from_slice(&std::fs::read(kept_path(bench)).unwrap()).unwrap();
     for (axis, (f0_hz, q)) in ["x", "y"].into_iter().zip(F0_HZ.into_iter().zip(Q)) {
@@ -66,7 +66,7 @@ fn resonances_are_identified_behind_the_controllers_filter() {
 
 #[test]
 fn lost_and_spoilt_frames_leave_gaps_and_shift_nothing() {
-    // The axes share a tenth of their movements, and the mirror drifts and never repeats itself.
+    // The axes are coupled by a tenth of their movements, and the mirror drifts and has a repeatability error.
     let faults = "coupling = 0.1\ndrift_deg_per_s = [0.02, -0.01]\nrepeat_deg = 0.0005\n\
                   [sim.dots.camera]\ndropped = 0.05\nduplicated = 0.02\nsaturated = 0.01\n";
     let bench = Bench::dots(&rig(&mirror(1000.0, faults)));
@@ -111,14 +111,14 @@ fn a_session_says_what_was_found_and_gives_it_again() {
     assert!(!kept_path(&bench).exists(), "an old session is not the rig's newest word");
 }
 
-/// Where the dots of a run land on the plane: column and row, none for one that was not seen.
+/// Column and row at which each dot of a run falls on the plane; `None` for a dot that was not seen.
 fn places(ended: &Ended) -> Vec<Option<[f64; 2]>> {
     let dots: Array2<f32> = ended.open().0.products().read_image("dots").unwrap();
     let place = |column: f32, row: f32| (column >= 0.0).then(|| [f64::from(column), f64::from(row)]);
     dots.rows().into_iter().map(|dot| place(dot[1], dot[2])).collect()
 }
 
-/// Root mean square distance of dots from where they should be.
+/// Root mean square distance between the dots and their targets.
 fn distance_px(found: &[Option<[f64; 2]>], wanted: &[Option<[f64; 2]>]) -> f64 {
     let both: Vec<f64> = found
         .iter()
@@ -132,7 +132,7 @@ fn distance_px(found: &[Option<[f64; 2]>], wanted: &[Option<[f64; 2]>]) -> f64 {
 
 #[test]
 fn paths_distorted_by_what_was_identified_are_followed_closer() {
-    // x swings at 180 Hz, a third of its resonance.
+    // x moves at 180 Hz, a third of its resonant frequency.
     let raster = plan("product = [{ kind = \"floodlit\" }]", 2).replace(
         "shape = \"lissajous\"\ncycles = [7, 1]\namplitude_deg = [2.3, 1.3]",
         "shape = \"raster\"\nlines = 18\namplitude_deg = [1.6, 1.1]\nflyback = 0.15",
@@ -160,7 +160,7 @@ fn paths_distorted_by_what_was_identified_are_followed_closer() {
     let said = settings(&distorted);
     assert_eq!(said["session"].as_str(), found.session.file_name().unwrap().to_str());
     assert!((said["x"]["f0_hz"].as_f64().unwrap() / F0_HZ[0] - 1.0).abs() < 0.01, "{said}");
-    // Its products can be made again when the rig's own file is gone.
+    // The products can be recomputed when the rig's own file is gone.
     std::fs::remove_file(kept_path(&bench)).unwrap();
     assert_eq!(process(&distorted.session).unwrap().problems, [""; 0]);
     assert_eq!(settings(&distorted), said);
@@ -173,11 +173,11 @@ fn paths_distorted_by_what_was_identified_are_followed_closer() {
 fn what_shows_no_resonance_faults_the_run_and_overwrites_nothing() {
     let known = "what was known before";
     for (mirror, more, expected) in [
-        // Nothing gets through such a filter.
+        // The filter blocks the chirp.
         (mirror(1.0, ""), "", "axis x, under whose chirp the dot moved by"),
         ("[sim.dots.mirror]\nmechanics = false\n".into(), "", "no resonance between 100 and 900 Hz"),
         (mirror(5000.0, "[sim.dots.camera]\ndropped = 0.2\n"), "", "never came"),
-        // The dot is in the middle.
+        // The dot is in the centre.
         (mirror(5000.0, ""), "region = [0, 16, 0, 16]", "0 of the"),
     ] {
         let bench = Bench::dots(&rig(&mirror));

@@ -1,4 +1,4 @@
-//! Sweeps larger than the memory: solved some camera rows at a time, with the files of one piece.
+//! Sweeps that exceed the memory limit: solved in strips of camera rows, with the same files as when solved as a whole.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -17,13 +17,13 @@ use raysweep_session::stack::ArrayName;
 use raysweep_session::{Session, manifest};
 use raysweep_tests::{Bench, Ended, PRODUCTS, rig_text, with_products};
 
-/// Three strips, the last of them low, and pixels that saturate.
+/// Three strips, the last with fewer rows, and pixels that saturate.
 fn rig() -> String {
     let rig = rig_text(150, "scene = \"mix\"\nscene_rows = 150\nscene_columns = 70\nseed = 11", "");
     rig.replace("[camera]\n", "[camera]\nwhite_dn = 3800\n")
 }
 
-/// A hot-pixel filter, whose pixels depend on rows of the strips beside; and profiles that lie in several strips.
+/// A hot-pixel filter, whose pixels depend on rows of adjacent strips, and profiles that span several strips.
 fn plan(stages: &[&str]) -> String {
     let sweep = "kind = \"sweep\"\nname = \"strips\"\n[sweep]\naverage = 1\n\
                  delay_us = { start = -300, stop = 300, count = 7 }\nexposure_us = [100, 250]\n";
@@ -36,14 +36,14 @@ fn plan(stages: &[&str]) -> String {
     with_products(&[&PRODUCTS[..], &more].concat(), sweep) + &stages
 }
 
-/// What the results of a plan take in one piece.
+/// Memory needed for a plan's results without strips.
 fn whole_bytes(bench: &Bench, plan: &str) -> u64 {
     let report = bench.runner.check(plan).unwrap();
     assert!(report.warnings.iter().all(|warning| !warning.contains("at a time")), "{:?}", report.warnings);
     report.memory_bytes
 }
 
-/// SHA-256 of every file but those that hold the time of the run.
+/// SHA-256 of all files except those that contain the time of the run.
 fn checksums(session: &Path) -> BTreeMap<String, String> {
     let session = Session::open(session).unwrap();
     assert!(manifest::verify(&session).unwrap().is_empty());
@@ -96,7 +96,7 @@ fn a_run_and_a_processing_in_strips_give_the_files_of_one_piece() {
     assert!((checksums(&whole.session), report_of(&whole)) == before);
 }
 
-/// Subtracts the mean of the image, so that every pixel depends on all others.
+/// Subtracts the image's mean, so that every pixel depends on all others.
 struct Levelled;
 
 impl Stage for Levelled {
@@ -160,7 +160,7 @@ fn what_does_not_fit_in_strips_either_is_refused_before_anything_is_written() {
     assert!(refused.message.contains("--memory"), "{refused}");
 }
 
-/// Cancels the run when it has seen so many images.
+/// Cancels the run after a given number of images.
 struct Canceller {
     images_left: AtomicUsize,
     runner: Arc<OnceLock<Arc<Runner>>>,
@@ -188,7 +188,8 @@ fn a_run_cancelled_between_strips_leaves_no_part_of_a_transport_and_can_be_proce
     let mut registry = Registry::default();
     registry.register("canceller", {
         let runner = runner.clone();
-        // 14 points of the sweep, two dark images and the regular one: as they come, to choose by, and for the first strip.
+        // 14 points of the sweep, two dark images and the regular image; processed on arrival, for choosing the
+        // solver's parameters, and for the first strip.
         move |_, _, _| {
             let images_left = AtomicUsize::new(3 * 17);
             Ok(Entry::Stage(Box::new(Canceller { images_left, runner: runner.clone() })))

@@ -1,4 +1,4 @@
-//! The edges between crates that ARCHITECTURE.md allows, and no others.
+//! Only the dependencies between crates that ARCHITECTURE.md allows exist.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -65,7 +65,8 @@ fn crates_depend_on_each_other_as_allowed() {
     assert_eq!(seen.len(), allowed.len(), "crates are missing: {seen:?}");
 }
 
-/// Where the daemon may name the simulator: the factory, the types of the section `[sim]`, and the simulated camera's program.
+/// Files of the daemon that may refer to the simulator: the factory, the types of `[sim]`, and the simulated camera's
+/// program.
 const KNOW_THE_SIMULATOR: [&str; 5] =
     ["src/rig.rs", "src/rig/", "src/config/rig.rs", "src/config/dots.rs", "src/bin/raysweep-sim-camera.rs"];
 

@@ -1,4 +1,4 @@
-//! Whole sweeps whose edges come from a real driver: a triggerbox on a pseudo-terminal makes the VSYNC of the simulated rig.
+//! Complete sweeps with edges from a real driver: a triggerbox on a pseudo-terminal provides the simulated rig's VSYNC.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -26,7 +26,7 @@ fn bench(port: &Path, reopen_s: f64) -> Bench {
     Bench::new(&rig.replace("[vsync]\ndriver = \"sim\"", &vsync))
 }
 
-/// A round trip over a pseudo-terminal of a busy machine tells the time to a hundred microseconds or so.
+/// On a busy machine, a round trip over a pseudo-terminal determines the time to about a hundred microseconds.
 fn plan(delays: usize, average: u32) -> String {
     format!(
         "kind = \"sweep\"\n[sweep]\ndelay_us = {{ start = -300, stop = 300, count = {delays} }}\nexposure_us = [500]\n\
@@ -46,7 +46,7 @@ fn a_sweep_with_a_triggerbox_is_complete() {
     assert!(vsync.edges > 12, "{vsync:?}");
 }
 
-/// Runs a sweep whose box is pulled out when two points are stored; `meanwhile` sees to what comes after.
+/// Runs a sweep and unplugs the box when two points are stored; `meanwhile` may plug it in again.
 fn run_unplugged(reopen_s: f64, meanwhile: impl FnOnce(&Path) -> Option<TriggerBoxPty>) -> (Ended, Counts) {
     let folder = tempfile::tempdir().unwrap();
     let port = folder.path().join("by-id");

@@ -1,4 +1,4 @@
-//! `cargo xtask bench`: what is fast enough, and how we know.
+//! `cargo xtask bench`: benchmarks.
 
 use crate::run::{Done, cargo, run, target};
 use crate::{live, python};
@@ -26,7 +26,8 @@ benchmarks: cargo xtask bench <name> [options]
   edges   the logic analyser's edge scan on one core: samples a second against its 24 MHz, quiet to worst
   unpack  packed pixels to u16: share of the speed of a memcpy of the same output, by format and instructions";
 
-/// Runs the benchmark that the first argument names with the options that follow; without a name, lists all.
+/// Runs the benchmark named by the first argument with the options that follow; without arguments, lists all
+/// benchmarks.
 pub fn bench(arguments: &[&str]) -> Done {
     match arguments {
         [] => {
@@ -55,7 +56,7 @@ pub fn bench(arguments: &[&str]) -> Done {
     }
 }
 
-/// A benchmark of the mathematics; its peers run in a Python environment with what `requirements` names.
+/// Runs a benchmark of the numerics; its peers run in a Python environment with the packages in `requirements`.
 fn transport(name: &str, environment: &str, requirements: &str, options: &[&str]) -> Done {
     if let Some(unknown) = options.iter().find(|option| !["--json", "--peers"].contains(option)) {
         return Err(format!("`{name}` has no option `{unknown}`\n{BENCHES}"));
@@ -72,7 +73,7 @@ fn transport(name: &str, environment: &str, requirements: &str, options: &[&str]
     run(&mut bench)
 }
 
-/// The camera's driver, alone or under a whole sweep.
+/// Runs the benchmark of the camera's driver, alone or within a complete sweep.
 fn camera(options: &[&str]) -> Done {
     let (mut is_sweep, mut passed_on) = (false, Vec::new());
     let mut words = options.iter().copied();

@@ -6,21 +6,21 @@ use std::time::{Duration, Instant};
 
 use crate::run::{Done, run};
 
-/// Starting takes longer only where something is wrong; a large simulated scene is rendered first.
+/// Generous, because a large simulated scene is rendered first; only a faulty start takes longer.
 const START_TIMEOUT: Duration = Duration::from_secs(120);
 
 const SOCKET: &str = "raysweepd.sock";
 
-/// The daemon, ended in order when all is well and in any case when not.
+/// The daemon's process; stopped properly on success, and killed otherwise.
 pub struct Daemon {
     process: Child,
     runtime: PathBuf,
 }
 
 impl Daemon {
-    /// Starts the daemon of a folder of programs, and waits until it listens.
+    /// Starts the daemon from a folder of programs, and waits until it listens.
     pub fn start(programs: &Path, rig: &Path, data: &Path) -> Done<Self> {
-        // Socket paths are short by law (108 bytes), checkouts are not.
+        // Paths of sockets are limited to 108 bytes; checkout paths may be longer.
         let runtime = std::env::temp_dir().join(format!("raysweep-xtask-{}", std::process::id()));
         std::fs::create_dir_all(&runtime).map_err(|error| format!("{}: {error}", runtime.display()))?;
         let process = Command::new(programs.join("raysweepd"))
@@ -37,12 +37,12 @@ impl Daemon {
         Ok(daemon)
     }
 
-    /// Where clients connect.
+    /// Path of the daemon's socket.
     pub fn socket(&self) -> PathBuf {
         self.runtime.join(SOCKET)
     }
 
-    /// The process's number.
+    /// Process id.
     pub fn id(&self) -> u32 {
         self.process.id()
     }
@@ -62,9 +62,9 @@ impl Daemon {
         Ok(())
     }
 
-    /// Asks the daemon to end, as systemd does, and waits until it has.
+    /// Asks the daemon to terminate, as systemd does, and waits for its end.
     pub fn stop(mut self) -> Done {
-        // The shell's own `kill`: a bare Debian has no other.
+        // The shell's built-in `kill`: a bare Debian has no other.
         run(Command::new("sh").args(["-c", &format!("kill -TERM {}", self.process.id())]))?;
         let status = self.process.wait().map_err(|error| format!("raysweepd: {error}"))?;
         if status.success() { Ok(()) } else { Err(format!("raysweepd ended with {status}")) }
@@ -73,7 +73,7 @@ impl Daemon {
 
 impl Drop for Daemon {
     fn drop(&mut self) {
-        // Both fail where the daemon has ended in order, which is how it should be.
+        // Both fail if the daemon has already terminated properly.
         let _ = self.process.kill();
         let _ = self.process.wait();
         let _ = std::fs::remove_dir_all(&self.runtime);

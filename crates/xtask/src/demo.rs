@@ -31,7 +31,7 @@ pub fn demo() -> Done {
     Ok(())
 }
 
-/// The newest session: names begin with the time.
+/// The newest session; session names begin with the time.
 fn newest(data: &Path) -> Done<PathBuf> {
     let folders = std::fs::read_dir(data).map_err(|error| format!("{}: {error}", data.display()))?;
     let newest = folders.flatten().map(|folder| folder.path()).max();

@@ -11,39 +11,39 @@ use crate::run::{Done, cargo, root, run, target};
 
 const SIDES_PX: [u32; 2] = [128, 512];
 
-/// Threads that a simulated device runs in, and the pool's workers, which draw its noise until the last frame and have nothing
-/// else to do before; the pool has the daemon's name.
+/// Threads of the simulated devices, and the workers of the thread pool, which compute sensor noise until the last
+/// frame and have no other work before that; pool threads carry the daemon's name.
 const SIMULATOR: [&str; 3] = ["camera", "vsync", "raysweepd"];
 
-/// Clock ticks of `/proc/PID/task/TID/stat` in a second: Linux has had 100 on all machines for decades.
+/// Clock ticks per second of `/proc/PID/task/TID/stat`: 100 on all Linux machines for decades.
 const TICKS_PER_S: f64 = 100.0;
 
 /// The event that follows the last frame.
 const DRAINING: &str = "\"draining\"";
 
-/// By thread: its name and its processor time in seconds.
+/// Name and processor time in seconds, by thread.
 type Times = BTreeMap<String, (String, f64)>;
 
-/// How figures are printed.
+/// Output format.
 pub enum Print {
-    /// For people.
+    /// Text for people.
     Text,
-    /// For programs.
+    /// JSON lines for programs.
     JsonLines,
 }
 
-/// What was measured of a run.
+/// Measurements of a run.
 struct Ran {
     run_s: f64,
-    /// From the last frame to the transport on disk.
+    /// Time from the last frame to the transport on disk.
     final_s: f64,
-    /// Processor time of all threads.
+    /// Total processor time of all threads.
     all_s: f64,
-    /// Processor time of the simulator's threads over the time from the run's start to its last frame.
+    /// Average number of cores used by the simulator's threads between the start of the run and its last frame.
     simulator_cores: f64,
 }
 
-/// Builds the daemon, and runs the sweep at each size.
+/// Builds the daemon and runs the sweep at each size.
 pub fn live(print: Print) -> Done {
     run(cargo().args(["build", "--package", "raysweep", "--bins", "--release"]))?;
     let cores = std::thread::available_parallelism().map_err(|error| error.to_string())?.get();
@@ -78,7 +78,7 @@ pub fn live(print: Print) -> Done {
     Ok(())
 }
 
-/// A camera whose readout takes more than a period answers every other edge, 30 a second.
+/// A camera whose readout takes longer than a period responds to every other edge, 30 per second.
 fn rig(side_px: u32) -> String {
     format!(
         "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
@@ -87,7 +87,7 @@ fn rig(side_px: u32) -> String {
     )
 }
 
-/// Runs a plan in a daemon of its own.
+/// Runs a plan in a separate daemon.
 fn ran(rig: &Path, plan: &Path, folder: &Path) -> Done<Ran> {
     let programs = target().join("release");
     let daemon = Daemon::start(&programs, rig, &folder.join("sessions"))?;
@@ -104,7 +104,7 @@ fn ran(rig: &Path, plan: &Path, folder: &Path) -> Done<Ran> {
     let events = client.stdout.take().map(BufReader::new).ok_or("raysweep run has no output")?;
     let mut latest = before.clone();
     let (mut simulator_cores, mut final_s) = (None, None);
-    // A run says something at each point, often enough to see threads before they end.
+    // Events arrive at every point, often enough to see each thread before it ends.
     for event in events.lines() {
         let event = event.map_err(|error| format!("raysweep run: {error}"))?;
         latest.extend(cpu_s(daemon.id()));
@@ -126,13 +126,13 @@ fn ran(rig: &Path, plan: &Path, folder: &Path) -> Done<Ran> {
     }
 }
 
-/// Processor time of some threads, chosen by name, since `before`.
+/// Processor time since `before` of the threads selected by name.
 fn spent_s(before: &Times, latest: &Times, wanted: impl Fn(&str) -> bool) -> f64 {
     let threads = latest.iter().filter(|(_, (name, _))| wanted(name));
     threads.map(|(thread, (_, s))| s - before.get(thread).map_or(0.0, |(_, s)| *s)).sum()
 }
 
-/// Processor time of each thread of a process so far, with its name; nothing of those that ended.
+/// Name and processor time of each running thread of a process.
 fn cpu_s(process: u32) -> Times {
     let threads = std::fs::read_dir(format!("/proc/{process}/task")).into_iter().flatten().flatten();
     let times = threads.filter_map(|thread| {
@@ -142,7 +142,7 @@ fn cpu_s(process: u32) -> Times {
     times.collect()
 }
 
-/// From a line of `stat`: names may hold blanks and parentheses, so that fields count from the last parenthesis on.
+/// Parses a line of `stat`. Names may contain spaces and parentheses, so fields are counted from the last parenthesis.
 fn name_and_cpu_s(stat: &str) -> Option<(String, f64)> {
     let name = stat.get(stat.find('(')? + 1..stat.rfind(')')?)?;
     let mut fields = stat.get(stat.rfind(')')? + 1..)?.split_whitespace().skip(11);

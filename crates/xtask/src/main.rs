@@ -1,4 +1,5 @@
-//! `cargo xtask demo | test | packages | fresh | guest | bench`: the project's own commands. Plain std, so that they build at once everywhere.
+//! `cargo xtask demo | test | packages | fresh | guest | bench`: the project's own commands. Uses only std, so that it
+//! builds quickly everywhere.
 
 mod bench;
 mod daemon;

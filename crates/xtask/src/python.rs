@@ -5,8 +5,8 @@ use std::process::Command;
 
 use crate::run::{Done, root, run, target};
 
-/// The Python of an environment with the packages that `requirements` in `tests/python` names; made anew whenever that
-/// file has changed, or the system's Python, which it leads to, has gone.
+/// Returns the Python of an environment with the packages listed in `tests/python/<requirements>`. The environment is
+/// recreated when that file has changed or the system's Python, to which it links, is gone.
 pub fn environment(name: &str, requirements: &str) -> Done<PathBuf> {
     let requirements = root().join("tests/python").join(requirements);
     let wanted =

@@ -1,12 +1,12 @@
-//! A root file system of its own for a script: made for it, and gone with all mounts and processes on every way out.
+//! Temporary root file systems for scripts; removed with all mounts and processes, however the script ends.
 
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
 
-/// Ends what still runs and removes the folder `$1`, once told that the script has ended or left alone by us: a pipe ends with
-/// whoever holds its other end, however that came about. `$2...` runs a program as the folder's owner.
+/// Kills remaining processes and removes the folder `$1`, once told that the script has ended, or when we have died:
+/// the pipe closes in either case. `$2...` runs a program as the folder's owner.
 const GUARD: &str = r#"
 folder=$1; shift
 read -r process
@@ -17,10 +17,10 @@ for attempt in 1 2 3 4 5; do
 done
 "#;
 
-/// What precedes each script, and a function for it: `mount_system ROOT`.
+/// Prepended to each script; defines the function `mount_system ROOT`.
 const PRELUDE: &str = include_str!("rootfs.sh");
 
-/// Why this machine can make none, if so.
+/// Why this machine does not allow it, or `None`.
 pub fn forbidden() -> Option<String> {
     let tried = Command::new("unshare").args(namespaces()).args(["chroot", "/", "true"]).output();
     match tried {
@@ -34,18 +34,18 @@ pub fn forbidden() -> Option<String> {
     }
 }
 
-/// A script that runs as root, in mounts and processes of its own.
+/// A script running as root in its own mount and process namespaces.
 pub struct Running {
     process: Child,
     guard: Guard,
 }
 
 impl Running {
-    /// Starts a shell script, whose `$1` is the folder, and what follows the arguments. It prints to a pipe.
+    /// Starts a shell script with the folder as `$1`, followed by the arguments. Its output goes to a pipe.
     pub fn start(script: &str, folder: &Path, arguments: &[&str]) -> Result<Self, String> {
         let mut guard = Guard::start(folder)?;
         let script = format!("{PRELUDE}\n{script}");
-        // A group of its own: whoever interrupts us leaves the rest to the guard.
+        // A separate process group: if we are interrupted, the guard cleans up.
         let process = Command::new("unshare")
             .args(namespaces())
             .args(["sh", "-euc", &script, "sh"])
@@ -60,7 +60,7 @@ impl Running {
         Ok(Self { process, guard })
     }
 
-    /// Takes what the script prints line by line to its end; whether it ended well.
+    /// Passes the script's output to `take` line by line until the end; returns whether the script succeeded.
     pub fn follow(mut self, mut take: impl FnMut(&str)) -> Result<bool, String> {
         let output = self.process.stdout.take().ok_or("unshare without output")?;
         for line in BufReader::new(output).split(b'\n') {
@@ -73,7 +73,7 @@ impl Running {
     }
 }
 
-/// What to `unshare`; only root needs no namespace of users.
+/// Arguments of `unshare`; root does not need a user namespace.
 fn namespaces() -> Vec<&'static str> {
     let mut all = user_namespace();
     all.extend(["--mount", "--pid", "--fork", "--kill-child"]);
@@ -84,13 +84,13 @@ fn user_namespace() -> Vec<&'static str> {
     if is_root() { Vec::new() } else { vec!["--user", "--map-root-user", "--map-auto"] }
 }
 
-/// Whether we may do everything.
+/// Whether we are root.
 pub fn is_root() -> bool {
     let uid = Command::new("id").arg("-u").output();
     uid.is_ok_and(|output| output.stdout.trim_ascii() == b"0")
 }
 
-/// The process that cleans up. Dropping it waits until it has.
+/// The process that cleans up. Dropping it waits until it has finished.
 struct Guard {
     process: Child,
     pipe: Option<ChildStdin>,

@@ -4,37 +4,37 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// What went wrong, in words for the person at the terminal.
+/// Result with an error message for the terminal.
 pub type Done<T = ()> = Result<T, String>;
 
-/// The project's root.
+/// The project's root folder.
 pub fn root() -> &'static Path {
-    // The manifest lies at crates/xtask, two folders below the root.
+    // The manifest is in crates/xtask, two folders below the root.
     Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("."))
 }
 
-/// Where cargo puts what it builds.
+/// Cargo's target folder.
 pub fn target() -> PathBuf {
     named_target().unwrap_or_else(|| root().join("target"))
 }
 
-/// The folder that the environment names, as seen from where we were started.
+/// Target folder from the environment, relative to our working directory.
 fn named_target() -> Option<PathBuf> {
     std::path::absolute(std::env::var_os("CARGO_TARGET_DIR")?).ok()
 }
 
-/// The cargo that runs us.
+/// The cargo that started us, run in the project's root.
 pub fn cargo() -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.current_dir(root());
-    // It runs in another folder than we do, from which a relative name would lead elsewhere.
+    // Cargo runs in a different folder, where a relative path would point elsewhere.
     if let Some(target) = named_target() {
         command.env("CARGO_TARGET_DIR", target);
     }
     command
 }
 
-/// Prints a line. A reader who has seen enough and left is no fault.
+/// Prints a line. A reader that has closed the pipe is not an error.
 pub fn say(line: &str) -> Done {
     match writeln!(std::io::stdout(), "{line}") {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => Err(format!("cannot print: {error}")),
@@ -42,7 +42,7 @@ pub fn say(line: &str) -> Done {
     }
 }
 
-/// Runs a program to its end and says which one failed.
+/// Runs a program to completion; an error names the program.
 pub fn run(command: &mut Command) -> Done {
     let shown = shown(command);
     eprintln!("$ {shown}");

@@ -1,5 +1,5 @@
-//! The list of packages, `tests/packages.txt`, held against a bare Debian: what shows that a package is there must be missing
-//! without it, also beside packages that resemble it, and there with it.
+//! Checks the package list `tests/packages.txt` on a bare Debian: the probes of each package fail without it, even when
+//! similar packages are installed, and succeed with it.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -12,11 +12,12 @@ use std::process::Command;
 
 const SCRIPT: &str = include_str!("packages.sh");
 
-/// What the script says last where there is no mirror to make a root from, or mmdebstrap fails otherwise.
+/// Last line of the script's output if there is no mirror for making a root, or mmdebstrap fails otherwise.
 const NO_ROOT: &str = "no root";
 
-/// The suites that the list is made for, and packages of each that were or could be taken for listed ones: libraries without
-/// their headers, libclang-cpp, a compiler under another name, a Python that makes no environments, a busybox that needs libraries.
+/// Suites of the list, and in each the packages that could be mistaken for listed ones: libraries without their
+/// headers, libclang-cpp, a compiler under another name, a Python that cannot create environments, a busybox that needs
+/// libraries.
 const SUITES: [(&str, &str); 2] = [
     ("bookworm", "gcc-12,python3,libusb-1.0-0,libaravis-0.8-0,libclang-cpp14,qemu-utils,busybox"),
     ("trixie", "gcc-14,python3,libusb-1.0-0,libaravis-0.8-0,libclang-cpp19,qemu-utils,busybox"),
@@ -55,20 +56,20 @@ fn each_package_is_missing_before_it_is_installed_and_present_after() {
     }
 }
 
-/// The suite of this machine, and the packages that resemble listed ones in it.
+/// This machine's suite, and the packages in it that resemble listed ones.
 fn own_suite() -> Option<(&'static str, &'static str)> {
     let about = std::fs::read_to_string("/etc/os-release").ok()?;
     let suite = about.lines().find_map(|line| line.strip_prefix("VERSION_CODENAME="))?;
     SUITES.into_iter().find(|&(known, _)| about.lines().any(|line| line == "ID=debian") && known == suite)
 }
 
-/// The last line of mmdebstrap that tells anything; its very last one only says that it has failed.
+/// The last meaningful line of mmdebstrap's output; the very last one only says that it has failed.
 fn reason(said: &[String]) -> &str {
     let tells = |line: &&String| *line != NO_ROOT && !line.ends_with("mmdebstrap failed to run");
     said.iter().rev().find(tells).map_or("it does not say why", String::as_str)
 }
 
-/// Says so past the harness, which prints nothing of tests that pass.
+/// Prints directly to standard output, because the test harness captures `println!` of tests that pass.
 fn skipped(why: &str) {
     std::io::stdout().write_all(format!("packages: SKIPPED: {why}\n").as_bytes()).unwrap();
 }

@@ -1,4 +1,4 @@
-//! The program `raysweep` itself: what it prints and how it exits.
+//! The program `raysweep`: its output and exit codes.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Lines};
@@ -135,7 +135,7 @@ fn the_preview_is_a_picture_of_both_images_and_is_followed_to_the_result() {
     show(5, false);
     let (exit, out, err) = run(&daemon, &[&arguments[..], &["--json"]].concat());
     assert_eq!((exit, json_lines(&out)[0]["points"].as_u64()), (0, Some(5)), "{out}{err}");
-    // Width and height stand in the first chunk of a PNG file.
+    // Width and height are in the first chunk of a PNG file.
     let size = |at: usize| u32::from_be_bytes(fs::read(&output).unwrap()[at..at + 4].try_into().unwrap());
     assert_eq!((size(16), size(20)), (8 + 4 + 8, 6));
 
@@ -251,7 +251,7 @@ fn watch_begins_with_what_an_operator_was_asked_before() {
     assert_eq!(child.wait().unwrap().code(), Some(0));
 }
 
-/// Begins to watch, and waits until events arrive there.
+/// Starts `raysweep watch` and waits until it receives events.
 fn watching(daemon: &Daemon) -> (Child, Lines<BufReader<ChildStdout>>) {
     let mut child = command(daemon, &["watch", "--json"]).stdout(Stdio::piped()).spawn().unwrap();
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();

@@ -1,4 +1,4 @@
-//! What `docs/reference/socket.md` promises.
+//! Checks the statements of `docs/reference/socket.md`.
 
 use std::process::Command;
 

@@ -1,4 +1,4 @@
-//! A daemon without a rig: what it does is told by the plan's first word.
+//! A daemon without a rig; the first word of the plan determines what it does.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -15,17 +15,17 @@ use raysweep_proto::{
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
 
-/// Events that the fake keeps for a subscriber.
+/// Number of events that the fake queues for a subscriber.
 pub const KEPT_EVENTS: usize = 16;
 
-/// A complete [`Control`] whose state is all there is to it.
+/// A complete [`Control`] that consists only of its state.
 pub struct Fake {
     pub state: Mutex<RunState>,
     pub runs: Mutex<Vec<RunParams>>,
     pub resumed: Mutex<Vec<PathBuf>>,
-    /// A call of `check` on the plan `wait` holds until somebody lets go of this.
+    /// Held by a test to block a call of `check` with the plan `wait`.
     pub gate: Mutex<()>,
-    /// Where the file of live images is, if there is one.
+    /// Path of the file with live images; the file need not exist.
     pub live: PathBuf,
     events: broadcast::Sender<Event>,
 }
@@ -70,7 +70,7 @@ impl Fake {
         });
     }
 
-    /// Begins a run and, unless the plan says `hang`, ends it as the plan says.
+    /// Starts a run and, unless the plan says `hang`, ends it as the plan says.
     fn begin(&self, plan: &str) -> Result<Started, RpcError> {
         if *self.state.lock().unwrap() == RunState::Running {
             return Err(RpcError::new(ErrorCode::Busy, "the daemon is running: cancel the run"));
@@ -156,7 +156,7 @@ pub fn listed() -> SessionInfo {
     }
 }
 
-/// The error of the plan `bad ...`: its fifth and sixth byte are wrong.
+/// The error for the plan `bad ...`, which marks its fifth and sixth byte.
 pub fn bad_plan() -> RpcError {
     let mut error =
         RpcError::new(ErrorCode::InvalidPlan, "count is 0; 1 to 1000 is allowed").of_field("sweep.count");
@@ -218,7 +218,7 @@ impl Control for Fake {
         self.turn(RunState::Paused, RunState::Running)
     }
 
-    /// Ends a run, unless it was begun with the note `stubborn`.
+    /// Cancels a run, unless it was started with the note `stubborn`.
     fn cancel(&self) -> Result<(), RpcError> {
         if *self.state.lock().unwrap() != RunState::Running {
             return Err(RpcError::new(ErrorCode::NotRunning, "there is no run"));
@@ -242,7 +242,7 @@ impl Control for Fake {
     }
 }
 
-/// A server over a real socket, with the fake behind it.
+/// A server on a real socket, with the fake behind it.
 pub struct Daemon {
     pub fake: Arc<Fake>,
     pub path: PathBuf,
@@ -281,7 +281,7 @@ impl Daemon {
         Client::connect(&self.path).unwrap()
     }
 
-    /// Stops the server and waits until it has ended.
+    /// Stops the server and waits for its end.
     pub fn stop(&mut self) {
         if let (Some(runtime), Some(served)) = (&self.runtime, self.served.take()) {
             drop(self.stop.take());
@@ -292,7 +292,7 @@ impl Daemon {
 
 impl Drop for Daemon {
     fn drop(&mut self) {
-        // Clients that a failed test leaves behind must not keep the test from ending.
+        // Clients left behind by a failed test must not block its end.
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_timeout(Duration::from_millis(100));
         }

@@ -1,4 +1,4 @@
-//! The socket and the command line, over a real Unix socket, with a fake daemon behind them.
+//! The socket and the command line, over a real Unix socket with a fake daemon behind it.
 #![expect(clippy::unwrap_used, reason = "a helper of a test fails the test")]
 
 mod command;

@@ -1,4 +1,4 @@
-//! Messages that break the rules: each gets its error, and others are served all the while.
+//! Invalid messages: each gets its error, and other clients continue to be served.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::Shutdown;
@@ -10,10 +10,10 @@ use serde_json::{Value, json};
 
 use crate::fake::Daemon;
 
-/// Sends bytes, then all that comes back until the server hangs up.
+/// Sends bytes, then returns all messages received until the server closes the connection.
 fn exchange(path: &Path, bytes: &[u8]) -> Vec<Value> {
     let mut stream = UnixStream::connect(path).unwrap();
-    // A server that has read enough hangs up while we still write.
+    // The server may close the connection while we are still writing.
     let _ = stream.write_all(bytes).and_then(|()| stream.shutdown(Shutdown::Write));
     let mut answers = Vec::new();
     match stream.read_to_end(&mut answers) {

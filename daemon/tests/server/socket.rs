@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 
 use crate::fake::{Daemon, KEPT_EVENTS, bad_plan, listed, progress, report, session};
 
-/// What takes so long has hung.
+/// Time after which an operation counts as hung.
 const HANGS: Duration = Duration::from_secs(60);
 
 fn code(result: Result<impl std::fmt::Debug, ClientError>) -> ErrorCode {
@@ -89,7 +89,7 @@ fn one_clients_long_call_does_not_hold_another() {
             b"{\"jsonrpc\":\"2.0\",\"id\":\"slow\",\"method\":\"check\",\"params\":{\"plan\":\"wait\"}}\n",
         )
         .unwrap();
-    // The call holds until the gate opens, so that this answer comes before the other.
+    // The call blocks until the gate opens, so this answer comes first.
     assert_eq!(other.check("fine").unwrap(), report());
     drop(gate);
     let mut line = String::new();
@@ -99,12 +99,12 @@ fn one_clients_long_call_does_not_hold_another() {
 
 #[test]
 fn a_slow_subscriber_skips_and_the_others_do_not_wait() {
-    // No time-out, so that it does not matter how long the quick one takes.
+    // No time-out, so the speed of the quick subscriber does not matter.
     let limits = Limits { write_timeout: Duration::from_secs(3600), ..Limits::default() };
     let daemon = Daemon::with(limits, Access::new(None));
     let mut slow = daemon.client().subscribe().unwrap();
     let mut quick = daemon.client().subscribe().unwrap();
-    // 400 events of 8 KiB are more than a socket's buffers and the fake's memory of events hold.
+    // 400 events of 8 KiB exceed the capacity of the socket's buffers and the fake's event queue.
     let event = |number: usize| {
         let session = Some(format!("{number}/{}", "x".repeat(8192)).into());
         Event::State { state: RunState::Running, session }
@@ -130,7 +130,7 @@ fn a_client_that_does_not_read_is_dropped() {
     let limits = Limits { write_timeout: Duration::from_millis(20), clients: 1, ..Limits::default() };
     let daemon = Daemon::with(limits, Access::new(None));
     let mut deaf = UnixStream::connect(&daemon.path).unwrap();
-    // The server stops reading once its answers find no room, and hangs up: then writing fails.
+    // The server stops reading when its answers find no room, and then closes the connection, so that writing fails.
     deaf.set_write_timeout(Some(HANGS)).unwrap();
     let ask = b"{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"describe\"}\n".repeat(100);
     let end = loop {
@@ -139,11 +139,11 @@ fn a_client_that_does_not_read_is_dropped() {
         }
     };
     assert!(matches!(end, ErrorKind::BrokenPipe | ErrorKind::ConnectionReset), "{end:?}");
-    // Its place is free again.
+    // The client's slot is free again.
     come_in(&daemon);
 }
 
-/// Connects and calls as soon as there is a place: the server learns of a hang-up soon, not at once.
+/// Connects and calls until there is a free slot: the server does not notice a closed connection immediately.
 fn come_in(daemon: &Daemon) {
     let since = Instant::now();
     while let Err(error) = daemon.client().status() {
@@ -206,7 +206,7 @@ fn the_end_of_the_daemon_reaches_subscribers_after_their_events() {
     let mut daemon = Daemon::start();
     let mut events = daemon.client().subscribe().unwrap();
     let idle = daemon.client();
-    // So many that most still wait when the end comes.
+    // Enough events that most are still queued when the daemon stops.
     let event =
         |number: usize| Event::State { state: RunState::Idle, session: Some(number.to_string().into()) };
     for number in 0..KEPT_EVENTS {

@@ -1,6 +1,6 @@
-//! The whole rig over a real wire: raysweepd with the driver `aravis`, the simulated GigE Vision camera, and the bench beside
-//! it, each a process of its own. Without noise and jitter, what is stored must be what the scene gives for the settings
-//! in the ledger, pixel for pixel, whatever the wire loses.
+//! The whole rig over a real network connection: raysweepd with the driver `aravis`, and the simulated GigE Vision
+//! camera with its bench socket, each in its own process. Without noise and jitter, stored data must match the scene
+//! under the settings in the ledger, pixel for pixel, whatever the network loses.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on may panic")]
 
@@ -22,49 +22,49 @@ use raysweep_sim::bench::BenchProbe;
 use raysweep_sim::gige::{Faults, WireTruth};
 use raysweep_sim::{Devices, PlaneRig};
 
-/// From the simulated camera's trigger to its exposure, at no delay.
+/// Time from the simulated camera's trigger to its exposure at zero delay.
 const LATENCY_US: f64 = 8.0;
 
-/// A sweep or a film and what happens to it.
+/// A sweep or a film, with faults and actions during the run.
 pub struct Sweep<'a> {
     /// Rows and columns of the scene, and rows of the projector.
     pub side_px: usize,
-    /// The plan's kind: `sweep`, or `film`, which the camera's sequencer must then take if it has the sets.
+    /// Kind of plan: `sweep`, or `film`, which must use the camera's sequencer if the camera has enough sets.
     pub kind: &'a str,
-    /// The plan's `[sweep]` or `[film]`.
+    /// Contents of the plan's `[sweep]` or `[film]`.
     pub plan: &'a str,
-    /// Lines of `[sim.camera]`.
+    /// Contents of `[sim.camera]`.
     pub camera: &'a str,
-    /// What goes wrong on the wire from the start, each as `key=value`.
+    /// Network faults from the start, each as `key=value`.
     pub faults: &'a [&'a str],
-    /// What happens once so many points or cycles are stored.
+    /// An action, and the number of stored points or cycles that triggers it.
     pub then: Option<(usize, Then)>,
 }
 
-/// What happens in the middle of a run.
+/// An action during a run.
 #[allow(dead_code, reason = "the benchmark needs not all of it")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Then {
-    /// The camera loses its power for two seconds.
+    /// The camera loses power for two seconds.
     Dies,
-    /// A film is held and goes on.
+    /// The film is paused and continued.
     IsHeld,
-    /// A film is cancelled.
+    /// The film is cancelled.
     IsCancelled,
 }
 
-/// What came of it.
+/// Result of a run.
 pub struct Swept {
-    /// What became of the frames.
+    /// Accounting of the frames.
     pub counts: Counts,
-    /// What really left the camera.
+    /// Ground truth of what the camera sent.
     pub wire: WireTruth,
     /// How the run ended.
     pub end: EndEntry,
 }
 
 impl Sweep<'_> {
-    /// Runs it to its end on a network of its own and holds its images against the scene.
+    /// Runs the plan in a separate network namespace and compares its images with the scene.
     pub fn run(&self) -> Swept {
         unshare(CloneFlags::CLONE_NEWNET)
             .expect("a network namespace needs root: run `cargo xtask test` as root");
@@ -109,7 +109,7 @@ impl Sweep<'_> {
         )
     }
 
-    /// Whether the simulated camera has as many sets as a film has settings.
+    /// Whether the simulated camera has as many sets as the film has settings.
     fn has_sets(&self) -> bool {
         self.parsed().film.delay_us.values().len() <= 16
     }
@@ -136,7 +136,7 @@ impl Sweep<'_> {
         let events = Client::connect(&socket).unwrap().subscribe().unwrap();
         client.run(&RunParams { plan: self.plan(), ..RunParams::default() }).unwrap();
         let mut then = self.then;
-        // How often settings had been written when a cycle of a film was stored.
+        // Number of settings written by the time each cycle of a film was stored.
         let mut written = Vec::new();
         for event in events {
             match event.unwrap() {
@@ -153,7 +153,7 @@ impl Sweep<'_> {
                         _ => client.cancel().unwrap(),
                     }
                 }
-                // Well before the film's end, which this may hear of late.
+                // Well before the film's end, because events may arrive late.
                 Event::Progress(progress)
                     if self.kind == "film"
                         && (4..progress.points_planned / 2).contains(&progress.points_stored) =>
@@ -182,14 +182,14 @@ impl Sweep<'_> {
     }
 }
 
-/// What a client that others wrote reads of the camera's features.
+/// Reads the camera's features with an independent client.
 fn camera_says(features: &[&str]) -> String {
     let arguments = [&["-a", "127.0.0.1", "control"], features].concat();
     let output = Command::new("arv-tool-0.8").args(arguments).output().expect("aravis-tools is installed");
     String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
-/// Holds a film that the camera's sequencer takes, and lets it go on.
+/// Pauses and continues a film that uses the camera's sequencer.
 fn hold(client: &mut Client) {
     let wait_for_sequencer = |mode: &str| {
         wait_for("the sequencer is not told", || {
@@ -200,7 +200,7 @@ fn hold(client: &mut Client) {
     client.pause().unwrap();
     wait_for_sequencer("Off");
     let cycles = |client: &mut Client| client.status().unwrap().film.unwrap().cycles_stored;
-    // What was exposed before is stored meanwhile.
+    // Frames exposed before the pause are stored in the meantime.
     thread::sleep(Duration::from_millis(500));
     let held = cycles(client);
     thread::sleep(Duration::from_millis(500));
@@ -209,8 +209,8 @@ fn hold(client: &mut Client) {
     wait_for_sequencer("On");
 }
 
-/// The camera's sequencer is off, and it has the settings that were written last: those of the cycle's first place, which
-/// are not those of the last set that was saved. They can be written anew.
+/// The camera's sequencer is off, and the camera has the settings written last: those of the cycle's first position,
+/// which differ from those of the last saved set. Settings can be written again.
 fn assert_camera_is_left_as_set(rig: &Rig, plan: &Plan) {
     let exposure_us = plan.film.exposure_us;
     let trigger_delay_us = trigger_delay_us(rig, plan.film.delay_us.values()[6], exposure_us);
@@ -227,7 +227,7 @@ fn assert_camera_is_left_as_set(rig: &Rig, plan: &Plan) {
     assert!(lines.iter().all(|line| found.contains(line)), "{lines:?}: {found}");
 }
 
-/// Ended with the test.
+/// A process that is killed at the end of the test.
 struct Process(Child);
 
 impl Process {
@@ -245,7 +245,7 @@ impl Drop for Process {
     }
 }
 
-/// Waits until something is there.
+/// Waits until `look` returns a value.
 fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let patience = Instant::now() + Duration::from_secs(60);
     loop {
@@ -257,7 +257,7 @@ fn wait_for<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Each stored image is so many times what the scene gives for the settings that the ledger has of it.
+/// Each stored image is the scene's image under the settings in the ledger, times the number of frames.
 fn assert_images_of_the_scene(session: &Session, rig: &Rig) {
     let state = session.state().unwrap();
     for (array, pattern) in [(ArrayName::Sum, Pattern::White), (ArrayName::Dark, Pattern::Black)] {
@@ -273,7 +273,7 @@ fn assert_images_of_the_scene(session: &Session, rig: &Rig) {
     }
 }
 
-/// Each frame of a stored cycle is what the scene gives under its setting.
+/// Each frame of a stored cycle is the scene's image under its setting.
 fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &Plan) {
     let settings = plan.film.delay_us.values();
     let expected: Vec<Vec<u32>> = settings
@@ -291,11 +291,11 @@ fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &Plan) {
     }
 }
 
-/// One frame of the simulated camera itself, without wire or daemon.
+/// Counts of one frame of the simulated camera, without network and daemon.
 fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -> Vec<u32> {
     let scene: &PlaneRig = rig.simulated().unwrap();
     let Devices { mut camera, mut projector, vsync, .. } = scene.open();
-    // Time waits for every device.
+    // Virtual time waits for every device.
     drop(vsync);
     let (raster, format) = (rig.file.raster(), camera.capabilities().format);
     let trigger_delay_us = trigger_delay_us(rig, delay_us, exposure_us);
@@ -305,7 +305,7 @@ fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -
     camera.arm().unwrap();
     let pixels = camera.capabilities().width * camera.capabilities().height;
     let mut frame = FramePool::new(1, format.frame_bytes(pixels)).take();
-    // Light of the period before may reach into the first frame.
+    // Light of the previous period may reach into the first frame.
     let from_ns = shown.not_before_ns + ns_from_us(raster.period_us);
     loop {
         let stamp = camera.next_frame(&mut frame, Duration::from_secs(1)).unwrap().unwrap();
@@ -318,7 +318,7 @@ fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -
     counts
 }
 
-/// What a delay and an exposure are set to.
+/// Trigger delay for a delay and an exposure.
 fn trigger_delay_us(rig: &Rig, delay_us: f64, exposure_us: f64) -> f64 {
     let scene: &PlaneRig = rig.simulated().unwrap();
     rig.file.raster().trigger(scene.first_row(), delay_us, exposure_us, LATENCY_US).trigger_delay_us

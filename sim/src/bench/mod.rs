@@ -1,6 +1,7 @@
-//! The bench socket: what of a simulated rig is no camera, for a daemon in another process. The camera's wire carries
-//! pictures; the VSYNC edges that triggered it and the projector that lights its scene go over a Unix socket, one JSON
-//! message a line. Times are nanoseconds of `CLOCK_MONOTONIC`, which all processes of a machine share.
+//! The bench socket: serves all devices of a simulated rig except the camera to a daemon in another process. Pictures
+//! travel over the camera's network connection; the VSYNC edges that triggered them, and commands to the projector, go
+//! over a Unix socket, one JSON message per line. Times are nanoseconds of `CLOCK_MONOTONIC`, which all processes of a
+//! machine share.
 
 mod remote;
 mod server;
@@ -14,48 +15,48 @@ pub use server::{BenchError, BenchServer};
 use crate::gige::{Faults, WireTruth};
 use crate::line::LineTruth;
 
-/// Longest line that either side takes: a pattern of many thousand rows.
+/// Maximum line length for either side: enough for a pattern of many thousand rows.
 const MAX_LINE: u64 = 1 << 20;
 
-/// What a client asks.
+/// Requests of a client.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Request {
-    /// Tell every edge from now on; the connection is good for nothing else then.
+    /// Subscribe to all further edges; the connection then accepts no other requests.
     Edges,
     /// Show a pattern.
     Show(Pattern),
-    /// Light off.
+    /// Switch the light off.
     Blank,
-    /// What really happened so far.
+    /// Get the ground truth so far.
     Truth,
-    /// What goes wrong at present.
+    /// Get the current faults.
     Faults,
-    /// What goes wrong from now on; what is left out goes right.
+    /// Set the faults from now on; faults that are left out are switched off.
     SetFaults(Faults),
 }
 
-/// What the bench says.
+/// Messages from the bench.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Reply {
-    /// An edge of the VSYNC line, as its watcher saw it.
+    /// An edge of the VSYNC line, as seen by its monitor.
     Edge { seq: u64, host_ns: i64 },
-    /// From when on what was asked for is in the light.
+    /// Earliest time at which the light shows what was requested.
     Shown { not_before_ns: i64 },
     /// The answer to [`Request::Truth`].
     Truth(Truth),
-    /// The faults in force.
+    /// The active faults.
     Faults(Faults),
-    /// Why it cannot be done.
+    /// Why the request failed.
     Error { kind: DeviceErrorKind, message: String },
 }
 
-/// What really happened, on the line and on the wire, for tests alone.
+/// Ground truth of the line and the wire, for tests only.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Truth {
-    /// On the VSYNC line.
+    /// The VSYNC line.
     pub line: LineTruth,
-    /// On the camera's wire.
+    /// The camera's network connection.
     pub wire: WireTruth,
 }

@@ -1,4 +1,4 @@
-//! The daemon's side of the socket: devices of a rig that is simulated by another process.
+//! The daemon's side of the socket: devices of a rig that another process simulates.
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
@@ -10,10 +10,10 @@ use raysweep_core::{DeviceError, DeviceErrorKind, Edge, Pattern, Projector, Show
 use super::{MAX_LINE, Reply, Request, Truth};
 use crate::gige::Faults;
 
-/// Longest wait for an answer: the first sight of a pattern takes the bench a moment.
+/// Longest wait for an answer: a new pattern takes the bench a moment to compute.
 const ANSWER: Duration = Duration::from_secs(10);
 
-/// One connection.
+/// A connection to the bench.
 struct Connection {
     device: &'static str,
     reader: BufReader<UnixStream>,
@@ -40,9 +40,9 @@ impl Connection {
         self.reader.get_mut().write_all(&line).map_err(|error| self.gone(error))
     }
 
-    /// The next line; `None` when it is not whole within `timeout`.
+    /// Returns the next line, or `None` if it is not complete within `timeout`.
     fn receive(&mut self, timeout: Duration) -> Result<Option<Reply>, DeviceError> {
-        // Zero would be for ever.
+        // A zero timeout would mean to wait forever.
         let timeout = timeout.max(Duration::from_micros(1));
         self.reader.get_ref().set_read_timeout(Some(timeout)).map_err(|error| self.gone(error))?;
         match (&mut self.reader).take(MAX_LINE - self.text.len() as u64).read_until(b'\n', &mut self.text) {
@@ -73,11 +73,11 @@ impl Connection {
     }
 }
 
-/// The watcher of a bench's VSYNC line.
+/// The VSYNC monitor of a bench.
 pub struct RemoteVsync(Connection);
 
 impl RemoteVsync {
-    /// Watches the line of the bench at `path`.
+    /// Subscribes to the edges of the bench at `path`.
     ///
     /// # Errors
     /// `Disconnected` when there is no bench.
@@ -91,7 +91,7 @@ impl RemoteVsync {
 impl Vsync for RemoteVsync {
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
         let deadline = Instant::now() + timeout;
-        // A part of a line may take more than one read.
+        // A line may arrive in several reads.
         loop {
             match self.0.receive(deadline.saturating_duration_since(Instant::now()))? {
                 Some(Reply::Edge { seq, host_ns }) => return Ok(Some(Edge { seq, host_ns })),
@@ -107,7 +107,7 @@ impl Vsync for RemoteVsync {
 pub struct RemoteProjector(Connection);
 
 impl RemoteProjector {
-    /// The projector of the bench at `path`.
+    /// Connects to the projector of the bench at `path`.
     ///
     /// # Errors
     /// `Disconnected` when there is no bench.
@@ -133,11 +133,11 @@ impl Projector for RemoteProjector {
     }
 }
 
-/// Looks behind a bench's devices and lets things go wrong, for tests alone.
+/// Reads a bench's ground truth and sets its faults, for tests only.
 pub struct BenchProbe(Connection);
 
 impl BenchProbe {
-    /// A look at the bench at `path`.
+    /// Connects to the bench at `path`.
     ///
     /// # Errors
     /// `Disconnected` when there is no bench.
@@ -145,7 +145,7 @@ impl BenchProbe {
         Ok(Self(Connection::open("bench", path)?))
     }
 
-    /// What has really happened so far.
+    /// Ground truth so far.
     ///
     /// # Errors
     /// `Disconnected` when the bench is gone.
@@ -156,7 +156,7 @@ impl BenchProbe {
         }
     }
 
-    /// What goes wrong at present.
+    /// The current faults.
     ///
     /// # Errors
     /// `Disconnected` when the bench is gone.
@@ -167,7 +167,7 @@ impl BenchProbe {
         }
     }
 
-    /// Changes what goes wrong from now on.
+    /// Changes the faults from now on.
     ///
     /// # Errors
     /// `Disconnected` when the bench is gone.

@@ -16,23 +16,23 @@ use super::{MAX_LINE, Reply, Request, Truth};
 use crate::devices::TruthProbe;
 use crate::gige::GigeCamera;
 
-/// Longest wait for a client or an edge, and so the longest that a stop waits.
+/// Longest wait for a client or an edge, and so the longest delay of a stop.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// Clients at once; more are turned away.
+/// Maximum number of clients; further ones are refused.
 const MAX_CLIENTS: usize = 16;
 
-/// Why the bench cannot be there.
+/// Why the bench cannot be started.
 #[derive(Debug, thiserror::Error)]
 pub enum BenchError {
-    /// Its socket cannot be made.
+    /// Its socket cannot be created.
     #[error("sim.bench = {}: {source}; give a path in a folder that exists and that no other bench has", path.display())]
     Listen {
-        /// The socket.
+        /// The socket's path.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A thread cannot be had.
+    /// A thread cannot be started.
     #[error("cannot start the bench: {0}")]
     System(#[from] io::Error),
 }
@@ -44,21 +44,21 @@ pub struct BenchServer {
     threads: Vec<JoinHandle<()>>,
 }
 
-/// What clients share.
+/// State shared by all clients.
 struct Bench {
     projector: Mutex<Box<dyn Projector>>,
     truth: TruthProbe,
     camera: Arc<GigeCamera>,
-    /// Clients that are told of edges.
+    /// Clients subscribed to edges.
     watchers: Mutex<Vec<UnixStream>>,
     stop: Arc<AtomicBool>,
 }
 
 impl BenchServer {
-    /// Offers VSYNC line and projector beside a camera at `path`.
+    /// Serves VSYNC line and projector at `path`, for use with a separate camera.
     ///
     /// # Errors
-    /// When there can be no socket at `path`.
+    /// When the socket cannot be created at `path`.
     pub fn start(
         path: &Path,
         vsync: Box<dyn Vsync>,
@@ -86,10 +86,10 @@ impl Drop for BenchServer {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
-            // A thread that panicked has said so on stderr.
+            // A panic was already reported on stderr.
             let _ = thread.join();
         }
-        // Somebody may have removed it already.
+        // It may have been removed already.
         let _ = std::fs::remove_file(&self.path);
     }
 }
@@ -100,7 +100,7 @@ fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> io::Result<JoinHan
 
 fn listen(path: &Path) -> io::Result<UnixListener> {
     let listener = match UnixListener::bind(path) {
-        // A bench that was killed leaves its socket behind, where nobody answers.
+        // A bench that was killed leaves its socket behind; nobody answers there.
         Err(error) if error.kind() == ErrorKind::AddrInUse && UnixStream::connect(path).is_err() => {
             std::fs::remove_file(path)?;
             UnixListener::bind(path)?
@@ -115,7 +115,7 @@ fn accept(listener: &UnixListener, bench: &Arc<Bench>) {
     let mut clients: Vec<JoinHandle<()>> = Vec::new();
     while !bench.stop.load(Ordering::Relaxed) {
         let mut ready = [PollFd::new(listener.as_fd(), PollFlags::POLLIN)];
-        // An interrupted wait is as good as one that is over.
+        // An interrupted wait counts as a completed one.
         let _ = poll(&mut ready, PollTimeout::try_from(PATIENCE).unwrap_or(PollTimeout::ZERO));
         clients.retain(|client| !client.is_finished());
         let Ok((stream, _)) = listener.accept() else { continue };
@@ -134,7 +134,7 @@ impl Bench {
         while !self.stop.load(Ordering::Relaxed) {
             let Ok(Some(Edge { seq, host_ns })) = vsync.next_edge(PATIENCE) else { continue };
             let line = line(&Reply::Edge { seq, host_ns });
-            // A watcher that does not read is cut off rather than waited for; it learns of it by the end of its stream.
+            // A subscriber that does not read is disconnected rather than waited for; it sees the end of its stream.
             lock(&self.watchers).retain_mut(|watcher| watcher.write_all(&line).is_ok());
         }
     }
@@ -149,7 +149,7 @@ impl Bench {
             match (&mut reader).take(MAX_LINE - text.len() as u64).read_until(b'\n', &mut text) {
                 Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => continue,
                 Ok(_) if text.ends_with(b"\n") => {}
-                // The end, or a line without end.
+                // End of stream, or a line that is too long.
                 _ => return,
             }
             let reply = match serde_json::from_slice(&text) {
@@ -193,13 +193,13 @@ impl Bench {
 }
 
 fn line(reply: &Reply) -> Vec<u8> {
-    // Numbers and texts always have a JSON form.
+    // Numbers and strings always serialise to JSON.
     let mut line = serde_json::to_vec(reply).unwrap_or_default();
     line.push(b'\n');
     line
 }
 
-// What these guard is never left half changed, so a panic elsewhere does not spoil it.
+// The guarded data are never left half changed, so a panic elsewhere does not corrupt them.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

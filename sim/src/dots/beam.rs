@@ -1,13 +1,13 @@
-//! The profile of the spot: an elliptic Gaussian that changes over the field of view.
+//! Profile of the spot: an elliptical Gaussian that varies over the field of view.
 
 use super::config::SimDot;
 
-/// Standard deviation of a Gaussian over its full width at half maximum.
+/// Ratio of a Gaussian's standard deviation to its full width at half maximum.
 const SIGMA_OVER_FWHM: f64 = 0.424_661;
-/// Beyond so many standard deviations there is no light.
+/// Distance from the centre, in standard deviations, beyond which the light is taken as zero.
 const REACH_SIGMAS: f64 = 4.5;
 
-/// The beam, wherever it points. Directions are tangents of the beam's angles, x and y.
+/// The beam over the whole field of view. Directions are tangents of the beam's angles, x and y.
 #[derive(Debug, Clone)]
 pub struct Beam {
     sigma: f64,
@@ -15,27 +15,27 @@ pub struct Beam {
     half: [f64; 2],
 }
 
-/// The beam in one direction.
+/// The spot of the beam in one direction.
 #[derive(Debug, Clone, Copy)]
 pub struct Spot {
-    /// Where its middle is.
+    /// Direction of its centre.
     pub centre: [f64; 2],
-    /// Irradiance in its middle; 1 is the full beam.
+    /// Irradiance at its centre; 1 is the full beam.
     pub light: f64,
-    /// Along its long and its short axis.
+    /// Standard deviations along its long and short axis.
     sigmas: [f64; 2],
     /// Direction of the long axis.
     long: [f64; 2],
 }
 
 impl Beam {
-    /// The beam over a field of `2 half` tangents.
+    /// The beam over a field of view of `2 half`, as tangents.
     pub fn new(dot: &SimDot, half: [f64; 2]) -> Self {
         let sigma = SIGMA_OVER_FWHM * dot.fwhm_deg.to_radians().tan();
         Self { sigma, uneven: dot.uneven, half }
     }
 
-    /// The spot around `centre`: round in the middle of the field, drawn out away from it towards the corners.
+    /// The spot around `centre`: round in the middle of the field, elongated radially towards the corners.
     pub fn spot(&self, centre: [f64; 2], light: f64) -> Spot {
         let [x, y] = [centre[0] / self.half[0], centre[1] / self.half[1]];
         let square = x * x + y * y;
@@ -48,11 +48,11 @@ impl Beam {
 }
 
 impl Spot {
-    /// Irradiance at a direction.
+    /// Irradiance in a direction.
     pub fn at(&self, direction: [f64; 2]) -> f64 {
         let [x, y] = [direction[0] - self.centre[0], direction[1] - self.centre[1]];
         let reach = REACH_SIGMAS * self.sigmas[0];
-        // Also for NaN, which stands for what no beam reaches.
+        // Also true for NaN, which marks points that the beam cannot reach.
         if !(x.abs() <= reach && y.abs() <= reach) {
             return 0.0;
         }
@@ -61,17 +61,17 @@ impl Spot {
         self.light * (-0.5 * (along * along + across * across)).exp()
     }
 
-    /// Its light in all: irradiance over solid angle.
+    /// Total light: irradiance integrated over solid angle.
     pub fn flux(&self) -> f64 {
         self.light * std::f64::consts::TAU * self.sigmas[0] * self.sigmas[1]
     }
 
-    /// The same spot at another place, with a share of its light.
+    /// The same spot at another position, with a fraction of its light.
     pub fn refracted(&self, centre: [f64; 2], share: f64) -> Self {
         Self { centre, light: share * self.light, ..*self }
     }
 
-    /// Its standard deviation, as of a round spot.
+    /// Standard deviation of a round spot of the same area.
     pub fn sigma(&self) -> f64 {
         (self.sigmas[0] * self.sigmas[1]).sqrt()
     }

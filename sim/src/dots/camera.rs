@@ -1,4 +1,4 @@
-//! The simulated high-speed camera: global shutter, one frame a trigger.
+//! The simulated high-speed camera: global shutter, one frame per trigger.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use super::scene::{Light, Still};
 use super::world::{Due, FrameFate, Next, World, even_light};
 use crate::sensor::Exposed;
 
-/// The trailing dot's standard deviation, in parts of the margin's rows.
+/// Standard deviation of the trailing dot, as a fraction of the margin's rows.
 const TRAILING_SIGMA: f64 = 0.15;
 /// Light at which every pixel is overexposed.
 const FLASH: f32 = 100.0;
@@ -24,19 +24,19 @@ pub struct DotCamera {
     exposure_us: f64,
     before: Option<Before>,
     light: Light,
-    /// The whole sensor's light and counts, `[row, column]` row-major.
+    /// Light of the whole sensor, `[row, column]` row-major; `counts` has the same layout.
     sensor_light: Vec<f32>,
     counts: Vec<u16>,
     /// The trailing dot's image in the margin.
     trailing: Vec<f32>,
-    /// The frame that came last, if it comes twice.
+    /// Stamp of the last frame, if it is to be delivered a second time.
     again: Option<FrameStamp>,
 }
 
-/// What stands before the camera in a batch of a path.
+/// The scene or plane in front of the camera during one batch.
 struct Before {
     still: Arc<dyn Still>,
-    /// Which it is: subject, path, batch.
+    /// Subject, path and batch.
     key: (Subject, u64, u64),
 }
 
@@ -175,7 +175,7 @@ impl Camera for DotCamera {
                     return Ok(Some(stamp));
                 }
                 Next::At(due_ns) => due_ns,
-                // A path may be started any time.
+                // A path can be started at any time.
                 Next::Nothing => now_ns.saturating_add(IDLE_NS),
             };
             if now_ns >= deadline_ns {
@@ -192,5 +192,5 @@ impl Camera for DotCamera {
     }
 }
 
-/// How often a camera without triggers looks for some.
+/// Poll interval of a camera without triggers.
 const IDLE_NS: i64 = 1_000_000;

@@ -1,5 +1,6 @@
-//! The `[sim.dots]` table of a rig file: what the simulated dot rig is made of. Every key has a default; those that no
-//! measurement or data sheet backs are assumptions (marked [A]) to be replaced by a lab's own values.
+//! The `[sim.dots]` table of a rig file, which describes the simulated dot rig. Every key has a default. Defaults
+//! without a measurement or data sheet behind them are assumptions (marked [A]); replace them with your lab's own
+//! values.
 
 use std::path::PathBuf;
 
@@ -12,28 +13,28 @@ use crate::mirror::MechanicsConfig;
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DotsConfig {
-    /// An `.npz` file with `T` and `uv`, a `.npy` file with dots on a square grid (relative to the rig file), or the name
-    /// of a built-in scene.
+    /// An `.npz` file with `T` and `uv`, or an `.npy` file with dots on a square grid (paths relative to the rig file),
+    /// or the name of a built-in scene.
     pub scene: PathBuf,
-    /// Camera rows of a built-in scene, 8..=4096; a file brings its own.
+    /// Camera rows of a built-in scene, 8..=4096; ignored for a scene file.
     pub rows: usize,
-    /// Camera columns of a built-in scene, 8..=4096; a file brings its own.
+    /// Camera columns of a built-in scene, 8..=4096; ignored for a scene file.
     pub columns: usize,
-    /// Camera rows below the scene, where the trailing dot shows.
+    /// Camera rows below the scene, in which the trailing dot appears.
     pub margin_rows: usize,
-    /// Seeds everything that is random: the same seed gives the same bits.
+    /// Seed of all random numbers: the same seed gives the same bits.
     pub seed: u64,
-    /// Time in which a built-in scene that moves goes there and back, 0.1..=1e6.
+    /// Period of a moving built-in scene (there and back), 0.1..=1e6.
     pub motion_period_s: f64,
-    /// Pace by the host's clock instead of as fast as it can.
+    /// Run in real time on the host's clock instead of as fast as possible.
     pub realtime: bool,
-    /// Angles of the beam over which the scene extends, x and y.
+    /// Field of view of the beam covered by the scene, as full angles x and y.
     pub fov_deg: [f64; 2],
-    /// Index in the batch of the frame whose light goes onto the trailing dot's static plane; left out: the last.
+    /// Index in the batch of the frame whose light goes onto the trailing dot's static plane. Default: the last.
     pub trailing_index: Option<u32>,
-    /// Indices in the batch of the frames whose light goes into the beam dump.
+    /// Indices in the batch of frames whose light goes into the beam dump.
     pub dump_indices: Vec<u32>,
-    /// Distances of the Lambertian planes that can stand before the camera, in parts of the scene's.
+    /// Distances of the Lambertian planes that can be placed in front of the camera, relative to the scene's distance.
     pub plane_depths: Vec<f64>,
     /// `[sim.dots.dot]`
     pub dot: SimDot,
@@ -67,43 +68,43 @@ impl Default for DotsConfig {
     }
 }
 
-/// The spot of light that the mirror moves.
+/// The spot of light moved by the mirror.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimDot {
-    /// Full width at half maximum in the middle of the field.
+    /// Full width at half maximum in the middle of the field of view.
     pub fwhm_deg: f64,
-    /// By which part it is wider, and across its long axis narrower, in the corners of the field.
+    /// Relative widening along the long axis, and narrowing across it, in the corners of the field of view.
     pub uneven: f64,
-    /// Light of the ghost that the mirror's cover glass makes, in parts of the dot's.
+    /// Light of the ghost caused by the mirror's cover glass, as a fraction of the dot's.
     pub ghost: f64,
-    /// Where the ghost lies from the dot, as angles of the beam.
+    /// Offset of the ghost from the dot, as beam angles.
     pub ghost_deg: [f64; 2],
 }
 
 impl Default for SimDot {
     fn default() -> Self {
-        Self { fwhm_deg: 0.42, uneven: 0.25, ghost: 0.01, ghost_deg: [0.9, -0.6] } // [A] but the width
+        Self { fwhm_deg: 0.42, uneven: 0.25, ghost: 0.01, ghost_deg: [0.9, -0.6] } // [A] except the width
     }
 }
 
-/// How the mirror moves.
+/// Mirror mechanics.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimMirror {
-    /// `false`: the mirror is where it is commanded to be, always.
+    /// `false`: the mirror always follows its commands exactly.
     pub mechanics: bool,
-    /// Resonances, x and y.
+    /// Resonant frequencies, x and y.
     pub f0_hz: [f64; 2],
-    /// Quality factors.
+    /// Quality factors, x and y.
     pub q: [f64; 2],
     /// -3 dB frequency of the controller's filter.
     pub filter_hz: f64,
-    /// Share of each axis' movement that shows in the other.
+    /// Fraction of each axis' movement that appears in the other.
     pub coupling: f64,
-    /// How fast the rest position wanders off, x and y.
+    /// Drift of the rest position, x and y.
     pub drift_deg_per_s: [f64; 2],
-    /// Standard deviation of a movement repeated, drawn anew every batch of the paper's (1/6 s).
+    /// Standard deviation of the repeatability error, drawn anew once per batch of the paper (1/6 s).
     pub repeat_deg: f64,
 }
 
@@ -130,19 +131,19 @@ impl SimMirror {
     }
 }
 
-/// The camera's clock and its faults.
+/// Camera timing and faults.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimDotCamera {
-    /// Parts by which it makes more frames than the mirror's sample clock triggers; 0: it is triggered by that clock.
+    /// Relative excess of the camera's frame rate over the mirror's sample clock; 0: triggered by that clock.
     pub clock_error: f64,
-    /// Frames of the first batch that are over before it begins to record.
+    /// Number of frames at the start of a path that pass before the camera records.
     pub late_frames: u32,
-    /// Share of frames that are exposed and then lost on the way.
+    /// Fraction of frames that are exposed and then lost in transit.
     pub dropped: f64,
-    /// Share of frames that come twice.
+    /// Fraction of frames delivered twice.
     pub duplicated: f64,
-    /// Share of frames in which every pixel is overexposed.
+    /// Fraction of frames in which every pixel is overexposed.
     pub saturated: f64,
 }
 
@@ -152,29 +153,29 @@ impl Default for SimDotCamera {
     }
 }
 
-/// The sensor after EMVA 1288; figures of the class of the Photron SA-X2.
+/// Sensor after EMVA 1288; defaults in the class of the Photron SA-X2.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SimDotSensor {
-    /// `false`: no temporal noise, no pattern, no hot pixels; quantisation and saturation stay.
+    /// `false`: no temporal noise, no fixed pattern, no hot pixels; quantisation and saturation remain.
     pub noise: bool,
-    /// Electrons per count of a 12-bit scale.
+    /// Electrons per count on a 12-bit scale.
     pub electrons_per_dn: f64,
     /// Electrons at which a pixel saturates.
     pub full_well_e: f64,
-    /// Temporal dark noise.
+    /// Temporal dark noise, in electrons.
     pub read_noise_e: f64,
-    /// Spread of the pixels' offsets.
+    /// Spread of the pixels' offsets, in electrons.
     pub dsnu_e: f64,
-    /// Spread of the columns' offsets.
+    /// Spread of the columns' offsets, in electrons.
     pub column_e: f64,
     /// Spread of the pixels' gains, in percent.
     pub prnu_percent: f64,
-    /// Share of hot pixels.
+    /// Fraction of hot pixels.
     pub hot_pixels: f64,
     /// Dark current of a hot pixel, electrons per second.
     pub hot_pixel_e_per_s: f64,
-    /// Loss of light in the corners of the picture, in percent.
+    /// Loss of light in the corners of the image, in percent.
     pub vignetting_percent: f64,
 }
 
@@ -186,7 +187,7 @@ impl Default for SimDotSensor {
             full_well_e: 40_000.0,  // [A]
             read_noise_e: 30.0,     // [A]
             dsnu_e: 10.0,           // [A] 1 count
-            column_e: 5.0,          // [A] half a count
+            column_e: 5.0,          // [A] 0.5 count
             prnu_percent: 1.0,      // [A]
             hot_pixels: 1e-4,       // [A]
             hot_pixel_e_per_s: 5e7, // [A] 350 counts in 70 us
@@ -207,7 +208,7 @@ impl SimDotSensor {
             prnu_percent: self.prnu_percent,
             hot_pixels: self.hot_pixels,
             hot_pixel_e_per_s: self.hot_pixel_e_per_s,
-            // Negligible in the exposure of a dot.
+            // Negligible during a dot's exposure.
             dark_current_e_per_s: 0.0,
             adc_bits: 12,
             vignetting_percent: self.vignetting_percent,

@@ -1,4 +1,4 @@
-//! The simulated mirror, and how a mirror that is driven for itself moves the simulated beam.
+//! The simulated mirror, and the adapter that moves the simulated beam with a mirror that has its own driver.
 
 use std::sync::Arc;
 
@@ -6,10 +6,10 @@ use raysweep_core::{DeviceError, DeviceErrorKind, Mirror, MirrorCapabilities, Mi
 
 use super::world::World;
 
-/// From the start to the path's first sample.
+/// Time from the start to the path's first sample.
 const LEAD_NS: i64 = 1_000_000;
 
-/// A mirror without a controller: it plays what it is given, by the rig's clock.
+/// A mirror without a controller: it plays its path by the rig's clock.
 pub struct DotMirror {
     world: Arc<World>,
     capabilities: MirrorCapabilities,
@@ -45,7 +45,7 @@ impl Mirror for DotMirror {
 
     fn load(&mut self, path: &MirrorPath) -> Result<f64, DeviceError> {
         self.park()?;
-        // The path may have been made for another mirror.
+        // Check the limits of this mirror; the path may have been built for another.
         let path = MirrorPath::new(path.points().to_vec(), path.rate_hz(), &self.capabilities.limits)
             .map_err(|error| fault(DeviceErrorKind::OutOfRange, error.to_string()))?;
         let rate_hz = path.rate_hz();
@@ -96,12 +96,12 @@ impl Mirror for DotMirror {
 
 impl Drop for DotMirror {
     fn drop(&mut self) {
-        // Cannot fail.
+        // Parking cannot fail.
         let _ = self.park();
     }
 }
 
-/// A mirror with its own driver, whose beam falls on the simulated scene.
+/// A mirror with its own driver; its beam falls on the simulated scene.
 pub struct WatchedMirror {
     mirror: Box<dyn Mirror>,
     world: Arc<World>,
@@ -152,7 +152,7 @@ impl Mirror for WatchedMirror {
 
 impl Drop for WatchedMirror {
     fn drop(&mut self) {
-        // The driver parks its mirror by itself.
+        // The driver itself parks its mirror.
         self.world.stop();
     }
 }

@@ -1,9 +1,9 @@
-//! The simulated dot rig: a mirror moves one spot of light over a scene, and a camera that the mirror's sample clock
-//! triggers takes a frame of each place.
+//! The simulated dot rig: a mirror moves a spot of light over a scene, and a camera triggered by the mirror's sample
+//! clock takes one frame per position.
 //!
-//! A [`DotsRig`] opens devices that implement the traits of `raysweep-core` and carry nothing that real devices lack.
-//! Frames come only while a path is played, from its first sample on, so that virtual time decides nothing about what is
-//! in them. What is random in a frame is keyed by the path that is played and the frame's number in it.
+//! A [`DotsRig`] opens devices that implement the traits of `raysweep-core` and offer no more than real devices do.
+//! Frames are taken only while a path is playing, starting at its first sample, so their contents do not depend on
+//! virtual time. Random effects in a frame are keyed by the path and the frame's number in it.
 
 mod beam;
 mod camera;

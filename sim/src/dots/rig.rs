@@ -1,4 +1,4 @@
-//! The simulated dot rig and what it takes to build it.
+//! The simulated dot rig and its construction.
 
 use std::ops::Range;
 use std::path::Path;
@@ -17,23 +17,23 @@ use crate::sensor::{Scale, Sensor};
 /// Why a simulated dot rig cannot be built.
 #[derive(Debug, thiserror::Error)]
 pub enum DotsError {
-    /// The scene cannot be read or made.
+    /// The scene cannot be read or computed.
     #[error("sim.dots.scene: {0}")]
     Scene(#[from] DotSceneError),
     /// A key of `[sim.dots]` outside its range.
     #[error("sim.dots.{key} = {value}: allowed is {allowed}")]
     Range {
-        /// The key below `[sim.dots]`.
+        /// Key below `[sim.dots]`.
         key: &'static str,
-        /// Its value.
+        /// Given value.
         value: f64,
-        /// What it may be.
+        /// Allowed values.
         allowed: &'static str,
     },
 }
 
 impl DotsError {
-    /// The key below `[sim.dots]` that it is about.
+    /// The key below `[sim.dots]` that causes the error.
     pub fn key(&self) -> &'static str {
         match self {
             Self::Scene(_) => "scene",
@@ -42,55 +42,55 @@ impl DotsError {
     }
 }
 
-/// What the rest of the rig file says that the simulation needs.
+/// Parameters from the rest of the rig file that the simulation needs.
 #[derive(Debug, Clone)]
 pub struct DotsSetup {
-    /// How frames are packed.
+    /// Pixel packing of the frames.
     pub format: PixelFormat,
-    /// Counts, above black, of a white plane in the dot's middle in an exposure of `white_exposure_us`.
+    /// Counts, above black, of a white plane at the dot's centre in an exposure of `white_exposure_us`.
     pub white_dn: f64,
-    /// The exposure that `white_dn` is for.
+    /// Exposure that `white_dn` refers to.
     pub white_exposure_us: f64,
     /// Counts without light.
     pub black_dn: f64,
     /// Angle between the beam and the mirror's normal at rest.
     pub incidence: MechanicalDeg,
-    /// What the mirror survives.
+    /// Limits of the mirror.
     pub limits: MirrorLimits,
 }
 
-/// A simulated dot rig whose devices can be opened again and again.
+/// A simulated dot rig, whose devices can be opened repeatedly.
 pub struct DotsRig {
     bench: Arc<Bench>,
 }
 
-/// Everything about the rig that does not change while it runs.
+/// The parts of the rig that are constant while it runs.
 pub(super) struct Bench {
     pub config: DotsConfig,
     pub setup: DotsSetup,
     pub scene: Scene,
     pub beam: Beam,
     pub sensor: Sensor,
-    /// Camera rows and columns, the margin included.
+    /// Camera rows and columns, including the margin.
     pub size: (usize, usize),
 }
 
-/// The devices of one dot rig, all on one clock.
+/// The devices of one dot rig, sharing one clock.
 pub struct DotsDevices {
-    /// The camera, one dot a frame.
+    /// The camera, which takes one frame per dot.
     pub camera: Box<dyn Camera>,
     /// The mirror and its light.
     pub mirror: Box<dyn Mirror>,
-    /// Puts planes before the camera.
+    /// Selects the scene or a plane in front of the camera.
     pub subject: SubjectSwitch,
-    /// The clock that they live by.
+    /// The devices' clock.
     pub clock: Clock,
-    /// What really happens. A real rig has no such thing: it is for tests alone.
+    /// Ground truth, for tests only; real rigs have none.
     pub truth: DotsTruth,
 }
 
 impl DotsRig {
-    /// Builds the rig; a scene file is looked up relative to `folder`.
+    /// Builds the rig; the path of a scene file is relative to `folder`.
     ///
     /// # Errors
     /// When the scene cannot be read or a key is out of range; the message names the key.
@@ -106,25 +106,25 @@ impl DotsRig {
         Ok(Self { bench: Arc::new(Bench { config, setup, scene, beam, sensor, size }) })
     }
 
-    /// Camera rows (those of the scene above, the margin with the trailing dot below them) and columns.
+    /// Camera rows (the scene's, then the margin with the trailing dot) and columns.
     pub fn size(&self) -> (usize, usize) {
         self.bench.size
     }
 
-    /// Rows of the scene: the margin begins below them.
+    /// Number of scene rows; the margin follows.
     pub fn scene_rows(&self) -> usize {
         self.bench.scene.view().size.0
     }
 
-    /// Camera rows and columns in which the trailing dot shows, and nothing else: it fills less than half of them.
+    /// Camera rows and columns that show only the trailing dot, which covers less than half of them.
     pub fn trailing_region(&self) -> (Range<usize>, Range<usize>) {
         let (rows, columns) = self.bench.size;
         let (middle, margin) = (columns / 2, self.bench.config.margin_rows);
         (self.scene_rows()..rows, middle.saturating_sub(margin)..(middle + margin).min(columns))
     }
 
-    /// Opens the devices, with a camera that makes `frame_rate_hz` frames a second. With a mirror that is driven by its
-    /// own driver the rig is paced by the host's clock, and its camera runs beside the mirror's clock.
+    /// Opens the devices, with a camera that takes `frame_rate_hz` frames per second. With a mirror that has its own
+    /// driver, the rig runs on the host's clock and the camera is not synchronised to the mirror's clock.
     pub fn open(&self, frame_rate_hz: f64, mirror: Option<Box<dyn Mirror>>) -> DotsDevices {
         let by_the_clock = self.bench.config.realtime || mirror.is_some();
         let clock = if by_the_clock { Clock::real() } else { Clock::simulated() };
@@ -144,12 +144,12 @@ impl DotsRig {
 }
 
 impl Bench {
-    /// Light of one moment's white plane, in the sensor's units of a white plane in its exposure.
+    /// Light of a white plane in an exposure of `exposure_us`, relative to one of `white_exposure_us`.
     pub fn exposed(&self, exposure_us: f64) -> f64 {
         exposure_us / self.setup.white_exposure_us
     }
 
-    /// Shortest time between two frames.
+    /// Minimum time between two frames.
     pub fn frame_ns(frame_rate_hz: f64) -> i64 {
         ns_from_us(1e6 / frame_rate_hz).max(1)
     }

@@ -1,4 +1,4 @@
-//! A path being played: where the beam is at which sample, and what its light meets.
+//! A path being played: the beam's position at each sample, and what its light falls on.
 
 use std::collections::VecDeque;
 
@@ -7,50 +7,50 @@ use raysweep_core::{MechanicalDeg, MirrorPath, Tilt};
 use super::config::DotsConfig;
 use crate::mirror::Mechanics;
 
-/// Places that are remembered behind the newest one: more than a frame needs.
+/// Number of stored positions behind the newest one: more than a frame needs.
 const REMEMBERED: usize = 64;
-/// How long the mirror has stood on the path's first point before the path begins.
+/// Time for which the mirror rests on the path's first point before the path begins.
 const SETTLE_S: f64 = 0.5;
-/// Moments into which an exposure is cut, at most.
+/// Maximum number of points in time at which an exposure is evaluated.
 const MOST_MOMENTS: usize = 8;
 
-/// Where the light is in one moment of an exposure.
+/// Where the light falls at one point in time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lit {
-    /// On the scene, in this direction (tangents), at this part of full light.
+    /// On the scene: direction (as tangents) and fraction of full light.
     Scene([f64; 2], f64),
-    /// On the trailing dot's plane, at this part of full light.
+    /// On the trailing dot's plane: fraction of full light.
     Trailing(f64),
-    /// Off, or in the beam dump.
+    /// Nowhere: off, or in the beam dump.
     Nowhere,
 }
 
-/// A path, how often it is played, and how it is cut into frames.
+/// A path, how often it is played, and how it is divided into frames.
 #[derive(Clone)]
 pub struct Scan {
     path: MirrorPath,
     incidence: MechanicalDeg,
     samples: u64,
     samples_per_frame: f64,
-    /// The same as the mirror's sample clock would have it.
+    /// Samples per dot by the mirror's sample clock, without the camera's clock error.
     samples_per_dot: f64,
     trailing_index: u64,
     dump_indices: Vec<u64>,
     motion: Option<Motion>,
 }
 
-/// The mirror's motion, sample after sample.
+/// The mirror's motion, sample by sample.
 #[derive(Clone)]
 struct Motion {
     at_rest: Mechanics,
     mechanics: Mechanics,
-    /// Where the mirror is at the end of the newest samples; `next` is the one after them.
+    /// Positions at the end of the most recent samples; `next` is the number of the following sample.
     places: VecDeque<Tilt>,
     next: u64,
 }
 
 impl Scan {
-    /// A path that is played `batches` times, at `frame_rate_hz`.
+    /// Plays a path `batches` times, with frames at `frame_rate_hz`.
     pub fn new(
         path: MirrorPath,
         batches: u32,
@@ -83,33 +83,33 @@ impl Scan {
         }
     }
 
-    /// Samples per second.
+    /// The path's sample rate.
     pub fn rate_hz(&self) -> f64 {
         self.path.rate_hz()
     }
 
-    /// Samples of one batch.
+    /// Number of samples per batch.
     pub fn samples_per_batch(&self) -> u64 {
         self.path.points().len() as u64
     }
 
-    /// Samples of all batches.
+    /// Number of samples in all batches.
     pub fn samples(&self) -> u64 {
         self.samples
     }
 
-    /// Frames that are triggered within all batches.
+    /// Number of frames triggered during all batches.
     pub fn frames(&self) -> u64 {
-        // A frame that begins with the last sample's end is none any more, whatever rounding says.
+        // Exclude a frame that starts exactly at the end of the last sample, despite rounding.
         (self.samples as f64 / self.samples_per_frame - 1e-6).ceil() as u64
     }
 
-    /// The moment at which a frame is triggered, in samples.
+    /// Trigger time of a frame, in samples.
     pub fn trigger(&self, frame: u64) -> f64 {
         frame as f64 * self.samples_per_frame
     }
 
-    /// Batch and index of the dot at a moment in samples.
+    /// Batch and index of the dot at a time in samples.
     pub fn dot_at(&self, moment: f64) -> (u64, u64) {
         let samples_per_batch = self.path.points().len() as f64;
         let batch = (moment / samples_per_batch).floor();
@@ -117,12 +117,12 @@ impl Scan {
         (batch as u64, index as u64)
     }
 
-    /// Batch and index of the dot in the middle of a frame.
+    /// Batch and index of the dot at the middle of a frame.
     pub fn dot_of(&self, frame: u64) -> (u64, u64) {
         self.dot_at((frame as f64 + 0.5) * self.samples_per_frame)
     }
 
-    /// Where the light is in the moments of an exposure that begins with a frame's trigger; each counts alike.
+    /// Where the light falls during an exposure that starts at a frame's trigger: equally weighted points in time.
     pub fn exposure(&mut self, frame: u64, exposure_us: f64) -> Vec<Lit> {
         let length = exposure_us * 1e-6 * self.rate_hz();
         let moments = (length.ceil() as usize).clamp(1, MOST_MOMENTS);
@@ -153,9 +153,9 @@ impl Scan {
 }
 
 impl Motion {
-    /// Where the mirror is at the beginning and at the end of a sample.
+    /// Mirror positions at the beginning and at the end of a sample.
     fn around(&mut self, sample: u64, path: &MirrorPath) -> [Tilt; 2] {
-        // Who looks far back begins anew: the motion is the same each time.
+        // The sample is no longer stored: restart the motion, which is deterministic.
         if sample + (self.places.len() as u64) < self.next + 1 {
             self.mechanics = self.at_rest.clone();
             self.places = VecDeque::from([path.at(0).tilt]);

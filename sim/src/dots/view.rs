@@ -1,14 +1,14 @@
-//! The geometry of projector and camera: two pinholes, not rectified, whose epipole lies beside the image.
+//! Geometry of projector and camera: two pinholes, not rectified, with the epipole outside the image.
 
-/// Where the camera stands, in parts of the scene's distance from the projector, x, y and z.
+/// Position of the camera relative to the projector, x, y and z, in units of the scene's distance.
 const BASELINE: [f64; 3] = [0.12, 0.03, -0.05];
 
-/// A camera that sees the field of view of the beam at the scene's distance, with square pixels.
+/// A camera with square pixels that sees the beam's field of view at the scene's distance.
 #[derive(Debug, Clone, Copy)]
 pub struct View {
     /// Scene rows and columns.
     pub size: (usize, usize),
-    /// Half the beam's field of view as tangents, x and y.
+    /// Half the beam's field of view, as tangents x and y.
     pub half: [f64; 2],
 }
 
@@ -17,7 +17,7 @@ impl View {
         2.0 * self.half[0] / self.size.1 as f64
     }
 
-    /// The direction from the projector to the point at distance `depth` that a pixel sees.
+    /// Direction from the projector to the point at distance `depth` that a pixel sees.
     pub fn direction(&self, row: usize, column: usize, depth: f64) -> [f64; 2] {
         let (rows, columns) = self.size;
         let from_middle = [column as f64 + 0.5 - columns as f64 / 2.0, row as f64 + 0.5 - rows as f64 / 2.0];
@@ -27,7 +27,7 @@ impl View {
         [(at_scene[0], x), (at_scene[1], y)].map(|(at, base)| (base + (depth - z) * ray(at, base)) / depth)
     }
 
-    /// The pixel (row, column; its middle at whole numbers plus a half) that sees the point at `depth` along a direction.
+    /// Pixel coordinates (row, column; centres at half-integers) of the point at `depth` in a direction.
     pub fn pixel(&self, direction: [f64; 2], depth: f64) -> [f64; 2] {
         let (rows, columns) = self.size;
         let [x, y, z] = BASELINE;
@@ -39,7 +39,7 @@ impl View {
         ]
     }
 
-    /// Where the beam falls in the field of view, 0..1 from left to right and from top to bottom.
+    /// Position of the beam in the field of view, 0..1 from left to right and from top to bottom.
     pub fn uv(&self, direction: [f64; 2]) -> [f64; 2] {
         [0, 1].map(|axis| 0.5 + direction[axis] / (2.0 * self.half[axis]))
     }

@@ -1,4 +1,4 @@
-//! What camera and mirror share: the path that is played, what stands before the camera, and which frame is next.
+//! State shared by camera and mirror: the playing path, the subject in front of the camera, and the next frame.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -9,18 +9,18 @@ use super::scan::{Lit, Scan};
 use super::scene::{Light, Still};
 use crate::keyed::{Purpose, keyed, uniform};
 
-/// Frames that a camera by the host's clock keeps for a host that is late.
+/// Frames that a camera in real time buffers for a slow host.
 const CAMERA_BUFFERS: u64 = 64;
 
-/// What a pixel sees of the diffuser, in parts of a white plane: its lamp is dimmed until the exposure suits.
+/// Light of the diffuser relative to a white plane: its lamp is dimmed to suit the exposure.
 const DIFFUSER_LIGHT: f32 = 0.6;
 
-/// Light that is the same in every pixel, whatever the mirror does.
+/// Light of a subject that is uniform over all pixels, independent of the mirror; `None` for other subjects.
 pub(super) fn even_light(subject: Subject) -> Option<f32> {
     (subject == Subject::Diffuser).then_some(DIFFUSER_LIGHT)
 }
 
-/// Puts planes before the camera, as an operator would.
+/// Changes the subject in front of the camera, as an operator would.
 #[derive(Clone)]
 pub struct SubjectSwitch(Arc<World>);
 
@@ -29,10 +29,10 @@ impl SubjectSwitch {
         Self(world)
     }
 
-    /// Puts it there. What is before the camera when a path begins stays there until its end.
+    /// Places a subject in front of the camera. A path keeps the subject that was in place when it began.
     ///
     /// # Errors
-    /// `OutOfRange` for a plane that the rig does not have.
+    /// `OutOfRange` for a plane that does not exist on this rig.
     pub fn place(&self, subject: Subject) -> Result<(), DeviceError> {
         let planes = self.0.bench.scene.planes();
         if let Subject::Plane(number) = subject
@@ -46,35 +46,35 @@ impl SubjectSwitch {
     }
 }
 
-/// What became of a frame.
+/// What happened to a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FrameFate {
-    /// It came once.
+    /// Delivered once.
     Delivered,
-    /// It was exposed and never came.
+    /// Exposed, but never delivered.
     Dropped,
-    /// It came twice.
+    /// Delivered twice.
     Duplicated,
-    /// It came once, overexposed everywhere.
+    /// Delivered once, with every pixel overexposed.
     Saturated,
 }
 
-/// What a frame really was.
+/// Ground truth of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FrameTruth {
-    /// How many paths were started before the one that it belongs to.
+    /// Number of paths started before the one that the frame belongs to.
     pub scan: u64,
     /// Its batch in that path, from 0.
     pub batch: u64,
     /// Its index in the batch, from 0.
     pub index: u64,
-    /// What stood before the camera.
+    /// Subject in front of the camera.
     pub subject: Subject,
-    /// What became of it.
+    /// What happened to it.
     pub fate: FrameFate,
 }
 
-/// Looks behind the devices, for tests alone.
+/// Access to the ground truth behind the devices, for tests only.
 #[derive(Clone)]
 pub struct DotsTruth(Arc<World>);
 
@@ -83,7 +83,7 @@ impl DotsTruth {
         Self(world)
     }
 
-    /// The frame with this id; none that was not triggered yet.
+    /// The frame with this id; `None` if it has not been triggered yet.
     pub fn frame(&self, seq: u64) -> Option<FrameTruth> {
         let state = self.0.lock();
         let (record, frame) = state.record_of(seq)?;
@@ -92,9 +92,9 @@ impl DotsTruth {
         Some(FrameTruth { scan: record.number, batch, index, subject: record.subject, fate })
     }
 
-    /// The frame's light without noise, in an exposure of `exposure_us`, `[row, column]` row-major without the margin, in
-    /// parts of a white plane's in `camera.white_exposure_us`: straight from the mirror, and all other. Of scenes from
-    /// files the first is all light.
+    /// Noise-free light of a frame at an exposure of `exposure_us`, `[row, column]` row-major without the margin,
+    /// relative to a white plane in `camera.white_exposure_us`: direct light, and all other light. For scenes from
+    /// files, the first is all light.
     pub fn light(&self, seq: u64, exposure_us: f64) -> Option<(Vec<f32>, Vec<f32>)> {
         let (mut scan, still, frame) = {
             let state = self.0.lock();
@@ -117,13 +117,13 @@ impl DotsTruth {
         Some((light.direct, light.global))
     }
 
-    /// Ids given so far.
+    /// Number of frame ids used so far.
     pub fn frames(&self) -> u64 {
         self.0.lock().next_seq
     }
 }
 
-/// The rig in motion.
+/// The running rig.
 pub struct World {
     pub bench: Arc<Bench>,
     pub frame_rate_hz: f64,
@@ -134,11 +134,11 @@ pub struct World {
 
 struct State {
     subject: Subject,
-    /// The path that is played or was played last, and all before it.
+    /// All paths so far; the last is the one that is playing or was played last.
     records: Vec<Record>,
     armed: bool,
     next_seq: u64,
-    /// The next frame of the last path.
+    /// Number of the next frame within the last path.
     next_frame: u64,
 }
 
@@ -147,30 +147,30 @@ struct Record {
     number: u64,
     scan: Scan,
     subject: Subject,
-    /// When its first sample is played; none before the mirror's driver knows.
+    /// Time of its first sample; `None` until the mirror's driver knows it.
     start_ns: Option<i64>,
-    /// Where it was broken off, in samples.
+    /// End of the path in samples, earlier if it was interrupted.
     end: f64,
-    /// Id and number of the first frame that the camera took of it.
+    /// Id and number of the first frame taken by the camera.
     first: Option<(u64, u64)>,
 }
 
-/// What a camera has next.
+/// The camera's next event.
 pub enum Next {
-    /// This frame.
+    /// A frame that has been exposed.
     Frame(Due),
-    /// One at this time.
+    /// A frame at this time.
     At(i64),
-    /// None, as long as no other path is started.
+    /// No frame until another path is started.
     Nothing,
 }
 
-/// A frame that is exposed.
+/// An exposed frame.
 pub struct Due {
     pub seq: u64,
     pub start_ns: i64,
     pub done_ns: i64,
-    /// Of the path and of the frame in it: what its noise is keyed by.
+    /// Noise key: path and number of the frame in it.
     pub key: [u64; 2],
     pub batch: u64,
     pub lit: Vec<Lit>,
@@ -204,11 +204,11 @@ impl World {
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
-        // A device that panicked has ended its own thread; the state is never left half changed.
+        // A panic in a device ends only that device's thread; the state is never left half changed.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// A path begins; its first sample is played at `start_ns`, if that is known already.
+    /// Starts a path whose first sample is played at `start_ns`, if already known.
     pub fn start(&self, path: MirrorPath, batches: u32, start_ns: Option<i64>) {
         let scan =
             Scan::new(path, batches, self.frame_rate_hz, self.bench.setup.incidence, &self.bench.config);
@@ -219,14 +219,14 @@ impl World {
         state.next_frame = u64::from(self.bench.config.camera.late_frames);
     }
 
-    /// The first sample of the path was played at `start_ns`.
+    /// Sets the time at which the path's first sample was played, unless it is known already.
     pub fn started(&self, start_ns: i64) {
         if let Some(record) = self.lock().records.last_mut() {
             record.start_ns.get_or_insert(start_ns);
         }
     }
 
-    /// Samples per second of the path.
+    /// Sample rate of the path.
     pub fn rate_hz(&self) -> f64 {
         self.lock().records.last().map_or(1.0, |record| record.scan.rate_hz())
     }
@@ -236,7 +236,7 @@ impl World {
         self.lock().next_seq
     }
 
-    /// The light goes off and the triggers end.
+    /// Switches the light off and ends the triggers.
     pub fn stop(&self) {
         let now_ns = self.clock.now_ns();
         if let Some(record) = self.lock().records.last_mut() {
@@ -247,7 +247,7 @@ impl World {
         }
     }
 
-    /// Samples played, and samples of the whole path.
+    /// Number of samples played, and total number of samples in the path.
     pub fn played(&self) -> (u64, u64) {
         let now_ns = self.clock.now_ns();
         let state = self.lock();
@@ -262,12 +262,12 @@ impl World {
         self.lock().armed
     }
 
-    /// From now on triggers are answered, or no longer.
+    /// Sets whether the camera responds to triggers.
     pub fn set_armed(&self, armed: bool) {
         let now_ns = self.clock.now_ns();
         let mut state = self.lock();
         if armed && !state.armed {
-            // Triggers that came before are over.
+            // Skip triggers that have already passed.
             let gone = state.records.last().and_then(|record| {
                 let moment = (now_ns - record.start_ns?) as f64 * 1e-9 * record.scan.rate_hz();
                 Some((moment / record.scan.trigger(1)).ceil().max(0.0) as u64)
@@ -277,7 +277,7 @@ impl World {
         state.armed = armed;
     }
 
-    /// The camera's next frame.
+    /// The camera's next event at `now_ns`.
     pub fn next(&self, now_ns: i64, exposure_us: f64) -> Next {
         let mut state = self.lock();
         let State { records, next_seq, next_frame, .. } = &mut *state;
@@ -339,7 +339,7 @@ impl World {
         }
     }
 
-    /// What stands before the camera in a batch of the path that is played.
+    /// What is in front of the camera during a batch of the playing path.
     pub fn still_in(&self, subject: Subject, batch: u64) -> Option<Arc<dyn Still>> {
         let state = self.lock();
         let record = state.records.last()?;
@@ -358,14 +358,14 @@ impl World {
         })
     }
 
-    /// Images without light, of the scene's size.
+    /// Dark images of the scene's size.
     pub fn dark(&self) -> Light {
         let (rows, columns) = self.bench.scene.view().size;
         Light { direct: vec![0.0; rows * columns], global: vec![0.0; rows * columns] }
     }
 
-    /// Adds the light of an exposure; how much went onto the trailing dot's plane. Light that has no fine detail is that
-    /// of the exposure's middle.
+    /// Adds the light of an exposure to `light`; returns how much fell on the trailing dot's plane. Light
+    /// without fine detail is computed once, for the exposure's mean position.
     pub fn render(&self, lit: &[Lit], exposure_us: f64, still: &dyn Still, light: &mut Light) -> f64 {
         let dot = &self.bench.config.dot;
         let share = self.bench.exposed(exposure_us) / lit.len() as f64;

@@ -1,4 +1,4 @@
-//! The control channel: who may do what, what reads and writes do, and what becomes of a client that falls silent.
+//! The control channel: access rights, register reads and writes, and the heartbeat time-out of silent clients.
 
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
 use std::sync::Arc;
@@ -26,23 +26,23 @@ const PACKET_BYTES: u32 = 0xFFFF;
 /// Bits of the register `GevTimestampControl`.
 const LATCH: u32 = 2;
 const RESET: u32 = 1;
-/// `UserSetSelector` of the set that the camera starts with.
+/// `UserSetSelector` value of the power-on settings.
 const FACTORY_SET: u32 = 0;
 
-/// The client that holds the camera.
+/// The client in control of the camera.
 struct Owner {
     address: SocketAddr,
     heard: Instant,
 }
 
-/// The camera as its control channel sees it.
+/// State of the control channel.
 pub struct Control {
     registers: Registers,
     owner: Option<Owner>,
     factory_set: Vec<u8>,
     user_set: Vec<u8>,
     sequencer: Sequencer,
-    /// What the sensor has.
+    /// Settings of the sensor.
     settings: CameraSettings,
     selector_written: bool,
     acquisitions: u64,
@@ -53,7 +53,7 @@ pub struct Control {
 }
 
 impl Control {
-    /// The camera after power is switched on.
+    /// The camera after power-on.
     pub fn new(registers: Registers, controls: Arc<dyn Controls>, stream: Arc<Stream>, wire: Wire) -> Self {
         let settings = settings_of(&registers);
         let set = registers.snapshot();
@@ -75,7 +75,7 @@ impl Control {
         control
     }
 
-    /// What a loss of power leaves: the factory's settings, no client, no stream.
+    /// Restarts after a power loss: factory settings, no client, no stream.
     pub fn restart(&mut self) {
         self.release();
         let factory_set = std::mem::take(&mut self.factory_set);
@@ -86,14 +86,14 @@ impl Control {
         self.sequencer = Sequencer::new(self.settings);
     }
 
-    /// Takes note of faults that clients can see in registers.
+    /// Applies faults that clients can see in registers.
     pub fn faults_changed(&mut self) {
         let faults = *lock(&self.stream.faults);
         self.registers.set_resends(faults.resend);
         self.controls.set_late_frames(faults.late_frames);
     }
 
-    /// Answers a datagram; `false`: there is nothing to send.
+    /// Handles a datagram and writes the answer to `reply`; returns whether to send it.
     pub fn handle(&mut self, datagram: &[u8], from: SocketAddr, now: Instant, reply: &mut Vec<u8>) -> bool {
         let Some(request) = Request::parse(datagram) else { return false };
         if let Some(owner) = &mut self.owner
@@ -116,7 +116,7 @@ impl Control {
         request.acknowledge && !matches!(request.command, Ok(Command::Resend(_)))
     }
 
-    /// Frees the camera of a client that has fallen silent.
+    /// Releases the camera if its client has been silent for too long.
     pub fn check_heartbeat(&mut self, now: Instant) {
         let timeout = Duration::from_millis(self.registers.number(Id::GevHeartbeatTimeout).into());
         if self.owner.as_ref().is_some_and(|owner| now.saturating_duration_since(owner.heard) > timeout) {
@@ -150,7 +150,7 @@ impl Control {
             Command::WriteRegisters(pairs) => {
                 reply.extend_from_slice(&[0; 4]);
                 for (index, pair) in pairs.as_chunks::<8>().0.iter().enumerate() {
-                    // Where it stops, if it does: the answer tells the index of what was refused.
+                    // Index of the current write: on an error, the answer tells which write was refused.
                     reply[8 + 3] = index as u8;
                     self.write(u32_at(pair, 0).unwrap_or(0), &pair[4..], from, now)?;
                     reply[8 + 3] += 1;
@@ -162,7 +162,7 @@ impl Control {
                 reply.extend_from_slice(&(data.len() as u16).to_be_bytes());
             }
             Command::Resend(wanted) => {
-                // Clients ask from the socket that they receive on, not from the one that they control with.
+                // Clients send resend requests from the receiving socket, not from the controlling one.
                 if self.owner.as_ref().is_some_and(|owner| owner.address.ip() == from.ip()) {
                     self.stream.resend(wanted, &mut self.wire);
                 }
@@ -171,13 +171,13 @@ impl Control {
         Ok(())
     }
 
-    /// The set that frames are at changes by itself.
+    /// Updates the active set, which changes by itself.
     fn note_active_set(&mut self) {
         let set = self.controls.active_set().unwrap_or(0);
         self.registers.set_number(Id::SequencerSetActive, set as u32);
     }
 
-    /// Everybody may look, unless a client wants to be alone.
+    /// All clients may read, unless one has exclusive access.
     fn may_read(&self, from: SocketAddr) -> Result<(), Status> {
         let exclusive = self.registers.number(Id::GevCCP) & EXCLUSIVE != 0;
         let stranger = self.owner.as_ref().is_some_and(|owner| owner.address != from);
@@ -213,7 +213,7 @@ impl Control {
         self.effect(write)
     }
 
-    /// What a write does beyond the register.
+    /// Side effects of a register write.
     fn effect(&mut self, write: Write<'_>) -> Result<(), Status> {
         let number = |id| self.registers.number(id);
         match write.id {
@@ -301,7 +301,7 @@ impl Control {
         self.registers.set_long(Id::GevTimestampValue, ticks);
     }
 
-    /// The settings in the registers go to the sensor, and what it made of them back.
+    /// Applies the registers' settings to the sensor and writes the actual values back.
     fn apply_settings(&mut self) -> Result<(), Status> {
         let wanted = settings_of(&self.registers);
         let applied = self.controls.configure(&self.sensor_settings(wanted));
@@ -322,20 +322,20 @@ impl Control {
         self.registers.number(Id::TriggerMode) == 1
     }
 
-    /// A camera that triggers itself delays nothing.
+    /// A free-running camera has no trigger delay.
     fn sensor_settings(&self, settings: CameraSettings) -> CameraSettings {
         let delay_us = if self.is_triggered() { settings.trigger_delay_us } else { 0.0 };
         CameraSettings { trigger_delay_us: delay_us, ..settings }
     }
 
     fn apply_all(&mut self) {
-        // Values of a user set were taken before, so they are taken again.
+        // Cannot fail: the sensor has accepted a user set's values before.
         let _ = self.apply_settings();
         self.controls.set_triggered_by(triggered_by(&self.registers));
         self.update_derived();
     }
 
-    /// Registers that follow from others.
+    /// Updates registers that depend on others.
     fn update_derived(&mut self) {
         let number = |id| self.registers.number(id);
         let (width, height) = (number(Id::SensorWidth), number(Id::SensorHeight));
@@ -361,7 +361,7 @@ impl Control {
             all
         });
         View {
-            // The register takes codes of formats alone.
+            // The register accepts only codes of pixel formats.
             format: format.unwrap_or(PixelFormat::Mono8),
             x: number(Id::OffsetX) as usize,
             y: number(Id::OffsetY) as usize,
@@ -371,7 +371,7 @@ impl Control {
         }
     }
 
-    /// Where the client wants packets; `None` until it has said so.
+    /// Destination of the stream; `None` until the client has set it.
     fn route(&self) -> Option<Route> {
         let port = self.registers.number(Id::GevSCPHostPort) as u16;
         let address = Ipv4Addr::from(self.registers.number(Id::GevSCDA));
@@ -385,7 +385,7 @@ impl Control {
         if self.stream.order().is_some() {
             return Ok(());
         }
-        // Without a place to send to there is nothing to begin.
+        // Acquisition needs a destination.
         let route = self.route().ok_or(Status::AccessDenied)?;
         self.acquisitions += 1;
         let first_seq = self.controls.arm();
@@ -405,7 +405,7 @@ impl Control {
         self.stream.set_order(None);
     }
 
-    /// The camera is nobody's again.
+    /// Releases control of the camera.
     fn release(&mut self) {
         self.stop();
         self.owner = None;

@@ -1,45 +1,45 @@
-//! What goes wrong on the wire and in the camera's firmware: seeded, and changeable while the camera runs.
+//! Faults of the network and the camera's firmware: seeded, and changeable while the camera runs.
 
 use serde::{Deserialize, Serialize};
 
-/// In which order a camera lets its trigger be set.
+/// Order in which a camera accepts its trigger features.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum TriggerOrder {
-    /// Any.
+    /// Any order.
     #[default]
     Any,
-    /// Nothing about the trigger can be written before `TriggerSelector` was.
+    /// No trigger feature can be written before `TriggerSelector`.
     SelectorFirst,
     /// Source, activation and delay cannot be written while `TriggerMode` is `On`.
     ModeLast,
 }
 
-/// The camera's faults. Shares are of packets unless they say otherwise, 0..=1.
+/// Faults of the camera. Fractions are of packets unless stated otherwise, 0..=1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Faults {
-    /// Seeds everything that is random.
+    /// Seed of all random faults.
     pub seed: u64,
-    /// Share of packets lost, resent ones too.
+    /// Fraction of packets lost, including resent ones.
     pub packet_loss: f64,
-    /// Share of packets sent twice.
+    /// Fraction of packets sent twice.
     pub duplication: f64,
-    /// Share of packets that the next one overtakes.
+    /// Fraction of packets overtaken by the next one.
     pub reordering: f64,
-    /// Share of frames that are exposed, counted and never sent.
+    /// Fraction of frames that are exposed and counted, but never sent.
     pub frame_loss: f64,
-    /// How much later than it could a frame is sent.
+    /// Additional delay before a frame is sent.
     pub delay_us: u32,
-    /// Whether packets are sent again for a client that asks.
+    /// Whether packets are resent on request.
     pub resend: bool,
-    /// Frames that still have the old settings after a change; left out: what the rig file says.
+    /// Number of frames after a change that still use the old settings. Default: as in the rig file.
     pub late_frames: Option<u32>,
-    /// Whether the chunk `ExposureTime` tells the exposure of the frame before.
+    /// Whether the chunk `ExposureTime` reports the exposure of the previous frame.
     pub late_chunk: bool,
-    /// In which order the trigger can be set.
+    /// Order in which the trigger features can be set.
     pub trigger_order: TriggerOrder,
-    /// Answers nothing and sends nothing; afterwards the camera starts anew, as after a loss of power.
+    /// The camera neither answers nor sends; afterwards it restarts as after a power loss.
     pub dead: bool,
 }
 
@@ -61,16 +61,16 @@ impl Default for Faults {
     }
 }
 
-/// What really left the camera, for tests alone.
+/// Ground truth of what the camera sent, for tests only.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WireTruth {
-    /// Frames sent, whatever became of their packets.
+    /// Frames sent, whether or not their packets arrived.
     pub frames: u64,
-    /// When the last packet of the newest of them left, on the host's clock.
+    /// When the last packet of the newest frame was sent, on the host's clock.
     pub last_left_ns: i64,
-    /// Frames kept back by [`Faults::frame_loss`].
+    /// Frames withheld by [`Faults::frame_loss`].
     pub frames_lost: u64,
-    /// Packets sent for the first time, those lost included.
+    /// Packets sent for the first time, including lost ones.
     pub packets: u64,
     /// Packets lost by [`Faults::packet_loss`].
     pub packets_lost: u64,
@@ -78,12 +78,12 @@ pub struct WireTruth {
     pub packets_duplicated: u64,
     /// Packets overtaken.
     pub packets_reordered: u64,
-    /// Packets sent again because a client asked.
+    /// Packets resent on request.
     pub packets_resent: u64,
-    /// Packets asked for that were no longer kept.
+    /// Packets requested that were no longer stored.
     pub packets_unavailable: u64,
-    /// Packets that the host's network did not take.
+    /// Packets rejected by the host's network.
     pub packets_refused: u64,
-    /// Writes of exposure, delay or shutter that were taken.
+    /// Accepted writes of exposure, delay or shutter.
     pub settings_written: u64,
 }

@@ -1,10 +1,10 @@
-//! The one table of what the camera offers: the description that clients download and the registers that they read and
-//! write are both made of it, so that they cannot disagree. Names are those of the GenICam SFNC 2.7; registers below
-//! 0x1000 lie where GigE Vision 2.0 puts them.
+//! The camera's feature table. Both the description that clients download and the registers that they access are
+//! generated from it, so they always agree. Names are from the GenICam SFNC 2.7; registers below 0x1000 are located as
+//! GigE Vision 2.0 requires.
 
 use raysweep_core::{CameraCapabilities, Mosaic, PixelFormat};
 
-/// A register; its name is the feature's.
+/// Identifies a register by the name of its feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[allow(missing_docs, reason = "the names are defined by the SFNC and by GigE Vision")]
 pub enum Id {
@@ -72,80 +72,80 @@ pub enum Id {
     SequencerSetActive,
 }
 
-/// Who may change a register.
+/// Access mode of a register.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// The camera alone.
+    /// Read-only for clients.
     ReadOnly,
-    /// The client in control.
+    /// Writable by the client in control.
     ReadWrite,
-    /// The client in control, but not while frames are acquired.
+    /// Writable by the client in control, but not during acquisition.
     ReadWriteIdle,
-    /// A command: writing does something, reading gives 0.
+    /// A command: writing executes it, reading returns 0.
     Command,
 }
 
-/// What a register holds; all of it big-endian.
+/// Type of a register; all types are big-endian.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Kind {
-    /// Four bytes, unsigned.
+    /// Unsigned, four bytes.
     Integer {
         /// Smallest value.
         min: u32,
         /// Largest value.
         max: u32,
-        /// Distance of allowed values.
+        /// Step between allowed values.
         step: u32,
-        /// The register with the largest value as things stand.
+        /// Register that holds the current maximum, if it varies.
         max_in: Option<Id>,
     },
-    /// Eight bytes, unsigned.
+    /// Unsigned, eight bytes.
     Long,
-    /// A double.
+    /// Double, eight bytes.
     Float {
         /// Smallest value.
         min: f64,
         /// Largest value.
         max: f64,
-        /// Its unit.
+        /// Unit.
         unit: &'static str,
     },
-    /// Four bytes, one of these.
+    /// Four bytes, one of these values.
     Enumeration(Vec<(String, u32)>),
-    /// Four bytes, 0 or 1.
+    /// Four bytes: 0 or 1.
     Boolean,
-    /// Four bytes, 0 or 1, for each entry of an enumeration.
+    /// Four bytes, 0 or 1, for each entry of this enumeration.
     BooleanFor(Id),
-    /// Zero-terminated, in so many bytes.
+    /// Zero-terminated text in a register of this many bytes.
     Text(u32),
 }
 
 impl Kind {
-    /// A whole number of any size.
+    /// An integer without range limits.
     fn any() -> Self {
         Self::Integer { min: 0, max: u32::MAX, step: 1, max_in: None }
     }
 }
 
-/// One line of the table.
+/// One row of the table.
 #[derive(Debug, Clone)]
 pub struct Feature {
-    /// Which it is.
+    /// Register and feature name.
     pub id: Id,
-    /// Where clients look for it; `None`: it serves other features and is not shown.
+    /// Category in the description; `None`: an auxiliary register that is not shown.
     pub category: Option<&'static str>,
-    /// Its register.
+    /// Address of the register.
     pub address: u32,
-    /// Who may change it.
+    /// Access mode.
     pub access: Access,
-    /// What it holds.
+    /// Type.
     pub kind: Kind,
-    /// What it holds at first, as bits of a `u64`: a whole number, or those of a double.
+    /// Initial value as the bits of a `u64`: an integer, or a double's bits.
     pub initial: u64,
 }
 
 impl Feature {
-    /// Bytes of its register.
+    /// Size of its register in bytes.
     pub fn bytes(&self, features: &[Self]) -> u32 {
         match &self.kind {
             Kind::Integer { .. } | Kind::Enumeration(_) | Kind::Boolean => 4,
@@ -162,30 +162,30 @@ impl Feature {
     }
 }
 
-/// Where the registers begin that GigE Vision leaves to the maker.
+/// First address of the manufacturer-specific registers.
 pub const MAKERS_REGISTERS: u32 = 0x1_0000;
-/// Bytes kept for each of them.
+/// Bytes reserved for each manufacturer-specific register.
 pub const MAKERS_STRIDE: u32 = 16;
 
-/// Longest gap between packets: what is sent in gaps is waited for.
+/// Maximum gap between packets: the sender waits during gaps.
 const MAX_PACKET_GAP_TICKS: u32 = 100_000;
 
-/// Values of `AcquisitionMode`.
+/// Value of `AcquisitionMode`.
 pub const SINGLE_FRAME: u32 = 1;
-/// Values of `TriggerSource`.
+/// Value of `TriggerSource`.
 pub const SOFTWARE: u32 = 1;
-/// Values of `SensorShutterMode`.
+/// Value of `SensorShutterMode`.
 pub const GLOBAL_SHUTTER: u32 = 1;
-/// Sets of the sequencer.
+/// Number of sequencer sets.
 pub const SEQUENCER_SETS: usize = 16;
-/// Values of `SequencerTriggerSource`.
+/// Value of `SequencerTriggerSource`.
 pub const FRAME_START: u32 = 1;
 /// Entries of `SequencerFeatureSelector`.
 pub const SEQUENCED: [&str; 2] = ["ExposureTime", "TriggerDelay"];
-/// Entries of `ChunkSelector`, which are also what `ChunkEnable` is told apart by.
+/// Entries of `ChunkSelector`, which also select an entry of `ChunkEnable`.
 pub const CHUNKS: [&str; 4] = ["ExposureTime", "Timestamp", "FrameID", "SequencerSetActive"];
 
-/// The table for a camera with these capabilities.
+/// Returns the feature table of a camera with these capabilities.
 pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
     use Access::{Command, ReadOnly, ReadWrite, ReadWriteIdle};
     let (width, height) = (camera.width as u32, camera.height as u32);
@@ -198,7 +198,7 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
     let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
     let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
     let mosaic = camera.format.mosaic;
-    // A region that starts in the middle of a 2 x 2 cell would have another mosaic.
+    // A region that starts in the middle of a 2 x 2 cell would change the mosaic.
     let offset_step = if mosaic == Mosaic::Mono { 1 } else { 2 };
     let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
     let formats = formats.filter_map(|format| Some((format.to_string(), format.pfnc()?)));
@@ -311,29 +311,29 @@ pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
     ]
 }
 
-/// A feature that is a part of a register, or another name of one.
+/// A feature that is part of a register, or an alias of one.
 pub struct View {
     /// Its SFNC name.
     pub name: &'static str,
     /// The register.
     pub of: Id,
-    /// What it shows of it.
+    /// The part of the register that it represents.
     pub shows: Shows,
 }
 
-/// What a [`View`] shows.
+/// What a [`View`] represents.
 pub enum Shows {
-    /// These bits, counted from the least significant, as a whole number.
+    /// The bits from the first to the second, counted from the least significant, as an integer.
     Bits(u32, u32),
     /// One bit.
     Flag(u32),
     /// A command that writes this value.
     Command(u32),
-    /// All of it.
+    /// The whole register.
     All,
 }
 
-/// Views for the description alone; what they read and write is checked where the register is.
+/// Views in the description only; accesses are checked at the register.
 pub const VIEWS: [View; 7] = [
     View { name: "GevSCPSPacketSize", of: Id::GevSCPS, shows: Shows::Bits(0, 15) },
     View { name: "GevSCPSDoNotFragment", of: Id::GevSCPS, shows: Shows::Flag(30) },

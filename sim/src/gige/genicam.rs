@@ -1,4 +1,4 @@
-//! The camera's own description in the GenICam schema 1.1, made of the feature table.
+//! The camera's description in the GenICam schema 1.1, generated from the feature table.
 
 use std::fmt::Write as _;
 use std::io::{self, Cursor, Write as _};
@@ -9,7 +9,7 @@ use zip::write::SimpleFileOptions;
 use super::features::{Access, Feature, Id, Kind, Shows, VIEWS};
 use super::gvsp::Chunk;
 
-/// The description that clients download.
+/// Generates the description that clients download.
 pub fn describe(features: &[Feature], model: &str) -> String {
     let mut xml = String::new();
     // Writing to a String cannot fail.
@@ -34,10 +34,10 @@ pub fn describe(features: &[Feature], model: &str) -> String {
     xml
 }
 
-/// The description as clients unpack it: one file in a zip archive.
+/// Packs the description into a zip archive with one file.
 ///
 /// # Errors
-/// Never for a description of less than 4 GiB.
+/// None for a description of less than 4 GiB.
 pub fn zip(description: &str) -> io::Result<Vec<u8>> {
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     archive.start_file("raysweep.xml", SimpleFileOptions::default())?;
@@ -74,7 +74,7 @@ fn element(xml: &mut String, tag: &str, text: &str) {
     let _ = write!(xml, "<{tag}>{text}</{tag}>");
 }
 
-/// The node that a client asks for by name.
+/// Appends the nodes of a feature.
 fn node(xml: &mut String, feature: &Feature) {
     let Feature { id, access, kind, .. } = feature;
     let tag = match (access, kind) {
@@ -83,7 +83,7 @@ fn node(xml: &mut String, feature: &Feature) {
         (_, Kind::Float { .. }) => "Float",
         (_, Kind::Enumeration(_)) => "Enumeration",
         (_, Kind::Boolean | Kind::BooleanFor(_)) => "Boolean",
-        // A text is its own register.
+        // A text feature is a register node itself.
         (_, Kind::Text(_)) => return,
     };
     let _ = write!(xml, "<{tag} Name=\"{id:?}\">");
@@ -148,7 +148,7 @@ fn register(xml: &mut String, feature: &Feature, features: &[Feature]) {
     };
     let _ = write!(xml, "<Length>{bytes}</Length><AccessMode>{mode}</AccessMode><pPort>Device</pPort>");
     if let Access::ReadOnly = access {
-        // What the camera changes by itself must be read anew each time.
+        // Values that the camera changes by itself must not be cached.
         element(xml, "Cachable", "NoCache");
     }
     match kind {
@@ -197,7 +197,7 @@ fn view_node(xml: &mut String, name: &str, shows: &Shows, of: &Feature) {
     };
 }
 
-/// The chunks of a frame: each has a port of its own, which is the chunk's data.
+/// Appends the chunk nodes: each chunk has its own port, which maps to its data.
 fn chunks(xml: &mut String) {
     for chunk in Chunk::ALL {
         let (name, id) = (chunk.feature(), chunk.id());

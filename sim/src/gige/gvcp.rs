@@ -1,17 +1,17 @@
-//! GVCP, the control protocol of GigE Vision 2.0: what datagrams say. Every field is big-endian.
+//! GVCP, the control protocol of GigE Vision 2.0: datagram contents. All fields are big-endian.
 
-/// The port that cameras listen on.
+/// UDP port of cameras.
 pub const PORT: u16 = 3956;
-/// Bytes of a header.
+/// Length of a header in bytes.
 pub const HEADER: usize = 8;
-/// Most bytes that one request may read or write: a datagram is at most 576 bytes.
+/// Maximum number of data bytes per request: a datagram has at most 576 bytes.
 pub const MAX_DATA: usize = 536;
 
 const KEY: u8 = 0x42;
 const ACKNOWLEDGE: u8 = 0x01;
 const EXTENDED_IDS: u8 = 0x10;
 
-/// How a request went.
+/// Status of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the names are defined by GigE Vision")]
 pub enum Status {
@@ -26,49 +26,49 @@ pub enum Status {
     InvalidHeader = 0x800E,
 }
 
-/// The packets of a frame that a client misses.
+/// A client's request for missing packets of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Resend {
-    /// The frame.
+    /// Block id of the frame.
     pub block: u64,
-    /// First packet missed.
+    /// First missing packet.
     pub first: u32,
-    /// Last packet missed.
+    /// Last missing packet.
     pub last: u32,
 }
 
-/// What a client asks for.
+/// A client's command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command<'a> {
-    /// Who is there?
+    /// Device discovery.
     Discovery,
-    /// Addresses of registers, four bytes each.
+    /// Register addresses, four bytes each.
     ReadRegisters(&'a [u8]),
-    /// Addresses and values, eight bytes a pair.
+    /// Pairs of address and value, eight bytes each.
     WriteRegisters(&'a [u8]),
-    /// So many bytes from an address on.
+    /// Start address and number of bytes.
     ReadMemory(u32, usize),
-    /// Bytes for an address.
+    /// Start address and data.
     WriteMemory(u32, &'a [u8]),
-    /// Send these again.
+    /// Packets to resend.
     Resend(Resend),
 }
 
 /// A request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Request<'a> {
-    /// What to call it in the answer.
+    /// Request id, repeated in the answer.
     pub id: u16,
-    /// The number of its command.
+    /// Command code.
     pub code: u16,
-    /// Whether it wants an answer.
+    /// Whether an answer is requested.
     pub acknowledge: bool,
-    /// The command, or why it cannot be one.
+    /// The command, or the error status if it is invalid.
     pub command: Result<Command<'a>, Status>,
 }
 
 impl<'a> Request<'a> {
-    /// Reads a datagram; `None`: it is not for a camera, or not whole, and must not be answered.
+    /// Parses a datagram; `None` if it is incomplete or not a request, and must not be answered.
     pub fn parse(datagram: &'a [u8]) -> Option<Self> {
         let (header, data) = datagram.split_first_chunk::<HEADER>()?;
         let [key, flags, code_high, code_low, length_high, length_low, id_high, id_low] = *header;
@@ -113,7 +113,7 @@ impl<'a> Request<'a> {
         }
     }
 
-    /// Begins an answer, whose data the caller appends; [`seal`] ends it.
+    /// Starts an answer, to which the caller appends data; [`seal`] completes it.
     pub fn answer(&self, status: Status, reply: &mut Vec<u8>) {
         reply.clear();
         reply.extend_from_slice(&(status as u16).to_be_bytes());
@@ -123,13 +123,13 @@ impl<'a> Request<'a> {
     }
 }
 
-/// Writes the length of an answer's data into its header.
+/// Writes the length of the answer's data into its header.
 pub fn seal(reply: &mut [u8]) {
     let length = (reply.len() - HEADER) as u16;
     reply[4..6].copy_from_slice(&length.to_be_bytes());
 }
 
-/// A big-endian word of `data`.
+/// Reads a big-endian word of `data` at byte `at`.
 pub fn u32_at(data: &[u8], at: usize) -> Option<u32> {
     data.get(at..)?.first_chunk().map(|word| u32::from_be_bytes(*word))
 }

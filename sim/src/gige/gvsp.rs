@@ -1,55 +1,55 @@
-//! GVSP, the streaming protocol of GigE Vision 2.0: a frame as a leader, packets of payload and a trailer. Every field
-//! of a header is big-endian; ids have 16 bits for frames and 24 for packets.
+//! GVSP, the streaming protocol of GigE Vision 2.0: a frame consists of a leader, payload packets and a trailer. All
+//! header fields are big-endian; frame ids have 16 bits, packet ids 24.
 
 use raysweep_core::PixelFormat;
 
 use super::gvcp::Status;
 
-/// Bytes of IP, UDP and GVSP headers, which a packet's size counts too.
+/// Bytes of IP, UDP and GVSP headers, which are included in a packet's size.
 const HEADERS: usize = 20 + 8 + GVSP_HEADER;
 const GVSP_HEADER: usize = 8;
-/// Smallest packet that a client may choose.
+/// Minimum packet size that a client may choose.
 pub const MIN_PACKET_BYTES: usize = 576;
-/// Largest datagram that IP carries.
+/// Maximum size of an IP datagram.
 pub const MAX_PACKET_BYTES: usize = 65_535;
 
 const LEADER: u8 = 1;
 const TRAILER: u8 = 2;
 const PAYLOAD: u8 = 3;
 
-/// A payload of an image, and of an image with chunks behind it.
+/// Payload types: an image, and an image followed by chunks.
 const IMAGE: u16 = 0x0001;
 const IMAGE_WITH_CHUNKS: u16 = 0x4001;
-/// Identifies the image among the chunks.
+/// Chunk id of the image.
 const IMAGE_CHUNK: u32 = 0x0000_0001;
-/// Each chunk ends with its id and its length.
+/// Bytes of a chunk's trailer: its id and its length.
 const CHUNK_TRAILER: usize = 8;
-/// All chunks of this camera but the image are one 64-bit value.
+/// Data bytes of each chunk other than the image: one 64-bit value.
 const CHUNK_DATA: usize = 8;
 
-/// What a frame can carry about itself.
+/// Metadata that a frame can carry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Chunk {
-    /// Microseconds, a double.
+    /// Exposure time in microseconds, a double.
     ExposureTime,
     /// Start of the exposure in ticks of the camera's clock.
     Timestamp,
-    /// The frame's number, which does not wrap.
+    /// Frame number, which does not wrap.
     FrameId,
-    /// The sequencer's set; 0 while it is off.
+    /// Active sequencer set; 0 while the sequencer is off.
     SequencerSetActive,
 }
 
 impl Chunk {
-    /// All, in the order of `ChunkSelector`.
+    /// All chunks, in the order of `ChunkSelector`.
     pub const ALL: [Self; 4] = [Self::ExposureTime, Self::Timestamp, Self::FrameId, Self::SequencerSetActive];
 
-    /// Its id in the payload.
+    /// Chunk id in the payload.
     pub fn id(self) -> u32 {
         0x1000 + self as u32
     }
 
-    /// Its name in the SFNC.
+    /// SFNC name.
     pub fn feature(self) -> &'static str {
         match self {
             Self::ExposureTime => "ChunkExposureTime",
@@ -60,10 +60,10 @@ impl Chunk {
     }
 }
 
-/// What of a picture is sent, and how.
+/// Region, packing and chunks of the transmitted frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct View {
-    /// How pixels are packed.
+    /// Pixel packing.
     pub format: PixelFormat,
     /// First column.
     pub x: usize,
@@ -73,17 +73,17 @@ pub struct View {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// The chunks sent, in the order of [`Chunk::ALL`]; `None`: the plain image.
+    /// Enabled chunks, in the order of [`Chunk::ALL`]; `None`: plain image without chunks.
     pub chunks: Option<[bool; Chunk::ALL.len()]>,
 }
 
 impl View {
-    /// Bytes of the pixels alone.
+    /// Size of the pixels in bytes.
     pub fn image_bytes(&self) -> usize {
         self.format.frame_bytes(self.width * self.height)
     }
 
-    /// Bytes of a frame.
+    /// Size of a frame in bytes.
     pub fn payload_bytes(&self) -> usize {
         match self.chunks {
             None => self.image_bytes(),
@@ -94,54 +94,54 @@ impl View {
         }
     }
 
-    /// A chunk's length is a multiple of four.
+    /// Size of the image chunk; a chunk's length is a multiple of four.
     fn image_chunk_bytes(&self) -> usize {
         self.image_bytes().next_multiple_of(4)
     }
 }
 
-/// What a frame says of itself.
+/// Metadata of a frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Stamp {
-    /// The camera's own count of exposures.
+    /// The camera's exposure counter.
     pub seq: u64,
     /// Start of row 0's exposure in ticks of the camera's clock.
     pub ticks: u64,
-    /// The exposure, as the chunk tells it.
+    /// Exposure time as reported by the chunk.
     pub exposure_us: f64,
-    /// The sequencer's set.
+    /// Active sequencer set.
     pub set: u64,
 }
 
-/// A frame as it is sent, kept for clients that miss packets of it.
+/// A frame as sent, kept for resend requests.
 pub struct Block {
-    /// The id that packets carry; 0 is none.
+    /// Block id carried by its packets; 0 if empty.
     pub id: u16,
-    /// What it shows.
+    /// Region and packing.
     pub view: View,
-    /// When it was exposed.
+    /// Metadata.
     pub stamp: Stamp,
-    /// Bytes of a packet, headers included.
+    /// Packet size in bytes, headers included.
     pub packet_bytes: usize,
-    /// Room for pixels and chunks; [`View::payload_bytes`] of it are in use.
+    /// Buffer for pixels and chunks; the first [`View::payload_bytes`] bytes are used.
     pub payload: Vec<u8>,
 }
 
 impl Block {
-    /// An empty block with room for any view of `pixels` pixels.
+    /// An empty block with capacity for any view of `pixels` pixels.
     pub fn with_room(view: View, pixels: usize) -> Self {
         let bytes =
             PixelFormat::Mono16.frame_bytes(pixels) + (CHUNK_DATA + CHUNK_TRAILER) * (Chunk::ALL.len() + 1);
         Self { id: 0, view, stamp: Stamp::default(), packet_bytes: MIN_PACKET_BYTES, payload: vec![0; bytes] }
     }
 
-    /// Where the packed pixels go.
+    /// Buffer for the packed pixels.
     pub fn image_mut(&mut self) -> &mut [u8] {
         let bytes = self.view.image_bytes();
         &mut self.payload[..bytes]
     }
 
-    /// Writes the chunks behind the pixels.
+    /// Writes the chunks after the pixels.
     pub fn write_chunks(&mut self) {
         let Some(enabled) = self.view.chunks else { return };
         let mut at = self.view.image_chunk_bytes();
@@ -160,12 +160,12 @@ impl Block {
         }
     }
 
-    /// Packets of the block, leader and trailer included.
+    /// Number of packets, including leader and trailer.
     pub fn packets(&self) -> u32 {
         (self.view.payload_bytes().div_ceil(self.packet_bytes - HEADERS) + 2) as u32
     }
 
-    /// Writes packet `number` into `datagram`; returns its bytes.
+    /// Writes packet `number` into `datagram`; returns its length.
     pub fn packet(&self, number: u32, datagram: &mut [u8]) -> usize {
         let mut at = 0;
         let mut word = |bytes: &[u8]| put(datagram, &mut at, bytes);
@@ -195,7 +195,7 @@ impl Block {
                 word(&payload_type.to_be_bytes());
                 word(&(self.view.height as u32).to_be_bytes());
                 if self.view.chunks.is_some() {
-                    // The layout of the chunks never changes while a client acquires.
+                    // Chunk layout id: constant, since the layout does not change during acquisition.
                     word(&[0; 4]);
                 }
             }
@@ -209,7 +209,7 @@ impl Block {
     }
 }
 
-/// Writes the answer to a request for packets that are no longer kept.
+/// Writes the answer to a request for packets that are no longer stored; returns its length.
 pub fn unavailable(block: u16, number: u32, datagram: &mut [u8]) -> usize {
     let mut at = 0;
     put(datagram, &mut at, &(Status::PacketUnavailable as u16).to_be_bytes());
@@ -223,7 +223,7 @@ fn put(to: &mut [u8], at: &mut usize, bytes: &[u8]) {
     *at += bytes.len();
 }
 
-/// The id of the `n`th frame since acquisition began, counted from 0: 1 to 65535 and round again, without 0.
+/// Block id of the `n`th frame since the start of acquisition, from 0: runs from 1 to 65535 and wraps to 1.
 pub fn block_id(n: u64) -> u16 {
     (n % 0xFFFF) as u16 + 1
 }

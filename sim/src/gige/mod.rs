@@ -1,5 +1,5 @@
-//! A GigE Vision 2.0 camera on real wires: GVCP and GVSP over UDP, described in GenICam, in front of the simulated rig or
-//! of test pictures. Nothing here knows any client library, so that those can be tested against it.
+//! A GigE Vision 2.0 camera on the network: GVCP and GVSP over UDP with a GenICam description, showing the simulated
+//! rig or test pictures. The code is independent of any client library, so that it can be used to test them.
 
 mod clock;
 mod control;
@@ -34,62 +34,62 @@ use self::source::{Controls, Pictures};
 use self::stream::Stream;
 use crate::devices::SimCamera;
 
-/// Longest wait for a datagram, and so the longest that a lost client or a stop waits.
+/// Longest wait for a datagram, and so the longest delay in detecting a lost client or a stop.
 const PATIENCE: Duration = Duration::from_millis(20);
-/// Datagrams of GVCP are smaller.
+/// Receive buffer size; GVCP datagrams are smaller.
 const MAX_DATAGRAM: usize = 2048;
 
-/// Why the camera cannot be there.
+/// Why the camera cannot be started.
 #[derive(Debug, thiserror::Error)]
 pub enum GigeError {
-    /// Its address is taken, or not this machine's.
+    /// Its address is in use or not an address of this machine.
     #[error(
         "cannot listen on {address}: {source}; give an address of this machine (any of 127.0.0.0/8 is) that no other camera has"
     )]
     Listen {
         /// Address and port.
         address: SocketAddrV4,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// A thread or a socket cannot be had.
+    /// A thread or a socket cannot be created.
     #[error("cannot start the simulated camera: {0}")]
     System(#[from] io::Error),
 }
 
-/// What the camera is on the network.
+/// Network configuration of the camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GigeSetup {
-    /// Where it listens.
+    /// Address to listen on.
     pub address: Ipv4Addr,
     /// Serial number, at most 15 characters.
     pub serial: String,
     /// Its clock.
     pub clock: DeviceClock,
-    /// What goes wrong at first.
+    /// Initial faults.
     pub faults: Faults,
-    /// Whether its description is downloaded as a zip file.
+    /// Whether the description is served as a zip file.
     pub zipped: bool,
 }
 
-/// What the camera looks at.
+/// The camera's picture source.
 pub struct Look(Arc<dyn Controls>, Box<dyn Pictures>);
 
 impl Look {
-    /// At the simulated scene.
+    /// The simulated scene.
     pub(crate) fn at_scene(written: SimCamera, read: SimCamera) -> Self {
         let (controls, pictures) = source::scene(written, read);
         Self(controls, pictures)
     }
 
-    /// At test pictures of so many rows and columns, see [`test_pixel`]: as fast as a client takes them.
+    /// Test pictures of this many rows and columns, see [`test_pixel`], sent as fast as a client receives them.
     pub fn at_test_pictures(size: (usize, usize)) -> Self {
         let (controls, pictures) = source::pattern(size);
         Self(controls, pictures)
     }
 }
 
-/// A camera that answers until it is dropped.
+/// A running camera, which stops when dropped.
 pub struct GigeCamera {
     stream: Arc<Stream>,
     stop: Arc<AtomicBool>,
@@ -97,10 +97,10 @@ pub struct GigeCamera {
 }
 
 impl GigeCamera {
-    /// Connects the camera.
+    /// Starts the camera.
     ///
     /// # Errors
-    /// When its address cannot be had.
+    /// When it cannot listen on its address.
     pub fn start(setup: &GigeSetup, look: Look) -> Result<Self, GigeError> {
         let address = SocketAddrV4::new(setup.address, gvcp::PORT);
         let listen = |address| listen(address).map_err(|source| GigeError::Listen { address, source });
@@ -142,17 +142,17 @@ impl GigeCamera {
         Ok(())
     }
 
-    /// What goes wrong at present.
+    /// The current faults.
     pub fn faults(&self) -> Faults {
         *lock(&self.stream.faults)
     }
 
-    /// Changes what goes wrong from now on.
+    /// Changes the faults from now on.
     pub fn set_faults(&self, faults: Faults) {
         *lock(&self.stream.faults) = faults;
     }
 
-    /// What really left the camera. A real one has no such thing: it is for tests alone.
+    /// Ground truth of what the camera sent, for tests only; real cameras have none.
     pub fn truth(&self) -> WireTruth {
         *lock(&self.stream.truth)
     }
@@ -162,13 +162,13 @@ impl Drop for GigeCamera {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         for thread in self.threads.drain(..) {
-            // A thread that panicked has said so on stderr.
+            // A panic was already reported on stderr.
             let _ = thread.join();
         }
     }
 }
 
-/// A socket that other cameras of this machine may share a broadcast address with.
+/// Opens a socket that can share a broadcast address with other cameras of this machine.
 fn listen(address: SocketAddrV4) -> io::Result<UdpSocket> {
     use nix::sys::socket::{
         AddressFamily, SockFlag, SockType, SockaddrIn, bind, setsockopt, socket, sockopt,
@@ -183,7 +183,7 @@ fn listen(address: SocketAddrV4) -> io::Result<UdpSocket> {
     Ok(socket)
 }
 
-/// Answers datagrams on `sockets`, from the first, until `stop`.
+/// Answers datagrams on both `sockets` until `stop`; answers are sent from the first.
 fn serve(mut control: Control, stream: &Stream, sockets: &[UdpSocket; 2], stop: &AtomicBool) {
     use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
     use std::os::fd::AsFd;
@@ -192,7 +192,7 @@ fn serve(mut control: Control, stream: &Stream, sockets: &[UdpSocket; 2], stop: 
     let mut faults = None;
     while !stop.load(Ordering::Relaxed) {
         let mut ready = sockets.each_ref().map(|socket| PollFd::new(socket.as_fd(), PollFlags::POLLIN));
-        // An interrupted wait is as good as one that is over.
+        // An interrupted wait counts as a completed one.
         let _ = poll(&mut ready, PollTimeout::try_from(PATIENCE).unwrap_or(PollTimeout::ZERO));
         let present = *lock(&stream.faults);
         if faults.replace(present) != Some(present) {
@@ -215,11 +215,11 @@ fn serve(mut control: Control, stream: &Stream, sockets: &[UdpSocket; 2], stop: 
 }
 
 fn send(socket: &UdpSocket, reply: &[u8], to: SocketAddr) {
-    // A client that is gone asks no more; one that is there asks again.
+    // A lost answer needs no handling: a client that is still there repeats its request.
     let _ = socket.send_to(reply, to);
 }
 
-// What these guard is never left half changed, so a panic elsewhere does not spoil it.
+// The guarded data are never left half changed, so a panic elsewhere does not corrupt them.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

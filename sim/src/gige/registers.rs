@@ -1,41 +1,41 @@
-//! The camera's memory: the registers of the feature table, the standard's constants, and the description.
+//! The camera's memory: registers of the feature table, constants of the standard, and the description.
 
 use std::net::Ipv4Addr;
 
 use super::features::{Access, Feature, Id, Kind, MAKERS_REGISTERS, MAKERS_STRIDE};
 use super::gvcp::Status;
 
-/// Bytes that a discovery answers with: the beginning of the memory.
+/// Length of a discovery answer: the beginning of the memory.
 pub const DISCOVERY_BYTES: usize = 0xF8;
-/// Bytes of the registers that the standard defines.
+/// Size of the address range defined by the standard.
 const STANDARD_BYTES: u32 = 0x1000;
 const DESCRIPTION: u32 = 0x10_0000;
-/// GigE Vision 2.0.
+/// Version 2.0 of GigE Vision.
 const VERSION: u32 = 0x0002_0000;
-/// Big-endian, names in UTF-8.
+/// Big-endian, UTF-8 character set.
 const DEVICE_MODE: u32 = 0x8000_0001;
-/// Link-local address, the only configuration that every device has.
+/// Link-local addressing, the only configuration mode that all devices support.
 const LINK_LOCAL: u32 = 4;
 const URL_BYTES: usize = 512;
-/// Optional parts of GVCP that this camera has: concatenated reads, memory writes, resending, heartbeat, names.
+/// Optional GVCP features of this camera: concatenated reads, memory writes, resending, heartbeat, names.
 const CAPABILITIES: u32 = 1 | 1 << 1 | 1 << 30 | 1 << 31;
 const RESENDS: u32 = 1 << 2;
 
-/// What is fixed when the camera is built.
+/// Properties that are fixed when the camera is created.
 pub struct Identity<'a> {
-    /// Where it listens.
+    /// Address on which it listens.
     pub address: Ipv4Addr,
-    /// Model, as clients show it.
+    /// Model name.
     pub model: &'a str,
     /// Serial number.
     pub serial: &'a str,
-    /// Ticks a second of its clock.
+    /// Ticks per second of its clock.
     pub tick_frequency_hz: u64,
-    /// The description and the name of its file.
+    /// Description, and the name of its file.
     pub description: (Vec<u8>, &'static str),
 }
 
-/// The memory.
+/// The memory of the camera.
 pub struct Registers {
     features: Vec<Feature>,
     standard: Vec<u8>,
@@ -43,26 +43,26 @@ pub struct Registers {
     description: Vec<u8>,
 }
 
-/// A write that was checked and not yet done.
+/// A validated write that has not been carried out yet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Write<'a> {
     /// The register.
     pub id: Id,
-    /// Who may do it.
+    /// Access mode of the register.
     pub access: Access,
     address: u32,
     data: &'a [u8],
 }
 
 impl Write<'_> {
-    /// What is written, where it is a whole number of four bytes.
+    /// The written value, for a four-byte integer register.
     pub fn value(&self) -> u32 {
         super::gvcp::u32_at(self.data, 0).unwrap_or(0)
     }
 }
 
 impl Registers {
-    /// The memory after power is switched on.
+    /// The memory after power-on.
     pub fn new(features: Vec<Feature>, identity: Identity<'_>) -> Self {
         let (description, file) = identity.description;
         let bytes = description.len();
@@ -72,10 +72,10 @@ impl Registers {
             features,
             description,
         };
-        // Clients read whole words, the last one too.
+        // Clients read whole words, including the last one.
         registers.description.resize(bytes.next_multiple_of(4), 0);
         let octets = identity.address.octets();
-        // A locally administered address, made of the camera's other one.
+        // A locally administered MAC address, derived from the IP address.
         let mac = [0x02, 0x52, octets[0], octets[1], octets[2], octets[3]];
         let url = format!("Local:{file};{DESCRIPTION:x};{bytes:x}");
         let mut put = |address: usize, bytes: &[u8]| {
@@ -106,21 +106,21 @@ impl Registers {
         registers
     }
 
-    /// Says whether lost packets can be asked for.
+    /// Sets whether the camera declares support for resending packets.
     pub fn set_resends(&mut self, resends: bool) {
         let capabilities = if resends { CAPABILITIES | RESENDS } else { CAPABILITIES };
         self.standard[0x934..0x938].copy_from_slice(&capabilities.to_be_bytes());
     }
 
-    /// What a discovery answers with.
+    /// Contents of a discovery answer.
     pub fn discovery(&self) -> &[u8] {
         &self.standard[..DISCOVERY_BYTES]
     }
 
-    /// Bytes from an address on.
+    /// Reads bytes from an address.
     ///
     /// # Errors
-    /// `BadAlignment` unless address and length are multiples of four, `InvalidAddress` where there is no memory.
+    /// `BadAlignment` unless address and length are multiples of four, `InvalidAddress` outside the memory.
     pub fn read(&self, address: u32, bytes: usize) -> Result<&[u8], Status> {
         if !address.is_multiple_of(4) || !bytes.is_multiple_of(4) {
             return Err(Status::BadAlignment);
@@ -134,11 +134,11 @@ impl Registers {
         memory.get(from..from + bytes).ok_or(Status::InvalidAddress)
     }
 
-    /// Checks a write; nothing has happened yet.
+    /// Validates a write without carrying it out.
     ///
     /// # Errors
-    /// `InvalidAddress` unless it is exactly one register, `WriteProtect` where the camera alone may write,
-    /// `InvalidParameter` for a value that the feature does not take.
+    /// `InvalidAddress` unless it covers exactly one register, `WriteProtect` for a read-only register,
+    /// `InvalidParameter` for a value that the feature does not accept.
     pub fn check<'a>(&self, address: u32, data: &'a [u8]) -> Result<Write<'a>, Status> {
         if !address.is_multiple_of(4) {
             return Err(Status::BadAlignment);
@@ -183,7 +183,7 @@ impl Registers {
         Ok(Write { id: feature.id, access: feature.access, address, data })
     }
 
-    /// Does a checked write; a command leaves nothing behind.
+    /// Carries out a validated write; a command stores nothing.
     pub fn commit(&mut self, write: Write<'_>) {
         if write.access != Access::Command
             && let Some(memory) = self.memory(write.address, write.data.len())
@@ -206,35 +206,35 @@ impl Registers {
         self.features.iter().find(|feature| feature.id == id).map_or(0, |feature| feature.address)
     }
 
-    /// The bits of a register of four or eight bytes.
+    /// Sets the bits of a register of four or eight bytes.
     fn set_bits(&mut self, id: Id, bits: u64) {
         let wide = self.features.iter().any(|feature| feature.id == id && feature.bytes(&self.features) == 8);
         if wide { self.set_long(id, bits) } else { self.set_number(id, bits as u32) }
     }
 
-    /// A register of four bytes.
+    /// Reads a four-byte register.
     pub fn number(&self, id: Id) -> u32 {
         self.number_for(id, 0)
     }
 
-    /// The entry `index` of a register that has one for each entry of an enumeration.
+    /// Reads entry `index` of a register that has one entry per enumeration value.
     pub fn number_for(&self, id: Id, index: u32) -> u32 {
         let word = self.read(self.address(id) + 4 * index, 4);
         word.ok().and_then(|bytes| super::gvcp::u32_at(bytes, 0)).unwrap_or(0)
     }
 
-    /// A register that holds a double.
+    /// Reads a register that holds a double.
     pub fn float(&self, id: Id) -> f64 {
         let bytes = self.read(self.address(id), 8).ok().and_then(|bytes| bytes.first_chunk());
         bytes.map_or(0.0, |bytes| f64::from_be_bytes(*bytes))
     }
 
-    /// Sets a register of four bytes.
+    /// Sets a four-byte register.
     pub fn set_number(&mut self, id: Id, value: u32) {
         self.set(id, &value.to_be_bytes());
     }
 
-    /// Sets a register of eight bytes.
+    /// Sets an eight-byte register.
     pub fn set_long(&mut self, id: Id, value: u64) {
         self.set(id, &value.to_be_bytes());
     }
@@ -256,12 +256,12 @@ impl Registers {
         }
     }
 
-    /// What a client may change, as it stands: a user set.
+    /// Returns a user set: the current values of everything that clients can change.
     pub fn snapshot(&self) -> Vec<u8> {
         self.makers.clone()
     }
 
-    /// Puts a user set back.
+    /// Restores a user set.
     pub fn restore(&mut self, set: &[u8]) {
         self.makers.copy_from_slice(set);
     }

@@ -1,5 +1,5 @@
-//! The camera's own sequencer after the SFNC 2.7, chapter "Sequencer Control": sets of settings that frames go through, one
-//! a frame, without a word from the client.
+//! The camera's sequencer after the SFNC 2.7, chapter "Sequencer Control": sets of settings that the camera steps
+//! through, one per frame, without intervention by the client.
 
 use raysweep_core::CameraSettings;
 
@@ -10,11 +10,11 @@ use super::source::Sets;
 
 /// Values of `SequencerMode` and `SequencerConfigurationMode`.
 const ON: u32 = 1;
-/// Places in `SequencerFeatureEnable`, as in [`super::features::SEQUENCED`].
+/// Entries of `SequencerFeatureEnable`, as in [`super::features::SEQUENCED`].
 const EXPOSURE_TIME: u32 = 0;
 const TRIGGER_DELAY: u32 = 1;
 
-/// The saved sets.
+/// The stored sets.
 pub struct Sequencer {
     sets: [Set; SEQUENCER_SETS],
 }
@@ -30,13 +30,13 @@ struct Set {
 }
 
 impl Sequencer {
-    /// Sets that all have these settings and lead nowhere.
+    /// All sets have these settings and no successor.
     pub fn new(settings: CameraSettings) -> Self {
         Self { sets: [Set { settings, next: 0, source: 0 }; SEQUENCER_SETS] }
     }
 
-    /// Whether a register may be written now: sets are changed in configuration mode alone, and while the sequencer runs
-    /// neither they nor what it sets.
+    /// Whether a register may be written now: sets can be changed only in configuration mode; while the sequencer runs,
+    /// neither the sets nor the features they control can be written.
     ///
     /// # Errors
     /// `AccessDenied`.
@@ -65,7 +65,7 @@ impl Sequencer {
         if allowed { Ok(()) } else { Err(Status::AccessDenied) }
     }
 
-    /// Whether it is switched on.
+    /// Whether the sequencer is switched on.
     pub fn runs(registers: &Registers) -> bool {
         registers.number(Id::SequencerMode) == ON
     }
@@ -74,7 +74,7 @@ impl Sequencer {
         registers.number(Id::SequencerSetSelector) as usize
     }
 
-    /// Keeps what the camera has as the selected set.
+    /// Saves the current settings to the selected set.
     pub fn save(&mut self, registers: &Registers, settings: CameraSettings) {
         if let Some(set) = self.sets.get_mut(Self::selected(registers)) {
             let number = |id| registers.number(id);
@@ -86,7 +86,7 @@ impl Sequencer {
         }
     }
 
-    /// Shows where the selected set leads.
+    /// Writes the selected set's successor and trigger source to the registers.
     pub fn show(&self, registers: &mut Registers) {
         if let Some(set) = self.sets.get(Self::selected(registers)) {
             registers.set_number(Id::SequencerSetNext, set.next);
@@ -94,7 +94,7 @@ impl Sequencer {
         }
     }
 
-    /// Puts the selected set into the registers.
+    /// Loads the selected set into the registers.
     pub fn load(&self, registers: &mut Registers) {
         self.show(registers);
         if let Some(Set { settings, .. }) = self.sets.get(Self::selected(registers)) {
@@ -103,7 +103,7 @@ impl Sequencer {
         }
     }
 
-    /// What frames go through; what is not enabled stays as `settings` have it.
+    /// The sets for the frames; features that are not enabled keep their values in `settings`.
     pub fn sequence(&self, registers: &Registers, settings: CameraSettings) -> Sets {
         let enabled = |feature| registers.number_for(Id::SequencerFeatureEnable, feature) == ON;
         let (exposure, delay) = (enabled(EXPOSURE_TIME), enabled(TRIGGER_DELAY));

@@ -1,4 +1,4 @@
-//! Where the camera's pictures come from: the simulated scene, or test pictures made in advance.
+//! Picture sources of the camera: the simulated scene, or precomputed test pictures.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
@@ -15,59 +15,59 @@ use crate::devices::SimCamera;
 use crate::line::Line;
 pub use crate::line::{Sets, TriggeredBy};
 
-/// Pictures that are kept for clients that miss packets; test pictures repeat after as many.
+/// Number of pictures kept for resend requests; test pictures repeat with this period.
 pub const BLOCKS: usize = 16;
 
-/// What a client's writes do, from the thread of the control protocol.
+/// The control side of a source, used by the thread of the control protocol.
 pub trait Controls: Send + Sync {
-    /// What the camera is.
+    /// Capabilities of the camera.
     fn capabilities(&self) -> CameraCapabilities;
-    /// Takes settings; returns what the sensor made of them.
+    /// Applies settings; returns the actual values.
     ///
     /// # Errors
-    /// `OutOfRange`; the old settings then stay.
+    /// `OutOfRange`; the old settings then remain.
     fn configure(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError>;
-    /// Takes frames through settings from the set `first` on, until [`Controls::configure`].
+    /// Steps through sets from `first` on, one per frame, until [`Controls::configure`].
     fn set_sequence(&self, sets: Sets, first: usize);
-    /// The set of the newest frame, while frames go through some.
+    /// The set of the newest frame, while a sequence is running.
     fn active_set(&self) -> Option<usize>;
-    /// Chooses what starts exposures.
+    /// Selects what starts exposures.
     fn set_triggered_by(&self, triggered_by: TriggeredBy);
-    /// Triggers are answered from now on; returns the number of the next exposure.
+    /// Responds to triggers from now on; returns the number of the next exposure.
     fn arm(&self) -> u64;
-    /// No further trigger is answered.
+    /// Stops responding to triggers.
     fn disarm(&self);
-    /// Triggers by command.
+    /// Triggers by software.
     fn fire(&self);
-    /// How many frames still have the old settings after a change; `None`: as configured.
+    /// Sets how many frames after a change still use the old settings; `None`: as configured.
     fn set_late_frames(&self, frames: Option<u32>);
 }
 
 /// One exposure.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Exposed {
-    /// Its number; counts every exposure.
+    /// Its number; all exposures are counted.
     pub seq: u64,
     /// Start of row 0's exposure on the host's clock.
     pub start_ns: i64,
-    /// How long each row was exposed.
+    /// Exposure time of each row.
     pub exposure_us: f64,
-    /// The sequencer's set; 0 while it is off.
+    /// Active sequencer set; 0 while the sequencer is off.
     pub set: u64,
 }
 
-/// Pictures, from the thread that sends them.
+/// The picture side of a source, used by the sending thread.
 pub trait Pictures: Send {
-    /// Waits for the next exposure; a region's rows begin to be exposed with its first.
+    /// Waits for the next exposure; exposure starts with the first row of the region.
     fn wait(&mut self, view: &View, timeout: Duration) -> Option<Exposed>;
-    /// Writes the last one's pixels; `slot` is `seq` modulo [`BLOCKS`], and so is the block.
+    /// Writes the pixels of the last exposure; `block` is the one at `seq` modulo [`BLOCKS`].
     fn write(&mut self, exposed: &Exposed, block: &mut Block);
 }
 
-/// The simulated scene behind the wire.
+/// Control side of the simulated scene.
 struct SceneControls {
     camera: Mutex<SimCamera>,
-    /// Settings written so far: what noise is keyed by, in the place of a sweep's points.
+    /// Number of settings written so far, which keys noise in place of a sweep's points.
     written: AtomicU32,
 }
 
@@ -76,7 +76,7 @@ struct ScenePictures {
     region: Vec<u16>,
 }
 
-/// Both sides of the simulated scene, from two handles of its camera.
+/// Control and picture side of the simulated scene, from two handles to its camera.
 pub fn scene(written: SimCamera, read: SimCamera) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
     let region = Vec::with_capacity(read.counts().len());
     (
@@ -138,14 +138,14 @@ impl Pictures for ScenePictures {
     fn wait(&mut self, view: &View, timeout: Duration) -> Option<Exposed> {
         let exposure = self.camera.next_exposure(view.y, timeout)?;
         let (seq, start_ns) = (exposure.seq, exposure.start_ns);
-        // Sets are keyed by their number, other settings as point 0.
+        // Sequencer sets are keyed by their index; other settings have point 0.
         let [set, ..] = exposure.key;
         Some(Exposed { seq, start_ns, exposure_us: exposure.settings.exposure_us, set })
     }
 
     fn write(&mut self, _: &Exposed, block: &mut Block) {
         let view = block.view;
-        // The converter's bits are the rig's format's; another format keeps the upper ones, or leaves the lower ones 0.
+        // The converter has the bits of the rig's format; other formats keep the upper bits or set the lower ones to 0.
         let (from, to) = (self.camera.capabilities().format.bits(), view.format.bits());
         self.region.clear();
         for row in
@@ -161,12 +161,12 @@ impl Pictures for ScenePictures {
 }
 
 fn pack(format: PixelFormat, pixels: &[u16], block: &mut Block) {
-    // The block has room for exactly its view.
+    // The block has room for exactly its own view.
     let packed = format.pack_into(pixels, block.image_mut());
     debug_assert!(packed.is_ok(), "{packed:?}");
 }
 
-/// Test pictures: nothing is simulated, so that whoever receives them is what is measured.
+/// Test pictures: nothing is simulated, so that benchmarks measure only the receiver.
 struct Pattern {
     size: (usize, usize),
     state: Mutex<PatternState>,
@@ -186,17 +186,17 @@ struct PatternState {
 struct PatternPictures {
     pattern: Arc<Pattern>,
     clock: ClockHandle,
-    /// What each block holds already.
+    /// View of the picture that each block already contains.
     made: [Option<View>; BLOCKS],
     pixels: Vec<u16>,
 }
 
-/// The value of a pixel of test picture `picture`: a diagonal ramp that moves by 16 a picture.
+/// Pixel value of test picture `picture`: a diagonal ramp that moves by 16 per picture.
 pub fn test_pixel(x: usize, y: usize, picture: usize, format: PixelFormat) -> u16 {
     ((x + y + 16 * picture) as u16) & format.max_value()
 }
 
-/// Both sides of a camera of `size` (rows, columns) that sends test pictures.
+/// Control and picture side of a camera of `size` (rows, columns) that sends test pictures.
 pub fn pattern(size: (usize, usize)) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
     let clock = Clock::real();
     let idle = CameraSettings {
@@ -246,7 +246,7 @@ impl Controls for Pattern {
     }
 
     fn set_sequence(&self, _: Sets, _: usize) {
-        // A test picture shows no settings, whichever set they are of.
+        // Test pictures do not depend on settings.
     }
 
     fn active_set(&self) -> Option<usize> {
@@ -278,12 +278,12 @@ impl Controls for Pattern {
     }
 
     fn set_late_frames(&self, _: Option<u32>) {
-        // A test picture shows no settings, so none can be late.
+        // Test pictures do not depend on settings, so none can be late.
     }
 }
 
 impl PatternState {
-    /// When the next exposure starts, if one does.
+    /// Start time of the next exposure, if any.
     fn due_ns(&self, now_ns: i64) -> Option<i64> {
         match self.triggered_by {
             _ if !self.armed => None,
@@ -299,7 +299,7 @@ impl Pictures for PatternPictures {
         let mut state = lock(&self.pattern.state);
         let now_ns = self.clock.now_ns();
         let Some(due_ns) = state.due_ns(now_ns) else {
-            // What there is after the wait, the next call finds.
+            // The next call handles whatever has changed by then.
             drop(self.pattern.changed.wait_timeout(state, timeout));
             return None;
         };
@@ -313,7 +313,7 @@ impl Pictures for PatternPictures {
             state = lock(&self.pattern.state);
         }
         if let TriggeredBy::FreeRun { period_ns } = state.triggered_by {
-            // A host that was busy elsewhere is not made up for by a burst.
+            // Do not catch up with a burst after a delay of the host.
             state.next_free_ns = (due_ns + period_ns).max(now_ns - period_ns);
         }
         state.fired = state.fired.saturating_sub(1);

@@ -1,4 +1,4 @@
-//! The stream channel: frames from their pictures to the wire, and again for a client that missed packets.
+//! The stream channel: sends frames, and resends packets on request.
 
 use std::net::UdpSocket;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,33 +16,33 @@ use super::wire::{Route, Wire};
 use super::{lock, read, write};
 use crate::keyed::{Purpose, keyed, uniform};
 
-/// Longest wait for an exposure, and so the longest that a stop waits.
+/// Longest wait for an exposure, and so the longest delay of a stop.
 const PATIENCE: Duration = Duration::from_millis(2);
 
-/// What the client asked to be sent.
+/// What the client has requested.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Order {
-    /// Which acquisition: frames exposed for an earlier one are not sent.
+    /// Number of the acquisition: frames exposed for an earlier one are not sent.
     pub acquisition: u64,
-    /// What of the pictures.
+    /// Region and packing.
     pub view: View,
-    /// Bytes of a packet, with IP and UDP headers.
+    /// Packet size in bytes, including IP and UDP headers.
     pub packet_bytes: usize,
-    /// Where to.
+    /// Destination and packet gap.
     pub route: Route,
-    /// Number of the first exposure.
+    /// Number of the first exposure to send.
     pub first_seq: u64,
-    /// Whether one frame is all.
+    /// Whether to send a single frame only.
     pub single: bool,
 }
 
-/// What the threads of control and of the stream share.
+/// State shared by the control and stream threads.
 pub struct Stream {
     order: Mutex<Option<Order>>,
     blocks: Vec<RwLock<Block>>,
-    /// What goes wrong.
+    /// Current faults.
     pub faults: Mutex<Faults>,
-    /// What really left.
+    /// Ground truth of what was sent.
     pub truth: Arc<Mutex<WireTruth>>,
     /// The camera's clock.
     pub clock: Mutex<DeviceClock>,
@@ -50,7 +50,7 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// A stream at rest that leaves from `socket`; pictures have at most `pixels` pixels.
+    /// An idle stream that sends from `socket`; pictures have at most `pixels` pixels.
     pub fn new(socket: UdpSocket, pixels: usize, clock: DeviceClock, faults: Faults) -> Self {
         let nothing = View { format: PixelFormat::Mono8, x: 0, y: 0, width: 0, height: 0, chunks: None };
         Self {
@@ -63,29 +63,29 @@ impl Stream {
         }
     }
 
-    /// A way to the network.
+    /// A new sender on the stream's socket.
     ///
     /// # Errors
-    /// When the socket cannot be shared.
+    /// When the socket cannot be cloned.
     pub fn wire(&self) -> std::io::Result<Wire> {
         Ok(Wire::new(self.socket.try_clone()?, self.truth.clone()))
     }
 
-    /// Begins or ends an acquisition.
+    /// Starts or ends an acquisition.
     pub fn set_order(&self, order: Option<Order>) {
         if order.is_some() {
-            // Ids begin anew: what is kept of the acquisition before has other frames under them.
+            // Block ids restart, and stored frames of the previous acquisition would match them.
             self.blocks.iter().for_each(|block| write(block).id = 0);
         }
         *lock(&self.order) = order;
     }
 
-    /// What is being sent.
+    /// The current order, if any.
     pub fn order(&self) -> Option<Order> {
         *lock(&self.order)
     }
 
-    /// Sends packets again that a client missed.
+    /// Resends packets that a client is missing.
     pub fn resend(&self, wanted: Resend, wire: &mut Wire) {
         let Some(order) = self.order() else { return };
         let faults = *lock(&self.faults);
@@ -134,7 +134,7 @@ impl Stream {
                 std::thread::sleep(Duration::from_micros(faults.delay_us.into()));
             }
             if uniform(&mut keyed(faults.seed, Purpose::Wire, &[exposed.seq])) < faults.frame_loss {
-                // Frames of which nothing is sent are not kept either, or a client could ask for them.
+                // A frame that is not sent must not be stored either, or a client could request it.
                 write(slot).id = 0;
                 lock(&self.truth).frames_lost += 1;
             } else {

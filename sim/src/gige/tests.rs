@@ -1,4 +1,4 @@
-//! The protocol without a network: what datagrams do to the camera, and what it makes of frames.
+//! The protocol without a network: effects of datagrams on the camera, and packets of frames.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
@@ -24,7 +24,7 @@ const WRITE_MEMORY: u16 = 0x0086;
 const SUCCESS: u16 = 0;
 const CCP: u32 = 0xA00;
 
-/// A camera of 48 x 64 test pictures and the datagrams to it.
+/// A camera with test pictures of 48 x 64 pixels, and the datagrams sent to it.
 struct Bench {
     control: Control,
     stream: std::sync::Arc<Stream>,
@@ -57,7 +57,7 @@ impl Bench {
         Self { control, stream, features, now: Instant::now(), reply: Vec::new() }
     }
 
-    /// Status and data of the answer.
+    /// Sends a request; returns status and data of the answer.
     fn ask(&mut self, from: u16, command: u16, data: &[u8]) -> (u16, Vec<u8>) {
         let mut datagram = vec![0x42, 1];
         datagram.extend_from_slice(&command.to_be_bytes());
@@ -147,7 +147,7 @@ fn a_silent_client_loses_the_camera_and_its_stream() {
     bench.now += timeout;
     bench.control.check_heartbeat(bench.now);
     assert!(bench.stream.order().is_some());
-    // A stranger's word does not keep it alive.
+    // Messages of other clients do not reset the heartbeat.
     bench.now += Duration::from_millis(1);
     assert_eq!(bench.read(1, CCP), Ok(2));
     bench.control.check_heartbeat(bench.now);
@@ -213,7 +213,7 @@ fn a_region_is_bounded_by_the_sensor_and_sets_the_payload() {
     assert_eq!(bench.set(Id::ChunkModeActive, 1), SUCCESS);
     let enable = bench.address(Id::ChunkEnable);
     assert_eq!(bench.write(0, enable + 8, 1), SUCCESS);
-    // 140 bytes of pixels, then 8 of its trailer; 8 of a chunk, then 8 of its trailer.
+    // 140 bytes of pixels and an 8-byte trailer; 8 bytes of a chunk and an 8-byte trailer.
     assert_eq!(bench.get(Id::PayloadSize), 140 + 8 + 16);
 }
 
@@ -316,7 +316,7 @@ fn writes_of_several_registers_stop_at_the_first_that_is_refused() {
 fn the_clock_keeps_its_offset_and_drift() {
     let clock = DeviceClock { tick_frequency_hz: 125_000_000, offset_ns: 1_000, drift_ppm: 100.0 };
     assert_eq!(clock.ticks(0), 125);
-    // One second of the host is 1.0001 s of the camera.
+    // One second of the host's clock is 1.0001 s of the camera's.
     assert_eq!(clock.ticks(1_000_000_000), 125_012_500 + 125);
     let reset = clock.reset(5_000_000_000);
     assert_eq!(reset.ticks(5_000_000_000), 0);
@@ -331,13 +331,13 @@ fn ids_of_blocks_go_round_without_zero() {
 }
 
 proptest! {
-    /// Whatever arrives, the camera lives on and answers with whole datagrams that fit GVCP's size.
+    /// Any datagram leaves the camera running, and answers are well-formed and within GVCP's size limit.
     #[test]
     fn no_datagram_upsets_the_camera(
         datagrams in prop::collection::vec(
             prop_oneof![
                 prop::collection::vec(any::<u8>(), 0..700),
-                // What looks like a request gets further.
+                // Datagrams that resemble requests reach more of the code.
                 (
                     prop_oneof![Just(2_u16), Just(0x40), Just(0x80), Just(0x82), Just(0x84), Just(0x86), any::<u16>()],
                     any::<u8>(),
@@ -371,7 +371,7 @@ proptest! {
         prop_assert_eq!(bench.ask(7, 0x0002, &[]).0, SUCCESS);
     }
 
-    /// Packets of a block, put together, are its payload, whatever their size.
+    /// The packets of a block, reassembled, are its payload at any packet size.
     #[test]
     fn packets_carry_the_payload(
         width in 1_usize..80,

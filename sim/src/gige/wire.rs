@@ -1,4 +1,4 @@
-//! The way of packets into the network, and what is lost, doubled and overtaken on it.
+//! Sends packets to the network, with packet loss, duplication and reordering.
 
 use std::net::{SocketAddrV4, UdpSocket};
 use std::ops::RangeInclusive;
@@ -11,29 +11,29 @@ use super::gvsp::{self, Block, MAX_PACKET_BYTES};
 use super::lock;
 use crate::keyed::{Purpose, keyed, uniform};
 
-/// Sends packets from one socket; each thread that sends has its own.
+/// Sends packets from one socket; each sending thread has its own.
 pub struct Wire {
     socket: UdpSocket,
     clock: Clock,
     truth: Arc<Mutex<WireTruth>>,
     datagram: Vec<u8>,
-    /// A packet that the next one overtakes.
+    /// A packet that the next one will overtake.
     held: Vec<u8>,
-    /// Packets sent again so far: what the luck of the next is keyed by.
+    /// Number of resent packets so far, which keys the faults of the next one.
     resent: u64,
 }
 
-/// Where packets go and how fast.
+/// Destination and rate of packets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Route {
     /// The client.
     pub to: SocketAddrV4,
-    /// Least time from packet to packet.
+    /// Minimum time between packets.
     pub gap_ns: i64,
 }
 
 impl Wire {
-    /// A way from `socket`.
+    /// A sender on `socket`.
     pub fn new(socket: UdpSocket, truth: Arc<Mutex<WireTruth>>) -> Self {
         Self {
             socket,
@@ -51,7 +51,7 @@ impl Wire {
         let mut due_ns = self.clock.now_ns();
         for number in 0..block.packets() {
             if route.gap_ns > 0 {
-                // Gaps are microseconds: too short to sleep.
+                // Gaps are in the range of microseconds: too short to sleep.
                 while self.clock.now_ns() < due_ns {
                     std::hint::spin_loop();
                 }
@@ -68,7 +68,7 @@ impl Wire {
         self.note(truth);
     }
 
-    /// Sends packets of a frame again.
+    /// Resends packets of a frame.
     pub fn resend(&mut self, block: &Block, numbers: RangeInclusive<u32>, route: Route, faults: &Faults) {
         let mut truth = WireTruth::default();
         let last = block.packets() - 1;
@@ -82,7 +82,7 @@ impl Wire {
         self.note(truth);
     }
 
-    /// Tells a client that a packet is no longer kept.
+    /// Tells a client that a packet is no longer stored.
     pub fn send_unavailable(&mut self, block: u16, number: u32, route: Route) {
         let bytes = gvsp::unavailable(block, number, &mut self.datagram);
         let mut truth = WireTruth { packets_unavailable: 1, ..WireTruth::default() };
@@ -90,7 +90,7 @@ impl Wire {
         self.note(truth);
     }
 
-    /// A packet of the size that a client wants to try out: `packet_bytes` with IP and UDP headers.
+    /// Sends a test packet of the requested size: `packet_bytes`, including IP and UDP headers.
     pub fn send_test(&mut self, packet_bytes: usize, route: Route) {
         self.datagram.fill(0);
         let mut truth = WireTruth::default();
@@ -151,7 +151,7 @@ impl Wire {
 }
 
 fn transmit(socket: &UdpSocket, datagram: &[u8], to: SocketAddrV4, truth: &mut WireTruth) {
-    // A client that is gone answers with an ICMP message, which the next packet sent learns of.
+    // The ICMP message of a vanished client appears as an error on the next packet.
     if socket.send_to(datagram, to).is_err() {
         truth.packets_refused += 1;
     }

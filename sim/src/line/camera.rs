@@ -1,4 +1,4 @@
-//! The camera at the end of the line: what triggers it, and under which settings each frame is exposed.
+//! The camera on the line: what triggers it, and the settings of each frame.
 
 use std::collections::VecDeque;
 
@@ -8,15 +8,15 @@ use raysweep_core::{CameraSettings, SettingsId, Shutter, ns_from_us};
 pub struct Exposure {
     /// The camera's frame id.
     pub seq: u64,
-    /// Point, attempt, and frames since the settings were written: what noise is keyed by.
+    /// Noise key: point, attempt, and number of frames since the settings were written.
     pub key: [u64; 3],
-    /// Settings in force.
+    /// Settings of the exposure.
     pub settings: CameraSettings,
     /// Start of row 0's exposure.
     pub start_ns: i64,
-    /// When the frame is on the host.
+    /// When the frame arrives at the host.
     pub done_ns: i64,
-    /// Whether it gets there.
+    /// Whether the frame arrives.
     pub delivered: bool,
 }
 
@@ -25,47 +25,47 @@ pub struct Exposure {
 pub enum TriggeredBy {
     /// The edges of the VSYNC line.
     Edges,
-    /// [`super::Line::fire`] alone.
+    /// Calls of [`super::Line::fire`] only.
     Software,
-    /// The camera's own clock, as often as it is ready and no faster than this.
+    /// The camera's own clock, whenever it is ready but no faster than `period_ns`.
     FreeRun {
-        /// From one exposure's trigger to the next one's.
+        /// Minimum time between triggers.
         period_ns: i64,
     },
 }
 
-/// The camera at the line's end.
+/// State of the camera on the line.
 pub(super) struct CameraLine {
     pub(super) armed: bool,
     pub(super) triggered_by: TriggeredBy,
-    /// When a free-running camera triggers itself next.
+    /// Next trigger of a free-running camera.
     pub(super) next_free_ns: i64,
-    /// Triggers before this are not heard.
+    /// Triggers before this time are ignored.
     pub(super) deaf_until_ns: i64,
-    /// No exposure may start before this.
+    /// Exposures cannot start before this time.
     pub(super) occupied_until_ns: i64,
     pub(super) in_force: Written,
-    /// Triggers answered under the settings in force.
+    /// Number of frames triggered under the current settings.
     pub(super) frames: u64,
-    /// Settings on their way into the sensor, in the order of their first frames.
+    /// Settings that have not taken effect yet, in the order of their first frames.
     pub(super) written: VecDeque<Written>,
     pub(super) sequence: Option<Sequence>,
     pub(super) seq: u64,
     pub(super) exposures: VecDeque<Exposure>,
 }
 
-/// Settings of the camera's own sequencer, each with the number of those that the frame after has.
+/// Sets of the camera's sequencer: settings, and the index of the next frame's set.
 pub type Sets = Vec<(CameraSettings, usize)>;
 
-/// The camera's own sequencer while it runs.
+/// The camera's running sequencer.
 pub(super) struct Sequence {
     pub(super) sets: Sets,
-    /// Which one the next frame has.
+    /// Index of the next frame's set.
     pub(super) next: usize,
     pub(super) frames: u32,
 }
 
-/// Settings, and the first frame that has them.
+/// Settings, and the first frame that uses them.
 #[derive(Clone, Copy)]
 pub(super) struct Written {
     pub(super) first_seq: u64,
@@ -95,25 +95,25 @@ impl CameraLine {
         }
     }
 
-    /// The settings of the next frame to be triggered, and how many frames have had them.
+    /// Settings of the next frame to be triggered, and the number of frames that have used them.
     pub(super) fn due(&self) -> (Written, u64) {
         let due = self.written.iter().rev().find(|written| written.first_seq <= self.seq);
         due.map_or((self.in_force, self.frames), |written| (*written, 0))
     }
 
-    /// What noise and faults of the next frame are keyed by.
+    /// Key for noise and faults of the next frame.
     pub(super) fn key(&self) -> [u64; 3] {
         let (Written { id, .. }, frames) = self.due();
         [u64::from(id.point), u64::from(id.attempt), frames]
     }
 
-    /// The key of the newest frame.
+    /// Key of the newest frame.
     pub(super) fn newest_key(&self) -> [u64; 3] {
         let Written { id, .. } = self.in_force;
         [u64::from(id.point), u64::from(id.attempt), self.frames.saturating_sub(1)]
     }
 
-    /// Where the sequencer runs, the next frame has its next set.
+    /// If a sequence is running, moves on to the next frame's set.
     pub(super) fn take_next_set(&mut self) {
         let Some(Sequence { sets, next, frames }) = &mut self.sequence else { return };
         let Some(&(settings, after)) = sets.get(*next) else { return };
@@ -122,13 +122,13 @@ impl CameraLine {
         (*next, *frames) = (after, *frames + 1);
     }
 
-    /// When the camera triggers itself, where it does.
+    /// Time of the next trigger of a free-running camera; `i64::MAX` if it is not free-running.
     pub(super) fn free_run_ns(&self) -> i64 {
         let runs = self.armed && matches!(self.triggered_by, TriggeredBy::FreeRun { .. });
         if runs { self.next_free_ns } else { i64::MAX }
     }
 
-    /// Whether an edge at `edge_ns` would be answered.
+    /// Whether the camera would respond to an edge at `edge_ns`.
     pub(super) fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
         let (Written { settings, .. }, _) = self.due();
         let start_ns = edge_ns + ns_from_us(latency_us + settings.trigger_delay_us);

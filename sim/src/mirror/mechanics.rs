@@ -1,5 +1,5 @@
-//! How a MEMS mirror moves: clamp -> zero-order hold -> 6th-order Bessel low-pass -> resonator, exact for a command that
-//! holds for each sample; then coupling between the axes, drift, and the spread of repeated movements.
+//! Mechanics of a MEMS mirror: clamp -> zero-order hold -> 6th-order Bessel low-pass -> resonator, exact for commands
+//! held for one sample each; then coupling between the axes, drift, and repeatability error.
 
 use std::f64::consts::TAU;
 
@@ -8,7 +8,7 @@ use raysweep_core::{MechanicalDeg, Tilt};
 
 use crate::keyed::{Purpose, keyed};
 
-/// Natural frequencies, over the -3 dB frequency, and Q of the three sections of a 6th-order Bessel low-pass
+/// Natural frequencies relative to the -3 dB frequency, and Q, of the three sections of a 6th-order Bessel low-pass
 /// (from the roots of the reverse Bessel polynomial).
 const BESSEL: [(f64, f64); 3] = [(1.603_919, 0.510_318), (1.689_168, 0.611_195), (1.904_708, 1.023_314)];
 /// Two states for each of the four sections.
@@ -17,26 +17,26 @@ const AUGMENTED: usize = STATES + 1;
 
 type Matrix = [[f64; AUGMENTED]; AUGMENTED];
 
-/// What a simulated mirror is. Values that no data sheet backs are marked [A].
+/// Parameters of a simulated mirror. Values without a data sheet behind them are marked [A].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MechanicsConfig {
-    /// Tilt at which the controller clamps, to either side.
+    /// Tilt in either direction at which the controller clamps.
     pub max_tilt: MechanicalDeg,
-    /// Resonances, x and y.
+    /// Resonant frequencies, x and y.
     pub f0_hz: [f64; 2],
-    /// Quality factors.
+    /// Quality factors, x and y.
     pub q: [f64; 2],
-    /// -3 dB frequency of the controller's filter.
+    /// -3 dB frequency of the controller's low-pass filter.
     pub filter_hz: f64,
-    /// Share of each axis' movement that shows in the other.
+    /// Fraction of each axis' movement that appears in the other.
     pub coupling: f64,
-    /// How fast the rest position wanders off, x and y.
+    /// Drift of the rest position, x and y.
     pub drift_deg_per_s: [f64; 2],
-    /// Standard deviation of a movement repeated, drawn anew every `repeat_s`.
+    /// Standard deviation of the repeatability error, drawn anew every `repeat_s`.
     pub repeat_deg: f64,
-    /// How long one draw of it lasts.
+    /// Duration of one draw of the repeatability error.
     pub repeat_s: f64,
-    /// Seeds it.
+    /// Seed of the repeatability error.
     pub seed: u64,
 }
 
@@ -56,7 +56,7 @@ impl Default for MechanicsConfig {
     }
 }
 
-/// A mirror in motion, one sample of `1 / rate_hz` at a time.
+/// State of a moving mirror, advanced in samples of `1 / rate_hz`.
 #[derive(Debug, Clone)]
 pub struct Mechanics {
     config: MechanicsConfig,
@@ -69,7 +69,7 @@ pub struct Mechanics {
 }
 
 impl Mechanics {
-    /// At rest at the origin.
+    /// A mirror at rest at the origin.
     pub fn new(config: MechanicsConfig, rate_hz: f64) -> Self {
         let mut mechanics = Self {
             config,
@@ -84,18 +84,18 @@ impl Mechanics {
         mechanics
     }
 
-    /// Changes the rate; the motion goes on from where it is.
+    /// Changes the sample rate; the motion continues from its current state.
     pub fn set_rate(&mut self, rate_hz: f64) {
         self.rate_hz = rate_hz;
         self.step = [0, 1].map(|axis| self.transition(axis, 1.0 / rate_hz));
     }
 
-    /// Samples per second.
+    /// The sample rate.
     pub fn rate_hz(&self) -> f64 {
         self.rate_hz
     }
 
-    /// Holds a command for one sample; returns where the mirror is at its end.
+    /// Holds a command for one sample; returns the mirror's tilt at its end.
     pub fn hold(&mut self, command: Tilt) -> Tilt {
         let limit = self.config.max_tilt.0;
         let mut moved = [0.0; 2];
@@ -130,8 +130,8 @@ impl Mechanics {
         self.offset_deg = [spread.sample(&mut random), spread.sample(&mut random)];
     }
 
-    /// The exact change of the four sections' states (position, velocity over natural frequency) and their input over
-    /// `seconds`.
+    /// Exact transition matrix over `seconds` of the four sections' states (position, velocity over natural frequency)
+    /// and their input.
     fn transition(&self, axis: usize, seconds: f64) -> Matrix {
         let bessel = BESSEL.map(|(frequency, q)| (frequency * self.config.filter_hz, q));
         let sections = bessel.into_iter().chain([(self.config.f0_hz[axis], self.config.q[axis])]);
@@ -149,7 +149,7 @@ impl Mechanics {
     }
 }
 
-/// The exponential of a matrix by Taylor's series, scaled and squared.
+/// Matrix exponential by Taylor series with scaling and squaring.
 fn exponential(mut matrix: Matrix) -> Matrix {
     let norm = matrix.iter().map(|row| row.iter().map(|v| v.abs()).sum::<f64>()).fold(0.0, f64::max);
     let squarings = norm.log2().ceil().max(0.0) as i32 + 2;
@@ -187,7 +187,7 @@ mod tests {
         (0..samples).map(|n| mechanics.hold(Tilt::new(command(n), 0.0)).x.0).collect()
     }
 
-    /// The amplitude at the end of a long sine.
+    /// Steady-state amplitude of a sine.
     fn gain(config: MechanicsConfig, frequency_hz: f64) -> f64 {
         let sine = |n: usize| (TAU * frequency_hz * n as f64 / RATE_HZ).sin();
         x_of(config, sine, 40_000)[30_000..].iter().fold(0.0, |peak: f64, x| peak.max(x.abs()))
@@ -195,9 +195,9 @@ mod tests {
 
     #[test]
     fn the_filter_is_a_sixth_order_bessel() {
-        // The resonator far above leaves the filter alone.
+        // A resonator at a much higher frequency does not affect the filter.
         let filter = MechanicsConfig { f0_hz: [1e5, 1e5], q: [0.7, 0.7], ..Default::default() };
-        // 20 lg |theta_6(0) / theta_6(2.703395 j f)| worked out from the polynomial, not from its sections.
+        // 20 lg |theta_6(0) / theta_6(2.703395 j f)|, calculated from the polynomial rather than from its sections.
         for (over_cutoff, expected_db) in [(0.5, -0.7282), (1.0, -3.0103), (2.0, -14.1721), (4.0, -44.6763)] {
             let db = 20.0 * gain(filter, 200.0 * over_cutoff).log10();
             assert!((db - expected_db).abs() < 0.05, "{over_cutoff}: {db} dB, expected {expected_db}");
@@ -206,12 +206,12 @@ mod tests {
 
     #[test]
     fn a_step_rings_at_the_resonance_and_dies_by_its_q() {
-        // The filter far above leaves the resonator alone.
+        // A filter at a much higher frequency does not affect the resonator.
         let config = MechanicsConfig { filter_hz: 15_000.0, q: [30.0, 20.0], ..Default::default() };
         let x = x_of(config, |_| 1.0, 8000);
         let (w0, q) = (TAU * 500.0, 30.0);
         let (decay, w) = (w0 / (2.0 * q), w0 * (1.0_f64 - 1.0 / (4.0 * q * q)).sqrt());
-        // What the filter delays: the sum of 1 / (w Q) over its sections.
+        // Delay of the filter: the sum of 1 / (w Q) over its sections.
         let delay = BESSEL.iter().map(|(f, q)| 1.0 / (TAU * 15_000.0 * f * q)).sum::<f64>();
         for (n, x) in x.iter().enumerate().skip(20) {
             let t = (n + 1) as f64 / RATE_HZ - delay;

@@ -1,5 +1,5 @@
-//! Mirror controllers on a pseudo-terminal, with the mirror behind them: they speak the real wire to the real drivers,
-//! drain by the host's clock, and keep the truth about what the mirror was told for tests.
+//! Simulated mirror controllers on a pseudo-terminal, each with its mirror. They speak the real serial protocols to the
+//! real drivers, play samples by the host's clock, and record the ground truth for tests.
 
 mod mechanics;
 mod mti;

@@ -1,4 +1,4 @@
-//! A Mirrorcle MTI controller in its ASCII mode: one line a command, one line an answer.
+//! A Mirrorcle MTI controller in ASCII mode: one line per command, one line per answer.
 
 use std::sync::{Arc, Mutex};
 
@@ -7,7 +7,7 @@ use super::plant::{Held, MirrorTruth, Plant};
 use super::pty::Controller;
 
 const ORIGIN: Held = Held { x: 0.0, y: 0.0, light: 0 };
-/// How often the mirror's motion is worked out between commands.
+/// Rate at which the mirror's motion is computed between commands.
 const MECHANICS_RATE_HZ: f64 = 10_000.0;
 const LONGEST_LINE: usize = 64;
 
@@ -23,7 +23,7 @@ pub struct MtiController {
 }
 
 impl MtiController {
-    /// As it comes up: high voltage off, not in command mode.
+    /// Power-on state: high voltage off, not in command mode.
     pub fn new(mechanics: MechanicsConfig) -> Self {
         let plant =
             Plant::new(mechanics, MECHANICS_RATE_HZ, ORIGIN, mechanics.max_tilt.0, |held| [held.x, held.y]);
@@ -38,7 +38,7 @@ impl MtiController {
         }
     }
 
-    /// The answer to one line; none to what it does not hear.
+    /// Answers one line; `None` if the line is ignored.
     fn answer(&mut self, line: &str, now_ns: i64) -> Option<&'static str> {
         if line == "$MTI$" && !self.in_command_mode {
             self.in_command_mode = true;

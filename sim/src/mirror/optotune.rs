@@ -1,4 +1,5 @@
-//! An Optotune MR-E-2 controller in its simple mode: one line a command, `OK`, `NO`, `OL` or `OU` back. It has no light.
+//! An Optotune MR-E-2 controller in simple mode: one line per command, answered by `OK`, `NO`, `OL` or `OU`. It
+//! controls no light.
 
 use std::sync::{Arc, Mutex};
 
@@ -10,7 +11,7 @@ const ORIGIN: Held = Held { x: 0.0, y: 0.0, light: 0 };
 const MECHANICS_RATE_HZ: f64 = 10_000.0;
 const LONGEST_LINE: usize = 64;
 
-/// An MR-E-2.
+/// An MR-E-2 controller.
 pub struct OptotuneController {
     plant: Plant,
     line: Vec<u8>,
@@ -18,9 +19,9 @@ pub struct OptotuneController {
 }
 
 impl OptotuneController {
-    /// As it comes up, at the origin.
+    /// Power-on state, at the origin.
     pub fn new(mechanics: MechanicsConfig) -> Self {
-        // x = tan(optical angle) / tan 50 degrees, and the optical angle is twice the mirror's.
+        // x = tan(optical angle) / tan 50 degrees; the optical angle is twice the mechanical angle.
         let to_tilt = |held: Held| {
             [held.x, held.y].map(|x| (x * 50.0_f64.to_radians().tan()).atan().to_degrees() / 2.0)
         };

@@ -1,4 +1,4 @@
-//! What hangs on a controller's outputs: the mirror, its light, and the record of both.
+//! What a controller drives: the mirror, its light, and the record of both.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -6,42 +6,42 @@ use raysweep_core::Tilt;
 
 use super::mechanics::{Mechanics, MechanicsConfig};
 
-/// What a controller's outputs hold: the numbers of its own wire.
+/// Outputs of a controller, in the units of its own protocol.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Held {
-    /// As the wire has it: a code of 0..=4095, or -1..=1.
+    /// x as sent on the wire: a code 0..=4095, or a value -1..=1.
     pub x: f64,
-    /// The same of the other axis.
+    /// y, in the same units.
     pub y: f64,
-    /// 0: off, 255: full.
+    /// Light level: 0 is off, 255 is full.
     pub light: u8,
 }
 
-/// What a controller and its mirror did, in truth. A real rig knows nothing of this.
+/// Ground truth about a controller and its mirror; not available on a real rig.
 #[derive(Debug, Clone)]
 pub struct MirrorTruth {
-    /// Every output in order.
+    /// All outputs so far, in order.
     pub held: Vec<Held>,
-    /// Where the mirror is.
+    /// Current tilt of the mirror.
     pub tilt: Tilt,
-    /// Times that the controller ran dry with the light on or the mirror in motion.
+    /// How often the controller ran out of samples with the light on or the mirror moving.
     pub underruns: u64,
-    /// Samples that found no room.
+    /// Samples lost because the FIFO was full.
     pub overfills: u64,
-    /// Bytes that made no command.
+    /// Bytes that were not part of a command.
     pub garbage_bytes: u64,
-    /// Longest time that one output stayed lit.
+    /// Longest time that one output was held with the light on.
     pub longest_lit_ns: i64,
-    /// Since when the light is off, on the host's monotonic clock.
+    /// Since when the light has been off, on the host's monotonic clock.
     pub dark_since_ns: Option<i64>,
-    /// Since when the outputs are at the origin, with the light off.
+    /// Since when the outputs have been at the origin with the light off, on the same clock.
     pub parked_since_ns: Option<i64>,
 }
 
-/// Most samples that the mirror is moved on after a pause: more than any ringing lasts.
+/// Maximum time by which the mirror is simulated after a pause: longer than any ringing.
 const SETTLE_S: f64 = 1.0;
 
-/// The mirror and its light behind a controller's outputs.
+/// The mirror and its light, driven by a controller's outputs.
 pub struct Plant {
     mechanics: Mechanics,
     to_tilt: fn(Held) -> [f64; 2],
@@ -54,7 +54,7 @@ pub struct Plant {
 }
 
 impl Plant {
-    /// At rest and dark. `to_tilt` makes parts of the full scale of what the wire says.
+    /// At rest and dark. `to_tilt` converts outputs to fractions of full scale.
     pub fn new(
         config: MechanicsConfig,
         rate_hz: f64,
@@ -84,27 +84,27 @@ impl Plant {
         }
     }
 
-    /// What it did so far.
+    /// The record so far.
     pub fn truth(&self) -> Arc<Mutex<MirrorTruth>> {
         self.truth.clone()
     }
 
-    /// Changes the rate at which outputs are held.
+    /// Changes the sample rate at which outputs are held.
     pub fn set_rate(&mut self, rate_hz: f64) {
         self.mechanics.set_rate(rate_hz);
     }
 
-    /// Whether the outputs are dark and the last one was where the one before it was.
+    /// Whether the light is off and the last two outputs have the same position.
     pub fn is_still(&self) -> bool {
         self.now.light == 0 && (self.now.x, self.now.y) == (self.before.x, self.before.y)
     }
 
-    /// Puts the outputs at rest, as a controller does that starts anew.
+    /// Resets the outputs to the origin, as when a controller restarts.
     pub fn reset(&mut self, at_ns: i64) {
         self.hold(self.origin, at_ns);
     }
 
-    /// Holds a new output from `at_ns` on.
+    /// Sets a new output, held from `at_ns` on.
     pub fn hold(&mut self, next: Held, at_ns: i64) {
         let truth = self.truth.clone();
         let mut truth = lock(&truth);
@@ -130,12 +130,12 @@ impl Plant {
         }
     }
 
-    /// Takes time into account in which nothing changed.
+    /// Accounts for time in which the outputs have not changed.
     pub fn stand(&mut self, at_ns: i64) {
         self.note_light(&mut lock(&self.truth), at_ns);
     }
 
-    /// Writes to the record.
+    /// Updates the record.
     pub fn note(&self, write: impl FnOnce(&mut MirrorTruth)) {
         write(&mut lock(&self.truth));
     }
@@ -147,7 +147,7 @@ impl Plant {
     }
 }
 
-/// No code panics between changing two fields, so a poisoned record is still one.
+/// Locks the record. No code panics between changing two fields, so a poisoned record is still consistent.
 pub(super) fn lock(truth: &Mutex<MirrorTruth>) -> MutexGuard<'_, MirrorTruth> {
     truth.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,5 +1,5 @@
 //! A PlayzerX controller, after Mirrorcle's published serial protocol: frames 'p' 'l' command length data 0x0A, a FIFO
-//! that drains at the sample rate as soon as it holds a sample, outputs that hold the last one.
+//! that starts to drain at the sample rate once it holds a sample, and outputs that hold the last one.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -8,20 +8,20 @@ use super::mechanics::MechanicsConfig;
 use super::plant::{Held, MirrorTruth, Plant};
 use super::pty::Controller;
 
-/// What a simulated PlayzerX is.
+/// Parameters of a simulated PlayzerX.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlayzerXConfig {
     /// The mirror.
     pub mechanics: MechanicsConfig,
-    /// Samples of its FIFO: 125,000, with RGB 83,333.
+    /// Capacity of its FIFO in samples: 125,000, or 83,333 with RGB.
     pub fifo_samples: usize,
-    /// Parts by which its clock runs fast.
+    /// Relative clock error; positive is fast.
     pub clock_error: f64,
-    /// Fastest rate that it really keeps, whatever it is told.
+    /// Highest sample rate that it actually reaches, whatever is requested.
     pub max_rate_hz: f64,
-    /// After how many samples it stops to move, until its FIFO is cleared.
+    /// Number of samples after which it stops moving until its FIFO is cleared.
     pub freezes_after: Option<u64>,
-    /// How long it is deaf after a reset.
+    /// Time for which it ignores input after a reset.
     pub reset_s: f64,
 }
 
@@ -38,11 +38,11 @@ impl Default for PlayzerXConfig {
     }
 }
 
-/// The code of the origin.
+/// Output at the origin.
 const ORIGIN: Held = Held { x: 2048.0, y: 2048.0, light: 0 };
 const LONGEST_FRAME: usize = 11;
 
-/// A PlayzerX, monochrome.
+/// A monochrome PlayzerX.
 pub struct PlayzerXController {
     config: PlayzerXConfig,
     plant: Plant,
@@ -50,7 +50,7 @@ pub struct PlayzerXController {
     fifo: VecDeque<Held>,
     rate_hz: f64,
     due_ns: f64,
-    /// Whether the FIFO ran dry or was cleared: the next sample is played at once.
+    /// Whether the FIFO ran empty or was cleared; the next sample is then played at once.
     idle: bool,
     played: u64,
     report_ms: u16,
@@ -59,7 +59,7 @@ pub struct PlayzerXController {
 }
 
 impl PlayzerXController {
-    /// As it comes up: at the origin, dark, 10,000 samples a second.
+    /// Power-on state: at the origin, dark, 10,000 samples per second.
     pub fn new(config: PlayzerXConfig) -> Self {
         let rate_hz = 10_000.0;
         let full_scale_deg = config.mechanics.max_tilt.0;
@@ -115,7 +115,7 @@ impl PlayzerXController {
         }
     }
 
-    /// The length of a frame with this command, if there is one.
+    /// Whether there is a frame with this command and length.
     fn is_frame(command: u8, length: usize) -> bool {
         matches!(
             (command, length),
@@ -159,7 +159,7 @@ impl PlayzerXController {
             (b'D' | b'd', [x_low, mixed, y_high, light @ ..]) => {
                 let x = u16::from(*x_low) | (u16::from(*mixed) & 0xF0) << 4;
                 let y = (u16::from(*mixed) & 0x0F) | u16::from(*y_high) << 4;
-                // "D" has no light of its own: full.
+                // "D" carries no light level: full.
                 let light = light.iter().copied().max().unwrap_or(255);
                 self.push(Held { x: f64::from(x), y: f64::from(y), light }, now_ns);
             }

@@ -1,5 +1,5 @@
-//! A controller, of a mirror or of anything else, at the far end of a pseudo-terminal or of another line, with the faults of its
-//! wire.
+//! Runs a simulated controller, of a mirror or any other device, at the far end of a pseudo-terminal or another serial
+//! line, with line faults.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -22,37 +22,37 @@ use thread_priority::{
 use super::plant::{MirrorTruth, lock};
 use crate::keyed::{Purpose, keyed, uniform};
 
-/// What a controller does with what comes over its wire.
+/// A device's response to bytes on its serial line.
 pub trait Controller: Send + 'static {
-    /// Lets time pass to `now_ns`, takes `bytes`, and appends what it answers to `replies`.
+    /// Advances time to `now_ns`, handles `bytes`, and appends answers to `replies`.
     fn run(&mut self, bytes: &[u8], now_ns: i64, replies: &mut Vec<u8>);
 
-    /// What it did so far.
+    /// The ground truth so far.
     fn truth(&self) -> Arc<Mutex<MirrorTruth>>;
 }
 
-/// How fast the wire takes bytes.
+/// Speed of the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
-    /// A virtual serial port over USB: the baud rate means nothing.
+    /// A virtual serial port over USB: the baud rate has no effect.
     VirtualCom,
-    /// A UART: ten bits a byte.
+    /// A UART with ten bits per byte.
     Uart {
-        /// Bits a second.
+        /// Bits per second.
         baud: u32,
     },
 }
 
-/// What goes wrong on the wire, seeded.
+/// Faults of the line, seeded.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WireFaults {
-    /// Seeds them.
+    /// Seed of the faults.
     pub seed: u64,
-    /// Share of replies with garbage of 1 to 16 bytes before them.
+    /// Fraction of replies preceded by 1 to 16 garbage bytes.
     pub garbage: f64,
-    /// Share of the wire's milliseconds that begin a stall: nothing is read or answered.
+    /// Fraction of milliseconds in which a stall starts: nothing is read or answered.
     pub stalls: f64,
-    /// How long a stall lasts.
+    /// Duration of a stall.
     pub stall_ms: u32,
 }
 
@@ -62,10 +62,10 @@ impl Default for WireFaults {
     }
 }
 
-/// What a device does with what comes over its wire: [`Controller::run`].
+/// A device's handler for bytes on its line, see [`Controller::run`].
 pub type Run = Box<dyn FnMut(&[u8], i64, &mut Vec<u8>) + Send>;
 
-/// A device on a pseudo-terminal or another line. Dropping it unplugs it.
+/// A device at the end of a pseudo-terminal or another line. Dropping it unplugs it.
 pub struct Pty {
     path: PathBuf,
     unplugged: Arc<AtomicBool>,
@@ -73,13 +73,13 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Plugs a device in.
+    /// Plugs in a device.
     ///
     /// # Errors
-    /// When there is no pseudo-terminal or no thread.
+    /// When a pseudo-terminal or a thread cannot be created.
     pub fn plug(run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
-        // Closed on exec: a process that a test starts must not keep an unplugged controller's port alive. The other end
-        // is left to the driver, so that it can be opened and closed like a real port.
+        // Close-on-exec: a process started by a test must not keep an unplugged controller's port alive. The other end
+        // is left to the driver, which can open and close it like a real port.
         let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC)?;
         grantpt(&master)?;
         unlockpt(&master)?;
@@ -87,12 +87,12 @@ impl Pty {
         Self::start(File::from(OwnedFd::from(master)), path, run, link, faults, run_as_soon_as_awake)
     }
 
-    /// Plugs a device in at one end of a line, opened without blocking, whose other end a driver opens at `path`.
+    /// Plugs in a device at the non-blocking end of a line; a driver opens the other end at `path`.
     ///
     /// # Errors
-    /// When there is no thread.
+    /// When a thread cannot be created.
     pub fn attach(end: File, path: PathBuf, run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
-        // In a guest whose one processor is emulated it would leave none for the driver.
+        // No real-time priority: in a guest with one emulated processor it would starve the driver.
         Self::start(end, path, run, link, faults, || ())
     }
 
@@ -122,16 +122,16 @@ impl Pty {
         Ok(Self { path, unplugged, thread: Some(thread) })
     }
 
-    /// The port that a driver opens.
+    /// The port for the driver to open.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Pulls the plug: the port goes away, and with it the power.
+    /// Unplugs the device: the port disappears, and the device loses power.
     pub fn unplug(&mut self) {
         self.unplugged.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // A device that panicked has said so on stderr.
+            // A panic was already reported on stderr.
             let _ = thread.join();
         }
     }
@@ -143,49 +143,48 @@ impl Drop for Pty {
     }
 }
 
-/// A mirror's controller on a pseudo-terminal or another line. Dropping it unplugs it.
+/// A mirror controller at the end of a pseudo-terminal or another line. Dropping it unplugs it.
 pub struct MirrorPty {
     pty: Pty,
     truth: Arc<Mutex<MirrorTruth>>,
 }
 
 impl MirrorPty {
-    /// Plugs a controller in.
+    /// Plugs in a controller.
     ///
     /// # Errors
-    /// When there is no pseudo-terminal or no thread.
+    /// When a pseudo-terminal or a thread cannot be created.
     pub fn plug(controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
         let truth = controller.truth();
         Ok(Self { pty: Pty::plug(run_of(controller), link, faults)?, truth })
     }
 
-    /// Plugs a controller in at one end of a line without faults, opened without blocking, whose other end a driver opens at
-    /// `path`.
+    /// Plugs in a controller at the non-blocking end of a line without faults; a driver opens the other end at `path`.
     ///
     /// # Errors
-    /// When there is no thread.
+    /// When a thread cannot be created.
     pub fn attach(end: File, path: PathBuf, controller: impl Controller) -> io::Result<Self> {
         let truth = controller.truth();
         let faults = WireFaults::default();
         Ok(Self { pty: Pty::attach(end, path, run_of(controller), Link::VirtualCom, faults)?, truth })
     }
 
-    /// The port that a driver opens.
+    /// The port for the driver to open.
     pub fn path(&self) -> &Path {
         self.pty.path()
     }
 
-    /// What the controller did so far.
+    /// The controller's ground truth so far.
     pub fn truth(&self) -> MirrorTruth {
         lock(&self.truth).clone()
     }
 
-    /// One figure of it, without a copy of all outputs.
+    /// Reads a value from the ground truth without copying all outputs.
     pub fn look<T>(&self, at: impl FnOnce(&MirrorTruth) -> T) -> T {
         at(&lock(&self.truth))
     }
 
-    /// Pulls the plug: the port goes away, and with it the power.
+    /// Unplugs the controller: the port disappears, and the controller loses power.
     pub fn unplug(&mut self) {
         self.pty.unplug();
     }
@@ -195,8 +194,8 @@ fn run_of(mut controller: impl Controller) -> Run {
     Box::new(move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| controller.run(bytes, now_ns, replies))
 }
 
-/// Has the calling thread run as soon as it wakes, where that is permitted: a controller has a processor of its own, and
-/// answers in time whatever the host is busy with.
+/// Gives the calling thread real-time priority, if permitted: a real controller has its own processor and answers in
+/// time however busy the host is.
 fn run_as_soon_as_awake() {
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, policy);
@@ -232,7 +231,7 @@ impl Wire {
                 _ if stalled => 0,
                 Link::VirtualCom => buffer.len(),
                 Link::Uart { baud } => {
-                    // An idle line saves nothing up.
+                    // An idle line accumulates no credit.
                     let carried = (now_ns - start_ns) as u64 / 1000 * u64::from(baud) / 10_000_000;
                     taken = taken.max(carried.saturating_sub(64));
                     (carried.saturating_sub(taken) as usize).min(buffer.len())
@@ -240,7 +239,7 @@ impl Wire {
             };
             let read = match room {
                 0 => 0,
-                // EIO: nobody has the port open. Either way there is nothing to take.
+                // EIO: nobody has the port open. In either case there is nothing to read.
                 _ => self.end.read(&mut buffer[..room]).unwrap_or(0),
             };
             taken += read as u64;
@@ -249,10 +248,10 @@ impl Wire {
                 self.answer(&mut replies);
             }
         }
-        // The power goes with the plug: whatever a mirror's controller held, the mirror springs back and the light goes out.
+        // Unplugging cuts the power: whatever the outputs were, the mirror springs back and the light goes out.
     }
 
-    /// Until something comes, a millisecond at most, and never at full speed on a port that nobody has open.
+    /// Waits for input, at most a millisecond, and never busily on a port that nobody has open.
     fn wait(&self) {
         let mut fds = [PollFd::new(self.end.as_fd(), PollFlags::POLLIN)];
         let ready = poll(&mut fds, PollTimeout::from(1_u8)).unwrap_or(0);
@@ -269,7 +268,7 @@ impl Wire {
             let garbage = (0..length).map(|n| (self.draw(&[3, self.replies, n]) * 256.0) as u8);
             replies.splice(0..0, garbage);
         }
-        // A host that reads nothing loses replies, as on a real port.
+        // Replies that the host does not read are lost, as on a real port.
         let _ = self.end.write(replies);
         replies.clear();
     }

@@ -1,10 +1,9 @@
 //! `mirror-ball`: a ball of plane mirrors over a printed page.
 //!
-//! Traced: the page's direct light, with the ball's shadow; projector -> facet -> page, bright
-//! spots that arrive at other rows than the page's own; camera -> facet -> page, the page (and the
-//! spots on it) seen in the mirrors. The ball is the convex body cut out by its facets' planes, so
-//! that no mirrored ray meets a second facet. Neglected: page -> ball -> page from diffuse light, and the
-//! surroundings, which are black.
+//! Traced paths: the page's direct light, with the ball's shadow; projector -> facet -> page, bright spots that arrive
+//! at rows other than the page's own; camera -> facet -> page, the page (and the spots on it) seen in the mirrors. The
+//! ball is the convex polyhedron bounded by its facets' planes, so no mirrored ray meets a second facet. Neglected:
+//! diffuse light on the path page -> ball -> page, and the surroundings, which are black.
 
 use std::f64::consts::PI;
 
@@ -19,30 +18,30 @@ use super::{Direct, Indirect, Object, SceneSize};
 const TO_CAMERA: Vector = [0.0, 0.0, 1.0];
 /// Reflectance of a facet \[A\].
 const MIRROR: f64 = 0.85;
-/// Dust on the facets \[A\]: a matte part, and a glossy lobe that shows the facets halfway between
+/// Dust on the facets \[A\]: a matte component, and a glossy lobe that shows the facets oriented halfway between
 /// camera and projector.
 const DUST_ALBEDO: f64 = 0.05;
 const GLOSS: f64 = 0.7;
 const GLOSS_EXPONENT: i32 = 60;
-/// Angle between neighbouring facets, and how far glue lets them stray.
+/// Angle between neighbouring facets, and their largest misalignment.
 const FACET_ANGLE: f64 = PI / 12.0;
 const FACET_TILT: f64 = 0.03;
 /// Samples along each side of a pixel.
 const SAMPLES: usize = 4;
 
-/// Light of one pixel that comes from elsewhere than its own row's direct light.
+/// Light of one pixel other than the direct light of its own row.
 #[derive(Debug, Clone)]
 struct Ray {
     row: usize,
-    /// Projector cell that draws it; see [`Rays::cells`].
+    /// Projector cell that the light comes from; see [`Rays::cells`].
     cell: usize,
-    /// Per RGB band.
+    /// Weight per RGB band.
     weight: [f32; 3],
 }
 
 #[derive(Debug)]
 struct Rays {
-    /// `row * columns + column`.
+    /// The rays of each pixel, at index `row * columns + column`.
     pixels: Vec<Vec<Ray>>,
     columns: usize,
     bands: Vec<usize>,
@@ -53,7 +52,7 @@ struct Rays {
 struct Ball {
     centre: Vector,
     radius: f64,
-    /// Unit normals; every facet's plane touches the sphere.
+    /// Unit normals; every facet's plane is tangent to the sphere.
     facets: Vec<Vector>,
 }
 
@@ -69,8 +68,8 @@ pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Object {
     build_swung(size, bands, seed, 0.0)
 }
 
-/// The ball as a pendulum's bob, at `swing` from -1 to 1 of its way: over a tenth of a radius it rises, over most of
-/// one it goes sideways.
+/// The ball as the bob of a pendulum at `swing`, -1 to 1: it moves sideways by up to 0.8 radii to either side and
+/// rises by up to a tenth of a radius.
 pub(super) fn build_swung(size: SceneSize, bands: &[usize], seed: u64, swing: f64) -> Object {
     let SceneSize { rows, columns } = size;
     let mut dice = Dice::new(seed);
@@ -118,11 +117,11 @@ impl Ball {
         Self { centre, radius, facets }
     }
 
-    /// Facet and point where a ray from outside enters the ball.
+    /// Facet and point at which a ray from outside enters the ball.
     fn hit(&self, origin: Vector, direction: Vector) -> Option<(usize, Vector)> {
         let from_centre = minus(origin, self.centre);
         let along = dot(from_centre, direction);
-        // Facets stand out of the sphere by less than one part in cos(facet angle).
+        // Facets extend beyond the sphere by less than a factor of 1 / cos(facet angle).
         let reach = self.radius / FACET_ANGLE.cos();
         if dot(from_centre, from_centre) - along * along > reach * reach || along > 0.0 {
             return None;
@@ -142,7 +141,7 @@ impl Ball {
         facet.filter(|_| entry < exit).map(|facet| (facet, plus(origin, direction, entry)))
     }
 
-    /// What the camera sees through the point (x, y).
+    /// Facet and point that the camera sees at (x, y).
     fn hit_from_above(&self, origin: Vector) -> Option<(usize, Vector)> {
         self.hit([origin[0], origin[1], self.centre[2] + 2.0 * self.radius], [0.0, 0.0, -1.0])
     }
@@ -175,7 +174,7 @@ impl Stage {
         (merge(rays), direct.map(|d| d as f32))
     }
 
-    /// Direct light that dust on a facet sends to the camera.
+    /// Direct light that dust on a facet scatters to the camera.
     fn dust(&self, facet: usize) -> f64 {
         let (normal, light) = (self.ball.facets[facet], to_projector());
         let cos = dot(normal, light).max(0.0);
@@ -184,7 +183,7 @@ impl Stage {
         (DUST_ALBEDO + GLOSS * gloss) * cos / projector_cos()
     }
 
-    /// Light of the page as seen from `point` on the ball along `view`.
+    /// Adds the light of the page as seen from `point` on the ball along `view`.
     fn mirrored(&self, point: Vector, view: Vector, weight: f64, rays: &mut Vec<Ray>) {
         if view[2] >= 0.0 {
             return;
@@ -198,8 +197,8 @@ impl Stage {
         self.spots(on_page, albedo, rays);
     }
 
-    /// Light that facets throw on the page at `point`: each mirrors the beam, so the point looks
-    /// back along the mirrored beam and asks whether that very facet is there.
+    /// Adds the light that facets reflect onto the page at `point`. For each facet, a ray is traced from the point back
+    /// along the beam that this facet reflects; it counts if it hits that facet.
     fn spots(&self, point: Vector, albedo: [f64; 3], rays: &mut Vec<Ray>) {
         let beam = to_projector().map(|component| -component);
         for (facet, &normal) in self.ball.facets.iter().enumerate() {
@@ -219,7 +218,7 @@ impl Stage {
         }
     }
 
-    /// Adds light that the projector sheds on `point`, if one of its rows draws it.
+    /// Adds the projector's light at `point`, if the point lies in one of its rows.
     fn push(&self, point: Vector, weight: [f64; 3], rays: &mut Vec<Ray>) {
         if (0.0..self.size.rows as f64).contains(&point[1]) {
             let column = f64::from(self.frame.column(point[0], point[2])) * self.cells as f64;
@@ -232,7 +231,7 @@ impl Stage {
         self.ball.hit(point, to_projector()).is_none()
     }
 
-    /// Albedo of the page, which ends where the camera's picture ends.
+    /// Albedo of the page, which ends at the border of the camera's image.
     fn albedo(&self, point: Vector) -> Option<[f64; 3]> {
         let [x, y, _] = point;
         let inside = x >= 0.0 && x < self.size.columns as f64 && y >= 0.0 && y < self.size.rows as f64;
@@ -240,7 +239,7 @@ impl Stage {
     }
 }
 
-/// One ray per projector cell.
+/// Merges rays that come from the same projector cell.
 fn merge(mut rays: Vec<Ray>) -> Vec<Ray> {
     rays.sort_by_key(|ray| (ray.row, ray.cell));
     rays.dedup_by(|next, kept| {
@@ -320,8 +319,8 @@ mod tests {
         assert!(ball.hit([40.0, 0.0, 200.0], [0.0, 0.0, -1.0]).is_none());
     }
 
-    /// A facet passes on the flux that it takes from the beam: its cross-section, counted with rays along the
-    /// beam, equals the spot's area on the page times the cosine of the mirrored beam, counted on the page.
+    /// A facet preserves the flux it takes from the beam: its cross-section, counted with rays along the beam, equals
+    /// the spot's area on the page times the cosine of the reflected beam, counted on the page.
     #[test]
     fn spots_keep_the_flux() {
         let ball = ball();
@@ -337,7 +336,7 @@ mod tests {
                 let places = (-half..half).flat_map(|i| (-half..half).map(move |j| (i, j)));
                 places.filter(|&(i, j)| hits([step * f64::from(i), step * f64::from(j), 0.0])).count() as f64
             };
-            // The beam crosses the page's plane at the cosine of the projector's angle.
+            // The beam meets the page's plane at the projector's angle, hence the cosine.
             let taken = |at| ball.hit(plus(at, beam, -200.0), beam).is_some_and(|(k, _)| k == facet);
             let given = |at| ball.hit(at, mirrored.map(|c| -c)).is_some_and(|(k, _)| k == facet);
             let cross_section = count(&taken, 240) * projector_cos();

@@ -1,8 +1,8 @@
-//! `candle`: an upright wax cylinder before a dark printed page.
+//! `candle`: an upright wax cylinder in front of a dark printed page.
 //!
-//! Wax diffuses light by the dipole over the straight distance between two points of the visible
-//! surface. Neglected: the curvature in the diffusion itself, light through the rim, and light that
-//! the candle sheds on the page. Scale: 0.5 mm per row.
+//! Wax diffuses light according to the dipole model, over the straight distance between two points of the visible
+//! surface. Neglected: the effect of curvature on diffusion, light through the rim, and light from the candle onto the
+//! page. Scale: 0.5 mm per row.
 
 use std::f64::consts::PI;
 
@@ -16,11 +16,11 @@ use super::texture::{Dice, noise, printed_page};
 use super::translucent::Strip;
 use super::{Direct, Object, SceneSize};
 
-/// Matte reflection at the wax's surface \[A\].
+/// Albedo of the matte reflection at the wax surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.04;
-/// The page behind is printed on dark paper.
+/// Factor on the page's albedo: it is printed on dark paper.
 const PAGE_DIMMING: f32 = 0.2;
-/// Samples across a pixel: silhouettes are soft and pixels near the limb see a long arc.
+/// Samples across a pixel: silhouettes are soft, and pixels near the limb see a long arc.
 const SAMPLES: usize = 4;
 
 struct Candle {
@@ -41,7 +41,7 @@ impl Candle {
         (self.axis_x + self.radius * angle.sin(), self.axis_z + self.radius * angle.cos())
     }
 
-    /// Row where the melted rim begins.
+    /// Row at which the melted rim begins.
     fn rim(&self, angle: f64) -> f64 {
         let dip = noise(self.seed, 1.6 * angle + 40.0, 0.0)
             + 0.5 * noise(self.seed.wrapping_add(1), 4.0 * angle, 0.0);
@@ -52,7 +52,7 @@ impl Candle {
         row as f64 + 0.5 >= self.rim(angle)
     }
 
-    /// Uneven wax: transmittance of the surface, 0.85 to 1, with runs of drips downwards.
+    /// Unevenness of the wax: surface transmittance of 0.85 to 1, with vertical runs of drips.
     fn grain(&self, row: usize, angle: f64) -> f32 {
         let (x, y) = (angle * self.radius, row as f64);
         let drip = noise(self.seed.wrapping_add(2), x / 5.0, y / 40.0);
@@ -60,7 +60,7 @@ impl Candle {
         (0.85 + 0.11 * drip + 0.04 * fine) as f32
     }
 
-    /// Whether the candle keeps the projector's light from the page at x.
+    /// Whether the candle shadows the page at x.
     fn shades(&self, row: usize, x: f64) -> bool {
         let cos = projector_cos();
         let offset = (x - self.axis_x) * cos + self.axis_z * PROJECTOR_TAN * cos;
@@ -72,7 +72,7 @@ pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Object {
     build_swung(size, bands, seed, 0.0)
 }
 
-/// The candle pushed sideways, at `swing` from -1 to 1 of its way: half a radius to either side.
+/// The candle displaced sideways at `swing`, -1 to 1: by up to half a radius to either side.
 pub(super) fn build_swung(size: SceneSize, bands: &[usize], seed: u64, swing: f64) -> Object {
     let SceneSize { rows, columns } = size;
     let mut dice = Dice::new(seed);
@@ -90,7 +90,7 @@ pub(super) fn build_swung(size: SceneSize, bands: &[usize], seed: u64, swing: f6
     Object { direct, indirect: Box::new(vec![strip]) }
 }
 
-/// Angles of the wax that pixel (row, column) sees, at most [`SAMPLES`] of them.
+/// Angles on the wax seen by pixel (row, column), at most [`SAMPLES`] of them.
 fn seen(candle: &Candle, row: usize, column: usize) -> impl Iterator<Item = f64> {
     samples(column).filter_map(|x| candle.angle(x)).filter(move |&angle| candle.covers(row, angle))
 }
@@ -117,7 +117,7 @@ fn direct_light(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands:
     direct
 }
 
-/// Irradiance of the cylinder under white light.
+/// Irradiance on the cylinder under white light.
 fn irradiance(angle: f64) -> f64 {
     cos_to_projector(angle).max(0.0) / projector_cos()
 }
@@ -170,7 +170,7 @@ fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usiz
     }
 }
 
-/// `[lag, camera column, cell]`: cells are equal arcs, one row high.
+/// `[lag, camera column, cell]`; cells are equal arcs, one row high.
 fn cylinder_kernel(
     dipole: &Dipole,
     candle: &Candle,
@@ -219,7 +219,7 @@ fn cylinder_kernel(
 mod tests {
     use super::*;
 
-    /// A fat cylinder is nearly flat: the light that a cell sends back sums to the wax's albedo.
+    /// A fat cylinder is nearly flat: the light returned by a cell sums to the wax's albedo.
     #[test]
     fn kernel_of_a_fat_cylinder_keeps_the_energy() {
         let candle = Candle { axis_x: 1000.0, axis_z: 0.0, radius: 1000.0, top: 0.0, seed: 0 };

@@ -1,8 +1,8 @@
 //! Diffusion of light inside a translucent medium: the dipole of Jensen, Marschner, Levoy and
 //! Hanrahan, "A practical model for subsurface light transport", SIGGRAPH 2001.
 //!
-//! Neglected: the single-scattering term, and every departure from a flat, semi-infinite, uniform
-//! medium (curved and bounded bodies use the straight distance between entry and exit).
+//! Neglected: the single-scattering term, and any deviation from a flat, semi-infinite, uniform medium (for curved and
+//! bounded bodies, the straight distance between entry and exit is used).
 
 use std::f64::consts::PI;
 
@@ -33,7 +33,7 @@ const fn material(
     Material { name, scattering_per_mm, absorption_per_mm, refraction }
 }
 
-/// Measured media, Jensen et al. 2001, figure 5 (the paper's table of measured parameters).
+/// Measured media from Jensen et al. 2001, figure 5 (the paper's table of measured parameters).
 pub(super) const MEASURED: [Material; 5] = [
     material("marble", [2.19, 2.62, 3.00], [0.0021, 0.0041, 0.0071], 1.5),
     material("skim milk", [0.70, 1.22, 1.90], [0.0014, 0.0025, 0.0142], 1.3),
@@ -42,10 +42,10 @@ pub(super) const MEASURED: [Material; 5] = [
     material("ketchup", [0.18, 0.07, 0.03], [0.061, 0.97, 1.45], 1.3),
 ];
 
-/// Candle wax \[A\]: no published table is at hand, so a medium between skim milk and marble.
+/// Candle wax \[A\]: a medium between skim milk and marble, for lack of a published table.
 pub(super) const WAX: Material = material("wax", [1.30, 1.20, 1.10], [0.0008, 0.0020, 0.0090], 1.44);
 
-/// A real source below the surface and its negative image above.
+/// A real source below the surface and its negative image source above it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Dipole {
     reduced_albedo: f64,
@@ -69,8 +69,8 @@ impl Dipole {
         }
     }
 
-    /// Diffuse reflectance R_d at the distance `r_mm` from where light enters: exitance per
-    /// incident power, 1/mm² (equation 4).
+    /// Diffuse reflectance R_d at the distance `r_mm` from the point where light enters: exitance per incident power,
+    /// 1/mm² (equation 4).
     pub(super) fn reflectance_per_mm2(&self, r_mm: f64) -> f64 {
         let pole = |z: f64| {
             let d = (r_mm * r_mm + z * z).sqrt();
@@ -80,7 +80,7 @@ impl Dipole {
     }
 }
 
-/// Unpolarised Fresnel transmittance into a dielectric at the given cosine of incidence.
+/// Unpolarised Fresnel transmittance into a dielectric at the given cosine of the angle of incidence.
 pub(super) fn fresnel_transmittance(cos: f64, refraction: f64) -> f64 {
     let cos = cos.clamp(0.0, 1.0);
     let inside = (1.0 - (1.0 - cos * cos) / (refraction * refraction)).sqrt();
@@ -107,7 +107,7 @@ mod tests {
             for band in 0..3 {
                 let dipole = material.dipole(band);
                 let steps = 200_000;
-                // Substitution r = exp(q) spreads the samples over the decades of r.
+                // The substitution r = exp(q) spreads the samples over the decades of r.
                 let (from, to) = (1e-5_f64.ln(), 2000.0_f64.ln());
                 let step = (to - from) / f64::from(steps);
                 let sum: f64 = (0..steps)
@@ -120,7 +120,7 @@ mod tests {
         }
     }
 
-    /// The paper prints the diffuse reflectance of each medium beside its coefficients.
+    /// The paper lists the diffuse reflectance of each medium next to its coefficients.
     #[test]
     fn albedo_agrees_with_the_published_reflectance() {
         let published = [
@@ -139,7 +139,7 @@ mod tests {
         }
     }
 
-    /// Marble, green, worked by hand: sigma_t' = 2.6241, alpha' = 0.998438, sigma_tr = 0.179657,
+    /// Marble, green, computed by hand: sigma_t' = 2.6241, alpha' = 0.998438, sigma_tr = 0.179657,
     /// z_r = 0.381083, F_dr = 0.596733, A = 3.959500, z_v = 2.392947.
     #[test]
     fn marble_by_hand() {
@@ -158,7 +158,7 @@ mod tests {
     fn fresnel_at_normal_and_grazing_incidence() {
         assert!((fresnel_transmittance(1.0, 1.5) - 0.96).abs() < 1e-12);
         assert!(fresnel_transmittance(0.0, 1.5).abs() < 1e-12);
-        // Brewster's angle, where p light is not reflected: 1 - s²/2 with s = (n² - 1)/(n² + 1).
+        // Brewster's angle, where p-polarised light is not reflected: 1 - s²/2 with s = (n² - 1)/(n² + 1).
         let brewster = (1.0_f64 / (1.0 + 1.5 * 1.5)).sqrt();
         let expected = 1.0 - 0.5 * (1.25_f64 / 3.25).powi(2);
         assert!((fresnel_transmittance(brewster, 1.5) - expected).abs() < 1e-12);

@@ -1,4 +1,4 @@
-//! What can go wrong with a scene.
+//! Errors of scenes.
 
 use std::path::PathBuf;
 
@@ -6,40 +6,40 @@ use ndarray_npy::{ReadNpzError, WriteNpzError};
 
 use super::{BUILTIN_NAMES, MAX_ENTRIES, MIN_SIDE, MOVING_NAMES, Window};
 
-/// Why a scene could not be had, or could not answer.
+/// Why a scene cannot be loaded, computed, saved or rendered.
 #[derive(Debug, thiserror::Error)]
 pub enum SceneError {
-    /// No built-in scene of this name.
+    /// There is no built-in scene of this name.
     #[error("scene \"{name}\": no such built-in scene; choose one of {}, one that moves ({}), or name a file that ends in .npz", BUILTIN_NAMES.join(", "), MOVING_NAMES.join(", "))]
     UnknownName {
-        /// The name asked for.
+        /// The requested name.
         name: String,
     },
-    /// A built-in scene cannot have this size.
+    /// A built-in scene does not support this size.
     #[error(
         "scene size {rows} rows x {columns} columns, {channels} channel(s): rows and columns start \
          at {MIN_SIDE}, and rows x rows x columns x channels may reach {MAX_ENTRIES}; choose a size \
          within"
     )]
     Size {
-        /// Rows asked for.
+        /// Requested rows.
         rows: usize,
-        /// Columns asked for.
+        /// Requested columns.
         columns: usize,
         /// 1 for mono, 3 for RGB.
         channels: usize,
     },
-    /// A moving scene is computed in several positions, which would be too large together.
+    /// A moving scene is computed in several positions, which together would be too large.
     #[error(
         "scene size {rows} rows x {columns} columns: a moving scene is kept in {keys} positions, and \
          {keys} x rows x rows x columns may reach {MAX_ENTRIES}; choose a smaller size or a scene at rest"
     )]
     MovingSize {
-        /// Rows asked for.
+        /// Requested rows.
         rows: usize,
-        /// Columns asked for.
+        /// Requested columns.
         columns: usize,
-        /// Positions.
+        /// Number of positions.
         keys: usize,
     },
     /// The file cannot be opened.
@@ -47,10 +47,10 @@ pub enum SceneError {
     Open {
         /// The file.
         path: PathBuf,
-        /// The system's reason.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// The file is not an intact `.npz`.
+    /// The file is not a valid `.npz`.
     #[error(
         "scene file {}: not a readable .npz ({source}); it may be cut short or damaged, so copy it \
          again", path.display()
@@ -58,10 +58,10 @@ pub enum SceneError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What went wrong.
+        /// The read error.
         source: ReadNpzError,
     },
-    /// The file has no array `T`.
+    /// The file has no array named `T`.
     #[error(
         "scene file {}: no array T among [{found}]; save the transport [V, H, W] or [V, H, W, 3] as \
          T", path.display()
@@ -69,29 +69,29 @@ pub enum SceneError {
     MissingTransport {
         /// The file.
         path: PathBuf,
-        /// Names of the arrays that are there.
+        /// Names of the arrays in the file.
         found: String,
     },
-    /// An array has another element type.
+    /// An array has an unsupported element type.
     #[error("scene file {}: array {array} has type {dtype}; save it as float32 or float64", path.display())]
     Dtype {
         /// The file.
         path: PathBuf,
-        /// The array.
+        /// Name of the array.
         array: &'static str,
-        /// NumPy's description of the type found.
+        /// NumPy's description of the element type.
         dtype: String,
     },
-    /// An array has another shape.
+    /// An array has an unexpected shape.
     #[error("scene file {}: array {array} has shape {shape:?}; expected {expected}", path.display())]
     Shape {
         /// The file.
         path: PathBuf,
-        /// The array.
+        /// Name of the array.
         array: &'static str,
-        /// Shape found.
+        /// Actual shape.
         shape: Vec<usize>,
-        /// Shape wanted.
+        /// Expected shape.
         expected: String,
     },
     /// The file cannot be written.
@@ -102,10 +102,10 @@ pub enum SceneError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What went wrong.
+        /// The write error.
         source: WriteNpzError,
     },
-    /// Transport and projector columns do not fit together.
+    /// The shapes of transport and projector columns do not match.
     #[error(
         "transport of shape {transport:?} with projector columns {projector_column:?}: expected \
          [V, H, W, 1 or 3] with no length 0, and [H, W]"
@@ -116,32 +116,32 @@ pub enum SceneError {
         /// Shape of the projector columns, if given.
         projector_column: Option<(usize, usize)>,
     },
-    /// Light is finite and not negative.
+    /// Transport contains a negative or non-finite value.
     #[error(
         "{origin}: value {value} at [v, t, s, channel] = {index:?}; transport must be finite and not negative"
     )]
     Value {
-        /// Where the array came from.
+        /// Origin of the array.
         origin: String,
-        /// Place of the first such value.
+        /// Index of the first invalid value.
         index: (usize, usize, usize, usize),
-        /// The value.
+        /// The invalid value.
         value: f32,
     },
-    /// A pattern must fit the projector.
+    /// A pattern does not fit the projector.
     #[error(
         "pattern of {rows} rows x {columns} columns: expected {expected} rows (the scene's projector \
          rows), at least one column, and finite values"
     )]
     Pattern {
-        /// Rows given.
+        /// Rows of the pattern.
         rows: usize,
-        /// Columns given.
+        /// Columns of the pattern.
         columns: usize,
-        /// Rows of the scene.
+        /// Projector rows of the scene.
         expected: usize,
     },
-    /// The scene was given by its rows and cannot tell columns apart.
+    /// The pattern varies along a row, but the scene is defined by row transport only.
     #[error(
         "pattern of {columns} columns that change along a row: this scene is given by its rows \
          (T[V, H, W]), whose columns are summed; use patterns that are constant along each row, or a \
@@ -151,10 +151,10 @@ pub enum SceneError {
         /// Columns of the pattern.
         columns: usize,
     },
-    /// The window leaves the image.
+    /// The window extends beyond the image.
     #[error("window {window:?}: expected a part, not empty, of the image of {height} rows x {width} columns")]
     Window {
-        /// The window given.
+        /// The requested window.
         window: Window,
         /// Camera rows.
         height: usize,

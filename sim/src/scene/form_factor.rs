@@ -6,15 +6,15 @@ use std::ops::Range;
 use super::quadrature::{GAUSS_2, GAUSS_8};
 use super::vector::{Vector, cross, dot, length, minus};
 
-/// A rectangle on one of the two planes: distances from the common edge, and places along it.
+/// A rectangle on one of the two planes: range of distances from the common edge, and range along it.
 pub(super) type Rectangle<'a> = (&'a Range<f64>, &'a Range<f64>);
 
-/// Exchange area A_1 F_12 = A_2 F_21 of two rectangles whose planes enclose the angle `opening` (radians), in
-/// the square of their unit of length.
+/// Exchange area A_1 F_12 = A_2 F_21 of two rectangles whose planes form the angle `opening` (radians), in squared
+/// units of length.
 ///
-/// The view of the second rectangle from a point of the first is exact (Lambert's polygon
-/// formula), so that form factors onto a tiled wall add up to the wall's own; the first
-/// rectangle's area is integrated by quadrature.
+/// The view factor from a point of the first rectangle to the second is exact (Lambert's polygon formula), so that form
+/// factors onto a tiled wall add up to that of the whole wall; the integral over the first rectangle is computed by
+/// quadrature.
 pub(super) fn exchange(opening: f64, first: Rectangle, second: Rectangle) -> f64 {
     let (sin, cos) = opening.sin_cos();
     let corner = |b: f64, x: f64| [x, b * cos, b * sin];
@@ -58,7 +58,7 @@ mod tests {
     use super::*;
     use crate::scene::texture::Dice;
 
-    /// Howell's C-14 with all edges equal: two faces of a cube that share an edge, F = 0.200044.
+    /// Howell's C-14 with all edges equal: two adjacent faces of a cube, F = 0.200044.
     #[test]
     fn adjacent_faces_of_a_cube() {
         let steps = 8;
@@ -93,7 +93,7 @@ mod tests {
         }
     }
 
-    /// Cosine-weighted rays counted on a patch off to the side. 400,000 rays: standard error below 0.0005.
+    /// Counts cosine-weighted rays on an off-centre patch. 400,000 rays: standard error below 0.0005.
     #[test]
     fn rays_agree() {
         let opening = 1.4_f64;
@@ -104,7 +104,7 @@ mod tests {
             let (y, x) = (dice.between(0.2, 1.1), dice.between(0.0, 0.8));
             let (r, phi) = (dice.between(0.0, 1.0).sqrt(), dice.between(0.0, 2.0 * PI));
             let direction = [r * phi.cos(), r * phi.sin(), (1.0 - r * r).sqrt()];
-            // The second plane holds the points with -y sin + z cos = 0.
+            // The second plane consists of the points with -y sin + z cos = 0.
             let towards = -direction[1] * opening.sin() + direction[2] * opening.cos();
             let t = y * opening.sin() / towards;
             let (px, py, pz) = (x + t * direction[0], y + t * direction[1], t * direction[2]);

@@ -1,11 +1,11 @@
 //! `v-groove`: two printed diffuse walls that meet in a horizontal concave edge, so that light
 //! bounces between rows.
 //!
-//! Radiosity over patches: B = Phi + rho H, H = F B, with Phi the first reflection of the projected
-//! light. Patches are fine near the edge and coarser away from it; light is spread from
-//! pixels to patches and read back by the same linear interpolation, which makes transport smooth
-//! in both its rows. Print is averaged over a patch for the bounces and kept sharp where the camera looks.
-//! Neglected: light that leaves and returns from anything but the two walls.
+//! Radiosity over patches: B = Phi + rho H, H = F B, with Phi the first reflection of the projected light. Patches are
+//! fine near the edge and coarser away from it. Light is distributed from pixels to patches, and read back, by the same
+//! linear interpolation, so that the transport is smooth in both of its rows. The print is averaged over a patch for
+//! the bounces and kept sharp where the camera looks. Neglected: light that leaves the walls and returns from anything
+//! else.
 
 use std::f64::consts::PI;
 use std::ops::Range;
@@ -18,17 +18,17 @@ use super::projector::{PatternPart, ProjectorFrame};
 use super::texture::{Dice, printed_page};
 use super::{Direct, Indirect, Object, SceneSize};
 
-/// Largest number of patches along the edge.
+/// Maximum number of patches along the edge.
 const PATCH_COLUMNS: usize = 32;
-/// Patches grow with the distance from the edge at this rate, up to [`LARGEST_PATCH`] of a wall.
+/// Growth rate of patches with the distance from the edge, up to [`LARGEST_PATCH`] of a wall.
 const PATCH_GROWTH: f64 = 0.25;
 const LARGEST_PATCH: f64 = 1.0 / 16.0;
-/// Light left unbounced, relative to the light that bounces.
+/// Light that is left unbounced, as a fraction of the light that bounces.
 const REMAINDER: f64 = 1e-6;
-/// Projector rows that one work item handles; fixed, so that the sums do not depend on the threads.
+/// Projector rows per work item; fixed, so that the sums do not depend on the number of threads.
 const BLOCK_ROWS: usize = 16;
 
-/// One wall: from the edge outwards, patches are numbered `ring * columns + column`.
+/// One wall. Patches are numbered `ring * columns + column`, with rings counted from the edge outwards.
 #[derive(Debug)]
 struct Wall {
     /// Ring boundaries as distances from the edge, in camera rows.
@@ -45,7 +45,7 @@ impl Wall {
         loop {
             let step = (PATCH_GROWTH * at).clamp(1.0, (LARGEST_PATCH * rows).max(1.0));
             at += step;
-            // The last patch takes what would be a sliver.
+            // Avoid a sliver: the last patch is extended instead.
             if rows - at < 0.5 * step {
                 rings.push(rows);
                 break;
@@ -84,25 +84,25 @@ impl Between {
     }
 }
 
-/// The groove's light after its first reflection.
+/// The groove's light after the first reflection.
 #[derive(Debug)]
 struct Bounces {
     /// First camera row of the lower wall.
     edge_row: usize,
-    /// Per camera row its place between rings of its wall, per camera column between patch columns.
+    /// For each camera row, its position between rings of its wall; for each camera column, between patch columns.
     rows: Vec<Between>,
     columns: Vec<Between>,
     patch_columns: usize,
     /// `[receiver, sender]`: form factors onto the upper wall and onto the lower wall.
     onto: [Array2<f32>; 2],
-    /// Per wall, 1 / patch area and pixel area on the wall, in pixels.
+    /// Per wall: 1 / patch area, and pixel area on the wall, in pixels.
     inverse_areas: [Array1<f32>; 2],
     pixel_areas: [f32; 2],
-    /// Per wall `[channel, patch]`: mean albedo.
+    /// Per wall, mean albedo `[channel, patch]`.
     patch_albedo: [Array2<f32>; 2],
-    /// `[row, column, channel]`.
+    /// Albedo `[row, column, channel]`.
     albedo: Array3<f32>,
-    /// First reflection: its value under white light and the projector columns it comes from.
+    /// First reflection: its value under white light and the projector columns that it comes from.
     direct: Direct,
     bounces: usize,
 }
@@ -174,7 +174,7 @@ impl Bounces {
         usize::from(row >= self.edge_row)
     }
 
-    /// Patches that share the pixel (row, column), with their weights (sum 1).
+    /// Patches that share the pixel (row, column), with their weights, which sum to 1.
     fn patches(&self, row: usize, column: usize) -> impl Iterator<Item = (usize, f32)> {
         let (r, c, width) = (self.rows[row], self.columns[column], self.patch_columns);
         (0..4).map(move |k| {
@@ -204,7 +204,7 @@ impl Bounces {
         [mean(upper, &weights[0]), mean(lower, &weights[1])]
     }
 
-    /// Bounces until the geometric bound on the light still under way is below [`REMAINDER`].
+    /// Number of bounces until the geometric bound on the remaining light is below [`REMAINDER`].
     fn bounces_needed(&self) -> usize {
         let kept = [0, 1].map(|w| {
             let received = self.onto[w].sum_axis(Axis(1));
@@ -215,7 +215,7 @@ impl Bounces {
         ((REMAINDER * (1.0 - kept)).ln() / kept.ln()).ceil() as usize
     }
 
-    /// Irradiance `[case, patch]` of both walls after all bounces, from the first exitance `[case, patch]`.
+    /// Irradiance `[case, patch]` on both walls after all bounces, from the initial exitance `[case, patch]`.
     fn irradiance(&self, channel: usize, first: &[Array2<f32>; 2]) -> [Array2<f32>; 2] {
         let receive = |exitance: &[Array2<f32>; 2]| {
             [exitance[1].dot(&self.onto[0].t()), exitance[0].dot(&self.onto[1].t())]
@@ -231,7 +231,7 @@ impl Bounces {
         receive(&exitance)
     }
 
-    /// Spreads the first reflection of one row, lit as `lit` says per column, over its wall's patches.
+    /// Distributes the first reflection of one row, lit per column by `lit`, over its wall's patches.
     fn reflect(
         &self,
         row: usize,
@@ -248,7 +248,7 @@ impl Bounces {
         }
     }
 
-    /// Adds what the camera sees of the `irradiance` of each wall's patches.
+    /// Adds the camera's view of the `irradiance` on each wall's patches.
     fn add_seen(&self, irradiance: [ArrayView1<f32>; 2], channel: usize, image: &mut ArrayViewMut3<f32>) {
         for row in 0..self.rows.len() {
             let on_wall = &irradiance[self.wall_of(row)];
@@ -260,7 +260,7 @@ impl Bounces {
         }
     }
 
-    /// Exitance arrays `[case, patch]` of both walls, all dark.
+    /// Zero exitance arrays `[case, patch]` for both walls.
     fn dark(&self, cases: usize) -> [Array2<f32>; 2] {
         [0, 1].map(|w| Array2::zeros((cases, self.inverse_areas[w].len())))
     }
@@ -268,11 +268,11 @@ impl Bounces {
 
 /// Form factors `[receiver, sender]` onto the upper wall and onto the lower wall.
 ///
-/// Both come from one table of exchange areas, so that reciprocity A_i F_ij = A_j F_ji is exact.
+/// Both are derived from one table of exchange areas, so that reciprocity A_i F_ij = A_j F_ji holds exactly.
 fn form_factors(walls: &[Wall; 2], opening: f64, patch_columns: usize, patch_width: f64) -> [Array2<f32>; 2] {
     let pairs: Vec<(usize, usize)> =
         (0..walls[0].len()).flat_map(|i| (0..walls[1].len()).map(move |j| (i, j))).collect();
-    // The walls look the same from each patch column, so the columns enter by their distance alone.
+    // The walls look the same from each patch column, so only the distance between columns matters.
     let areas: Vec<Vec<f64>> = pairs
         .par_iter()
         .map(|&(i, j)| {

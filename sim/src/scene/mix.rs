@@ -1,6 +1,6 @@
-//! `mix`: the four objects in one picture, each in a quarter of it.
+//! `mix`: all four objects in one image, one per quarter.
 //!
-//! The quarters do not light each other, and each has half of the projector's columns to itself.
+//! The quarters do not illuminate each other, and each uses half of the projector's columns.
 
 use super::{Object, Panel, SceneSize, ball, candle, groove, slab};
 
@@ -19,7 +19,7 @@ pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Vec<Panel> {
                 row: top,
                 column: left,
                 projector_columns: 0.5 * j as f64..0.5 * (j + 1) as f64,
-                // Each quarter has a print of its own.
+                // Each quarter has its own print.
                 object: build(quarter, bands, seed.wrapping_mul(4).wrapping_add((2 * i + j) as u64)),
             });
         }

@@ -1,13 +1,12 @@
 //! Scenes: light transport from projector rows to camera pixels.
 //!
-//! A scene's transport T `[V, H, W, C]` is the image `[H, W, C]` that the camera sees while
-//! projector row v alone is lit, for each of the V rows; C is 1 (mono) or 3 (linear RGB). Top rows
-//! come first. T = 1 is a white Lambertian plane at the reference distance, lit by that row alone
-//! during its dwell, so an image under row weights p is the sum over v of p\[v\] T\[v\]. Camera row
-//! t lies on the epipolar plane of projector row t: direct light is T\[t, t, ..\].
+//! A scene's transport T `[V, H, W, C]` is the image `[H, W, C]` that the camera sees while only projector row v is
+//! lit, for each of the V rows; C is 1 (mono) or 3 (linear RGB). Top rows come first. T = 1 is a white Lambertian plane
+//! at the reference distance, lit by that row alone during its dwell, so the image under row weights p is the sum over
+//! v of p\[v\] T\[v\]. Camera row t lies on the epipolar plane of projector row t: direct light is T\[t, t, ..\].
 //!
-//! Scenes come from files ([`Scene::load`]) or are computed by the project
-//! ([`Scene::builtin`]). Those keep their columns and so answer patterns that change along a row.
+//! Scenes are loaded from files ([`Scene::load`]) or computed ([`Scene::builtin`]). Built-in scenes keep their columns
+//! and can therefore render patterns that vary along a row.
 
 mod ball;
 mod candle;
@@ -36,20 +35,20 @@ pub use motion::{MOVING_NAMES, Motion};
 use projector::{Pattern, PatternPart};
 pub use slab::slab_materials;
 
-/// Names that [`Scene::builtin`] knows.
+/// Names accepted by [`Scene::builtin`].
 pub const BUILTIN_NAMES: [&str; 5] = ["v-groove", "mirror-ball", "slab", "candle", "mix"];
 
-/// Fewest rows and columns of a built-in scene.
+/// Minimum number of rows and columns of a built-in scene.
 pub const MIN_SIDE: usize = 8;
 
-/// Most entries of a built-in scene's transport: 2 GiB of float32, and 720 x 720 x 720 fits in mono.
+/// Maximum number of entries of a built-in scene's transport: 2 GiB of float32; 720 x 720 x 720 fits in mono.
 pub const MAX_ENTRIES: usize = 1 << 29;
 
-/// RGB bands of mono and of colour scenes; mono takes the green coefficients of every medium and print.
+/// RGB bands of mono and colour scenes; mono uses the green coefficients of every medium and print.
 const MONO: &[usize] = &[1];
 const RGB: &[usize] = &[0, 1, 2];
 
-/// Camera rows (as many as projector rows) and camera columns of a built-in scene.
+/// Camera rows (equal to projector rows) and camera columns of a built-in scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SceneSize {
     /// Camera rows, equal to projector rows.
@@ -70,12 +69,12 @@ pub struct Window {
 /// Light transport of a scene under a rectified projector-camera pair; see the [module](self).
 #[derive(Debug)]
 pub struct Scene {
-    /// T `[V, H, W, C]`: finite, not negative.
+    /// T `[V, H, W, C]`: finite and not negative.
     pub transport: Array4<f32>,
-    /// `[H, W]`: projector column 0..1 (left to right) that draws the point a pixel sees, where
-    /// the scene knows it. Pixels that see nothing lit hold any value within 0..1.
+    /// `[H, W]`: projector column 0..1 (left to right) that lights the point a pixel sees, if known. Pixels that see
+    /// nothing lit hold an arbitrary value within 0..1.
     pub projector_column: Option<Array2<f32>>,
-    /// What a built-in scene is made of; empty for scenes given by their rows alone.
+    /// Objects of a built-in scene; empty for scenes defined by row transport only.
     panels: Vec<Panel>,
 }
 
@@ -85,8 +84,8 @@ impl Scene {
     /// [`Scene::projector_column`].
     ///
     /// # Errors
-    /// The file cannot be opened or is damaged; `T` is missing; an array has another type or
-    /// shape; `T` holds a negative or non-finite value.
+    /// When the file cannot be opened or is damaged; when `T` is missing; when an array has another type or shape; when
+    /// `T` holds a negative or non-finite value.
     pub fn load(path: &Path) -> Result<Self, SceneError> {
         npz::load(path)
     }
@@ -99,11 +98,10 @@ impl Scene {
         npz::save(self, path)
     }
 
-    /// A scene given by its row transport `[V, H, W, C]` and, if known, projector columns `[H, W]`.
+    /// Creates a scene from its row transport `[V, H, W, C]` and, if known, projector columns `[H, W]`.
     ///
     /// # Errors
-    /// [`SceneError::Value`] for a negative or non-finite entry, [`SceneError::Layout`] for lengths
-    /// that do not fit together.
+    /// [`SceneError::Value`] for a negative or non-finite entry, [`SceneError::Layout`] for mismatched shapes.
     pub fn from_transport(
         transport: Array4<f32>,
         projector_column: Option<Array2<f32>>,
@@ -113,8 +111,7 @@ impl Scene {
 
     /// Computes a built-in scene in mono: one of [`BUILTIN_NAMES`].
     ///
-    /// The seed varies print, texture and details of the geometry. The result does not depend on
-    /// the number of threads.
+    /// The seed varies print, texture and geometric details. The result does not depend on the number of threads.
     ///
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`].
@@ -122,7 +119,7 @@ impl Scene {
         Self::compute(name, size, MONO, seed, 0.0)
     }
 
-    /// Computes a built-in scene in linear RGB; otherwise as [`Scene::builtin`].
+    /// Like [`Scene::builtin`], in linear RGB.
     ///
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`].
@@ -130,7 +127,8 @@ impl Scene {
         Self::compute(name, size, RGB, seed, 0.0)
     }
 
-    /// `swing` is the place of what moves, from -1 at the left end of its swing to 1; scenes at rest have none.
+    /// `swing` is the position of a moving object, from -1 at the left end of its swing to 1; ignored for scenes at
+    /// rest.
     fn compute(
         name: &str,
         size: SceneSize,
@@ -197,19 +195,19 @@ impl Scene {
         self.transport.len_of(Axis(3))
     }
 
-    /// All camera pixels.
+    /// The window of all camera pixels.
     pub fn full_window(&self) -> Window {
         let (rows, columns) = self.size();
         Window { rows: 0..rows, columns: 0..columns }
     }
 
-    /// Image `[h, w, C]` of a window of camera pixels under `pattern` `[V, columns]`, whose columns
-    /// share the projector's width equally.
+    /// Renders the image `[h, w, C]` of a window of camera pixels under `pattern` `[V, columns]`, whose columns divide
+    /// the projector's width equally.
     ///
     /// # Errors
-    /// [`SceneError::Pattern`] unless the pattern has V rows, some columns and finite values;
-    /// [`SceneError::RowsOnly`] for a pattern that changes along a row under a scene that was
-    /// given by its rows; [`SceneError::Window`] for a window outside the image.
+    /// [`SceneError::Pattern`] unless the pattern has V rows, at least one column and finite values;
+    /// [`SceneError::RowsOnly`] for a pattern that varies along a row when the scene is defined by row transport only;
+    /// [`SceneError::Window`] for a window outside the image.
     pub fn render(&self, pattern: ArrayView2<f32>, window: &Window) -> Result<Array3<f32>, SceneError> {
         let (height, width) = self.size();
         if window.rows.end > height
@@ -237,7 +235,7 @@ impl Scene {
         Ok(image)
     }
 
-    /// Image `[H, W, C]` under any pattern, from what the scene is made of.
+    /// Renders the image `[H, W, C]` under any pattern, from the scene's objects.
     fn render_columns(&self, pattern: ArrayView2<f32>) -> Result<Array3<f32>, SceneError> {
         if self.panels.is_empty() {
             return Err(SceneError::RowsOnly { columns: pattern.ncols() });
@@ -253,13 +251,13 @@ impl Scene {
     }
 }
 
-/// One object of a built-in scene and its place in the image.
+/// One object of a built-in scene and its position in the image.
 #[derive(Debug)]
 struct Panel {
     /// Camera (and projector) row and camera column of the upper left corner.
     row: usize,
     column: usize,
-    /// Stretch of the projector's columns that lights the object.
+    /// Range of projector columns that lights the object.
     projector_columns: Range<f64>,
     object: Object,
 }
@@ -293,7 +291,7 @@ impl Panel {
         self.object.indirect.add_image(pattern, image);
     }
 
-    /// Projector column, of the whole projector, at each pixel's middle.
+    /// Projector column at each pixel's centre, relative to the whole projector.
     fn middle_columns(&self) -> Array2<f32> {
         let (rows, columns, _) = self.object.direct.value.dim();
         let Range { start, end } = self.projector_columns;
@@ -304,24 +302,24 @@ impl Panel {
     }
 }
 
-/// An object as the built-in scenes compute it.
+/// Direct and indirect light of an object of a built-in scene.
 #[derive(Debug)]
 struct Object {
     direct: Direct,
     indirect: Box<dyn Indirect>,
 }
 
-/// Light that comes straight from the projector: row t draws what camera row t sees.
+/// Direct light from the projector: row t lights what camera row t sees.
 #[derive(Debug, Clone)]
 struct Direct {
-    /// `[row, column, channel]` under white light.
+    /// Value under white light, `[row, column, channel]`.
     value: Array3<f32>,
-    /// `[row, column, 2]`: projector columns 0..1 that draw the pixel's left and right border.
+    /// `[row, column, 2]`: projector columns 0..1 at the pixel's left and right border.
     columns: Array3<f32>,
 }
 
 impl Direct {
-    /// No light yet; `column_at(row, x)` is the projector column that draws the point seen at x.
+    /// All dark; `column_at(row, x)` is the projector column that lights the point seen at x.
     fn new(size: SceneSize, channels: usize, column_at: impl Fn(usize, f64) -> f32) -> Self {
         Self {
             value: Array3::zeros((size.rows, size.columns, channels)),
@@ -336,8 +334,8 @@ impl Direct {
     }
 }
 
-/// Light that reaches the camera on any other way. Both answers describe the same light: the
-/// transport of a row equals the image under that row alone.
+/// Light that reaches the camera on any other path. Both methods describe the same light: the transport of a row
+/// equals the image under that row alone.
 trait Indirect: fmt::Debug + Send + Sync {
     /// Adds the image under each row to `transport` `[V, H, W, C]`.
     fn add_transport(&self, transport: ArrayViewMut4<f32>);

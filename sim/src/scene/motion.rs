@@ -1,4 +1,4 @@
-//! Scenes that move: there and back again, as pendulums do.
+//! Moving scenes, which swing back and forth like a pendulum.
 
 use raysweep_core::ns_from_us;
 
@@ -7,19 +7,19 @@ use super::{MAX_ENTRIES, MONO, Scene, SceneError, SceneSize};
 /// Names of the built-in scenes that move.
 pub const MOVING_NAMES: [&str; 2] = ["pendulum", "moving-candle"];
 
-/// Positions from one end of the swing to the other in which a moving scene is computed.
+/// Number of key positions, from one end of the swing to the other, in which a moving scene is computed.
 const KEYS: usize = 16;
 
-/// Which of a scene's key positions is before the camera when. A scene at rest has one.
+/// Maps time to the key positions of a scene. A scene at rest has one.
 #[derive(Debug, Clone, Copy)]
 pub struct Motion {
     keys: usize,
-    /// There and back.
+    /// Full period, there and back.
     period_ns: i64,
 }
 
 impl Motion {
-    /// A motion over `keys` positions, there and back in `period_s`.
+    /// A motion over `keys` positions with a full period of `period_s`.
     pub fn new(keys: usize, period_s: f64) -> Self {
         Self { keys, period_ns: ns_from_us(period_s * 1e6).max(1) }
     }
@@ -33,8 +33,8 @@ impl Motion {
 }
 
 impl Scene {
-    /// A built-in scene in mono, in each of its key positions from one end of its swing to the other: one for those of
-    /// [`super::BUILTIN_NAMES`], more for those of [`MOVING_NAMES`].
+    /// Computes a built-in scene in mono at each of its key positions, from one end of its swing to the other: one for
+    /// [`super::BUILTIN_NAMES`], several for [`MOVING_NAMES`].
     ///
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`], [`SceneError::MovingSize`].
@@ -46,7 +46,7 @@ impl Scene {
         if rows.saturating_mul(rows).saturating_mul(columns).saturating_mul(KEYS) > MAX_ENTRIES {
             return Err(SceneError::MovingSize { rows, columns, keys: KEYS });
         }
-        // The positions are evenly spaced in time: slow at the ends of the swing, fast in its middle.
+        // Key positions are equally spaced in time: the motion is slow at the ends of the swing and fast in the middle.
         let swing = |key: usize| -(std::f64::consts::PI * (key as f64 + 0.5) / KEYS as f64).cos();
         (0..KEYS).map(|key| Self::compute(name, size, MONO, seed, swing(key))).collect()
     }

@@ -1,8 +1,7 @@
 //! Light transport in files: NumPy's `.npz`.
 //!
-//! Arrays: `T` float32 or float64 `[V, H, W]` or `[V, H, W, 3]`, and optionally `proj_uv`
-//! `[H, W, 2]`, the projector coordinate (u right, v down, 0..1) of the point each pixel sees.
-//! Others are ignored.
+//! Arrays: `T` float32 or float64 `[V, H, W]` or `[V, H, W, 3]`, and optionally `proj_uv` `[H, W, 2]`, the projector
+//! coordinate (u right, v down, 0..1) of the point that each pixel sees. Other arrays are ignored.
 
 use std::fs::File;
 use std::io::{BufReader, BufWriter, Write};
@@ -73,12 +72,12 @@ fn read_projector_column(
     })
 }
 
-/// A pixel that sees nothing or a point outside the frame has no direct light to place: any column does.
+/// Replaces invalid columns: a pixel that sees nothing, or a point outside the frame, has no direct light.
 fn usable_column(column: f32) -> f32 {
     if column.is_nan() { 0.5 } else { column.clamp(0.0, 1.0) }
 }
 
-/// Reads float32, or float64 by conversion.
+/// Reads a float32 array, or a float64 array with conversion.
 fn read(
     npz: &mut NpzReader<BufReader<File>>,
     path: &Path,
@@ -110,7 +109,7 @@ pub(super) fn save(scene: &Scene, path: &Path) -> Result<(), SceneError> {
     transport.map_err(failed)?;
     if let Some(column) = &scene.projector_column {
         let (rows, columns) = scene.size();
-        // Rectified: a pixel's direct light comes from the middle of its own row.
+        // Rectified: a pixel's direct light comes from the centre of its own row.
         let uv = Array3::from_shape_fn((rows, columns, 2), |(row, x, axis)| match axis {
             0 => column[[row, x]],
             _ => (row as f32 + 0.5) / scene.rows() as f32,

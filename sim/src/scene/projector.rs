@@ -1,20 +1,19 @@
-//! The rig's geometry as the built-in scenes see it, and patterns as the projector draws them.
+//! Geometry of the rig as used by the built-in scenes, and patterns as drawn by the projector.
 //!
-//! Camera and projector are far away compared with a scene's depth, so both project in parallel:
-//! x right, y down, z towards the camera, all in pixels (one camera column = one row pitch). The
-//! projector stands to the right of the camera, so that a point (x, y, z) is drawn by row y and at
-//! x - z tan(angle) along the row: rectified by construction, with disparity along the rows only.
-//! Neglected: perspective, inverse-square fall-off, defocus.
+//! Camera and projector are distant compared with a scene's depth, so both are modelled as parallel projections: x
+//! right, y down, z towards the camera, all in pixels (one camera column = one row pitch). The projector stands to the
+//! right of the camera; a point (x, y, z) is drawn by row y, at x - z tan(angle) along the row. The pair is therefore
+//! rectified by construction, with disparity along the rows only. Neglected: perspective, inverse-square fall-off,
+//! defocus.
 
 use std::ops::Range;
 
 use ndarray::{Array2, ArrayView2, s};
 
-/// Tangent of the angle between the projector's and the camera's direction \[A\]: a baseline of a
-/// quarter of the distance.
+/// Tangent of the angle between the directions of projector and camera \[A\]: a baseline of a quarter of the distance.
 pub(super) const PROJECTOR_TAN: f64 = 0.25;
 
-/// Millimetres per projector row at the scene \[A\]: a 720-row frame 360 mm high.
+/// Millimetres per projector row at the scene \[A\]: a 720-row frame is 360 mm high.
 pub(super) const ROW_PITCH_MM: f64 = 0.5;
 
 /// Unit vector from the scene towards the projector.
@@ -23,13 +22,13 @@ pub(super) fn to_projector() -> [f64; 3] {
     [PROJECTOR_TAN * cos, 0.0, cos]
 }
 
-/// Cosine of the projector's angle. A fronto-parallel plane receives irradiance 1, a surface with
-/// normal n receives n · [`to_projector`] divided by this cosine.
+/// Cosine of the projector's angle. A fronto-parallel plane receives irradiance 1; a surface with normal n receives
+/// n · [`to_projector`] divided by this cosine.
 pub(super) fn projector_cos() -> f64 {
     1.0 / (1.0 + PROJECTOR_TAN * PROJECTOR_TAN).sqrt()
 }
 
-/// The stretch of the x axis that the projector's columns 0..1 cover.
+/// Section of the x axis covered by the projector's columns 0..1.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ProjectorFrame {
     left_px: f64,
@@ -49,7 +48,7 @@ impl ProjectorFrame {
     }
 }
 
-/// A projected pattern, ready for averages over stretches of a row.
+/// A projected pattern, prepared for averages over sections of a row.
 #[derive(Debug)]
 pub(super) struct Pattern {
     /// `[row, column + 1]`: running sum along each row.
@@ -66,7 +65,7 @@ impl Pattern {
         Self { cumulative }
     }
 
-    /// The part of the pattern that falls on a panel, addressed from the panel's own corner.
+    /// The part of the pattern that falls on a panel, in coordinates relative to the panel's corner.
     pub(super) fn part(&self, rows: Range<usize>, columns: Range<f64>) -> PatternPart<'_> {
         PatternPart { cumulative: self.cumulative.slice(s![rows, ..]), columns }
     }
@@ -80,8 +79,8 @@ pub(super) struct PatternPart<'a> {
 }
 
 impl PatternPart<'_> {
-    /// Mean of the pattern over the projector columns `from..to` (0..1) of a row; a stretch much
-    /// narrower than a column is a point sample.
+    /// Mean of the pattern over the projector columns `from..to` (0..1) of a row; a section much narrower than a column
+    /// is a point sample.
     pub(super) fn mean(&self, row: usize, (from, to): (f32, f32)) -> f32 {
         let count = (self.cumulative.ncols() - 1) as f64;
         let place = |u: f32| {
@@ -109,7 +108,7 @@ mod tests {
     fn mean_weighs_partial_columns() {
         let pattern = Pattern::new(array![[1.0, 0.0, 3.0, 5.0]].view());
         let part = pattern.part(0..1, 0.0..1.0);
-        // Columns 0.5..2.5 hold half of 1, all of 0 and half of 3.
+        // Columns 0.5..2.5 contain half of 1, all of 0 and half of 3.
         assert!((part.mean(0, (0.125, 0.625)) - 1.0).abs() < 1e-6);
         assert_eq!(part.mean(0, (0.6, 0.6)), 3.0);
         assert_eq!(part.mean(0, (1.0, 1.0)), 5.0);

@@ -1,4 +1,4 @@
-//! Quadrature over patches and over the cells between which light diffuses.
+//! Quadrature rules for patches and for cells between which light diffuses.
 
 /// Gauss-Legendre nodes and weights on 0..1.
 pub(super) const GAUSS_2: [(f64, f64); 2] = [(0.211_324_865_405_187_1, 0.5), (0.788_675_134_594_812_9, 0.5)];
@@ -20,13 +20,13 @@ pub(super) const GAUSS_8: [(f64, f64); 8] = [
 ];
 const MIDPOINT: [(f64, f64); 1] = [(0.0, 1.0)];
 
-/// Distances, in cells, below which four and two points are needed: the dipole's profile is as
-/// narrow as a cell, steep near its middle and flat far out.
+/// Distances, in cells, below which four and two points are needed: the dipole's profile is as narrow as a cell, steep
+/// near its centre and flat far away.
 const NEAR_CELLS: f64 = 4.0;
 const MIDDLE_CELLS: f64 = 20.0;
 
-/// Nodes and weights (sum 1) for the mean over the offset between two points, each anywhere in its
-/// own cell of length 1: the offset has a triangular density on -1..1.
+/// Nodes and weights (sum 1) for the mean over the offset between two points, each uniform in its own cell of length 1:
+/// the offset has a triangular density on -1..1.
 pub(super) fn offset_rule(distance_cells: f64) -> &'static [(f64, f64)] {
     const NEAR: [(f64, f64); 8] = triangle(&GAUSS_4);
     const MIDDLE: [(f64, f64); 4] = triangle(&GAUSS_2);

@@ -1,7 +1,7 @@
-//! `slab`: stripes of measured translucent media behind a black frame, flat and facing the camera.
+//! `slab`: stripes of measured translucent media in a black frame, flat and facing the camera.
 //!
-//! Each stripe diffuses light by the dipole of its medium. Light that reaches a stripe's border is
-//! lost in the frame. Scale: 0.5 mm per row at any size, so that profiles of 128 rows and of 720 rows agree.
+//! Each stripe diffuses light according to its medium's dipole. Light that reaches a stripe's border is absorbed by the
+//! frame. Scale: 0.5 mm per row at any size, so that profiles at 128 rows and 720 rows agree.
 
 use std::ops::Range;
 
@@ -15,13 +15,13 @@ use super::texture::noise;
 use super::translucent::Strip;
 use super::{Direct, Object, SceneSize};
 
-/// Matte reflection at the surface \[A\].
+/// Albedo of the matte reflection at the surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.03;
 const FRAME_ALBEDO: f32 = 0.04;
 
 /// Name and camera columns of each medium of the scene `slab`, left to right.
 ///
-/// A scene too narrow for all five media holds the first ones.
+/// A scene too narrow for all five media contains only the first ones.
 pub fn slab_materials(columns: usize) -> Vec<(&'static str, Range<usize>)> {
     stripes(columns).map(|(material, columns)| (material.name, columns)).collect()
 }
@@ -62,7 +62,7 @@ pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Object {
     Object { direct, indirect: Box::new(strips) }
 }
 
-/// Transmittance of the surface, uneven as real ones are: 0.8 to 1.
+/// Uneven transmittance of the surface: 0.8 to 1.
 fn grain(rows: usize, columns: usize, seed: u64) -> Array2<f32> {
     Array2::from_shape_fn((rows, columns), |(y, x)| {
         let (x, y) = (x as f64, y as f64);
@@ -73,7 +73,7 @@ fn grain(rows: usize, columns: usize, seed: u64) -> Array2<f32> {
     })
 }
 
-/// `[lag, camera column, cell]` of a flat medium whose cells are the pixels themselves.
+/// Kernel `[lag, camera column, cell]` of a flat medium whose cells are the pixels themselves.
 fn flat_kernel(dipole: &Dipole, rows: usize, columns: usize) -> Array3<f32> {
     let by_offset: Vec<Vec<f32>> = (0..rows)
         .into_par_iter()
@@ -82,7 +82,7 @@ fn flat_kernel(dipole: &Dipole, rows: usize, columns: usize) -> Array3<f32> {
     Array3::from_shape_fn((rows, columns, columns), |(lag, s, cell)| by_offset[lag][s.abs_diff(cell)])
 }
 
-/// Mean exitance of a pixel per unit irradiance on another, both areas integrated.
+/// Mean exitance of a pixel per unit irradiance on another pixel, integrated over both areas.
 fn pixel_to_pixel(dipole: &Dipole, rows: f64, columns: f64) -> f32 {
     let rule = offset_rule(rows.hypot(columns));
     let mut sum = 0.0;
@@ -99,10 +99,10 @@ fn pixel_to_pixel(dipole: &Dipole, rows: f64, columns: f64) -> f32 {
 mod tests {
     use super::*;
 
-    /// All the light that a wide slab sends back equals the medium's diffuse albedo.
+    /// The total light returned by a wide slab equals the medium's diffuse albedo.
     #[test]
     fn kernel_keeps_the_energy_of_the_dipole() {
-        // Diffuse reflectance of whole milk, ketchup and marble in green from the closed form.
+        // Diffuse reflectance of whole milk, ketchup and marble (green) from the closed form.
         for (material, albedo) in [(&MEASURED[3], 0.88087), (&MEASURED[4], 0.006337), (&MEASURED[0], 0.79096)]
         {
             let dipole = material.dipole(1);

@@ -15,7 +15,7 @@ fn random_pattern(rows: usize, columns: usize, seed: u64) -> Array2<f32> {
     Array2::from_shape_fn((rows, columns), |_| dice.between(0.0, 1.0) as f32)
 }
 
-/// Largest difference, relative to the largest value of `b`.
+/// Largest difference relative to the largest value of `b`.
 fn difference(a: &Array3<f32>, b: &Array3<f32>) -> f32 {
     let largest = b.fold(0.0_f32, |m, &v| m.max(v.abs()));
     (a - b).fold(0.0_f32, |m, &v| m.max(v.abs())) / largest
@@ -41,7 +41,7 @@ fn light_is_finite_and_not_negative_at_any_size() {
     }
 }
 
-/// The two answers of every object, its row transport and its response to a pattern, are one light.
+/// For every object, row transport and response to a pattern agree.
 #[test]
 fn a_row_rendered_alone_is_that_row_of_the_transport() {
     for name in BUILTIN_NAMES {
@@ -69,7 +69,7 @@ fn rendering_is_linear() {
     }
 }
 
-/// Columns 0..k and k.. of the projector, one after the other, are the whole projector.
+/// The images under projector columns 0..k and k.. add up to the image under all columns.
 #[test]
 fn parts_of_the_columns_add_up() {
     for (name, scene) in scenes() {
@@ -84,7 +84,7 @@ fn parts_of_the_columns_add_up() {
     }
 }
 
-/// One column of the projector lights, directly, the pixels that claim it as theirs.
+/// A single projector column lights directly only the pixels assigned to that column.
 #[test]
 fn projector_columns_are_where_direct_light_comes_from() {
     let scene = Scene::builtin("v-groove", SceneSize { rows: 32, columns: 64 }, 1).unwrap();
@@ -137,7 +137,7 @@ fn bits_do_not_depend_on_the_threads() {
     }
 }
 
-/// Shares of the light of a pixel: u = 0, and |u| > 2.
+/// Fractions of a pixel's light at u = 0 and at |u| > 2.
 fn shares(scene: &Scene, row: usize, column: usize) -> (f32, f32) {
     let profile = scene.transport.slice(s![.., row, column, 0]);
     let total = profile.sum();
@@ -169,9 +169,9 @@ fn mirror_ball_has_pixels_with_two_peaks() {
     assert!(count > 40, "{count}");
 }
 
-/// The share of far light falls with the mean free path and with absorption: skim milk scatters
-/// every 0.8 mm, marble every 0.4 mm, whole milk every 0.3 mm; skin absorbs, and ketchup returns
-/// little but its surface's own light.
+/// The fraction of far light decreases with shorter mean free path and with absorption: skim milk scatters every
+/// 0.8 mm, marble every 0.4 mm, whole milk every 0.3 mm; skin absorbs, and ketchup returns little but its surface
+/// reflection.
 #[test]
 fn media_can_be_told_apart_by_their_profiles() {
     let scene = Scene::builtin("slab", SceneSize { rows: 96, columns: 128 }, 1).unwrap();
@@ -185,7 +185,7 @@ fn media_can_be_told_apart_by_their_profiles() {
     assert!(shares(&candle, 60, 66).1 > 0.3);
 }
 
-/// A profile depends on the medium and the rows' pitch, not on how much of the frame the scene fills.
+/// A profile depends on the medium and the row pitch, not on how much of the frame the scene fills.
 #[test]
 fn slab_profiles_do_not_depend_on_the_scene_size() {
     let profile = |rows: usize, seed: u64| {
@@ -195,7 +195,7 @@ fn slab_profiles_do_not_depend_on_the_scene_size() {
         far.into_iter().map(|value| value / total).collect::<Array1<f32>>()
     };
     let off = (profile(32, 1) - profile(160, 1)).fold(0.0_f32, |m, v| m.max(v.abs()));
-    // The uneven surface is another one at another size.
+    // The uneven surface differs between sizes.
     assert!(off < 0.02, "{off}");
 }
 

@@ -11,7 +11,7 @@ const INK: [f32; 3] = [0.09, 0.09, 0.10];
 const TEXT_ROWS: usize = 3;
 const LINE_PITCH_ROWS: usize = 5;
 
-/// Source of the seeded choices of one scene.
+/// Source of one scene's seeded random choices.
 pub(super) struct Dice(Xoshiro256PlusPlus);
 
 impl Dice {
@@ -79,7 +79,7 @@ fn print_line(page: &mut Array3<f32>, row: usize, columns: std::ops::Range<usize
     }
 }
 
-/// Hills under a sky with a sun.
+/// Paints hills under a sky with a sun.
 fn paint_picture(
     page: &mut Array3<f32>,
     rows: std::ops::Range<usize>,
@@ -122,7 +122,7 @@ pub(crate) fn noise(seed: u64, x: f64, y: f64) -> f64 {
     top + fy * (bottom - top)
 }
 
-/// SplitMix64's finaliser over the lattice point: a value that needs no stored table.
+/// SplitMix64's finaliser applied to the lattice point: random values without a stored table.
 fn lattice(seed: u64, x: i64, y: i64) -> f64 {
     let mut z = seed
         .wrapping_add((x as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15))

@@ -1,4 +1,4 @@
-//! Light that enters a translucent body in one place and leaves it in another.
+//! Light that enters a translucent body at one point and leaves it at another.
 
 use ndarray::{Array2, Array3, ArrayViewMut2, ArrayViewMut3, ArrayViewMut4, Axis, Zip, s};
 use rayon::prelude::*;
@@ -6,25 +6,25 @@ use rayon::prelude::*;
 use super::Indirect;
 use super::projector::PatternPart;
 
-/// Projector rows that one work item handles; fixed, so that the sums do not depend on the threads.
+/// Projector rows per work item; fixed, so that the sums do not depend on the number of threads.
 const BLOCK_ROWS: usize = 16;
-/// Lags whose images are summed by one work item; fixed for the same reason.
+/// Lags per work item, whose images are summed; fixed for the same reason.
 const BLOCK_LAGS: usize = 32;
 
-/// A body that looks the same from each of its rows (a slab's stripe, a vertical cylinder), so
-/// that its diffusion depends on rows by their lag alone.
+/// A body with the same cross-section at each of its rows (a slab's stripe, a vertical cylinder), so that diffusion
+/// depends only on the lag between rows.
 #[derive(Debug)]
 pub(super) struct Strip {
     /// First camera column of the body.
     pub(super) column: usize,
-    /// Per channel `[lag, camera column, cell]`: exitance of a pixel, lag rows away from the row of
-    /// a cell, per irradiance entering that cell.
+    /// Per channel `[lag, camera column, cell]`: exitance of a pixel, lag rows away from a cell's row, per irradiance
+    /// entering that cell.
     pub(super) kernel: Vec<Array3<f32>>,
     /// `[row, cell]`: irradiance that enters a cell of the lit surface under white light.
     pub(super) entry: Array2<f32>,
-    /// Projector columns (0..1) that draw each cell.
+    /// Projector columns (0..1) that light each cell.
     pub(super) cell_columns: Vec<(f32, f32)>,
-    /// `[row, camera column]`: share of the exitance that reaches the camera.
+    /// `[row, camera column]`: fraction of the exitance that reaches the camera.
     pub(super) exit: Array2<f32>,
 }
 

@@ -23,7 +23,7 @@ pub(super) fn length(a: Vector) -> f64 {
     dot(a, a).sqrt()
 }
 
-/// `direction` after a plane mirror with the unit `normal`.
+/// Reflects `direction` at a plane mirror with the unit `normal`.
 pub(super) fn reflect(direction: Vector, normal: Vector) -> Vector {
     plus(direction, normal, -2.0 * dot(direction, normal))
 }

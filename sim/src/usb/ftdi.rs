@@ -1,7 +1,7 @@
 //! A USB serial converter (FT232BM) whose DCD input carries a VSYNC.
 //!
-//! Each incoming packet begins with two bytes, the state of the modem lines and of the line. The chip sends one
-//! when a modem line has changed and, without a change, each time its latency timer expires.
+//! Each incoming packet starts with two bytes: modem status and line status. The chip sends a packet when a modem line
+//! has changed and, without a change, each time its latency timer expires.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -10,12 +10,12 @@ use std::time::{Duration, Instant};
 use super::{Identity, Request, Speed, Stall, UsbDevice};
 
 const LATENCY: Duration = Duration::from_millis(16);
-/// Modem state: a reserved bit that is always set, and DCD.
+/// Modem status: a reserved bit that is always set, and DCD.
 const MODEM_IDLE: u8 = 0x01;
 const MODEM_DCD: u8 = 0x80;
-/// Line state: transmitter empty.
+/// Line status: transmitter empty.
 const LINE_IDLE: u8 = 0x60;
-/// Vendor requests that are answered with data.
+/// Vendor requests that return data.
 const GET_MODEM_STATUS: u8 = 5;
 const GET_LATENCY_TIMER: u8 = 10;
 
@@ -30,7 +30,7 @@ pub struct Ftdi {
     line: FtdiLine,
 }
 
-/// What the test holds of the converter's DCD line.
+/// The test's handle to the converter's DCD line.
 #[derive(Clone, Default)]
 pub struct FtdiLine {
     pulses: Arc<AtomicU64>,
@@ -39,17 +39,17 @@ pub struct FtdiLine {
 }
 
 impl FtdiLine {
-    /// Pulses whose beginning the host has been told of.
+    /// Number of pulses whose start has been reported to the host.
     pub fn pulses(&self) -> u64 {
         self.pulses.load(Ordering::Relaxed)
     }
 
-    /// What the host was last told of the line.
+    /// State of the line last reported to the host.
     pub fn is_asserted(&self) -> bool {
         self.asserted.load(Ordering::Relaxed)
     }
 
-    /// Pulses come from now on; before, the line is clear.
+    /// Starts the pulses; until then the line is clear.
     pub fn start(&self) {
         self.toggles.store(true, Ordering::Relaxed);
     }
@@ -91,7 +91,7 @@ impl UsbDevice for Ftdi {
                 Ok(vec![MODEM_IDLE | if self.is_asserted() { MODEM_DCD } else { 0 }, LINE_IDLE])
             }
             GET_LATENCY_TIMER => Ok(vec![LATENCY.as_millis() as u8]),
-            // Baud rate, flow control and the like change nothing here.
+            // Baud rate, flow control and the like have no effect here.
             _ if !request.is_in() => Ok(Vec::new()),
             _ => Err(Stall),
         }

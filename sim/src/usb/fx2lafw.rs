@@ -1,4 +1,4 @@
-//! A logic analyser with sigrok's firmware fx2lafw, and the same chip before it has any.
+//! A logic analyser with sigrok's firmware fx2lafw, and the same chip without firmware.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -10,30 +10,30 @@ use raysweep_core::Clock;
 use super::{Identity, Request, Speed, Stall, UsbDevice};
 use crate::keyed::{Purpose, keyed, uniform};
 
-/// What lies on the analyser's inputs, on the host's clock: a VSYNC on input 0, whose edges stand on the multiples of its
-/// period like those of the simulated line, and the exposure of a camera that it triggers on input 1.
+/// Signals on the analyser's inputs, timed by the host's clock: a VSYNC on input 0, whose edges lie on multiples of its
+/// period like those of the simulated line, and on input 1 the exposures of a camera that it triggers.
 #[derive(Debug, Clone, Copy)]
 pub struct Signal {
-    /// Seeds what is random.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Of the VSYNC.
+    /// Period of the VSYNC.
     pub period_ns: i64,
-    /// How long it is high.
+    /// Pulse length of the VSYNC.
     pub pulse_ns: i64,
-    /// Standard deviation of its edges.
+    /// Standard deviation of the VSYNC edges.
     pub jitter_ns: f64,
-    /// Share of edges that are missing.
+    /// Fraction of edges that are missing.
     pub missing: f64,
-    /// Share of periods with a false pulse.
+    /// Fraction of periods with a false pulse.
     pub false_edges: f64,
-    /// From an edge to the start of an exposure.
+    /// Time from an edge to the start of an exposure.
     pub exposure_after_ns: i64,
-    /// How long the exposure is.
+    /// Exposure time.
     pub exposure_ns: i64,
 }
 
 impl Signal {
-    /// The pulse of a period, if it is not missing, and a false one: when they begin.
+    /// Start times of a period's pulse, unless it is missing, and of its false pulse, if any.
     pub fn edges(&self, period: i64) -> [Option<i64>; 2] {
         let mut random = keyed(self.seed, Purpose::Line, &[period.unsigned_abs()]);
         let z: f64 = StandardNormal.sample(&mut random);
@@ -41,12 +41,12 @@ impl Signal {
         let false_edge = uniform(&mut random) < self.false_edges;
         let nominal_ns = period * self.period_ns;
         let at = |share: f64| nominal_ns + (share * self.period_ns as f64) as i64;
-        // Between two exposures' ends and the next true edge there is room for a false pulse.
+        // A false pulse fits between the end of the exposure and the next true edge.
         let false_ns = at(0.3 + 0.5 * uniform(&mut random));
         [present.then_some(nominal_ns + (z * self.jitter_ns) as i64), false_edge.then_some(false_ns)]
     }
 
-    /// The samples from `first_ns` on, `step_ns` apart.
+    /// Writes the samples from `first_ns` on, `step_ns` apart.
     pub fn samples(&self, first_ns: f64, step_ns: f64, samples: &mut [u8]) {
         samples.fill(0);
         let end_ns = first_ns + step_ns * samples.len() as f64;
@@ -69,7 +69,7 @@ pub struct Fx2Lafw {
     identity: Identity,
     signal: Signal,
     clock: Clock,
-    /// By how much its clock is slow.
+    /// How slow its clock is, in parts per million.
     rate_ppm: f64,
     running: Option<Sampling>,
     faults: Fx2Faults,
@@ -81,7 +81,7 @@ struct Sampling {
     taken: u64,
 }
 
-/// What a test does to the analyser.
+/// Faults that a test injects into the analyser.
 #[derive(Clone, Default)]
 pub struct Fx2Faults {
     stalled: Arc<AtomicBool>,
@@ -90,24 +90,24 @@ pub struct Fx2Faults {
 }
 
 impl Fx2Faults {
-    /// The samples' endpoint halts until the host clears it.
+    /// Halts the sample endpoint until the host clears it.
     pub fn stall(&self) {
         self.stalled.store(true, Ordering::Relaxed);
     }
 
-    /// The analyser stops sampling, as one does whose host was too slow, until it is started again.
+    /// Stops sampling until restarted, as after an overrun when the host is too slow.
     pub fn overrun(&self) {
         self.overrun.store(true, Ordering::Relaxed);
     }
 
-    /// How often sampling was started.
+    /// Number of times sampling was started.
     pub fn starts(&self) -> u64 {
         self.starts.load(Ordering::Relaxed)
     }
 }
 
 impl Fx2Lafw {
-    /// An analyser that looks at a signal.
+    /// An analyser of a signal.
     pub fn new(signal: Signal, rate_ppm: f64) -> (Self, Fx2Faults) {
         let identity = Identity {
             speed: Speed::High,
@@ -170,13 +170,14 @@ impl UsbDevice for Fx2Lafw {
     }
 }
 
-/// The chip's own loader: it takes a firmware and, let go, leaves the bus; the test then plugs an [`Fx2Lafw`] in.
+/// The chip's boot loader: it accepts a firmware and leaves the bus when started; the test then plugs in an
+/// [`Fx2Lafw`].
 pub struct Fx2Blank {
     identity: Identity,
     memory: Fx2Memory,
 }
 
-/// What was loaded.
+/// The firmware loaded so far.
 #[derive(Clone, Default)]
 pub struct Fx2Memory {
     bytes: Arc<Mutex<BTreeMap<u16, u8>>>,
@@ -184,20 +185,20 @@ pub struct Fx2Memory {
 }
 
 impl Fx2Memory {
-    /// The first `len` bytes; those never written are zero.
+    /// The first `len` bytes; bytes never written are zero.
     pub fn image(&self, len: u16) -> Vec<u8> {
         let bytes = self.bytes.lock().unwrap_or_else(PoisonError::into_inner);
         (0..len).map(|address| bytes.get(&address).copied().unwrap_or(0)).collect()
     }
 
-    /// Whether the processor was let go.
+    /// Whether the processor was started.
     pub fn is_started(&self) -> bool {
         self.started.load(Ordering::Relaxed)
     }
 }
 
 impl Fx2Blank {
-    /// A clone as it is sold.
+    /// A clone of the analyser as sold, without firmware.
     pub fn new() -> (Self, Fx2Memory) {
         let identity = Identity {
             speed: Speed::High,

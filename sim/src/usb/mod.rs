@@ -1,5 +1,5 @@
-//! Simulated USB devices that the kernel's own drivers, or libusb, talk to: over USB/IP through `vhci-hcd`, without a
-//! network. Plugging one in takes root and that kernel module, which the kernel guest (`cargo xtask guest`) has.
+//! Simulated USB devices for the kernel's own drivers, or libusb: over USB/IP through `vhci-hcd`, without a network.
+//! Plugging one in requires root and that kernel module, which the kernel guest (`cargo xtask guest`) provides.
 
 mod ftdi;
 mod fx2lafw;
@@ -11,7 +11,7 @@ pub use fx2lafw::{Fx2Blank, Fx2Faults, Fx2Lafw, Fx2Memory, Signal};
 pub use responder::respond;
 pub use vhci::Plugged;
 
-/// The answer to what a device does not know or cannot do: the endpoint stalls.
+/// The endpoint stalls: the answer to requests that a device does not know or cannot perform.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stall;
 
@@ -26,12 +26,12 @@ pub struct Request {
     pub value: u16,
     /// `wIndex`.
     pub index: u16,
-    /// Bytes that follow, or that are wanted.
+    /// Number of bytes that follow or are requested.
     pub length: u16,
 }
 
 impl Request {
-    /// Whether the device answers with data.
+    /// Whether the device returns data.
     pub fn is_in(&self) -> bool {
         self.kind & 0x80 != 0
     }
@@ -39,32 +39,32 @@ impl Request {
 
 /// A device with one vendor-specific interface of bulk endpoints. The responder answers standard requests.
 pub trait UsbDevice: Send {
-    /// What it says it is; constant while it is plugged in.
+    /// The device's descriptors; constant while it is plugged in.
     fn identity(&self) -> &Identity;
 
-    /// A vendor's or class's request, with the data of an outgoing one; returns the data of an incoming one.
+    /// Handles a vendor or class request, with the data of an outgoing one; returns the data of an incoming one.
     ///
     /// # Errors
-    /// If the device does not know the request.
+    /// When the device does not know the request.
     fn control(&mut self, request: &Request, data: &[u8]) -> Result<Vec<u8>, Stall>;
 
-    /// At most `room` bytes for the host from an endpoint; `None` while there are none. Asked every millisecond.
+    /// Returns at most `room` bytes for the host from an endpoint, `None` if there are none. Polled every millisecond.
     ///
     /// # Errors
-    /// If the endpoint has halted.
+    /// When the endpoint is halted.
     fn bulk_in(&mut self, endpoint: u8, room: usize) -> Option<Result<Vec<u8>, Stall>>;
 
-    /// Bytes from the host to an endpoint.
+    /// Handles bytes from the host to an endpoint.
     ///
     /// # Errors
-    /// If the endpoint has halted.
+    /// When the endpoint is halted.
     fn bulk_out(&mut self, endpoint: u8, data: &[u8]) -> Result<(), Stall>;
 
-    /// The host has cleared an endpoint that may have halted.
+    /// The host has cleared an endpoint that may be halted.
     fn clear_halt(&mut self, _endpoint: u8) {}
 }
 
-/// How fast a device is, as Linux numbers it.
+/// Speed of a device, numbered as in Linux.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Speed {
     /// 12 Mbit/s.
@@ -73,7 +73,7 @@ pub enum Speed {
     High = 3,
 }
 
-/// What descriptors are made of.
+/// Contents of the descriptors.
 #[derive(Debug, Clone)]
 pub struct Identity {
     /// Full or high speed.
@@ -82,16 +82,16 @@ pub struct Identity {
     pub vendor: u16,
     /// `idProduct`.
     pub product: u16,
-    /// `bcdDevice`: by it, drivers tell chips apart.
+    /// `bcdDevice`, by which drivers tell chips apart.
     pub release: u16,
     /// Manufacturer, product, serial number.
     pub strings: [&'static str; 3],
-    /// Addresses of the bulk endpoints: bit 7 is set for those towards the host.
+    /// Addresses of the bulk endpoints; bit 7 is set for IN endpoints.
     pub endpoints: Vec<u8>,
 }
 
 impl Identity {
-    /// A descriptor by its type and index (USB 2.0, section 9.6).
+    /// Returns a descriptor by its type and index (USB 2.0, section 9.6).
     fn descriptor(&self, kind: u8, index: u8) -> Result<Vec<u8>, Stall> {
         match kind {
             1 => Ok(self.device_descriptor()),
@@ -111,7 +111,7 @@ impl Identity {
     fn configuration_descriptor(&self) -> Vec<u8> {
         let total = 9 + 9 + 7 * self.endpoints.len() as u16;
         let [low, high] = total.to_le_bytes();
-        // Self-described as bus-powered with 100 mA.
+        // Declared as bus-powered, 100 mA.
         let mut bytes = vec![9, 2, low, high, 1, 1, 0, 0x80, 50];
         bytes.extend([9, 4, 0, 0, self.endpoints.len() as u8, 0xff, 0xff, 0xff, 2]);
         let [low, high] = self.packet_len().to_le_bytes();
@@ -131,7 +131,7 @@ impl Identity {
         Ok(head.into_iter().chain(units.iter().flat_map(|unit| unit.to_le_bytes())).collect())
     }
 
-    /// The largest packet of a bulk endpoint.
+    /// Maximum packet size of a bulk endpoint.
     fn packet_len(&self) -> u16 {
         match self.speed {
             Speed::Full => 64,

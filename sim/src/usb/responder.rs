@@ -1,5 +1,5 @@
-//! The device's end of USB/IP: transfers come as messages, and each is answered once. An incoming bulk transfer without
-//! data waits, so that the host may cancel it, as real transfers do.
+//! The device's side of USB/IP: transfers arrive as messages, and each is answered once. An incoming bulk transfer
+//! waits until there is data, so that the host can cancel it, like a real transfer.
 //!
 //! The protocol is the kernel's `Documentation/usb/usbip_protocol.rst`; all fields are big-endian words.
 
@@ -15,24 +15,24 @@ use super::{Request, Stall, UsbDevice};
 
 const SUBMIT: u32 = 1;
 const UNLINK: u32 = 2;
-/// Answers have the number of what they answer plus two.
+/// The command code of an answer is that of its request plus this.
 const ANSWER: u32 = 2;
-/// A host that asks for more than a transfer can be has lost its place in the stream.
+/// Maximum transfer length; a host that asks for more has lost its place in the stream.
 const TRANSFER_MAX: u32 = 1 << 24;
-/// How long a device that has just had nothing to say is left in peace.
+/// Poll interval for a device that had no data.
 const TICK_MS: u8 = 1;
 
-/// An incoming bulk transfer that waits for data.
+/// An incoming bulk transfer waiting for data.
 struct Parked {
     seqnum: u32,
     endpoint: u8,
     room: usize,
 }
 
-/// Serves a device until the host unplugs it, which closes the stream.
+/// Serves a device until the host unplugs it by closing the stream.
 ///
 /// # Errors
-/// If the stream breaks or the host does not speak USB/IP.
+/// When the stream breaks or the host does not speak USB/IP.
 pub fn respond(device: &mut dyn UsbDevice, mut host: UnixStream) -> io::Result<()> {
     let mut parked = VecDeque::new();
     loop {
@@ -42,7 +42,7 @@ pub fn respond(device: &mut dyn UsbDevice, mut host: UnixStream) -> io::Result<(
             Err(Errno::EINTR) => false,
             Err(errno) => return Err(errno.into()),
         };
-        // What the device has said by now comes before the answer to a question of now, as on the bus.
+        // Data that the device already has are sent before the answer to a new request, as on the bus.
         serve(device, &mut parked, &mut host)?;
         if asked {
             let Some(message) = Message::read(&mut host)? else { return Ok(()) };
@@ -51,30 +51,30 @@ pub fn respond(device: &mut dyn UsbDevice, mut host: UnixStream) -> io::Result<(
     }
 }
 
-/// A message of the host.
+/// A message from the host.
 struct Message {
     command: u32,
     seqnum: u32,
     is_in: bool,
     endpoint: u8,
-    /// Of a submit: bytes to move. Of an unlink: number of the transfer.
+    /// Submit: number of bytes to transfer. Unlink: number of the transfer to cancel.
     argument: u32,
     setup: Request,
     data: Vec<u8>,
 }
 
 impl Message {
-    /// The next message; `None` at the end of the stream.
+    /// Reads the next message; `None` at the end of the stream.
     fn read(host: &mut UnixStream) -> io::Result<Option<Self>> {
         let mut head = [0; 48];
         if let Err(error) = host.read_exact(&mut head) {
             return if error.kind() == io::ErrorKind::UnexpectedEof { Ok(None) } else { Err(error) };
         }
         let word = |at: usize| u32::from_be_bytes([head[at], head[at + 1], head[at + 2], head[at + 3]]);
-        // The setup packet stands in the stream as it does on the bus: little-endian.
+        // The setup packet is in the stream as on the bus: little-endian.
         let half = |at: usize| u16::from_le_bytes([head[at], head[at + 1]]);
         let (command, is_in) = (word(0), word(12) == 1);
-        // An unlink names its transfer where a submit has its flags.
+        // In an unlink, the transfer's number takes the place of a submit's flags.
         let argument = if command == UNLINK { word(20) } else { word(24) };
         let strange = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
         let mut data = Vec::new();
@@ -105,7 +105,7 @@ fn answer(
     if command == UNLINK {
         let waited = parked.len();
         parked.retain(|transfer| transfer.seqnum != argument);
-        // What was answered before cannot be cancelled, which zero says.
+        // A transfer that was already answered cannot be cancelled; status zero says so.
         let status = if parked.len() < waited { -(Errno::ECONNRESET as i32) } else { 0 };
         return send(host, UNLINK, seqnum, status, 0, &[]);
     }
@@ -124,7 +124,7 @@ fn answer(
     complete(host, seqnum, device.bulk_out(endpoint, &data).map(|()| Vec::new()), data.len())
 }
 
-/// Answers incoming transfers while the device has data; those of one endpoint in the order in which they came.
+/// Answers incoming transfers while the device has data; those of one endpoint in the order of their arrival.
 fn serve(device: &mut dyn UsbDevice, parked: &mut VecDeque<Parked>, host: &mut UnixStream) -> io::Result<()> {
     let mut dry = 0_u16;
     let mut next = 0;
@@ -143,7 +143,7 @@ fn serve(device: &mut dyn UsbDevice, parked: &mut VecDeque<Parked>, host: &mut U
     Ok(())
 }
 
-/// Standard requests, which all devices answer alike, and the others, which go to the device.
+/// Answers standard requests, which are the same for all devices; passes all others to the device.
 fn control(device: &mut dyn UsbDevice, setup: &Request, data: &[u8]) -> Result<Vec<u8>, Stall> {
     let [index, kind] = setup.value.to_le_bytes();
     match (setup.kind, setup.request) {
@@ -152,19 +152,19 @@ fn control(device: &mut dyn UsbDevice, setup: &Request, data: &[u8]) -> Result<V
         (0x80..=0x82, 0) => Ok(vec![0, 0]),
         (0x80, 8) => Ok(vec![1]),
         (0x81, 10) => Ok(vec![0]),
-        // CLEAR_FEATURE of an endpoint, whose one feature is that it has halted.
+        // CLEAR_FEATURE of an endpoint, whose only feature is ENDPOINT_HALT.
         (0x02, 1) => {
             device.clear_halt(setup.index as u8);
             Ok(Vec::new())
         }
-        // CLEAR_FEATURE, SET_CONFIGURATION, SET_INTERFACE: there is but one of each.
+        // CLEAR_FEATURE, SET_CONFIGURATION, SET_INTERFACE: there is only one of each.
         (0x00..=0x02, 1 | 9 | 11) => Ok(Vec::new()),
         (kind, _) if kind & 0x60 == 0 => Err(Stall),
         _ => device.control(setup, data),
     }
 }
 
-/// Answers a transfer: with data that go in, or with how many bytes went out.
+/// Answers a transfer: with the data read, or with the number of bytes written.
 fn complete(
     host: &mut UnixStream,
     seqnum: u32,
@@ -201,7 +201,7 @@ mod tests {
     use crate::usb::{Identity, Speed};
     use std::time::Duration;
 
-    /// Gives back on 0x81 what it was sent on 0x02, stalls on 0x03.
+    /// Returns on 0x81 what was sent to 0x02; stalls on 0x03.
     struct Echo {
         identity: Identity,
         bytes: Vec<u8>,
@@ -235,7 +235,7 @@ mod tests {
         words.chain(setup).chain(data.iter().copied()).collect()
     }
 
-    /// Command, number, status, length.
+    /// Reads a reply: command, number, status, length.
     fn reply(host: &mut UnixStream) -> ([u32; 4], Vec<u8>) {
         let mut head = [0; 48];
         host.read_exact(&mut head).unwrap();
@@ -246,7 +246,7 @@ mod tests {
         ([word(0), word(4), word(20), word(24)], data)
     }
 
-    /// Odd numbers stand for incoming transfers, so that the test knows which answers carry data.
+    /// Odd numbers denote incoming transfers, so that the test knows which answers carry data.
     #[test]
     fn transfers_are_answered_once_in_order_and_can_be_cancelled() {
         let (mut host, end) = UnixStream::pair().unwrap();

@@ -1,4 +1,4 @@
-//! Plugging into the kernel's virtual host controller.
+//! Plugs devices into the kernel's virtual host controller.
 
 use std::fs;
 use std::io;
@@ -9,10 +9,10 @@ use std::thread::JoinHandle;
 use super::{UsbDevice, respond};
 
 const CONTROLLER: &str = "/sys/devices/platform/vhci_hcd.0";
-/// Any number but zero; the kernel passes it back in each message.
+/// Any nonzero number; the kernel repeats it in each message.
 const DEVICE_ID: u32 = 1;
 
-/// A device that is plugged in; dropping it unplugs it.
+/// A plugged-in device; dropping it unplugs it.
 pub struct Plugged {
     port: u32,
     responder: Option<JoinHandle<io::Result<()>>>,
@@ -22,14 +22,14 @@ impl Plugged {
     /// Plugs a device into a free port. The kernel then enumerates it.
     ///
     /// # Errors
-    /// Without the module `vhci-hcd`, without a free port, or if not permitted.
+    /// When the module `vhci-hcd` or a free port is missing, or without permission.
     pub fn new(mut device: impl UsbDevice + 'static) -> io::Result<Self> {
         let status = fs::read_to_string(format!("{CONTROLLER}/status"))?;
         let port = free_port(&status).ok_or_else(|| io::Error::other("vhci-hcd: no free port"))?;
         let (near, far) = UnixStream::pair()?;
         let attach = format!("{port} {} {DEVICE_ID} {}", far.as_raw_fd(), device.identity().speed as u8);
         fs::write(format!("{CONTROLLER}/attach"), attach)?;
-        // The kernel has taken its own hold of the far end, so ours goes.
+        // The kernel holds its own reference to the far end, so ours can be closed.
         drop(far);
         let responder = std::thread::Builder::new()
             .name("usb-device".into())
@@ -40,8 +40,8 @@ impl Plugged {
 
 impl Drop for Plugged {
     fn drop(&mut self) {
-        // The kernel closes the stream on detaching, and the responder ends. If it has given up before, there is
-        // nothing to detach.
+        // On detach the kernel closes the stream, which ends the responder. If the kernel has already given up, there
+        // is nothing to detach.
         let _ = fs::write(format!("{CONTROLLER}/detach"), self.port.to_string());
         if let Some(responder) = self.responder.take() {
             let _ = responder.join();
@@ -49,7 +49,7 @@ impl Drop for Plugged {
     }
 }
 
-/// A free port of the high-speed hub, in the table `hub port sta ...` that the controller shows.
+/// Finds a free port of the high-speed hub in the controller's status table, `hub port sta ...`.
 fn free_port(status: &str) -> Option<u32> {
     const FREE: &str = "004";
     status.lines().find_map(|line| match line.split_whitespace().collect::<Vec<_>>().as_slice() {

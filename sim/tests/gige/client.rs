@@ -1,4 +1,4 @@
-//! A client of GigE Vision cameras, just large enough for these tests and written against the standard, not the camera.
+//! A minimal client of GigE Vision cameras for these tests, written against the standard, not against the camera.
 
 use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
@@ -11,13 +11,13 @@ pub struct Client {
     stream: UdpSocket,
     camera: SocketAddr,
     next_id: u16,
-    /// Register addresses by feature, from the description.
+    /// Register addresses by feature name, from the description.
     addresses: BTreeMap<String, u32>,
-    /// Packets of frames that are not yet whole.
+    /// Packets of incomplete frames.
     parts: BTreeMap<u16, BTreeMap<u32, Vec<u8>>>,
-    /// How often each packet came.
+    /// How often each packet was received.
     pub received: BTreeMap<(u16, u32), u32>,
-    /// Whether to ask for packets that are missing.
+    /// Whether to request missing packets.
     pub resend: bool,
 }
 
@@ -29,7 +29,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// A chunk's eight bytes.
+    /// Value of an eight-byte chunk.
     pub fn chunk(&self, id: u32) -> u64 {
         let mut end = self.payload.len();
         loop {
@@ -45,7 +45,7 @@ impl Frame {
 }
 
 impl Client {
-    /// Takes control of the camera and tells it where to send.
+    /// Takes control of the camera and sets the stream's destination.
     pub fn open(address: Ipv4Addr) -> Self {
         let bind = || {
             let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
@@ -92,7 +92,7 @@ impl Client {
         }
     }
 
-    /// Status and data of the answer.
+    /// Sends a command; returns status and data of the answer.
     fn ask(&mut self, command: u16, data: &[u8]) -> (u16, Vec<u8>) {
         let id = self.next_id;
         self.next_id += 1;
@@ -114,7 +114,7 @@ impl Client {
         panic!("no answer to {command:#x}");
     }
 
-    /// Whether the camera says anything at all, for as long as `patience`.
+    /// Whether the camera answers within `patience`.
     pub fn is_answered(&mut self, patience: Duration) -> bool {
         self.control.send_to(&[0x42, 1, 0, 2, 0, 0, 0xFF, 0xFF], self.camera).unwrap();
         let deadline = Instant::now() + patience;
@@ -162,7 +162,7 @@ impl Client {
         u32::from_be_bytes(*self.read(address, 4).first_chunk().unwrap())
     }
 
-    /// Asks for packets, from the socket that receives them.
+    /// Requests packets, from the receiving socket.
     pub fn ask_again(&self, block: u16, first: u32, last: u32) {
         let mut datagram = vec![0x42, 0, 0, 0x40, 0, 12, 0, 1];
         for word in [u32::from(block), first, last] {
@@ -171,7 +171,7 @@ impl Client {
         self.stream.send_to(&datagram, self.camera).unwrap();
     }
 
-    /// One packet: status, block, kind, number, data.
+    /// Receives one packet: status, block, kind, number, data.
     pub fn packet(&mut self) -> Option<(u16, u16, u8, u32, Vec<u8>)> {
         let mut datagram = vec![0; 65_536];
         let bytes = self.stream.recv(&mut datagram).ok()?;
@@ -180,15 +180,15 @@ impl Client {
         Some((word(0), word(2), datagram[4], packet, datagram[8..bytes].to_vec()))
     }
 
-    /// The next frame that is whole; `None` when the camera falls silent.
+    /// Receives the next complete frame; `None` if the camera falls silent.
     pub fn frame(&mut self) -> Option<Frame> {
         let mut silent = Instant::now();
-        // Last packets by block, where the trailer told.
+        // Number of the last packet by block, where the trailer has arrived.
         let mut last = BTreeMap::new();
         while silent.elapsed() < Duration::from_millis(1500) {
             let Some((status, block, kind, packet, data)) = self.packet() else {
                 if self.resend {
-                    // What was left unfinished ended unheard.
+                    // The trailers of incomplete frames were lost, so request all their packets.
                     self.parts.keys().for_each(|block| self.ask_again(*block, 0, 0xFF_FFFF));
                 }
                 continue;

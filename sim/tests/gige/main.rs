@@ -1,4 +1,4 @@
-//! The simulated camera on real sockets: its pictures to the bit, its faults, and the bench beside it.
+//! The simulated camera on real sockets: bit-exact pictures, faults, and the bench socket.
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
@@ -26,7 +26,7 @@ const ROW_TIME_US: f64 = 20.0;
 const LATENCY_US: f64 = 8.0;
 const SECOND: Duration = Duration::from_secs(1);
 
-/// Camera addresses, so that tests can run at once.
+/// A separate camera address per test, so that tests can run in parallel.
 fn address(test: u8) -> Ipv4Addr {
     Ipv4Addr::new(127, 40, std::process::id() as u8, test)
 }
@@ -41,7 +41,7 @@ fn setup(test: u8, faults: Faults) -> GigeSetup {
     }
 }
 
-/// A rig whose pictures depend on settings alone: no noise, no jitter.
+/// A rig whose pictures depend only on settings: no noise, no jitter.
 fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
     let mut config = SimConfig {
         scene: PathBuf::from("mix"),
@@ -67,11 +67,11 @@ fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
     PlaneRig::new(config, setup, Path::new("")).unwrap()
 }
 
-/// The counts of a picture that the rig takes in virtual time, through the devices that a simulated run has.
+/// Counts of a picture taken in virtual time through the devices of a simulated run.
 fn expected(settings: CameraSettings) -> Vec<u16> {
     let devices = rig(|_| {}).open();
     let (mut camera, mut projector, mut vsync) = (devices.camera, devices.projector, devices.vsync);
-    // Virtual time waits for every device that is open.
+    // Virtual time waits for every open device.
     let watcher = std::thread::spawn(move || {
         while vsync.next_edge(SECOND).is_ok_and(|edge| edge.is_some_and(|edge| edge.seq < 20)) {}
     });
@@ -89,7 +89,7 @@ fn expected(settings: CameraSettings) -> Vec<u16> {
     counts
 }
 
-/// Starts the rig's camera with its projector lit, triggered by VSYNC.
+/// Starts the rig's camera, triggered by VSYNC, with the projector lit.
 fn lit(test: u8, rig: &PlaneRig, faults: Faults) -> (GigeCamera, Client, Box<dyn Vsync>) {
     let WireDevices { camera, vsync, mut projector, .. } = rig.open_for_wire();
     let camera = GigeCamera::start(&setup(test, faults), camera).unwrap();
@@ -135,7 +135,7 @@ fn pictures_are_those_of_the_simulation_to_the_bit() {
 #[test]
 fn a_region_exposes_its_first_row_at_the_trigger() {
     let (y, height) = (6, 9);
-    // The rows above a region cost it no time: as if the trigger came that much earlier.
+    // Rows above a region take no time: equivalent to an earlier trigger.
     let delay_us = 400.0 - y as f64 * ROW_TIME_US;
     let counts = expected(CameraSettings {
         shutter: Shutter::Rolling,
@@ -180,7 +180,7 @@ fn stamps_tell_the_start_of_the_exposure_on_the_cameras_own_clock() {
         assert_eq!(f64::from_bits(frame.chunk(0x1000)), 1000.0);
         assert_eq!(frame.chunk(0x1002), u64::from(frame.block) - 1);
     }
-    // A latch reads the same clock.
+    // Latching reads the same clock.
     let before = clock.ticks(Clock::real().now_ns());
     client.set("TimestampLatch", 1);
     let after = clock.ticks(Clock::real().now_ns());
@@ -291,7 +291,7 @@ fn lost_frames_leave_gaps_and_packets_cannot_be_had_for_ever() {
     let gaps: u64 = u64::from(blocks[39] - blocks[0] - 39);
     assert!(gaps > 0 && camera.truth().frames_lost >= gaps, "{gaps} {:?}", camera.truth());
     while client.packet().is_some() {}
-    // The first frame is long gone.
+    // The first frame is no longer stored.
     client.set("AcquisitionStart", 1);
     let block = (0..40).map(|_| client.frame().unwrap().block).last().unwrap();
     assert!(block > 16 + 1);
@@ -308,7 +308,7 @@ fn a_camera_that_died_comes_back_as_nobodys() {
     client.set("AcquisitionStart", 1);
     assert!(client.frame().is_some());
     camera.set_faults(Faults { dead: true, ..Faults::default() });
-    // Frames on their way still arrive, then nothing does.
+    // Frames in transit still arrive; then there are no more.
     while client.frame().is_some() {}
     assert!(!client.is_answered(Duration::from_millis(500)));
     camera.set_faults(Faults::default());

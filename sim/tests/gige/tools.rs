@@ -1,4 +1,4 @@
-//! Clients that others wrote, from the package aravis-tools: what they find, set and receive.
+//! Independent clients, from the package aravis-tools: what they find, set and receive.
 
 use std::process::Command;
 
@@ -6,7 +6,7 @@ use raysweep_sim::gige::{Faults, GigeCamera, GigeSetup, Look};
 
 use super::{address, rig, setup};
 
-/// What a tool prints, both ways.
+/// Returns a tool's standard output and standard error.
 fn run(tool: &str, arguments: &[&str]) -> String {
     let output = Command::new(tool).args(arguments).output();
     let output =
@@ -18,7 +18,7 @@ fn arv_tool(test: u8, arguments: &[&str]) -> String {
     run("arv-tool-0.8", &[&["-a", &address(test).to_string()], arguments].concat())
 }
 
-/// A figure of arv-camera-test's summary.
+/// Reads a number from arv-camera-test's summary.
 fn figure(report: &str, name: &str) -> u64 {
     let line =
         report.lines().find(|line| line.starts_with(name)).unwrap_or_else(|| panic!("{name}: {report}"));
@@ -106,7 +106,7 @@ fn arv_tool_reads_and_writes_features() {
         }
         let refused = arv_tool(test, &["control", "PixelFormat=Mono9", "PixelFormat"]);
         assert!(refused.contains("PixelFormat = Mono12p"), "{refused}");
-        // Every feature can be read: register and description agree.
+        // Every feature can be read: registers and description agree.
         let values = arv_tool(test, &["values"]);
         assert!(!values.to_lowercase().contains("error"), "{values}");
         let features = arv_tool(test, &["features"]);
@@ -131,8 +131,8 @@ fn arv_camera_test_streams_without_loss() {
     {
         assert_eq!(figure(&report, name), 0, "{name}: {report}");
     }
-    // On a busy machine the tool is late with its buffers and passes packets over, which it does not count as frames. What
-    // was on its way when it stopped, it does not count at all.
+    // On a busy machine the tool is late with its buffers and skips packets, which it does not count as frames. Frames
+    // in transit when it stops are not counted at all.
     let truth = camera.truth();
     assert!(completed <= truth.frames, "{truth:?} {report}");
     assert!(figure(&report, "n_received_packets") * 2 > truth.packets, "{truth:?} {report}");
@@ -144,7 +144,7 @@ fn arv_camera_test_gets_lost_packets_back() {
     let faults = Faults { packet_loss: 0.01, ..Faults::default() };
     let camera = GigeCamera::start(&setup(24, faults), Look::at_test_pictures((512, 512))).unwrap();
     let name = address(24).to_string();
-    // Few frames, kept long: a busy machine asks for packets late.
+    // Few frames with a long retention time: a busy machine requests packets late.
     let report = run(
         "arv-camera-test-0.8",
         &["-n", &name, "--duration", "2", "--features", "AcquisitionFrameRate=20", "-m", "5000"],
@@ -157,7 +157,7 @@ fn arv_camera_test_gets_lost_packets_back() {
     assert!(figure(&report, "n_completed_buffers") * 2 > truth.frames, "{truth:?} {report}");
 }
 
-/// Discovery is a broadcast, and cameras of other tests would answer it.
+/// Discovery is a broadcast, to which cameras of other tests would respond.
 #[test]
 fn arv_tool_discovers_cameras_by_broadcast() {
     let itself = std::env::current_exe().unwrap();

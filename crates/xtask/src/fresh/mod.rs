@@ -1,4 +1,4 @@
-//! `cargo xtask fresh`: the README's two commands where nothing is but a bare Debian, Rust and a C compiler.
+//! `cargo xtask fresh`: runs the README's two commands on a bare Debian with only Rust and a C compiler.
 
 use std::fs::{File, TryLockError};
 use std::io::Write;
@@ -20,13 +20,13 @@ struct Release {
 const RELEASES: [Release; 2] =
     [Release { number: "12", suite: "bookworm" }, Release { number: "13", suite: "trixie" }];
 
-/// What it takes here, and the packages that have it.
+/// Programs needed on this machine, and their packages.
 const PROGRAMS: [(&str, &str); 3] = [("unshare", "util-linux"), ("mmdebstrap", "mmdebstrap"), ("git", "git")];
 
-/// Variables of a machine without which its network is not reached.
+/// Environment variables needed for network access on some machines.
 const NETWORK: [&str; 6] = ["http_proxy", "https_proxy", "no_proxy", "HTTP_PROXY", "HTTPS_PROXY", "NO_PROXY"];
 
-/// Tries the releases that are named, or all; a line for each at the end.
+/// Tries the given releases, or all; prints one line for each at the end.
 pub fn fresh(numbers: &[&str]) -> Done {
     let releases = chosen(numbers)?;
     for (program, package) in PROGRAMS {
@@ -57,18 +57,18 @@ fn chosen(numbers: &[&str]) -> Done<Vec<&'static Release>> {
     Ok(RELEASES.iter().filter(|known| numbers.is_empty() || numbers.contains(&known.number)).collect())
 }
 
-/// How a release fared.
+/// Result for a release.
 struct Attempt {
     passed: bool,
     line: String,
 }
 
-/// Makes a root of a release and runs the commands in it; what they print goes to the terminal and to a log.
+/// Makes a root of a release and runs the commands in it; their output goes to the terminal and to a log.
 fn attempt(Release { number, suite }: &Release, rust: &str) -> Done<Attempt> {
     let began = Instant::now();
     let folder = target().join("fresh").join(number);
     std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-    // Held until we return.
+    // Held until the function returns.
     let _lock = lock(&folder.join("lock"), number)?;
     let path = folder.join("log");
     let mut log = File::create(&path).map_err(|error| format!("{}: {error}", path.display()))?;
@@ -96,7 +96,7 @@ fn attempt(Release { number, suite }: &Release, rust: &str) -> Done<Attempt> {
     Ok(Attempt { passed, line })
 }
 
-/// Two at once would remove each other's root.
+/// Takes a lock, because two runs at once would remove each other's root.
 fn lock(path: &Path, number: &str) -> Done<File> {
     let failed = |error| format!("{}: {error}", path.display());
     let file = File::create(path).map_err(failed)?;
@@ -109,11 +109,11 @@ fn lock(path: &Path, number: &str) -> Done<File> {
     }
 }
 
-/// Says that what is tried is not what lies here, if so.
+/// Warns if there are uncommitted changes, which are not tested.
 fn tell_uncommitted() -> Done {
     let output = Command::new("git").args(["status", "--porcelain"]).current_dir(root()).output();
     let output = output.map_err(|error| format!("cannot start git: {error}"))?;
-    // Where there is no repository, its copy fails and says so.
+    // Without a repository, making the copy fails with a message.
     let changed = String::from_utf8_lossy(&output.stdout).into_owned();
     let Some(first) = changed.lines().next() else { return Ok(()) };
     let rest = match changed.lines().count() - 1 {
@@ -123,8 +123,8 @@ fn tell_uncommitted() -> Done {
     say(&format!("fresh: uncommitted changes are not tried: {}{rest}", first.trim()))
 }
 
-/// A repository that is whole in one folder, so that the root can be lent it: a worktree's or a shared clone's commits lie
-/// elsewhere.
+/// Makes a complete repository in one folder, which can be mounted in the root: the commits of a worktree or a shared
+/// clone are stored elsewhere.
 fn copy_of_commits(folder: &Path) -> Done<PathBuf> {
     let copy = folder.join("source.git");
     if copy.exists() {
@@ -137,7 +137,7 @@ fn copy_of_commits(folder: &Path) -> Done<PathBuf> {
     Ok(copy)
 }
 
-/// Where the Rust lies that runs us: its programs and libraries, in one folder.
+/// Folder of the current Rust toolchain: its programs and libraries.
 fn sysroot() -> Done<String> {
     let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
     let output = Command::new(rustc).args(["--print", "sysroot"]).current_dir(root()).output();
@@ -151,7 +151,7 @@ fn sysroot() -> Done<String> {
     Ok(sysroot)
 }
 
-/// A bare Debian with all that a distribution has installed beside its Rust would not be bare.
+/// Rejects a toolchain in /usr: with all other programs of the distribution, the Debian would not be bare.
 fn lendable(sysroot: &Path) -> Done {
     let shown = sysroot.display();
     if sysroot.canonicalize().is_ok_and(|sysroot| sysroot == Path::new("/usr")) {

@@ -1,14 +1,15 @@
-//! The guest's first file system: busybox, the modules that mount the host's folders, and a script that does so.
+//! The guest's initial file system: busybox, the modules for mounting the host's folders, and a script that mounts
+//! them.
 
 use std::path::Path;
 
 use super::kernel::Kernel;
 use crate::run::Done;
 
-/// What the guest needs before it sees the host's folders.
+/// Modules needed before the host's folders are mounted.
 const BOOT_MODULES: [&str; 3] = ["virtio_pci", "9pnet_virtio", "9p"];
 
-/// Runs as process 1. Programs and libraries are the host's own; `run.sh` is made for each run.
+/// Init script (process 1). Programs and libraries are the host's own; `run.sh` is generated for each run.
 const INIT: &str = "\
 #!/bin/busybox sh
 /bin/busybox mkdir -p /proc /sys /dev /tmp /usr /share /etc /lib64
@@ -36,7 +37,7 @@ sh /share/run.sh
 poweroff -f
 ";
 
-/// Writes the initramfs: a cpio archive of the kind `newc`, not compressed.
+/// Writes the initramfs: an uncompressed cpio archive in `newc` format.
 pub fn write(path: &Path, kernel: &Kernel) -> Done {
     let mut archive = Archive::default();
     for folder in ["bin", "lib"] {
@@ -65,7 +66,8 @@ fn read(path: &Path) -> Done<Vec<u8>> {
     std::fs::read(path).map_err(|error| format!("{}: {error}", path.display()))
 }
 
-/// A cpio archive: a header of 110 characters, the name and the data of each entry, both padded to four bytes.
+/// A cpio archive: for each entry a header of 110 characters, the name and the data; the latter two padded to four
+/// bytes.
 #[derive(Default)]
 struct Archive {
     bytes: Vec<u8>,
@@ -93,7 +95,7 @@ impl Archive {
     fn entry(&mut self, name: &str, mode: u32, data: &[u8]) {
         self.entries += 1;
         let (data_len, name_len) = (data.len() as u32, name.len() as u32 + 1);
-        // inode, mode, uid, gid, links, mtime, size, device (4 fields), name's length, checksum
+        // inode, mode, uid, gid, links, mtime, size, device (4 fields), length of the name, checksum
         let fields = [self.entries, mode, 0, 0, 1, 0, data_len, 0, 0, 0, 0, name_len, 0];
         self.bytes.extend(b"070701");
         self.bytes.extend(fields.map(|field| format!("{field:08x}")).concat().bytes());

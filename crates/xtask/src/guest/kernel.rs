@@ -1,4 +1,4 @@
-//! A stock Debian kernel and the modules that the drivers' tests need, from its package, kept under the target folder.
+//! A stock Debian kernel and the modules needed by the drivers' tests, from its package; stored in the target folder.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -7,11 +7,11 @@ use std::process::{Command, Stdio};
 use crate::rootfs;
 use crate::run::{Done, run};
 
-/// The package that names the newest kernel. Not the cloud variant, which has neither cameras nor USB.
+/// Metapackage that depends on the newest kernel. Not the cloud variant, which supports neither cameras nor USB.
 const META_PACKAGE: &str = "linux-image-amd64";
 
-/// Where the modules lie that a test may ask for. Unpacking all 4000 would take longer than the tests. What a kernel of either
-/// release lacks must not be named: `fs/f*` stands for `fs/fscache`, which Debian 13 has as a part of `fs/netfs`.
+/// Folders of the modules that tests may request. Unpacking all 4000 modules would take longer than the tests. Every
+/// entry must exist in both releases: `fs/f*` stands for `fs/fscache`, which in Debian 13 is part of `fs/netfs`.
 const MODULE_FOLDERS: [&str; 15] = [
     "drivers/char",
     "drivers/gpu/drm/*.ko*",
@@ -32,19 +32,19 @@ const MODULE_FOLDERS: [&str; 15] = [
 
 /// An unpacked kernel.
 pub struct Kernel {
-    /// An ELF image, which QEMU boots faster than a compressed one, or what the package has.
+    /// ELF image, which QEMU boots faster than a compressed one, or else the image from the package.
     pub image: PathBuf,
-    /// What the guest mounts at `/lib/modules`: one folder, named as `uname -r` says.
+    /// Folder mounted by the guest as `/lib/modules`; it contains one folder, named after the output of `uname -r`.
     pub modules: PathBuf,
     release: String,
 }
 
 impl Kernel {
-    /// The kernel below `folder`, downloaded and unpacked if it is not there yet.
+    /// Returns the kernel in `folder`; downloads and unpacks it if necessary.
     pub fn fetch(folder: &Path) -> Done<Self> {
         let kept = folder.join("kernel");
         if !kept.join("vmlinux").exists() {
-            // Renamed only when whole, so that an interrupted download is begun anew.
+            // Renamed only when complete, so that an interrupted download is restarted.
             let fresh = folder.join("kernel.part");
             let _ = std::fs::remove_dir_all(&fresh);
             let _ = std::fs::remove_dir_all(&kept);
@@ -57,12 +57,12 @@ impl Kernel {
         Ok(Self { image: kept.join("vmlinux"), modules, release })
     }
 
-    /// Where the modules lie below [`Kernel::modules`].
+    /// Name of the release, which is the folder below [`Kernel::modules`].
     pub fn release(&self) -> &str {
         &self.release
     }
 
-    /// The files of modules and of all that they need, relative to the folder of the release; none of those built in.
+    /// Files of these modules and their dependencies, relative to the release's folder; built-in modules are skipped.
     pub fn files_of(&self, names: &[&str]) -> Done<BTreeSet<String>> {
         let folder = self.modules.join(&self.release);
         let path = folder.join("modules.dep");
@@ -81,7 +81,7 @@ impl Kernel {
     }
 }
 
-/// The kernel's package, through apt.
+/// Downloads the kernel's package with apt.
 fn download(folder: &Path) -> Done<PathBuf> {
     let fetched = package_name().and_then(|name| download_package(&name, folder)).or_else(|error| {
         if !rootfs::is_root() {
@@ -107,13 +107,13 @@ fn package_name() -> Done<String> {
 }
 
 fn download_package(name: &str, folder: &Path) -> Done {
-    // As root, apt would fetch as a user who may not write here, and warn of it.
+    // As root, apt would download as another user, who cannot write here, and print a warning.
     run(Command::new("apt-get")
         .args(["-o", "APT::Sandbox::User=root", "-qq", "download", name])
         .current_dir(folder))
 }
 
-/// The parts of the package that a guest needs, and the index of its modules.
+/// Unpacks the parts of the package that a guest needs, and generates the module index.
 fn unpack(package: &Path, folder: &Path) -> Done {
     let mut archive = Command::new("dpkg-deb")
         .arg("--fsys-tarfile")
@@ -122,7 +122,7 @@ fn unpack(package: &Path, folder: &Path) -> Done {
         .spawn()
         .map_err(|error| format!("cannot start dpkg-deb: {error}"))?;
     let stream = archive.stdout.take().ok_or("dpkg-deb without output")?;
-    // Debian 13 has its modules below /usr and compressed, Debian 12 neither.
+    // Debian 13 has its modules below /usr and compressed; in Debian 12 neither is the case.
     run(Command::new("tar")
         .arg("-x")
         .arg("-C")
@@ -151,8 +151,8 @@ fn unpack(package: &Path, folder: &Path) -> Done {
     decompress(&compressed, &folder.join("vmlinux"))
 }
 
-/// The ELF image inside `vmlinuz`, which is a loader followed by a stream: of xz in Debian 12. Debian 13's is quickly
-/// decompressed by its own loader.
+/// Extracts the ELF image from `vmlinuz`, which is a loader followed by a compressed stream: xz in Debian 12. Debian
+/// 13's image is kept as it is, because its own loader decompresses it quickly.
 fn decompress(compressed: &Path, image: &Path) -> Done {
     const XZ: &[u8] = b"\xfd7zXZ\0";
     let bytes = std::fs::read(compressed).map_err(|error| format!("{}: {error}", compressed.display()))?;
@@ -163,7 +163,7 @@ fn decompress(compressed: &Path, image: &Path) -> Done {
     std::fs::write(&stream, &bytes[start..]).map_err(|error| format!("{}: {error}", stream.display()))?;
     let part = image.with_extension("part");
     let output = std::fs::File::create(&part).map_err(|error| format!("{}: {error}", part.display()))?;
-    // The loader's own tail follows the stream: xz writes all of the image and then complains.
+    // The end of the loader follows the stream, so xz writes the complete image and then reports an error.
     let _ = Command::new("xz")
         .args(["-dc", "--single-stream"])
         .arg(&stream)
@@ -182,7 +182,7 @@ fn read_to_string(path: &Path) -> Done<String> {
     std::fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))
 }
 
-/// The name of the one entry of a folder that ends so.
+/// Name of the only entry of a folder with this ending.
 fn only_entry(folder: &Path, ending: &str) -> Done<String> {
     let entries = std::fs::read_dir(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
     let names = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned());

@@ -1,10 +1,10 @@
 //! `cargo xtask guest`: the drivers' hardware tests against real kernel drivers, in a small QEMU guest.
 //!
-//! The tests are ordinary integration tests, most of the crate `drivers`, marked `#[ignore]` since they need devices. The guest
-//! runs a stock Debian kernel in software emulation, mounts the host's `/usr` read-only, and so runs the very
-//! executables that cargo built. A test has QEMU's monitor (QMP) at `/dev/virtio-ports/qmp`, with which it plugs and
-//! unplugs devices and takes screen dumps; these land in `/share`, which the host keeps in `guest/run` of its
-//! target folder. Timing in the guest says nothing: tests assert order, counts, values and kinds of errors.
+//! The tests are ordinary integration tests, most of them in the crate `drivers`, marked `#[ignore]` because they need
+//! devices. The guest runs a stock Debian kernel in software emulation and mounts the host's `/usr` read-only, so that
+//! it runs the same executables that cargo built. Tests reach QEMU's monitor (QMP) at `/dev/virtio-ports/qmp`, with
+//! which they plug and unplug devices and take screen dumps. The dumps are written to `/share`, which is `guest/run` in
+//! the host's target folder. Timing in the guest is meaningless: tests check order, counts, values and kinds of errors.
 
 mod initramfs;
 mod kernel;
@@ -20,23 +20,23 @@ use crate::packages;
 use crate::run::{Done, cargo, target};
 use kernel::Kernel;
 
-/// One integration test and the guest that it needs.
+/// An integration test and its requirements on the guest.
 pub struct GuestTest {
-    /// The file in a crate's `tests`, without `.rs`.
+    /// File name in the crate's `tests` folder, without `.rs`.
     name: &'static str,
-    /// Programs of that crate that the test starts; they lie beside it.
+    /// Programs of that crate that the test starts; they are placed next to it.
     programs: &'static [&'static str],
-    /// Kernel modules with their parameters, loaded right before the test.
+    /// Kernel modules with their parameters, loaded just before the test.
     modules: &'static [&'static str],
-    /// Devices of the guest that QEMU must have from the start; others are plugged in by the test, through QMP.
+    /// QEMU devices present from the start; tests plug in others through QMP.
     devices: &'static [&'static str],
-    /// QEMU's character devices whose other end the test holds, as `/dev/virtio-ports/NAME`.
+    /// QEMU character devices whose other end the test opens as `/dev/virtio-ports/NAME`.
     pipes: &'static [&'static str],
-    /// Names the devices to the test.
+    /// Environment variables that tell the test its devices.
     environment: &'static [(&'static str, &'static str)],
 }
 
-/// Adding a test is adding its line here, and its modules' folder in `kernel.rs` if it has a new one.
+/// To add a test, add its line here, and its modules' folder in `kernel.rs` if that is new.
 const TESTS: &[GuestTest] = &[
     GuestTest {
         name: "guest_daemon",
@@ -96,7 +96,7 @@ const TESTS: &[GuestTest] = &[
     },
 ];
 
-/// Runs the tests that are named, or all.
+/// Runs the given tests, or all.
 pub fn guest(names: &[&str]) -> Done {
     packages::install()?;
     let tests = chosen(names)?;
@@ -122,7 +122,7 @@ pub fn guest(names: &[&str]) -> Done {
     Ok(())
 }
 
-/// What is said when the guest is not wanted.
+/// Message when the guest is skipped on request.
 pub fn skipped() -> String {
     let names: Vec<&str> = TESTS.iter().map(|test| test.name).collect();
     format!("kernel guest: SKIPPED (--no-guest); not tested against the kernel: {}", names.join(", "))
@@ -136,14 +136,14 @@ fn chosen(names: &[&str]) -> Done<Vec<&'static GuestTest>> {
     Ok(TESTS.iter().filter(|test| names.is_empty() || names.contains(&test.name)).collect())
 }
 
-/// What the guest runs in a test's folder.
+/// A test or program to copy to a test's folder.
 struct Executable {
     test: &'static str,
     name: &'static str,
     path: PathBuf,
 }
 
-/// Builds the tests with the very features that `cargo xtask test` uses, so that both share what is built.
+/// Builds the tests with the same features as `cargo xtask test`, so that both share build artifacts.
 fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
     let mut build = cargo();
     build.args([
@@ -176,7 +176,7 @@ fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
     Ok(all)
 }
 
-/// The executables in cargo's JSON messages.
+/// Paths of the executables in cargo's JSON messages.
 fn executables(messages: &str) -> impl Iterator<Item = PathBuf> {
     messages
         .lines()
@@ -184,7 +184,7 @@ fn executables(messages: &str) -> impl Iterator<Item = PathBuf> {
         .map(|(path, _)| PathBuf::from(path))
 }
 
-/// The executable of a test: a file named after the test, a dash and a hash.
+/// The executable of a test: named after the test, with a dash and a hash.
 fn test_executable(messages: &str, name: &str) -> Option<PathBuf> {
     executables(messages).find(|path| {
         let file = path.file_name().map(|file| file.to_string_lossy().into_owned()).unwrap_or_default();
@@ -192,7 +192,7 @@ fn test_executable(messages: &str, name: &str) -> Option<PathBuf> {
     })
 }
 
-/// The executable of a program, which cargo builds with the tests of its crate: a file of its name.
+/// The executable of a program, which cargo builds together with the tests of its crate; it has the program's name.
 fn program(messages: &str, name: &str) -> Option<PathBuf> {
     executables(messages).find(|path| path.file_name().is_some_and(|file| file == name))
 }

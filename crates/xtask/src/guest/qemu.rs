@@ -1,4 +1,4 @@
-//! The guest's machine.
+//! The guest's virtual machine.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -8,8 +8,8 @@ use super::GuestTest;
 use super::kernel::Kernel;
 use crate::run::Done;
 
-/// The clock is the HPET: on a busy host the kernel misjudges the TSC's rate, and the guest's time then runs several times too
-/// fast. Mitigations are nothing that emulation needs.
+/// HPET clock source: on a busy host the kernel misjudges the TSC's rate, and the guest's time then runs several times
+/// too fast. Mitigations are unnecessary under emulation.
 const KERNEL_ARGUMENTS: &str = "console=ttyS0 loglevel=4 panic=-1 clocksource=hpet mitigations=off";
 
 /// A running guest, killed when dropped.
@@ -21,7 +21,7 @@ impl Machine {
         let log = run.join("qemu.log");
         let log = std::fs::File::create(&log).map_err(|error| format!("{}: {error}", log.display()))?;
         let mut qemu = Command::new("qemu-system-x86_64");
-        // Paths of sockets are short by law (108 bytes), target folders are not: so all names are relative.
+        // Paths of sockets are limited to 108 bytes and target folders may be longer, so all paths are relative.
         qemu.current_dir(run).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
         qemu.args(["-machine", "pc", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "1024"]);
         qemu.args(["-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"]);
@@ -40,7 +40,7 @@ impl Machine {
         ]);
         pipe(&mut qemu, "qmp");
         qemu.args(["-mon", "chardev=qmp,mode=control"]);
-        // Tests may share what they need.
+        // Tests may share pipes and devices.
         let pipes: BTreeSet<&str> = tests.iter().flat_map(|test| test.pipes).copied().collect();
         let devices: BTreeSet<&str> = tests.iter().flat_map(|test| test.devices).copied().collect();
         pipes.iter().for_each(|name| pipe(&mut qemu, name));
@@ -58,15 +58,15 @@ impl Machine {
 
 impl Drop for Machine {
     fn drop(&mut self) {
-        // Both fail where the guest has powered off, which is how it should be.
+        // Both fail if the guest has already powered off, as it should.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// A folder of the host that the guest can mount.
+/// Makes a host folder available to the guest.
 fn mount(qemu: &mut Command, tag: &str, path: &Path, options: &str) {
-    // A comma in a value is written twice.
+    // QEMU expects commas in values to be doubled.
     let path = path.display().to_string().replace(',', ",,");
     qemu.args([
         "-fsdev",
@@ -75,8 +75,8 @@ fn mount(qemu: &mut Command, tag: &str, path: &Path, options: &str) {
     qemu.args(["-device", &format!("virtio-9p-pci,fsdev={tag},mount_tag={tag}")]);
 }
 
-/// A character device of QEMU with both ends inside: `name` for a device or the monitor, the other one for programs
-/// of the guest. The ends meet in a socket, since QEMU has nothing that joins two directly.
+/// Adds a pair of connected character devices: `name` for a device or the monitor, the other for programs in the guest.
+/// They are connected through a socket, since QEMU cannot connect two directly.
 fn pipe(qemu: &mut Command, name: &str) {
     qemu.args(["-chardev", &format!("socket,id={name},path={name}.socket,server=on,wait=off")]);
     qemu.args(["-chardev", &format!("socket,id={name}-guest,path={name}.socket")]);

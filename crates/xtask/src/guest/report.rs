@@ -1,4 +1,4 @@
-//! Follows the tests in the guest: a line for each check as it ends, the log of each test that fails.
+//! Follows the tests in the guest: prints one line per finished check, and the log of each failed test.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -8,13 +8,14 @@ use super::qemu::Machine;
 use super::script::TEST_LIMIT_S;
 use crate::run::Done;
 
-/// Beyond what the guest itself grants a test, so that it comes first: for booting, which takes 5 s, and loading modules.
+/// Added to the guest's own time limit so that the guest's limit applies first: covers booting (5 s) and loading
+/// modules.
 const MARGIN: Duration = Duration::from_secs(60);
 
-/// What `timeout` returns of a program that it had to kill.
+/// Exit code of `timeout` for a program that it had to kill.
 const KILLED: &str = "137";
 
-/// Prints what the tests say until the last has ended; counts the checks that passed.
+/// Prints the tests' results until the last has ended; returns the number of checks that passed.
 pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<usize> {
     let mut checks = 0;
     let mut failures = Vec::new();
@@ -24,7 +25,7 @@ pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<u
         let mut printed = 0;
         let began = Instant::now();
         let code = loop {
-            // The order matters: an exit code that is there stands for a log that is whole.
+            // Read the exit code first: if it exists, the log is complete.
             let code = std::fs::read_to_string(folder.join("exit")).ok().filter(|code| code.ends_with('\n'));
             let ended = machine.has_ended();
             let log = std::fs::read_to_string(folder.join("log")).unwrap_or_default();
@@ -66,14 +67,14 @@ pub fn follow(machine: &mut Machine, run: &Path, tests: &[&GuestTest]) -> Done<u
     }
 }
 
-/// The line that ends a check: `test name ... ok`.
+/// Returns the line if it reports the end of a check: `test name ... ok`.
 fn verdict(line: &str) -> Option<&str> {
     let line = line.strip_prefix("test ")?;
     let (_, verdict) = line.split_once(" ... ")?;
     ["ok", "FAILED", "ignored"].iter().any(|known| verdict.starts_with(known)).then_some(line)
 }
 
-/// What a failed test said, and where more stands.
+/// A failed test's log, and where to find more.
 fn failure(folder: &Path, what: &str) -> String {
     let log = folder.join("log");
     let said = std::fs::read_to_string(&log).unwrap_or_default();

@@ -1,8 +1,8 @@
-//! What the guest runs once it sees the host's folders.
+//! The script that the guest runs once the host's folders are mounted.
 
 use super::GuestTest;
 
-/// A test that takes longer hangs.
+/// Time limit for a test; a test that takes longer counts as hung.
 pub const TEST_LIMIT_S: u32 = 120;
 
 const PREFACE: &str = "\
@@ -14,7 +14,7 @@ done
 export RUST_BACKTRACE=1
 ";
 
-/// The script: modules, then the test, its output and its exit code into its folder of the share.
+/// Generates the script: loads modules, runs each test, and writes its output and exit code to its folder in the share.
 pub fn script(tests: &[&GuestTest]) -> String {
     let mut script = PREFACE.to_owned();
     for GuestTest { name, modules, environment, .. } in tests {

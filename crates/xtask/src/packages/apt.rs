@@ -4,22 +4,22 @@ use std::process::{Command, Stdio};
 
 use crate::run::{Done, run};
 
-/// Only what is named and what that cannot do without.
+/// Installs only the named packages and their dependencies.
 const INSTALL: [&str; 3] = ["install", "--yes", "--no-install-recommends"];
 
-/// Whether this system has it.
+/// Whether this system has apt.
 pub fn is_there() -> bool {
     Command::new("apt-get").arg("--version").output().is_ok()
 }
 
-/// Fetches the lists of packages.
+/// Updates the package lists.
 pub fn update() -> Done {
     apt_get(&["update"])
 }
 
 /// Whether a package of this name can be installed.
 pub fn has_candidate(name: &str) -> bool {
-    // Its words are told apart below, so they must not be translated.
+    // The output is parsed below, so it must not be translated.
     let policy = Command::new("apt-cache").args(["policy", name]).env("LC_ALL", "C").output();
     policy.is_ok_and(|output| candidate(&String::from_utf8_lossy(&output.stdout)).is_some())
 }
@@ -37,7 +37,7 @@ pub fn install(names: &[String]) -> Done {
         .map_err(|error| format!("{error}\ninstall them by hand:\n  {}", by_hand(names)))
 }
 
-/// The commands that install packages; lists that are not all fetched may do.
+/// Commands for installing packages by hand; package lists that are only partly updated may be sufficient.
 pub fn by_hand(names: &[String]) -> String {
     format!("apt-get update; apt-get {} {}", INSTALL.join(" "), names.join(" "))
 }

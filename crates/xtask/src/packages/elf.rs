@@ -1,21 +1,21 @@
-//! What the headers of ELF files tell.
+//! ELF file headers.
 
-/// Up to and with the machine that the file is for.
+/// Length of the header up to and including the machine type.
 pub const HEADER: usize = 20;
 
-/// Whether a file that begins with these bytes is a 64-bit little-endian ELF file for the machine that we run on.
+/// Whether a file with this header is a 64-bit little-endian ELF file for the current machine.
 pub fn is_for_this_machine(header: &[u8]) -> bool {
     let machine: Option<u16> = match std::env::consts::ARCH {
         "x86_64" => Some(62),
         "aarch64" => Some(183),
-        // The list of packages is made for none of these: any will do.
+        // The package list is not made for other architectures: accept any.
         _ => None,
     };
     let Some(found) = header.get(18..HEADER) else { return false };
     header.starts_with(b"\x7fELF\x02\x01") && machine.is_none_or(|machine| found == machine.to_le_bytes())
 }
 
-/// The beginning of such a file.
+/// The header of the current executable.
 #[cfg(test)]
 pub fn own_header() -> [u8; HEADER] {
     let own = std::fs::read(std::env::current_exe().unwrap()).unwrap();

@@ -1,4 +1,4 @@
-//! Whether bindgen finds libclang: where its crate clang-sys looks, and by the names that it takes.
+//! Whether bindgen finds libclang: searches where its crate clang-sys does, for the same names.
 
 use std::ffi::OsString;
 use std::io::Read;
@@ -7,7 +7,7 @@ use std::process::Command;
 
 use super::elf;
 
-/// Folders that are searched, each `*` standing for any one name.
+/// Search path; each `*` matches the rest of one folder name.
 const FOLDERS: [&str; 7] = [
     "usr/local/llvm*/lib*",
     "usr/local/lib*/*/*",
@@ -18,10 +18,11 @@ const FOLDERS: [&str; 7] = [
     "usr/lib*",
 ];
 
-/// Whether bindgen finds it here.
+/// Whether bindgen finds libclang on this system.
 pub fn is_there() -> bool {
     if let Some(place) = std::env::var_os("LIBCLANG_PATH").map(PathBuf::from) {
-        // Then it is the only place: the file, or its folder. Build scripts, which look there, run in folders of their own.
+        // It is then the only place searched: the file, or its folder. Build scripts, which search it, run in other
+        // folders, so the path must be absolute.
         return place.is_absolute() && (is_libclang(&place) || has_libclang(&place));
     }
     let Some(llvm_folders) = llvm_folders() else { return false };
@@ -29,7 +30,7 @@ pub fn is_there() -> bool {
     is_in(Path::new("/"), &[llvm_folders, listed].concat())
 }
 
-/// Whether it lies in one of these folders, or below `root` where systems have their libraries.
+/// Whether libclang is in one of these folders, or below `root` in one of the system's library folders.
 fn is_in(root: &Path, folders: &[PathBuf]) -> bool {
     folders.iter().any(|folder| has_libclang(folder))
         || FOLDERS.iter().any(|pattern| matching(root, pattern).iter().any(|folder| has_libclang(folder)))
@@ -39,7 +40,7 @@ fn listed(variable: Option<OsString>) -> Vec<PathBuf> {
     variable.map(|list| std::env::split_paths(&list).collect()).unwrap_or_default()
 }
 
-/// The library folders of the LLVM that `llvm-config` belongs to. None: clang-sys ends there.
+/// Library folders of the LLVM that `llvm-config` belongs to. `None`: clang-sys fails at this point.
 fn llvm_folders() -> Option<Vec<PathBuf>> {
     let program = std::env::var_os("LLVM_CONFIG_PATH").unwrap_or_else(|| "llvm-config".into());
     let Ok(output) = Command::new(program).arg("--prefix").output() else { return Some(Vec::new()) };
@@ -49,13 +50,13 @@ fn llvm_folders() -> Option<Vec<PathBuf>> {
     folders_below(&String::from_utf8_lossy(&output.stdout))
 }
 
-/// What `llvm-config --prefix` says; that it says something is taken for granted by clang-sys.
+/// Folders below the prefix printed by `llvm-config --prefix`; clang-sys assumes that the output is not empty.
 fn folders_below(said: &str) -> Option<Vec<PathBuf>> {
     let prefix = Path::new(said.lines().next()?);
     Some(["bin", "lib", "lib64"].iter().map(|name| prefix.join(name)).collect())
 }
 
-/// The folders below `root` that a pattern stands for.
+/// Folders below `root` that match a pattern.
 fn matching(root: &Path, pattern: &str) -> Vec<PathBuf> {
     pattern.split('/').fold(vec![root.to_owned()], |folders, pattern| {
         let below = folders.iter().flat_map(|folder| names(folder).map(|name| folder.join(name)));
@@ -65,7 +66,7 @@ fn matching(root: &Path, pattern: &str) -> Vec<PathBuf> {
     })
 }
 
-/// Whether a name is the pattern, or begins as it does where it ends in `*`.
+/// Whether a name equals the pattern or, for a pattern that ends in `*`, starts with the part before it.
 fn fits(name: &str, pattern: &str) -> bool {
     pattern.strip_suffix('*').map_or(name == pattern, |beginning| name.starts_with(beginning))
 }
@@ -78,12 +79,12 @@ fn has_libclang(folder: &Path) -> bool {
     names(folder).any(|name| is_libclang(&folder.join(name)))
 }
 
-/// Whether a file has a name of the library and is one for this machine.
+/// Whether a file is named like the library and built for this machine.
 fn is_libclang(file: &Path) -> bool {
     file.file_name().is_some_and(|name| is_named_libclang(&name.to_string_lossy())) && is_for_us(file)
 }
 
-/// `libclang.so`, `libclang-*.so`, `libclang.so.*`, `libclang-*.so.*`; libclang-cpp is another library.
+/// `libclang.so`, `libclang-*.so`, `libclang.so.*`, `libclang-*.so.*`; libclang-cpp is a different library.
 fn is_named_libclang(name: &str) -> bool {
     let Some(rest) = name.strip_prefix("libclang") else { return false };
     let is_library = rest.ends_with(".so") || rest.contains(".so.");
@@ -100,7 +101,7 @@ fn is_for_us(file: &Path) -> bool {
 mod tests {
     use super::*;
 
-    /// A root in which these files lie.
+    /// A temporary root with the given files.
     struct Root(PathBuf);
 
     impl Root {

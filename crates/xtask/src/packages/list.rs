@@ -3,7 +3,7 @@
 use super::probe::Probe;
 use crate::run::Done;
 
-/// Where the list lies in the project.
+/// Path of the list in the project.
 pub const PATH: &str = "tests/packages.txt";
 
 const TEXT: &str = include_str!("../../../../tests/packages.txt");
@@ -11,27 +11,27 @@ const TEXT: &str = include_str!("../../../../tests/packages.txt");
 /// One line of the list.
 #[derive(Debug, PartialEq)]
 pub struct Entry {
-    /// The package's name in each release of Debian, in the order in which they are tried.
+    /// The package's name in each Debian release, in the order in which they are tried.
     pub names: Vec<String>,
-    /// What shows that the package is there; all of it must.
+    /// Probes that must all succeed if the package is present.
     pub probes: Vec<Probe>,
-    /// What it is for.
+    /// Purpose of the package.
     pub why: String,
 }
 
 impl Entry {
-    /// Whether nothing is missing that the package is for.
+    /// Whether all probes succeed.
     pub fn is_there(&self) -> bool {
         self.probes.iter().all(Probe::holds)
     }
 
-    /// The package's names for a reader.
+    /// The package's names, formatted for display.
     pub fn name(&self) -> String {
         self.names.join(" or ")
     }
 }
 
-/// The project's list.
+/// Reads the project's list.
 pub fn entries() -> Done<Vec<Entry>> {
     parse(TEXT)
 }

@@ -1,4 +1,4 @@
-//! System packages that the tests need: a list in the project, installed when we may.
+//! System packages that the tests need: a list in the project, installed if permitted.
 
 mod apt;
 mod elf;
@@ -10,14 +10,14 @@ use crate::rootfs::is_root;
 use crate::run::{Done, say};
 use list::{Entry, PATH};
 
-/// What to do on systems that the list is not made for.
+/// Advice for systems other than those of the list.
 const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install what serves the same purposes\n\
                          by its own means: `cargo xtask packages` tells what is found";
 
-/// How a package may be installed and yet not be what programs find.
+/// Why a package may be installed without being found by programs.
 const SHADOWED: &str = "another program of the same name may come first on the path, or an environment variable may name another folder";
 
-/// Prints what the list asks for, and whether it is there.
+/// Prints the list's entries, and whether they are present.
 pub fn print() -> Done {
     for entry in list::entries()? {
         let state = if entry.is_there() { "present" } else { "missing" };
@@ -26,7 +26,7 @@ pub fn print() -> Done {
     Ok(())
 }
 
-/// Installs what is missing, or says how to.
+/// Installs what is missing, or prints how to.
 pub fn install() -> Done {
     let missing = missing(list::entries()?);
     if missing.is_empty() {
@@ -42,7 +42,7 @@ pub fn install() -> Done {
     if !is_root() {
         return Err(for_root(&missing, apt::has_candidate));
     }
-    // One source of several may be out of reach, and another one have what is missing.
+    // If one of several sources is unreachable, another may still have what is missing.
     if let Err(error) = apt::update() {
         eprintln!("{error}; going on with the lists that there are");
     }
@@ -54,7 +54,7 @@ fn missing(entries: Vec<Entry>) -> Vec<Entry> {
     entries.into_iter().filter(|entry| !entry.is_there()).collect()
 }
 
-/// The first name of each entry that can be installed, or which entries have none.
+/// The first installable name of each entry, or an error that lists the entries without one.
 fn chosen(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Done<Vec<String>> {
     let (names, unknown) = choices(missing, can_be_installed);
     if unknown.is_empty() {
@@ -66,8 +66,8 @@ fn chosen(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Done<Ve
     ))
 }
 
-/// What to tell who may not install: the command to run. Apt's lists may never have been fetched, and only root may do that, so
-/// what they do not have is no failure yet.
+/// Message for users who may not install: the command to run. Apt's lists may never have been fetched, which only root
+/// can do, so packages missing from them are not an error yet.
 fn for_root(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> String {
     let (names, unknown) = choices(missing, can_be_installed);
     let mut said = format!("only root may install packages; run\n  sudo sh -c '{}'", apt::by_hand(&names));
@@ -81,7 +81,7 @@ fn for_root(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Strin
     said + "\nif they are installed already: " + SHADOWED
 }
 
-/// Each entry's first name that can be installed, or its first one; and the entries without any that can.
+/// The first installable name of each entry, or else its first name; and the entries without an installable name.
 fn choices(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> (Vec<String>, Vec<&Entry>) {
     let known = |entry: &Entry| entry.names.iter().find(|name| can_be_installed(name)).cloned();
     let choices: Vec<_> = missing.iter().map(|entry| (entry, known(entry))).collect();
@@ -90,7 +90,7 @@ fn choices(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> (Vec<S
     (choices.into_iter().filter_map(name).collect(), unknown)
 }
 
-/// A package may be installed and yet not be what programs find.
+/// Fails if programs still do not find what the installed packages provide.
 fn still_missing(entries: &[Entry]) -> Done {
     if entries.is_empty() {
         return Ok(());

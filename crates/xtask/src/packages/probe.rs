@@ -1,4 +1,4 @@
-//! What shows that a package is there: the very thing that needs it finds it.
+//! Checks whether a package is present, by using it as the build or the tests do.
 
 use std::ffi::OsStr;
 use std::os::unix::fs::PermissionsExt;
@@ -8,24 +8,24 @@ use std::process::{Command, Stdio};
 use super::{elf, libclang};
 use crate::run::Done;
 
-/// One thing that must be there.
+/// A requirement that a package fulfils.
 #[derive(Debug, PartialEq)]
 pub enum Probe {
-    /// A program on the path.
+    /// A program on the search path.
     Program(String),
-    /// A program that runs without any library, as a guest does that has none.
+    /// A statically linked program, which also runs in a guest without libraries.
     Static(String),
-    /// A compiler that makes a program of this language.
+    /// A compiler that can build a program in this language.
     Compiles(Language),
-    /// A Python of this version or a later one that makes environments with pip.
+    /// Python of at least this version that can create environments with pip.
     Python { major: u32, minor: u32 },
-    /// A C library that can be built with, and its lowest version.
+    /// A C library with development files, and its minimum version.
     PkgConfig { library: String, version: Option<String> },
-    /// The library that bindgen loads.
+    /// The library that bindgen loads at run time.
     Libclang,
 }
 
-/// What a compiler is tried with.
+/// Language in which a compiler is tried.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Language {
     C,
@@ -33,7 +33,7 @@ pub enum Language {
 }
 
 impl Probe {
-    /// Reads a probe as the list writes it.
+    /// Parses a probe of the list.
     pub fn parse(word: &str) -> Done<Self> {
         match word.split_once(':') {
             None if word == "libclang" => Ok(Self::Libclang),
@@ -55,7 +55,7 @@ impl Probe {
         }
     }
 
-    /// Whether it is there.
+    /// Whether the requirement is fulfilled.
     pub fn holds(&self) -> bool {
         match self {
             Self::Program(name) => program(name).is_some(),
@@ -73,7 +73,7 @@ impl Probe {
                         Command::new("pkg-config").arg(format!("--atleast-version={version}")).arg(library),
                     )
                 });
-                // Flags, unlike existence, ask for the libraries that it is built with, too.
+                // Unlike `--exists`, querying the flags also requires the libraries that it depends on.
                 is_new_enough && succeeds(Command::new("pkg-config").args(["--cflags", "--libs", library]))
             }
             Self::Libclang => libclang::is_there(),
@@ -89,7 +89,7 @@ fn python(version: &str) -> Done<Probe> {
         .ok_or_else(|| format!("`{version}` is not a version of Python like 3.11"))
 }
 
-/// The program that a shell would start.
+/// The program that a shell would start for a name.
 fn program(name: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     program_on(&path, name)
@@ -104,7 +104,7 @@ fn program_on(path: &OsStr, name: &str) -> Option<PathBuf> {
 fn is_static(path: &Path) -> bool {
     std::fs::read(path).is_ok_and(|bytes| {
         let kinds = program_headers(&bytes).unwrap_or_default();
-        // Something to run, and no interpreter, which would load libraries for it.
+        // Loadable segments, but no interpreter, which would load libraries.
         kinds.contains(&PT_LOAD) && !kinds.contains(&PT_INTERP)
     })
 }
@@ -112,19 +112,19 @@ fn is_static(path: &Path) -> bool {
 const PT_LOAD: u32 = 1;
 const PT_INTERP: u32 = 3;
 
-/// The kinds of an ELF file's program headers. None: no such file, or none for this machine.
+/// Types of an ELF file's program headers; `None` if it is not an ELF file for this machine.
 fn program_headers(bytes: &[u8]) -> Option<Vec<u32>> {
     let u16_at = |at: usize| Some(u16::from_le_bytes(bytes.get(at..at.checked_add(2)?)?.try_into().ok()?));
     let u32_at = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at.checked_add(4)?)?.try_into().ok()?));
     if !elf::is_for_this_machine(bytes) {
         return None;
     }
-    // The program headers' place, the size of one, their number: of the file's header.
+    // From the file header: offset, entry size and number of the program headers.
     let (start, size, count) = (u32_at(32)? as usize, u16_at(54)? as usize, u16_at(56)? as usize);
     (0..count).map(|index| u32_at(start + index * size)).collect()
 }
 
-/// Compiles and links a program that does nothing, by the compiler that crates and cargo use.
+/// Compiles and links an empty program with the default compiler of crates and cargo.
 fn compiles(language: Language) -> bool {
     let (compiler, kind, source) = match language {
         Language::C => {
@@ -140,7 +140,7 @@ fn compiles(language: Language) -> bool {
         .spawn();
     let Ok(mut compiler) = compiler else { return false };
     if let Some(mut input) = compiler.stdin.take() {
-        // A compiler that does not read ends with a status that says so.
+        // A compiler that does not read its input also fails with an exit status.
         let _ = std::io::Write::write_all(&mut input, source.as_bytes());
     }
     compiler.wait().is_ok_and(|status| status.success())
@@ -190,7 +190,7 @@ mod tests {
 
     #[test]
     fn a_static_program_is_loaded_by_the_kernel_alone() {
-        // One program header of each of these kinds, right after the file's header.
+        // One program header of each of these types, directly after the file header.
         let program = |kinds: &[u8]| {
             let mut bytes = vec![0; 64 + 56 * kinds.len()];
             bytes[..elf::HEADER].copy_from_slice(&elf::own_header());

@@ -1,19 +1,19 @@
-//! What can go wrong with a scene of dots.
+//! Errors of dot scenes.
 
 use std::path::PathBuf;
 
 use super::BUILTIN_NAMES;
 
-/// Why there is no scene.
+/// Why a scene cannot be loaded or computed.
 #[derive(Debug, thiserror::Error)]
 pub enum DotSceneError {
-    /// No built-in scene of this name.
+    /// There is no built-in scene of this name.
     #[error(
         "scene \"{name}\": no such built-in scene of dots; choose one of {}, or name a file that ends in .npz or .npy",
         BUILTIN_NAMES.join(", ")
     )]
     UnknownName {
-        /// The name asked for.
+        /// The requested name.
         name: String,
     },
     /// The file cannot be opened or is damaged.
@@ -21,20 +21,20 @@ pub enum DotSceneError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What went wrong.
+        /// The read error.
         reason: String,
     },
-    /// The file's arrays do not make a scene.
+    /// The file's arrays do not form a scene.
     #[error("scene file {}: {found}; expected {expected}", path.display())]
     Layout {
         /// The file.
         path: PathBuf,
-        /// What it has.
+        /// What the file contains.
         found: String,
-        /// What it needs.
+        /// What is required.
         expected: String,
     },
-    /// Light is finite and not negative.
+    /// Light is negative or not finite.
     #[error(
         "scene file {}: T[{dot}] holds {value} (value {index} of its image): light must be finite and not negative",
         path.display()
@@ -42,11 +42,11 @@ pub enum DotSceneError {
     Value {
         /// The file.
         path: PathBuf,
-        /// Of which dot.
+        /// Index of the dot.
         dot: usize,
-        /// Which value of its image.
+        /// Index of the value in the dot's image.
         index: usize,
-        /// It.
+        /// The invalid value.
         value: f32,
     },
 }

@@ -1,8 +1,8 @@
-//! Scenes from files: the image under each of N dots.
+//! Scenes from files: one image for each of N dots.
 //!
-//! `.npz`: `T` float32 (or float64, converted) `[N, H, W]` or `[N, H, W, 3]`, and `uv` `[N, 2]`, the dots' centres in the field of view,
-//! 0..1 from left to right and from top to bottom. `.npy`: `T` alone, its dots on a square grid, row by row from the
-//! top. Between dots the images are interpolated.
+//! `.npz`: `T` float32 (or float64, converted) `[N, H, W]` or `[N, H, W, 3]`, and `uv` `[N, 2]`, the dots' centres in
+//! the field of view, 0..1 from left to right and from top to bottom. `.npy`: `T` alone, with dots on a square grid,
+//! row by row from the top. Images are interpolated between dots.
 
 use std::fs::File;
 use std::io::BufReader;
@@ -16,21 +16,21 @@ use super::{DotSceneError, Still, seen};
 use crate::dots::beam::Spot;
 use crate::dots::view::View;
 
-/// Dots around a place that make its image where they lie on no grid.
+/// Number of surrounding dots that are interpolated if the dots do not form a grid.
 const NEIGHBOURS: usize = 4;
 
-/// A scene that is known by its dots.
+/// A scene defined by its dots.
 pub struct FileScene {
-    /// `[dots, pixels]`, as the sensor's pixels see it.
+    /// `[dots, pixels]`, as seen by the sensor's pixels.
     images: Array2<f32>,
     uv: Vec<[f64; 2]>,
-    /// Columns and rows of the grid that the dots lie on, row by row, if they do.
+    /// Columns and rows of the dots' grid in row order, if they form one.
     grid: Option<[usize; 2]>,
     view: View,
 }
 
 impl FileScene {
-    /// Reads it.
+    /// Loads a scene from a file.
     pub fn load(path: &Path, half: [f64; 2], mosaic: Mosaic) -> Result<Self, DotSceneError> {
         let unreadable = |reason: String| DotSceneError::Unreadable { path: path.into(), reason };
         let file = || File::open(path).map(BufReader::new).map_err(|error| unreadable(error.to_string()));
@@ -119,12 +119,12 @@ impl FileScene {
         Ok(Self { images, uv, grid, view: View { size: (rows, columns), half } })
     }
 
-    /// Rows and columns of its images.
+    /// Rows and columns of the images.
     pub fn size(&self) -> (usize, usize) {
         self.view.size
     }
 
-    /// The dots whose images make that of a spot, with their weights; none beside the field of view.
+    /// Dots to interpolate for a spot, with their weights; empty outside the field of view.
     fn neighbours(&self, uv: [f64; 2]) -> Vec<(usize, f64)> {
         if let Some([columns, rows]) = self.grid {
             let (first, last) = (self.uv[0], self.uv[self.uv.len() - 1]);
@@ -180,7 +180,7 @@ impl Still for FileScene {
     fn add_global(&self, _: &Spot, _: &mut [f32]) {}
 }
 
-/// Columns and rows of the grid on which the dots lie, row by row, if they do.
+/// Columns and rows of the dots' grid in row order, if they form one.
 fn grid_of(uv: &[[f64; 2]]) -> Option<[usize; 2]> {
     let columns = uv.windows(2).position(|pair| pair[1][0] <= pair[0][0])? + 1;
     let rows = uv.len() / columns;
@@ -199,7 +199,7 @@ fn grid_of(uv: &[[f64; 2]]) -> Option<[usize; 2]> {
     on_grid.then_some(counts)
 }
 
-/// Reads float32, or float64 by conversion.
+/// Reads a float32 array, or a float64 array with conversion.
 fn array(npz: &mut NpzReader<BufReader<File>>, name: &str) -> Result<ArrayD<f32>, ReadNpzError> {
     match npz.by_name::<OwnedRepr<f32>, IxDyn>(name) {
         Err(ReadNpzError::Npy(ReadNpyError::WrongDescriptor(_))) => {

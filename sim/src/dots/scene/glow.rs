@@ -1,4 +1,5 @@
-//! Light after its first reflection or refraction, in models that are simple and of the right kind: none is measured.
+//! Light after its first reflection or refraction: simple, qualitatively correct models that are not based on
+//! measurements.
 
 use std::f64::consts::PI;
 
@@ -6,39 +7,39 @@ use super::model::{Coarse, Model, Place};
 use crate::dots::beam::Spot;
 use crate::dots::view::View;
 
-/// What a scene's light does.
+/// Global light transport of a scene.
 pub enum Glow {
-    /// Nothing more.
+    /// No global light.
     None,
-    /// It bounces once from wall to wall.
+    /// One bounce between the walls.
     Bounce,
-    /// It is refracted by a ball, and a caustic gathers it.
+    /// Refraction by a ball, which forms a caustic.
     Caustic { centre: [f64; 2], radius: f64 },
-    /// It wanders in wax and comes out around where it went in.
+    /// Subsurface scattering in wax: light leaves around the point of entry.
     Wax { centre: f64, radius: f64, top: f64 },
-    /// It is scattered along the beam and around it.
+    /// Scattering along the beam and around it.
     Fog { density: Box<dyn Fn([f64; 2]) -> f64 + Send + Sync> },
 }
 
-/// Widths of the wax's glow, in parts of the field's height, and the share of the light in each.
+/// Widths of the wax's glow, relative to the height of the field of view, and the fraction of light in each.
 const WAX: [(f64, f64); 2] = [(0.10, 0.30), (0.30, 0.25)];
-/// Distances at which the beam's light is scattered in the fog.
+/// Distances at which fog scatters the beam's light.
 const FOG_DEPTHS: [f64; 6] = [0.90, 0.92, 0.94, 0.96, 0.98, 1.00];
-/// Light scattered towards the camera at each of them, of a beam through the thickest fog.
+/// Fraction of light scattered towards the camera at each distance, for a beam through the densest fog.
 const FOG_STREAK: f64 = 0.02;
-/// The same that comes out after several scatterings, and how wide.
+/// Fraction of light that leaves after multiple scattering, and its width.
 const FOG_HALO: (f64, f64) = (0.012, 0.5);
 
-/// The light at a coarse pixel, from its number, its direction and its place.
+/// Light at a coarse pixel, given its index, direction and surface point.
 type LightAt<'a> = Box<dyn Fn(usize, [f64; 2], &Place) -> f64 + 'a>;
 
 impl Glow {
-    /// Whether it falls on the surface, whose albedo then counts; else it comes from what is before it.
+    /// Whether the light falls on the surface and is weighted by its albedo, rather than coming from in front of it.
     pub fn is_of_surface(&self) -> bool {
         !matches!(self, Self::Fog { .. })
     }
 
-    /// The light at the coarse pixels, of what has no fine detail.
+    /// Light without fine detail at the coarse pixels; `None` if there is none.
     pub fn coarse(&self, spot: &Spot, model: &Model, view: &View, coarse: &Coarse) -> Option<Vec<f32>> {
         let light: LightAt = match self {
             Self::None | Self::Caustic { .. } => return None,
@@ -83,17 +84,17 @@ impl Glow {
     }
 }
 
-/// Irradiance at `to` of a unit of flux that a small diffuse patch at `from` sends out.
+/// Irradiance at `to` caused by unit flux from a small diffuse patch at `from`.
 fn exchange(from: &Place, to: &Place, blur: f64) -> f64 {
     let way = [0, 1, 2].map(|axis| to.point[axis] - from.point[axis]);
     let square: f64 = way.iter().map(|part| part * part).sum();
     let dot = |normal: [f64; 3]| (0..3).map(|axis| normal[axis] * way[axis]).sum::<f64>();
     let (out, into) = (dot(from.normal).max(0.0), (-dot(to.normal)).max(0.0));
-    // Near the edge the patch is no point.
+    // Near the edge the patch cannot be treated as a point; `blur` is its variance.
     out * into / (PI * square.max(1e-12) * (square + blur))
 }
 
-/// Light that went into the wax under a spot and comes out elsewhere.
+/// Light that entered the wax under a spot and leaves it at `m`.
 fn wandered(spot: &Spot, m: [f64; 2], height: f64) -> f64 {
     let square = (m[0] - spot.centre[0]).powi(2) + (m[1] - spot.centre[1]).powi(2);
     let gaussians = WAX.iter().map(|(width, share)| {
@@ -103,8 +104,8 @@ fn wandered(spot: &Spot, m: [f64; 2], height: f64) -> f64 {
     gaussians.sum()
 }
 
-/// The spots behind a ball of glass of a spot on it. Those from near its rim and from nearer its middle meet, so that
-/// light gathers in a ring.
+/// The refracted spot behind a glass ball for a spot on the ball. Spots from near the rim and from closer to the centre
+/// overlap, so that light concentrates in a ring.
 pub fn caustic(centre: [f64; 2], radius: f64, spot: &Spot) -> Option<Spot> {
     let from_centre = [0, 1].map(|axis| (spot.centre[axis] - centre[axis]) / radius);
     let rho = from_centre[0].hypot(from_centre[1]);

@@ -1,4 +1,4 @@
-//! What stands before the camera of the dot rig, and how it looks under one spot of light.
+//! Subjects in front of the dot rig's camera, and their images under one spot of light.
 
 mod error;
 mod file;
@@ -20,10 +20,10 @@ use super::view::View;
 /// Names of the built-in scenes.
 pub const BUILTIN_NAMES: [&str; 4] = ["v-groove", "glass", "candle", "fog"];
 
-/// Images of one spot, `[row, column]` row-major, in parts of a white plane's under the full beam.
+/// Images under one spot, `[row, column]` row-major, relative to a white plane under the full beam.
 #[derive(Debug, Clone)]
 pub struct Light {
-    /// Light straight from the mirror; of a scene from a file, all light.
+    /// Direct light from the mirror; for a scene from a file, all light.
     pub direct: Vec<f32>,
     /// All other light.
     pub global: Vec<f32>,
@@ -31,14 +31,14 @@ pub struct Light {
 
 /// A scene at rest.
 pub trait Still: Send + Sync {
-    /// Adds the light of a spot that comes straight from the mirror; of a scene from a file, all light.
+    /// Adds the direct light of a spot; for a scene from a file, all light.
     fn add_direct(&self, spot: &Spot, image: &mut [f32]);
 
     /// Adds all other light of a spot.
     fn add_global(&self, spot: &Spot, image: &mut [f32]);
 }
 
-/// A scene that may move, and the planes that can stand in its place.
+/// A scene that may move, and the planes that can replace it.
 pub struct Scene {
     kind: Kind,
     planes: Vec<Arc<dyn Still>>,
@@ -53,10 +53,10 @@ enum Kind {
 }
 
 impl Scene {
-    /// Reads or makes it; files are looked up relative to `folder`.
+    /// Loads or computes a scene; file paths are relative to `folder`.
     ///
     /// # Errors
-    /// When it cannot be read, or there is none of that name or size.
+    /// When it cannot be read, or when the name or the size is invalid.
     pub fn new(
         config: &DotsConfig,
         half: [f64; 2],
@@ -85,22 +85,22 @@ impl Scene {
         Ok(Self { kind, planes, view, mosaic, seed: config.seed })
     }
 
-    /// Rows and columns.
+    /// The camera's view of the scene.
     pub fn view(&self) -> View {
         self.view
     }
 
-    /// How many planes there are.
+    /// Number of planes.
     pub fn planes(&self) -> usize {
         self.planes.len()
     }
 
-    /// One of the planes.
+    /// The plane with this index.
     pub fn plane(&self, number: usize) -> Option<Arc<dyn Still>> {
         self.planes.get(number).cloned()
     }
 
-    /// The scene at a place of its swing, -1..=1.
+    /// The scene at a position of its swing, -1..=1.
     pub fn at(&self, swing: f64) -> Arc<dyn Still> {
         match &self.kind {
             Kind::File(still) => still.clone(),
@@ -112,11 +112,11 @@ impl Scene {
     }
 }
 
-/// What a pixel of a mosaic sees of a colour; a monochrome one the mean.
+/// A colour as seen by a pixel of a mosaic; on a monochrome sensor, the mean.
 fn seen(mosaic: Mosaic, row: usize, column: usize, colour: [f32; 3]) -> f32 {
     let Some((red_column, red_row)) = mosaic.red() else {
         return colour.iter().sum::<f32>() / 3.0;
     };
-    // Blue lies diagonally from red, green beside both.
+    // Blue is diagonal to red; green is adjacent to both.
     colour[usize::from(row % 2 != red_row) + usize::from(column % 2 != red_column)]
 }

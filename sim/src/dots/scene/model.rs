@@ -1,4 +1,4 @@
-//! Built-in scenes: a surface over the beam's directions, its print, and what its light does after the first reflection.
+//! Built-in scenes: a surface as a function of the beam's direction, its print, and its global light transport.
 
 use rayon::prelude::*;
 use raysweep_core::Mosaic;
@@ -9,20 +9,20 @@ use crate::dots::beam::Spot;
 use crate::dots::view::View;
 use crate::scene::texture::{noise, printed_page};
 
-/// Steps in which the point that a pixel sees is found; each brings it nearer by a factor of five or more.
+/// Iterations for finding the point that a pixel sees; each reduces the error by a factor of at least five.
 const TRACE_STEPS: usize = 12;
-/// Half the distance over which a surface's slope is measured, as a tangent.
+/// Half the step for finite differences of the surface, as a tangent.
 const STEP_TANGENT: f64 = 1e-4;
-/// Size of a scene's print.
+/// Size of a scene's print in pixels.
 const PAGE_ROWS: usize = 192;
 const PAGE_COLUMNS: usize = 320;
 
-/// Distance at which a direction meets the surface.
+/// Distance of the surface in a direction.
 pub type Depth = Box<dyn Fn([f64; 2]) -> f64 + Send + Sync>;
 /// Linear RGB albedo in a direction.
 pub type Albedo = Box<dyn Fn([f64; 2]) -> [f32; 3] + Send + Sync>;
 
-/// A surface without its image.
+/// A surface and its light transport, independent of the camera.
 pub struct Model {
     depth: Depth,
     albedo: Albedo,
@@ -35,7 +35,7 @@ impl Model {
         Self { depth: Box::new(move |_| depth), albedo: Box::new(|_| [1.0; 3]), glow: Glow::None }
     }
 
-    /// One of [`super::BUILTIN_NAMES`], at a place of its swing.
+    /// One of [`super::BUILTIN_NAMES`], at a position of its swing.
     pub fn builtin(name: &str, half: [f64; 2], swing: f64, seed: u64) -> Self {
         match name {
             "glass" => Self::glass(half, swing, seed),
@@ -45,7 +45,7 @@ impl Model {
         }
     }
 
-    /// Two printed walls that meet in an upright concave edge, which moves sideways.
+    /// Two printed walls that meet in a vertical concave edge, which moves sideways.
     fn v_groove(half: [f64; 2], swing: f64, seed: u64) -> Self {
         let edge = 0.3 * half[0] * swing;
         Self {
@@ -55,20 +55,20 @@ impl Model {
         }
     }
 
-    /// A ball of glass before a printed page: it takes the beam elsewhere and gathers it in a caustic.
+    /// A glass ball in front of a printed page: it deflects the beam and focuses it into a caustic.
     fn glass(half: [f64; 2], swing: f64, seed: u64) -> Self {
         let (centre, radius) = ([0.35 * half[0] * swing, 0.1 * half[1]], 0.5 * half[1]);
         let within = move |[x, y]: [f64; 2]| (x - centre[0]).hypot(y - centre[1]) < radius;
         let page = page(half, [0.0, 0.0], seed);
         Self {
             depth: Box::new(|_| 1.05),
-            // Of the ball itself only a faint reflection is seen.
+            // Only a faint reflection of the ball itself is visible.
             albedo: Box::new(move |m| if within(m) { [0.05, 0.05, 0.06] } else { page(m) }),
             glow: Glow::Caustic { centre, radius },
         }
     }
 
-    /// A candle of wax before a wall; light wanders in the wax.
+    /// A wax candle in front of a wall, with subsurface scattering.
     fn candle(half: [f64; 2], swing: f64, seed: u64) -> Self {
         let (centre, radius, top) = (0.3 * half[0] * swing, 0.45 * half[1], -0.7 * half[1]);
         let within = move |[x, y]: [f64; 2]| (x - centre).abs() < radius && y > top;
@@ -83,7 +83,7 @@ impl Model {
         }
     }
 
-    /// A slab of fog, which drifts, before a printed page.
+    /// A drifting slab of fog in front of a printed page.
     fn fog(half: [f64; 2], swing: f64, seed: u64) -> Self {
         let density = move |m: [f64; 2]| {
             0.55 + 0.45 * noise(seed, 3.0 * (m[0] / half[0] + swing), 3.0 * m[1] / half[0])
@@ -91,7 +91,7 @@ impl Model {
         let page = page(half, [0.0, 0.0], seed);
         Self {
             depth: Box::new(|_| 1.05),
-            // The beam goes through the fog to the page, and what the page sends goes through it again.
+            // The fog attenuates both the beam on its way to the page and the light returned by the page.
             albedo: Box::new(move |m| page(m).map(|part| part * (-1.2 * density(m)).exp() as f32)),
             glow: Glow::Fog { density: Box::new(density) },
         }
@@ -110,32 +110,32 @@ fn page(half: [f64; 2], middle: [f64; 2], seed: u64) -> Albedo {
     })
 }
 
-/// A place on a surface.
+/// A point on a surface.
 #[derive(Debug, Clone, Copy)]
 pub struct Place {
-    /// In units of the scene's distance.
+    /// Position, in units of the scene's distance.
     pub point: [f64; 3],
-    /// Towards the projector.
+    /// Unit normal towards the projector.
     pub normal: [f64; 3],
 }
 
-/// A surface as the camera sees it.
+/// A surface as seen by the camera.
 pub struct Surface {
     model: Model,
     view: View,
-    /// Directions from the projector to what the pixels see.
+    /// Direction from the projector to the point that each pixel sees.
     directions: Vec<[f64; 2]>,
-    /// Albedo of each pixel, through its colour filter.
+    /// Albedo of each pixel, as seen through its colour filter.
     albedo: Vec<f32>,
-    /// How strongly the beam's light falls there: 1 where the surface faces the projector at the scene's distance.
+    /// Irradiance factor of each pixel: 1 where the surface faces the projector at the scene's distance.
     facing: Vec<f32>,
     coarse: Coarse,
 }
 
-/// What pixels [`Coarse::STEP`] apart see: enough for light without fine detail.
+/// Samples of the surface every [`Coarse::STEP`] pixels, sufficient for light without fine detail.
 pub struct Coarse {
     columns: usize,
-    /// Direction and place of each.
+    /// Direction and surface point of each sample.
     pub seen: Vec<([f64; 2], Place)>,
 }
 
@@ -153,12 +153,12 @@ impl Coarse {
         Self { columns, seen: seen.collect() }
     }
 
-    /// Row and column of a node's pixel's middle.
+    /// Row and column of the centre of a sample's pixel.
     pub fn pixel(&self, node: usize) -> [f64; 2] {
         [node / self.columns, node % self.columns].map(|place| (place * Self::STEP) as f64 + 0.5)
     }
 
-    /// The value at a pixel between those of the nodes.
+    /// Interpolates the samples' values at a pixel.
     fn at(&self, values: &[f32], row: usize, column: usize) -> f32 {
         let (node, below) = (row / Self::STEP, (row % Self::STEP) as f32 / Self::STEP as f32);
         let (column, right) = (column / Self::STEP, (column % Self::STEP) as f32 / Self::STEP as f32);
@@ -169,7 +169,7 @@ impl Coarse {
 }
 
 impl Model {
-    /// The direction from the projector to what a pixel sees.
+    /// Direction from the projector to the point that a pixel sees.
     fn seen(&self, view: View, row: usize, column: usize) -> [f64; 2] {
         let mut depth = 1.0;
         for _ in 0..TRACE_STEPS {
@@ -178,7 +178,7 @@ impl Model {
         view.direction(row, column, depth)
     }
 
-    /// The point in a direction, and which way the surface faces there.
+    /// Surface point and normal in a direction.
     pub fn place(&self, direction: [f64; 2]) -> Place {
         let point = |[x, y]: [f64; 2]| {
             let depth = (self.depth)([x, y]);
@@ -197,14 +197,14 @@ impl Model {
         Place { point: point(direction), normal: normal.map(|part| part / length) }
     }
 
-    /// Mean albedo in a direction.
+    /// Albedo in a direction, averaged over the colours.
     pub fn mean_albedo(&self, direction: [f64; 2]) -> f64 {
         f64::from((self.albedo)(direction).iter().sum::<f32>()) / 3.0
     }
 }
 
 impl Surface {
-    /// Finds what each pixel sees.
+    /// Computes what each pixel sees.
     pub fn trace(model: Model, view: View, mosaic: Mosaic) -> Self {
         let (rows, columns) = view.size;
         let pixels: Vec<([f64; 2], f32, f32)> = (0..rows * columns)

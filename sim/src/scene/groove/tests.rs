@@ -6,7 +6,7 @@ fn size() -> SceneSize {
     SceneSize { rows: 40, columns: 48 }
 }
 
-/// A groove of one colour whose edge lies at row 18.
+/// A uniformly coloured groove whose edge lies at row 18.
 fn plain(albedo: f32) -> Bounces {
     let SceneSize { rows, columns } = size();
     let mut direct = Direct::new(size(), 1, |_, x| x as f32 / columns as f32);
@@ -20,9 +20,9 @@ fn walls() -> [Wall; 2] {
     [Wall::new(18, TILTS[0]), Wall::new(22, TILTS[1])]
 }
 
-/// Each row of form factors adds up to the view of the whole other wall, which is one rectangle.
-/// For the lower wall the table comes from the upper wall's quadrature by reciprocity, and the
-/// whole is integrated the other way round: an independent check.
+/// Each row of form factors sums to the form factor of the whole opposite wall, which is one rectangle. For the lower
+/// wall, the table is derived from the upper wall's quadrature by reciprocity while the whole is integrated the other
+/// way round, which makes the check independent.
 #[test]
 fn form_factors_close() {
     let groove = plain(0.8);
@@ -58,8 +58,8 @@ fn form_factors_are_reciprocal() {
     }
 }
 
-/// White furnace: if the surroundings shine with radiance 1 through the opening, walls of albedo 1
-/// shine with exitance 1 everywhere.
+/// White furnace: if the surroundings emit radiance 1 through the opening, walls of albedo 1 have exitance 1
+/// everywhere.
 #[test]
 fn white_furnace() {
     let mut groove = plain(0.8);
@@ -94,14 +94,14 @@ fn spreading_over_patches_keeps_the_flux() {
         let wall = groove.wall_of(row);
         groove.reflect(row, 0, |_| 1.0, &mut first[wall].row_mut(0));
         let flux: f32 = first[wall].row(0).iter().zip(&groove.inverse_areas[wall]).map(|(e, a)| e / a).sum();
-        // A row lights one row height of the picture, whatever the tilt.
+        // A row lights one row height of the image, whatever the tilt.
         let expected = 0.6 * size().columns as f32;
         assert!((flux / expected - 1.0).abs() < 1e-5, "row {row}: {flux} {expected}");
     }
 }
 
-/// Particles that start on the lit row and are followed over all their bounces. 1,000,000
-/// particles: the standard error of a band of four rows is below 1 %; the tolerance is 4 %.
+/// Traces particles from the lit row through all their bounces. 1,000,000 particles: the standard error of a band of
+/// four rows is below 1 %; the tolerance is 4 %.
 #[test]
 fn particles_agree() {
     let (albedo, rows, columns) = (0.7_f32, size().rows, size().columns as f64);
@@ -133,7 +133,7 @@ fn particles_agree() {
         for band in 0..rows / 4 {
             let rows = band * 4..band * 4 + 4;
             let flux = f64::from(albedo) * columns / f64::from(particles);
-            // Landed flux is irradiance times wall area; the picture shows albedo times irradiance.
+            // The landed flux is irradiance times wall area; the image shows albedo times irradiance.
             let expected: f64 = rows
                 .clone()
                 .map(|row| landed[row] * flux * TILTS[usize::from(row >= 18)].cos() * f64::from(albedo))
@@ -144,7 +144,7 @@ fn particles_agree() {
     }
 }
 
-/// Sends a diffuse particle off `(wall, distance from the edge, x)`; where it lands on the other wall.
+/// Emits a diffuse particle from `(wall, distance from the edge, x)`; returns where it lands on the other wall.
 fn fly(
     from: (usize, f64, f64),
     walls: &[Wall; 2],
