@@ -1,24 +1,15 @@
 //! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
 
-mod advice;
-pub mod check;
 pub mod cli;
-pub mod config;
 pub mod control;
-mod dots;
-mod film;
+mod devices;
 pub mod live;
-mod memory;
 pub mod mirror;
-pub mod process;
-pub mod processing;
-mod report;
-mod response;
-mod results;
+mod plane;
+mod procedure;
 pub mod rig;
-pub mod run;
+mod run;
+mod runner;
 pub mod server;
-mod strips;
 
-/// Name and version, as sessions keep it.
-pub const SOFTWARE: &str = concat!("raysweepd ", env!("CARGO_PKG_VERSION"));
+pub use runner::Runner;

@@ -451,7 +451,7 @@ fn a_film_that_is_killed_keeps_its_cycles_and_is_processed_not_resumed() {
     assert!(refused.contains("cannot be resumed") && refused.contains("raysweep process"), "{refused}");
     drop(daemon);
 
-    let processed = raysweep::process::process(&started.session).unwrap();
+    let processed = raysweep_processing::process(&started.session).unwrap();
     assert_eq!((processed.stored, processed.problems), (state.cycles().count(), Vec::new()));
     let transports = TransportFilm::open(&session.transport_film_path()).unwrap();
     for cycle in state.cycles() {

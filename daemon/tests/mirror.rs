@@ -10,11 +10,11 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use raysweep::config::{DotRigFile, Plan};
+use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::mirror::state_file;
 use raysweep::rig::AnyRig;
-use raysweep::run::Runner;
+use raysweep_config::{DotRigFile, Plan, Procedure};
 use raysweep_core::{Clock, MirrorLimits};
 use raysweep_drivers::mirror::playzerx::protocol::Sample;
 use raysweep_drivers::mirror::{Parked, park};
@@ -197,7 +197,8 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
     let truth = lab.pty.truth();
     assert_eq!((truth.underruns, truth.overfills), (0, 0));
     let rig = DotRigFile::parse(&fs::read_to_string(lab.folder.path().join("rig.toml")).unwrap()).unwrap();
-    let path = Plan::parse(&text).unwrap().batches.mirror_path(&rig.limits()).unwrap();
+    let Procedure::Batches(plan) = Plan::parse(&text).unwrap().procedure else { panic!("batches") };
+    let path = plan.mirror_path(&rig.limits()).unwrap();
     assert_eq!(path.points().len(), 6500);
     let codes: Vec<Held> = path
         .points()

@@ -4,4 +4,5 @@
 pub mod camera;
 pub mod mirror;
 pub mod projector;
+pub mod serial;
 pub mod vsync;

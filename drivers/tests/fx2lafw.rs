@@ -221,7 +221,8 @@ fn any_bytes_are_samples() {
 #[test]
 fn what_cannot_be_is_refused_with_its_key() {
     let refused = |config: Fx2LafwConfig, key: &str| {
-        let (found, message) = config.check().unwrap_err();
+        let fault = config.faults().into_iter().next().unwrap();
+        let (found, message) = (fault.key, format!("vsync.fx2lafw.{fault}"));
         assert!(found == key && message.contains(key), "{message}");
         assert_eq!(
             Fx2Lafw::new(Bytes(Vec::new(), 0), &config).err().unwrap().kind,

@@ -17,7 +17,7 @@ use guest::{Monitor, PATIENCE, wait_for};
 use nix::fcntl::OFlag;
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorLimits, MirrorPath, Tilt};
 use raysweep_drivers::mirror::playzerx::protocol::Sample;
-use raysweep_drivers::mirror::{LightGuard, Link, MirrorReport, PlayzerX, PlayzerXConfig, arm_light};
+use raysweep_drivers::mirror::{LightGuard, MirrorReport, PlayzerX, PlayzerXConfig, PlayzerXLink, arm_light};
 use raysweep_sim::mirror::{
     Held, MechanicsConfig, MirrorPty, PlayzerXConfig as SimConfig, PlayzerXController,
 };
@@ -72,7 +72,7 @@ impl Lab {
     fn open(&self) -> PlayzerX {
         let config = || PlayzerXConfig {
             port: PORT.into(),
-            link: Link::VirtualCom,
+            link: PlayzerXLink::VirtualCom,
             full_scale: MechanicsConfig::default().max_tilt,
             limits: LIMITS,
             state: self.state(),

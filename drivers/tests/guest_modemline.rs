@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use guest::{PATIENCE, wait_for};
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
 use raysweep_drivers::vsync::Polarity;
-use raysweep_drivers::vsync::modemline::{Line, ModemLine};
+use raysweep_drivers::vsync::modemline::{ModemLine, ModemLineInput};
 use raysweep_drivers::vsync::pps::Pps;
 use raysweep_sim::usb::{Ftdi, FtdiLine, Plugged};
 
@@ -66,7 +66,7 @@ fn numbers_are_the_line_s_own(vsync: &mut dyn Vsync, line: &FtdiLine) {
 #[ignore = "needs the kernel guest: cargo xtask guest"]
 fn modem_line_counts_each_pulse_and_stamps_those_it_sees() {
     let (plugged, line) = plug();
-    let mut vsync = ModemLine::open(Path::new(PORT), Line::Dcd, Polarity::Assert).unwrap();
+    let mut vsync = ModemLine::open(Path::new(PORT), ModemLineInput::Dcd, Polarity::Assert).unwrap();
     numbers_are_the_line_s_own(&mut vsync, &line);
     unplug(plugged);
 }
@@ -76,7 +76,7 @@ fn modem_line_counts_each_pulse_and_stamps_those_it_sees() {
 fn modem_line_tells_of_an_unplugged_port_and_opens_again() {
     for _ in 0..2 {
         let (plugged, line) = plug();
-        let mut vsync = ModemLine::open(Path::new(PORT), Line::Dcd, Polarity::Clear).unwrap();
+        let mut vsync = ModemLine::open(Path::new(PORT), ModemLineInput::Dcd, Polarity::Clear).unwrap();
         line.start();
         assert!(vsync.next_edge(PATIENCE).unwrap().is_some());
         drop(plugged);
@@ -98,7 +98,7 @@ fn modem_line_tells_of_an_unplugged_port_and_opens_again() {
 fn a_line_that_does_not_change_gives_no_edge() {
     let (plugged, line) = plug();
     line.start();
-    let mut vsync = ModemLine::open(Path::new(PORT), Line::Cts, Polarity::Assert).unwrap();
+    let mut vsync = ModemLine::open(Path::new(PORT), ModemLineInput::Cts, Polarity::Assert).unwrap();
     assert_eq!(vsync.next_edge(Duration::from_millis(200)).unwrap(), None);
     drop(vsync); // and closing it does not hang
     unplug(plugged);
@@ -147,7 +147,7 @@ fn the_polarity_says_which_change_is_the_edge() {
     for edge in [Polarity::Assert, Polarity::Clear] {
         // After an edge, the line stays unchanged for longer than a guest takes to notice it.
         let (plugged, line) = plug_with(Duration::from_secs(2), Duration::from_secs(1));
-        let mut vsync = ModemLine::open(Path::new(PORT), Line::Dcd, edge).unwrap();
+        let mut vsync = ModemLine::open(Path::new(PORT), ModemLineInput::Dcd, edge).unwrap();
         line.start();
         assert!(vsync.next_edge(PATIENCE).unwrap().is_some());
         assert_eq!(line.is_asserted(), edge == Polarity::Assert, "{edge:?} by TIOCMIWAIT");

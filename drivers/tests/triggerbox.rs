@@ -6,9 +6,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
-use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Receiver};
+use raysweep_drivers::serial::wire::{LONGEST_REPLY, Receiver};
 use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
-use raysweep_drivers::vsync::triggerbox::{Link, TriggerBox, TriggerBoxConfig};
+use raysweep_drivers::vsync::triggerbox::{TriggerBox, TriggerBoxConfig, TriggerBoxLink};
 use raysweep_sim::mirror::{Link as Wire, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 
@@ -21,7 +21,7 @@ fn plug(faults: WireFaults) -> TriggerBoxPty {
 }
 
 fn config(path: &Path) -> TriggerBoxConfig {
-    TriggerBoxConfig { port: path.to_owned(), link: Link::Usb }
+    TriggerBoxConfig { port: path.to_owned(), link: TriggerBoxLink::Usb }
 }
 
 fn edges(vsync: &mut dyn Vsync, count: usize) -> Vec<Edge> {

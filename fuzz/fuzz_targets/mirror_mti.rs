@@ -3,7 +3,7 @@
 
 use libfuzzer_sys::fuzz_target;
 use raysweep_drivers::mirror::parse_mti;
-use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Receiver};
+use raysweep_drivers::serial::wire::{LONGEST_REPLY, Receiver};
 
 fuzz_target!(|data: &[u8]| {
     let mut receiver = Receiver::default();

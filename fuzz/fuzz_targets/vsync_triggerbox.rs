@@ -2,7 +2,7 @@
 //! Feeds bytes from a triggerbox in chunks; the first byte of each chunk is its length.
 
 use libfuzzer_sys::fuzz_target;
-use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Receiver};
+use raysweep_drivers::serial::wire::{LONGEST_REPLY, Receiver};
 use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
 
 fuzz_target!(|data: &[u8]| {

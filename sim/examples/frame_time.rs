@@ -5,8 +5,9 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use raysweep_config::sim::SimConfig;
 use raysweep_core::{FramePool, Pattern, PixelFormat, Raster};
-use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimConfig};
+use raysweep_sim::{Devices, PlaneRig, PlaneSetup};
 
 const FRAMES: u32 = 1000;
 

@@ -9,10 +9,10 @@ use raysweep_core::{
     us_from_ns,
 };
 
-use crate::gige::Look;
+use crate::error::SimError;
 use crate::line::{Exposure, Light, Line, LineTruth};
-use crate::rig::{Bench, SimError};
 use crate::sensor::Exposed;
+use crate::world::PlaneWorld;
 
 /// The devices of one rig, sharing one clock.
 pub struct Devices {
@@ -25,18 +25,6 @@ pub struct Devices {
     /// The devices' clock.
     pub clock: Clock,
     /// Ground truth of the line, for tests only; real rigs have none.
-    pub truth: TruthProbe,
-}
-
-/// The devices of one rig on the host's clock, with the camera behind a network connection.
-pub struct WireDevices {
-    /// The simulated scene as the camera's picture source.
-    pub camera: Look,
-    /// The VSYNC monitor.
-    pub vsync: Box<dyn Vsync>,
-    /// The projector, initially dark.
-    pub projector: Box<dyn Projector>,
-    /// Ground truth of the line, for tests only.
     pub truth: TruthProbe,
 }
 
@@ -89,31 +77,33 @@ impl SharedLine {
     }
 }
 
-pub fn open(bench: &Arc<Bench>, line: Line, clock: Clock) -> Devices {
+pub fn open(world: &Arc<PlaneWorld>, line: Line, clock: Clock) -> Devices {
     let line = SharedLine(Arc::new(Mutex::new(line)));
     Devices {
-        camera: Box::new(SimCamera::new(bench.clone(), line.clone(), clock.register())),
+        camera: Box::new(SimCamera::new(world.clone(), line.clone(), clock.register())),
         vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
-        projector: Box::new(SimProjector { bench: bench.clone(), line: line.clone(), clock: clock.clone() }),
+        projector: Box::new(SimProjector { world: world.clone(), line: line.clone(), clock: clock.clone() }),
         truth: TruthProbe(line),
         clock,
     }
 }
 
-/// The devices of [`open`], with two handles to the camera: one writes settings while the other waits for frames.
-pub fn open_for_wire(bench: &Arc<Bench>, line: Line) -> WireDevices {
+/// VSYNC monitor and projector on the host's clock, with two handles to the camera: one writes settings while the other
+/// waits for frames.
+pub type Shared = ([SimCamera; 2], Box<dyn Vsync>, Box<dyn Projector>, TruthProbe);
+
+/// The devices of [`open`] on the host's clock.
+pub fn open_shared(world: &Arc<PlaneWorld>, line: Line) -> Shared {
     let (line, clock) = (SharedLine(Arc::new(Mutex::new(line))), Clock::real());
-    let camera = || SimCamera::new(bench.clone(), line.clone(), clock.register());
-    WireDevices {
-        camera: Look::at_scene(camera(), camera()),
-        vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
-        projector: Box::new(SimProjector { bench: bench.clone(), line: line.clone(), clock }),
-        truth: TruthProbe(line),
-    }
+    let camera = || SimCamera::new(world.clone(), line.clone(), clock.register());
+    let cameras = [camera(), camera()];
+    let vsync = Box::new(SimVsync { line: line.clone(), clock: clock.register() });
+    let projector = Box::new(SimProjector { world: world.clone(), line: line.clone(), clock });
+    (cameras, vsync, projector, TruthProbe(line))
 }
 
 pub struct SimCamera {
-    bench: Arc<Bench>,
+    world: Arc<PlaneWorld>,
     line: SharedLine,
     clock: ClockHandle,
     capabilities: CameraCapabilities,
@@ -122,11 +112,11 @@ pub struct SimCamera {
 }
 
 impl SimCamera {
-    fn new(bench: Arc<Bench>, line: SharedLine, clock: ClockHandle) -> Self {
-        let (height, width) = bench.size;
-        let capabilities = bench.capabilities();
+    fn new(world: Arc<PlaneWorld>, line: SharedLine, clock: ClockHandle) -> Self {
+        let (height, width) = world.size;
+        let capabilities = world.capabilities();
         Self {
-            bench,
+            world,
             line,
             clock,
             capabilities,
@@ -161,12 +151,12 @@ impl SimCamera {
 
     /// Integrates the light of an exposure and reads the sensor.
     fn render(&mut self, exposure: &Exposure, lights: &[Light], first_row: usize) {
-        let (_, width) = self.bench.size;
+        let (_, width) = self.world.size;
         let exposure_us = exposure.settings.exposure_us;
-        let ambient = self.bench.ambient(exposure);
+        let ambient = self.world.ambient(exposure);
         for (t, row) in self.light.chunks_mut(width).enumerate().skip(first_row) {
             row.fill(ambient);
-            let row_start_us = self.bench.row_start_us(exposure.settings.shutter, t - first_row);
+            let row_start_us = self.world.row_start_us(exposure.settings.shutter, t - first_row);
             for light in lights {
                 if let Some(optics) = &light.optics {
                     let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
@@ -175,7 +165,7 @@ impl SimCamera {
             }
         }
         let exposed = Exposed { light: &mut self.light, exposure_us, key: exposure.key };
-        self.bench.sensor.read(exposed, &mut self.counts);
+        self.world.sensor.read(exposed, &mut self.counts);
     }
 }
 
@@ -189,7 +179,7 @@ impl Camera for SimCamera {
     }
 
     fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
-        let camera = &self.bench.config.camera;
+        let camera = &self.world.config.camera;
         let stepped = |value: f64, step: f64| if step > 0.0 { (value / step).round() * step } else { value };
         let actual = CameraSettings {
             shutter: settings.shutter,
@@ -225,7 +215,7 @@ impl Camera for SimCamera {
             ));
         }
         let Some(exposure) = self.next_exposure(0, timeout) else { return Ok(None) };
-        self.bench
+        self.world
             .format
             .pack_into(&self.counts, buf)
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::Protocol, error))?;
@@ -234,7 +224,7 @@ impl Camera for SimCamera {
             device_ns: exposure.start_ns,
             exposure_start_ns: exposure.start_ns,
             host_ns: exposure.done_ns,
-            exposure_us: self.bench.config.camera.chunk_exposure.then_some(exposure.settings.exposure_us),
+            exposure_us: self.world.config.camera.chunk_exposure.then_some(exposure.settings.exposure_us),
         }))
     }
 
@@ -256,14 +246,14 @@ impl Vsync for SimVsync {
 }
 
 struct SimProjector {
-    bench: Arc<Bench>,
+    world: Arc<PlaneWorld>,
     line: SharedLine,
     clock: Clock,
 }
 
 impl Projector for SimProjector {
     fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
-        let optics = self.bench.optics_of(pattern).map_err(|error| {
+        let optics = self.world.optics_of(pattern).map_err(|error| {
             let along_rows = matches!(error, SimError::AlongRows);
             let kind = if along_rows { DeviceErrorKind::Unsupported } else { DeviceErrorKind::OutOfRange };
             DeviceError::new("projector", kind, error)

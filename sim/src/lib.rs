@@ -5,9 +5,9 @@
 //! for any number of threads and wherever a run was interrupted.
 
 pub mod bench;
-pub mod config;
 mod devices;
 pub mod dots;
+mod error;
 pub mod gige;
 mod keyed;
 mod line;
@@ -18,8 +18,12 @@ pub mod scene;
 mod sensor;
 pub mod triggerbox;
 pub mod usb;
+mod wire;
+mod world;
 
-pub use config::SimConfig;
-pub use devices::{Devices, TruthProbe, WireDevices};
+pub use devices::{Devices, TruthProbe};
+pub use error::SimError;
 pub use line::LineTruth;
-pub use rig::{PlaneRig, PlaneSetup, SimError};
+pub use rig::PlaneRig;
+pub use wire::WireDevices;
+pub use world::PlaneSetup;

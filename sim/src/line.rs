@@ -11,10 +11,10 @@ use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, ns_from_us};
 
 use self::camera::{CameraLine, Sequence, Written};
 pub use self::camera::{Exposure, Sets, TriggeredBy};
-use crate::config::{SimCamera, SimProjector, SimVsync};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::optics::Optics;
 use crate::scene::Motion;
+use raysweep_config::sim::{SimCamera, SimProjector, SimVsync};
 
 /// What the projector shows: the scene under its pattern, for each key position of the scene's motion.
 pub type Shown = Arc<[Arc<Optics>]>;

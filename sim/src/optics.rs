@@ -7,10 +7,10 @@ use ndarray::{Array2, Array3, Axis, s};
 use rayon::prelude::*;
 use raysweep_core::{Mosaic, Raster};
 
-use crate::SimError;
-use crate::config::{Beam, RowTable, SimProjector, Spot};
+use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::scene::Scene;
+use raysweep_config::sim::{Beam, RowTable, SimProjector, Spot};
 
 /// A scene under a raster projector, prepared so that an exposure takes two look-ups per camera row.
 pub struct Optics {

@@ -4,130 +4,21 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use ndarray::Array2;
-use raysweep_core::{
-    CameraCapabilities, Clock, Pattern, PatternError, PixelFormat, Raster, Shutter, ns_from_us,
-};
+use raysweep_core::{Clock, Pattern, Shutter};
 
-use crate::config::SimConfig;
-use crate::devices::{self, Devices, WireDevices};
-use crate::keyed::{Purpose, keyed, uniform};
-use crate::line::{Exposure, Line, LineConfig, Shown};
-use crate::optics::{self, Optics};
-use crate::scene::{Motion, Scene, SceneError, SceneSize};
+use crate::devices::{self, Devices};
+use crate::error::SimError;
+use crate::line::Line;
+use crate::optics;
+use crate::scene::{Motion, Scene, SceneSize};
 use crate::sensor::{Scale, Sensor};
-
-/// Why a simulated rig cannot be built.
-#[derive(Debug, thiserror::Error)]
-pub enum SimError {
-    /// The scene cannot be read or computed.
-    #[error("sim.scene: {0}")]
-    Scene(#[from] SceneError),
-    /// The scene has more rows than the projector below its first row.
-    #[error(
-        "sim.scene has {scene_rows} rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.first_projector_row or take a smaller scene"
-    )]
-    SceneRows {
-        /// Scene rows.
-        scene_rows: usize,
-        /// Projector row of the scene's first row.
-        first_row: usize,
-        /// Projector rows.
-        projector_rows: usize,
-    },
-    /// The camera rows span more projector rows than there are.
-    #[error(
-        "the camera rows of sim.scene look along {camera_rows} projector rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.row_pitch or set camera.first_projector_row"
-    )]
-    CameraRows {
-        /// Projector rows spanned by the scene's camera rows.
-        camera_rows: usize,
-        /// Projector row of the first camera row.
-        first_row: usize,
-        /// Projector rows.
-        projector_rows: usize,
-    },
-    /// Row times do not increase from row to row.
-    #[error(
-        "sim.projector.row_table: rows would be drawn in a different order; take a smaller percent or amplitude_us"
-    )]
-    RowTable,
-    /// The beam has no extent or is too wide.
-    #[error(
-        "sim.projector.beam: sigma_rows must lie in 0..=100 (not 0), up_rows + down_rows in 0..=500 (not 0)"
-    )]
-    Beam,
-    /// The pattern does not fit the projector.
-    #[error(transparent)]
-    Pattern(#[from] PatternError),
-    /// The pattern varies along rows, which the scenes' row transport cannot represent.
-    #[error(
-        "the simulated projector shows white, black, a line and row weights: a pattern that changes along rows needs a real one"
-    )]
-    AlongRows,
-    /// A key of `[sim]` outside its range.
-    #[error("sim.{key} = {value}: allowed is {allowed}")]
-    Range {
-        /// Key below `[sim]`.
-        key: &'static str,
-        /// Given value.
-        value: f64,
-        /// Allowed values.
-        allowed: &'static str,
-    },
-}
-
-impl SimError {
-    /// The key below `[sim]` that causes the error.
-    pub fn key(&self) -> &'static str {
-        match self {
-            Self::Scene(_)
-            | Self::SceneRows { .. }
-            | Self::CameraRows { .. }
-            | Self::Pattern(_)
-            | Self::AlongRows => "scene",
-            Self::RowTable => "projector.row_table",
-            Self::Beam => "projector.beam",
-            Self::Range { key, .. } => key,
-        }
-    }
-}
-
-/// Parameters from the rest of the rig file that the simulation needs.
-#[derive(Debug, Clone, Copy)]
-pub struct PlaneSetup {
-    /// Raster timing of the projector.
-    pub raster: Raster,
-    /// Row time of the camera.
-    pub camera_row_time_us: f64,
-    /// Projector rows from one camera row to the next, as for the scene.
-    pub row_pitch: f64,
-    /// Counts, above black, of a white pixel in the time of one projector row.
-    pub white_dn: f64,
-    /// Counts without light.
-    pub black_dn: f64,
-    /// Pixel packing of the frames.
-    pub format: PixelFormat,
-    /// Projector row seen by camera row 0. `None`: the scene is centred in the projector's rows.
-    pub first_row: Option<usize>,
-}
+use crate::wire::{self, WireDevices};
+use crate::world::{PlaneSetup, PlaneWorld};
+use raysweep_config::sim::SimConfig;
 
 /// A simulated plane rig, whose devices can be opened repeatedly.
 pub struct PlaneRig {
-    bench: Arc<Bench>,
-}
-
-/// The parts of the rig that are constant while it runs.
-pub(crate) struct Bench {
-    pub config: SimConfig,
-    setup: PlaneSetup,
-    /// The scene in each key position of its motion; all have the same size.
-    scenes: Vec<Scene>,
-    motion: Motion,
-    first_row: usize,
-    pub size: (usize, usize),
-    pub format: PixelFormat,
-    pub sensor: Sensor,
-    white: OnceLock<Shown>,
+    world: Arc<PlaneWorld>,
 }
 
 impl PlaneRig {
@@ -148,7 +39,7 @@ impl PlaneRig {
         let size = scenes[0].size();
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
         let sensor = Sensor::new(&config.sensor, size, scale, config.seed);
-        let bench = Bench {
+        let world = PlaneWorld {
             config,
             setup,
             scenes,
@@ -159,8 +50,8 @@ impl PlaneRig {
             sensor,
             white: OnceLock::new(),
         };
-        bench.optics_of(&Pattern::White)?;
-        Ok(Self { bench: Arc::new(bench) })
+        world.optics_of(&Pattern::White)?;
+        Ok(Self { world: Arc::new(world) })
     }
 
     /// The scene, at time zero if it moves: the ground truth for recovered transports.
@@ -170,12 +61,12 @@ impl PlaneRig {
 
     /// The scene during the projector frame that begins at a time of the devices' clock.
     pub fn scene_at(&self, time_ns: i64) -> &Scene {
-        &self.bench.scenes[self.bench.motion.key(time_ns)]
+        &self.world.scenes[self.world.motion.key(time_ns)]
     }
 
     /// Projector row seen by camera row 0.
     pub fn first_row(&self) -> usize {
-        self.bench.first_row
+        self.world.first_row
     }
 
     /// True start of each projector row's light, and the last row's end, after the VSYNC edge: `[rows + 1]`. The ground
@@ -184,19 +75,19 @@ impl PlaneRig {
     /// # Errors
     /// None for a rig that was built successfully; returned so that no caller has to rely on that.
     pub fn row_starts_us(&self) -> Result<Vec<f64>, SimError> {
-        let Bench { config, setup, .. } = &*self.bench;
+        let PlaneWorld { config, setup, .. } = &*self.world;
         optics::row_table(&setup.raster, &config.projector.row_table, config.seed)
     }
 
     /// Opens the devices, starting at time zero of their own clock.
     pub fn open(&self) -> Devices {
-        let clock = if self.bench.config.realtime { Clock::real() } else { Clock::simulated() };
-        devices::open(&self.bench, Line::new(self.bench.line_config(), clock.now_ns()), clock)
+        let clock = if self.world.config.realtime { Clock::real() } else { Clock::simulated() };
+        devices::open(&self.world, Line::new(self.world.line_config(), clock.now_ns()), clock)
     }
 
     /// Opens the devices on the host's clock, with the camera as the picture source of a network camera.
     pub fn open_for_wire(&self) -> WireDevices {
-        devices::open_for_wire(&self.bench, Line::new(self.bench.line_config(), Clock::real().now_ns()))
+        wire::open(&self.world, Line::new(self.world.line_config(), Clock::real().now_ns()))
     }
 
     /// Light of an image without noise or jitter, in the scene's units, `[t, s]`: one white frame, each camera row
@@ -218,100 +109,17 @@ impl PlaneRig {
         delay_us: f64,
         exposure_us: f64,
     ) -> Result<Array2<f32>, SimError> {
-        let shown = self.bench.optics_of(&Pattern::White)?;
-        let optics = &shown[self.bench.motion.key(time_ns)];
-        let start_us = self.bench.setup.raster.row_centre_us(self.first_row()) + delay_us - exposure_us / 2.0;
-        let mut image = Array2::zeros(self.bench.size);
+        let shown = self.world.optics_of(&Pattern::White)?;
+        let optics = &shown[self.world.motion.key(time_ns)];
+        let start_us = self.world.setup.raster.row_centre_us(self.first_row()) + delay_us - exposure_us / 2.0;
+        let mut image = Array2::zeros(self.world.size);
         for (t, mut row) in image.rows_mut().into_iter().enumerate() {
             let mut light = vec![0.0; row.len()];
-            let from_us = start_us + self.bench.row_start_us(Shutter::Rolling, t);
+            let from_us = start_us + self.world.row_start_us(Shutter::Rolling, t);
             optics.expose_row(t, from_us, from_us + exposure_us, &mut light);
             row.assign(&ndarray::ArrayView1::from(&light));
         }
         Ok(image)
-    }
-}
-
-impl Bench {
-    pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
-        let rows = self.setup.raster.rows;
-        let build = |weights: &[f32]| {
-            let mosaic = self.format.mosaic;
-            let (raster, projector) = (&self.setup.raster, &self.config.projector);
-            let optics = |scene| {
-                Optics::new(scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)
-                    .map(Arc::new)
-            };
-            self.scenes.iter().map(optics).collect::<Result<Shown, SimError>>()
-        };
-        if *pattern == Pattern::White {
-            if let Some(white) = self.white.get() {
-                return Ok(white.clone());
-            }
-            let white = build(&vec![1.0; rows])?;
-            return Ok(self.white.get_or_init(|| white).clone());
-        }
-        build(&pattern.row_weights(rows)?.ok_or(SimError::AlongRows)?)
-    }
-
-    /// Start of row `t`'s exposure relative to row 0.
-    pub fn row_start_us(&self, shutter: Shutter, t: usize) -> f64 {
-        match shutter {
-            Shutter::Rolling => t as f64 * self.setup.camera_row_time_us,
-            Shutter::Global => 0.0,
-        }
-    }
-
-    /// Ambient light of an exposure, in the scene's units.
-    pub fn ambient(&self, exposure: &Exposure) -> f32 {
-        let ambient = &self.config.ambient;
-        if ambient.level == 0.0 {
-            return 0.0;
-        }
-        let exposure_s = exposure.settings.exposure_us * 1e-6;
-        let key = [exposure.key[0], exposure.key[1]];
-        let phase = uniform(&mut keyed(self.config.seed, Purpose::Flicker, &key));
-        let start_s = exposure.key[2] as f64 * self.setup.raster.period_us * 1e-6;
-        let angle = |time_s: f64| std::f64::consts::TAU * (phase + ambient.flicker_hz * time_s);
-        // The integral of 1 + m sin(angle) over the exposure.
-        let swing = (angle(start_s).cos() - angle(start_s + exposure_s).cos())
-            / (std::f64::consts::TAU * ambient.flicker_hz.max(1e-9));
-        let rows = (exposure_s + ambient.flicker * swing) / (self.setup.raster.row_time_us * 1e-6);
-        (ambient.level * rows) as f32
-    }
-
-    pub fn capabilities(&self) -> CameraCapabilities {
-        let (height, width) = self.size;
-        let camera = &self.config.camera;
-        CameraCapabilities {
-            model: "raysweep simulated camera".into(),
-            width,
-            height,
-            format: self.format,
-            row_time_us: self.setup.camera_row_time_us,
-            trigger_latency_us: camera.trigger_latency_us,
-            readout_us: self.readout_us(),
-            readout: camera.readout,
-            exposure_us: camera.exposure_step_us..=1e6,
-            trigger_delay_us: 0.0..=16e6,
-        }
-    }
-
-    fn readout_us(&self) -> f64 {
-        self.config.camera.readout_us.unwrap_or(self.size.0 as f64 * self.setup.camera_row_time_us)
-    }
-
-    fn line_config(&self) -> LineConfig {
-        LineConfig {
-            seed: self.config.seed,
-            period_ns: ns_from_us(self.setup.raster.period_us),
-            vsync: self.config.vsync.clone(),
-            projector: self.config.projector.clone(),
-            camera: self.config.camera.clone(),
-            motion: self.motion,
-            readout_ns: ns_from_us(self.readout_us()),
-            rolling_ns: ns_from_us(self.size.0.saturating_sub(1) as f64 * self.setup.camera_row_time_us),
-        }
     }
 }
 

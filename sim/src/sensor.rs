@@ -4,8 +4,8 @@ use ndarray::Array2;
 use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
-use crate::config::SimSensor;
 use crate::keyed::{Purpose, keyed, uniform};
+use raysweep_config::sim::SimSensor;
 
 /// One frame's exposure: its light, its duration and its noise key.
 pub struct Exposed<'a> {

@@ -9,14 +9,12 @@ use std::time::Duration;
 
 use ndarray::{Array2, Array3, Array4};
 use ndarray_npy::{NpzWriter, write_npy};
+use raysweep_config::sim::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
 use raysweep_core::{
     CameraSettings, FramePool, FrameStamp, MechanicalDeg, MirrorLimits, MirrorPath, MirrorPoint, PixelFormat,
     RasterScan, SettingsId, Shutter, Subject, Tilt,
 };
-use raysweep_sim::dots::{
-    DotsConfig, DotsDevices, DotsError, DotsRig, DotsSetup, FrameFate, SimDot, SimDotCamera, SimDotSensor,
-    SimMirror,
-};
+use raysweep_sim::dots::{DotsDevices, DotsError, DotsRig, DotsSetup, FrameFate};
 use raysweep_sim::mirror::{Mechanics, MechanicsConfig};
 
 const EXPOSURE_US: f64 = 70.0;

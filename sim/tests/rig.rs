@@ -7,12 +7,13 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 use ndarray::Array3;
+use raysweep_config::sim::SimConfig;
+use raysweep_config::sim::{Beam, RowTable, SimProjector, SimSensor, SimVsync, Spot};
 use raysweep_core::{
     Camera, CameraSettings, DeviceErrorKind, Edge, FirstFrame, FramePool, FrameStamp, Pattern, PixelFormat,
     Raster, SettingsId, Shutter,
 };
-use raysweep_sim::config::{Beam, RowTable, SimProjector, SimSensor, SimVsync, Spot};
-use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimConfig};
+use raysweep_sim::{Devices, PlaneRig, PlaneSetup};
 
 const ROWS: usize = 8;
 const COLUMNS: usize = 4;

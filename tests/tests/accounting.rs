@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::mpsc::channel;
 use std::time::Duration;
 
-use raysweep::config::RigFile;
+use raysweep_config::RigFile;
 use raysweep_core::{CameraSettings, Counts, Frame, FramePool, LossCause, SettingsId, Shutter};
 use raysweep_pipeline::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
 use raysweep_sim::{Devices, PlaneRig, PlaneSetup};

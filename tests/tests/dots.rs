@@ -6,11 +6,11 @@ use std::process::Command;
 use std::time::Duration;
 
 use ndarray::{Array3, Axis, s};
-use raysweep::config::Plan;
 use raysweep::control::Control;
-use raysweep::process::process;
 use raysweep::rig::DotRig;
+use raysweep_config::{Plan, Procedure};
 use raysweep_core::{CameraSettings, FramePool, LossCause, SettingsId, Shutter, Subject};
+use raysweep_processing::process;
 use raysweep_session::dots::BatchEntry;
 use raysweep_tests::dots::{plan, rig};
 use raysweep_tests::{Bench, Ended, data};
@@ -70,7 +70,7 @@ fn true_floodlit(plan: &str, rig_text: &str) -> Array3<f32> {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("rig.toml"), rig_text).unwrap();
     let rig = DotRig::load(&folder.path().join("rig.toml")).unwrap();
-    let plan = Plan::parse(plan).unwrap().batches;
+    let Procedure::Batches(plan) = Plan::parse(plan).unwrap().procedure else { panic!("batches") };
     let path = plan.mirror_path(&rig.file.limits()).unwrap();
     let mut devices = rig.open(folder.path(), plan.camera_rate_hz()).unwrap();
     let (mut mirror, truth) = (devices.mirror.unwrap(), devices.truth.unwrap());

@@ -11,11 +11,11 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use ndarray::{Array2, Array3, Array4, Axis, Zip, s};
+use raysweep::Runner;
 use raysweep::control::Control;
-use raysweep::process::process;
-use raysweep::run::Runner;
 use raysweep_pipeline::Registry;
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker, DotStages};
+use raysweep_processing::process;
 use raysweep_proto::{RunParams, RunState};
 use raysweep_session::dots::BatchEntry;
 use raysweep_tests::dots::{plan, rig};

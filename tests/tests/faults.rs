@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use ndarray::Array2;
-use raysweep::config::{Plan, RigFile};
+use raysweep_config::{Plan, Procedure, RigFile};
 use raysweep_core::{LossCause, PixelFormat};
 use raysweep_session::stack::ArrayName;
 use raysweep_sim::{PlaneRig, PlaneSetup};
@@ -39,8 +39,8 @@ fn truth(rig_toml: &str) -> PlaneRig {
 fn assert_true(rig_toml: &str, ended: &Ended) {
     let truth = truth(rig_toml);
     let (_, state) = ended.open();
-    let plan = Plan::parse(PLAN).unwrap();
-    let (delays, exposures) = (plan.sweep.delay_us.values(), plan.sweep.exposure_us.values());
+    let Procedure::Sweep(sweep) = Plan::parse(PLAN).unwrap().procedure else { panic!("a sweep") };
+    let (delays, exposures) = (sweep.delay_us.values(), sweep.exposure_us.values());
     assert!(state.counts.balanced(), "{:?}", state.counts);
     assert_eq!(state.stored(ArrayName::Sum).count(), 15, "every point is stored");
     for point in state.stored(ArrayName::Sum) {

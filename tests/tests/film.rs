@@ -8,14 +8,14 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use ndarray::{Array2, Array3, Axis, s};
-use raysweep::config::RigFile;
+use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile, LiveReader};
-use raysweep::process;
 use raysweep::rig::Rig;
-use raysweep::run::Runner;
+use raysweep_config::RigFile;
 use raysweep_core::{FilmSummary, LossCause, PixelFormat};
 use raysweep_pipeline::Registry;
+use raysweep_processing as process;
 use raysweep_proto::{ErrorCode, Event, ResumeParams, RunParams, RunState};
 use raysweep_session::film::{CycleEntry, TransportFilm};
 use raysweep_session::manifest;
@@ -318,7 +318,8 @@ fn check_says_how_many_transports_a_second_the_camera_allows() {
     assert!((film.transports_per_s - 4.0).abs() < 0.001);
     assert_eq!((free.points, free.extra_points, free.frames), (240, 1, 240 * 15 + 32));
     // Per pixel: 15 frames of 2 bytes, and 4 bytes per row of the transport.
-    let reach = (free.reach_rows.1 - free.reach_rows.0 + 1) as f64;
+    let (first_row, last_row) = free.reach_rows.unwrap();
+    let reach = f64::from(last_row - first_row + 1);
     let minute = 240.0 * (ROWS * COLUMNS) as f64 * (30.0 + 4.0 * reach);
     assert!((film.disk_bytes_per_minute as f64 / minute - 1.0).abs() < 0.001);
     let held = check("[sim.camera]\nreadout = \"overlapped\"\nreadout_us = 16_100\n").film.unwrap();

@@ -9,9 +9,9 @@ use std::process::Command;
 
 use ndarray::Array2;
 use raysweep::control::Control;
-use raysweep::process;
 use raysweep_core::LossCause;
 use raysweep_pipeline::{Entry, HotPixels, Registry, Stage, StageError, Unit};
+use raysweep_processing as process;
 use raysweep_proto::{ErrorCode, Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, PRODUCTS, data, end_of, rig_text, wait_until, with_products};

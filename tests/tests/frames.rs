@@ -8,9 +8,10 @@ use std::path::Path;
 
 use ndarray::{Array1, Array2, Array3, Axis};
 use ndarray_npy::NpzReader;
+use raysweep_config::sim::SimConfig;
 use raysweep_core::{PixelFormat, Raster};
 use raysweep_session::stack::ArrayName;
-use raysweep_sim::{PlaneRig, PlaneSetup, SimConfig};
+use raysweep_sim::{PlaneRig, PlaneSetup};
 use raysweep_tests::{Bench, corner_rig, data};
 
 struct Reference {

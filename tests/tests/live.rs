@@ -9,10 +9,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use ndarray::{Array2, ArrayD, ArrayView2, Ix2};
+use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile, LiveReader, TOTAL};
 use raysweep::rig::Rig;
-use raysweep::run::Runner;
 use raysweep_pipeline::{Entry, Fold, FoldError, Product, Registry, Snapshot, Stage, StageError, Unit};
 use raysweep_proto::Event;
 use raysweep_session::stack::ArrayName;

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use ndarray::{Array2, Array3, s};
 use raysweep::control::Control;
-use raysweep::process::{self, Asked};
+use raysweep_processing::{self as process, Asked};
 use raysweep_proto::{ErrorCode, RunParams};
 use raysweep_session::stack::ArrayName;
 use raysweep_session::{Session, manifest};

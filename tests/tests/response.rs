@@ -6,11 +6,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use ndarray::Array2;
+use raysweep::Runner;
 use raysweep::control::Control;
-use raysweep::process::process;
 use raysweep::rig::DotRig;
-use raysweep::run::Runner;
 use raysweep_pipeline::Registry;
+use raysweep_processing::process;
 use raysweep_proto::RunParams;
 use raysweep_session::manifest;
 use raysweep_tests::dots::{plan, rig};

@@ -8,10 +8,10 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};
 
 use ndarray::Array2;
+use raysweep::Runner;
 use raysweep::control::Control;
-use raysweep::process::{self, Asked, ProcessError};
-use raysweep::run::Runner;
 use raysweep_pipeline::{Entry, Registry, Stage, StageError, Unit};
+use raysweep_processing::{self as process, Asked, ProcessError};
 use raysweep_proto::{ErrorCode, RunParams};
 use raysweep_session::stack::ArrayName;
 use raysweep_session::{Session, manifest};

@@ -1,5 +1,6 @@
 //! Fold `demux`: from the averaged images of a sweep to its light transport.
 
+mod options;
 mod strips;
 mod tally;
 
@@ -8,71 +9,18 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
-use raysweep_transport::plane::{Demux, PlaneError, Prior, RowTiming, Setting, Transport};
-use serde::Deserialize;
+use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting, Transport};
 
+pub use self::options::DemuxOptions;
+use self::tally::Tally;
 use crate::findings::{Choices, choose, rows_to_choose_by};
-use crate::products::SweepStack;
+use crate::product::Product;
 use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
-use crate::stage::{Fold, FoldError, Product, Snapshot};
+use crate::stack::SweepStack;
+use crate::stage::{Fold, FoldError, Snapshot};
 use crate::strips::{InStrips, Strip};
 use crate::unit::Unit;
-
-use self::tally::Tally;
-
-/// Options of `demux` in a plan.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DemuxOptions {
-    /// Which prior: `split` (direct light is a spike at u = 0) or `paper`. If omitted, prior and weights are those
-    /// that predict held-out settings best, or `split` if there is no clear difference.
-    pub prior: Option<PriorName>,
-    /// Weight of smoothness over rows; if omitted, the prior's default.
-    pub alpha: Option<f64>,
-    /// Weight of sparsity; if omitted, the prior's default.
-    pub beta: Option<f64>,
-    /// Whether neighbouring pixels that see the same kind of light are averaged before they are solved.
-    pub coupling: bool,
-}
-
-impl Default for DemuxOptions {
-    fn default() -> Self {
-        Self { prior: None, alpha: None, beta: None, coupling: true }
-    }
-}
-
-/// The names of priors in plans.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum PriorName {
-    /// Scale-free smoothness that excludes u = 0.
-    Split,
-    /// The paper's objective as printed.
-    Paper,
-}
-
-impl DemuxOptions {
-    /// Whether a plan fully specifies the prior.
-    pub(crate) fn states_prior(&self) -> bool {
-        self.prior.is_some() || self.alpha.is_some() || self.beta.is_some()
-    }
-
-    fn prior(&self) -> Prior {
-        let prior = match self.prior {
-            None | Some(PriorName::Split) => Prior::SPLIT,
-            Some(PriorName::Paper) => Prior::PAPER,
-        };
-        match prior {
-            Prior::Split { alpha, beta } => {
-                Prior::Split { alpha: self.alpha.unwrap_or(alpha), beta: self.beta.unwrap_or(beta) }
-            }
-            Prior::Paper { alpha, beta } => {
-                Prior::Paper { alpha: self.alpha.unwrap_or(alpha), beta: self.beta.unwrap_or(beta) }
-            }
-        }
-    }
-}
 
 /// Name of the figure that checks consistency: the light of the regular image, predicted by the model over captured
 /// by the camera.

@@ -14,8 +14,8 @@ use raysweep_transport::plane::{
 };
 
 use crate::demux::DemuxOptions;
-use crate::products::SweepStack;
 use crate::schedule::{Spot, SweepGeometry};
+use crate::stack::SweepStack;
 
 /// Smaller offsets of direct light are ignored, because modelling them requires several models per row.
 const NEGLIGIBLE_U0_ROWS: f32 = 0.02;

@@ -1,42 +1,16 @@
 //! Stages and folds by their names in plans.
 
+mod error;
+
 use std::collections::BTreeMap;
 
 use serde_json::Value;
 
+pub use self::error::RegistryError;
 use crate::demux::{DemuxFold, DemuxOptions};
 use crate::dots::DotStages;
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage::{Fold, HotPixels, Stage};
-
-/// Why a plan's stage cannot be created.
-#[derive(Debug, thiserror::Error)]
-pub enum RegistryError {
-    /// The name does not exist.
-    #[error("stage name = {name:?}: known are {known}")]
-    Unknown {
-        /// The name in the plan.
-        name: String,
-        /// All existing names.
-        known: String,
-    },
-    /// An option that the stage does not have, or a value that it does not accept.
-    #[error("stage {name}: {source}")]
-    Options {
-        /// The stage's name.
-        name: String,
-        /// The error message of serde.
-        source: serde_json::Error,
-    },
-    /// Options that are well formed but invalid.
-    #[error("stage {name}: {what}")]
-    Invalid {
-        /// The stage's name.
-        name: String,
-        /// Field, value, and the allowed values.
-        what: String,
-    },
-}
 
 /// The entry of a name.
 pub enum Entry {

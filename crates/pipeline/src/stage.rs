@@ -1,11 +1,10 @@
 //! Processing of units: stages, in parallel and each unit independently; folds, over all units in order.
 
-use ndarray::{Array2, Array3, ArrayView2};
+use ndarray::{Array2, ArrayView2};
 use raysweep_transport::plane::Transport;
 use serde::{Deserialize, Serialize};
 
-use crate::findings::Findings;
-use crate::products::{Profile, SweepStack};
+use crate::product::Product;
 use crate::strips::InStrips;
 use crate::unit::Unit;
 
@@ -36,51 +35,6 @@ pub trait Stage: Send + Sync {
     fn halo_rows(&self) -> Option<usize> {
         None
     }
-}
-
-/// The results of a fold.
-#[derive(Debug, Clone)]
-pub enum Product {
-    /// An image `[t, s]` in the scene's units (1 = a white pixel).
-    Image {
-        /// File name without extension.
-        name: String,
-        /// Description in one sentence.
-        about: String,
-        /// The pixels.
-        image: Array2<f32>,
-    },
-    /// Images `[k, t, s]` in the scene's units.
-    Sequence {
-        /// File name without extension.
-        name: String,
-        /// Description in one sentence.
-        about: String,
-        /// The quantity in which the images differ, with its unit.
-        axis: String,
-        /// The value of `axis` for each image.
-        at: Vec<f64>,
-        /// The pixels.
-        images: Array3<f32>,
-    },
-    /// Light as a function of the delay.
-    Profile(Profile),
-    /// The light transport `[u, t, s]`.
-    Transport(Box<Transport>),
-    /// The images from which it was computed, needed by [`crate::ProductSpec`] to compute other products. Not written
-    /// to disk.
-    Stack(Box<SweepStack>),
-    /// How the sweep was demultiplexed.
-    Findings(Box<Findings>),
-    /// A problem that makes other products worse than they look.
-    Warning(String),
-    /// A number for the report.
-    Figure {
-        /// Name, with the unit.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-    },
 }
 
 /// Why a fold could not finish.

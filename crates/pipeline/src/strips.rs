@@ -6,7 +6,7 @@ use ndarray::Array2;
 use raysweep_transport::plane::Transport;
 
 use crate::findings::Findings;
-use crate::products::SweepStack;
+use crate::stack::SweepStack;
 use crate::stage::FoldError;
 
 /// Reads images again that a fold was given and did not keep.

@@ -337,20 +337,22 @@ pub struct CheckReport {
     pub disk_bytes: u64,
     /// Free disk space.
     pub disk_free_bytes: u64,
-    /// First and last relative row that the sweep covers.
-    pub reach_rows: (i32, i32),
-    /// Condition number of the demultiplexing of a middle camera row, including its prior.
-    pub condition: f64,
+    /// First and last relative row that a plane rig's plan covers; `None` on a dot rig.
+    #[serde(default)]
+    pub reach_rows: Option<(i32, i32)>,
+    /// Condition number of the demultiplexing of a middle camera row, including its prior; `None` on a dot rig.
+    #[serde(default)]
+    pub condition: Option<f64>,
     /// Expected errors of the sweep and a better sweep; `None` for films, or if a warning says why.
     #[serde(default)]
     pub advice: Option<SweepAdvice>,
     /// Details if the plan is a film.
     #[serde(default)]
     pub film: Option<FilmCheck>,
-    /// Details if the plan consists of batches; `reach_rows` and `condition` are then meaningless.
+    /// Details if the plan consists of batches.
     #[serde(default)]
     pub batches: Option<BatchesCheck>,
-    /// Details if the plan measures a mirror's response; `reach_rows` and `condition` are then meaningless.
+    /// Details if the plan measures a mirror's response.
     #[serde(default)]
     pub response: Option<ResponseCheck>,
     /// Warnings for the operator; none of them prevents the run.
@@ -533,7 +535,7 @@ pub struct RpcError {
     pub message: String,
     /// Details for programs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub data: Option<ErrorData>,
+    pub data: Option<Box<ErrorData>>,
 }
 
 /// Machine-readable details of an error.
@@ -547,16 +549,32 @@ pub struct ErrorData {
     /// Byte range (from, to) in the plan's text that the error is about.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub span: Option<(usize, usize)>,
+    /// Everything that is wrong with a plan, in the order of its text; `field` and `span` are those of the first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub mistakes: Vec<Mistake>,
     /// What to do.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub help: Option<String>,
 }
 
+/// One mistake in a plan.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Mistake {
+    /// Field, value, what is allowed, what to do.
+    pub message: String,
+    /// The offending field.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub field: Option<String>,
+    /// Byte range (from, to) in the plan's text.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub span: Option<(usize, usize)>,
+}
+
 impl RpcError {
     /// An error with a code and a message only.
     pub fn new(code: ErrorCode, message: impl Into<String>) -> Self {
-        let data = ErrorData { name: code, field: None, span: None, help: None };
-        Self { code: code as i64, message: message.into(), data: Some(data) }
+        let data = ErrorData { name: code, field: None, span: None, mistakes: Vec::new(), help: None };
+        Self { code: code as i64, message: message.into(), data: Some(Box::new(data)) }
     }
 
     /// Adds the field that the error is about.

@@ -20,7 +20,7 @@ use raysweep_session::report::{
     Block, ContactSheet, Guide, Marker, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle,
     Table, ToneMap,
 };
-use raysweep_session::stack::{ArrayName, Stack, StackShape};
+use raysweep_session::stack::{ArrayName, Contents, Stack, StackShape};
 use raysweep_session::{Session, durable, manifest, transport};
 use serde_json::{Map, Value, json};
 
@@ -62,12 +62,12 @@ fn acquire(
 ) -> Result<Session, Box<dyn Error>> {
     let (_, rows, columns) = scene.dim();
     let shape = StackShape {
-        points: delays_us.len() * exposures_us.len(),
-        exposures: exposures_us.len(),
+        contents: Contents::Sweep {
+            points: delays_us.len() * exposures_us.len(),
+            exposures: exposures_us.len(),
+        },
         rows,
         columns,
-        settings: 0,
-        dots: 0,
     };
     let header = SessionEntry {
         format: raysweep_session::ledger::FORMAT,
@@ -106,7 +106,7 @@ fn acquire(
     ledger.append(&Entry::End(EndEntry {
         state: EndState::Complete,
         error: None,
-        stored: shape.points,
+        stored: shape.points(),
         missing: 0,
         vsync: None,
         final_s: None,
@@ -296,7 +296,7 @@ fn make_report(
             pair("Sample", "printed V-groove"),
             pair(
                 "Points",
-                &format!("{} of {}", state.stored(ArrayName::Sum).count(), state.session.shape.points),
+                &format!("{} of {}", state.stored(ArrayName::Sum).count(), state.session.shape.points()),
             ),
             pair("Frames", &state.counts.averaged.to_string()),
             pair("Frame", &format!("{columns} × {rows}")),

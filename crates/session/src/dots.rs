@@ -113,7 +113,7 @@ impl Dots {
         let attributes = json!({
             "height": shape.rows,
             "width": shape.columns,
-            "dots": shape.dots,
+            "dots": shape.dots(),
             "block_px": BLOCK_PX,
             "units": "camera counts (DN) above the background, times the flat field's gain",
         });
@@ -124,7 +124,7 @@ impl Dots {
     /// Uses the existing group at `dir`.
     pub fn open(dir: &Path, shape: &StackShape) -> Self {
         let blocks = [shape.rows.div_ceil(BLOCK_PX), shape.columns.div_ceil(BLOCK_PX)];
-        Self { dir: dir.to_owned(), dots: shape.dots, blocks }
+        Self { dir: dir.to_owned(), dots: shape.dots(), blocks }
     }
 
     fn path_of(&self, batch: usize) -> PathBuf {
@@ -375,9 +375,10 @@ fn into_map(value: Value) -> Map<String, Value> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::stack::Contents;
 
     fn shape() -> StackShape {
-        StackShape { points: 4, exposures: 0, rows: 40, columns: 64, settings: 0, dots: 3 }
+        StackShape { contents: Contents::Batches { batches: 4, dots: 3 }, rows: 40, columns: 64 }
     }
 
     fn columns(seed: u32) -> BatchColumns {

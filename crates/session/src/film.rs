@@ -55,9 +55,10 @@ impl Film {
     /// # Errors
     /// [`Error::Zarr`] if the file system refuses.
     pub fn create(dir: &Path, shape: &StackShape) -> Result<Self> {
-        let cycle = [shape.settings, shape.rows, shape.columns];
+        let (cycles, settings) = shape.cycles()?;
+        let cycle = [settings, shape.rows, shape.columns];
         let attributes = Map::from_iter([("units".to_owned(), Value::from("DN"))]);
-        Self::create_array(dir, shape.points, cycle, film_layout(), attributes)
+        Self::create_array(dir, cycles, cycle, film_layout(), attributes)
     }
 
     /// Opens the film at `dir`.
@@ -65,8 +66,9 @@ impl Film {
     /// # Errors
     /// [`Error::Zarr`] if it cannot be read, [`Error::Shape`] if it has another shape.
     pub fn open(dir: &Path, shape: &StackShape) -> Result<Self> {
+        let (cycles, settings) = shape.cycles()?;
         let opened = Self::open_array(dir, &film_layout())?;
-        let expected = [shape.points, shape.settings, shape.rows, shape.columns];
+        let expected = [cycles, settings, shape.rows, shape.columns];
         let found = zarr::shape_of(&opened.array);
         if found != expected {
             let what = opened.path.display().to_string();
@@ -250,9 +252,10 @@ pub struct CycleEntry {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::stack::Contents;
 
     fn shape(rows: usize, columns: usize) -> StackShape {
-        StackShape { points: 4, exposures: 1, rows, columns, settings: 3, dots: 0 }
+        StackShape { contents: Contents::Film { cycles: 4, settings: 3, exposures: 1 }, rows, columns }
     }
 
     fn frames(rows: usize, columns: usize, seed: usize) -> Array3<u16> {

@@ -11,7 +11,7 @@ use crate::dots::Dots;
 use crate::film::Film;
 use crate::ledger::{self, EndState, Ledger, SessionEntry, State};
 use crate::products::Products;
-use crate::stack::Stack;
+use crate::stack::{Contents, Stack};
 use crate::{Error, Result, durable};
 
 /// Maximum bytes of a session's name that are used in its folder's name.
@@ -45,13 +45,13 @@ impl Session {
         durable::write(&created.plan_path(), plan.as_bytes())?;
         durable::write(&created.rig_path(), rig.as_bytes())?;
         durable::create_dir(&created.products_path())?;
-        if session.shape.is_batches() {
-            Dots::create(&created.dots_path(), &session.shape)?;
-        } else if !session.shape.is_axes() {
+        if !session.shape.arrays().is_empty() {
             Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
         }
-        if session.shape.is_film() {
-            Film::create(&created.film_path(), &session.shape)?;
+        match session.shape.contents {
+            Contents::Batches { .. } => drop(Dots::create(&created.dots_path(), &session.shape)?),
+            Contents::Film { .. } => drop(Film::create(&created.film_path(), &session.shape)?),
+            Contents::Sweep { .. } | Contents::Axes { .. } | Contents::Darks { .. } => {}
         }
         let ledger = Ledger::create(&created.ledger_path(), session)?;
         Ok((created, ledger))
@@ -245,7 +245,7 @@ pub fn list(root: &Path) -> Result<Listing> {
         match session.state() {
             Ok(state) => listing.sessions.push(SessionSummary {
                 stored: state.stored_points(),
-                points: state.session.shape.points,
+                points: state.session.shape.points(),
                 end: state.end.as_ref().map(|end| end.state),
                 name: state.session.name,
                 kind: state.session.kind,
@@ -295,7 +295,7 @@ fn folder_name(name: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stack::StackShape;
+    use crate::stack::{Contents, StackShape};
 
     fn session(name: &str) -> SessionEntry {
         SessionEntry {
@@ -308,7 +308,7 @@ mod tests {
             tags: vec!["test".into()],
             created: "2026-03-04T05:06:07Z".parse().unwrap(),
             software: "raysweep 0.1.0".into(),
-            shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0, dots: 0 },
+            shape: StackShape { contents: Contents::Sweep { points: 4, exposures: 2 }, rows: 3, columns: 5 },
             first_row: 0,
         }
     }

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::dots::BatchEntry;
 use crate::film::CycleEntry;
-use crate::stack::{ArrayName, StackShape};
+use crate::stack::{ArrayName, Contents, StackShape};
 use crate::{Error, Result};
 
 /// The format of the session folder that this version writes.
@@ -220,6 +220,17 @@ pub enum EndState {
     Faulted,
 }
 
+impl EndState {
+    /// The state in a word, as reports and messages call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Complete => "complete",
+            Self::Cancelled => "cancelled",
+            Self::Faulted => "faulted",
+        }
+    }
+}
+
 /// The state that results from the lines of a ledger.
 #[derive(Debug, Clone, PartialEq)]
 pub struct State {
@@ -287,10 +298,15 @@ impl State {
         self.axes.values()
     }
 
-    /// Number of stored points of the plan: points of a sweep, cycles of a film, batches of a flying dot, or
-    /// axes of a mirror.
+    /// Number of stored points of the plan, which are what [`Contents`] says.
     pub fn stored_points(&self) -> usize {
-        self.stored(ArrayName::Sum).count() + self.cycles.len() + self.batches.len() + self.axes.len()
+        match self.session.shape.contents {
+            Contents::Sweep { .. } => self.stored(ArrayName::Sum).count(),
+            Contents::Film { .. } => self.cycles.len(),
+            Contents::Batches { .. } => self.batches.len(),
+            Contents::Axes { .. } => self.axes.len(),
+            Contents::Darks { .. } => self.stored(ArrayName::Dark).count(),
+        }
     }
 
     /// A point, if it is stored.
@@ -327,7 +343,10 @@ impl State {
                 }
             }
             Entry::Cycle(CycleEntry { cycle, .. }) | Entry::CycleLost { cycle, .. } => {
-                let cycles = self.session.shape.points * usize::from(self.session.shape.is_film());
+                let cycles = match self.session.shape.contents {
+                    Contents::Film { cycles, .. } => cycles,
+                    _ => 0,
+                };
                 if *cycle < cycles {
                     Ok(())
                 } else {
@@ -335,7 +354,10 @@ impl State {
                 }
             }
             Entry::Batch(BatchEntry { batch, .. }) | Entry::BatchLost { batch, .. } => {
-                let batches = self.session.shape.points * usize::from(self.session.shape.is_batches());
+                let batches = match self.session.shape.contents {
+                    Contents::Batches { batches, .. } => batches,
+                    _ => 0,
+                };
                 if *batch < batches {
                     Ok(())
                 } else {
@@ -343,7 +365,10 @@ impl State {
                 }
             }
             Entry::Axis(AxisEntry { axis, .. }) => {
-                let axes = self.session.shape.points * usize::from(self.session.shape.is_axes());
+                let axes = match self.session.shape.contents {
+                    Contents::Axes { axes } => axes,
+                    _ => 0,
+                };
                 if *axis < axes {
                     Ok(())
                 } else {

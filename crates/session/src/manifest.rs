@@ -81,7 +81,7 @@ pub fn write(
     settings: Map<String, Value>,
 ) -> Result<Manifest> {
     let stored = state.stored_points();
-    let planned = state.session.shape.points;
+    let planned = state.session.shape.points();
     let manifest = Manifest {
         format: FORMAT,
         software,

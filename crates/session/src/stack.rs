@@ -60,69 +60,189 @@ impl ArrayName {
     }
 }
 
-/// The shapes of the stack's arrays.
+/// What a session stores, and how much of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "StoredShape", try_from = "StoredShape")]
 pub struct StackShape {
-    /// Planned points of a sweep, cycles of a film, batches of a flying dot, or axes of a mirror.
-    pub points: usize,
-    /// Number of exposures, each with a dark frame; 0 for a dot rig.
-    pub exposures: usize,
+    /// What a point of the plan is, and how many there are.
+    pub contents: Contents,
     /// Camera rows, axis t.
     pub rows: usize,
     /// Camera columns, axis s.
     pub columns: usize,
-    /// Settings per cycle of a film; 0 for other kinds.
+}
+
+/// What the points of a plan are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Contents {
+    /// Images under delays and exposures, in `stack.zarr` with their dark images and the regular image.
+    Sweep {
+        /// Number of images.
+        points: usize,
+        /// Number of exposures, each with a dark image.
+        exposures: usize,
+    },
+    /// Cycles of settings, with frames in `film.zarr` and dark images in `stack.zarr`.
+    Film {
+        /// Number of cycles.
+        cycles: usize,
+        /// Settings per cycle.
+        settings: usize,
+        /// Number of exposures, each with a dark image.
+        exposures: usize,
+    },
+    /// Batches of a flying dot, with columns in `dots.zarr`; there is no stack.
+    Batches {
+        /// Number of batches.
+        batches: usize,
+        /// Frames per batch.
+        dots: usize,
+    },
+    /// Axes of a mirror, with records in `products`; there is no stack.
+    Axes {
+        /// Number of axes.
+        axes: usize,
+    },
+    /// Dark images alone, in `stack.zarr`.
+    Darks {
+        /// Number of images.
+        images: usize,
+    },
+}
+
+/// A shape as ledgers have it. Those written before there was `contents` tell it by what is 0.
+#[derive(Serialize, Deserialize)]
+struct StoredShape {
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    contents: Option<Kind>,
+    points: usize,
+    exposures: usize,
+    rows: usize,
+    columns: usize,
     #[serde(default, skip_serializing_if = "is_zero")]
-    pub settings: usize,
-    /// Frames per batch of a flying dot; 0 for other kinds.
+    settings: usize,
     #[serde(default, skip_serializing_if = "is_zero")]
-    pub dots: usize,
+    dots: usize,
+}
+
+#[derive(Clone, Copy, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Kind {
+    Sweep,
+    Film,
+    Batches,
+    Axes,
+    Darks,
 }
 
 fn is_zero(count: &usize) -> bool {
     *count == 0
 }
 
+impl From<StackShape> for StoredShape {
+    fn from(StackShape { contents, rows, columns }: StackShape) -> Self {
+        let (kind, points, exposures, settings, dots) = match contents {
+            Contents::Sweep { points, exposures } => (Kind::Sweep, points, exposures, 0, 0),
+            Contents::Film { cycles, settings, exposures } => (Kind::Film, cycles, exposures, settings, 0),
+            Contents::Batches { batches, dots } => (Kind::Batches, batches, 0, 0, dots),
+            Contents::Axes { axes } => (Kind::Axes, axes, 0, 0, 0),
+            Contents::Darks { images } => (Kind::Darks, images, images, 0, 0),
+        };
+        Self { contents: Some(kind), points, exposures, rows, columns, settings, dots }
+    }
+}
+
+impl TryFrom<StoredShape> for StackShape {
+    type Error = String;
+
+    fn try_from(stored: StoredShape) -> std::result::Result<Self, String> {
+        let StoredShape { contents, points, exposures, rows, columns, settings, dots } = stored;
+        let kind = contents.unwrap_or(match (exposures, settings, dots) {
+            (_, 1.., _) => Kind::Film,
+            (_, _, 1..) => Kind::Batches,
+            (0, ..) => Kind::Axes,
+            _ => Kind::Sweep,
+        });
+        let contents = match kind {
+            Kind::Sweep => Contents::Sweep { points, exposures },
+            Kind::Film => Contents::Film { cycles: points, settings, exposures },
+            Kind::Batches => Contents::Batches { batches: points, dots },
+            Kind::Axes => Contents::Axes { axes: points },
+            Kind::Darks => Contents::Darks { images: points },
+        };
+        let shape = Self { contents, rows, columns };
+        shape.check().map(|()| shape).map_err(|error| error.to_string())
+    }
+}
+
 impl StackShape {
-    /// Number of points of an array.
-    pub fn len(&self, array: ArrayName) -> usize {
-        match array {
-            ArrayName::Sum => self.points * usize::from(self.is_sweep()),
-            ArrayName::Dark => self.exposures,
-            ArrayName::Regular => usize::from(self.is_sweep()),
+    /// Planned points: images of a sweep, cycles of a film, batches of a flying dot, axes of a mirror, or dark images.
+    pub fn points(&self) -> usize {
+        match self.contents {
+            Contents::Sweep { points, .. } => points,
+            Contents::Film { cycles, .. } => cycles,
+            Contents::Batches { batches, .. } => batches,
+            Contents::Axes { axes } => axes,
+            Contents::Darks { images } => images,
         }
     }
 
-    /// Whether the points are cycles, with frames in `film.zarr`.
-    pub fn is_film(&self) -> bool {
-        self.settings > 0
+    /// Number of points of an array.
+    pub fn len(&self, array: ArrayName) -> usize {
+        match (array, self.contents) {
+            (ArrayName::Sum, Contents::Sweep { points, .. }) => points,
+            (ArrayName::Regular, Contents::Sweep { .. }) => 1,
+            (ArrayName::Dark, Contents::Sweep { exposures, .. } | Contents::Film { exposures, .. }) => {
+                exposures
+            }
+            (ArrayName::Dark, Contents::Darks { images }) => images,
+            _ => 0,
+        }
     }
 
-    /// Whether the points are batches, with columns in `dots.zarr`; there is then no stack.
-    pub fn is_batches(&self) -> bool {
-        self.dots > 0
+    /// The arrays that exist for this kind of session; none: there is no stack.
+    pub(crate) fn arrays(&self) -> &'static [ArrayName] {
+        match self.contents {
+            Contents::Sweep { .. } => &ArrayName::ALL,
+            Contents::Film { .. } | Contents::Darks { .. } => &[ArrayName::Dark],
+            Contents::Batches { .. } | Contents::Axes { .. } => &[],
+        }
     }
 
-    /// Whether the points are axes of a mirror, with records in `products`; there is then no stack.
-    pub fn is_axes(&self) -> bool {
-        self.exposures == 0 && !self.is_film() && !self.is_batches()
+    /// Cycles of a film, and settings per cycle.
+    pub(crate) fn cycles(&self) -> Result<(usize, usize)> {
+        match self.contents {
+            Contents::Film { cycles, settings, .. } => Ok((cycles, settings)),
+            _ => Err(Error::Shape {
+                what: "the film of a session without cycles".into(),
+                found: vec![self.points()],
+                allowed: "a film".into(),
+            }),
+        }
     }
 
-    fn is_sweep(&self) -> bool {
-        !self.is_film() && !self.is_batches() && !self.is_axes()
-    }
-
-    /// The arrays that exist for this kind of session.
-    fn arrays(&self) -> &'static [ArrayName] {
-        if self.is_film() { &[ArrayName::Dark] } else { &ArrayName::ALL }
+    /// Frames per batch of a flying dot; 0 for other kinds.
+    pub(crate) fn dots(&self) -> usize {
+        match self.contents {
+            Contents::Batches { dots, .. } => dots,
+            _ => 0,
+        }
     }
 
     pub(crate) fn check(&self) -> Result<()> {
-        let found = vec![self.points, self.exposures, self.rows, self.columns];
-        let has_stack = !self.is_batches() && !self.is_axes();
-        if found.iter().enumerate().any(|(axis, &len)| len == 0 && (axis != 1 || has_stack)) {
+        let (axes, counts): (_, Vec<usize>) = match self.contents {
+            Contents::Sweep { points, exposures } => ("points, exposures", vec![points, exposures]),
+            Contents::Film { cycles, settings, exposures } => {
+                ("cycles, settings, exposures", vec![cycles, settings, exposures])
+            }
+            Contents::Batches { batches, dots } => ("batches, dots", vec![batches, dots]),
+            Contents::Axes { axes } => ("axes", vec![axes]),
+            Contents::Darks { images } => ("images", vec![images]),
+        };
+        let found: Vec<usize> = counts.into_iter().chain([self.rows, self.columns]).collect();
+        if found.contains(&0) {
             return Err(Error::Shape {
-                what: "the stack [points, exposures, rows, columns]".into(),
+                what: format!("the stack [{axes}, rows, columns]"),
                 found,
                 allowed: "at least 1 along each axis".into(),
             });

@@ -7,7 +7,7 @@ use std::fs;
 use ndarray::{Array2, array};
 use raysweep_core::Counts;
 use raysweep_session::ledger::{Entry, FORMAT, PointEntry, SessionEntry};
-use raysweep_session::stack::{ArrayName, StackShape, crc32};
+use raysweep_session::stack::{ArrayName, Contents, StackShape, crc32};
 use raysweep_session::{Session, list};
 
 fn header() -> SessionEntry {
@@ -21,7 +21,7 @@ fn header() -> SessionEntry {
         tags: Vec::new(),
         created: "2026-03-04T05:06:07Z".parse().unwrap(),
         software: "raysweep 0.1.0".into(),
-        shape: StackShape { points: 3, exposures: 1, rows: 2, columns: 2, settings: 0, dots: 0 },
+        shape: StackShape { contents: Contents::Sweep { points: 3, exposures: 1 }, rows: 2, columns: 2 },
         first_row: 0,
     }
 }

@@ -8,11 +8,11 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::Parser;
+use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::live::{LiveError, LiveFile};
 use raysweep::mirror;
 use raysweep::rig::AnyRig;
-use raysweep::run::Runner;
 use raysweep::server::{self, Access, Listening};
 use raysweep_drivers::mirror::{Parked, park};
 use raysweep_pipeline::Registry;

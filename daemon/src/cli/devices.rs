@@ -4,7 +4,9 @@ use std::path::PathBuf;
 
 use clap::Subcommand;
 
-use super::{Exit, Failure, Printer};
+use super::exit::Exit;
+use super::failure::Failure;
+use super::printer::Printer;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum CameraCommand {

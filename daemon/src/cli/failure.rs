@@ -3,16 +3,16 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use miette::{Diagnostic, NamedSource, SourceSpan};
+use miette::{Diagnostic, LabeledSpan, NamedSource};
 #[cfg(feature = "aravis")]
 use raysweep_core::{DeviceError, DeviceErrorKind};
 use raysweep_drivers::mirror::ParkError;
 use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
-use super::Exit;
+use super::exit::Exit;
 use crate::live::LiveError;
-use crate::process::ProcessError;
+use raysweep_processing::ProcessError;
 
 /// Why the command did not do what it was asked for.
 #[derive(Debug, thiserror::Error)]
@@ -59,9 +59,8 @@ pub(super) struct PlanProblem {
     error: RpcError,
     #[source_code]
     plan: NamedSource<String>,
-    #[label("{}", label.as_deref().unwrap_or("here"))]
-    span: Option<SourceSpan>,
-    label: Option<String>,
+    #[label(collection, "here")]
+    labels: Vec<LabeledSpan>,
     #[help]
     help: Option<String>,
 }
@@ -72,13 +71,20 @@ impl Failure {
         match error {
             ClientError::Rpc(error) if error.name() == Some(ErrorCode::InvalidPlan) => {
                 let data = error.data.clone();
-                let span = data.as_ref().and_then(|data| data.span).map(|(start, end)| {
+                let places: Vec<_> = match &data {
+                    Some(data) if data.mistakes.is_empty() => vec![(data.field.clone(), data.span)],
+                    Some(data) => data.mistakes.iter().map(|one| (one.field.clone(), one.span)).collect(),
+                    None => Vec::new(),
+                };
+                let labels = places.into_iter().filter_map(|(field, span)| {
+                    let (start, end) = span?;
                     let start = start.min(text.len());
-                    SourceSpan::from(start..end.clamp(start, text.len()))
+                    let label = field.unwrap_or_else(|| "here".into());
+                    Some(LabeledSpan::new_with_span(Some(label), start..end.clamp(start, text.len())))
                 });
-                let (label, help) = data.map_or((None, None), |data| (data.field, data.help));
+                let (labels, help) = (labels.collect(), data.and_then(|data| data.help));
                 let plan = NamedSource::new(path.display().to_string(), text.to_owned());
-                Self::Plan(Box::new(PlanProblem { error, plan, span, label, help }))
+                Self::Plan(Box::new(PlanProblem { error, plan, labels, help }))
             }
             error => error.into(),
         }

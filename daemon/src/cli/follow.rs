@@ -8,7 +8,7 @@ use raysweep_proto::{Client, Event, Subscription};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
-use super::Exit;
+use super::exit::Exit;
 use super::failure::Failure;
 use super::view::View;
 

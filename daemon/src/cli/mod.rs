@@ -1,15 +1,17 @@
 //! The command line `raysweep`: what it takes, whom it asks, how it ends.
 
 mod devices;
+mod exit;
 mod failure;
 mod follow;
 mod preview;
+mod printer;
 mod show;
 mod view;
 
 use std::ffi::OsString;
 use std::fs;
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -17,14 +19,15 @@ use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
 use raysweep_drivers::mirror;
 use raysweep_proto::{Client, ClientError, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started};
-use serde::Serialize;
 use serde_json::json;
 
 use self::devices::CameraCommand;
+use self::exit::Exit;
 use self::failure::Failure;
 use self::follow::{Interrupts, OnInterrupt, follow};
+use self::printer::Printer;
 use self::view::View;
-use crate::process::{Asked, export, process_asked};
+use raysweep_processing::{Asked, export, process_asked};
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -37,23 +40,6 @@ Exit codes:
   3  a run was cancelled, is incomplete, or was left running by a second Ctrl-C
   4  no daemon can be reached, or it went away
   5  the daemon refused: forbidden, busy, no such run or session, invalid plan";
-
-/// How the command ends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Exit {
-    Done = 0,
-    Failed = 1,
-    Usage = 2,
-    Incomplete = 3,
-    Unreachable = 4,
-    Refused = 5,
-}
-
-impl From<Exit> for ExitCode {
-    fn from(exit: Exit) -> Self {
-        ExitCode::from(exit as u8)
-    }
-}
 
 /// Asks raysweepd for sweeps of light transport and follows them.
 #[derive(Debug, Parser)]
@@ -293,22 +279,6 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, Failure> {
         view.show(&Event::Ask { text }).map_err(Failure::Output)?;
     }
     follow(events, &session, interrupts, view, OnInterrupt::Leave)
-}
-
-/// Prints results for people or for programs.
-#[derive(Debug, Clone, Copy)]
-struct Printer {
-    json: bool,
-}
-
-impl Printer {
-    fn print<T: Serialize>(self, result: &T, text: impl FnOnce(&T) -> String) -> Result<(), Failure> {
-        let line = match self.json {
-            true => serde_json::to_string(result).map_err(io::Error::from).map_err(Failure::Output)?,
-            false => text(result),
-        };
-        writeln!(io::stdout(), "{line}").map_err(Failure::Output)
-    }
 }
 
 fn socket_path(argument: Option<PathBuf>, variable: Option<OsString>) -> PathBuf {

@@ -11,8 +11,9 @@ use raysweep_proto::Client;
 use raysweep_session::report::{Picture, ToneMap};
 use serde_json::{Value, json};
 
+use super::exit::Exit;
 use super::failure::Failure;
-use super::{Exit, Printer};
+use super::printer::Printer;
 use crate::live::{EPIPOLAR, INDIRECT, LiveError, LiveImage, LiveReader};
 
 /// How often a picture that is followed is looked after.
@@ -76,7 +77,7 @@ fn side_by_side(epipolar: LiveImage, indirect: &LiveImage) -> Result<Vec<u8>, Fa
         .map_err(|error| Failure::Output(io::Error::other(error)))?;
     Ok(Picture::grey(both.view(), ToneMap { white: 1.0 })
         .to_png()
-        .map_err(crate::process::ProcessError::from)?)
+        .map_err(raysweep_processing::ProcessError::from)?)
 }
 
 /// In one step, so that a viewer that watches the file never sees half a picture.

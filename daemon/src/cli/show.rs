@@ -11,7 +11,7 @@ use raysweep_proto::{
     RunState, SessionInfo, Status, SweepAdvice,
 };
 
-use crate::process::Processed;
+use raysweep_processing::Processed;
 
 /// `status`
 pub(super) fn status(status: &Status) -> String {
@@ -96,7 +96,6 @@ fn mirror(mirror: &MirrorStatus) -> String {
 
 /// `check`
 pub(super) fn check(report: &CheckReport) -> String {
-    let (first, last) = report.reach_rows;
     let mut rows = vec![
         ("points", format!("{}, and {} of dark and regular images", report.points, report.extra_points)),
         ("frames", report.frames.to_string()),
@@ -106,9 +105,11 @@ pub(super) fn check(report: &CheckReport) -> String {
             "disk",
             format!("{} of {} free", BinaryBytes(report.disk_bytes), BinaryBytes(report.disk_free_bytes)),
         ),
-        ("reach", format!("relative rows {first} to {last}")),
-        ("condition", format!("{:.3e}", report.condition)),
     ];
+    if let (Some((first, last)), Some(condition)) = (report.reach_rows, report.condition) {
+        rows.push(("reach", format!("relative rows {first} to {last}")));
+        rows.push(("condition", format!("{condition:.3e}")));
+    }
     rows.extend(report.advice.iter().flat_map(advice));
     if let Some(film) = &report.film {
         rows[0] = (
@@ -121,10 +122,12 @@ pub(super) fn check(report: &CheckReport) -> String {
         );
         let minute = BinaryBytes(film.disk_bytes_per_minute);
         rows.insert(1, ("pace", pace));
-        rows.insert(2, ("a minute", format!("{minute} on disk, uncompressed; latency hangs on the machine")));
+        rows.insert(
+            2,
+            ("a minute", format!("{minute} on disk, uncompressed; the latency depends on the machine")),
+        );
     }
     if let Some(batches) = &report.batches {
-        rows.truncate(5);
         let planes: Vec<String> = batches.planes.iter().map(u32::to_string).collect();
         let planes = if planes.is_empty() { "no".into() } else { planes.join(" and ") };
         rows[0] = (
@@ -147,7 +150,6 @@ pub(super) fn check(report: &CheckReport) -> String {
         rows.push(("a batch", format!("about {} on disk", BinaryBytes(batches.disk_bytes_per_batch))));
     }
     if let Some(response) = &report.response {
-        rows.truncate(5);
         let [low_hz, high_hz] = response.band_hz;
         rows[0] = (
             "chirps",

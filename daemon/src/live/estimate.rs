@@ -13,7 +13,8 @@ use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::{EPIPOLAR, INDIRECT, LiveError, LiveFile, TOTAL};
-use crate::run::{Board, priority};
+use crate::devices::priority;
+use crate::run::board::StatusBoard;
 
 /// Between two estimates, at least: no display or subscriber wants more.
 const REST: Duration = Duration::from_millis(100);
@@ -24,7 +25,7 @@ pub struct Outlet {
     /// The file that clients map.
     pub file: Arc<LiveFile>,
     /// Who tells subscribers.
-    pub board: Arc<Board>,
+    pub board: Arc<StatusBoard>,
     /// The session's folder, as the metadata name it.
     pub session: String,
 }
@@ -248,7 +249,7 @@ mod tests {
     fn stage() -> Stage {
         let folder = tempfile::tempdir().unwrap();
         let file = Arc::new(LiveFile::create(&folder.path().join("live")).unwrap());
-        let board = Arc::new(Board::new("plane"));
+        let board = Arc::new(StatusBoard::new("plane"));
         let events = board.subscribe();
         let live = LiveEstimate::start(Outlet { file, board, session: "s".into() }).unwrap();
         let (begin, begun) = channel();

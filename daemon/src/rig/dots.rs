@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use raysweep_config::DotRigFile;
+use raysweep_config::rig::dots::{DotCameraDriver, MirrorDriver};
 use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror, Subject};
 use raysweep_drivers::camera::replay::{ReplayCamera, ReplayConfig, ReplayPace};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
@@ -12,8 +14,7 @@ use raysweep_drivers::mirror::{
 };
 use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, SubjectSwitch};
 
-use super::{Pace, RigError};
-use crate::config::{ConfigError, DotCameraDriver, DotRigFile, MirrorDriver};
+use super::{Pace, RigError, Source};
 use crate::mirror;
 
 /// A dot rig whose devices can be opened, one run at a time.
@@ -74,11 +75,13 @@ impl DotRig {
     /// # Errors
     /// With file, line and field.
     pub fn load(path: &Path) -> Result<Self, RigError> {
-        let text = std::fs::read_to_string(path)
-            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
-        let shown = |error: ConfigError| RigError::Config(error.render(&path.display().to_string(), &text));
-        let file = DotRigFile::parse(&text).map_err(shown)?;
-        let folder = path.parent().unwrap_or(Path::new(".")).to_owned();
+        let source = Source::read(path)?;
+        let file = DotRigFile::parse(&source.text).map_err(|error| source.shown(&error))?;
+        Self::of(file, source)
+    }
+
+    pub(super) fn of(file: DotRigFile, source: Source<'_>) -> Result<Self, RigError> {
+        let folder = source.folder().to_owned();
         let setup = DotsSetup {
             format: file.camera.pixel_format,
             white_dn: file.camera.white_dn(),
@@ -91,13 +94,13 @@ impl DotRig {
             DotCameraDriver::Sim => {
                 let sim = DotsRig::new(file.sim.dots.clone(), setup, &folder).map_err(|error| {
                     let path: Vec<&str> = ["sim", "dots"].into_iter().chain(error.key().split('.')).collect();
-                    shown(ConfigError::at(&text, &path, error.to_string()))
+                    source.shown(&file.places.error(&path, error.to_string()))
                 })?;
                 Some(Arc::new(sim))
             }
             _ => None,
         };
-        Ok(Self { file, text, sim, folder })
+        Ok(Self { file, text: source.text, sim, folder })
     }
 
     /// The simulated rig, where its camera is simulated.
@@ -165,11 +168,11 @@ impl DotRig {
         Ok(Some(match section.driver {
             MirrorDriver::Sim => return Ok(None),
             MirrorDriver::PlayzerX => {
-                let link = section.link();
+                let link = section.link;
                 Box::new(PlayzerX::open(PlayzerXConfig { port, link, full_scale, limits, state, light })?)
             }
             MirrorDriver::Mti => {
-                let (drive, most) = (section.drive(), section.max_drive());
+                let (drive, most) = (section.drive, section.max_drive);
                 Box::new(Mti::open(MtiConfig { port, drive, most, full_scale, limits, state, light })?)
             }
             MirrorDriver::Optotune => {

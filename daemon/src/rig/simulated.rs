@@ -2,12 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
+use raysweep_config::RigFile;
+use raysweep_config::rig::plane::CameraDriver;
 use raysweep_core::{Camera, Clock, Projector, Vsync};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimError};
 
 use super::{Rig, RigError};
-use crate::config::{CameraDriver, RigFile};
 
 /// Makes the simulated rig that a file describes; scenes lie beside it, in `folder`.
 pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimError> {

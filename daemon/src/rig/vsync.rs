@@ -2,14 +2,13 @@
 
 use std::time::Duration;
 
+use raysweep_config::rig::vsync::{VsyncDriver, VsyncSection};
 use raysweep_core::{DeviceError, Vsync};
 use raysweep_drivers::vsync::fx2lafw::Fx2Lafw;
 use raysweep_drivers::vsync::modemline::ModemLine;
 use raysweep_drivers::vsync::pps::Pps;
 use raysweep_drivers::vsync::reopen::Reopened;
 use raysweep_drivers::vsync::triggerbox::TriggerBox;
-
-use crate::config::{VsyncDriver, VsyncSection};
 
 /// Opens the watcher that a rig names; `None`: the simulated one. Where it is unplugged within a run, it is opened again.
 ///

@@ -11,7 +11,7 @@ use tokio::sync::broadcast;
 const EVENTS: usize = 1024;
 
 /// The daemon's state as its clients see it.
-pub struct Board {
+pub struct StatusBoard {
     status: Mutex<Status>,
     events: broadcast::Sender<Event>,
 }
@@ -20,7 +20,7 @@ pub struct Board {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WrongState(pub RunState);
 
-impl Board {
+impl StatusBoard {
     /// An idle daemon for a rig of this kind.
     pub fn new(rig: &str) -> Self {
         let status = Status {

@@ -125,8 +125,8 @@ pub fn report() -> CheckReport {
         memory_free_bytes: 8_000_000_000,
         disk_bytes: 30 << 20,
         disk_free_bytes: 1 << 40,
-        reach_rows: (-94, 94),
-        condition: 1234.5,
+        reach_rows: Some((-94, 94)),
+        condition: Some(1234.5),
         advice: Some(SweepAdvice {
             noise: NoiseEstimate { dark: 0.002, shot: 0.0155, source: NoiseSource::Assumed },
             prior: "split".into(),

@@ -11,8 +11,8 @@ use std::time::{Duration, Instant};
 
 use ndarray::Axis;
 use nix::sched::{CloneFlags, unshare};
-use raysweep::config::Plan;
 use raysweep::rig::Rig;
+use raysweep_config::{FilmPlan, Plan, Procedure};
 use raysweep_core::{CameraSettings, Counts, FramePool, Pattern, SettingsId, Shutter, ns_from_us};
 use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
@@ -84,10 +84,7 @@ impl Sweep<'_> {
         }
         if self.kind == "film" {
             let (stored, plan) = (session.state().unwrap().cycles().count(), self.parsed());
-            assert!(
-                2 * stored > plan.film.cycles as usize || self.is_cancelled(),
-                "too few to prove anything"
-            );
+            assert!(2 * stored > plan.cycles as usize || self.is_cancelled(), "too few to prove anything");
             assert_frames_of_the_scene(&session, &rig, &plan);
         } else {
             assert_images_of_the_scene(&session, &rig);
@@ -111,15 +108,16 @@ impl Sweep<'_> {
 
     /// Whether the simulated camera has as many sets as the film has settings.
     fn has_sets(&self) -> bool {
-        self.parsed().film.delay_us.values().len() <= 16
+        self.parsed().delay_us.values().len() <= 16
     }
 
     fn is_cancelled(&self) -> bool {
         matches!(self.then, Some((_, Then::IsCancelled)))
     }
 
-    fn parsed(&self) -> Plan {
-        Plan::parse(&self.plan()).unwrap()
+    fn parsed(&self) -> FilmPlan {
+        let Procedure::Film(film) = Plan::parse(&self.plan()).unwrap().procedure else { panic!("a film") };
+        film
     }
 
     fn plan(&self) -> String {
@@ -211,9 +209,9 @@ fn hold(client: &mut Client) {
 
 /// The camera's sequencer is off, and the camera has the settings written last: those of the cycle's first position,
 /// which differ from those of the last saved set. Settings can be written again.
-fn assert_camera_is_left_as_set(rig: &Rig, plan: &Plan) {
-    let exposure_us = plan.film.exposure_us;
-    let trigger_delay_us = trigger_delay_us(rig, plan.film.delay_us.values()[6], exposure_us);
+fn assert_camera_is_left_as_set(rig: &Rig, plan: &FilmPlan) {
+    let exposure_us = plan.exposure_us;
+    let trigger_delay_us = trigger_delay_us(rig, plan.delay_us.values()[6], exposure_us);
     let lines = [
         "SequencerMode = Off".to_owned(),
         "SequencerConfigurationMode = Off".to_owned(),
@@ -274,11 +272,11 @@ fn assert_images_of_the_scene(session: &Session, rig: &Rig) {
 }
 
 /// Each frame of a stored cycle is the scene's image under its setting.
-fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &Plan) {
-    let settings = plan.film.delay_us.values();
+fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &FilmPlan) {
+    let settings = plan.delay_us.values();
     let expected: Vec<Vec<u32>> = settings
         .iter()
-        .map(|&delay_us| scene_counts(rig, &Pattern::White, delay_us, plan.film.exposure_us))
+        .map(|&delay_us| scene_counts(rig, &Pattern::White, delay_us, plan.exposure_us))
         .collect();
     let (film, state) = (session.film().unwrap(), session.state().unwrap());
     for cycle in state.cycles() {

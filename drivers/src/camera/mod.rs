@@ -1,5 +1,6 @@
 //! Cameras.
 
+#[cfg(feature = "aravis")]
 pub mod aravis;
 pub mod replay;
 pub mod v4l2;

@@ -4,19 +4,18 @@
 //! of it was sent is recorded next to it. After a crash, [`park()`], a [`Guardian`] or the next run can therefore
 //! determine the mirror's position and move it to the origin, light off first.
 
+mod error;
 mod guardian;
-pub mod identify;
 mod light;
 mod mti;
+mod open;
 mod optotune;
 mod park;
 pub mod playzerx;
 mod points;
-pub(crate) mod port;
 mod rules;
 mod sequence;
 mod state;
-pub mod wire;
 
 pub use guardian::{Guardian, park_when_closed};
 pub use light::{LightGuard, LightState, NoLight, arm_light};
@@ -25,5 +24,5 @@ pub use optotune::{
     Laser, Optotune, OptotuneCommand, OptotuneConfig, OptotuneReply, RtsLaser, parse_optotune,
 };
 pub use park::{ParkError, Parked, park};
-pub use playzerx::{Link, PlayzerX, PlayzerXConfig};
+pub use playzerx::{PlayzerX, PlayzerXConfig, PlayzerXLink};
 pub use state::{MirrorReport, StateError, StateFile};

@@ -4,52 +4,36 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Duration;
 
+pub use raysweep_config::rig::dots::MtiDrive;
 use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorLimits, MirrorPoint, Tilt};
 
+use super::error::{DEVICE, fault};
 use super::light::LightGuard;
 use super::points::{self, PointController, PointMirror};
-use super::port::{Port, fault};
-use super::state::{MirrorState, Reach, Sent};
-use super::wire::{Parsed, line};
+use super::state::{MirrorState, Reach, Sent, StateFile};
+use crate::serial::port::Port;
+use crate::serial::wire::{Parsed, line};
 
 const BAUD: u32 = 115_200;
 const REPLY_WAIT: Duration = Duration::from_millis(300);
 /// Maximum wait for switching the high voltage.
 const ENABLE_WAIT: Duration = Duration::from_secs(2);
 
-/// Drive settings of the controller. Too high values destroy the mirror.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct MtiDrive {
-    /// Bias, 0..=100 V.
-    pub bias_v: u32,
-    /// Maximum voltage difference between the electrodes of an axis, 0..=200 V.
-    pub difference_v: u32,
-    /// -3 dB frequency of the controller's low-pass, 50..=15,000 Hz.
-    pub bandwidth_hz: u32,
-}
-
-impl MtiDrive {
-    /// Maximum drive of Mirrorcle's A7B2.3-3600AL.
-    pub const A7B2_3_3600AL: Self = Self { bias_v: 80, difference_v: 150, bandwidth_hz: 200 };
-
-    /// Checks the drive settings.
-    ///
-    /// # Errors
-    /// The first value above `most` or outside the controller's range.
-    fn check(&self, most: &Self) -> Result<(), DeviceError> {
-        let rules = [
-            ("bias_v", self.bias_v, 0, most.bias_v.min(100)),
-            ("difference_v", self.difference_v, 0, most.difference_v.min(200)),
-            ("bandwidth_hz", self.bandwidth_hz, 50, most.bandwidth_hz.min(15_000)),
-        ];
-        for (field, value, low, high) in rules {
-            if !(low..=high).contains(&value) {
-                let what = format!("{field} = {value}: this mirror takes {low} to {high}");
-                return Err(fault(DeviceErrorKind::OutOfRange, what));
-            }
+/// # Errors
+/// The first value of a drive beyond `most` or beyond what the controller takes.
+pub(super) fn check(drive: &MtiDrive, most: &MtiDrive) -> Result<(), DeviceError> {
+    let rules = [
+        ("bias_v", drive.bias_v, 0, most.bias_v.min(100)),
+        ("difference_v", drive.difference_v, 0, most.difference_v.min(200)),
+        ("bandwidth_hz", drive.bandwidth_hz, 50, most.bandwidth_hz.min(15_000)),
+    ];
+    for (field, value, low, high) in rules {
+        if !(low..=high).contains(&value) {
+            let what = format!("{field} = {value}: this mirror takes {low} to {high}");
+            return Err(fault(DeviceErrorKind::OutOfRange, what));
         }
-        Ok(())
     }
+    Ok(())
 }
 
 /// Configuration of an MTI controller and its mirror.
@@ -179,7 +163,7 @@ impl MtiLine {
 
     /// Completes any partial line and enters the command mode, or detects that the controller is already in it.
     fn enter(port: &std::path::Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
-        let mut line = Self { port: Port::open(port, BAUD)?, full_scale };
+        let mut line = Self { port: Port::open(DEVICE, port, BAUD)?, full_scale };
         line.port.send(b"\n")?;
         line.port.await_silence(parse_mti)?;
         let model = match line.ask(MtiCommand::Enter, REPLY_WAIT)? {
@@ -210,26 +194,18 @@ impl PointController for MtiLine {
 pub type Mti = PointMirror<MtiLine>;
 
 impl PointMirror<MtiLine> {
-    /// Opens the controller, sets the drive and switches the high voltage on. If a crashed process left the mirror
-    /// away from rest, it is parked first.
-    ///
-    /// # Errors
-    /// `OutOfRange` for a drive that would destroy the mirror, `Busy`, `Disconnected`, `Timeout`, `Protocol`.
-    pub fn open(config: MtiConfig) -> Result<Self, DeviceError> {
-        let MtiConfig { port, drive, most, full_scale, limits, state, light } = config;
-        drive.check(&most)?;
-        let reach = Reach::Mti { port: port.clone(), full_scale };
-        PointMirror::open_with(&state, limits, light, reach, || {
-            let (mut line, model) = MtiLine::enter(&port, full_scale)?;
-            // The drive can be set only with the high voltage off.
-            line.tell(MtiCommand::Disable, ENABLE_WAIT)?;
-            line.tell(MtiCommand::Bias(drive.bias_v), REPLY_WAIT)?;
-            line.tell(MtiCommand::Difference(drive.difference_v), REPLY_WAIT)?;
-            line.tell(MtiCommand::Bandwidth(drive.bandwidth_hz), REPLY_WAIT)?;
-            line.tell(MtiCommand::Enable, ENABLE_WAIT)?;
-            line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
-            Ok((line, model))
-        })
+    /// Opens the controller of a mirror that is parked, sets the drive and switches the high voltage on.
+    pub(super) fn open_parked(config: MtiConfig, state: StateFile) -> Result<Self, DeviceError> {
+        let MtiConfig { port, drive, full_scale, limits, light, .. } = config;
+        let (mut line, model) = MtiLine::enter(&port, full_scale)?;
+        // The drive can be set only with the high voltage off.
+        line.tell(MtiCommand::Disable, ENABLE_WAIT)?;
+        line.tell(MtiCommand::Bias(drive.bias_v), REPLY_WAIT)?;
+        line.tell(MtiCommand::Difference(drive.difference_v), REPLY_WAIT)?;
+        line.tell(MtiCommand::Bandwidth(drive.bandwidth_hz), REPLY_WAIT)?;
+        line.tell(MtiCommand::Enable, ENABLE_WAIT)?;
+        line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
+        Ok(PointMirror::parked(state, limits, light, Reach::Mti { port, full_scale }, line, model))
     }
 }
 
@@ -277,14 +253,14 @@ mod tests {
     #[test]
     fn a_drive_beyond_the_mirrors_is_refused() {
         let most = MtiDrive::A7B2_3_3600AL;
-        assert!(most.check(&most).is_ok());
+        assert!(check(&most, &most).is_ok());
         for drive in [
             MtiDrive { bias_v: 81, ..most },
             MtiDrive { difference_v: 151, ..most },
             MtiDrive { bandwidth_hz: 201, ..most },
             MtiDrive { bandwidth_hz: 49, ..most },
         ] {
-            assert_eq!(drive.check(&most).unwrap_err().kind, DeviceErrorKind::OutOfRange);
+            assert_eq!(check(&drive, &most).unwrap_err().kind, DeviceErrorKind::OutOfRange);
         }
     }
 }

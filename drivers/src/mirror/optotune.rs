@@ -7,11 +7,12 @@ use std::time::Duration;
 
 use raysweep_core::{DeviceError, DeviceErrorKind, MirrorLimits, MirrorPoint, Tilt};
 
+use super::error::{DEVICE, fault};
 use super::light::LightGuard;
 use super::points::{self, PointController, PointMirror};
-use super::port::{Port, fault};
-use super::state::{MirrorState, Reach, Sent, node_of};
-use super::wire::{Parsed, line};
+use super::state::{MirrorState, Reach, Sent, StateFile, node_of};
+use crate::serial::port::Port;
+use crate::serial::wire::{Parsed, line};
 
 const BAUD: u32 = 256_000;
 const REPLY_WAIT: Duration = Duration::from_millis(300);
@@ -38,7 +39,7 @@ impl RtsLaser {
     /// # Errors
     /// If the port cannot be opened or has no RTS line.
     pub fn open(port: &Path) -> Result<Self, DeviceError> {
-        let mut laser = Self { port: Port::open(port, 9600)? };
+        let mut laser = Self { port: Port::open(DEVICE, port, 9600)? };
         laser.switch(false)?;
         Ok(laser)
     }
@@ -135,7 +136,7 @@ pub struct OptotuneLine {
 
 impl OptotuneLine {
     fn open(port: &Path, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
-        let mut line = Self { port: Port::open(port, BAUD)?, laser, lit: true };
+        let mut line = Self { port: Port::open(DEVICE, port, BAUD)?, laser, lit: true };
         line.light(false)?;
         // Completes any partial line; the reply to that is discarded.
         line.port.send(b"\r\n")?;
@@ -194,18 +195,18 @@ impl PointController for OptotuneLine {
 pub type Optotune = PointMirror<OptotuneLine>;
 
 impl PointMirror<OptotuneLine> {
-    /// Opens the controller. If a crashed process left the mirror away from rest, it is parked first.
-    ///
-    /// # Errors
-    /// `Busy`, `Disconnected`, `Timeout`, `Protocol`.
-    pub fn open(config: OptotuneConfig, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
-        let OptotuneConfig { port, laser_port, limits, state, light } = config;
-        let reach = Reach::Optotune { port: port.clone(), node: node_of(&port), laser_port };
-        PointMirror::open_with(&state, limits, light, reach, || {
-            let mut line = OptotuneLine::open(&port, laser)?;
-            line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
-            Ok((line, "Optotune MR-E-2".into()))
-        })
+    /// Opens the controller of a mirror that is parked.
+    pub(super) fn open_parked(
+        config: OptotuneConfig,
+        laser: Box<dyn Laser>,
+        state: StateFile,
+    ) -> Result<Self, DeviceError> {
+        let OptotuneConfig { port, laser_port, limits, light, .. } = config;
+        let node = node_of(&port);
+        let mut line = OptotuneLine::open(&port, laser)?;
+        line.go(MirrorPoint { tilt: Tilt::ORIGIN, light: 0 })?;
+        let reach = Reach::Optotune { port, node, laser_port };
+        Ok(PointMirror::parked(state, limits, light, reach, line, "Optotune MR-E-2".into()))
     }
 }
 

@@ -1,7 +1,6 @@
 //! Mirrors that take one point at a time and acknowledge it: the host's clock is the sample clock.
 
 use std::ops::RangeInclusive;
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use raysweep_core::{
@@ -9,15 +8,12 @@ use raysweep_core::{
     MirrorProgress, Tilt,
 };
 
+use super::error::fault;
 use super::light::LightGuard;
-use super::park::park_left;
-use super::port::fault;
 use super::rules;
 use super::sequence::Sequence;
 use super::state::{MirrorState, Reach, Sent, StateFile, of_state};
 
-/// Maximum wait for another process to release the mirror.
-const LOCK_WAIT: Duration = Duration::from_secs(1);
 /// Interval of checking the light's permission.
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
 /// Maximum time that the light may stay on one point because the host is late [A].
@@ -127,20 +123,17 @@ impl Pace {
 }
 
 impl<C: PointController> PointMirror<C> {
-    /// Takes the lock, parks a mirror that a crashed process left behind, then opens the controller with `open`,
-    /// which returns it with its name.
-    pub(super) fn open_with(
-        state: &Path,
+    /// A parked mirror with this controller, of this name.
+    pub(super) fn parked(
+        state: StateFile,
         limits: MirrorLimits,
         light: LightGuard,
         reach: Reach,
-        open: impl FnOnce() -> Result<(C, String), DeviceError>,
-    ) -> Result<Self, DeviceError> {
-        let state = StateFile::open(state, LOCK_WAIT).map_err(of_state)?;
-        park_left(&state).map_err(|error| fault(DeviceErrorKind::NotReady, error.to_string()))?;
-        let (controller, model) = open()?;
+        controller: C,
+        model: String,
+    ) -> Self {
         let capabilities = MirrorCapabilities { model, limits, rate_hz: C::RATE_HZ, fifo_samples: 1 };
-        Ok(Self { controller, reach, capabilities, light, state, phase: Phase::Parked })
+        Self { controller, reach, capabilities, light, state, phase: Phase::Parked }
     }
 
     fn record(&self, rate_hz: f64, playing: Option<&Sequence>) -> Result<(), DeviceError> {

@@ -2,8 +2,8 @@
 
 use raysweep_core::{DeviceError, DeviceErrorKind, MirrorLimits, MirrorPath};
 
+use super::error::fault;
 use super::light::LightGuard;
-use super::port::fault;
 
 /// Returns the path if it respects the limits of this mirror: it may have been made for another one.
 pub(super) fn fitting(path: &MirrorPath, limits: &MirrorLimits) -> Result<MirrorPath, DeviceError> {

@@ -9,7 +9,7 @@ use std::time::Duration;
 use nix::errno::Errno;
 use nix::libc;
 
-use super::modemline::Line;
+use raysweep_config::rig::vsync::ModemLineInput;
 
 /// `struct serial_icounter_struct`: transitions of each line since the port appeared.
 #[repr(C)]
@@ -54,34 +54,33 @@ nix::ioctl_readwrite_bad!(
     PpsFetch
 );
 
-fn bit(line: Line) -> libc::c_int {
+fn bit(line: ModemLineInput) -> libc::c_int {
     match line {
-        Line::Dcd => libc::TIOCM_CD,
-        Line::Cts => libc::TIOCM_CTS,
+        ModemLineInput::Dcd => libc::TIOCM_CD,
+        ModemLineInput::Cts => libc::TIOCM_CTS,
     }
 }
 
-/// Blocks until the line changes. There is no timeout, but a hang-up ends the wait.
-pub fn wait_for_change(port: impl AsFd, line: Line) -> Result<(), Errno> {
-    // SAFETY: the ioctl takes an integer and does not access our memory; the descriptor is open for as long as
-    // `port`.
+/// Blocks until the line changes. There is no timeout; a hang-up ends it.
+pub fn wait_for_change(port: impl AsFd, line: ModemLineInput) -> Result<(), Errno> {
+    // SAFETY: the request takes an integer and touches no memory of ours; the descriptor is open for as long as `port`.
     unsafe { tiocmiwait(port.as_fd().as_raw_fd(), bit(line)) }.map(drop)
 }
 
-/// Number of transitions of the line since the port appeared, wrapping.
-pub fn transitions(port: impl AsFd, line: Line) -> Result<u32, Errno> {
+/// How often the line has changed since the port came up, wrapping.
+pub fn transitions(port: impl AsFd, line: ModemLineInput) -> Result<u32, Errno> {
     let mut counters = SerialCounters::default();
     // SAFETY: the ioctl writes one `serial_icounter_struct`, whose layout `SerialCounters` has.
     unsafe { tiocgicount(port.as_fd().as_raw_fd(), &mut counters) }?;
     let count = match line {
-        Line::Dcd => counters.carrier,
-        Line::Cts => counters.cts,
+        ModemLineInput::Dcd => counters.carrier,
+        ModemLineInput::Cts => counters.cts,
     };
     Ok(count.cast_unsigned())
 }
 
 /// Whether the line is asserted.
-pub fn is_asserted(port: impl AsFd, line: Line) -> Result<bool, Errno> {
+pub fn is_asserted(port: impl AsFd, line: ModemLineInput) -> Result<bool, Errno> {
     let mut lines = 0;
     // SAFETY: the ioctl writes one `int`.
     unsafe { tiocmget(port.as_fd().as_raw_fd(), &mut lines) }?;

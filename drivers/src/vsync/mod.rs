@@ -10,22 +10,12 @@ pub mod triggerbox;
 use std::path::Path;
 
 use nix::errno::Errno;
+pub use raysweep_config::rig::vsync::Polarity;
 use raysweep_core::{DeviceError, DeviceErrorKind};
 
 const DEVICE: &str = "vsync";
 
-/// The change of the line that is the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Polarity {
-    /// The line becomes asserted.
-    #[default]
-    Assert,
-    /// The line becomes clear.
-    Clear,
-}
-
-/// The operating system's error about a device file, and what to do about it.
+/// What the system said of a device file, and what to do about it.
 #[derive(Debug, thiserror::Error)]
 #[error("{path}: {call}: {errno}: {advice}")]
 struct SystemError {

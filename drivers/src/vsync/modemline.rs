@@ -19,9 +19,11 @@ use nix::errno::Errno;
 use nix::fcntl::{OFlag, open};
 use nix::sys::stat::Mode;
 use nix::sys::termios::{ControlFlags, SetArg, cfmakeraw, tcgetattr, tcsetattr};
+pub use raysweep_config::rig::vsync::ModemLineInput;
+use raysweep_config::rig::vsync::Polarity;
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind, Edge, Vsync};
 
-use super::{DEVICE, Polarity, ioctl, system_error};
+use super::{DEVICE, ioctl, system_error};
 
 /// Maximum number of edges that wait for the reader: 4 s at 60 Hz. Any more are lost, which shows in their numbers.
 const QUEUE: usize = 256;
@@ -36,35 +38,10 @@ const DOUBTS: u8 = 8;
 /// How long closing waits for the thread, which wakes up at the next transition.
 const CLOSE_PATIENCE: Duration = Duration::from_millis(100);
 
-/// `[vsync.modemline]`
-#[derive(Debug, Clone, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ModemLineConfig {
-    /// The serial port.
-    pub port: PathBuf,
-    /// The line that carries the VSYNC.
-    #[serde(default)]
-    pub line: Line,
-    /// The change of the line that is the edge.
-    #[serde(default)]
-    pub edge: Polarity,
-}
-
-/// A modem line that can carry the VSYNC.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Line {
-    /// Data carrier detect.
-    #[default]
-    Dcd,
-    /// Clear to send.
-    Cts,
-}
-
 /// A VSYNC line on a serial port.
 pub struct ModemLine {
     path: PathBuf,
-    line: Line,
+    line: ModemLineInput,
     watch: Arc<Watch>,
     edges: Receiver<Result<Edge, DeviceError>>,
     thread: Option<JoinHandle<()>>,
@@ -80,8 +57,8 @@ impl ModemLine {
     /// Opens the port and starts watching. Edges are numbered from 1.
     ///
     /// # Errors
-    /// `Disconnected` if the port is missing, `Unsupported` if it has no modem lines that can be waited for.
-    pub fn open(path: &Path, line: Line, edge: Polarity) -> Result<Self, DeviceError> {
+    /// `Disconnected` if there is no such port, `Unsupported` if it has no modem lines that can be waited for.
+    pub fn open(path: &Path, line: ModemLineInput, edge: Polarity) -> Result<Self, DeviceError> {
         let failed = |call| move |errno| system_error(path, call, errno);
         // Without NONBLOCK, open waits for a carrier, which is the very line that toggles here.
         let flags = OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC;
@@ -173,8 +150,8 @@ impl Watch {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Passes on edges until the port disappears or the receiver is dropped.
-    fn follow(&self, path: &Path, line: Line, edges: &SyncSender<Result<Edge, DeviceError>>) {
+    /// Hands on edges until the port ends or nobody wants them.
+    fn follow(&self, path: &Path, line: ModemLineInput, edges: &SyncSender<Result<Edge, DeviceError>>) {
         let clock = Clock::real();
         while !self.closing.load(Ordering::Relaxed) {
             let waited = ioctl::wait_for_change(&self.port, line);
@@ -312,10 +289,11 @@ mod tests {
     fn what_has_no_modem_lines_is_refused() {
         let pty = openpty(None, None).unwrap();
         let path = nix::unistd::ttyname(&pty.slave).unwrap();
-        let refused = ModemLine::open(&path, Line::Dcd, Polarity::Assert).err().unwrap();
+        let refused = ModemLine::open(&path, ModemLineInput::Dcd, Polarity::Assert).err().unwrap();
         assert_eq!(refused.kind, DeviceErrorKind::Unsupported);
         assert!(refused.to_string().contains(&path.display().to_string()), "{refused}");
-        let missing = ModemLine::open(Path::new("/dev/ttyNONE"), Line::Cts, Polarity::Clear).err().unwrap();
+        let missing =
+            ModemLine::open(Path::new("/dev/ttyNONE"), ModemLineInput::Cts, Polarity::Clear).err().unwrap();
         assert_eq!(missing.kind, DeviceErrorKind::Disconnected);
     }
 }

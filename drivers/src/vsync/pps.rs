@@ -7,10 +7,11 @@ use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
 use nix::time::{ClockId, clock_gettime};
+use raysweep_config::rig::vsync::Polarity;
 use raysweep_core::{Clock, DeviceError, Edge, Vsync};
 
 use super::ioctl::{self, PpsEvent};
-use super::{Polarity, system_error};
+use super::system_error;
 
 /// A source may vanish without waking the waiting thread, so its presence is checked at this interval.
 const LOOK: Duration = Duration::from_millis(250);
@@ -18,18 +19,7 @@ const LOOK: Duration = Duration::from_millis(250);
 /// The kernel counts waits in ticks of up to 10 ms and does not wait at all for less than one tick.
 const TICK: Duration = Duration::from_millis(10);
 
-/// `[vsync.pps]`
-#[derive(Debug, Clone, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PpsConfig {
-    /// The source, for example `/dev/pps0`.
-    pub source: PathBuf,
-    /// The change of the line that is the edge.
-    #[serde(default)]
-    pub edge: Polarity,
-}
-
-/// A VSYNC line with timestamps from the kernel.
+/// A VSYNC line that the kernel stamps.
 pub struct Pps {
     path: PathBuf,
     source: File,

@@ -1,8 +1,8 @@
 //! The parsers of replies with 10 million bytes of seeded noise, and with replies between noise.
 
 use raysweep_drivers::mirror::playzerx::protocol::{Reply, parse_response};
-use raysweep_drivers::mirror::wire::{LONGEST_REPLY, Parsed, Receiver};
 use raysweep_drivers::mirror::{MtiReply, OptotuneReply, parse_mti, parse_optotune};
+use raysweep_drivers::serial::wire::{LONGEST_REPLY, Parsed, Receiver};
 
 const BYTES: usize = 10_000_000;
 

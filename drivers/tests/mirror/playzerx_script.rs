@@ -118,7 +118,7 @@ impl Lab {
     fn open(&self) -> PlayzerX {
         let config = mirror::PlayzerXConfig {
             port: self.script.pty.path().to_owned(),
-            link: mirror::Link::VirtualCom,
+            link: mirror::PlayzerXLink::VirtualCom,
             full_scale: LIMITS.max_tilt,
             limits: LIMITS,
             state: self.script.state(),

@@ -49,7 +49,7 @@ impl Rig {
     pub fn config(&self) -> mirror::PlayzerXConfig {
         mirror::PlayzerXConfig {
             port: self.pty.path().to_owned(),
-            link: mirror::Link::VirtualCom,
+            link: mirror::PlayzerXLink::VirtualCom,
             full_scale: MechanicsConfig::default().max_tilt,
             limits: LIMITS,
             state: self.state(),

@@ -195,7 +195,7 @@ fn a_playzerx_is_known_by_its_words() {
         let script = Script::new(answers, frame);
         let config = mirror::PlayzerXConfig {
             port: script.pty.path().to_owned(),
-            link: mirror::Link::VirtualCom,
+            link: mirror::PlayzerXLink::VirtualCom,
             full_scale: LIMITS.max_tilt,
             limits: LIMITS,
             state: script.state(),

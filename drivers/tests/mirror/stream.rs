@@ -89,7 +89,7 @@ fn a_rate_that_the_controller_does_not_keep_is_found_out() {
 #[test]
 fn what_the_link_or_the_limits_forbid_is_refused_before_anything_moves() {
     let rig = Rig::good();
-    let uart = mirror::PlayzerXConfig { link: mirror::Link::Uart, ..rig.config() };
+    let uart = mirror::PlayzerXConfig { link: mirror::PlayzerXLink::Uart, ..rig.config() };
     let mut mirror = PlayzerX::open(uart).unwrap();
     let error = mirror.load(&batch()).unwrap_err();
     assert!(error.to_string().contains("10240"), "{error}");

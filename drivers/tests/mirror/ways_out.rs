@@ -161,7 +161,7 @@ fn child() {
     } else {
         let config = mirror::PlayzerXConfig {
             port: port.into(),
-            link: mirror::Link::VirtualCom,
+            link: mirror::PlayzerXLink::VirtualCom,
             full_scale: LIMITS.max_tilt,
             limits: LIMITS,
             state,

@@ -1,6 +1,6 @@
 //! Profile of the spot: an elliptical Gaussian that varies over the field of view.
 
-use super::config::SimDot;
+use raysweep_config::sim::SimDot;
 
 /// Ratio of a Gaussian's standard deviation to its full width at half maximum.
 const SIGMA_OVER_FWHM: f64 = 0.424_661;

@@ -6,8 +6,8 @@
 //! virtual time. Random effects in a frame are keyed by the path and the frame's number in it.
 
 mod beam;
+mod bench;
 mod camera;
-mod config;
 mod mirror;
 mod rig;
 mod scan;
@@ -15,7 +15,7 @@ mod scene;
 mod view;
 mod world;
 
-pub use config::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
-pub use rig::{DotsDevices, DotsError, DotsRig, DotsSetup};
+pub use bench::DotsSetup;
+pub use rig::{DotsDevices, DotsError, DotsRig};
 pub use scene::{BUILTIN_NAMES, DotSceneError};
 pub use world::{DotsTruth, FrameFate, FrameTruth, SubjectSwitch};

@@ -4,15 +4,16 @@ use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
 
-use raysweep_core::{Camera, Clock, MechanicalDeg, Mirror, MirrorLimits, PixelFormat, ns_from_us};
+use raysweep_core::{Camera, Clock, Mirror};
 
 use super::beam::Beam;
+use super::bench::{Bench, DotsSetup};
 use super::camera::DotCamera;
-use super::config::DotsConfig;
 use super::mirror::{DotMirror, WatchedMirror};
 use super::scene::{DotSceneError, Scene};
 use super::world::{DotsTruth, SubjectSwitch, World};
 use crate::sensor::{Scale, Sensor};
+use raysweep_config::sim::{DotsConfig, SimDotSensor, SimSensor};
 
 /// Why a simulated dot rig cannot be built.
 #[derive(Debug, thiserror::Error)]
@@ -42,37 +43,9 @@ impl DotsError {
     }
 }
 
-/// Parameters from the rest of the rig file that the simulation needs.
-#[derive(Debug, Clone)]
-pub struct DotsSetup {
-    /// Pixel packing of the frames.
-    pub format: PixelFormat,
-    /// Counts, above black, of a white plane at the dot's centre in an exposure of `white_exposure_us`.
-    pub white_dn: f64,
-    /// Exposure that `white_dn` refers to.
-    pub white_exposure_us: f64,
-    /// Counts without light.
-    pub black_dn: f64,
-    /// Angle between the beam and the mirror's normal at rest.
-    pub incidence: MechanicalDeg,
-    /// Limits of the mirror.
-    pub limits: MirrorLimits,
-}
-
 /// A simulated dot rig, whose devices can be opened repeatedly.
 pub struct DotsRig {
     bench: Arc<Bench>,
-}
-
-/// The parts of the rig that are constant while it runs.
-pub(super) struct Bench {
-    pub config: DotsConfig,
-    pub setup: DotsSetup,
-    pub scene: Scene,
-    pub beam: Beam,
-    pub sensor: Sensor,
-    /// Camera rows and columns, including the margin.
-    pub size: (usize, usize),
 }
 
 /// The devices of one dot rig, sharing one clock.
@@ -101,7 +74,7 @@ impl DotsRig {
         let (rows, columns) = scene.view().size;
         let size = (rows + config.margin_rows, columns);
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
-        let sensor = Sensor::new(&config.sensor.emva(), size, scale, config.seed);
+        let sensor = Sensor::new(&emva(&config.sensor), size, scale, config.seed);
         let beam = Beam::new(&config.dot, half);
         Ok(Self { bench: Arc::new(Bench { config, setup, scene, beam, sensor, size }) })
     }
@@ -140,18 +113,6 @@ impl DotsRig {
             truth: DotsTruth::new(world),
             clock,
         }
-    }
-}
-
-impl Bench {
-    /// Light of a white plane in an exposure of `exposure_us`, relative to one of `white_exposure_us`.
-    pub fn exposed(&self, exposure_us: f64) -> f64 {
-        exposure_us / self.setup.white_exposure_us
-    }
-
-    /// Minimum time between two frames.
-    pub fn frame_ns(frame_rate_hz: f64) -> i64 {
-        ns_from_us(1e6 / frame_rate_hz).max(1)
     }
 }
 
@@ -200,4 +161,23 @@ fn check_ranges(config: &DotsConfig) -> Result<(), DotsError> {
         }
     }
     Ok(())
+}
+
+/// The same sensor in the terms of the plane rig's.
+fn emva(sensor: &SimDotSensor) -> SimSensor {
+    SimSensor {
+        noise: sensor.noise,
+        electrons_per_dn: sensor.electrons_per_dn,
+        full_well_e: sensor.full_well_e,
+        read_noise_e: sensor.read_noise_e,
+        dsnu_e: sensor.dsnu_e,
+        column_e: sensor.column_e,
+        prnu_percent: sensor.prnu_percent,
+        hot_pixels: sensor.hot_pixels,
+        hot_pixel_e_per_s: sensor.hot_pixel_e_per_s,
+        // Negligible in the exposure of a dot.
+        dark_current_e_per_s: 0.0,
+        adc_bits: 12,
+        vignetting_percent: sensor.vignetting_percent,
+    }
 }

@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
+use raysweep_config::sim::{DotsConfig, SimMirror};
 use raysweep_core::{MechanicalDeg, MirrorPath, Tilt};
 
-use super::config::DotsConfig;
-use crate::mirror::Mechanics;
+use crate::mirror::{Mechanics, MechanicsConfig};
 
 /// Number of stored positions behind the newest one: more than a frame needs.
 const REMEMBERED: usize = 64;
@@ -62,7 +62,7 @@ impl Scan {
         let samples_per_dot = rate_hz / frame_rate_hz;
         let dots = (path.points().len() as f64 / samples_per_dot).round() as u64;
         let motion = config.mirror.mechanics.then(|| {
-            let mut mechanics = Mechanics::new(config.mirror.mechanics(config.seed), rate_hz);
+            let mut mechanics = Mechanics::new(mechanics(&config.mirror, config.seed), rate_hz);
             let first = path.at(0).tilt;
             let mut place = first;
             for _ in 0..(SETTLE_S * rate_hz) as u32 {
@@ -170,5 +170,19 @@ impl Motion {
         }
         let end = self.places.len() - 1 - (self.next - 1 - sample) as usize;
         [self.places[end.saturating_sub(1)], self.places[end]]
+    }
+}
+
+/// The mechanics of a mirror as the rig file describes it.
+fn mechanics(mirror: &SimMirror, seed: u64) -> MechanicsConfig {
+    MechanicsConfig {
+        f0_hz: mirror.f0_hz,
+        q: mirror.q,
+        filter_hz: mirror.filter_hz,
+        coupling: mirror.coupling,
+        drift_deg_per_s: mirror.drift_deg_per_s,
+        repeat_deg: mirror.repeat_deg,
+        seed,
+        ..MechanicsConfig::default()
     }
 }

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind, MirrorPath, Subject, ns_from_us};
 
-use super::rig::Bench;
+use super::bench::Bench;
 use super::scan::{Lit, Scan};
 use super::scene::{Light, Still};
 use crate::keyed::{Purpose, keyed, uniform};

@@ -10,7 +10,7 @@ use super::faults::TriggerOrder;
 use super::features::{Access, CHUNKS, GLOBAL_SHUTTER, Id, SINGLE_FRAME, SOFTWARE};
 use super::gvcp::{Command, Request, Status, seal, u32_at};
 use super::gvsp::{MAX_PACKET_BYTES, MIN_PACKET_BYTES, View};
-use super::lock;
+use super::locks::lock;
 use super::registers::{Registers, Write};
 use super::sequencer::Sequencer;
 use super::source::{Controls, TriggeredBy};

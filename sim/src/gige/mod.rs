@@ -8,6 +8,7 @@ mod features;
 mod genicam;
 mod gvcp;
 mod gvsp;
+mod locks;
 mod registers;
 mod sequencer;
 mod source;
@@ -19,8 +20,8 @@ mod wire;
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
 use std::os::fd::AsRawFd;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -29,6 +30,7 @@ pub use faults::{Faults, TriggerOrder, WireTruth};
 pub use source::test_pixel;
 
 use self::control::Control;
+use self::locks::lock;
 use self::registers::{Identity, Registers};
 use self::source::{Controls, Pictures};
 use self::stream::Stream;
@@ -217,17 +219,4 @@ fn serve(mut control: Control, stream: &Stream, sockets: &[UdpSocket; 2], stop: 
 fn send(socket: &UdpSocket, reply: &[u8], to: SocketAddr) {
     // A lost answer needs no handling: a client that is still there repeats its request.
     let _ = socket.send_to(reply, to);
-}
-
-// The guarded data are never left half changed, so a panic elsewhere does not corrupt them.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-fn read<T>(shared: &RwLock<T>) -> RwLockReadGuard<'_, T> {
-    shared.read().unwrap_or_else(PoisonError::into_inner)
-}
-
-fn write<T>(shared: &RwLock<T>) -> RwLockWriteGuard<'_, T> {
-    shared.write().unwrap_or_else(PoisonError::into_inner)
 }

@@ -10,7 +10,7 @@ use raysweep_core::{
 };
 
 use super::gvsp::{Block, View};
-use super::lock;
+use super::locks::lock;
 use crate::devices::SimCamera;
 use crate::line::Line;
 pub use crate::line::{Sets, TriggeredBy};

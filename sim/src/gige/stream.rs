@@ -11,9 +11,9 @@ use super::clock::DeviceClock;
 use super::faults::{Faults, WireTruth};
 use super::gvcp::Resend;
 use super::gvsp::{Block, MIN_PACKET_BYTES, Stamp, View, block_id};
+use super::locks::{lock, read, write};
 use super::source::{BLOCKS, Controls, Pictures};
 use super::wire::{Route, Wire};
-use super::{lock, read, write};
 use crate::keyed::{Purpose, keyed, uniform};
 
 /// Longest wait for an exposure, and so the longest delay of a stop.

@@ -12,7 +12,7 @@ use super::faults::{Faults, TriggerOrder};
 use super::features::{Access, Feature, Id, Kind, features};
 use super::gvcp::u32_at;
 use super::gvsp::{Block, View, block_id};
-use super::lock;
+use super::locks::lock;
 use super::registers::{Identity, Registers};
 use super::source;
 use super::stream::Stream;

@@ -8,7 +8,7 @@ use raysweep_core::Clock;
 
 use super::faults::{Faults, WireTruth};
 use super::gvsp::{self, Block, MAX_PACKET_BYTES};
-use super::lock;
+use super::locks::lock;
 use crate::keyed::{Purpose, keyed, uniform};
 
 /// Sends packets from one socket; each sending thread has its own.

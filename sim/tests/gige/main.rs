@@ -10,13 +10,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use raysweep_config::sim::SimConfig;
+use raysweep_config::sim::{SimProjector, SimSensor, SimVsync};
 use raysweep_core::{
     CameraSettings, Clock, FramePool, Pattern, PixelFormat, Projector, Raster, SettingsId, Shutter, Vsync,
 };
 use raysweep_sim::bench::{BenchProbe, BenchServer, RemoteProjector, RemoteVsync};
-use raysweep_sim::config::{SimProjector, SimSensor, SimVsync};
 use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look, test_pixel};
-use raysweep_sim::{PlaneRig, PlaneSetup, SimConfig, WireDevices};
+use raysweep_sim::{PlaneRig, PlaneSetup, WireDevices};
 
 use self::client::Client;
 

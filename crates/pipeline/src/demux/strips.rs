@@ -12,8 +12,9 @@ use raysweep_transport::plane::{PlaneError, Setting};
 use super::tally::Tally;
 use super::{DemuxFold, Taken, refused};
 use crate::findings::rows_to_choose_by;
+use crate::product::Product;
 use crate::schedule::Role;
-use crate::stage::{FoldError, Product};
+use crate::stage::FoldError;
 use crate::strips::{ImageRows, InStrips};
 
 impl DemuxFold {

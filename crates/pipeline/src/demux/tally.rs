@@ -4,7 +4,7 @@ use ndarray::Array2;
 use raysweep_transport::plane::Transport;
 
 use crate::findings::Findings;
-use crate::stage::Product;
+use crate::product::Product;
 
 use super::PREDICTED_SHARE;
 

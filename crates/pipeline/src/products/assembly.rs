@@ -4,8 +4,9 @@ use ndarray::{Array3, Axis, s};
 use raysweep_transport::plane::Transport;
 
 use super::profile::ProfileSums;
-use super::{Kind, NotMade, ProductSpec, SweepStack, uncertainty};
-use crate::stage::Product;
+use super::{Kind, NotMade, ProductSpec, uncertainty};
+use crate::product::Product;
+use crate::stack::SweepStack;
 
 /// A product under construction. It has the same bits for any division into strips.
 #[derive(Debug)]

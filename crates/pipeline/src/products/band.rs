@@ -7,7 +7,7 @@ use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 
 use super::reach_of;
-use crate::stage::Product;
+use crate::product::Product;
 
 /// Options of `epipolar` and `non-epipolar`: the rows that count as the pixel's own.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]

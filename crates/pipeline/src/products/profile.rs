@@ -5,9 +5,9 @@ use ndarray::Axis;
 use raysweep_transport::plane::{DelayProfile, Setting, Transport};
 use serde::Deserialize;
 
-use super::SweepStack;
+use crate::product::{Product, Profile};
 use crate::schedule::{Role, Schedule, SweepGeometry};
-use crate::stage::Product;
+use crate::stack::SweepStack;
 
 /// Options of `delay-profile`, as given in a plan.
 #[derive(Debug, Clone, Copy, Deserialize)]
@@ -38,34 +38,6 @@ pub(super) struct ProfileSums {
     measured: Vec<f64>,
     predicted: Vec<f64>,
     pixels: usize,
-}
-
-/// Light as a function of the delay at one exposure.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Profile {
-    /// File name without extension.
-    pub name: String,
-    /// Description in one sentence.
-    pub about: String,
-    /// The planned exposure.
-    pub exposure_us: f64,
-    /// Measured light.
-    pub measured: DelayProfile,
-    /// Light predicted from the transport by the forward model.
-    pub predicted: DelayProfile,
-}
-
-impl Profile {
-    /// The table to write: names and values of its columns, one row per delay.
-    pub fn columns(&self) -> [(&'static str, Vec<f64>); 5] {
-        [
-            ("delay_us", self.measured.delays_us.clone()),
-            ("light", self.measured.light.clone()),
-            ("predicted", self.predicted.light.clone()),
-            ("light_per_area_us", self.measured.normalised_per_us()),
-            ("predicted_per_area_us", self.predicted.normalised_per_us()),
-        ]
-    }
 }
 
 /// Smallest number of delays of a profile: its area needs two.

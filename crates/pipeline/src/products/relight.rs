@@ -5,8 +5,8 @@ use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
 use super::reach_of;
+use crate::product::Product;
 use crate::schedule::SweepGeometry;
-use crate::stage::Product;
 
 /// Options of `relight`: the brightness of each projector row.
 #[derive(Debug, Clone, PartialEq, Deserialize)]

@@ -3,6 +3,9 @@ use raysweep_core::Raster;
 use raysweep_transport::plane::predict;
 use serde_json::json;
 
+use ndarray::{Array2, Array3};
+use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting};
+
 use super::*;
 use crate::schedule::{Point, Role, Spot};
 

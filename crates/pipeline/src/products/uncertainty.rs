@@ -3,9 +3,9 @@
 use ndarray::Axis;
 use raysweep_transport::plane::{Samples, Transport, Uncertainty};
 
-use super::SweepStack;
 use super::band::Band;
-use crate::stage::Product;
+use crate::product::Product;
+use crate::stack::SweepStack;
 
 /// Computes it for the camera rows starting at `first_row`, to which stack and transport belong.
 pub(super) fn make(

@@ -80,12 +80,12 @@ impl Dots {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stack::StackShape;
+    use crate::stack::{Contents, StackShape};
 
     #[test]
     fn a_flat_field_reads_back_and_says_where_there_is_none_or_another() {
         let dir = tempfile::tempdir().unwrap();
-        let shape = StackShape { points: 4, exposures: 0, rows: 2, columns: 32, settings: 0, dots: 3 };
+        let shape = StackShape { contents: Contents::Batches { batches: 4, dots: 3 }, rows: 2, columns: 32 };
         let dots = Dots::create(dir.path(), &shape).unwrap();
         assert!(!dots.has_flat());
         assert!(dots.read_flat([2, 32]).unwrap_err().to_string().contains("batches.flat_frames"));

@@ -13,7 +13,7 @@ fn session() -> SessionEntry {
         tags: vec!["a".into(), "b".into()],
         created: "2026-03-04T05:06:07.25Z".parse().unwrap(),
         software: "raysweep 0.1.0".into(),
-        shape: StackShape { points: 4, exposures: 2, rows: 3, columns: 5, settings: 0, dots: 0 },
+        shape: StackShape { contents: Contents::Sweep { points: 4, exposures: 2 }, rows: 3, columns: 5 },
         first_row: 0,
     }
 }
@@ -260,7 +260,7 @@ fn records_of_a_mirrors_axes_are_points_of_their_own() {
         "a sweep has none"
     );
     let dir = tempfile::tempdir().unwrap();
-    let shape = StackShape { points: 2, exposures: 0, rows: 3, columns: 5, settings: 0, dots: 0 };
+    let shape = StackShape { contents: Contents::Axes { axes: 2 }, rows: 3, columns: 5 };
     let session = SessionEntry { kind: "response".into(), shape, ..session() };
     let (session, mut ledger) = crate::Session::create(dir.path(), session, "plan", "rig").unwrap();
     assert!(!session.stack_path().exists() && !session.dots_path().exists(), "records are products");

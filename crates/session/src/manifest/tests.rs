@@ -1,6 +1,6 @@
 use super::*;
 use crate::ledger::{Entry, PointEntry, SessionEntry};
-use crate::stack::{ArrayName, StackShape};
+use crate::stack::{ArrayName, Contents, StackShape};
 use serde_json::json;
 
 fn session() -> (tempfile::TempDir, Session) {
@@ -15,7 +15,7 @@ fn session() -> (tempfile::TempDir, Session) {
         tags: Vec::new(),
         created: "2026-03-04T05:06:07Z".parse().unwrap(),
         software: "raysweep 0.1.0".into(),
-        shape: StackShape { points: 3, exposures: 1, rows: 2, columns: 2, settings: 0, dots: 0 },
+        shape: StackShape { contents: Contents::Sweep { points: 3, exposures: 1 }, rows: 2, columns: 2 },
         first_row: 0,
     };
     let (session, mut ledger) = Session::create(root.path(), header, "plan", "rig").unwrap();

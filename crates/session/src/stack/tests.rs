@@ -2,7 +2,7 @@ use super::*;
 use std::fs;
 
 fn shape(rows: usize, columns: usize) -> StackShape {
-    StackShape { points: 4, exposures: 2, rows, columns, settings: 0, dots: 0 }
+    StackShape { contents: Contents::Sweep { points: 4, exposures: 2 }, rows, columns }
 }
 
 fn image(shape: &StackShape, seed: u32) -> Array2<u32> {

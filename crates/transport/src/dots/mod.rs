@@ -11,6 +11,7 @@ mod correction;
 mod denoise;
 mod error;
 mod flat;
+pub mod identify;
 pub mod product;
 mod sensor;
 mod shape;

@@ -13,7 +13,6 @@ use raysweep_core::{
 };
 
 use super::chunks::{Chunks, Said};
-use super::config::{AravisConfig, TimestampAt};
 use super::frames::{Frames, image_data};
 use super::ids::FrameIds;
 use super::library::Health;
@@ -21,6 +20,7 @@ use super::losses::Losses;
 use super::owner::{Command, Done, Opened, Order, Owner, Reply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
 use super::sequencer::Sequence;
+use raysweep_config::rig::aravis::{AravisConfig, TimestampAt};
 
 /// Properties of the rig that the camera driver needs.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -97,7 +97,10 @@ impl AravisCamera {
     /// `Disconnected` if it does not answer, `Busy` if another program holds it, `Unsupported` or `OutOfRange` with
     /// the feature that it lacks or whose value it rejects.
     pub fn open(config: &AravisConfig, facts: RigFacts) -> Result<Self, DeviceError> {
-        config.check().map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
+        if let Some(fault) = config.faults().into_iter().next() {
+            let what = format!("camera.aravis.{fault}");
+            return Err(DeviceError::new("camera", DeviceErrorKind::OutOfRange, what));
+        }
         let clock = Clock::real();
         let shared = Shared {
             health: Arc::new(Health::new(clock.clone())),

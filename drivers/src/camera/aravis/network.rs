@@ -6,7 +6,7 @@ use aravis::glib::object::Cast;
 use aravis::prelude::*;
 use aravis::{Camera, GvStream, GvStreamOption, GvStreamSocketBuffer, Stream};
 
-use super::config::AravisConfig;
+use raysweep_config::rig::aravis::AravisConfig;
 
 /// The system's limit for socket buffers.
 const RMEM_MAX: &str = "/proc/sys/net/core/rmem_max";

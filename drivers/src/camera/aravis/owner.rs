@@ -10,7 +10,6 @@ use raysweep_core::{
 };
 
 use super::chunks::Chunks;
-use super::config::AravisConfig;
 use super::driver::RigFacts;
 use super::features::{FeatureError, Features};
 use super::frames::Frames;
@@ -19,6 +18,7 @@ use super::network::{self, SocketBuffer};
 use super::sequencer::{self, Sequence};
 use super::settings::Writer;
 use super::setup::set_up;
+use raysweep_config::rig::aravis::AravisConfig;
 
 /// Interval of reading the clock of a camera that delivers no frames, which also checks that it is there.
 const ASK_PERIOD: Duration = Duration::from_millis(200);
@@ -181,9 +181,10 @@ impl Owner {
 
     fn connect(&mut self) -> Result<(Connection, Opened), DeviceError> {
         let Self { config, facts, shared, .. } = self;
-        let named = config
-            .device()
-            .map_err(|fault| DeviceError::new("camera", DeviceErrorKind::OutOfRange, fault))?;
+        let named = config.device().ok_or_else(|| {
+            let what = "camera.aravis.address or camera.aravis.name: give one of them";
+            DeviceError::new("camera", DeviceErrorKind::OutOfRange, what)
+        })?;
         let device = Device::open(named, shared.health.clone())?;
         if device.has("AcquisitionStop") {
             // A client that died may have left it streaming; a camera that is not streaming may refuse this.

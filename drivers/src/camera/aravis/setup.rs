@@ -3,10 +3,10 @@
 
 use raysweep_core::{DeviceErrorKind, PixelFormat};
 
-use super::config::{AravisConfig, Region};
 use super::features::{FeatureError, Features, Result, first_present, put_boolean, put_integer, put_text};
 use super::sequencer;
 use super::settings::Names;
+use raysweep_config::rig::aravis::{AravisConfig, Region};
 
 /// Result of setting up a camera.
 #[derive(Debug, PartialEq)]

@@ -1,18 +1,17 @@
 //! A camera that plays back recorded frames: high-speed cameras record into their own memory first and are downloaded
 //! later.
 
-mod config;
 mod npy;
 mod recording;
 
 use std::time::{Duration, Instant};
 
+pub use raysweep_config::rig::replay::{RawPacking, ReplayConfig, ReplayPace};
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState,
     FirstFrame, FrameBuf, FrameStamp, PixelFormat, Readout, SettingsId, ns_from_us,
 };
 
-pub use self::config::{RawPacking, ReplayConfig, ReplayPace};
 use self::recording::Recording;
 
 /// A recording as a camera. After the last frame, it is [`DeviceState::Ready`] again, although armed.

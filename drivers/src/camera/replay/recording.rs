@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use png::{BitDepth, ColorType};
 use raysweep_core::{DeviceError, DeviceErrorKind, Packing, PixelFormat};
 
-use super::config::{RawPacking, ReplayConfig};
 use super::npy::NpyHeader;
+use raysweep_config::rig::replay::{RawPacking, ReplayConfig};
 
 /// Format of the files of a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -5,8 +5,8 @@ use std::ops::RangeInclusive;
 
 use nix::libc::ERANGE;
 
-use super::config::TimeControl;
 use super::node::{Control, ControlKind, Node};
+use raysweep_config::rig::v4l2::TimeControl;
 
 /// Exposure controls of the kernel, in order of preference. The absolute ones are in units of 100 us, that of a
 /// sensor is in rows. The name changed with kernel 5.13.

@@ -4,13 +4,13 @@
 //! streaming error is handled by closing the device and opening it again, whether its node disappeared or its stream
 //! has to be set up again.
 
-mod config;
 mod controls;
 mod formats;
 #[cfg(feature = "v4l2")]
 mod kernel;
 mod node;
 mod session;
+mod setup;
 mod timing;
 
 use std::collections::VecDeque;
@@ -24,11 +24,12 @@ use raysweep_core::{
     FirstFrame, FrameBuf, FrameStamp, LossCause, SettingsId, Shutter, us_from_ns,
 };
 
-pub use self::config::{TimeControl, V4l2Config, V4l2Setup};
 pub use self::formats::fourcc;
 pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, Opener};
 use self::session::{Layout, Session};
+pub use self::setup::V4l2Setup;
 use self::timing::{Exposures, Ids, exposure_start_ns, is_monotonic};
+pub use raysweep_config::rig::v4l2::{TimeControl, V4l2Config};
 
 /// Pause before the second attempt to open a lost camera again; the first is made at once. The pause doubles from
 /// attempt to attempt.
@@ -94,7 +95,9 @@ impl V4l2Camera {
     /// # Errors
     /// As [`open`].
     pub fn open(setup: V4l2Setup, mut opener: Box<dyn Opener>, clock: Clock) -> Result<Self, DeviceError> {
-        setup.config.check().map_err(|(_, what)| error(DeviceErrorKind::OutOfRange, what))?;
+        if let Some(fault) = setup.config.faults().into_iter().next() {
+            return Err(error(DeviceErrorKind::OutOfRange, format!("camera.v4l2.{fault}")));
+        }
         let session = Session::open(opener.as_mut(), &setup)?;
         let capabilities = session.capabilities(&setup);
         let settings = session.settings().map_err(kernel_error)?;

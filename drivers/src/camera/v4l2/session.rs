@@ -5,9 +5,9 @@ use std::io;
 use nix::libc::ENOTTY;
 use raysweep_core::{CameraCapabilities, CameraSettings, DeviceError, DeviceErrorKind, PixelFormat, Shutter};
 
-use super::config::V4l2Setup;
 use super::controls::{ControlError, Controls, Timer};
 use super::node::{FLAG_ERROR, Filled, Format, Identity, Node, Opener};
+use super::setup::V4l2Setup;
 use super::{error, fourcc, kernel_error, kernel_error_at};
 
 /// Maximum relative deviation of row times, the same as elsewhere between camera and projector.

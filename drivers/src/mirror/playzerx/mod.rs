@@ -12,6 +12,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+pub use raysweep_config::rig::dots::PlayzerXLink;
 use raysweep_core::{
     DeviceError, DeviceErrorKind, MechanicalDeg, Mirror, MirrorCapabilities, MirrorLimits, MirrorPath,
     MirrorProgress, Tilt,
@@ -19,12 +20,12 @@ use raysweep_core::{
 
 use self::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, parse_response};
 use self::stream::Stream;
+use super::error::{DEVICE, fault};
 use super::light::LightGuard;
-use super::park::park_left;
-use super::port::{Port, fault};
 use super::rules;
 use super::sequence::Sequence;
 use super::state::{MirrorState, Reach, Sent, StateFile, node_of, of_state};
+use crate::serial::port::Port;
 
 /// The controller's baud rate; a virtual serial port ignores it.
 const BAUD: u32 = 921_600;
@@ -36,27 +37,16 @@ const REPLY_WAIT: Duration = Duration::from_millis(300);
 const RESET_WAIT: Duration = Duration::from_millis(2500);
 /// Interval of checking the light's permission.
 const LIGHT_CHECK: Duration = Duration::from_millis(50);
-/// Maximum wait for another process to release the mirror.
-const LOCK_WAIT: Duration = Duration::from_secs(1);
 /// Maximum relative deviation of the controller's actual rate from the requested one; includes the measurement error.
 const RATE_TOLERANCE: f64 = 0.03;
 
-/// How the controller is connected.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Link {
-    /// USB, as a virtual serial port: faster than any sample rate requires.
-    VirtualCom,
-    /// UART at 921,600 baud: 10 bits per byte and 9 bytes per sample, so at most 10,240 samples/s.
-    Uart,
-}
-
-/// Configuration of a PlayzerX and its limits.
+/// Which PlayzerX, and what it may do.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlayzerXConfig {
     /// Its serial port.
     pub port: PathBuf,
-    /// Its connection.
-    pub link: Link,
+    /// How it is connected.
+    pub link: PlayzerXLink,
     /// Tilt of the mirror at the controller's full scale.
     pub full_scale: MechanicalDeg,
     /// Limits of its mirror.
@@ -88,15 +78,9 @@ enum Phase {
 }
 
 impl PlayzerX {
-    /// Opens the controller. If a crashed process left the mirror away from rest, it is parked first.
-    ///
-    /// # Errors
-    /// `Busy` if another process has it, `Disconnected` or `Timeout` if it is missing, `Unsupported` if it is another
-    /// device, `NotReady` if it plays samples that this driver did not send.
-    pub fn open(config: PlayzerXConfig) -> Result<Self, DeviceError> {
-        let state = StateFile::open(&config.state, LOCK_WAIT).map_err(of_state)?;
-        park_left(&state).map_err(|error| fault(DeviceErrorKind::NotReady, error.to_string()))?;
-        let mut port = Port::open(&config.port, BAUD)?;
+    /// Opens the controller of a mirror that is parked.
+    pub(super) fn open_parked(config: PlayzerXConfig, state: StateFile) -> Result<Self, DeviceError> {
+        let mut port = Port::open(DEVICE, &config.port, BAUD)?;
         let node = node_of(&config.port);
         let device = hello(&mut port)?;
         let left = samples_left(&mut port, REPLY_WAIT)?;
@@ -110,8 +94,8 @@ impl PlayzerX {
             ));
         }
         let top_hz = match config.link {
-            Link::VirtualCom => *RATE_HZ.end(),
-            Link::Uart => f64::from(BAUD / 10) / SAMPLE_BYTES as f64,
+            PlayzerXLink::VirtualCom => *RATE_HZ.end(),
+            PlayzerXLink::Uart => f64::from(BAUD / 10) / SAMPLE_BYTES as f64,
         };
         let capabilities = MirrorCapabilities {
             model: device,
@@ -344,7 +328,7 @@ pub(super) fn recover(
     else {
         return Ok(None);
     };
-    let mut port = Port::open(name, BAUD)?;
+    let mut port = Port::open(DEVICE, name, BAUD)?;
     let left = if state.is_plugged_in_since(name, *node) { stream::halt(&mut port, 0)? } else { None };
     let Some(left) = left else {
         // The reset switches off light and drive; the mirror springs back, damped by the drive's own filter.

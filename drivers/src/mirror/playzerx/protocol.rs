@@ -3,7 +3,7 @@
 
 use raysweep_core::{MechanicalDeg, MirrorPoint};
 
-use crate::mirror::wire::Parsed;
+use crate::serial::wire::Parsed;
 
 /// FIFO size of a monochrome controller in samples: the maximum count of samples left.
 pub const FIFO_SAMPLES: u32 = 125_000;

@@ -6,9 +6,10 @@ use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorProgress,
 
 use super::REPLY_WAIT;
 use super::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, Sample, parse_response};
-use crate::mirror::port::{Port, fault};
+use crate::mirror::error::fault;
 use crate::mirror::sequence::Sequence;
 use crate::mirror::state::{Sent, StateFile, of_state};
+use crate::serial::port::Port;
 
 /// Samples per write, which is the uncertainty after a crash: 1.6 ms at 39,000 samples/s, too short for any mirror's
 /// filter to pass.

@@ -9,10 +9,10 @@ pub mod protocol;
 pub mod scan;
 mod usb;
 
-use std::collections::{BTreeMap, VecDeque};
-use std::path::PathBuf;
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+pub use raysweep_config::rig::vsync::{Fx2LafwConfig, Slope};
 use raysweep_core::{ClockQuality, DeviceError, DeviceErrorKind, Edge, Vsync, ns_from_us};
 
 use self::clock::SampleClock;
@@ -21,85 +21,10 @@ use self::scan::Scanner;
 use super::DEVICE;
 pub use usb::Usb;
 
-/// The channel that carries the VSYNC.
-pub const VSYNC: &str = "vsync";
-/// After this long without a sample, the analyser has stopped.
+/// Without a sample for so long the analyser has stopped.
 const STALL: Duration = Duration::from_millis(1000);
 
-/// `[vsync.fx2lafw]`
-#[derive(Debug, Clone, serde::Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct Fx2LafwConfig {
-    /// Firmware for analysers without one, as installed by sigrok's packages.
-    pub firmware: Option<PathBuf>,
-    /// Samples per second: 48 or 30 MHz divided by an integer.
-    pub sample_rate_hz: u32,
-    /// Inputs, 0 to 7, by signal name; `vsync` is one of them.
-    pub channels: BTreeMap<String, u8>,
-    /// The change of the VSYNC signal that is its edge.
-    pub edge: Slope,
-    /// A change counts only after the signal was quiet for this long, because lines ring.
-    pub quiet_us: f64,
-    /// From a sample to its transfer's arrival if nothing delays it.
-    pub latency_us: f64,
-}
-
-impl Default for Fx2LafwConfig {
-    fn default() -> Self {
-        Self {
-            firmware: None,
-            sample_rate_hz: 1_000_000,
-            channels: [(VSYNC.to_owned(), 0)].into(),
-            edge: Slope::Rising,
-            quiet_us: 5.0,
-            latency_us: 100.0, // [A]
-        }
-    }
-}
-
-/// A direction of change.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Slope {
-    /// From low to high.
-    Rising,
-    /// From high to low.
-    Falling,
-}
-
-impl Fx2LafwConfig {
-    /// Checks the values.
-    ///
-    /// # Errors
-    /// The key, and its value with what is allowed.
-    pub fn check(&self) -> Result<SampleRate, (&'static str, String)> {
-        let Self { sample_rate_hz, channels, quiet_us, latency_us, .. } = self;
-        let Some(rate) = SampleRate::from_hz(*sample_rate_hz) else {
-            let what = format!(
-                "vsync.fx2lafw.sample_rate_hz = {sample_rate_hz}: allowed is 48000000 or 30000000 over a whole number, 20000 to 24000000; take 1000000"
-            );
-            return Err(("sample_rate_hz", what));
-        };
-        let inputs: std::collections::BTreeSet<_> = channels.values().collect();
-        if !channels.contains_key(VSYNC)
-            || channels.values().any(|&input| input > 7)
-            || inputs.len() < channels.len()
-        {
-            let what = format!(
-                "vsync.fx2lafw.channels = {channels:?}: each is an input of its own, 0 to 7, and \"{VSYNC}\" is one of them"
-            );
-            return Err(("channels", what));
-        }
-        for (key, value, high) in [("quiet_us", *quiet_us, 1000.0), ("latency_us", *latency_us, 10_000.0)] {
-            if !(0.0..=high).contains(&value) {
-                return Err((key, format!("vsync.fx2lafw.{key} = {value}: allowed is 0 to {high}")));
-            }
-        }
-        Ok(rate)
-    }
-}
-
-/// The connection to a sampling analyser.
+/// The way to an analyser that samples.
 pub trait Link: Send {
     /// Passes the next samples to `take`, with their arrival time on the host's clock. Does nothing if none arrived
     /// within `timeout`.
@@ -165,8 +90,15 @@ impl Fx2Lafw<Usb> {
     }
 }
 
+/// The rate of a configuration that an analyser can have.
 fn checked(config: &Fx2LafwConfig) -> Result<SampleRate, DeviceError> {
-    config.check().map_err(|(_, what)| DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, what))
+    let refused =
+        |what: String| DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, format!("vsync.fx2lafw.{what}"));
+    if let Some(fault) = config.faults().into_iter().next() {
+        return Err(refused(fault.to_string()));
+    }
+    SampleRate::from_hz(config.sample_rate_hz)
+        .ok_or_else(|| refused(format!("sample_rate_hz = {}: no such rate", config.sample_rate_hz)))
 }
 
 impl<L: Link> Fx2Lafw<L> {
@@ -263,7 +195,7 @@ impl<L: Link> Vsync for Fx2Lafw<L> {
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             let Some(change) = self.next_change(left)? else { return Ok(None) };
-            if self.names[change.channel] == VSYNC && change.slope == self.edge {
+            if self.names[change.channel] == Fx2LafwConfig::VSYNC && change.slope == self.edge {
                 return Ok(Some(Edge { seq: change.seq, host_ns: change.host_ns }));
             }
         }

@@ -7,16 +7,16 @@
 
 pub mod protocol;
 
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
+pub use raysweep_config::rig::vsync::{TriggerBoxConfig, TriggerBoxLink};
 use raysweep_core::{
     Clock, ClockModel, ClockQuality, DeviceError, DeviceErrorKind, Edge, RoundTrip, Vsync, ns_from_us,
 };
 
 use self::protocol::{Command, QUESTION_BYTES, REPLY_BYTES, Reply, Timer, VERSION, parse_reply};
 use super::DEVICE;
-use crate::mirror::port::Port;
+use crate::serial::port::Port;
 
 const BAUD: u32 = 115_200;
 /// Opening the port resets an Arduino; its bootloader and handshake then take up to 7 s.
@@ -38,35 +38,12 @@ const STRAY_NS: i64 = 1_000_000;
 /// This many outliers in a row mean that the clock has changed: the box was reset.
 const STRAYS: u32 = 5;
 
-/// `[vsync.triggerbox]`
-#[derive(Debug, Clone, serde::Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TriggerBoxConfig {
-    /// Its serial port.
-    pub port: PathBuf,
-    /// The connection between the port and the box.
-    #[serde(default)]
-    pub link: Link,
-}
-
-/// How the box is connected.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Link {
-    /// A UART (Arduino Uno and Nano): each byte takes 87 us.
-    #[default]
-    Uart,
-    /// The box's own USB (Raspberry Pi Pico): transmission takes no time.
-    Usb,
-}
-
-impl Link {
-    fn bytes_ns(self, bytes: usize) -> i64 {
-        match self {
-            // Ten bits per byte.
-            Self::Uart => bytes as i64 * 10 * 1_000_000_000 / i64::from(BAUD),
-            Self::Usb => 0,
-        }
+/// How long bytes take on their way to the box or back.
+fn bytes_ns(link: TriggerBoxLink, bytes: usize) -> i64 {
+    match link {
+        // Ten bits a byte.
+        TriggerBoxLink::Uart => bytes as i64 * 10 * 1_000_000_000 / i64::from(BAUD),
+        TriggerBoxLink::Usb => 0,
     }
 }
 
@@ -150,7 +127,7 @@ impl TriggerBox {
             let error = TriggerBoxError::Period(period_us);
             return Err(DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, error));
         };
-        let port = Port::open_for(DEVICE, &config.port, BAUD)?;
+        let port = Port::open(DEVICE, &config.port, BAUD)?;
         Ok(Self { config, timer, port, clock: Clock::real(), stage: Stage::Greeting { asked: None } })
     }
 
@@ -212,8 +189,8 @@ impl TriggerBox {
                 && let Some(asked_ns) = running.asked_ns.take()
             {
                 let link = self.config.link;
-                let request_ns = asked_ns + link.bytes_ns(QUESTION_BYTES);
-                let receive_ns = receive_ns - link.bytes_ns(REPLY_BYTES);
+                let request_ns = asked_ns + bytes_ns(link, QUESTION_BYTES);
+                let receive_ns = receive_ns - bytes_ns(link, REPLY_BYTES);
                 running.take(self.timer, pulses, ticks, (request_ns, receive_ns));
             }
         }

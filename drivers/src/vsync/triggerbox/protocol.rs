@@ -4,7 +4,7 @@
 //! key. The box answers `V` and `P` with that letter, the payload's length 7, the payload (version or the request's
 //! number, pulses as a little-endian u32, timer as a little-endian u16) and the sum of the payload's bytes.
 
-use crate::mirror::wire::Parsed;
+use crate::serial::wire::Parsed;
 
 /// The supported firmware version.
 pub const VERSION: u8 = 14;

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use super::BUILTIN_NAMES;
+use super::still::BUILTIN_NAMES;
 
 /// Why a scene cannot be loaded or computed.
 #[derive(Debug, thiserror::Error)]

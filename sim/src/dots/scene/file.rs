@@ -12,7 +12,8 @@ use ndarray::{Array2, ArrayD, Axis, Ix2, IxDyn, OwnedRepr};
 use ndarray_npy::{NpzReader, ReadNpyError, ReadNpyExt, ReadNpzError};
 use raysweep_core::Mosaic;
 
-use super::{DotSceneError, Still, seen};
+use super::error::DotSceneError;
+use super::still::{Still, seen};
 use crate::dots::beam::Spot;
 use crate::dots::view::View;
 

@@ -4,6 +4,7 @@ mod error;
 mod file;
 mod glow;
 mod model;
+mod still;
 
 use std::path::Path;
 use std::sync::Arc;
@@ -13,30 +14,9 @@ use raysweep_core::Mosaic;
 pub use self::error::DotSceneError;
 use self::file::FileScene;
 use self::model::{Model, Surface};
-use super::beam::Spot;
-use super::config::DotsConfig;
+pub use self::still::{BUILTIN_NAMES, Light, Still};
 use super::view::View;
-
-/// Names of the built-in scenes.
-pub const BUILTIN_NAMES: [&str; 4] = ["v-groove", "glass", "candle", "fog"];
-
-/// Images under one spot, `[row, column]` row-major, relative to a white plane under the full beam.
-#[derive(Debug, Clone)]
-pub struct Light {
-    /// Direct light from the mirror; for a scene from a file, all light.
-    pub direct: Vec<f32>,
-    /// All other light.
-    pub global: Vec<f32>,
-}
-
-/// A scene at rest.
-pub trait Still: Send + Sync {
-    /// Adds the direct light of a spot; for a scene from a file, all light.
-    fn add_direct(&self, spot: &Spot, image: &mut [f32]);
-
-    /// Adds all other light of a spot.
-    fn add_global(&self, spot: &Spot, image: &mut [f32]);
-}
+use raysweep_config::sim::DotsConfig;
 
 /// A scene that may move, and the planes that can replace it.
 pub struct Scene {
@@ -110,13 +90,4 @@ impl Scene {
             }
         }
     }
-}
-
-/// A colour as seen by a pixel of a mosaic; on a monochrome sensor, the mean.
-fn seen(mosaic: Mosaic, row: usize, column: usize, colour: [f32; 3]) -> f32 {
-    let Some((red_column, red_row)) = mosaic.red() else {
-        return colour.iter().sum::<f32>() / 3.0;
-    };
-    // Blue is diagonal to red; green is adjacent to both.
-    colour[usize::from(row % 2 != red_row) + usize::from(column % 2 != red_column)]
 }

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 use raysweep_core::Mosaic;
 
 use super::glow::{self, Glow};
-use super::{Still, seen};
+use super::still::{Still, seen};
 use crate::dots::beam::Spot;
 use crate::dots::view::View;
 use crate::scene::texture::{noise, printed_page};

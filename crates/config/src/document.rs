@@ -1,0 +1,264 @@
+//! A TOML text, parsed once: its tables are decoded one by one, and each check adds what it finds.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::ops::{Range, RangeInclusive};
+
+use serde::Deserialize;
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use crate::{ConfigError, Mistake};
+
+/// A value that no device can be opened with.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{key}{message}")]
+pub struct Fault {
+    /// The key, from the device's table on.
+    pub key: &'static str,
+    pub(crate) message: String,
+}
+
+/// The faults of values that are beyond their ranges, both ends of which are allowed.
+pub(crate) fn out_of_range<const N: usize>(
+    rules: [(&'static str, f64, RangeInclusive<f64>); N],
+) -> impl Iterator<Item = Fault> {
+    rules.into_iter().filter(|(_, value, allowed)| !allowed.contains(value)).map(|(key, value, allowed)| {
+        let (low, high) = (allowed.start(), allowed.end());
+        Fault { key, message: format!(" = {value}: allowed is {low} to {high}") }
+    })
+}
+
+/// A text while it is being read.
+pub(crate) struct Document<'a> {
+    tables: DeTable<'a>,
+    places: Places,
+    mistakes: Vec<Mistake>,
+}
+
+impl<'a> Document<'a> {
+    /// Parses a text.
+    ///
+    /// # Errors
+    /// A syntax error; nothing else can be told of such a text.
+    pub fn parse(text: &'a str) -> Result<Self, ConfigError> {
+        let table = DeTable::parse(text).map_err(|error| {
+            ConfigError::from(Mistake { message: error.message().into(), field: None, span: error.span() })
+        })?;
+        let places = Places::of(&table);
+        Ok(Self { tables: table.into_inner(), places, mistakes: Vec::new() })
+    }
+
+    /// Where its values stand.
+    pub fn places(&self) -> &Places {
+        &self.places
+    }
+
+    /// Decodes the value of a key of the file, if there is one. What cannot be decoded is a mistake.
+    pub fn take<T: Deserialize<'a>>(&mut self, key: &str) -> Option<T> {
+        let (_, value) = self.tables.remove_entry(key)?;
+        match T::deserialize(toml::de::ValueDeserializer::from(value)) {
+            Ok(value) => Some(value),
+            Err(error) => {
+                let field = error.span().and_then(|span| self.places.path_at(&span));
+                let field = field.unwrap_or_else(|| key.to_owned());
+                let message = format!("{field}: {}", error.message());
+                self.mistakes.push(Mistake { message, field: Some(field), span: error.span() });
+                None
+            }
+        }
+    }
+
+    /// Decodes the value of a key, or takes the default where the key is left out.
+    pub fn take_or_default<T: Deserialize<'a> + Default>(&mut self, key: &str) -> Option<T> {
+        if self.tables.contains_key(key) { self.take(key) } else { Some(T::default()) }
+    }
+
+    /// Decodes the value of a key that must be there; `example` shows what to write.
+    pub fn require<T: Deserialize<'a>>(&mut self, key: &str, example: &str) -> Option<T> {
+        if !self.tables.contains_key(key) {
+            self.refuse(&[key], format!("missing field `{key}`: add {example}"));
+        }
+        self.take(key)
+    }
+
+    /// What is left of the file are keys that nothing has asked for.
+    pub fn refuse_others(&mut self, known: &[&str]) {
+        let others: Vec<String> = self.tables.keys().map(|key| key.get_ref().to_string()).collect();
+        for key in others.iter().filter(|key| !known.contains(&key.as_str())) {
+            let known = known.iter().map(|known| format!("`{known}`")).collect::<Vec<_>>().join(", ");
+            self.refuse(&[key], format!("unknown field `{key}`, expected one of {known}"));
+        }
+    }
+
+    /// Whether none of these values has been refused, so that rules between them mean something.
+    pub fn is_sound(&self, paths: &[&[&str]]) -> bool {
+        let is_refused = |path: &&[&str]| {
+            let field = path.join(".");
+            self.mistakes.iter().any(|mistake| mistake.field.as_ref() == Some(&field))
+        };
+        !paths.iter().any(is_refused)
+    }
+
+    /// Notes a mistake about the value at a path of keys.
+    pub fn refuse(&mut self, path: &[&str], message: impl Into<String>) {
+        self.mistakes.push(self.places.mistake(path, message));
+    }
+
+    /// Notes what is wrong with a device's table.
+    pub fn refuse_all(&mut self, table: &[&str], faults: Vec<Fault>) {
+        for Fault { key, message } in faults {
+            let path: Vec<&str> = table.iter().copied().chain(key.split('.')).collect();
+            self.refuse(&path, format!("{}.{key}{message}", table.join(".")));
+        }
+    }
+
+    /// Notes a mistake unless a value is within its range, both ends included.
+    pub fn check_range(&mut self, path: &[&str], value: f64, allowed: RangeInclusive<f64>) {
+        if !allowed.contains(&value) {
+            let (low, high) = (allowed.start(), allowed.end());
+            self.refuse(path, format!("{} = {value}: allowed is {low} to {high}", path.join(".")));
+        }
+    }
+
+    /// The same for counts.
+    pub fn check_count(&mut self, path: &[&str], value: u64, allowed: RangeInclusive<u64>) {
+        if !allowed.contains(&value) {
+            let (low, high) = (allowed.start(), allowed.end());
+            self.refuse(path, format!("{} = {value}: {low} to {high} are allowed", path.join(".")));
+        }
+    }
+
+    /// Notes a mistake unless a value is finite and more than zero.
+    pub fn check_positive(&mut self, path: &[&str], value: f64, unit: &str) {
+        if !(value > 0.0 && value.is_finite()) {
+            self.refuse(path, format!("{} = {value}: give {unit} greater than 0", path.join(".")));
+        }
+    }
+
+    /// The end of reading: what was read, unless there were mistakes.
+    ///
+    /// # Errors
+    /// All mistakes.
+    pub fn finish<T>(self, read: Option<T>) -> Result<T, ConfigError> {
+        match (ConfigError::of(self.mistakes), read) {
+            (None, Some(read)) => Ok(read),
+            (Some(error), _) => Err(error),
+            // Nothing fails to be read without a mistake.
+            (None, None) => Err(ConfigError::of_field("kind", "the file cannot be read")),
+        }
+    }
+}
+
+/// Where the values of a TOML text stand, for errors that are found later.
+#[derive(Clone, Default)]
+pub struct Places {
+    root: Place,
+}
+
+#[derive(Clone, Default)]
+struct Place {
+    key: Range<usize>,
+    value: Range<usize>,
+    inside: BTreeMap<String, Place>,
+}
+
+impl Places {
+    fn of(table: &Spanned<DeTable<'_>>) -> Self {
+        let inside = Place::of_table(table.get_ref());
+        Self { root: Place { key: 0..0, value: table.span(), inside } }
+    }
+
+    /// Whether the text has a value at a path of keys.
+    pub fn has(&self, path: &[&str]) -> bool {
+        path.iter().try_fold(&self.root, |place, key| place.inside.get(*key)).is_some()
+    }
+
+    /// A mistake about the value at a path of keys (of an array: numbers). Where the text has no such value, it points
+    /// at the deepest table on the way to it.
+    pub fn mistake(&self, path: &[&str], message: impl Into<String>) -> Mistake {
+        let mut place = &self.root;
+        for key in path {
+            match place.inside.get(*key) {
+                Some(inner) => place = inner,
+                None => break,
+            }
+        }
+        Mistake { message: message.into(), field: Some(path.join(".")), span: Some(place.value.clone()) }
+    }
+
+    /// [`Self::mistake`] alone as an error.
+    pub fn error(&self, path: &[&str], message: impl Into<String>) -> ConfigError {
+        self.mistake(path, message).into()
+    }
+
+    /// The path of the innermost key or value that a span begins in. The text of a table need not lie within that of the
+    /// table around it.
+    fn path_at(&self, span: &Range<usize>) -> Option<String> {
+        let (_, path) =
+            self.root.inside.iter().filter_map(|(key, place)| place.narrowest(key, span.start)).min()?;
+        Some(path)
+    }
+}
+
+impl Place {
+    /// The shortest key or value at a byte of the text, with its length and path: this one's, or of one inside it.
+    fn narrowest(&self, path: &str, byte: usize) -> Option<(usize, String)> {
+        let own = [&self.key, &self.value].into_iter().filter(|text| text.contains(&byte));
+        let own = own.map(|text| (text.len(), path.to_owned())).min();
+        let inner =
+            self.inside.iter().filter_map(|(key, place)| place.narrowest(&format!("{path}.{key}"), byte));
+        inner.chain(own).min()
+    }
+
+    fn of_table(table: &DeTable<'_>) -> BTreeMap<String, Self> {
+        let place = |(key, value): (&Spanned<std::borrow::Cow<'_, str>>, &Spanned<DeValue<'_>>)| {
+            let inside = Self::of_value(value.get_ref());
+            (key.get_ref().to_string(), Self { key: key.span(), value: value.span(), inside })
+        };
+        table.iter().map(place).collect()
+    }
+
+    fn of_value(value: &DeValue<'_>) -> BTreeMap<String, Self> {
+        match value {
+            DeValue::Table(table) => Self::of_table(table),
+            DeValue::Array(array) => {
+                let place = |(index, value): (usize, &Spanned<DeValue<'_>>)| {
+                    let (key, value_span) = (value.span(), value.span());
+                    (
+                        index.to_string(),
+                        Self { key, value: value_span, inside: Self::of_value(value.get_ref()) },
+                    )
+                };
+                array.iter().enumerate().map(place).collect()
+            }
+            _ => BTreeMap::new(),
+        }
+    }
+}
+
+/// Two files of the same values are the same, wherever these stand.
+impl fmt::Debug for Places {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Places")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn places_point_at_the_value_however_it_is_written() {
+        let text = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = 1, stop = 2, count = 0 }\n";
+        let at = |text: &str, path: &[&str]| {
+            let document = Document::parse(text).unwrap();
+            let span = document.places().mistake(path, "").span.unwrap();
+            text[span].to_owned()
+        };
+        assert_eq!(at(text, &["sweep", "delay_us", "count"]), "0");
+        assert!(at(text, &["sweep", "average"]).contains("[sweep]"));
+        let stages = "[[stage]]\nname = \"a\"\n[[stage]]\nname = \"b\"\n";
+        assert_eq!(at(stages, &["stage", "1", "name"]), "\"b\"");
+    }
+}

@@ -1,0 +1,74 @@
+//! What is wrong with a rig or plan file, and where.
+
+use std::fmt;
+use std::ops::Range;
+
+/// One mistake in a file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mistake {
+    /// Field, value, what is allowed, what to do.
+    pub message: String,
+    /// The path of the field, `sweep.delay_us.count` for example, where one is meant.
+    pub field: Option<String>,
+    /// Bytes of the text that it is about.
+    pub span: Option<Range<usize>>,
+}
+
+/// Everything that is wrong with a rig or plan file: at least one mistake, in the order of the text.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ConfigError {
+    first: Mistake,
+    others: Vec<Mistake>,
+}
+
+impl ConfigError {
+    /// An error that has no place in a text.
+    pub fn of_field(field: &str, message: impl Into<String>) -> Self {
+        Mistake { message: message.into(), field: Some(field.into()), span: None }.into()
+    }
+
+    /// The mistakes that a file has, if it has any.
+    pub(crate) fn of(mut mistakes: Vec<Mistake>) -> Option<Self> {
+        mistakes.sort_by_key(|mistake| mistake.span.as_ref().map(|span| span.start));
+        let mut mistakes = mistakes.into_iter();
+        Some(Self { first: mistakes.next()?, others: mistakes.collect() })
+    }
+
+    /// The first mistake.
+    pub fn first(&self) -> &Mistake {
+        &self.first
+    }
+
+    /// All mistakes.
+    pub fn mistakes(&self) -> impl Iterator<Item = &Mistake> {
+        std::iter::once(&self.first).chain(&self.others)
+    }
+
+    /// The mistakes with the name of their file, the line and the line's text, for logs and plain output.
+    pub fn render(&self, file: &str, text: &str) -> String {
+        let rendered = self.mistakes().map(|Mistake { message, span, .. }| {
+            let Some(span) = span.clone().filter(|span| span.start <= text.len()) else {
+                return format!("{file}: {message}");
+            };
+            let line = text[..span.start].matches('\n').count();
+            let shown = text.lines().nth(line).unwrap_or_default();
+            format!("{file}, line {}: {message}\n  {shown}", line + 1)
+        });
+        rendered.collect::<Vec<_>>().join("\n")
+    }
+}
+
+impl From<Mistake> for ConfigError {
+    fn from(first: Mistake) -> Self {
+        Self { first, others: Vec::new() }
+    }
+}
+
+impl fmt::Display for ConfigError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let messages: Vec<&str> = self.mistakes().map(|mistake| mistake.message.as_str()).collect();
+        f.write_str(&messages.join("\n"))
+    }
+}
+
+impl std::error::Error for ConfigError {}

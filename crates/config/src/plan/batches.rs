@@ -1,0 +1,383 @@
+//! `[batches]`: what a dot rig's mirror scans and its camera takes.
+
+use raysweep_core::{MirrorLimits, MirrorPath, MirrorPoint, PathError, RasterScan, Tilt};
+use serde::Deserialize;
+
+use crate::document::Document;
+
+/// `[batches]`: the mirror goes round its path once a batch, the camera takes a frame of each dot.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BatchesPlan {
+    /// Batches of the scene.
+    pub count: u32,
+    /// Frames of a batch.
+    pub dots: u32,
+    /// Frames a second; left out: what gives `dots` frames in the time of the mirror's path.
+    pub camera_rate_hz: Option<f64>,
+    /// Exposure of each frame.
+    pub exposure_us: f64,
+    /// Index of the frame that shows the trailing dot; left out: the last.
+    pub trailing_index: Option<u32>,
+    /// Where it lands: first row, row after the last, first column, column after the last.
+    pub trailing_region: [usize; 4],
+    /// Indices of the frames whose light goes to the beam dump.
+    pub background_indices: Vec<u32>,
+    /// Frames without light before the first batch: what is known of the sensor.
+    pub dark_frames: u32,
+    /// Frames of even light after them, for the flat field; 0: none.
+    pub flat_frames: u32,
+    /// Whether the raw frames are kept, 16 bits a pixel.
+    pub keep_raw: bool,
+    /// `[batches.path]`
+    pub path: PathPlan,
+    /// `[[batches.calibration]]`: the calibration plane at one or two depths, before the scene.
+    pub calibration: Vec<PlanePlan>,
+}
+
+/// `[batches.path]`: where the mirror points in the time of a batch.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PathPlan {
+    /// Its shape; the other keys are for some of them.
+    pub shape: Shape,
+    /// Largest mechanical tilt to either side, x and y.
+    pub amplitude_deg: [f64; 2],
+    /// Of a raster: crossings, an even number.
+    pub lines: u32,
+    /// Of a raster: share of the batch in which y goes back.
+    pub flyback: f64,
+    /// Of a Lissajous figure: whole cycles a batch, x and y.
+    pub cycles: [u32; 2],
+    /// Of a spiral: turns out and back.
+    pub turns: u32,
+    /// Of points: mechanical tilts x, y, in degrees; between them the mirror stays.
+    pub points_deg: Vec<[f64; 2]>,
+    /// Samples a batch; of points: as many as there are points.
+    pub samples: usize,
+    /// Samples a second.
+    pub rate_hz: f64,
+}
+
+/// Shapes of paths by their names in plans.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Shape {
+    /// x to and fro as a sine, y down and back.
+    Raster,
+    /// Sines of both axes.
+    Lissajous,
+    /// From the centre out and back.
+    Spiral,
+    /// As listed.
+    Points,
+}
+
+/// `[[batches.calibration]]`: batches that show the Lambertian plane alone.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PlanePlan {
+    /// How many.
+    pub batches: u32,
+    /// Where it stands, from the mirror on; for the report.
+    pub depth_mm: Option<f64>,
+}
+
+impl Default for BatchesPlan {
+    /// The paper's: 2250 dots at 13,500 a second, 39,000 samples a second.
+    fn default() -> Self {
+        Self {
+            count: 12,
+            dots: 2250,
+            camera_rate_hz: None,
+            exposure_us: 50.0,
+            trailing_index: None,
+            trailing_region: [0, 32, 0, 32],
+            background_indices: vec![0],
+            dark_frames: 256,
+            flat_frames: 0,
+            keep_raw: false,
+            path: PathPlan::default(),
+            calibration: vec![PlanePlan { batches: 2, depth_mm: None }],
+        }
+    }
+}
+
+impl Default for PathPlan {
+    fn default() -> Self {
+        Self {
+            shape: Shape::Raster,
+            amplitude_deg: [3.0, 3.0],
+            lines: 46,
+            flyback: 0.1,
+            cycles: [23, 1],
+            turns: 23,
+            points_deg: Vec::new(),
+            samples: 6500,
+            rate_hz: 39_000.0,
+        }
+    }
+}
+
+/// Most batches: six hours at six a second.
+const MAX_BATCHES: u64 = 129_600;
+/// Most frames of a batch.
+const MAX_DOTS: u64 = 1 << 16;
+/// Camera and mirror may disagree by this much of a frame a batch; more, and no index is certain.
+const RATE_TOLERANCE_FRAMES: f64 = 0.5;
+
+/// Batches that are played beside those that are wanted: the first has no beginning, the next two may pass before the
+/// trailing dot is known.
+const SPARE_BATCHES: u32 = 2;
+
+impl BatchesPlan {
+    pub(super) fn check(&self, document: &mut Document<'_>) {
+        let dots = self.dots;
+        document.check_count(&["batches", "count"], self.count.into(), 1..=MAX_BATCHES);
+        document.check_count(&["batches", "dots"], dots.into(), 8..=MAX_DOTS);
+        if self.trailing_index.is_some_and(|index| index >= dots) {
+            let message = format!(
+                "batches.trailing_index = {}: give one below batches.dots = {dots}",
+                self.trailing_index()
+            );
+            document.refuse(&["batches", "trailing_index"], message);
+        }
+        if self.background_indices.is_empty() {
+            let message = "batches.background_indices is empty: send the light of one frame a batch to the beam dump and give its index";
+            document.refuse(&["batches", "background_indices"], message);
+        }
+        let is_wrong = |index: &&u32| **index >= dots || **index == self.trailing_index();
+        if let Some(index) = self.background_indices.iter().find(is_wrong) {
+            let message = format!(
+                "batches.background_indices contains {index}: give indices below batches.dots = {dots}, and not the trailing dot's"
+            );
+            document.refuse(&["batches", "background_indices"], message);
+        }
+        let [top, bottom, left, right] = self.trailing_region;
+        if top >= bottom || left >= right {
+            let message = format!(
+                "batches.trailing_region = {:?}: give [first row, row after the last, first column, column after the last]",
+                self.trailing_region
+            );
+            document.refuse(&["batches", "trailing_region"], message);
+        }
+        document.check_positive(&["batches", "exposure_us"], self.exposure_us, "microseconds");
+        document.check_count(&["batches", "dark_frames"], self.dark_frames.into(), 16..=1 << 20);
+        if self.flat_frames != 0 && !(16..=1 << 20).contains(&self.flat_frames) {
+            let message = format!(
+                "batches.flat_frames = {}: 16 to 1048576 are allowed, or 0 for no flat field",
+                self.flat_frames
+            );
+            document.refuse(&["batches", "flat_frames"], message);
+        }
+        self.path.check(document);
+        self.check_rate(document);
+        if self.calibration.len() > 2 {
+            let message =
+                format!("batches.calibration has {} planes: give one or two", self.calibration.len());
+            document.refuse(&["batches", "calibration"], message);
+        }
+        for (index, plane) in self.calibration.iter().enumerate() {
+            let path = ["batches", "calibration", &index.to_string(), "batches"];
+            document.check_count(&path, plane.batches.into(), 1..=MAX_BATCHES);
+        }
+    }
+
+    /// Whether camera and mirror keep pace.
+    fn check_rate(&self, document: &mut Document<'_>) {
+        let (dots, duration_s) = (self.dots, self.path.duration_s());
+        if !(duration_s > 0.0 && duration_s.is_finite()) {
+            return;
+        }
+        let camera_rate_hz = self.camera_rate_hz();
+        if !(camera_rate_hz > 0.0 && camera_rate_hz.is_finite()) {
+            let message =
+                format!("batches.camera_rate_hz = {camera_rate_hz}: give frames a second, more than 0");
+            return document.refuse(&["batches", "camera_rate_hz"], message);
+        }
+        let frames = camera_rate_hz * duration_s;
+        if (frames - f64::from(dots)).abs() > RATE_TOLERANCE_FRAMES {
+            let message = format!(
+                "batches.camera_rate_hz = {camera_rate_hz}: the camera takes {frames:.2} frames while the mirror goes once round its path, not batches.dots = {dots}; {:.3} Hz would do, or leave it out",
+                f64::from(dots) / duration_s
+            );
+            document.refuse(&["batches", "camera_rate_hz"], message);
+        }
+        if self.exposure_us * camera_rate_hz > 1e6 {
+            let message = format!(
+                "batches.exposure_us = {}: longer than the {:.2} us from one frame to the next",
+                self.exposure_us,
+                1e6 / camera_rate_hz
+            );
+            document.refuse(&["batches", "exposure_us"], message);
+        }
+    }
+
+    /// Index of the frame that shows the trailing dot.
+    pub fn trailing_index(&self) -> u32 {
+        self.trailing_index.unwrap_or(self.dots.saturating_sub(1))
+    }
+
+    /// Frames a second.
+    pub fn camera_rate_hz(&self) -> f64 {
+        self.camera_rate_hz.unwrap_or(f64::from(self.dots) / self.path.duration_s())
+    }
+
+    /// Batches of the calibration planes and of the scene.
+    pub fn total(&self) -> usize {
+        self.count as usize + self.calibration.iter().map(|plane| plane.batches as usize).sum::<usize>()
+    }
+
+    /// The calibration plane that a batch shows; none: the scene.
+    pub fn plane_of(&self, batch: usize) -> Option<usize> {
+        let mut end = 0;
+        self.calibration.iter().position(|plane| {
+            end += plane.batches as usize;
+            batch < end
+        })
+    }
+
+    /// Times that the path is played so that so many batches are whole.
+    pub fn rounds(batches: u32) -> u32 {
+        batches + SPARE_BATCHES
+    }
+
+    /// Times that the path is played, without light, for so many frames of the sensor's calibration.
+    pub fn dark_rounds(&self, frames: u32) -> u32 {
+        if frames == 0 { 0 } else { frames.div_ceil(self.dots) + 1 }
+    }
+
+    /// The path of one batch, with the light off where it goes to the beam dump.
+    ///
+    /// # Errors
+    /// The first of the mirror's limits that the path would break.
+    pub fn mirror_path(&self, limits: &MirrorLimits) -> Result<MirrorPath, PathError> {
+        let path = self.path.path(limits)?;
+        let (samples, dots) = (path.points().len() as u64, u64::from(self.dots));
+        let dumped = |sample: usize| {
+            let index = (sample as u64 * dots / samples) as u32;
+            self.background_indices.contains(&index)
+        };
+        Ok(path.with_light(|sample| if dumped(sample) { 0 } else { 255 }))
+    }
+}
+
+impl PathPlan {
+    /// Limits are the mirror's affair; a shape that is none is the plan's, and no mirror has infinite ones.
+    fn check(&self, document: &mut Document<'_>) {
+        if !(self.rate_hz > 0.0 && self.rate_hz.is_finite()) {
+            let message =
+                format!("batches.path.rate_hz = {}: give samples a second, more than 0", self.rate_hz);
+            document.refuse(&["batches", "path", "rate_hz"], message);
+        }
+        if self.samples() == 0 {
+            let (key, what) = match self.shape {
+                Shape::Points => ("points_deg", "give tilts [x, y] in degrees"),
+                _ => ("samples", "give samples a batch, at least 1"),
+            };
+            document.refuse(&["batches", "path", key], format!("batches.path.{key} is empty: {what}"));
+        }
+    }
+
+    fn samples(&self) -> usize {
+        if self.shape == Shape::Points { self.points_deg.len() } else { self.samples }
+    }
+
+    /// Time of a batch.
+    pub fn duration_s(&self) -> f64 {
+        self.samples() as f64 / self.rate_hz
+    }
+
+    fn path(&self, limits: &MirrorLimits) -> Result<MirrorPath, PathError> {
+        let [x_deg, y_deg] = self.amplitude_deg;
+        let amplitude = Tilt::new(x_deg, y_deg);
+        let (samples, rate_hz) = (self.samples, self.rate_hz);
+        match self.shape {
+            Shape::Raster => {
+                let scan = RasterScan { amplitude, lines: self.lines, flyback: self.flyback };
+                MirrorPath::raster(&scan, samples, rate_hz, limits)
+            }
+            Shape::Lissajous => MirrorPath::lissajous(amplitude, self.cycles, samples, rate_hz, limits),
+            Shape::Spiral => MirrorPath::spiral(amplitude, self.turns, samples, rate_hz, limits),
+            Shape::Points => {
+                let point =
+                    |&[x_deg, y_deg]: &[f64; 2]| MirrorPoint { tilt: Tilt::new(x_deg, y_deg), light: 255 };
+                MirrorPath::new(self.points_deg.iter().map(point).collect(), rate_hz, limits)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ConfigError;
+    use crate::plan::tests::{documented, refused};
+    use crate::plan::{Plan, Procedure};
+
+    fn parse(more: &str) -> Result<BatchesPlan, ConfigError> {
+        let plan = Plan::parse(&format!("kind = \"batches\"\n{more}"))?;
+        let Procedure::Batches(batches) = plan.procedure else { panic!("{plan:?}") };
+        Ok(batches)
+    }
+
+    #[test]
+    fn the_default_is_the_papers_scan_and_the_documented_one() {
+        let plan = parse("").unwrap();
+        assert!((plan.camera_rate_hz() - 13_500.0).abs() < 1e-9);
+        assert_eq!((plan.total(), plan.plane_of(1), plan.plane_of(2)), (14, Some(0), None));
+        assert_eq!(plan.trailing_index(), 2249);
+        let documented = Plan::parse(documented("batches")).unwrap();
+        assert_eq!(documented.procedure, Procedure::Batches(plan));
+    }
+
+    #[test]
+    fn a_path_is_dark_where_its_light_would_be_background() {
+        let plan = parse("[batches]\ndots = 100\nbackground_indices = [3]\n[batches.path]\nshape = \"lissajous\"\ncycles = [3, 2]\nsamples = 1000\nrate_hz = 10000").unwrap();
+        let path = plan.mirror_path(&MirrorLimits::A7B2_3_3600AL).unwrap();
+        let dark: Vec<usize> = (0..1000).filter(|&sample| path.points()[sample].light == 0).collect();
+        assert_eq!(dark, (30..40).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_path_beyond_the_mirrors_limits_is_none() {
+        let plan = parse("[batches.path]\namplitude_deg = [9, 3]").unwrap();
+        let error = plan.mirror_path(&MirrorLimits::A7B2_3_3600AL).unwrap_err();
+        assert!(error.to_string().contains("6.5"), "{error}");
+    }
+
+    #[test]
+    fn bad_plans_are_refused_with_field_and_place() {
+        let cases = [
+            ("[batches]\ncount = 0", "batches.count", "1 to 129600"),
+            ("[batches]\ntrailing_index = 2250", "batches.trailing_index", "below batches.dots = 2250"),
+            ("[batches]\nbackground_indices = []", "batches.background_indices", "beam dump"),
+            (
+                "[batches]\nbackground_indices = [2249]",
+                "batches.background_indices",
+                "not the trailing dot's",
+            ),
+            ("[batches]\ntrailing_region = [4, 4, 0, 9]", "batches.trailing_region", "row after the last"),
+            ("[batches]\nexposure_us = nan", "batches.exposure_us", "greater than 0"),
+            ("[batches]\nexposure_us = 80", "batches.exposure_us", "longer than the 74.07 us"),
+            ("[batches]\ndark_frames = 3", "batches.dark_frames", "16 to"),
+            ("[batches]\nflat_frames = 3", "batches.flat_frames", "or 0 for no flat field"),
+            ("[batches]\ncamera_rate_hz = 13000", "batches.camera_rate_hz", "13500.000 Hz would do"),
+            (
+                "[batches]\ncount = 3\n[[batches.calibration]]\nbatches = 0",
+                "batches.calibration.0.batches",
+                "1 to 129600",
+            ),
+            ("[batches.path]\nsamples = 0", "batches.path.samples", "samples is empty"),
+            ("[batches.path]\nshape = \"points\"", "batches.path.points_deg", "points_deg is empty"),
+            ("[batches.path]\nrate_hz = 0", "batches.path.rate_hz", "more than 0"),
+            ("[batches]\nspeed = 1", "batches.speed", "unknown field"),
+            ("[sweep]\naverage = 2", "sweep", "[batches]"),
+        ];
+        for (text, field, expected) in cases {
+            refused(&[(&format!("kind = \"batches\"\n{text}"), field, expected)]);
+        }
+        let error = parse("[batches]\ndots = 7").unwrap_err();
+        assert!(error.first().message.contains("8 to 65536"), "{error}");
+    }
+}

@@ -1,0 +1,197 @@
+//! `plan.toml`: what to acquire and what to make of it.
+
+mod batches;
+mod film;
+mod response;
+mod sweep;
+mod tables;
+
+use serde::Deserialize;
+use serde_json::Map;
+
+pub use self::batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
+pub use self::film::FilmPlan;
+pub use self::response::ResponsePlan;
+pub use self::sweep::{Axis, SweepPlan};
+pub use self::tables::{ProductTable, StageTable, products_of_argument};
+use crate::document::Document;
+use crate::{ConfigError, Places};
+
+/// A plan.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// Names the session; left out: its kind does.
+    pub name: String,
+    /// `kind`, with the table of that name.
+    pub procedure: Procedure,
+    /// `[[stage]]`: stages in order, then folds; left out: [`Procedure::default_stage`].
+    pub stages: Vec<StageTable>,
+    /// `[[product]]`: what to make of the transport; left out: the procedure's defaults.
+    pub products: Option<Vec<ProductTable>>,
+    /// Where all that stands in the text.
+    pub places: Places,
+}
+
+/// The procedures by which light is measured.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Procedure {
+    /// A delay-exposure sweep of the plane rig.
+    Sweep(SweepPlan),
+    /// A short sweep again and again, each time with a light transport of its own.
+    Film(FilmPlan),
+    /// Batches of frames of a flying dot.
+    Batches(BatchesPlan),
+    /// Chirps of a mirror, from which its resonances are identified.
+    Response(ResponsePlan),
+}
+
+/// The procedures by the names that plans use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+enum Kind {
+    Sweep,
+    Film,
+    Batches,
+    Response,
+}
+
+impl Kind {
+    const ALL: [Self; 4] = [Self::Sweep, Self::Film, Self::Batches, Self::Response];
+
+    /// Its name in plans, which is also that of its table.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Sweep => "sweep",
+            Self::Film => "film",
+            Self::Batches => "batches",
+            Self::Response => "response",
+        }
+    }
+
+    /// Reads and checks its table.
+    fn read(self, document: &mut Document<'_>) -> Option<Procedure> {
+        Some(match self {
+            Self::Sweep => {
+                let plan: SweepPlan = document.take_or_default(self.name())?;
+                plan.check(document);
+                Procedure::Sweep(plan)
+            }
+            Self::Film => {
+                let plan: FilmPlan = document.take_or_default(self.name())?;
+                plan.check(document);
+                Procedure::Film(plan)
+            }
+            Self::Batches => {
+                let plan: BatchesPlan = document.take_or_default(self.name())?;
+                plan.check(document);
+                Procedure::Batches(plan)
+            }
+            Self::Response => {
+                let plan: ResponsePlan = document.take_or_default(self.name())?;
+                plan.check(document);
+                Procedure::Response(plan)
+            }
+        })
+    }
+
+    /// The stage of a plan that names none.
+    fn default_stage(self) -> Option<&'static str> {
+        match self {
+            Self::Sweep | Self::Film => Some("demux"),
+            Self::Batches => Some("denoise"),
+            Self::Response => None,
+        }
+    }
+}
+
+impl Procedure {
+    /// Its name in plans and sessions.
+    pub fn kind(&self) -> &'static str {
+        let kind = match self {
+            Self::Sweep(_) => Kind::Sweep,
+            Self::Film(_) => Kind::Film,
+            Self::Batches(_) => Kind::Batches,
+            Self::Response(_) => Kind::Response,
+        };
+        kind.name()
+    }
+}
+
+impl Plan {
+    /// Reads a plan.
+    ///
+    /// # Errors
+    /// Everything that keeps it from being run, with the places in the text.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let mut document = Document::parse(text)?;
+        let Some(kind) = document.require::<Kind>("kind", "kind = \"sweep\", for instance") else {
+            return document.finish(None);
+        };
+        let own = kind.name();
+        for other in Kind::ALL.map(Kind::name).into_iter().filter(|other| *other != own) {
+            if document.places().has(&[other]) {
+                let message = format!("kind = \"{own}\" has no [{other}]: give [{own}], or another kind");
+                document.refuse(&[other], message);
+            }
+        }
+        let procedure = kind.read(&mut document);
+        let name = document.take::<String>("name").unwrap_or_else(|| own.to_owned());
+        if name.trim().is_empty() {
+            document.refuse(&["name"], "name is empty: give the session a name");
+        }
+        let default_stages =
+            kind.default_stage().map(|name| StageTable { name: name.into(), options: Map::new() });
+        for key in ["stage", "product"] {
+            if default_stages.is_none() && document.places().has(&[key]) {
+                document.refuse(&[key], format!("kind = \"{own}\" has no [[{key}]]: leave it out"));
+            }
+        }
+        let stages: Option<Vec<StageTable>> = document.take("stage");
+        let products: Option<Vec<ProductTable>> = document.take("product");
+        tables::check_stages(stages.iter().flatten(), &mut document);
+        tables::check_products(products.iter().flatten(), &mut document);
+        let stages = stages.unwrap_or_else(|| default_stages.into_iter().collect());
+        document.refuse_others(&["kind", "name", "stage", "product", "sweep", "film", "batches", "response"]);
+        let places = document.places().clone();
+        document.finish(procedure.map(|procedure| Self { name, procedure, stages, products, places }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    pub(super) fn parse(text: &str) -> Result<Plan, ConfigError> {
+        Plan::parse(text)
+    }
+
+    /// The example of a kind in the reference.
+    pub(super) fn documented(kind: &str) -> &'static str {
+        let page = include_str!("../../../../docs/reference/plan.md");
+        let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
+        blocks.find(|block| block.contains(&format!("kind = \"{kind}\""))).unwrap()
+    }
+
+    /// Each text has one mistake: this field, and a message that contains this.
+    pub(super) fn refused(cases: &[(&str, &str, &str)]) {
+        for (text, field, expected) in cases {
+            let error = Plan::parse(text).unwrap_err();
+            let mistake = error.first();
+            assert_eq!(error.mistakes().count(), 1, "{text:?}: {error}");
+            assert_eq!(mistake.field.as_deref(), Some(*field), "{text:?}: {error}");
+            assert!(mistake.message.contains(expected), "{text:?}: {error}");
+            assert!(mistake.span.is_some(), "{text:?} has no place");
+        }
+    }
+
+    #[test]
+    fn all_mistakes_are_reported_with_their_places() {
+        let text = "kind = \"sweep\"\nname = \"\"\n[sweep]\naverage = 0\nmax_jitter_us = nan\nexposure_us = [0]\n[[product]]\nkind = 3\n";
+        let error = Plan::parse(text).unwrap_err();
+        let fields: Vec<_> = error.mistakes().map(|mistake| mistake.field.as_deref().unwrap()).collect();
+        assert_eq!(
+            fields,
+            ["name", "sweep.average", "sweep.max_jitter_us", "sweep.exposure_us", "product.0.kind"]
+        );
+    }
+}

@@ -1,0 +1,136 @@
+//! `[response]`: the chirp by which a dot rig finds out how its mirror answers.
+
+use serde::Deserialize;
+
+use crate::document::Document;
+
+/// `[response]`: one axis after the other plays a chirp about the origin while the camera follows the dot on a plane.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ResponsePlan {
+    /// Where the chirp begins and ends: the resonances of both axes lie between.
+    pub band_hz: [f64; 2],
+    /// Its amplitude, mechanical.
+    pub amplitude_deg: f64,
+    /// The largest quality factor that an axis may have: it bounds how far the mirror moves at its resonance.
+    pub max_q: f64,
+    /// How long the chirp lasts.
+    pub chirp_s: f64,
+    /// How long the mirror stands at the origin after it, until the ringing has died down.
+    pub rest_s: f64,
+    /// Samples a second of the mirror.
+    pub rate_hz: f64,
+    /// Frames a second.
+    pub camera_rate_hz: f64,
+    /// Exposure of each frame.
+    pub exposure_us: f64,
+    /// Frames without light before the first chirp.
+    pub dark_frames: u32,
+    /// Where the dot is looked for: first row, row after the last, first column, column after the last; left out:
+    /// everywhere.
+    pub region: Option<[usize; 4]>,
+}
+
+impl Default for ResponsePlan {
+    /// For Mirrorcle's A7B2.3-3600AL and the paper's camera.
+    fn default() -> Self {
+        Self {
+            band_hz: [100.0, 900.0],
+            amplitude_deg: 0.014,
+            max_q: 100.0,
+            chirp_s: 1.0,
+            rest_s: 0.25,
+            rate_hz: 39_000.0,
+            camera_rate_hz: 13_500.0,
+            exposure_us: 50.0,
+            dark_frames: 256,
+            region: None,
+        }
+    }
+}
+
+/// Samples, and frames, that a period of the band's upper end has at least: fewer would not show its movement.
+const LEAST_A_PERIOD: f64 = 4.0;
+
+impl ResponsePlan {
+    pub(super) fn check(&self, document: &mut Document<'_>) {
+        let rules = [
+            ("amplitude_deg", self.amplitude_deg, 1e-6..=45.0),
+            ("max_q", self.max_q, 0.5..=1e5),
+            ("chirp_s", self.chirp_s, 0.1..=60.0),
+            ("rest_s", self.rest_s, 0.0..=60.0),
+            ("rate_hz", self.rate_hz, 1.0..=1e6),
+            ("camera_rate_hz", self.camera_rate_hz, 1.0..=1e6),
+            ("exposure_us", self.exposure_us, 0.1..=1e6),
+            ("dark_frames", self.dark_frames.into(), 16.0..=65_536.0),
+        ];
+        for (key, value, allowed) in rules {
+            document.check_range(&["response", key], value, allowed);
+        }
+        let [low_hz, high_hz] = self.band_hz;
+        let most_hz = self.camera_rate_hz.min(self.rate_hz) / LEAST_A_PERIOD;
+        if !(low_hz > 0.0 && low_hz < high_hz && high_hz <= most_hz) {
+            let message = format!(
+                "response.band_hz = [{low_hz}, {high_hz}]: allowed is from above 0 to {most_hz}, low before high: a period needs {LEAST_A_PERIOD} frames (camera_rate_hz) and samples (rate_hz)"
+            );
+            document.refuse(&["response", "band_hz"], message);
+        }
+        if self.exposure_us * self.camera_rate_hz > 1e6 {
+            let message = format!(
+                "response.exposure_us = {}: longer than the {:.2} us from one frame to the next",
+                self.exposure_us,
+                1e6 / self.camera_rate_hz
+            );
+            document.refuse(&["response", "exposure_us"], message);
+        }
+        if let Some(region @ [top, bottom, left, right]) = self.region
+            && (top >= bottom || left >= right)
+        {
+            let message = format!(
+                "response.region = {region:?}: give [first row, row after the last, first column, column after the last]"
+            );
+            document.refuse(&["response", "region"], message);
+        }
+    }
+
+    /// Time of one axis.
+    pub fn duration_s(&self) -> f64 {
+        self.chirp_s + self.rest_s
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::tests::{documented, refused};
+    use crate::plan::{Plan, Procedure};
+
+    #[test]
+    fn the_default_is_the_documented_one() {
+        let documented = Plan::parse(documented("response")).unwrap();
+        assert_eq!(documented.procedure, Procedure::Response(ResponsePlan::default()));
+    }
+
+    #[test]
+    fn bad_plans_are_refused_with_field_and_place() {
+        let cases = [
+            ("[response]\nband_hz = [900, 100]", "response.band_hz", "low before high"),
+            ("[response]\nband_hz = [0, 100]", "response.band_hz", "above 0"),
+            ("[response]\ncamera_rate_hz = 3000\nexposure_us = 50", "response.band_hz", "to 750"),
+            ("[response]\nrate_hz = 2000", "response.band_hz", "to 500"),
+            ("[response]\namplitude_deg = 0", "response.amplitude_deg", "amplitude_deg = 0"),
+            ("[response]\nmax_q = nan", "response.max_q", "max_q = NaN"),
+            ("[response]\nchirp_s = 0", "response.chirp_s", "chirp_s = 0"),
+            ("[response]\nrest_s = -1", "response.rest_s", "rest_s = -1"),
+            ("[response]\nexposure_us = 80", "response.exposure_us", "longer than the 74.07 us"),
+            ("[response]\ndark_frames = 3", "response.dark_frames", "dark_frames = 3"),
+            ("[response]\nregion = [4, 4, 0, 9]", "response.region", "row after the last"),
+            ("[response]\naxes = 1", "response.axes", "unknown field"),
+            ("[[product]]\nkind = \"floodlit\"", "product", "no [[product]]"),
+            ("[batches]\ncount = 2", "batches", "[response]"),
+        ];
+        for (text, field, expected) in cases {
+            refused(&[(&format!("kind = \"response\"\n{text}"), field, expected)]);
+        }
+    }
+}

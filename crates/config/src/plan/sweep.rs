@@ -1,0 +1,176 @@
+//! `[sweep]`: the grid of delays and exposures.
+
+use serde::Deserialize;
+
+use crate::document::Document;
+
+/// `[sweep]`: the grid of delays and exposures; the defaults are the paper's.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SweepPlan {
+    /// t_d.
+    pub delay_us: Axis,
+    /// t_e.
+    pub exposure_us: Axis,
+    /// Frames averaged at each point.
+    pub average: u32,
+    /// Frames whose measured delay is further off do not count and are taken again.
+    pub max_jitter_us: f64,
+}
+
+impl Default for SweepPlan {
+    fn default() -> Self {
+        Self {
+            delay_us: Axis::Range { start: -1500.0, stop: 1500.0, count: 15 },
+            exposure_us: Axis::Range { start: 600.0, stop: 1200.0, count: 5 },
+            average: 8,
+            max_jitter_us: 50.0,
+        }
+    }
+}
+
+/// Values along one axis of the sweep.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "a list of numbers, or { start = .., stop = .., count = .. }",
+    deny_unknown_fields
+)]
+pub enum Axis {
+    /// These, in this order.
+    List(Vec<f64>),
+    /// Evenly spaced, both ends included.
+    Range {
+        /// First value.
+        start: f64,
+        /// Last value.
+        stop: f64,
+        /// How many.
+        count: usize,
+    },
+}
+
+impl Axis {
+    /// The values in order.
+    pub fn values(&self) -> Vec<f64> {
+        match *self {
+            Self::List(ref values) => values.clone(),
+            Self::Range { start, count: 1, .. } => vec![start],
+            Self::Range { start, stop, count } => {
+                (0..count).map(|k| start + (stop - start) * k as f64 / (count - 1) as f64).collect()
+            }
+        }
+    }
+
+    /// How many values there are.
+    #[allow(clippy::len_without_is_empty, reason = "an axis without values is refused")]
+    pub fn len(&self) -> usize {
+        match self {
+            Self::List(values) => values.len(),
+            Self::Range { count, .. } => *count,
+        }
+    }
+}
+
+/// Most values along an axis.
+const MAX_AXIS: u64 = 1024;
+/// Most points of a sweep.
+const MAX_POINTS: usize = 8192;
+/// Most frames of a point: their sum fits 32 bits at 16 bits a pixel.
+const MAX_AVERAGE: u64 = 65_536;
+
+impl SweepPlan {
+    /// Whether a plan may have this table.
+    pub fn is_possible(&self) -> bool {
+        let Ok(mut document) = Document::parse("") else { return false };
+        self.check(&mut document);
+        document.finish(Some(())).is_ok()
+    }
+
+    pub(super) fn check(&self, document: &mut Document<'_>) {
+        let mut is_grid = true;
+        for (key, axis) in [("delay_us", &self.delay_us), ("exposure_us", &self.exposure_us)] {
+            if !(1..=MAX_AXIS).contains(&(axis.len() as u64)) {
+                let message = format!("sweep.{key} has {} values: 1 to {MAX_AXIS} are allowed", axis.len());
+                document.refuse(&["sweep", key, "count"], message);
+                is_grid = false;
+            } else if let Some(value) = axis.values().into_iter().find(|value| !value.is_finite()) {
+                let message = format!("sweep.{key} contains {value}: give finite microseconds");
+                document.refuse(&["sweep", key], message);
+            }
+        }
+        let exposures = if is_grid { self.exposure_us.values() } else { Vec::new() };
+        if let Some(value) = exposures.into_iter().find(|&exposure_us| exposure_us <= 0.0) {
+            let message = format!("sweep.exposure_us contains {value}: exposures are longer than 0 us");
+            document.refuse(&["sweep", "exposure_us"], message);
+        }
+        let points = self.delay_us.len() * self.exposure_us.len();
+        if is_grid && points > MAX_POINTS {
+            let message =
+                format!("the sweep has {points} points: at most {MAX_POINTS} are allowed; split it");
+            document.refuse(&["sweep"], message);
+        }
+        if !(1..=MAX_AVERAGE).contains(&self.average.into()) {
+            let message = format!("sweep.average = {}: 1 to {MAX_AVERAGE} frames are allowed", self.average);
+            document.refuse(&["sweep", "average"], message);
+        }
+        document.check_positive(&["sweep", "max_jitter_us"], self.max_jitter_us, "microseconds");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::tests::{documented, parse, refused};
+
+    #[test]
+    fn every_key_but_kind_has_a_default_and_it_is_the_papers_sweep() {
+        let sweep = SweepPlan::default();
+        assert_eq!(sweep.delay_us.values().len() * sweep.exposure_us.values().len(), 75);
+        assert_eq!((sweep.delay_us.values()[0], sweep.delay_us.values()[14]), (-1500.0, 1500.0));
+        assert_eq!(sweep.exposure_us.values(), [600.0, 750.0, 900.0, 1050.0, 1200.0]);
+        assert_eq!(parse("kind = \"sweep\"").unwrap().stages[0].name, "demux");
+    }
+
+    #[test]
+    fn the_documented_plan_file_is_the_defaults() {
+        let (documented, default) = (parse(documented("sweep")).unwrap(), parse("kind = \"sweep\"").unwrap());
+        assert_eq!(documented.procedure, default.procedure);
+        assert_eq!((&documented.name, &documented.stages[0].name), (&default.name, &default.stages[0].name));
+    }
+
+    #[test]
+    fn bad_plans_are_refused_with_field_and_place() {
+        refused(&[
+            ("kind = \"swep\"", "kind", "sweep"),
+            ("kind = \"sweep\"\naverage = 8", "average", "unknown field"),
+            ("kind = \"sweep\"\n[sweep]\naverage = 0", "sweep.average", "1 to 65536"),
+            (
+                "kind = \"sweep\"\n[sweep]\ndelay_us = { start = 0, stop = 1, count = 0 }",
+                "sweep.delay_us.count",
+                "1 to 1024",
+            ),
+            (
+                "kind = \"sweep\"\n[sweep]\ndelay_us = { start = 0, stop = 1 }",
+                "sweep.delay_us",
+                "list of numbers",
+            ),
+            ("kind = \"sweep\"\n[sweep]\nexposure_us = [0]", "sweep.exposure_us", "longer than 0"),
+            ("kind = \"sweep\"\n[sweep]\ndelay_us = [nan]", "sweep.delay_us", "finite"),
+            ("kind = \"sweep\"\n[sweep]\nmax_jitter_us = -1", "sweep.max_jitter_us", "greater than 0"),
+            ("kind = \"sweep\"\nname = \"  \"", "name", "empty"),
+            (
+                "kind = \"sweep\"\n[[stage]]\nname = \"demux\"\nalpha = nan",
+                "stage.0.alpha",
+                "not a finite number",
+            ),
+            ("kind = \"sweep\"\n[[stage]]\nprior = \"split\"", "stage", "name"),
+            ("kind = \"sweep\"\n[[product]]\nname = \"a\"", "product", "kind"),
+            (
+                "kind = \"sweep\"\n[[product]]\nkind = \"band\"\nfrom_rows = inf",
+                "product.0.from_rows",
+                "not a finite number",
+            ),
+        ]);
+    }
+}

@@ -1,0 +1,417 @@
+//! `rig.toml` of a dot rig: a mirror that moves one spot of light, and a camera that takes a frame of each place.
+
+use std::path::PathBuf;
+
+use raysweep_core::{MechanicalDeg, MirrorLimits, PixelFormat, SecondOrder};
+use serde::Deserialize;
+
+use super::aravis::AravisConfig;
+use super::replay::ReplayConfig;
+use super::v4l2::V4l2Config;
+use super::{RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn};
+use crate::document::Document;
+use crate::sim::DotsConfig;
+use crate::{ConfigError, Places};
+
+/// A dot rig.
+#[derive(Debug, Clone)]
+pub struct DotRigFile {
+    /// `[camera]`
+    pub camera: DotCameraSection,
+    /// `[mirror]`; left out where frames come from a recording.
+    pub mirror: Option<MirrorSection>,
+    /// `[sim]`, for the driver `sim`.
+    pub sim: DotSimSection,
+    /// Where all that stands in the text.
+    pub places: Places,
+}
+
+/// `[sim]` of a dot rig.
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DotSimSection {
+    /// `[sim.dots]`
+    pub dots: DotsConfig,
+}
+
+/// Drivers of a dot rig's camera by the names that rig files use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DotCameraDriver {
+    /// The simulated rig.
+    Sim,
+    /// Frames that were recorded before.
+    Replay,
+    /// GigE Vision and USB3 Vision through libaravis.
+    Aravis,
+    /// Cameras of the Linux kernel.
+    V4l2,
+}
+
+/// `[camera]` of a dot rig.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DotCameraSection {
+    /// Which driver opens it.
+    pub driver: DotCameraDriver,
+    /// How frames are packed.
+    #[serde(default = "default_pixel_format")]
+    pub pixel_format: PixelFormat,
+    /// Counts, above black, of a white plane in the dot's middle; left out: 2500 of 4096 of the format's.
+    white_dn: Option<f64>,
+    /// The exposure that `white_dn` is for.
+    #[serde(default = "default_white_exposure_us")]
+    pub white_exposure_us: f64,
+    /// Counts without light; left out: 64 of 4096 of the format's.
+    black_dn: Option<f64>,
+    /// How long a camera that stops answering within a run may stay away.
+    #[serde(default = "default_reopen_s")]
+    pub reopen_s: f64,
+    /// `[camera.aravis]`, for the driver `aravis`.
+    #[serde(default)]
+    pub aravis: AravisConfig,
+    /// `[camera.v4l2]`, for the driver `v4l2`.
+    pub v4l2: Option<V4l2Config>,
+    /// `[camera.replay]`, for the driver `replay`; its path is relative to the rig file.
+    pub replay: Option<ReplayConfig>,
+}
+
+impl DotCameraSection {
+    /// Counts, above black, of a white plane in the dot's middle.
+    pub fn white_dn(&self) -> f64 {
+        self.white_dn.unwrap_or_else(|| default_white_dn(self.pixel_format))
+    }
+
+    /// Counts without light.
+    pub fn black_dn(&self) -> f64 {
+        self.black_dn.unwrap_or_else(|| default_black_dn(self.pixel_format))
+    }
+}
+
+/// Drivers of mirrors by the names that rig files use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MirrorDriver {
+    /// The simulated rig.
+    Sim,
+    /// Mirrorcle's PlayzerX.
+    PlayzerX,
+    /// Mirrorcle's MTI controllers.
+    Mti,
+    /// Optotune's MR-E-2.
+    Optotune,
+}
+
+impl MirrorDriver {
+    /// As rig files call it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Sim => "sim",
+            Self::PlayzerX => "playzerx",
+            Self::Mti => "mti",
+            Self::Optotune => "optotune",
+        }
+    }
+}
+
+/// `[mirror]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MirrorSection {
+    /// Which driver opens it.
+    pub driver: MirrorDriver,
+    /// Its serial port, for all drivers but `sim`.
+    pub port: Option<PathBuf>,
+    /// How a PlayzerX is connected.
+    #[serde(default)]
+    pub link: PlayzerXLink,
+    /// Tilt of the mirror at the controller's full scale.
+    #[serde(default = "default_full_scale")]
+    pub full_scale_deg: f64,
+    /// Angle between the beam and the mirror's normal at rest.
+    #[serde(default)]
+    pub incidence_deg: f64,
+    /// What the mirror survives.
+    #[serde(default = "default_limits")]
+    pub limits: MirrorLimits,
+    /// What an MTI controller drives the mirror with.
+    #[serde(default)]
+    pub drive: MtiDrive,
+    /// The most that the mirror takes of it, from its data sheet.
+    #[serde(default)]
+    pub max_drive: MtiDrive,
+    /// How the axes answer; paths are then distorted beforehand so that the mirror follows them.
+    pub response: Option<ResponseKey>,
+    /// A file that begins with `1` while the interlock is closed, such as a GPIO's value; left out: the operator's word.
+    pub interlock: Option<PathBuf>,
+    /// The port whose RTS line enables the laser, for the driver `optotune`.
+    pub laser_port: Option<PathBuf>,
+}
+
+/// `mirror.response`
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(
+    untagged,
+    expecting = "\"identified\", or [{ f0_hz = .., q = .. }, { f0_hz = .., q = .. }] of x and y"
+)]
+pub enum ResponseKey {
+    /// As a plan of kind `response` has found it.
+    Found(Identified),
+    /// As stated here, x and y.
+    Stated([SecondOrder; 2]),
+}
+
+/// The word `identified`.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Identified {
+    /// It has no other.
+    Identified,
+}
+
+/// How a PlayzerX is connected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PlayzerXLink {
+    /// Over USB, as a virtual serial port: faster than any rate needs.
+    #[default]
+    VirtualCom,
+    /// Over a UART at 921,600 baud: 10 bits a byte, 9 bytes a sample, 10,240 samples/s at most.
+    Uart,
+}
+
+/// What an MTI controller drives a mirror with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct MtiDrive {
+    /// Bias, 0..=100 V.
+    pub bias_v: u32,
+    /// Largest difference between the electrodes of an axis, 0..=200 V.
+    pub difference_v: u32,
+    /// -3 dB frequency of the controller's low-pass, 50..=15,000 Hz.
+    pub bandwidth_hz: u32,
+}
+
+impl MtiDrive {
+    /// The most that Mirrorcle's A7B2.3-3600AL takes.
+    pub const A7B2_3_3600AL: Self = Self { bias_v: 80, difference_v: 150, bandwidth_hz: 200 };
+}
+
+impl Default for MtiDrive {
+    fn default() -> Self {
+        Self::A7B2_3_3600AL
+    }
+}
+
+/// Near the period of the paper's camera, 13,500 frames/s.
+fn default_white_exposure_us() -> f64 {
+    70.0
+}
+fn default_full_scale() -> f64 {
+    MirrorLimits::A7B2_3_3600AL.max_tilt.0
+}
+fn default_limits() -> MirrorLimits {
+    MirrorLimits::A7B2_3_3600AL
+}
+
+impl DotRigFile {
+    /// Reads a rig file.
+    ///
+    /// # Errors
+    /// Everything that is wrong with it, with the places in the text.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let mut document = Document::parse(text)?;
+        match document.require("kind", "kind = \"dots\"") {
+            Some(RigKind::Dots) => {}
+            Some(RigKind::Plane) => document.refuse(&["kind"], "kind: a dot rig's is \"dots\""),
+            None => return document.finish(None),
+        }
+        Self::read(document)
+    }
+
+    /// The rig of a document whose kind is [`RigKind::Dots`].
+    pub(super) fn read(mut document: Document<'_>) -> Result<Self, ConfigError> {
+        let camera: Option<DotCameraSection> = document.require("camera", "a table [camera] with a driver");
+        let has_mirror = document.places().has(&["mirror"]);
+        let mirror: Option<MirrorSection> = document.take("mirror");
+        let sim: Option<DotSimSection> = document.take_or_default("sim");
+        document.refuse_others(&["kind", "camera", "mirror", "sim"]);
+        if let Some(camera) = &camera {
+            camera.check(&mut document);
+        }
+        if let Some(mirror) = &mirror {
+            mirror.check(&mut document);
+        }
+        let (Some(camera), Some(sim), true) = (camera, sim, mirror.is_some() == has_mirror) else {
+            return document.finish(None);
+        };
+        let rig = Self { camera, mirror, sim, places: document.places().clone() };
+        rig.check(&mut document);
+        document.finish(Some(rig))
+    }
+
+    /// What its mirror's paths must keep to.
+    pub fn limits(&self) -> MirrorLimits {
+        self.mirror.as_ref().map_or_else(default_limits, |mirror| mirror.limits)
+    }
+
+    /// Angle between the beam and the mirror's normal at rest.
+    pub fn incidence(&self) -> MechanicalDeg {
+        MechanicalDeg(self.mirror.as_ref().map_or(0.0, |mirror| mirror.incidence_deg))
+    }
+
+    /// What holds between its tables.
+    fn check(&self, document: &mut Document<'_>) {
+        match &self.mirror {
+            None if self.camera.driver != DotCameraDriver::Replay => {
+                let message = "[mirror] is missing: name the driver that moves the beam; only camera.driver = \"replay\" needs none";
+                document.refuse(&["camera", "driver"], message);
+            }
+            Some(mirror)
+                if mirror.driver == MirrorDriver::Sim && self.camera.driver != DotCameraDriver::Sim =>
+            {
+                let message = "mirror.driver = \"sim\" moves no light before a real camera, and a recording needs no mirror: take the mirror's own driver, leave [mirror] out for a recording, or set camera.driver = \"sim\"";
+                document.refuse(&["mirror", "driver"], message);
+            }
+            _ => {}
+        }
+    }
+}
+
+impl DotCameraSection {
+    fn check(&self, document: &mut Document<'_>) {
+        let max_dn = f64::from(self.pixel_format.max_value());
+        for (key, value, allowed) in [
+            ("white_dn", self.white_dn(), 1.0..=16.0 * max_dn),
+            ("white_exposure_us", self.white_exposure_us, 0.1..=1e6),
+            ("black_dn", self.black_dn(), 0.0..=max_dn / 2.0),
+            ("reopen_s", self.reopen_s, 0.0..=3600.0),
+        ] {
+            document.check_range(&["camera", key], value, allowed);
+        }
+        match self.driver {
+            DotCameraDriver::Sim => {}
+            DotCameraDriver::Replay if self.replay.is_some() => {}
+            DotCameraDriver::Replay => {
+                let message = "camera.driver = \"replay\": a table [camera.replay] with the path of the recording is missing";
+                document.refuse(&["camera", "driver"], message);
+            }
+            DotCameraDriver::Aravis => document.refuse_all(&["camera", "aravis"], self.aravis.faults()),
+            DotCameraDriver::V4l2 => V4l2Config::check_section(self.v4l2.as_ref(), document),
+        }
+    }
+}
+
+impl MirrorSection {
+    fn check(&self, document: &mut Document<'_>) {
+        document.check_range(&["mirror", "full_scale_deg"], self.full_scale_deg, 0.1..=45.0);
+        document.check_range(&["mirror", "incidence_deg"], self.incidence_deg, 0.0..=60.0);
+        let limits = &self.limits;
+        for (key, value, allowed) in [
+            ("max_tilt", limits.max_tilt.0, 0.01..=45.0),
+            ("max_step", limits.max_step.0, 1e-4..=limits.max_tilt.0),
+            ("max_slew_deg_per_s", limits.max_slew_deg_per_s, 1e-3..=1e7),
+            ("bandwidth_hz", limits.bandwidth_hz, 1.0..=1e5),
+            ("out_of_band", limits.out_of_band.0, 0.0..=limits.max_tilt.0),
+        ] {
+            document.check_range(&["mirror", "limits", key], value, allowed);
+        }
+        if let Some(ResponseKey::Stated(axes)) = &self.response {
+            for SecondOrder { f0_hz, q } in axes {
+                document.check_range(&["mirror", "response"], *f0_hz, 1.0..=1e6);
+                document.check_range(&["mirror", "response"], *q, 0.1..=1e5);
+            }
+        }
+        let driver = self.driver.name();
+        if self.driver != MirrorDriver::Sim && self.port.is_none() {
+            let message = format!(
+                "mirror.driver = \"{driver}\": a mirror.port is missing, such as \"/dev/serial/by-id/...\""
+            );
+            document.refuse(&["mirror", "driver"], message);
+        }
+        if self.driver == MirrorDriver::Optotune && self.laser_port.is_none() {
+            let message = "mirror.driver = \"optotune\": a mirror.laser_port is missing: an MR-E-2 has no output for a laser; name the serial port whose RTS line enables it";
+            document.refuse(&["mirror", "driver"], message);
+        }
+        if limits.max_tilt.0 > self.full_scale_deg
+            && matches!(self.driver, MirrorDriver::PlayzerX | MirrorDriver::Mti)
+        {
+            let message = format!(
+                "mirror.limits.max_tilt = {} is beyond mirror.full_scale_deg = {}: give the smaller of what mirror and controller reach",
+                limits.max_tilt.0, self.full_scale_deg
+            );
+            document.refuse(&["mirror", "limits", "max_tilt"], message);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MINIMAL: &str = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n";
+
+    #[test]
+    fn every_key_but_kind_and_drivers_has_a_default() {
+        let rig = DotRigFile::parse(MINIMAL).unwrap();
+        assert_eq!(rig.camera.white_dn(), 2500.0);
+        assert_eq!(rig.limits(), MirrorLimits::A7B2_3_3600AL);
+    }
+
+    #[test]
+    fn bad_rigs_are_refused_with_field_and_place() {
+        let cases = [
+            (MINIMAL.replace("\"dots\"", "\"plane\""), "\"dots\""),
+            (MINIMAL.replace("[mirror]\ndriver = \"sim\"", "[mirror]\ndriver = \"playzerx\""), "mirror.port"),
+            (
+                MINIMAL
+                    .replace("[mirror]\ndriver = \"sim\"", "[mirror]\ndriver = \"optotune\"\nport = \"a\""),
+                "mirror.laser_port",
+            ),
+            (MINIMAL.replace("[mirror]\ndriver = \"sim\"\n", ""), "[mirror] is missing"),
+            (MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\""), "[camera.v4l2]"),
+            (
+                MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"replay\""),
+                "[camera.replay]",
+            ),
+            (
+                MINIMAL.replace(
+                    "[camera]\ndriver = \"sim\"",
+                    "[camera]\ndriver = \"replay\"\nreplay.path = \"a.npy\"",
+                ),
+                "leave [mirror] out for a recording",
+            ),
+            (MINIMAL.replace("[mirror]\n", "[mirror]\nincidence_deg = 80\n"), "mirror.incidence_deg = 80"),
+            (
+                MINIMAL.replace("[camera]\n", "[camera]\nwhite_exposure_us = 0\n"),
+                "camera.white_exposure_us = 0",
+            ),
+            (MINIMAL.replace("[mirror]\n", "[mirror]\nresponse = \"measured\"\n"), "\"identified\", or ["),
+            (
+                MINIMAL.replace(
+                    "[mirror]\n",
+                    "[mirror]\nresponse = [{ f0_hz = 0, q = 9 }, { f0_hz = 9, q = 9 }]\n",
+                ),
+                "mirror.response = 0",
+            ),
+            (format!("{MINIMAL}[sim.dots]\nscenes = 3\n"), "scenes"),
+            (format!("{MINIMAL}[sim.dots.camera]\nlate = 3\n"), "late"),
+        ];
+        for (text, expected) in cases {
+            let error = DotRigFile::parse(&text).unwrap_err();
+            assert!(error.to_string().contains(expected), "{text:?}: {error}");
+            assert!(error.mistakes().all(|mistake| mistake.span.is_some()), "{text:?} has no place");
+        }
+    }
+
+    #[test]
+    fn the_documented_rig_file_is_the_defaults() {
+        let page = include_str!("../../../../docs/reference/rig.md");
+        let mut blocks = page.split("```toml\n").filter_map(|rest| rest.split("```").next());
+        let documented = blocks.find(|block| block.contains("kind = \"dots\"")).unwrap();
+        assert_eq!(
+            format!("{:#?}", DotRigFile::parse(documented).unwrap()),
+            format!("{:#?}", DotRigFile::parse(MINIMAL).unwrap())
+        );
+    }
+}

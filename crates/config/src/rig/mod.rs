@@ -1,0 +1,71 @@
+//! `rig.toml`: what a rig is made of.
+
+pub mod aravis;
+pub mod dots;
+pub mod plane;
+pub mod replay;
+pub mod v4l2;
+pub mod vsync;
+
+use raysweep_core::PixelFormat;
+use serde::Deserialize;
+
+pub use self::dots::DotRigFile;
+pub use self::plane::RigFile;
+use crate::ConfigError;
+use crate::document::Document;
+
+/// The kinds of rigs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RigKind {
+    /// Raster projector and rolling-shutter camera.
+    Plane,
+    /// Mirror and fast camera.
+    Dots,
+}
+
+/// A rig file of either kind.
+pub enum AnyRigFile {
+    /// A plane rig's.
+    Plane(Box<RigFile>),
+    /// A dot rig's.
+    Dots(Box<DotRigFile>),
+}
+
+impl AnyRigFile {
+    /// Reads a rig file of the kind that it names.
+    ///
+    /// # Errors
+    /// Everything that is wrong with it, with the places in the text.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let mut document = Document::parse(text)?;
+        match document.require("kind", "kind = \"plane\" or kind = \"dots\"") {
+            Some(RigKind::Plane) => RigFile::read(document).map(|rig| Self::Plane(Box::new(rig))),
+            Some(RigKind::Dots) => DotRigFile::read(document).map(|rig| Self::Dots(Box::new(rig))),
+            None => document.finish(None),
+        }
+    }
+}
+
+/// Longer than a camera takes to start.
+pub(super) fn default_reopen_s() -> f64 {
+    60.0
+}
+/// 2500 of the 4096 counts of 12 bit, in a format's own counts.
+pub(super) fn default_white_dn(format: PixelFormat) -> f64 {
+    2500.0 / 4096.0 * full_scale_dn(format)
+}
+
+/// 64 of the 4096 counts of 12 bit.
+pub(super) fn default_black_dn(format: PixelFormat) -> f64 {
+    64.0 / 4096.0 * full_scale_dn(format)
+}
+
+pub(super) fn full_scale_dn(format: PixelFormat) -> f64 {
+    f64::from(format.max_value()) + 1.0
+}
+
+pub(super) fn default_pixel_format() -> PixelFormat {
+    PixelFormat::Mono12
+}

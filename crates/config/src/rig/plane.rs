@@ -1,0 +1,604 @@
+//! `rig.toml`: what the rig is made of and what is known of its timing.
+
+use std::path::PathBuf;
+
+use raysweep_core::{PixelFormat, Raster};
+use serde::Deserialize;
+
+use super::aravis::AravisConfig;
+use super::v4l2::V4l2Config;
+use super::vsync::{VsyncDriver, VsyncSection};
+use super::{
+    RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn, full_scale_dn,
+};
+use crate::document::Document;
+use crate::sim::{SimConfig, Spot as SimSpot};
+use crate::{ConfigError, Places};
+
+/// A rig.
+#[derive(Debug, Clone)]
+pub struct RigFile {
+    /// `[camera]`
+    pub camera: CameraSection,
+    /// `[vsync]`
+    pub vsync: VsyncSection,
+    /// `[projector]`
+    pub projector: ProjectorSection,
+    /// `[sim]`, for the driver `sim`.
+    pub sim: SimConfig,
+    /// Where all that stands in the text.
+    pub places: Places,
+}
+
+/// Drivers of cameras by the names that rig files use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CameraDriver {
+    /// The simulated rig.
+    Sim,
+    /// GigE Vision and USB3 Vision through libaravis.
+    Aravis,
+    /// Cameras of the Linux kernel.
+    V4l2,
+}
+
+/// Drivers of projectors by the names that rig files use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ProjectorDriver {
+    /// The simulated rig.
+    Sim,
+    /// A display output of this machine.
+    Drm,
+    /// The operator, asked through the daemon's clients.
+    External,
+}
+
+/// `[projector.drm]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DrmSection {
+    /// The graphics card.
+    pub card: PathBuf,
+    /// The output by the kernel's name; left out: the first with a display.
+    pub connector: Option<String>,
+    /// Video frames from a flip until the picture is certain to be in the light.
+    pub settle_frames: u32,
+}
+
+impl Default for DrmSection {
+    fn default() -> Self {
+        Self { card: "/dev/dri/card0".into(), connector: None, settle_frames: 2 } // [A]
+    }
+}
+
+/// `[camera]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraSection {
+    /// Which driver opens it.
+    pub driver: CameraDriver,
+    /// How long a camera that stops answering within a run may stay away.
+    #[serde(default = "default_reopen_s")]
+    pub reopen_s: f64,
+    /// `[camera.aravis]`, for the driver `aravis`.
+    #[serde(default)]
+    pub aravis: AravisConfig,
+    /// `[camera.v4l2]`, for the driver `v4l2`.
+    pub v4l2: Option<V4l2Config>,
+    /// Counts, above black, of a white pixel in the time of one projector row; left out: 2500 of 4096 of the format's.
+    white_dn: Option<f64>,
+    /// Counts without light; left out: 64 of 4096 of the format's.
+    black_dn: Option<f64>,
+    /// Electrons per count; left out: see [`RigFile::noise`].
+    electrons_per_dn: Option<f64>,
+    /// Electrons of noise in a dark sample; left out: see [`RigFile::noise`].
+    read_noise_e: Option<f64>,
+    /// How frames are packed.
+    #[serde(default = "default_pixel_format")]
+    pub pixel_format: PixelFormat,
+    /// From the start of one row's exposure to the next row's; left out: `row_pitch` times the projector's row time.
+    pub row_time_us: Option<f64>,
+    /// Projector rows from one camera row to the next, on the epipolar planes.
+    #[serde(default = "default_row_pitch")]
+    pub row_pitch: f64,
+    /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
+    pub first_projector_row: Option<usize>,
+    /// Projector columns, 0 to 1 over its width, that the image's left and right edges see; left out: not known.
+    pub projector_columns: Option<[f64; 2]>,
+}
+
+impl CameraSection {
+    /// Counts, above black, of a white pixel in the time of one projector row.
+    pub fn white_dn(&self) -> f64 {
+        self.white_dn.unwrap_or_else(|| default_white_dn(self.pixel_format))
+    }
+
+    /// Counts without light.
+    pub fn black_dn(&self) -> f64 {
+        self.black_dn.unwrap_or_else(|| default_black_dn(self.pixel_format))
+    }
+}
+
+/// How the noise of a camera is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NoiseSource {
+    /// The rig file states it.
+    Stated,
+    /// The simulator's own.
+    Simulated,
+    /// Typical values are assumed.
+    Assumed,
+}
+
+/// The figures that a camera's noise follows from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraNoise {
+    /// Electrons per count; infinitely many where light brings no noise.
+    pub electrons_per_dn: f64,
+    /// Electrons of noise in a dark sample.
+    pub read_noise_e: f64,
+    /// How they are known.
+    pub source: NoiseSource,
+}
+
+/// Electrons over the full scale of a typical camera [A].
+const TYPICAL_FULL_SCALE_E: f64 = 8000.0;
+/// Electrons of read noise of a typical camera [A].
+const TYPICAL_READ_NOISE_E: f64 = 15.0;
+
+/// `[projector]`
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ProjectorSection {
+    /// Which driver shows pictures.
+    pub driver: ProjectorDriver,
+    /// `[projector.drm]`, for the driver `drm`: 1280x720 at 60 Hz.
+    #[serde(default)]
+    pub drm: DrmSection,
+    /// Rows that it draws.
+    #[serde(default = "default_rows")]
+    pub rows: usize,
+    /// From one row to the next.
+    #[serde(default = "default_row_time_us")]
+    pub row_time_us: f64,
+    /// From the VSYNC edge to the start of row 0.
+    #[serde(default = "default_first_row_us")]
+    pub first_row_us: f64,
+    /// Measured start of each row's light and end of the last's, from `first_row_us` on; left out: rows of one row time.
+    pub row_table: Option<Vec<f64>>,
+    /// Standard deviation of the beam over rows, 0 for an ideal one; left out: not known.
+    pub beam_sigma_rows: Option<f64>,
+    /// How the light of a row is drawn.
+    #[serde(default)]
+    pub spot: SpotKind,
+    /// Which way a flying spot runs; left out: not known.
+    pub scan: Option<ScanKind>,
+}
+
+/// How the light of a row is drawn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SpotKind {
+    /// Over the row's whole time.
+    #[default]
+    Uniform,
+    /// At the moment the spot passes.
+    Flying,
+}
+
+/// Which way a flying spot runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ScanKind {
+    /// Nobody knows.
+    Unknown,
+    /// Every row from the first column to the last.
+    OneWay,
+    /// Odd rows backwards.
+    Bidirectional,
+}
+/// Rectified rows of the same height.
+fn default_row_pitch() -> f64 {
+    1.0
+}
+fn default_rows() -> usize {
+    720
+}
+/// 720p60 with its 750 lines.
+fn default_row_time_us() -> f64 {
+    22.22
+}
+/// 720p60: 5 lines of VSYNC and 20 of back porch.
+fn default_first_row_us() -> f64 {
+    555.5
+}
+
+/// Largest number of rows a raster projector is taken to have.
+const MAX_ROWS: u64 = 8192;
+
+/// Part of the row time by which camera and projector may differ. The model follows the drift of the delay; beyond this
+/// a sweep would no longer be one around the epipolar planes of all rows.
+const ROW_TIME_TOLERANCE: f64 = 0.01;
+
+impl RigFile {
+    /// Reads a rig file.
+    ///
+    /// # Errors
+    /// Everything that is wrong with it, with the places in the text.
+    pub fn parse(text: &str) -> Result<Self, ConfigError> {
+        let mut document = Document::parse(text)?;
+        match document.require("kind", "kind = \"plane\"") {
+            Some(RigKind::Plane) => {}
+            Some(RigKind::Dots) => document.refuse(&["kind"], "kind: a plane rig's is \"plane\""),
+            None => return document.finish(None),
+        }
+        Self::read(document)
+    }
+
+    /// The rig of a document whose kind is [`RigKind::Plane`].
+    pub(super) fn read(mut document: Document<'_>) -> Result<Self, ConfigError> {
+        let camera: Option<CameraSection> = document.require("camera", "a table [camera] with a driver");
+        let vsync: Option<VsyncSection> = document.require("vsync", "a table [vsync] with a driver");
+        let projector: Option<ProjectorSection> =
+            document.require("projector", "a table [projector] with a driver");
+        let sim: Option<SimConfig> = document.take_or_default("sim");
+        document.refuse_others(&["kind", "camera", "vsync", "projector", "sim"]);
+        if let Some(camera) = &camera {
+            camera.check(&mut document);
+        }
+        if let Some(vsync) = &vsync {
+            vsync.check(&mut document);
+        }
+        if let Some(projector) = &projector {
+            projector.check(&mut document);
+        }
+        let (Some(camera), Some(vsync), Some(projector), Some(sim)) = (camera, vsync, projector, sim) else {
+            return document.finish(None);
+        };
+        let rig = Self { camera, vsync, projector, sim, places: document.places().clone() };
+        rig.check(&mut document);
+        document.finish(Some(rig))
+    }
+
+    /// Whether any of its devices is simulated, in this process or on a bench.
+    pub fn has_simulated_device(&self) -> bool {
+        self.camera.driver == CameraDriver::Sim
+            || self.vsync.driver == VsyncDriver::Sim
+            || self.projector.driver == ProjectorDriver::Sim
+            || self.sim.bench.is_some()
+    }
+
+    /// When the projector lights its rows.
+    pub fn raster(&self) -> Raster {
+        Raster {
+            rows: self.projector.rows,
+            row_time_us: self.projector.row_time_us,
+            first_row_us: self.projector.first_row_us,
+            period_us: self.vsync.period_us,
+        }
+    }
+
+    /// The camera's row time: as stated, or that which keeps pace with the projector.
+    pub fn camera_row_time_us(&self) -> f64 {
+        self.camera.row_time_us.unwrap_or_else(|| self.pace_us())
+    }
+
+    /// The camera's row time that keeps pace with the projector.
+    fn pace_us(&self) -> f64 {
+        self.camera.row_pitch * self.projector.row_time_us
+    }
+
+    /// The camera's noise: as stated; what is left out of it as the simulator makes it, of other cameras typical values.
+    pub fn noise(&self) -> CameraNoise {
+        let (camera, sensor) = (&self.camera, &self.sim.sensor);
+        let unstated = if camera.driver != CameraDriver::Sim {
+            CameraNoise {
+                electrons_per_dn: TYPICAL_FULL_SCALE_E / full_scale_dn(camera.pixel_format),
+                read_noise_e: TYPICAL_READ_NOISE_E,
+                source: NoiseSource::Assumed,
+            }
+        } else if sensor.noise {
+            // The simulator counts its electrons on a scale of 12 bit.
+            let electrons_per_dn = sensor.electrons_per_dn * 4096.0 / full_scale_dn(camera.pixel_format);
+            CameraNoise {
+                electrons_per_dn,
+                read_noise_e: sensor.read_noise_e,
+                source: NoiseSource::Simulated,
+            }
+        } else {
+            CameraNoise { electrons_per_dn: f64::INFINITY, read_noise_e: 0.0, source: NoiseSource::Simulated }
+        };
+        match (camera.electrons_per_dn, camera.read_noise_e) {
+            (Some(electrons_per_dn), Some(read_noise_e)) => {
+                CameraNoise { electrons_per_dn, read_noise_e, source: NoiseSource::Stated }
+            }
+            (electrons_per_dn, read_noise_e) => CameraNoise {
+                electrons_per_dn: electrons_per_dn.unwrap_or(unstated.electrons_per_dn),
+                read_noise_e: read_noise_e.unwrap_or(unstated.read_noise_e),
+                ..unstated
+            },
+        }
+    }
+
+    /// What holds between its tables.
+    fn check(&self, document: &mut Document<'_>) {
+        let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
+        if !document.is_sound(&[
+            &["vsync", "period_us"],
+            &["projector", "rows"],
+            &["projector", "row_time_us"],
+        ]) {
+            return;
+        }
+        document.check_range(&["projector", "first_row_us"], projector.first_row_us, 0.0..=vsync.period_us);
+        let lit_us = projector.rows as f64 * projector.row_time_us;
+        if projector.first_row_us + lit_us > vsync.period_us {
+            let message = format!(
+                "projector.rows x row_time_us + first_row_us = {:.1} us is longer than vsync.period_us = {}: a frame's rows must be drawn before the next edge; lower rows, row_time_us or first_row_us",
+                projector.first_row_us + lit_us,
+                vsync.period_us
+            );
+            document.refuse(&["projector", "row_time_us"], message);
+        }
+        let is_paced =
+            (self.camera_row_time_us() - self.pace_us()).abs() <= ROW_TIME_TOLERANCE * self.pace_us();
+        if document.is_sound(&[&["camera", "row_pitch"], &["camera", "row_time_us"]]) && !is_paced {
+            let message = format!(
+                "camera.row_time_us = {} differs by more than {} % from camera.row_pitch x projector.row_time_us = {}: the rows must run at the same speed; set the camera's pixel clock or lens so that they do",
+                self.camera_row_time_us(),
+                100.0 * ROW_TIME_TOLERANCE,
+                self.pace_us()
+            );
+            document.refuse(&["camera", "row_time_us"], message);
+        }
+        if self.sim.projector.spot != SimSpot::Uniform && camera.row_pitch != 1.0 {
+            let message = "sim.projector.spot: flying spots are simulated for camera.row_pitch = 1 only; take \"uniform\"";
+            document.refuse(&["sim", "projector", "spot"], message);
+        }
+        if let Some(row) = camera.first_projector_row.filter(|row| *row >= projector.rows) {
+            let message = format!(
+                "camera.first_projector_row = {row}: allowed is 0 to {}",
+                projector.rows.saturating_sub(1)
+            );
+            document.refuse(&["camera", "first_projector_row"], message);
+        }
+        self.check_row_table(document);
+    }
+
+    fn check_row_table(&self, document: &mut Document<'_>) {
+        let Some(table) = &self.projector.row_table else { return };
+        let Raster { rows, first_row_us, period_us, .. } = self.raster();
+        let refused = if table.len() != rows + 1 {
+            format!(
+                "projector.row_table has {} entries: give {}, one for the start of each row and one for the end of the last",
+                table.len(),
+                rows + 1
+            )
+        } else if let Some(row) =
+            table.windows(2).position(|pair| !(pair[0] < pair[1] && pair[1].is_finite()))
+        {
+            format!(
+                "projector.row_table: entry {} is {}: give finite numbers, each later than the entry before: rows are lit one after the other",
+                row + 1,
+                table[row + 1]
+            )
+        } else {
+            let (start_us, end_us) = (first_row_us + table[0], first_row_us + table[rows]);
+            if start_us >= 0.0 && end_us <= period_us {
+                return;
+            }
+            format!(
+                "projector.row_table + first_row_us = {start_us:.1} to {end_us:.1} us after the edge: a frame's rows must be drawn from 0 to vsync.period_us = {period_us}"
+            )
+        };
+        document.refuse(&["projector", "row_table"], refused);
+    }
+}
+
+impl CameraSection {
+    fn check(&self, document: &mut Document<'_>) {
+        let max_dn = f64::from(self.pixel_format.max_value());
+        for (key, value, allowed) in [
+            ("row_pitch", self.row_pitch, 0.01..=100.0),
+            ("row_time_us", self.row_time_us.unwrap_or(1.0), 0.1..=10_000.0),
+            ("reopen_s", self.reopen_s, 0.0..=3600.0),
+            ("white_dn", self.white_dn(), 1.0..=max_dn),
+            ("electrons_per_dn", self.electrons_per_dn.unwrap_or(1.0), 1e-3..=1e6),
+            ("read_noise_e", self.read_noise_e.unwrap_or(0.0), 0.0..=1e6),
+            ("black_dn", self.black_dn(), 0.0..=max_dn / 2.0),
+        ] {
+            document.check_range(&["camera", key], value, allowed);
+        }
+        if let Some(column) = self.projector_columns.iter().flatten().find(|c| !(0.0..=1.0).contains(*c)) {
+            let message = format!(
+                "camera.projector_columns contains {column}: give 0 to 1, in parts of the projector's width"
+            );
+            document.refuse(&["camera", "projector_columns"], message);
+        }
+        match self.driver {
+            CameraDriver::Sim => {}
+            CameraDriver::Aravis => document.refuse_all(&["camera", "aravis"], self.aravis.faults()),
+            CameraDriver::V4l2 => V4l2Config::check_section(self.v4l2.as_ref(), document),
+        }
+    }
+}
+
+impl ProjectorSection {
+    fn check(&self, document: &mut Document<'_>) {
+        document.check_count(&["projector", "rows"], self.rows as u64, 1..=MAX_ROWS);
+        document.check_range(&["projector", "row_time_us"], self.row_time_us, 0.1..=10_000.0);
+        document.check_range(
+            &["projector", "beam_sigma_rows"],
+            self.beam_sigma_rows.unwrap_or(0.0),
+            0.0..=100.0,
+        );
+        if self.spot == SpotKind::Uniform && self.scan.is_some() {
+            let message = "projector.scan says which way a flying spot runs: set projector.spot = \"flying\" or leave scan out";
+            document.refuse(&["projector", "scan"], message);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MINIMAL: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n";
+
+    fn table(row_table: &str) -> String {
+        MINIMAL.replace("[projector]\n", &format!("[projector]\nrows = 3\nrow_table = {row_table}\n"))
+    }
+
+    #[test]
+    fn what_is_known_of_the_light_is_read() {
+        let rig = RigFile::parse(&table("[0, 21.5, 44, 66.66]")).unwrap();
+        assert_eq!(rig.projector.row_table, Some(vec![0.0, 21.5, 44.0, 66.66]));
+        let projector = |keys: &str| {
+            RigFile::parse(&MINIMAL.replace("[projector]\n", &format!("[projector]\n{keys}\n")))
+                .unwrap()
+                .projector
+        };
+        let drawn = |keys: &str| (projector(keys).spot, projector(keys).scan);
+        assert_eq!(drawn(""), (SpotKind::Uniform, None));
+        assert_eq!(drawn("spot = \"flying\""), (SpotKind::Flying, None));
+        let both_ways = drawn("spot = \"flying\"\nscan = \"bidirectional\"");
+        assert_eq!(both_ways, (SpotKind::Flying, Some(ScanKind::Bidirectional)));
+        assert_eq!(projector("beam_sigma_rows = 0").beam_sigma_rows, Some(0.0));
+        let halved = RigFile::parse(&MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0.5\n")).unwrap();
+        assert_eq!(halved.camera_row_time_us(), 11.11);
+    }
+
+    #[test]
+    fn noise_is_what_is_stated_else_what_is_simulated() {
+        let noise = |camera: &str, sensor: &str| {
+            let text = MINIMAL.replace("[camera]\n", &format!("[camera]\n{camera}\n"));
+            RigFile::parse(&format!("{text}[sim.sensor]\n{sensor}\n")).unwrap().noise()
+        };
+        let is =
+            |electrons_per_dn, read_noise_e, source| CameraNoise { electrons_per_dn, read_noise_e, source };
+        assert_eq!(noise("", "read_noise_e = 7"), is(1.66, 7.0, NoiseSource::Simulated));
+        assert_eq!(noise("pixel_format = \"Mono10\"", ""), is(6.64, 9.0, NoiseSource::Simulated));
+        assert_eq!(noise("read_noise_e = 3", ""), is(1.66, 3.0, NoiseSource::Simulated));
+        assert_eq!(noise("", "noise = false"), is(f64::INFINITY, 0.0, NoiseSource::Simulated));
+        assert_eq!(noise("electrons_per_dn = 2\nread_noise_e = 3", ""), is(2.0, 3.0, NoiseSource::Stated));
+    }
+
+    #[test]
+    fn an_operator_may_work_the_projector() {
+        let text = MINIMAL.replace("[projector]\ndriver = \"sim\"", "[projector]\ndriver = \"external\"");
+        assert_eq!(RigFile::parse(&text).unwrap().projector.driver, ProjectorDriver::External);
+        let error = RigFile::parse(&text.replace("external", "nobody")).unwrap_err();
+        assert!(error.first().message.contains("external"), "{error}");
+    }
+
+    #[test]
+    fn every_key_but_kind_and_drivers_has_a_default() {
+        let rig = RigFile::parse(MINIMAL).unwrap();
+        assert_eq!(rig.raster().rows, 720);
+        assert_eq!(rig.camera_row_time_us(), 22.22);
+    }
+
+    #[test]
+    fn bad_rigs_are_refused_with_field_and_place() {
+        let cases = [
+            (MINIMAL.replace("\"plane\"", "\"plan\""), "plane"),
+            (MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"fx3\""), "sim"),
+            (MINIMAL.replace("[vsync]\n", "[vsync]\nperiod_us = 5\n"), "vsync.period_us = 5"),
+            (
+                MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"modemline\""),
+                "[vsync.modemline]",
+            ),
+            (
+                MINIMAL.replace("[vsync]\ndriver = \"sim\"", "[vsync]\ndriver = \"triggerbox\""),
+                "[vsync.triggerbox]",
+            ),
+            (
+                MINIMAL.replace(
+                    "[vsync]\ndriver = \"sim\"",
+                    "[vsync]\ndriver = \"fx2lafw\"\nfx2lafw.sample_rate_hz = 7",
+                ),
+                "vsync.fx2lafw.sample_rate_hz = 7",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\ngain = 3\n"), "gain"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nwhite_dn = 5000\n"), "4095"),
+            (
+                MINIMAL.replace("[camera]\n", "[camera]\nelectrons_per_dn = 0\n"),
+                "electrons_per_dn = 0: allowed",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\nread_noise_e = -1\n"), "read_noise_e = -1: allowed"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nrow_time_us = 30\n"), "same speed"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 2\nrow_time_us = 22.22\n"), "44.44"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0\n"), "camera.row_pitch = 0"),
+            (MINIMAL.replace("[projector]\n", "[projector]\nrows = 1000\n"), "longer than"),
+            (MINIMAL.replace("[projector]\n", "[projector]\nbeam_sigma_rows = -1\n"), "beam_sigma_rows = -1"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nprojector_columns = [0, 1.5]\n"), "0 to 1"),
+            (MINIMAL.replace("[projector]\n", "[projector]\nscan = \"one-way\"\n"), "flying"),
+            (
+                format!(
+                    "{}[sim.projector]\nspot = \"one-way\"\n",
+                    MINIMAL.replace("[camera]\n", "[camera]\nrow_pitch = 0.5\n")
+                ),
+                "row_pitch = 1 only",
+            ),
+            (table("[0.0, 20.0]"), "projector.row_table has 2 entries: give 4"),
+            (table("[0, 20, 20, 40]"), "entry 2 is 20"),
+            (table("[-600, 20, 30, 40]"), "-44.5 to 595.5"),
+            (format!("{MINIMAL}[sim.camera]\nlate_frames = 3\n"), "late_frames"),
+            (
+                MINIMAL.replace("[projector]\n", "[projector]\nrow_time_us = nan\n"),
+                "projector.row_time_us = NaN",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\npixel_format = \"Mono13\"\n"), "Mono12p"),
+            (MINIMAL.replace("[camera]\n", "[camera]\nfirst_projector_row = 720\n"), "0 to 719"),
+            (format!("{MINIMAL}[sim]\nseed = -1\n"), "-1"),
+            (MINIMAL.replacen("\"sim\"", "\"aravis\"", 1), "`raysweep devices`"),
+            (MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\""), "[camera.v4l2]"),
+            (
+                format!(
+                    "{}[camera.v4l2]\ndevice = \"/dev/video0\"\nwidth = 640\nheight = 360\nbuffers = 1\n",
+                    MINIMAL.replace("[camera]\ndriver = \"sim\"", "[camera]\ndriver = \"v4l2\"")
+                ),
+                "camera.v4l2.buffers = 1: allowed is 2 to 32",
+            ),
+            (MINIMAL.replace("[camera]\n", "[camera]\nreopen_s = -1\n"), "camera.reopen_s = -1"),
+            (
+                MINIMAL.replacen("\"sim\"", "\"aravis\"\naravis.name = \"a\"\naravis.packet_size = 10", 1),
+                "camera.aravis.packet_size = 10",
+            ),
+            (MINIMAL.replacen("\"sim\"", "\"sim\"\naravis.nam = \"a\"", 1), "nam"),
+        ];
+        for (text, expected) in cases {
+            let error = RigFile::parse(&text).unwrap_err();
+            assert!(error.to_string().contains(expected), "{text:?}: {error}");
+            assert!(error.mistakes().all(|mistake| mistake.span.is_some()), "{text:?} has no place");
+        }
+    }
+
+    #[test]
+    fn five_mistakes_in_three_tables_are_five_places() {
+        let text = MINIMAL
+            .replace("[camera]\n", "[camera]\nreopen_s = -1\nwhite_dn = 0\n")
+            .replace("[vsync]\n", "[vsync]\nperiod_us = 5\ngate_us = 0\n")
+            .replace("[projector]\n", "[projector]\nbeam_sigma_rows = -1\n");
+        let error = RigFile::parse(&text).unwrap_err();
+        assert_eq!(
+            error.render("rig.toml", &text),
+            "rig.toml, line 3: camera.reopen_s = -1: allowed is 0 to 3600\n  reopen_s = -1\n\
+             rig.toml, line 4: camera.white_dn = 0: allowed is 1 to 4095\n  white_dn = 0\n\
+             rig.toml, line 7: vsync.period_us = 5: allowed is 4000 to 1000000\n  period_us = 5\n\
+             rig.toml, line 8: vsync.gate_us = 0: allowed is 1 to 1.25\n  gate_us = 0\n\
+             rig.toml, line 11: projector.beam_sigma_rows = -1: allowed is 0 to 100\n  beam_sigma_rows = -1"
+        );
+    }
+
+    #[test]
+    fn the_documented_rig_file_is_the_defaults() {
+        let page = include_str!("../../../../docs/reference/rig.md");
+        let documented = page.split("```toml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+        assert_eq!(
+            format!("{:#?}", RigFile::parse(documented).unwrap()),
+            format!("{:#?}", RigFile::parse(MINIMAL).unwrap())
+        );
+    }
+}

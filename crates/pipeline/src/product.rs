@@ -1,0 +1,80 @@
+//! What folds and plans make of a sweep.
+
+use ndarray::{Array2, Array3};
+use raysweep_transport::plane::{DelayProfile, Transport};
+
+use crate::findings::Findings;
+use crate::stack::SweepStack;
+
+/// The results of a fold.
+#[derive(Debug, Clone)]
+pub enum Product {
+    /// An image `[t, s]` in the scene's units (1 = a white pixel).
+    Image {
+        /// File name without extension.
+        name: String,
+        /// Description in one sentence.
+        about: String,
+        /// The pixels.
+        image: Array2<f32>,
+    },
+    /// Images `[k, t, s]` in the scene's units.
+    Sequence {
+        /// File name without extension.
+        name: String,
+        /// Description in one sentence.
+        about: String,
+        /// The quantity in which the images differ, with its unit.
+        axis: String,
+        /// The value of `axis` for each image.
+        at: Vec<f64>,
+        /// The pixels.
+        images: Array3<f32>,
+    },
+    /// Light as a function of the delay.
+    Profile(Profile),
+    /// The light transport `[u, t, s]`.
+    Transport(Box<Transport>),
+    /// The images from which it was computed, needed by [`crate::ProductSpec`] to compute other products. Not written
+    /// to disk.
+    Stack(Box<SweepStack>),
+    /// How the sweep was demultiplexed.
+    Findings(Box<Findings>),
+    /// A problem that makes other products worse than they look.
+    Warning(String),
+    /// A number for the report.
+    Figure {
+        /// Name, with the unit.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+    },
+}
+
+/// Light as a function of the delay at one exposure.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Profile {
+    /// File name without extension.
+    pub name: String,
+    /// Description in one sentence.
+    pub about: String,
+    /// The planned exposure.
+    pub exposure_us: f64,
+    /// Measured light.
+    pub measured: DelayProfile,
+    /// Light predicted from the transport by the forward model.
+    pub predicted: DelayProfile,
+}
+
+impl Profile {
+    /// The table to write: names and values of its columns, one row per delay.
+    pub fn columns(&self) -> [(&'static str, Vec<f64>); 5] {
+        [
+            ("delay_us", self.measured.delays_us.clone()),
+            ("light", self.measured.light.clone()),
+            ("predicted", self.predicted.light.clone()),
+            ("light_per_area_us", self.measured.normalised_per_us()),
+            ("predicted_per_area_us", self.predicted.normalised_per_us()),
+        ]
+    }
+}

@@ -1,0 +1,30 @@
+//! Why a plan's stage cannot be created.
+
+/// Why a plan's stage cannot be created.
+#[derive(Debug, thiserror::Error)]
+pub enum RegistryError {
+    /// The name does not exist.
+    #[error("stage name = {name:?}: known are {known}")]
+    Unknown {
+        /// The name in the plan.
+        name: String,
+        /// All existing names.
+        known: String,
+    },
+    /// An option that the stage does not have, or a value that it does not accept.
+    #[error("stage {name}: {source}")]
+    Options {
+        /// The stage's name.
+        name: String,
+        /// The error message of serde.
+        source: serde_json::Error,
+    },
+    /// Options that are well formed but invalid.
+    #[error("stage {name}: {what}")]
+    Invalid {
+        /// The stage's name.
+        name: String,
+        /// Field, value, and the allowed values.
+        what: String,
+    },
+}

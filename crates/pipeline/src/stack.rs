@@ -1,0 +1,57 @@
+//! The images of a sweep, ready to be demultiplexed.
+
+use ndarray::{Array2, Array3, Axis};
+use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting};
+
+/// The images from which a transport was computed.
+#[derive(Debug, Clone)]
+pub struct SweepStack {
+    /// The timing of projector and camera rows.
+    pub timing: RowTiming,
+    /// The prior used for the transport.
+    pub prior: Prior,
+    /// The planned exposure of each image.
+    pub exposures_us: Vec<f64>,
+    /// Delays and exposure of each image.
+    pub settings: Vec<Setting>,
+    /// `[settings, t, s]` of all camera rows, or those of a [`crate::Strip`]; dark image subtracted, 1 = a white pixel
+    /// lit by its own projector row.
+    pub images: Array3<f32>,
+    /// Which samples are not saturated, of the same shape; `None` if all.
+    pub valid: Option<Array3<bool>>,
+    /// The image with one whole VSYNC period of exposure, `[t, s]`, if it was taken.
+    pub regular: Option<Array2<f32>>,
+    /// The noise of a single frame, if it could be fitted.
+    pub noise: Option<NoiseModel>,
+    /// Share of the noise variance that remains after spatial coupling, `[t, s]`; `None` if not coupled.
+    pub variance_ratio: Option<Array2<f32>>,
+    /// Assumed position of direct light, in rows from the pixel's own, `[t, s]`; `None` if in its own row.
+    pub u0_rows: Option<Array2<f32>>,
+}
+
+impl SweepStack {
+    /// A stack with only these camera rows.
+    pub(crate) fn of_rows(&self, rows: &[usize]) -> Self {
+        Self {
+            timing: self.timing.clone(),
+            prior: self.prior,
+            exposures_us: self.exposures_us.clone(),
+            settings: self.settings.clone(),
+            images: self.images.select(Axis(1), rows),
+            valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
+            regular: None,
+            noise: None,
+            variance_ratio: None,
+            u0_rows: None,
+        }
+    }
+
+    /// Keeps the images for whose index `kept` returns true.
+    pub(crate) fn keep(&mut self, kept: impl Fn(usize) -> bool) {
+        let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
+        self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
+        self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();
+        self.images = self.images.select(Axis(0), &kept);
+        self.valid = self.valid.as_ref().map(|valid| valid.select(Axis(0), &kept));
+    }
+}

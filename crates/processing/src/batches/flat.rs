@@ -1,0 +1,40 @@
+//! The flat field between a run, its session, and later runs.
+
+use std::path::Path;
+
+use ndarray::{Array2, Axis};
+use raysweep_session::dots::FlatArrays;
+use raysweep_session::{Result, Session};
+use raysweep_transport::dots::{Correction, FlatField};
+
+use super::DotTask;
+
+/// Keeps the gains that the run's columns are made with.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn keep(session: &Session, correction: &Correction) -> Result<()> {
+    let size = (correction.shape().height(), correction.shape().width());
+    let mut repaired = Array2::from_elem(size, false);
+    correction
+        .hot()
+        .iter()
+        .for_each(|&pixel| repaired[[pixel as usize / size.1, pixel as usize % size.1]] = true);
+    let gain = Array2::from_shape_fn(size, |(t, s)| correction.gain()[t * size.1 + s]);
+    session.dots()?.write_flat(&FlatArrays { gain, repaired })
+}
+
+impl DotTask {
+    /// The flat field of the earlier session that the plan names, if it names one; sessions lie in `data`.
+    ///
+    /// # Errors
+    /// When that session has none, or one of another size.
+    pub fn earlier_flat_field(&self, data: &Path) -> Result<Option<FlatField>> {
+        let Some(dir) = &self.correct.flat_field else { return Ok(None) };
+        let size = [self.shape.height(), self.shape.width()];
+        let FlatArrays { gain, repaired } = Session::open(&data.join(dir))?.dots()?.read_flat(size)?;
+        let dead =
+            repaired.indexed_iter().filter(|(_, repaired)| **repaired).map(|(pixel, _)| pixel).collect();
+        Ok(Some(FlatField { gain: gain.insert_axis(Axis(2)), dead }))
+    }
+}

@@ -1,0 +1,234 @@
+//! From stored batches to videos, report and manifest: the same after a run and offline.
+
+use std::collections::BTreeMap;
+use std::io::ErrorKind;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use ndarray::{Array3, Array4};
+use raysweep_config::DotRigFile;
+use raysweep_session::dots::BatchEntry;
+use raysweep_session::ledger::State;
+use raysweep_session::products::VideoWriter;
+use raysweep_session::report::ToneMap;
+use raysweep_session::{Result, Session, manifest, pattern};
+use serde_json::{Map, Value, json};
+
+use super::DotTask;
+use super::calibration::{Calibration, read_batch};
+use super::product::{DotSpec, Scene, light_of, read_pattern};
+use super::report::{self, Strip};
+use crate::mirror_response::Predistortion;
+
+/// Images of a video that the report shows.
+const SHOWN: usize = 6;
+
+/// Makes the calibration, the videos, the report and the manifest; returns what could not be made, and why.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn make(
+    session: &Session,
+    state: &State,
+    task: &DotTask,
+    rig: &DotRigFile,
+    specs: &[DotSpec],
+    mut problems: Vec<String>,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Vec<String>> {
+    let dots = session.dots()?;
+    let calibration = Calibration::of(&dots, task.shape, state, &mut problems);
+    if let Some(calibration) = &calibration {
+        calibration.write(session)?;
+    }
+    let mut videos: Vec<Video> = Vec::new();
+    for spec in specs {
+        match patterns_of(session, spec) {
+            Ok(patterns) => videos.push(Video { spec, patterns, writers: Vec::new(), strips: Vec::new() }),
+            Err(problem) => problems.push(problem),
+        }
+    }
+    // A video's length is known before its first image, so batches are checked before they are drawn.
+    let mut sound: Vec<&BatchEntry> = Vec::new();
+    for entry in state.batches().filter(|entry| entry.plane.is_none()) {
+        match read_batch(&dots, task.shape, entry) {
+            Ok(_) => sound.push(entry),
+            Err(problem) => problems.push(problem),
+        }
+    }
+    for (image, entry) in sound.iter().enumerate() {
+        if !go_on() {
+            break;
+        }
+        let Ok((batch, seen)) = read_batch(&dots, task.shape, entry) else { continue };
+        let light = light_of(&batch);
+        let scene = Scene {
+            calibration: calibration.as_ref(),
+            image: (image, sound.len()),
+            seen: &seen,
+            light: &light,
+        };
+        let mut drawn = Vec::new();
+        for video in videos {
+            match video.spec.draw(&batch, &scene, video.patterns.as_ref()) {
+                Ok(images) => drawn.push((video, images)),
+                Err(problem) => problems.push(format!("product {}: {problem}", video.spec.name)),
+            }
+        }
+        videos = Vec::new();
+        for (mut video, images) in drawn {
+            video.append(session, task, images, (image, sound.len()), entry)?;
+            videos.push(video);
+        }
+    }
+    let mut strips = Vec::new();
+    let mut encoder = Encoder { problems: Vec::new() };
+    for Video { writers, strips: of_video, .. } in videos {
+        if !go_on() {
+            break;
+        }
+        for (name, writer) in writers {
+            writer.commit()?;
+            encoder.encode(session.products().dir(), &name, 1.0 / task.batches.path.duration_s());
+        }
+        strips.extend(of_video);
+    }
+    problems.append(&mut encoder.problems);
+    let page = report::make(session, state, task, calibration.as_ref(), &strips, &problems)?.to_html()?;
+    raysweep_session::durable::write(&session.report_path(), page.as_bytes())?;
+    write_manifest(session, state, task, rig)?;
+    Ok(problems)
+}
+
+/// Keeps the lighting patterns of a plan in its session, so that its products can be made again from the session alone.
+///
+/// # Errors
+/// What is wrong with a pattern.
+pub fn keep_patterns(session: &Session, task: &DotTask) -> std::result::Result<(), String> {
+    for spec in &task.specs {
+        let Some(path) = spec.pattern_file() else { continue };
+        let patterns = read_pattern(spec, path)?;
+        let kept = session.pattern_path(&spec.name);
+        kept.parent()
+            .map_or(Ok(()), raysweep_session::durable::create_dir_all)
+            .and_then(|()| pattern::write(&kept, &patterns))
+            .map_err(|error| error.to_string())?;
+    }
+    Ok(())
+}
+
+/// The patterns of a product: as kept in the session, or else, of one that the plan does not name, its file's.
+fn patterns_of(session: &Session, spec: &DotSpec) -> std::result::Result<Option<Array4<f32>>, String> {
+    let Some(file) = spec.pattern_file() else { return Ok(None) };
+    let kept = session.pattern_path(&spec.name);
+    read_pattern(spec, if kept.exists() { &kept } else { file }).map(Some)
+}
+
+/// A product under way.
+struct Video<'a> {
+    spec: &'a DotSpec,
+    patterns: Option<Array4<f32>>,
+    writers: Vec<(String, VideoWriter)>,
+    strips: Vec<Strip>,
+}
+
+impl Video<'_> {
+    fn append(
+        &mut self,
+        session: &Session,
+        task: &DotTask,
+        images: Vec<Array3<f32>>,
+        (number, count): (usize, usize),
+        entry: &BatchEntry,
+    ) -> Result<()> {
+        for (place, (image, (name, about))) in images.into_iter().zip(self.spec.videos()).enumerate() {
+            if self.writers.len() <= place {
+                let (rows, columns, channels) = image.dim();
+                let metadata = common(task, &about, channels);
+                let writer = session.products().video(&name, count, [rows, columns, channels], &metadata)?;
+                self.writers.push((name.clone(), writer));
+                self.strips.push(Strip { name, about, images: Vec::new() });
+            }
+            let scale: ToneMap = self.writers[place].1.append(image.view())?;
+            let step = count.div_ceil(SHOWN);
+            if number.is_multiple_of(step) {
+                self.strips[place].images.push((
+                    format!("{} ({:.2} s)", entry.batch, entry.start_s),
+                    image,
+                    scale,
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Makes video files of PNG sequences, where ffmpeg is installed.
+struct Encoder {
+    problems: Vec<String>,
+}
+
+impl Encoder {
+    fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) {
+        const MISSING: &str = "ffmpeg is not installed: there are no video files, the PNG sequences are complete; install it and run `raysweep process`";
+        let target = products.join(format!("{name}.mp4"));
+        let ended = Command::new("ffmpeg")
+            .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
+            .arg(products.join(name).join("%04d.png"))
+            // Players want even sides and colours at half the resolution.
+            .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"])
+            .arg(&target)
+            .stdin(Stdio::null())
+            .output();
+        match ended {
+            Ok(output) if output.status.success() => {}
+            Ok(output) => {
+                let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
+                self.problems.push(format!("ffmpeg made no {name}.mp4: {said}"));
+            }
+            Err(error) if error.kind() == ErrorKind::NotFound => {
+                if !self.problems.iter().any(|problem| problem == MISSING) {
+                    self.problems.push(MISSING.into());
+                }
+            }
+            Err(error) => self.problems.push(format!("ffmpeg made no {name}.mp4: {error}")),
+        }
+    }
+}
+
+/// What every video says of itself.
+fn common(task: &DotTask, about: &str, channels: usize) -> Map<String, Value> {
+    let axes: &[&str] = if channels == 1 { &["k", "t", "s"] } else { &["k", "t", "s", "rgb"] };
+    let entries = [
+        ("about", json!(about)),
+        ("axes", json!(axes)),
+        ("plan", json!(task.name)),
+        ("images_per_s", json!(1.0 / task.batches.path.duration_s())),
+        ("software", json!(crate::SOFTWARE)),
+    ];
+    entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
+    let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
+    let plan = &task.batches;
+    let settings = json!({
+        "rig": {
+            "pixel_format": task.format,
+            "white_dn": rig.camera.white_dn(),
+            "black_dn": rig.camera.black_dn(),
+            "mirror": rig.mirror.as_ref().map(|mirror| mirror.driver.name()),
+        },
+        "dots": plan.dots,
+        "camera_rate_hz": plan.camera_rate_hz(),
+        "exposure_us": plan.exposure_us,
+        "trailing_index": plan.trailing_index(),
+        "background_indices": plan.background_indices,
+        "samples": task.path.points().len(),
+        "rate_hz": task.path.rate_hz(),
+        "mirror_response": task.predistortion.as_ref().map(Predistortion::to_json),
+    });
+    let settings = settings.as_object().cloned().unwrap_or_default();
+    manifest::write(session, state, software, settings)?;
+    Ok(())
+}

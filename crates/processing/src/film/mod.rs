@@ -1,0 +1,113 @@
+//! Films: a light transport of each cycle of a few settings.
+
+mod process;
+mod report;
+
+use std::sync::Arc;
+
+use raysweep_config::{ConfigError, FilmPlan, Plan, RigFile};
+use raysweep_pipeline::{FilmSolver, Point, Registry, Role, Schedule, Stage};
+use raysweep_session::film::TransportFilm;
+use raysweep_session::{Result, Session};
+use serde_json::json;
+
+pub use self::process::process;
+pub use self::report::{shortcomings, write as write_report};
+use crate::plane::PlaneTask;
+
+/// Frames of the dark image: its noise is in every cycle, so there are many.
+const DARK_FRAMES: u32 = 32;
+
+/// A film on a plane rig.
+#[derive(Clone)]
+pub struct FilmTask {
+    /// The plan's own table.
+    pub film: FilmPlan,
+    /// The dark image, the settings of a cycle, and the model.
+    pub task: Arc<PlaneTask>,
+}
+
+impl FilmTask {
+    /// A film on a rig; see [`PlaneTask::new`].
+    ///
+    /// # Errors
+    /// Where the plan names products, which are made of sweeps.
+    pub fn new(plan: &Plan, film: FilmPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
+        let task = PlaneTask::new(plan, schedule(&film), film.max_jitter_us, rig, first_row, size);
+        Self { film, task: Arc::new(task) }
+    }
+
+    /// How many cycles it stores.
+    pub fn points(&self) -> usize {
+        self.film.cycles as usize
+    }
+
+    /// The stages that the plan names. Each cycle has a transport of its own, which no fold over the whole run makes.
+    ///
+    /// # Errors
+    /// With the place in the plan's text of the stage that cannot be made.
+    pub fn stages(&self, registry: &Registry) -> std::result::Result<Arc<[Box<dyn Stage>]>, ConfigError> {
+        let (stages, _) = self.task.made_stages(registry, |fold, _| {
+            let name = fold.name();
+            (name != "demux").then(|| format!("{name} is not for films: their only fold is demux"))
+        })?;
+        Ok(stages)
+    }
+
+    /// What makes transports of the cycles.
+    ///
+    /// # Errors
+    /// When delays and exposure make no model on this rig.
+    pub fn solver(&self) -> std::result::Result<FilmSolver, ConfigError> {
+        let task = &self.task;
+        FilmSolver::new(task.demux_options()?, &task.schedule, &task.geometry)
+            .map_err(|error| task.refuse(&["film"], error.to_string()))
+    }
+}
+
+/// The dark image, then the settings of one cycle in the plan's order. There is no regular image: what it would check
+/// has moved on.
+fn schedule(film: &FilmPlan) -> Schedule {
+    let exposure_us = film.exposure_us;
+    let dark = Point { role: Role::Dark(0), delay_us: 0.0, exposure_us, frames: DARK_FRAMES };
+    let setting = |(index, delay_us)| Point { role: Role::Sweep(index), delay_us, exposure_us, frames: 1 };
+    let settings = (0..).zip(film.delay_us.values()).map(setting);
+    Schedule { points: std::iter::once(dark).chain(settings).collect() }
+}
+
+/// Makes the empty series of a film's transports, in place of what is there.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn create_transports(
+    session: &Session,
+    task: &FilmTask,
+    reach_rows: (i32, i32),
+) -> Result<TransportFilm> {
+    let geometry = &task.task.geometry;
+    let (u_min, u_max) = reach_rows;
+    let mut attributes = task.task.metadata();
+    attributes.insert("u_min".into(), json!(u_min));
+    attributes.insert("u_max".into(), json!(u_max));
+    attributes.insert(
+        "about".into(),
+        json!("light from projector row v = t + first_row + u to camera pixel (t, s), by cycle; 0 where the projector has no such row, NaN where the cycle was not estimated"),
+    );
+    let cycle = [(u_max - u_min + 1) as usize, geometry.height, geometry.width];
+    TransportFilm::create(&session.transport_film_path(), task.points(), cycle, &attributes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_film_has_a_dark_image_and_one_frame_a_setting() {
+        let plan = Plan::parse("kind = \"film\"\n[film]\ndelay_us = [100, 0]\nexposure_us = 200").unwrap();
+        let raysweep_config::Procedure::Film(film) = plan.procedure else { panic!("{plan:?}") };
+        let schedule = schedule(&film);
+        assert_eq!((schedule.dark_len(), schedule.sweep_len(), schedule.points.len()), (1, 2, 3));
+        assert_eq!((schedule.points[1].delay_us, schedule.points[1].frames), (100.0, 1));
+        assert!(schedule.points.iter().all(|point| point.exposure_us == 200.0));
+    }
+}

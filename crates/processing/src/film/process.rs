@@ -1,0 +1,116 @@
+//! Offline: the transports of a film made again from its stored frames.
+
+use std::sync::Arc;
+
+use ndarray::{Array2, Axis};
+use raysweep_config::FilmPlan;
+use raysweep_core::{Counts, SettingsId};
+use raysweep_pipeline::{Registry, Stage, Unit, run_stages};
+use raysweep_session::Session;
+use raysweep_session::film::{CycleEntry, crc32};
+use raysweep_session::ledger::State;
+use raysweep_session::stack::ArrayName;
+use raysweep_transport::plane::Setting;
+
+use super::{FilmTask, write_report};
+use crate::plane::{manifest, unit_of};
+use crate::stored::{Asked, ProcessError, Processed, Stored};
+
+/// Makes the transports of a stored film again.
+///
+/// # Errors
+/// When the film has no products to ask for, or the disk refuses.
+pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Processed, ProcessError> {
+    let Stored { session, state, plan, .. } = stored;
+    let rig = stored.plane_rig()?;
+    let shape = state.session.shape;
+    let task = FilmTask::new(plan, film, &rig, state.session.first_row, (shape.rows, shape.columns));
+    let stages = task.stages(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
+    if !asked.products.is_empty() {
+        let message = "a film has no products to ask for: leave --product out";
+        return Err(ProcessError::Product(message.into()));
+    }
+    let problems = make_transports(session, &task, state, &stages)?;
+    write_report(session, state, &task, &problems)?;
+    manifest::write(session, state, &task.task, &rig)?;
+    Ok(Processed {
+        report: session.report_path(),
+        stored: state.stored_points(),
+        points: shape.points(),
+        problems,
+    })
+}
+
+/// Makes the transports of all stored cycles; returns what could not be made, and why.
+fn make_transports(
+    session: &Session,
+    task: &FilmTask,
+    state: &State,
+    stages: &[Box<dyn Stage>],
+) -> raysweep_session::Result<Vec<String>> {
+    let solver = match task.solver() {
+        Ok(solver) => solver,
+        Err(error) => return Ok(vec![error.to_string()]),
+    };
+    let Some(dark) = dark_image(session, state, stages)? else {
+        return Ok(vec!["the dark image is missing or damaged: no transport can be made without it".into()]);
+    };
+    let film = session.film()?;
+    let transports = super::create_transports(session, task, solver.reach_rows())?;
+    let mut problems = Vec::new();
+    for entry in state.cycles() {
+        let frames = match film.read(entry.cycle) {
+            Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,
+            Ok(_) => {
+                problems.push(format!("cycle {} is damaged: its checksum is not the ledger's", entry.cycle));
+                continue;
+            }
+            Err(error) => {
+                problems.push(format!("cycle {} is damaged ({error})", entry.cycle));
+                continue;
+            }
+        };
+        let images = frames.axis_iter(Axis(0)).zip(task.task.settings()).zip(&entry.delays_us).map(
+            |((frame, (ordinal, _)), &delay_us)| {
+                let unit = frame_unit(ordinal, entry, delay_us, frame.mapv(u32::from));
+                let setting = Setting::new(delay_us, entry.exposure_us);
+                run_stages(stages, &unit).map(|image| (setting, Arc::new(image)))
+            },
+        );
+        let solved = images
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(|error| error.to_string())
+            .and_then(|images| solver.solve(&images, &dark, &|| true).map_err(|error| error.to_string()));
+        match solved {
+            Ok(transport) => transports.write(entry.cycle, transport.t.view())?,
+            Err(error) => problems.push(format!("cycle {}: {error}", entry.cycle)),
+        }
+    }
+    Ok(problems)
+}
+
+fn frame_unit(ordinal: u32, entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
+    Unit {
+        id: SettingsId { point: ordinal, attempt: entry.cycle as u32 },
+        frames: 1,
+        exposure_us: entry.exposure_us,
+        delays_us: vec![delay_us],
+        last_exposure_ns: None,
+        sum: Arc::new(sum),
+        counts: Counts::default(),
+    }
+}
+
+/// The stored dark image after all stages, if it is sound.
+fn dark_image(
+    session: &Session,
+    state: &State,
+    stages: &[Box<dyn Stage>],
+) -> raysweep_session::Result<Option<Array2<f32>>> {
+    let Some(entry) = state.point(ArrayName::Dark, 0) else { return Ok(None) };
+    let sum = session.stack()?.read_point(ArrayName::Dark, 0)?;
+    if raysweep_session::stack::crc32(sum.view()) != entry.crc32 {
+        return Ok(None);
+    }
+    Ok(run_stages(stages, &unit_of(0, entry, sum)).ok())
+}

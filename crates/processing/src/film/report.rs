@@ -1,0 +1,187 @@
+//! The report of a film: some of its cycles at a glance, and how well it kept its pace.
+
+use ndarray::{Array2, ArrayView2, Axis, s};
+use raysweep_core::Percentiles;
+use raysweep_session::film::TransportFilm;
+use raysweep_session::ledger::State;
+use raysweep_session::report::{
+    Block, ContactSheet, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, ToneMap,
+};
+use raysweep_session::{Result, Session};
+
+use super::FilmTask;
+use crate::plane::report::{jitter, settings};
+use crate::report::{accounts, subtitle};
+
+/// Cycles on the contact sheet.
+const SHOWN: usize = 8;
+/// Share of pixels, in percent, that a picture's scale does not overexpose.
+const PERCENTILE: f64 = 99.5;
+
+/// Writes the report of a film.
+///
+/// # Errors
+/// When its transports cannot be read or the disk refuses.
+pub fn write(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<()> {
+    let page = make(session, state, task, problems)?.to_html()?;
+    raysweep_session::durable::write(&session.report_path(), page.as_bytes())
+}
+
+fn make(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<Report> {
+    let mut sections = Vec::new();
+    let mut blocks: Vec<Block> =
+        problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone())).collect();
+    blocks.extend(shortcomings(state).into_iter().map(|text| Block::Note(NoteLevel::Warning, text)));
+    if !blocks.is_empty() {
+        sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
+    }
+    sections.push(cycles(session, state)?);
+    sections.push(pace(state));
+    sections.push(trust(state, task));
+    Ok(Report {
+        title: state.session.name.clone(),
+        subtitle: subtitle(state, session),
+        facts: facts(state, task),
+        sections,
+    })
+}
+
+/// What makes the film less than it was to be.
+pub fn shortcomings(state: &State) -> Vec<String> {
+    let Some(film) = &state.film else { return Vec::new() };
+    let mut texts = Vec::new();
+    if film.cycles_incomplete > 0 {
+        texts.push(format!(
+            "{} cycles lack a frame and are not stored; the ledger says which frames, and why",
+            film.cycles_incomplete
+        ));
+    }
+    if film.transports_missing > 0 {
+        texts.push(format!(
+            "{} stored cycles had no transport when the film ended: `raysweep process` makes them",
+            film.transports_missing
+        ));
+    }
+    texts
+}
+
+fn facts(state: &State, task: &FilmTask) -> Vec<(String, String)> {
+    let delays = task.film.delay_us.values();
+    let (first, last) = (
+        delays.iter().fold(f64::INFINITY, |a, &b| a.min(b)),
+        delays.iter().fold(f64::NEG_INFINITY, |a, &b| a.max(b)),
+    );
+    let per_second = state.film.as_ref().and_then(|film| film.cycles_per_s);
+    [
+        ("delay", format!("{first:.0} … {last:.0} µs in {}", delays.len())),
+        ("exposure", format!("{:.0} µs", task.film.exposure_us)),
+        ("cycles stored", format!("{} of {}", state.stored_points(), task.points())),
+        ("cycles a second", per_second.map_or_else(|| "–".into(), |pace| format!("{pace:.3}"))),
+        ("camera", format!("{} × {} px", state.session.shape.columns, state.session.shape.rows)),
+        ("frames lost", state.counts.lost_total().to_string()),
+    ]
+    .map(|(key, value)| (key.to_owned(), value))
+    .to_vec()
+}
+
+/// The epipolar and the indirect image of some cycles, evenly spread.
+fn cycles(session: &Session, state: &State) -> Result<Section> {
+    let transports = TransportFilm::open(&session.transport_film_path()).ok();
+    let stored: Vec<_> = state.cycles().collect();
+    let shown = SHOWN.min(stored.len());
+    let mut labels = Vec::new();
+    let mut images: Vec<[Array2<f32>; 2]> = Vec::new();
+    for place in 0..shown {
+        let entry = stored[place * (stored.len() - 1) / (shown - 1).max(1)];
+        // What is damaged stands among the problems.
+        let read = transports.as_ref().and_then(|film| film.read(entry.cycle).ok().flatten());
+        let own_row = transports.as_ref().and_then(|film| film.attributes().get("u_min")?.as_i64());
+        if let (Some(transport), Some(u_min)) = (read, own_row) {
+            // Delays that are all long reach no pixel's own row.
+            let own_row = usize::try_from(-u_min).ok().filter(|&own_row| own_row < transport.len_of(Axis(0)));
+            let epipolar = match own_row {
+                Some(own_row) => transport.slice(s![own_row, .., ..]).to_owned(),
+                None => Array2::zeros((transport.len_of(Axis(1)), transport.len_of(Axis(2)))),
+            };
+            let indirect = transport.sum_axis(Axis(0)) - &epipolar;
+            labels.push(format!("{} ({:.2} s)", entry.cycle, entry.start_s));
+            images.push([epipolar, indirect]);
+        }
+    }
+    let sheet = |kind: usize, name: &str| {
+        let views: Vec<ArrayView2<'_, f32>> = images.iter().map(|image| image[kind].view()).collect();
+        let tone_map = ToneMap::percentile(&views, PERCENTILE);
+        Block::ContactSheet(ContactSheet {
+            column_title: "cycle".into(),
+            columns: labels.clone(),
+            row_title: "light".into(),
+            rows: vec![name.into()],
+            pictures: views.iter().map(|view| Some(Picture::thumbnail(*view, tone_map))).collect(),
+        })
+    };
+    let blocks = match images.is_empty() {
+        true => vec![Block::Note(NoteLevel::Warning, "No cycle has a transport.".into())],
+        false => vec![sheet(0, "epipolar"), sheet(1, "indirect")],
+    };
+    Ok(Section {
+        title: "The film".into(),
+        intro: "Some of the cycles, evenly spread. Epipolar: light from the pixel's own projector row; indirect: from all others within the reach. Each sheet has one scale.".into(),
+        blocks,
+    })
+}
+
+fn pace(state: &State) -> Section {
+    let film = state.film.clone().unwrap_or_default();
+    let mut entries = vec![
+        ("cycles planned", film.cycles_planned.to_string()),
+        ("stored", film.cycles_stored.to_string()),
+        ("incomplete", film.cycles_incomplete.to_string()),
+        ("transports made during the film", film.transports.to_string()),
+        ("sliding estimates", film.sliding_estimates.to_string()),
+    ];
+    match film.latency_ms {
+        Some(Percentiles { p50, p95, p99, max }) => {
+            let text = format!("{p50:.0} / {p95:.0} / {p99:.0} / {max:.0} ms");
+            entries.push(("latency p50 / p95 / p99 / max", text));
+        }
+        None => entries.push(("latency", "not measured: the clock was a virtual one".into())),
+    }
+    let starts: Vec<_> = state.cycles().collect();
+    let lengths = starts.windows(2).filter(|pair| pair[1].cycle == pair[0].cycle + 1);
+    let points = lengths.map(|pair| (pair[1].cycle as f64, 1e3 * (pair[1].start_s - pair[0].start_s)));
+    let plot = Plot {
+        title: "From the start of a cycle to that of the next".into(),
+        x_label: "cycle".into(),
+        y_label: "time / ms".into(),
+        series: vec![Series { name: "cycles".into(), style: SeriesStyle::Dots, points: points.collect() }],
+        guides: Vec::new(),
+    };
+    Section {
+        title: "Pace".into(),
+        intro: "Latency runs from the end of a cycle's last exposure to the publication of its transport."
+            .into(),
+        blocks: vec![
+            Block::Facts(entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()),
+            Block::Plots(vec![plot]),
+        ],
+    }
+}
+
+fn trust(state: &State, task: &FilmTask) -> Section {
+    let wanted = task.film.delay_us.values();
+    let deviations: Vec<f64> = state
+        .cycles()
+        .flat_map(|cycle| cycle.delays_us.iter().zip(&wanted).map(|(true_us, wanted_us)| true_us - wanted_us))
+        .collect();
+    let mut blocks = vec![settings(state, &task.task)];
+    blocks.extend(accounts(state));
+    blocks.push(Block::Plots(jitter(&deviations)));
+    Section {
+        title: "How far to trust it".into(),
+        intro: format!(
+            "Every frame is tied to the VSYNC edge of its light; a frame further than {:.0} µs from the wanted delay does not count, and its cycle is not stored. The model uses the measured delays.",
+            task.film.max_jitter_us
+        ),
+        blocks,
+    }
+}

@@ -1,0 +1,142 @@
+//! The response that a run has found, where the runs that follow find it.
+
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use raysweep_config::rig::dots::ResponseKey;
+use raysweep_config::{ConfigError, DotRigFile};
+use raysweep_core::SecondOrder;
+use raysweep_session::ledger::State;
+use raysweep_session::{Error, Result, Session, durable};
+use raysweep_transport::dots::identify::{Identified, Resonance};
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+/// The file in the daemon's data folder; a session's has the same name.
+pub fn path_in(folder: &Path) -> PathBuf {
+    folder.join("mirror-response.json")
+}
+
+/// `mirror-response.json`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KeptResponse {
+    /// When its session was begun.
+    pub identified: Timestamp,
+    /// Name of that session's folder.
+    pub session: String,
+    /// The axis in the plane of incidence.
+    pub x: AxisResponse,
+    /// The axis across it.
+    pub y: AxisResponse,
+}
+
+/// One axis.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AxisResponse {
+    /// Its resonance.
+    pub f0_hz: f64,
+    /// Its quality factor.
+    pub q: f64,
+    /// How late it answers, from the first frame's exposure on.
+    pub delay_s: f64,
+    /// Share of the measured movement that this does not explain.
+    pub residual: f64,
+    /// The band in which it was found to hold.
+    pub band_hz: [f64; 2],
+}
+
+impl From<&Identified> for AxisResponse {
+    fn from(found: &Identified) -> Self {
+        let Identified { resonance: Resonance { f0_hz, q }, delay_s, residual, band_hz, .. } = *found;
+        Self { f0_hz, q, delay_s, residual, band_hz }
+    }
+}
+
+impl KeptResponse {
+    /// What was found in a session.
+    pub fn new(session: &Session, state: &State, [x, y]: [&Identified; 2]) -> Self {
+        let name = session.dir().file_name().unwrap_or(session.dir().as_os_str());
+        Self {
+            identified: state.session.created,
+            session: name.to_string_lossy().into_owned(),
+            x: x.into(),
+            y: y.into(),
+        }
+    }
+
+    /// Writes it: all of it or nothing, durably.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let mut text = serde_json::to_vec_pretty(self).map_err(|error| Error::Codec {
+            action: "encode",
+            what: path.display().to_string(),
+            why: error.to_string(),
+        })?;
+        text.push(b'\n');
+        durable::write(path, &text)
+    }
+
+    fn read(path: &Path) -> std::result::Result<Self, String> {
+        let text = std::fs::read(path).map_err(|error| error.to_string())?;
+        let kept: Self = serde_json::from_slice(&text).map_err(|error| error.to_string())?;
+        Ok(kept)
+    }
+}
+
+/// What a run's path is distorted by beforehand, and from where that is known.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Predistortion {
+    /// Of x and y.
+    pub responses: [SecondOrder; 2],
+    /// What was identified; none where the rig file states it.
+    kept: Option<KeptResponse>,
+}
+
+impl Predistortion {
+    /// As the rig file wants it; what was identified lies in `folder`, the daemon's data or a session's.
+    ///
+    /// # Errors
+    /// When what was identified is to be used and cannot be read.
+    pub fn of(rig: &DotRigFile, folder: &Path) -> std::result::Result<Option<Self>, ConfigError> {
+        match rig.mirror.as_ref().and_then(|mirror| mirror.response) {
+            None => Ok(None),
+            Some(ResponseKey::Stated(responses)) => Ok(Some(Self { responses, kept: None })),
+            Some(ResponseKey::Found(_)) => {
+                let path = path_in(folder);
+                let kept = KeptResponse::read(&path).map_err(|why| {
+                    ConfigError::of_field(
+                        "mirror.response",
+                        format!(
+                            "the rig file's mirror.response = \"identified\" needs {} ({why}): run a plan of kind = \"response\" first, such as plans/mirror-response.toml, or state mirror.response in numbers",
+                            path.display()
+                        ),
+                    )
+                })?;
+                let responses =
+                    [kept.x, kept.y].map(|AxisResponse { f0_hz, q, .. }| SecondOrder { f0_hz, q });
+                Ok(Some(Self { responses, kept: Some(kept) }))
+            }
+        }
+    }
+
+    /// Keeps what was identified with the session whose path it distorted.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn keep(&self, session: &Session) -> Result<()> {
+        self.kept.as_ref().map_or(Ok(()), |kept| kept.write(&session.mirror_response_path()))
+    }
+
+    /// For the manifest.
+    pub fn to_json(&self) -> Value {
+        let [x, y] = self.responses;
+        match &self.kept {
+            Some(kept) => json!({ "x": x, "y": y, "identified": kept.identified, "session": kept.session }),
+            None => json!({ "x": x, "y": y, "stated_in": "rig.toml" }),
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! What procedures of the plane rig have in common: points, and the model that turns counts into light.
+
+pub mod manifest;
+pub mod report;
+
+use std::sync::Arc;
+
+use ndarray::Array2;
+use raysweep_config::rig::plane::{ScanKind, SpotKind};
+use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
+use raysweep_core::SettingsId;
+use raysweep_pipeline::{
+    DemuxOptions, Entry, Fold, Point, Registry, RegistryError, Role, Scan, Schedule, Spot, Stage,
+    SweepGeometry, Unit,
+};
+use raysweep_session::ledger::PointEntry;
+use raysweep_session::stack::ArrayName;
+use serde_json::{Map, Value, json};
+
+/// The points of a plan on a plane rig: everything that acquisition and processing have in common.
+#[derive(Clone)]
+pub struct PlaneTask {
+    /// The plan's name.
+    pub name: String,
+    /// What is done to each image.
+    pub stages: Vec<StageTable>,
+    /// Frames whose measured delay is further off do not count.
+    pub max_jitter_us: f64,
+    /// The points.
+    pub schedule: Schedule,
+    /// What turns counts into light transport.
+    pub geometry: SweepGeometry,
+    places: Places,
+}
+
+impl PlaneTask {
+    /// The points of `plan` on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its
+    /// row 0.
+    pub fn new(
+        plan: &Plan,
+        schedule: Schedule,
+        max_jitter_us: f64,
+        rig: &RigFile,
+        first_row: usize,
+        size: (usize, usize),
+    ) -> Self {
+        let geometry = SweepGeometry {
+            raster: rig.raster(),
+            row_table_us: rig.projector.row_table.as_deref().map(Into::into),
+            beam_sigma_rows: rig.projector.beam_sigma_rows,
+            spot: spot(rig.projector.spot, rig.projector.scan),
+            projector_columns: rig.camera.projector_columns,
+            first_row,
+            row_pitch: rig.camera.row_pitch,
+            camera_row_time_us: rig.camera_row_time_us(),
+            height: size.0,
+            width: size.1,
+            white_dn: rig.camera.white_dn(),
+            saturation_dn: crate::saturation_dn(rig.camera.pixel_format),
+        };
+        let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
+        Self { name, stages, max_jitter_us, schedule, geometry, places }
+    }
+
+    /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
+    pub fn settings(&self) -> impl Iterator<Item = (u32, &Point)> {
+        (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, Role::Sweep(_)))
+    }
+
+    /// An error about a value of the plan.
+    pub fn refuse(&self, path: &[&str], message: impl Into<String>) -> ConfigError {
+        self.places.error(path, message)
+    }
+
+    /// The options of `demux` as the plan states them.
+    ///
+    /// # Errors
+    /// When it has others.
+    pub fn demux_options(&self) -> Result<DemuxOptions, ConfigError> {
+        let Some(stage) = self.stages.iter().find(|stage| stage.name == "demux") else {
+            return Ok(DemuxOptions::default());
+        };
+        serde_json::from_value(Value::Object(stage.options.clone()))
+            .map_err(|error| self.refuse(&["stage"], format!("stage demux: {error}")))
+    }
+
+    /// The stages and folds that the plan names.
+    ///
+    /// # Errors
+    /// With the place in the plan of the stage that cannot be made, or that `refused` gives a reason against.
+    pub(crate) fn made_stages(
+        &self,
+        registry: &Registry,
+        refused: impl Fn(&dyn Fold, &[Box<dyn Fold>]) -> Option<String>,
+    ) -> Result<(Stages, Vec<Box<dyn Fold>>), ConfigError> {
+        let mut stages = Vec::new();
+        let mut folds: Vec<Box<dyn Fold>> = Vec::new();
+        for (index, stage) in self.stages.iter().enumerate() {
+            let place = index.to_string();
+            let refuse = |message: String| self.refuse(&["stage", &place, "name"], message);
+            let options = Value::Object(stage.options.clone());
+            let made = registry
+                .make(&stage.name, options, &self.schedule, &self.geometry)
+                .map_err(|error: RegistryError| refuse(error.to_string()))?;
+            match made {
+                Entry::Stage(stage) => stages.push(stage),
+                Entry::Fold(fold) => match refused(&*fold, &folds) {
+                    Some(message) => return Err(refuse(message)),
+                    None => folds.push(fold),
+                },
+            }
+        }
+        Ok((stages.into(), folds))
+    }
+
+    /// What every product says of itself.
+    pub(crate) fn metadata(&self) -> Map<String, Value> {
+        let geometry = &self.geometry;
+        let prior = self.stages.iter().find(|stage| stage.name == "demux");
+        let entries = [
+            ("units", json!("1 = a white pixel lit by its own projector row")),
+            ("plan", json!(self.name)),
+            ("demux", json!(prior.map(|stage| &stage.options))),
+            ("row_time_us", json!(geometry.raster.row_time_us)),
+            ("row_table", json!(geometry.row_table_us.is_some())),
+            ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
+            ("first_row", json!(geometry.first_row)),
+            ("row_pitch", json!(geometry.row_pitch)),
+            ("camera_row_time_us", json!(geometry.camera_row_time_us)),
+            ("white_dn", json!(geometry.white_dn)),
+            ("software", json!(crate::SOFTWARE)),
+        ];
+        entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+    }
+}
+
+/// What is done to each image, in order.
+pub type Stages = Arc<[Box<dyn Stage>]>;
+
+/// When within its row a pixel's direct light arrives.
+fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
+    match (kind, scan) {
+        (SpotKind::Uniform, _) => Spot::Uniform,
+        (SpotKind::Flying, None | Some(ScanKind::Unknown)) => Spot::Flying(Scan::Unknown),
+        (SpotKind::Flying, Some(ScanKind::OneWay)) => Spot::Flying(Scan::OneWay),
+        (SpotKind::Flying, Some(ScanKind::Bidirectional)) => Spot::Flying(Scan::Bidirectional),
+    }
+}
+
+/// Where in the stack a point lies.
+pub fn place(role: Role) -> (ArrayName, usize) {
+    match role {
+        Role::Sweep(index) => (ArrayName::Sum, index as usize),
+        Role::Dark(index) => (ArrayName::Dark, index as usize),
+        Role::Regular => (ArrayName::Regular, 0),
+    }
+}
+
+/// A stored point as the pipeline gave it.
+pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
+    Unit {
+        id: SettingsId { point: ordinal, attempt: entry.attempt },
+        frames: entry.frames,
+        exposure_us: entry.exposure_us,
+        delays_us: entry.delays_us.clone(),
+        last_exposure_ns: None,
+        sum: Arc::new(sum),
+        counts: entry.counts.clone(),
+    }
+}

@@ -1,0 +1,92 @@
+//! What the reports of a plane rig's procedures have in common.
+
+use std::collections::BTreeMap;
+
+use raysweep_pipeline::{Spot, SweepGeometry};
+use raysweep_session::ledger::State;
+use raysweep_session::report::{Block, Plot, Series, SeriesStyle};
+
+use super::PlaneTask;
+
+/// How far the delays of single frames lay from those wanted: over time, and how often.
+pub(crate) fn jitter(deviations_us: &[f64]) -> Vec<Plot> {
+    let mut histogram: BTreeMap<i64, f64> = BTreeMap::new();
+    for us in deviations_us {
+        *histogram.entry(us.round() as i64).or_default() += 1.0;
+    }
+    let plot = |title: &str, x: &str, y: &str, style, points| Plot {
+        title: title.into(),
+        x_label: x.into(),
+        y_label: y.into(),
+        series: vec![Series { name: "frames".into(), style, points }],
+        guides: Vec::new(),
+    };
+    vec![
+        plot(
+            "Delay of each frame, measured minus wanted",
+            "frame",
+            "deviation / µs",
+            SeriesStyle::Dots,
+            deviations_us.iter().enumerate().map(|(index, &us)| (index as f64, us)).collect(),
+        ),
+        plot(
+            "How often each deviation occurred",
+            "deviation / µs",
+            "frames",
+            SeriesStyle::Bars,
+            histogram.into_iter().map(|(us, frames)| (us as f64, frames)).collect(),
+        ),
+    ]
+}
+
+/// What the rig and the plan said, so that reports can be compared.
+pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
+    let geometry = &task.geometry;
+    let stages = task.stages.iter().map(|stage| {
+        let options: Vec<String> =
+            stage.options.iter().map(|(key, value)| format!("{key} = {value}")).collect();
+        if options.is_empty() {
+            stage.name.clone()
+        } else {
+            format!("{} ({})", stage.name, options.join(", "))
+        }
+    });
+    let entries = [
+        ("stages", stages.collect::<Vec<_>>().join(", ")),
+        ("row time", row_times(geometry)),
+        ("beam", beam(geometry)),
+        ("first row after VSYNC", format!("{} µs", geometry.raster.first_row_us)),
+        (
+            "projector rows",
+            format!(
+                "{}, the camera's first sees row {}, each of its rows {} further",
+                geometry.raster.rows, geometry.first_row, geometry.row_pitch
+            ),
+        ),
+        ("white", format!("{} counts above black", geometry.white_dn)),
+        ("software", state.session.software.clone()),
+    ];
+    Block::Facts(entries.map(|(key, value)| (key.to_owned(), value)).to_vec())
+}
+
+/// When rows are lit and exposed, as the model takes it.
+fn row_times(geometry: &SweepGeometry) -> String {
+    let table = if geometry.row_table_us.is_some() { ", by the measured table" } else { "" };
+    format!(
+        "projector {} µs{table}, camera {:.4} µs",
+        geometry.raster.row_time_us, geometry.camera_row_time_us
+    )
+}
+
+/// How a row's light spreads in space and time, as the model takes it.
+fn beam(geometry: &SweepGeometry) -> String {
+    let spot = match geometry.spot {
+        Spot::Uniform => "rows lit evenly",
+        Spot::Flying(_) => "a flying spot",
+    };
+    match geometry.beam_sigma_rows {
+        Some(0.0) => format!("ideal, {spot}"),
+        Some(sigma_rows) => format!("sigma {sigma_rows} rows, {spot}"),
+        None => format!("not stated by the rig, {spot}"),
+    }
+}

@@ -1,0 +1,70 @@
+//! What the reports of all procedures have in common.
+
+use raysweep_core::SettingsLatency;
+use raysweep_session::Session;
+use raysweep_session::ledger::State;
+use raysweep_session::report::{Block, NoteLevel, Table};
+
+/// When, by whom and of what a session was taken.
+pub(crate) fn subtitle(state: &State, session: &Session) -> String {
+    let entry = &state.session;
+    let parts = [
+        Some(entry.created.strftime("%Y-%m-%d %H:%M UTC").to_string()),
+        entry.operator.as_ref().map(|operator| format!("by {operator}")),
+        entry.sample.as_ref().map(|sample| format!("sample {sample}")),
+        (!entry.tags.is_empty()).then(|| entry.tags.join(", ")),
+        entry.note.clone(),
+        session.dir().file_name().map(|name| name.to_string_lossy().into_owned()),
+    ];
+    parts.into_iter().flatten().collect::<Vec<_>>().join(" · ")
+}
+
+/// Where the frames went, and what the VSYNC line was like.
+pub(crate) fn accounts(state: &State) -> Vec<Block> {
+    let counts = &state.counts;
+    let mut rows = vec![
+        vec!["expected triggers".to_owned(), counts.expected.to_string()],
+        vec!["averaged".into(), counts.averaged.to_string()],
+        vec!["settling".into(), counts.settling.to_string()],
+        vec!["cancelled".into(), counts.cancelled.to_string()],
+    ];
+    for (cause, frames) in &counts.lost {
+        let cause = serde_json::to_value(cause)
+            .ok()
+            .and_then(|value| value.as_str().map(|name| name.replace('_', " ")));
+        rows.push(vec![format!("lost: {}", cause.unwrap_or_default()), frames.to_string()]);
+    }
+    let mut blocks = vec![Block::Table(Table { headers: vec!["frames".into(), "count".into()], rows })];
+    if !counts.balanced() {
+        blocks.push(Block::Note(
+            NoteLevel::Error,
+            "The frames do not add up to the expected triggers: this is a defect.".into(),
+        ));
+    }
+    if let Some(end) = &state.end {
+        let light = end.light_s.map(|s| ("first to last frame with light", format!("{s:.2} s")));
+        let latency = end.settings_latency.map(|SettingsLatency { min_frames, max_frames }| {
+            ("camera settings act", format!("{min_frames} to {max_frames} frames late"))
+        });
+        let facts: Vec<_> =
+            light.into_iter().chain(latency).map(|(key, value)| (key.to_owned(), value)).collect();
+        if !facts.is_empty() {
+            blocks.push(Block::Facts(facts));
+        }
+    }
+    if let Some(vsync) = state.end.as_ref().and_then(|end| end.vsync) {
+        let allan = vsync.allan_1s.map(|allan| ("Allan deviation over 1 s", format!("{allan:.1e}")));
+        let facts = [
+            ("VSYNC period", format!("{:.3} µs", vsync.period_us)),
+            ("edge jitter (sigma)", format!("{:.2} µs", vsync.jitter_us)),
+            ("99 % of the edges within", format!("{:.1} µs", vsync.jitter_p99_us)),
+            (
+                "edges seen / missed / false",
+                format!("{} / {} / {}", vsync.edges, vsync.missed, vsync.false_edges),
+            ),
+        ];
+        let facts = facts.into_iter().chain(allan);
+        blocks.push(Block::Facts(facts.map(|(key, value)| (key.to_owned(), value)).collect()));
+    }
+    blocks
+}

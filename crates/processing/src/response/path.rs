@@ -1,0 +1,125 @@
+//! The chirp as the mirror plays it and as each frame sees it.
+
+use raysweep_config::ResponsePlan;
+use raysweep_core::{MirrorLimits, MirrorPath, PathError, Tilt};
+use raysweep_transport::dots::identify::chirp;
+
+/// The paths of both axes, x first, lit all the way.
+///
+/// # Errors
+/// The key of `[response]` and what is wrong, for a chirp that would take the mirror beyond its limits.
+pub fn paths(plan: &ResponsePlan, limits: &MirrorLimits) -> Result<[MirrorPath; 2], (&'static str, String)> {
+    let refused = |message| Err(("amplitude_deg", message));
+    let ResponsePlan { amplitude_deg, max_q, band_hz: [low_hz, high_hz], .. } = *plan;
+    // Limits of paths hold for what is commanded; at its resonance the mirror moves Q times as far.
+    let tilt_deg = amplitude_deg * max_q;
+    if tilt_deg > limits.max_tilt.0 {
+        return refused(format!(
+            "response.amplitude_deg = {amplitude_deg}: with response.max_q = {max_q} the mirror may move by {tilt_deg} degrees at its resonance, {} are allowed (mirror.limits.max_tilt); make the amplitude smaller, or max_q if no axis has that",
+            limits.max_tilt.0
+        ));
+    }
+    let deg_per_s = tilt_deg * std::f64::consts::TAU * high_hz;
+    if deg_per_s > limits.max_slew_deg_per_s {
+        return refused(format!(
+            "response.amplitude_deg = {amplitude_deg}: with response.max_q = {max_q} the mirror may move at {deg_per_s:.0} degrees/s at a resonance of {high_hz} Hz, {:.0} are allowed (mirror.limits.max_slew_deg_per_s); make the amplitude smaller, end band_hz lower, or make max_q smaller if no axis has that",
+            limits.max_slew_deg_per_s
+        ));
+    }
+    let tilts_deg = chirp(&(low_hz..=high_hz), amplitude_deg, plan.chirp_s, plan.rest_s, plan.rate_hz);
+    let path = |tilt: fn(f64) -> Tilt| {
+        MirrorPath::through(tilts_deg.iter().map(|&deg| tilt(deg)), plan.rate_hz, limits)
+    };
+    let both = path(|deg| Tilt::new(deg, 0.0)).and_then(|x| Ok([x, path(|deg| Tilt::new(0.0, deg))?]));
+    both.map_err(|error| {
+        let key = match error {
+            PathError::Points { .. } => "chirp_s",
+            _ => "amplitude_deg",
+        };
+        (key, format!("response.{key}: {error}"))
+    })
+}
+
+/// Frames of one axis whose exposures end within its path.
+pub fn frames(plan: &ResponsePlan, path: &MirrorPath) -> usize {
+    let duration_s = path.points().len() as f64 / path.rate_hz();
+    // An exposure that ends with the path is within it, whatever rounding says.
+    ((duration_s - plan.exposure_us * 1e-6) * plan.camera_rate_hz + 1e-6).floor() as usize + 1
+}
+
+/// What each frame's angle was commanded to be, in degrees: the mean of the path's samples over its exposure, each
+/// held until the next.
+pub fn commanded_deg(plan: &ResponsePlan, path: &MirrorPath, axis: usize) -> Vec<f64> {
+    let samples_per_frame = path.rate_hz() / plan.camera_rate_hz;
+    let exposure_samples = plan.exposure_us * 1e-6 * path.rate_hz();
+    let mean_deg = |frame: usize| {
+        let begin = frame as f64 * samples_per_frame;
+        let end = begin + exposure_samples;
+        let held = (begin as u64..end.ceil() as u64).map(|sample| {
+            let part = end.min(sample as f64 + 1.0) - begin.max(sample as f64);
+            part * path.at(sample).tilt.deg()[axis]
+        });
+        held.sum::<f64>() / exposure_samples
+    };
+    (0..frames(plan, path)).map(mean_deg).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raysweep_config::{ConfigError, Plan, Procedure};
+
+    const LIMITS: MirrorLimits = MirrorLimits::A7B2_3_3600AL;
+
+    fn parse(more: &str) -> Result<ResponsePlan, ConfigError> {
+        let plan = Plan::parse(&format!("kind = \"response\"\n{more}"))?;
+        let Procedure::Response(response) = plan.procedure else { panic!("{plan:?}") };
+        Ok(response)
+    }
+
+    #[test]
+    fn the_default_is_a_path() {
+        let plan = parse("").unwrap();
+        let [x, y] = paths(&plan, &LIMITS).unwrap();
+        assert_eq!(x.points().len(), 48_750);
+        assert!(x.points().iter().all(|point| point.tilt.y.0 == 0.0 && point.light == 255));
+        assert!(y.points().iter().all(|point| point.tilt.x.0 == 0.0));
+    }
+
+    #[test]
+    fn a_frame_is_commanded_the_mean_over_its_exposure() {
+        // 2.5 samples a frame, of which 2 are exposed.
+        let plan =
+            parse("[response]\nband_hz = [1, 2]\nrate_hz = 25\ncamera_rate_hz = 10\nexposure_us = 80000")
+                .unwrap();
+        let tilts = [0.0, 0.1, 0.2, 0.3, 0.2, 0.1, 0.0].map(|deg| Tilt::new(0.0, deg));
+        let path = MirrorPath::through(tilts, 25.0, &LIMITS).unwrap();
+        // Samples 0 and 1; half of 2, all of 3, half of 4; samples 5 and 6, with which the path ends.
+        let expected = [0.05, 0.25, 0.05];
+        let found = commanded_deg(&plan, &path, 1);
+        assert_eq!(found.len(), expected.len());
+        assert!(
+            found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-12),
+            "{found:?}"
+        );
+        assert!(commanded_deg(&plan, &path, 0).iter().all(|&deg| deg == 0.0));
+    }
+
+    #[test]
+    fn a_chirp_that_would_take_the_mirror_beyond_its_limits_is_none() {
+        let refused = |more: &str| {
+            let plan = parse(&format!("[response]\n{more}")).unwrap();
+            paths(&plan, &LIMITS).unwrap_err()
+        };
+        for (more, field, expected) in [
+            ("amplitude_deg = 0.014\nmax_q = 500", "amplitude_deg", "7 degrees at its resonance, 6.5"),
+            ("amplitude_deg = 0.015", "amplitude_deg", "max_slew_deg_per_s"),
+            ("chirp_s = 4", "chirp_s", "131072"),
+            // What limits hold for what is commanded: rms beyond the bandwidth of 200 Hz.
+            ("amplitude_deg = 0.5\nmax_q = 2", "amplitude_deg", "above the bandwidth"),
+        ] {
+            let (found, message) = refused(more);
+            assert!(found == field && message.contains(expected), "{more}: {found}: {message}");
+        }
+    }
+}

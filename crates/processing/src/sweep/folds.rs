@@ -1,0 +1,180 @@
+//! The stages and folds of a plan at work, and the products that are made of what they give.
+
+use std::any::Any;
+use std::fmt::Display;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+
+use ndarray::Array2;
+use raysweep_core::SettingsId;
+use raysweep_pipeline::{
+    Assembly, Findings, Fold, FoldError, ImageRows, InStrips, Product, ProductSpec, Snapshot, Stage, Strip,
+    Unit, message_of, run_stages,
+};
+use raysweep_session::STRIP_ROWS;
+use raysweep_session::ledger::State;
+use raysweep_session::stack::{Stack, crc32};
+
+use crate::plane::{PlaneTask, place, unit_of};
+
+/// The stages, folds and products of a plan.
+pub struct Processing {
+    /// Work on each unit alone.
+    pub stages: Arc<[Box<dyn Stage>]>,
+    /// Work on all units in order.
+    pub folds: Vec<Box<dyn Fold>>,
+    /// What is made of the transport of the folds.
+    pub products: Vec<ProductSpec>,
+    /// What could not be done so far, and why.
+    pub problems: Vec<String>,
+}
+
+impl Processing {
+    /// Passes points that are stored already through the stages into the folds, for as long as `go_on` says yes. A
+    /// point whose stage fails is left out, and named among the problems; so are points whose data are damaged, which
+    /// are returned: they must be acquired again.
+    pub fn feed_stored(
+        &mut self,
+        task: &PlaneTask,
+        state: &State,
+        stack: &Stack,
+        go_on: &dyn Fn() -> bool,
+    ) -> Vec<SettingsId> {
+        let mut damaged = Vec::new();
+        for (ordinal, point) in (0..).zip(&task.schedule.points) {
+            let (array, index) = place(point.role);
+            let Some(entry) = state.point(array, index).filter(|_| go_on()) else { continue };
+            let sum = match stack.read_point(array, index) {
+                Ok(sum) if crc32(sum.view()) == entry.crc32 => sum,
+                read => {
+                    let why = read
+                        .err()
+                        .map_or("its checksum is not the ledger's".into(), |error| error.to_string());
+                    self.problems.push(format!(
+                        "{} {index} is damaged ({why}): `raysweep resume` acquires it again",
+                        array.as_str()
+                    ));
+                    damaged.push(SettingsId { point: ordinal, attempt: state.next_attempt(array, index) });
+                    continue;
+                }
+            };
+            let unit = unit_of(ordinal, entry, sum);
+            match run_stages(&self.stages, &unit) {
+                Ok(image) => self.push(&unit, &image),
+                Err(error) => self.problems.push(error.to_string()),
+            }
+        }
+        damaged
+    }
+
+    /// Gives the folds a unit's image. A fold that panics is out, with its products; the others go on.
+    pub fn push(&mut self, unit: &Unit, image: &Array2<f32>) {
+        let problems = &mut self.problems;
+        self.folds.retain_mut(|fold| {
+            let pushed = catch_unwind(AssertUnwindSafe(|| fold.push(unit, image.view())));
+            pushed.map_err(|panic| problems.push(panicked(fold.name(), &*panic))).is_ok()
+        });
+    }
+
+    /// What the first fold that estimates while units come has so far.
+    pub fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
+        // A picture for between is no reason to lose a fold, let alone the run.
+        self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
+    }
+
+    /// Keeps no images from now on: [`Self::finish_in_strips`] reads them again.
+    pub fn keep_no_images(&mut self) {
+        self.folds.iter_mut().for_each(|fold| fold.keep_no_images());
+    }
+
+    /// [`Self::finish`] and [`Self::make_named`] after [`Self::keep_no_images`]: the transport goes into `write`, strip by strip, and is not among
+    /// the products.
+    pub fn finish_in_strips(
+        mut self,
+        images: &dyn ImageRows,
+        go_on: &(dyn Fn() -> bool + Sync),
+        write: &mut dyn FnMut(&Findings, &Strip) -> Result<(), String>,
+    ) -> (Vec<Product>, Vec<String>) {
+        let mut products = Vec::new();
+        let mut assemblies: Vec<Assembly> = self.products.drain(..).map(Assembly::new).collect();
+        let mut strips_taken = 0;
+        for fold in &mut self.folds {
+            let name = fold.name().to_owned();
+            let problems = &mut self.problems;
+            let mut take = |findings: &Findings, strip: Strip| {
+                write(findings, &strip).map_err(|what| FoldError { fold: name.clone(), what })?;
+                assemblies.retain_mut(|assembly| {
+                    let Strip { first_row, stack, transport } = &strip;
+                    let product = assembly.name().to_owned();
+                    let added = caught(&product, || assembly.add(*first_row, stack, transport));
+                    added.map_err(|problem| problems.push(problem)).is_ok()
+                });
+                strips_taken += 1;
+                Ok(())
+            };
+            let strips = InStrips { images, strip_rows: STRIP_ROWS, take: &mut take };
+            match caught(&name, || fold.finish_in_strips(strips, go_on)) {
+                Ok(made) => products.extend(made),
+                Err(problem) => {
+                    // Images of which rows are lacking are none.
+                    assemblies.clear();
+                    self.problems.push(problem);
+                }
+            }
+        }
+        for assembly in assemblies.into_iter().filter(|_| strips_taken > 0) {
+            let product = assembly.name().to_owned();
+            match caught(&product, || assembly.finish()) {
+                Ok(product) => products.push(product),
+                Err(problem) => self.problems.push(problem),
+            }
+        }
+        (products, self.problems)
+    }
+
+    /// The products of all folds. Ends early soon after `go_on` says no.
+    pub fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
+        let mut products = Vec::new();
+        for fold in &mut self.folds {
+            let name = fold.name().to_owned();
+            match caught(&name, || fold.finish(go_on)) {
+                Ok(made) => products.extend(made),
+                Err(problem) => self.problems.push(problem),
+            }
+        }
+        products
+    }
+
+    /// The products that the plan names, if the folds have made what they are made of.
+    pub fn make_named(&mut self, made: &[Product], go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
+        let transport = made.iter().find_map(|product| match product {
+            Product::Transport(transport) => Some(&**transport),
+            _ => None,
+        });
+        let stack = made.iter().find_map(|product| match product {
+            Product::Stack(stack) => Some(&**stack),
+            _ => None,
+        });
+        let Some((transport, stack)) = transport.zip(stack) else { return Vec::new() };
+        let mut products = Vec::new();
+        for spec in self.products.iter().take_while(|_| go_on()) {
+            match caught(spec.name(), || spec.make(stack, transport)) {
+                Ok(product) => products.push(product),
+                Err(problem) => self.problems.push(problem),
+            }
+        }
+        products
+    }
+}
+
+/// What `make` gives; as a problem, what kept `name` from being made: an error or a panic.
+fn caught<T, E: Display>(name: &str, make: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
+    match catch_unwind(AssertUnwindSafe(make)) {
+        Ok(made) => made.map_err(|error| error.to_string()),
+        Err(panic) => Err(panicked(name, &*panic)),
+    }
+}
+
+fn panicked(fold: &str, panic: &(dyn Any + Send)) -> String {
+    format!("{fold} panicked: {}", message_of(panic))
+}

@@ -1,0 +1,209 @@
+//! Sweeps: from images under many delays and exposures to one light transport.
+
+mod folds;
+mod report;
+mod results;
+mod strips;
+
+use std::sync::Arc;
+
+use raysweep_config::plan::products_of_argument;
+use raysweep_config::{ConfigError, Places, Plan, ProductTable, RigFile, SweepPlan};
+use raysweep_pipeline::{Point, ProductSpec, Registry, Role, Schedule};
+use raysweep_session::ledger::State;
+use raysweep_session::stack::ArrayName;
+
+pub use self::folds::Processing;
+pub use self::report::warnings;
+pub use self::results::{Results, write_products, write_report};
+pub use self::strips::Overview;
+use crate::memory::{MemoryNeed, available_bytes};
+use crate::plane::{PlaneTask, manifest};
+use crate::stored::{Asked, ProcessError, Processed, Stored};
+
+/// Fewest frames of a dark image: its noise is in all images of its exposure, so it should hardly have any.
+const MIN_DARK_AVERAGE: u32 = 8;
+
+/// A sweep on a plane rig.
+#[derive(Clone)]
+pub struct SweepTask {
+    /// The plan's own table.
+    pub sweep: SweepPlan,
+    /// Its points and model.
+    pub task: Arc<PlaneTask>,
+    products: Option<Vec<ProductTable>>,
+}
+
+impl SweepTask {
+    /// A sweep on a rig; see [`PlaneTask::new`].
+    pub fn new(plan: &Plan, sweep: SweepPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
+        let schedule = schedule(&sweep, rig.vsync.period_us);
+        let task = PlaneTask::new(plan, schedule, sweep.max_jitter_us, rig, first_row, size);
+        Self { sweep, task: Arc::new(task), products: plan.products.clone() }
+    }
+
+    /// The same task with another sweep, where a plan may have that and the products can be made of it.
+    pub fn with_sweep(&self, sweep: SweepPlan) -> Option<Self> {
+        let is_possible = sweep.is_possible();
+        let mut task = (*self.task).clone();
+        task.schedule = schedule(&sweep, task.geometry.raster.period_us);
+        let other = Self { sweep, task: Arc::new(task), products: self.products.clone() };
+        (is_possible && other.products().is_ok()).then_some(other)
+    }
+
+    /// How many images it stores beside dark and regular ones.
+    pub fn points(&self) -> usize {
+        self.task.schedule.sweep_len()
+    }
+
+    /// The stages, folds and products that the plan names.
+    ///
+    /// # Errors
+    /// With the place in the plan's text of the stage or product that cannot be made.
+    pub fn processing(&self, registry: &Registry) -> Result<Processing, ConfigError> {
+        let (stages, folds) = self.task.made_stages(registry, |fold, others| {
+            let name = fold.name();
+            let is_second = others.iter().any(|other| other.name() == name);
+            is_second
+                .then(|| format!("{name} stands twice: its products would overwrite each other; keep one"))
+        })?;
+        // After the folds, which refuse a rig that no product could be made on.
+        let products = self.products()?;
+        Ok(Processing { stages, folds, products, problems: Vec::new() })
+    }
+
+    /// What is made of the transport: the products that the plan names.
+    fn products(&self) -> Result<Vec<ProductSpec>, ConfigError> {
+        let Some(tables) = &self.products else { return Ok(ProductSpec::defaults()) };
+        if !tables.is_empty() && !self.task.stages.iter().any(|stage| stage.name == "demux") {
+            let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";
+            return Err(self.task.refuse(&["product"], what));
+        }
+        let mut specs = Vec::new();
+        for (index, table) in tables.iter().enumerate() {
+            append_product(&mut specs, table, index, &self.task, &|path, message| {
+                self.task.refuse(path, message)
+            })?;
+        }
+        Ok(specs)
+    }
+}
+
+/// The points of a sweep: dark images of each exposure, the regular image, then the grid with the exposure in the outer
+/// loop, because some cameras take long to change it.
+fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
+    let frames = sweep.average;
+    let point = |role, delay_us, exposure_us| {
+        let frames = if matches!(role, Role::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+        Point { role, delay_us, exposure_us, frames }
+    };
+    let exposures = sweep.exposure_us.values();
+    let delays = sweep.delay_us.values();
+
+    let mut dark_exposures: Vec<f64> = Vec::new();
+    for &exposure_us in exposures.iter().chain([&period_us]) {
+        if !dark_exposures.contains(&exposure_us) {
+            dark_exposures.push(exposure_us);
+        }
+    }
+    let mut points: Vec<Point> =
+        (0..).zip(&dark_exposures).map(|(index, &us)| point(Role::Dark(index), 0.0, us)).collect();
+    points.push(point(Role::Regular, 0.0, period_us));
+    let grid =
+        exposures.iter().flat_map(|&exposure_us| delays.iter().map(move |&delay_us| (delay_us, exposure_us)));
+    points.extend(
+        (0..)
+            .zip(grid)
+            .map(|(index, (delay_us, exposure_us))| point(Role::Sweep(index), delay_us, exposure_us)),
+    );
+    Schedule { points }
+}
+
+/// Appends the product that a table asks for to others. `refuse` makes an error about a value of the document in which
+/// it is product `index`.
+fn append_product(
+    specs: &mut Vec<ProductSpec>,
+    table: &ProductTable,
+    index: usize,
+    task: &PlaneTask,
+    refuse: &dyn Fn(&[&str], String) -> ConfigError,
+) -> Result<(), ConfigError> {
+    let index = index.to_string();
+    let refused = |path: &[String], message: String| {
+        let path: Vec<&str> =
+            ["product", &index].into_iter().chain(path.iter().map(String::as_str)).collect();
+        refuse(&path, message)
+    };
+    let ProductTable { kind, name, options } = table;
+    let spec = ProductSpec::new(kind, name.as_deref(), options, &task.schedule, &task.geometry)
+        .map_err(|error| refused(&error.path, error.to_string()))?;
+    if specs.iter().any(|other| other.name() == spec.name()) {
+        let message = format!(
+            "product {kind}: two products are named {:?} and would overwrite each other: give one another name",
+            spec.name()
+        );
+        return Err(refused(&["name".into()], message));
+    }
+    specs.push(spec);
+    Ok(())
+}
+
+/// Appends the products that a command line argument asks for: the keys of a `[[product]]` with commas between them.
+fn append_argument(specs: &mut Vec<ProductSpec>, argument: &str, task: &PlaneTask) -> Result<(), String> {
+    let shown = |(error, text): (ConfigError, String)| error.render("--product", &text);
+    let (tables, places, text): (_, Places, _) = products_of_argument(argument).map_err(shown)?;
+    for (index, table) in tables.iter().enumerate() {
+        append_product(specs, table, index, task, &|path, message| places.error(path, message))
+            .map_err(|error| error.render("--product", &text))?;
+    }
+    Ok(())
+}
+
+/// Makes the products of a stored sweep again.
+///
+/// # Errors
+/// When they cannot be had of it, before anything is written; when the disk refuses.
+pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<Processed, ProcessError> {
+    let Stored { session, state, plan, .. } = stored;
+    let rig = stored.plane_rig()?;
+    let shape = state.session.shape;
+    let sweep = SweepTask::new(plan, sweep, &rig, state.session.first_row, (shape.rows, shape.columns));
+    let task = &*sweep.task;
+    let mut processing = sweep.processing(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
+    if asked.only {
+        processing.products.clear();
+    }
+    for argument in &asked.products {
+        append_argument(&mut processing.products, argument, task).map_err(ProcessError::Product)?;
+    }
+    let memory = MemoryNeed::of_sweep(task, &processing.products)
+        .map_err(|error| ProcessError::Config(error.to_string()))?;
+    let available_bytes = available_bytes(asked.memory_limit_bytes);
+    if memory.bytes(available_bytes) > available_bytes {
+        return Err(ProcessError::Memory { needed_bytes: memory.bytes(available_bytes), available_bytes });
+    }
+    let in_strips = memory.in_strips(available_bytes);
+    if in_strips {
+        processing.keep_no_images();
+    }
+    processing.feed_stored(task, state, &session.stack()?, &|| true);
+    let mut results = match in_strips {
+        true => Results::in_strips(processing, session, state, task, &|| true)?,
+        false => Results::whole(processing, session, task, &|| true)?,
+    };
+    results.write_transport()?;
+    let overview = results.overview();
+    write_products(session, task, &results.products)?;
+    write_report(session, state, &sweep, &results, overview.as_ref())?;
+    manifest::write(session, state, task, &rig)?;
+    Ok(Processed {
+        report: session.report_path(),
+        stored: stored_points(state),
+        points: shape.points(),
+        problems: results.problems,
+    })
+}
+
+fn stored_points(state: &State) -> usize {
+    state.stored(ArrayName::Sum).count()
+}

@@ -1,0 +1,298 @@
+//! The report of a sweep: what was taken, what came out, and how far to trust it.
+
+mod findings;
+mod products;
+
+use ndarray::{Array1, Array2};
+use raysweep_pipeline::{PREDICTED_SHARE, Product, Role};
+use raysweep_session::ledger::{PointEntry, State};
+use raysweep_session::report::{
+    Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, ToneSamples,
+};
+use raysweep_session::stack::{ArrayName, Stack};
+use raysweep_session::{Result, Session, transport};
+
+use super::SweepTask;
+use super::strips::Overview;
+use crate::plane::place;
+use crate::plane::report::{jitter, settings};
+use crate::report::{accounts, subtitle};
+
+/// Share of pixels, in percent, that a picture's scale does not overexpose.
+const PERCENTILE: f64 = 99.5;
+
+/// The same for the stack's indirect light, which is far dimmer and fills more of its images.
+const INDIRECT_PERCENTILE: f64 = 70.0;
+
+/// Makes the report of a session.
+///
+/// # Errors
+/// When the stack cannot be read.
+pub fn make(
+    session: &Session,
+    state: &State,
+    task: &SweepTask,
+    overview: Option<&Overview>,
+    products: &[Product],
+    problems: &[String],
+) -> Result<Report> {
+    let stack = session.stack()?;
+    let markers = overview.map(mark).unwrap_or_default();
+    let sweep = SweepImages { task, state, stack: &stack };
+    let mut sections = Vec::new();
+    let errors = problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone()));
+    let warnings = warnings(products).into_iter().map(|text| Block::Note(NoteLevel::Warning, text));
+    let blocks: Vec<Block> = errors.chain(warnings).collect();
+    if !blocks.is_empty() {
+        sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
+    }
+    if let Some(overview) = overview {
+        let pixels: Vec<[usize; 2]> = markers.iter().map(|marker| [marker.row, marker.column]).collect();
+        let over_rows = transport::read_profiles(&session.transport_path(), &pixels)?;
+        sections.extend(products::images(products, &markers));
+        sections.push(profiles(&sweep, overview.u_min, &over_rows, &markers)?);
+        sections.extend(products::sequences(products));
+        sections.extend(products::profiles(products));
+    }
+    sections.push(sweep.contact_sheet()?);
+    sections.extend(findings::section(products));
+    sections.push(trust(state, task, products));
+    Ok(Report {
+        title: state.session.name.clone(),
+        subtitle: subtitle(state, session),
+        facts: facts(state, task),
+        sections,
+    })
+}
+
+/// What the products say against themselves.
+pub fn warnings(products: &[Product]) -> Vec<String> {
+    let warning = |product: &Product| match product {
+        Product::Warning(text) => Some(text.clone()),
+        _ => None,
+    };
+    products.iter().filter_map(warning).collect()
+}
+
+fn facts(state: &State, task: &SweepTask) -> Vec<(String, String)> {
+    let sweep = &task.sweep;
+    let range = |values: Vec<f64>| match (values.first(), values.last()) {
+        (Some(first), Some(last)) => format!("{first:.0} … {last:.0} µs in {}", values.len()),
+        _ => String::new(),
+    };
+    let stored = state.stored(ArrayName::Sum).count();
+    let lost = state.counts.lost_total();
+    [
+        ("delay", range(sweep.delay_us.values())),
+        ("exposure", range(sweep.exposure_us.values())),
+        ("frames averaged", sweep.average.to_string()),
+        ("points stored", format!("{stored} of {}", state.session.shape.points())),
+        ("camera", format!("{} × {} px", state.session.shape.columns, state.session.shape.rows)),
+        ("frames lost", lost.to_string()),
+    ]
+    .map(|(key, value)| (key.to_owned(), value))
+    .to_vec()
+}
+
+/// Pixels worth a look: the brightest of each kind of light.
+fn mark(overview: &Overview) -> Vec<Marker> {
+    let Overview { epipolar, near, middle, total, .. } = overview;
+    let kinds = [epipolar.clone(), near - epipolar, middle - near, total - middle];
+    let mut markers: Vec<Marker> = Vec::new();
+    for image in &kinds {
+        let brightest = image
+            .indexed_iter()
+            .filter(|((t, s), _)| {
+                // Far enough from the others to be told apart in the picture.
+                let apart = image.nrows().min(image.ncols()) / 10;
+                markers.iter().all(|marker| marker.row.abs_diff(*t).max(marker.column.abs_diff(*s)) > apart)
+            })
+            .max_by(|a, b| a.1.total_cmp(b.1));
+        if let Some(((row, column), _)) = brightest {
+            markers.push(Marker { label: (markers.len() + 1).to_string(), row, column });
+        }
+    }
+    markers
+}
+
+/// The marked pixels' light over the delay, and over relative rows from `u_min` on.
+fn profiles(
+    sweep: &SweepImages<'_>,
+    u_min: i32,
+    over_rows: &[Array1<f32>],
+    markers: &[Marker],
+) -> Result<Section> {
+    let exposure_us = sweep.task.sweep.exposure_us.values().into_iter().fold(f64::INFINITY, f64::min);
+    let over_delays = sweep.at_exposure(exposure_us, markers)?;
+    let delay = markers.iter().enumerate().map(|(index, marker)| {
+        let points = over_delays.iter().map(|(delay_us, light)| (*delay_us, f64::from(light[index])));
+        Series::line(
+            format!("pixel {} (t {}, s {})", marker.label, marker.row, marker.column),
+            points.collect(),
+        )
+    });
+    let delay = Plot {
+        title: format!("Delay profiles at an exposure of {exposure_us:.0} µs"),
+        x_label: "delay t_d / µs".into(),
+        y_label: "light".into(),
+        series: delay.collect(),
+        guides: Vec::new(),
+    };
+    let rows = markers.iter().zip(over_rows).map(|(marker, profile)| {
+        let points = profile
+            .iter()
+            .enumerate()
+            .map(|(index, &light)| (f64::from(u_min) + index as f64, f64::from(light.max(1e-5)).log10()));
+        Series::line(format!("pixel {}", marker.label), points.collect())
+    });
+    let rows = Plot {
+        title: "Transport over relative projector rows".into(),
+        x_label: "u = v − t / rows".into(),
+        y_label: "log10 of light".into(),
+        series: rows.collect(),
+        guides: Vec::new(),
+    };
+    Ok(Section {
+        title: "Profiles of the marked pixels".into(),
+        intro: "Left: what the camera saw over the delay. Right: what demultiplexing makes of all images: the light from each projector row.".into(),
+        blocks: vec![Block::Plots(vec![delay, rows])],
+    })
+}
+
+/// The sweep's images, read from the stack when they are needed.
+struct SweepImages<'a> {
+    task: &'a SweepTask,
+    state: &'a State,
+    stack: &'a Stack,
+}
+
+impl SweepImages<'_> {
+    /// A point's image minus its dark image, in the scene's units.
+    fn light(&self, role: Role) -> Result<Option<Array2<f32>>> {
+        let Some(point) = self.task.task.schedule.points.iter().find(|point| point.role == role) else {
+            return Ok(None);
+        };
+        let dark = self
+            .task
+            .task
+            .schedule
+            .dark_of(point.exposure_us)
+            .map(|dark| self.mean(dark))
+            .transpose()?
+            .flatten();
+        let Some((image, dark)) = self.mean(role)?.zip(dark) else { return Ok(None) };
+        Ok(Some((image - dark) / self.task.task.geometry.white_dn as f32))
+    }
+
+    fn mean(&self, role: Role) -> Result<Option<Array2<f32>>> {
+        let (array, index) = place(role);
+        let Some(entry) = self.state.point(array, index) else { return Ok(None) };
+        // What is damaged stands among the problems; the report shows it as missing.
+        let Ok(sum) = self.stack.read_point(array, index) else { return Ok(None) };
+        Ok(Some(sum.mapv(|sum| sum as f32 / entry.frames as f32)))
+    }
+
+    /// Delay, and light of the marked pixels, of each image at an exposure.
+    fn at_exposure(&self, exposure_us: f64, markers: &[Marker]) -> Result<Vec<(f64, Vec<f32>)>> {
+        let mut lights = Vec::new();
+        for point in &self.task.task.schedule.points {
+            if matches!(point.role, Role::Sweep(_))
+                && point.exposure_us == exposure_us
+                && let Some(image) = self.light(point.role)?
+            {
+                let light = markers.iter().map(|marker| image[[marker.row, marker.column]]);
+                lights.push((point.delay_us, light.collect()));
+            }
+        }
+        Ok(lights)
+    }
+
+    /// Pixels of the sweep's images that the ledger knows.
+    fn stored_px(&self) -> usize {
+        let shape = &self.state.session.shape;
+        self.state.stored(ArrayName::Sum).count() * shape.rows * shape.columns
+    }
+
+    fn contact_sheet(&self) -> Result<Section> {
+        let (delays, exposures) = (self.task.sweep.delay_us.values(), self.task.sweep.exposure_us.values());
+        let places = delays.len() * exposures.len();
+        // The sweep may be larger than the memory: one image at a time.
+        let mut samples = ToneSamples::new(self.stored_px());
+        let mut thumbnails = Vec::with_capacity(places);
+        for index in 0..places as u32 {
+            let light = self.light(Role::Sweep(index))?;
+            light.iter().for_each(|light| samples.add(light.view()));
+            thumbnails.push(light.map(|light| Picture::reduced(light.view())));
+        }
+        let label = |value: &f64| format!("{value:.0}");
+        let sheet = |tone_map| ContactSheet {
+            column_title: "delay / µs".into(),
+            columns: delays.iter().map(label).collect(),
+            row_title: "exposure / µs".into(),
+            rows: exposures.iter().map(label).collect(),
+            pictures: thumbnails
+                .iter()
+                .map(|image| image.as_ref().map(|image| Picture::thumbnail(image.view(), tone_map)))
+                .collect(),
+        };
+        Ok(Section {
+            title: "The stack".into(),
+            intro: "Every image of the sweep, dark image subtracted. A camera row collects the light of projector rows that lie delay / row time below its own, over a band as wide as the exposure. The second sheet is exposed for the indirect light.".into(),
+            blocks: vec![
+                Block::ContactSheet(sheet(samples.percentile(PERCENTILE))),
+                Block::ContactSheet(sheet(samples.percentile(INDIRECT_PERCENTILE))),
+            ],
+        })
+    }
+}
+
+fn trust(state: &State, task: &SweepTask, products: &[Product]) -> Section {
+    let mut blocks = vec![settings(state, &task.task)];
+    let figures: Vec<(String, String)> = products
+        .iter()
+        .filter_map(|product| match product {
+            Product::Figure { name, value } => Some(((*name).to_owned(), short(*value))),
+            _ => None,
+        })
+        .collect();
+    if !figures.is_empty() {
+        blocks.push(Block::Facts(figures));
+    }
+    blocks.extend(accounts(state));
+    let deviation = |point: &PointEntry| {
+        let delay_us = point.delay_us;
+        point.delays_us.iter().map(move |true_us| true_us - delay_us).collect::<Vec<_>>()
+    };
+    blocks.push(Block::Plots(jitter(&state.stored(ArrayName::Sum).flat_map(deviation).collect::<Vec<_>>())));
+    if let Some(note) = regular_note(products) {
+        blocks.push(note);
+    }
+    let sweep = &task.sweep;
+    Section {
+        title: "How far to trust it".into(),
+        intro: format!(
+            "Every frame is tied to the VSYNC edge of its light; a frame further than {:.0} µs from the wanted delay was taken again. The model uses the measured delays.",
+            sweep.max_jitter_us
+        ),
+        blocks,
+    }
+}
+
+/// A number with four decimals at the most.
+fn short(value: f64) -> String {
+    format!("{value:.4}").trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+fn regular_note(products: &[Product]) -> Option<Block> {
+    let share = products.iter().find_map(|product| match product {
+        Product::Figure { name, value } if *name == PREDICTED_SHARE => Some(*value),
+        _ => None,
+    })?;
+    Some(Block::Note(
+        NoteLevel::Info,
+        format!(
+            "Summed over all rows, the transport predicts {:.2} % of the light of the regular image. This checks the sum of all light, not where it came from.",
+            share * 100.0
+        ),
+    ))
+}

@@ -1,0 +1,248 @@
+//! From products to files.
+
+use raysweep_pipeline::{Findings, Product, Strip};
+use raysweep_session::ledger::State;
+use raysweep_session::products::VolumeWriter;
+use raysweep_session::{Result, Session, transport};
+use raysweep_transport::plane::Transport;
+use serde_json::{Map, Value, json};
+
+use super::strips::{Overview, StoredImages};
+use super::{Processing, SweepTask, report};
+use crate::plane::PlaneTask;
+
+/// What was made of a sweep.
+pub struct Results {
+    /// Everything; the transport only if it was made in one piece.
+    pub products: Vec<Product>,
+    /// What could not be made, and why.
+    pub problems: Vec<String>,
+    /// The transport's files, not in place yet.
+    writer: Option<TransportWriter>,
+    /// The sums of a transport that was made in strips.
+    overview: Option<Overview>,
+}
+
+impl Results {
+    /// Makes them in one piece; ends early, and short of results, soon after `go_on` says no.
+    ///
+    /// # Errors
+    /// When the disk refuses the transport.
+    pub fn whole(
+        mut processing: Processing,
+        session: &Session,
+        task: &PlaneTask,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Self> {
+        let mut products = processing.finish(go_on);
+        let write = || {
+            let Some(transport) = transport_in(&products) else { return Ok(None) };
+            let mut writer = TransportWriter::create(session, task, findings_in(&products), transport)?;
+            writer.append(transport)?;
+            Ok(Some(writer))
+        };
+        // Somebody may be waiting for the transport, and the disk is slower than what is made of it.
+        let (writer, named) = rayon::join(write, || processing.make_named(&products, go_on));
+        products.extend(named);
+        products.retain(|product| !matches!(product, Product::Stack(_)));
+        Ok(Self { products, problems: processing.problems, writer: writer?, overview: None })
+    }
+
+    /// Makes them strip by strip from what is stored, of folds that have kept no images; otherwise as [`Self::whole`].
+    ///
+    /// # Errors
+    /// When the stack cannot be opened or the disk refuses the transport.
+    pub fn in_strips(
+        processing: Processing,
+        session: &Session,
+        state: &State,
+        task: &PlaneTask,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Self> {
+        let (stack, stages) = (session.stack()?, processing.stages.clone());
+        let images = StoredImages { task, state, stack: &stack, stages: &stages };
+        let mut written: Option<(TransportWriter, Overview)> = None;
+        let mut append = |findings: &Findings, Strip { first_row, transport, .. }: &Strip| {
+            let (writer, overview) = match &mut written {
+                Some(written) => written,
+                None => written.insert((
+                    TransportWriter::create(session, task, Some(findings), transport)?,
+                    Overview::empty(task.geometry.height, transport),
+                )),
+            };
+            overview.put(*first_row, transport);
+            writer.append(transport)
+        };
+        let mut refused = None;
+        let mut write = |findings: &Findings, strip: &Strip| {
+            append(findings, strip).map_err(|error| {
+                let what = error.to_string();
+                refused = Some(error);
+                what
+            })
+        };
+        let (products, problems) = processing.finish_in_strips(&images, go_on, &mut write);
+        if let Some(error) = refused {
+            return Err(error);
+        }
+        // Where the fold broke off, rows are missing.
+        let (writer, overview) = written.filter(|(writer, _)| writer.is_whole()).unzip();
+        Ok(Self { products, problems, writer, overview })
+    }
+
+    /// Puts the transport in its place, as NPY and Zarr at the same time: somebody may be waiting for it.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn write_transport(&mut self) -> Result<()> {
+        self.writer.take().map_or(Ok(()), TransportWriter::commit)
+    }
+
+    /// The transport's sums, if there is one.
+    pub fn overview(&mut self) -> Option<Overview> {
+        self.overview.take().or_else(|| transport_in(&self.products).map(Overview::of))
+    }
+}
+
+fn transport_in(products: &[Product]) -> Option<&Transport> {
+    products.iter().find_map(|product| match product {
+        Product::Transport(transport) => Some(&**transport),
+        _ => None,
+    })
+}
+
+fn findings_in(products: &[Product]) -> Option<&Findings> {
+    products.iter().find_map(|product| match product {
+        Product::Findings(findings) => Some(&**findings),
+        _ => None,
+    })
+}
+
+/// Writes a transport from its first camera row to its last, as NPY and Zarr; nothing is seen of it before the end.
+struct TransportWriter {
+    npy: VolumeWriter,
+    zarr: transport::Writer,
+    rows_left: usize,
+}
+
+impl TransportWriter {
+    /// For a transport of which this is all, or some rows.
+    fn create(
+        session: &Session,
+        task: &PlaneTask,
+        findings: Option<&Findings>,
+        found: &Transport,
+    ) -> Result<Self> {
+        let mut metadata = task.metadata();
+        metadata.extend(findings.map(model).unwrap_or_default());
+        metadata.insert("axes".into(), json!(["u", "t", "s"]));
+        metadata.insert("u_min".into(), json!(found.u_min));
+        metadata.insert("u_max".into(), json!(found.u_max()));
+        metadata.insert(
+            "about".into(),
+            json!("light from projector row v = u + round(first_row + row_pitch t) to camera pixel (t, s); 0 where the projector has no such row"),
+        );
+        let (depth, _, columns) = found.t.dim();
+        let shape = (depth, task.geometry.height, columns);
+        Ok(Self {
+            npy: session.products().volume_writer("transport", shape, &metadata)?,
+            zarr: transport::Writer::create(&session.transport_path(), shape, &metadata)?,
+            rows_left: task.geometry.height,
+        })
+    }
+
+    fn append(&mut self, rows: &Transport) -> Result<()> {
+        let (npy, zarr) = (&mut self.npy, &mut self.zarr);
+        let (npy, zarr) = rayon::join(|| npy.append(rows.t.view()), || zarr.append(rows.t.view()));
+        npy.and(zarr)?;
+        self.rows_left = self.rows_left.saturating_sub(rows.exists.ncols());
+        Ok(())
+    }
+
+    fn is_whole(&self) -> bool {
+        self.rows_left == 0
+    }
+
+    fn commit(self) -> Result<()> {
+        let (npy, zarr) = rayon::join(|| self.npy.commit(), || self.zarr.commit());
+        npy.and(zarr)
+    }
+}
+
+/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY).
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product]) -> Result<()> {
+    let files = session.products();
+    for product in products {
+        match product {
+            Product::Image { name, about, image } => {
+                let mut metadata = task.metadata();
+                metadata.insert("axes".into(), json!(["t", "s"]));
+                metadata.insert("about".into(), json!(about));
+                files.image(name, image.view(), &metadata)?;
+            }
+            Product::Sequence { name, about, axis, at, images } => {
+                let layers: Vec<String> = (0..at.len()).map(|k| format!("k{k:04}")).collect();
+                let mut metadata = task.metadata();
+                metadata.insert("axes".into(), json!(["k", "t", "s"]));
+                metadata.insert("about".into(), json!(about));
+                metadata.insert("k".into(), json!({ "is": axis, "at": at }));
+                metadata.insert("layers".into(), json!(layers));
+                files.sequence(name, images.view(), &layers, &metadata)?;
+            }
+            Product::Profile(profile) => {
+                let columns = profile.columns();
+                let mut metadata = task.metadata();
+                metadata.insert("axes".into(), json!(["delay", "column"]));
+                metadata.insert("about".into(), json!(profile.about));
+                metadata.insert("exposure_us".into(), json!(profile.exposure_us));
+                metadata.insert(
+                    "columns".into(),
+                    json!(columns.iter().map(|(name, _)| name).collect::<Vec<_>>()),
+                );
+                files.table(&profile.name, &columns, &metadata)?;
+            }
+            Product::Transport(_)
+            | Product::Stack(_)
+            | Product::Findings(_)
+            | Product::Figure { .. }
+            | Product::Warning(_) => {}
+        }
+    }
+    Ok(())
+}
+
+/// What the transport was found with.
+fn model(found: &Findings) -> Map<String, Value> {
+    let remarks: Map<String, Value> =
+        found.remarks.iter().map(|(key, said)| ((*key).to_owned(), json!(said))).collect();
+    let entries = [
+        (
+            "prior",
+            json!({ "name": found.prior.name(), "alpha": found.prior.alpha(), "beta": found.prior.beta() }),
+        ),
+        ("beam_sigma_rows", json!(found.beam_sigma_rows)),
+        ("u0_rows", json!(found.u0_rows)),
+        ("left_out_us", json!(found.left_out_us)),
+        ("findings", json!(remarks)),
+    ];
+    entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+}
+
+/// Writes the report.
+///
+/// # Errors
+/// When the stack cannot be read or the disk refuses.
+pub fn write_report(
+    session: &Session,
+    state: &State,
+    task: &SweepTask,
+    results: &Results,
+    overview: Option<&Overview>,
+) -> Result<()> {
+    let Results { products, problems, .. } = results;
+    let page = report::make(session, state, task, overview, products, problems)?.to_html()?;
+    raysweep_session::durable::write(&session.report_path(), page.as_bytes())
+}

@@ -1,0 +1,100 @@
+//! What is larger than the memory: images read again from the stack, the transport written and summed up as it comes.
+
+use std::ops::Range;
+
+use ndarray::{Array2, s};
+use raysweep_pipeline::{ImageRows, Stage, run_stages};
+use raysweep_session::ledger::State;
+use raysweep_session::stack::Stack;
+use raysweep_transport::plane::Transport;
+
+use crate::plane::{PlaneTask, place, unit_of};
+
+/// The images of a session, as its folds were given them.
+pub struct StoredImages<'a> {
+    /// The plan on its rig.
+    pub task: &'a PlaneTask,
+    /// What is stored.
+    pub state: &'a State,
+    /// Where. That each point is what the ledger says was found when it was stored or fed to the folds.
+    pub stack: &'a Stack,
+    /// What is done to each image.
+    pub stages: &'a [Box<dyn Stage>],
+}
+
+impl ImageRows for StoredImages<'_> {
+    fn read(&self, point: u32, rows: Range<usize>) -> Result<Array2<f32>, String> {
+        let height = self.task.geometry.height;
+        let planned = self.task.schedule.points.get(point as usize);
+        let (array, index) = place(planned.ok_or_else(|| format!("the plan has no point {point}"))?.role);
+        let stored = self.state.point(array, index);
+        let entry =
+            stored.ok_or_else(|| format!("{} {index} is not stored: resume the run", array.as_str()))?;
+        let halo_rows = self.stages.iter().map(|stage| stage.halo_rows()).sum::<Option<usize>>();
+        let around = halo_rows.map_or(0..height, |halo_rows| {
+            rows.start.saturating_sub(halo_rows)..height.min(rows.end + halo_rows)
+        });
+        let sum = self.stack.read_rows(array, index, around.clone()).map_err(|error| error.to_string())?;
+        let image =
+            run_stages(self.stages, &unit_of(point, entry, sum)).map_err(|error| error.to_string())?;
+        Ok(image.slice(s![rows.start - around.start..rows.end - around.start, ..]).to_owned())
+    }
+}
+
+/// Sums of a transport over relative rows, `[t, s]` each: what is shown of it without the transport itself.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Overview {
+    /// Relative row of index 0 of its profiles.
+    pub u_min: i32,
+    /// Light from u = 0.
+    pub epipolar: Array2<f32>,
+    /// Light from all other rows.
+    pub non_epipolar: Array2<f32>,
+    /// Light from |u| <= 4.
+    pub near: Array2<f32>,
+    /// Light from |u| <= 20.
+    pub middle: Array2<f32>,
+    /// All light.
+    pub total: Array2<f32>,
+}
+
+impl Overview {
+    /// Of a whole transport, or of some rows of one.
+    pub fn of(transport: &Transport) -> Self {
+        Self {
+            u_min: transport.u_min,
+            epipolar: transport.epipolar(1),
+            non_epipolar: transport.non_epipolar(1),
+            near: transport.band(-4..=4),
+            middle: transport.band(-20..=20),
+            total: transport.total(),
+        }
+    }
+
+    /// Of `height` rows that are still to be put in.
+    pub fn empty(height: usize, transport: &Transport) -> Self {
+        let image = Array2::zeros((height, transport.saturated.ncols()));
+        Self {
+            u_min: transport.u_min,
+            epipolar: image.clone(),
+            non_epipolar: image.clone(),
+            near: image.clone(),
+            middle: image.clone(),
+            total: image,
+        }
+    }
+
+    /// Puts in the rows from `first_row` on, of which `transport` is.
+    pub fn put(&mut self, first_row: usize, transport: &Transport) {
+        let rows = Self::of(transport);
+        for (whole, part) in [
+            (&mut self.epipolar, rows.epipolar),
+            (&mut self.non_epipolar, rows.non_epipolar),
+            (&mut self.near, rows.near),
+            (&mut self.middle, rows.middle),
+            (&mut self.total, rows.total),
+        ] {
+            whole.slice_mut(s![first_row..first_row + part.nrows(), ..]).assign(&part);
+        }
+    }
+}

@@ -1,0 +1,23 @@
+//! What commands print.
+
+use std::io::{self, Write};
+
+use serde::Serialize;
+
+use super::failure::Failure;
+
+/// Prints results for people or for programs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Printer {
+    pub json: bool,
+}
+
+impl Printer {
+    pub fn print<T: Serialize>(self, result: &T, text: impl FnOnce(&T) -> String) -> Result<(), Failure> {
+        let line = match self.json {
+            true => serde_json::to_string(result).map_err(io::Error::from).map_err(Failure::Output)?,
+            false => text(result),
+        };
+        writeln!(io::stdout(), "{line}").map_err(Failure::Output)
+    }
+}

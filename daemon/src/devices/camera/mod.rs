@@ -1,0 +1,428 @@
+//! The camera's thread: sets the camera for one point after the other and hands its frames on.
+
+mod ahead;
+mod probe;
+mod sequence;
+mod sets;
+mod triggers;
+
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, OnceLock};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use raysweep_core::{
+    Camera, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState, Frame, FrameBuf, FramePool,
+    FrameStamp, LossCause, SettingsId, SettingsLatency, ns_from_us,
+};
+use raysweep_pipeline::{Event, Failure, Input, Label, Point, QueueError, Shot, message_of};
+
+pub use self::ahead::Line;
+use self::ahead::{Ahead, Seen};
+pub use self::sequence::{FilmPass, FilmSetting};
+use super::priority;
+use crate::rig::Pace;
+use crate::run::orders::Orders;
+
+/// One attempt at a point.
+#[derive(Debug, Clone, Copy)]
+pub struct Attempt {
+    /// Point and attempt.
+    pub id: SettingsId,
+    /// What to acquire.
+    pub point: Point,
+    /// How to set the camera for it.
+    pub shot: Shot,
+    /// How often it, the attempt of this number, was interrupted in this run.
+    pub interruptions: u32,
+}
+
+impl Attempt {
+    /// The attempt to make after this one has failed.
+    pub fn after(self, failure: Failure) -> Self {
+        match failure {
+            Failure::Losses => {
+                let id = SettingsId { attempt: self.id.attempt + 1, ..self.id };
+                Self { id, interruptions: 0, ..self }
+            }
+            Failure::Interrupted => Self { interruptions: self.interruptions + 1, ..self },
+        }
+    }
+}
+
+/// Points to acquire under one picture of the projector.
+#[derive(Debug, Clone)]
+pub struct Pass {
+    /// In order.
+    pub attempts: Vec<Attempt>,
+    /// Frames exposed earlier may still see the picture before.
+    pub not_before_ns: i64,
+}
+
+/// What the camera is for until its next flush.
+#[derive(Debug, Clone)]
+pub enum Work {
+    /// To find out how late settings take effect, by changes from and to these.
+    Probe(CameraSettings),
+    /// Points, each until all its frames are there.
+    Pass(Pass),
+    /// A film.
+    Film(FilmPass),
+}
+
+/// Buffers for frames on their way to the assembler: more than it ever holds while it waits for edges.
+const POOL_BUFFERS: usize = 40;
+/// One wait for a frame; orders are looked at in between.
+const POLL: Duration = Duration::from_millis(100);
+/// A camera without frames for so long, beyond the time that they take, has lost its trigger.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// Frames that pass before a run's first point, and at most after a pass's last, so that the line is known around each
+/// frame.
+const MARGIN_FRAMES: u32 = 6;
+
+/// How a pass ended.
+enum Ended {
+    /// Everything that it left is decided, or will be: the pipeline has its flush.
+    Flushed(Result<(), DeviceError>),
+    /// The pipeline takes nothing any more.
+    NotFlushed,
+}
+
+/// The camera's thread or the pipeline has failed: no verdict comes any more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Gone;
+
+/// The camera's thread as the run sees it.
+pub struct CameraThread {
+    work: SyncSender<Work>,
+    ended: Receiver<Ended>,
+    latency: Arc<OnceLock<SettingsLatency>>,
+    thread: JoinHandle<Exposures>,
+}
+
+/// When frames were exposed that a point waited for.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Exposures {
+    /// When the last of them ended.
+    pub until: Option<Instant>,
+    /// From the first to the end of the last of those with light, on the camera's clock.
+    lit_ns: Option<(i64, i64)>,
+}
+
+impl Exposures {
+    /// Seconds from the first frame with light to the end of the last.
+    pub fn light_s(&self) -> Option<f64> {
+        self.lit_ns.map(|(from_ns, to_ns)| (to_ns - from_ns) as f64 * 1e-9)
+    }
+}
+
+/// How a run's camera is driven.
+pub struct Drive {
+    /// The clock that stamps are on.
+    pub clock: Clock,
+    /// Who sets the pace.
+    pub pace: Pace,
+    /// The line that triggers it.
+    pub line: Line,
+}
+
+impl CameraThread {
+    /// Arms the camera on its own thread.
+    ///
+    /// # Errors
+    /// When the camera cannot be armed or the system gives no thread.
+    pub fn start(
+        mut camera: Box<dyn Camera>,
+        drive: Drive,
+        input: Input<Event>,
+        orders: Arc<Orders>,
+    ) -> Result<Self, DeviceError> {
+        camera.arm()?;
+        let latency = Arc::new(OnceLock::new());
+        let (work, todo) = sync_channel::<Work>(1);
+        let (done, ended) = sync_channel(1);
+        let thread = thread::Builder::new()
+            .name("camera".into())
+            .spawn({
+                let latency = latency.clone();
+                move || {
+                    // On a virtual clock it computes frames all the time.
+                    if drive.pace == Pace::Devices {
+                        priority::for_device("camera");
+                    }
+                    let mut sequencer = Sequencer::new(camera, drive, input, orders);
+                    for work in todo {
+                        if done.send(sequencer.work(work, &latency)).is_err() {
+                            break;
+                        }
+                    }
+                    if let Err(error) = sequencer.camera.disarm() {
+                        tracing::warn!(%error, "camera not disarmed");
+                    }
+                    sequencer.exposures
+                }
+            })
+            .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
+        Ok(Self { work, ended, latency, thread })
+    }
+
+    /// Does some work and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
+    /// at the pipeline's sink, also when the camera failed (the inner error).
+    ///
+    /// # Errors
+    /// [`Gone`] when there will be no verdicts.
+    pub fn acquire(&self, work: Work) -> Result<Result<(), DeviceError>, Gone> {
+        self.work.send(work).map_err(|_closed| Gone)?;
+        match self.ended.recv() {
+            Ok(Ended::Flushed(acquired)) => Ok(acquired),
+            Ok(Ended::NotFlushed) | Err(_) => Err(Gone),
+        }
+    }
+
+    /// How late settings take effect, once a probe has found out.
+    pub fn latency(&self) -> Option<SettingsLatency> {
+        self.latency.get().copied()
+    }
+
+    /// Disarms the camera and ends its thread; says when frames were exposed that a point waited for.
+    ///
+    /// # Errors
+    /// When the thread panicked.
+    pub fn join(self) -> Result<Exposures, DeviceError> {
+        drop(self.work);
+        self.thread.join().map_err(|panic| {
+            let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
+            DeviceError::new("camera", DeviceErrorKind::NotReady, what)
+        })
+    }
+}
+
+struct Sequencer {
+    camera: Box<dyn Camera>,
+    clock: Clock,
+    input: Input<Event>,
+    pace: Pace,
+    pool: FramePool,
+    /// Takes the frames that there is no room for.
+    spare: FrameBuf,
+    orders: Arc<Orders>,
+    warmed_up: bool,
+    /// The longest that a frame has taken so far, from its edge to its last row.
+    longest_frame_us: f64,
+    line: Line,
+    ahead: Ahead,
+    /// Up to this frame the assembler knows what became of each; nothing after a pause, whose frames are nobody's.
+    told_seq: Option<u64>,
+    /// Settings written that no point asked for.
+    lead_ins: u32,
+    exposures: Exposures,
+}
+
+/// A frame off the camera.
+struct Received {
+    stamp: FrameStamp,
+    seen: Seen,
+    /// Nothing where no buffer was free.
+    data: Option<FrameBuf>,
+}
+
+/// What became of a frame.
+enum Taken {
+    /// It is with the assembler.
+    Passed,
+    /// There was no room for it.
+    Lost,
+}
+
+impl Sequencer {
+    fn new(camera: Box<dyn Camera>, drive: Drive, input: Input<Event>, orders: Arc<Orders>) -> Self {
+        let Drive { clock, pace, line } = drive;
+        let capabilities = camera.capabilities();
+        let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
+        let pool = FramePool::new(POOL_BUFFERS, bytes);
+        let spare = pool.spare();
+        Self {
+            ahead: Ahead::new(capabilities.clone(), line),
+            camera,
+            clock,
+            input,
+            pace,
+            pool,
+            spare,
+            orders,
+            warmed_up: false,
+            longest_frame_us: 0.0,
+            line,
+            told_seq: None,
+            lead_ins: 0,
+            exposures: Exposures::default(),
+        }
+    }
+
+    /// Always ends with a flush, so that nothing stays undecided.
+    fn work(&mut self, work: Work, latency: &OnceLock<SettingsLatency>) -> Ended {
+        // Frames since the last work are nobody's: an operator may have taken minutes to change the picture.
+        self.told_seq = None;
+        let acquired = match work {
+            Work::Probe(settings) => self.probe(&settings).map(|found| {
+                if let Some(found) = found {
+                    latency.get_or_init(|| found);
+                }
+            }),
+            Work::Pass(pass) => self.sweep(pass),
+            Work::Film(film) => self.film(&film),
+        };
+        match self.input.send(Event::Flush) {
+            Ok(()) => Ended::Flushed(acquired),
+            Err(_) => Ended::NotFlushed,
+        }
+    }
+
+    /// Lets frames go by until the line is known and the picture is in the light.
+    fn warm_up(&mut self, not_before_ns: i64) -> Result<(), DeviceError> {
+        let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
+        self.pass_frames(margin, not_before_ns)?;
+        self.warmed_up = true;
+        Ok(())
+    }
+
+    /// Lets frames go by: at least `frames` of them, and until exposures start at `not_before_ns` or later.
+    fn pass_frames(&mut self, frames: u32, not_before_ns: i64) -> Result<(), DeviceError> {
+        let mut left = frames;
+        let mut watchdog = Watchdog::default();
+        let mut reached_ns = i64::MIN;
+        while (left > 0 || reached_ns < not_before_ns) && self.orders.go_on() {
+            let Some(received) = self.receive(POLL)? else {
+                watchdog.missed(POLL, self.longest_frame_us, self.camera.state())?;
+                continue;
+            };
+            watchdog.feed();
+            let start_ns = received.stamp.exposure_start_ns;
+            if let Taken::Passed = self.pass(received)? {
+                left = left.saturating_sub(1);
+                reached_ns = start_ns;
+            }
+        }
+        Ok(())
+    }
+
+    /// Lets a frame go by.
+    fn pass(&mut self, received: Received) -> Result<Taken, DeviceError> {
+        for _ in 0..received.seen.owner.unwrap_or(0) {
+            self.ahead.pop();
+        }
+        self.hand_on(received, Label::Cancelled)
+    }
+
+    fn frame_us(&self, settings: &CameraSettings) -> f64 {
+        let periods = self.camera.capabilities().periods_per_frame(settings, self.line.period_us);
+        f64::from(periods) * self.line.period_us
+    }
+
+    /// Notes a frame that a point waited for, which has just come.
+    fn note_exposure(&mut self, stamp: &FrameStamp, settings: &CameraSettings, is_lit: bool) {
+        let capabilities = self.camera.capabilities();
+        let rows_us = capabilities.height.saturating_sub(1) as f64 * capabilities.row_time_us;
+        let end_ns = stamp.exposure_start_ns + ns_from_us(settings.exposure_us + rows_us);
+        // The camera's clock may be a virtual one, so that only its differences count.
+        let since = Duration::from_nanos((stamp.host_ns - end_ns).try_into().unwrap_or(0));
+        self.exposures.until = Instant::now().checked_sub(since);
+        if is_lit {
+            let (first_ns, _) = self.exposures.lit_ns.unwrap_or((stamp.exposure_start_ns, end_ns));
+            self.exposures.lit_ns = Some((first_ns, end_ns));
+        }
+    }
+
+    /// Waits for a frame.
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Received>, DeviceError> {
+        let mut data = match self.pace {
+            Pace::Pipeline => Some(self.pool.take()),
+            Pace::Devices => self.pool.try_take(),
+        };
+        let stamp = self.camera.next_frame(data.as_mut().unwrap_or(&mut self.spare), timeout)?;
+        Ok(stamp.map(|stamp| Received { stamp, seen: self.ahead.see(&stamp), data }))
+    }
+
+    /// Gives a frame to the assembler, or notes that there was no room for it.
+    fn hand_on(
+        &mut self,
+        Received { stamp, data, .. }: Received,
+        label: Label,
+    ) -> Result<Taken, DeviceError> {
+        self.tell_losses(stamp.seq)?;
+        self.told_seq = Some(stamp.seq);
+        let Some(data) = data else { return self.lose(stamp, label, LossCause::PoolEmpty) };
+        let frame = Frame { data, format: self.camera.capabilities().format, stamp };
+        match self.input.offer(Event::Frame(frame, label)) {
+            Ok(()) => Ok(Taken::Passed),
+            Err(QueueError::Full(_)) => self.lose(stamp, label, LossCause::QueueFull),
+            Err(error @ QueueError::Closed) => Err(closed(error)),
+        }
+    }
+
+    /// Tells the assembler why frames before `seq` never came, where the camera knows more than that they did not.
+    fn tell_losses(&mut self, seq: u64) -> Result<(), DeviceError> {
+        let first = self.told_seq.map_or(seq, |told| told + 1);
+        for lost in first..seq {
+            let cause = self.camera.loss_of(lost);
+            if cause != LossCause::CameraGap {
+                self.input.send(Event::Lost(lost, Some(cause))).map_err(closed)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Only a frame that a point waits for is lost; the others are merely not looked at.
+    fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
+        let event = match label {
+            Label::Counted | Label::CountedUnless { .. } => Event::Lost(stamp.seq, Some(cause)),
+            Label::Settling | Label::Cancelled => Event::Lost(stamp.seq, None),
+        };
+        self.input.send(event).map_err(closed)?;
+        Ok(Taken::Lost)
+    }
+}
+
+/// Notices a camera that gives no frames.
+#[derive(Default)]
+struct Watchdog {
+    waited: Duration,
+}
+
+impl Watchdog {
+    fn feed(&mut self) {
+        self.waited = Duration::ZERO;
+    }
+
+    fn missed(
+        &mut self,
+        waited: Duration,
+        longest_frame_us: f64,
+        state: DeviceState,
+    ) -> Result<(), DeviceError> {
+        // A camera that its driver opens again comes back or ends the run itself.
+        if state == DeviceState::Lost {
+            self.waited = Duration::ZERO;
+            return Ok(());
+        }
+        self.waited += waited;
+        if self.waited < PATIENCE + Duration::from_secs_f64(3e-6 * longest_frame_us) {
+            return Ok(());
+        }
+        Err(DeviceError::new(
+            "camera",
+            DeviceErrorKind::Timeout,
+            format!(
+                "no frame for {:.1} s: is VSYNC on its trigger input, and is the trigger mode on?",
+                self.waited.as_secs_f64()
+            ),
+        ))
+    }
+}
+
+fn closed<T>(_: QueueError<T>) -> DeviceError {
+    DeviceError::new("camera", DeviceErrorKind::NotReady, "the pipeline has ended; the log says why")
+}
+
+#[cfg(test)]
+mod tests;

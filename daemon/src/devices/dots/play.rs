@@ -1,0 +1,133 @@
+//! A path played by the mirror while the camera takes its frames, and who puts what before the camera.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread;
+
+use raysweep_core::{Camera, Clock, FramePool, MirrorPath, Subject};
+use raysweep_pipeline::dots::{Arrival, Loss};
+use raysweep_pipeline::{PipelineError, message_of};
+
+use super::camera::{Refused, Source, Wanted};
+use super::motion::Motion;
+use crate::devices::priority;
+use crate::rig::{Pace, Stand};
+use crate::run::board::StatusBoard;
+use crate::run::error::RunError;
+use crate::run::orders::{Order, Orders};
+
+/// The devices of a run, and who is told and tells.
+pub struct Player<'a> {
+    pub orders: &'a Orders,
+    pub board: &'a StatusBoard,
+    pub motion: &'a mut Motion,
+    pub camera: &'a mut dyn Camera,
+    pub pool: FramePool,
+    pub stand: Stand,
+    pub clock: Clock,
+    pub pace: Pace,
+}
+
+impl Player<'_> {
+    /// Puts a subject before the camera, of so many planes; waits for the operator where that takes one.
+    ///
+    /// # Errors
+    /// For a plane that the rig does not have.
+    pub fn place(&self, subject: Subject, planes: usize) -> Result<(), RunError> {
+        self.orders.wait_while_paused();
+        if !self.stand.place(subject)? {
+            let text = match subject {
+                Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
+                Subject::Plane(plane) => {
+                    format!("put calibration plane {} of {} before the camera", plane + 1, planes)
+                }
+                Subject::Scene => "put the scene before the camera, and all else away".into(),
+            };
+            self.orders.give(Order::Pause);
+            self.board.ask(&text);
+            self.orders.wait_while_paused();
+        }
+        Ok(())
+    }
+
+    /// Plays a path `rounds` times while the camera takes its frames: until the path is over, or, without a mirror,
+    /// until `frames` have come; sooner if `enough` is set or the run is told to end. Returns what was
+    /// lost after the last frame.
+    ///
+    /// # Errors
+    /// What mirror and camera said.
+    pub fn play(
+        &mut self,
+        path: &MirrorPath,
+        rounds: u32,
+        frames: u64,
+        enough: &AtomicBool,
+        deliver: &mut (dyn FnMut(Arrival) -> Result<(), Refused> + Send),
+    ) -> Result<Vec<Loss>, RunError> {
+        let orders = self.orders;
+        let (path_over, camera_over) = (AtomicBool::new(false), AtomicBool::new(false));
+        let is_driven = self.motion.is_driven();
+        self.motion.start(path, rounds)?;
+        let mut source = Source { camera: &mut *self.camera, pool: &self.pool, pace: self.pace };
+        let (pace, is_simulated) = (self.pace, matches!(self.stand, Stand::Simulated(_)));
+        let taken = AtomicU64::new(0);
+        let wanted = || {
+            let is_over = match is_driven {
+                true => path_over.load(Ordering::Relaxed),
+                // The next frame of a recording is another pass'.
+                false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
+            };
+            match (orders.go_on(), is_over) {
+                (true, false) => Wanted::Frames,
+                (true, true) if is_driven => Wanted::Rest,
+                _ => Wanted::Nothing,
+            }
+        };
+        let mut deliver = |arrival| {
+            taken.fetch_add(1, Ordering::Relaxed);
+            deliver(arrival)
+        };
+        let clock = self.clock.clone();
+        let (fed, taken) = thread::scope(|scope| -> Result<_, PipelineError> {
+            let camera = thread::Builder::new()
+                .name("camera".into())
+                .spawn_scoped(scope, || {
+                    // A simulated camera computes its frames here, which must give way to the workers.
+                    if pace == Pace::Devices && !is_simulated {
+                        priority::for_device("camera");
+                    }
+                    let over = SetOnDrop(&camera_over);
+                    let taken = source.take(&wanted, &mut deliver);
+                    drop(over);
+                    // A virtual clock stands still with a camera that nobody asks, and the mirror must come to rest.
+                    source.idle(&|| path_over.load(Ordering::Relaxed));
+                    taken
+                })
+                .map_err(|source| PipelineError::Spawn { name: "camera", source: source.into() })?;
+            let fed = {
+                let _over = SetOnDrop(&path_over);
+                let go_on = || {
+                    orders.go_on() && !enough.load(Ordering::Relaxed) && !camera_over.load(Ordering::Relaxed)
+                };
+                self.motion.play(&clock, &go_on)
+            };
+            if fed.is_err() {
+                orders.give(Order::Fault);
+            }
+            Ok((fed, camera.join()))
+        })?;
+        fed?;
+        match taken {
+            Ok(taken) => Ok(taken?),
+            Err(panic) => Err(RunError::Panicked(message_of(&*panic).to_owned())),
+        }
+    }
+}
+
+/// Tells the other thread that this one is over, also where it panics.
+struct SetOnDrop<'a>(&'a AtomicBool);
+
+impl Drop for SetOnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}

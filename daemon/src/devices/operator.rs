@@ -1,0 +1,183 @@
+//! The operator of a projector that no driver reaches: its driver's questions hold the run, `continue` answers them.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Receiver;
+use std::thread::{self, JoinHandle};
+
+use raysweep_core::{DeviceError, DeviceErrorKind, Pattern};
+use raysweep_drivers::projector::external::{Request, Wanted};
+use raysweep_proto::Event;
+
+use crate::run::board::StatusBoard;
+use crate::run::orders::{Order, Orders};
+
+/// The thread that puts the projector's questions to the operator. It ends with the projector.
+pub struct Operator {
+    dismissed: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Operator {
+    /// Puts `questions` to the operator of a run.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(
+        questions: Receiver<Request>,
+        orders: Arc<Orders>,
+        board: Arc<StatusBoard>,
+    ) -> Result<Self, DeviceError> {
+        let dismissed = Arc::new(AtomicBool::new(false));
+        let thread = thread::Builder::new()
+            .name("operator".into())
+            .spawn({
+                let dismissed = dismissed.clone();
+                move || {
+                    for question in questions {
+                        match dismissed.load(Ordering::Relaxed) {
+                            true => tell(question, &board),
+                            false => ask(question, &orders, &board),
+                        }
+                    }
+                }
+            })
+            .map_err(|error| DeviceError::new("projector", DeviceErrorKind::NotReady, error))?;
+        Ok(Self { dismissed, thread: Some(thread) })
+    }
+
+    /// From now on the operator is told what to do, and nobody waits until it is done.
+    pub fn dismiss(&self) {
+        self.dismissed.store(true, Ordering::Relaxed);
+    }
+}
+
+impl Drop for Operator {
+    fn drop(&mut self) {
+        if let Some(thread) = self.thread.take() {
+            // A panic of it has been logged, and refuses what was asked.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Holds the run until the operator lets it go on.
+fn ask(question: Request, orders: &Orders, board: &StatusBoard) {
+    let text = task(&question.wanted);
+    // Who lets a run go on that was held for another reason does not answer this.
+    orders.wait_while_paused();
+    orders.give(Order::Pause);
+    if orders.go_on() {
+        tracing::info!("waiting for the operator: {text}");
+        board.ask(&text);
+        orders.wait_while_paused();
+    }
+    match orders.go_on() {
+        true => question.done(),
+        false => question.refuse("the run was ended before"),
+    }
+}
+
+/// Says what is left to do once the run is over.
+fn tell(question: Request, board: &StatusBoard) {
+    let text = task(&question.wanted);
+    board.publish(Event::Ask { text: format!("{text}: the run is over and does not wait for it") });
+    question.refuse("the run is over and did not wait for it");
+}
+
+fn task(wanted: &Wanted) -> String {
+    match wanted {
+        Wanted::Pattern(Pattern::White) => "make the projector show a white picture".into(),
+        Wanted::Pattern(pattern) => format!("make the projector show {pattern:?}"),
+        Wanted::Dark => "turn the projector's light off, or cover its lens".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use raysweep_core::Projector;
+    use raysweep_drivers::projector::external::External;
+    use raysweep_proto::RunState;
+
+    use super::*;
+
+    /// A run under way, and the operator that its projector asks.
+    struct Run {
+        board: Arc<StatusBoard>,
+        orders: Arc<Orders>,
+        operator: Operator,
+    }
+
+    impl Drop for Run {
+        /// Lets nobody wait for ever where a test fails.
+        fn drop(&mut self) {
+            self.orders.give(Order::Cancel);
+        }
+    }
+
+    fn run() -> (Run, External) {
+        let (board, orders) = (Arc::new(StatusBoard::new("plane")), Arc::new(Orders::default()));
+        for state in [RunState::Preparing, RunState::Armed, RunState::Running] {
+            board.go(state).unwrap();
+        }
+        let (projector, questions) = External::new(Duration::MAX);
+        let operator = Operator::start(questions, orders.clone(), board.clone()).unwrap();
+        (Run { board, orders, operator }, projector)
+    }
+
+    impl Run {
+        /// What the socket's `continue` does.
+        fn go_on(&self) {
+            self.board.go(RunState::Running).unwrap();
+            self.orders.give(Order::Go);
+        }
+
+        fn await_question(&self) {
+            for _ in 0..10_000 {
+                if self.board.status().question.is_some() {
+                    return;
+                }
+                thread::sleep(Duration::from_millis(1));
+            }
+            panic!("nothing was asked");
+        }
+    }
+
+    #[test]
+    fn who_lets_a_held_run_go_on_answers_no_question_that_was_not_asked() {
+        let (run, mut projector) = run();
+        run.orders.give(Order::Pause);
+        run.board.go(RunState::Paused).unwrap();
+        let shown = thread::spawn(move || projector.show(&Pattern::White));
+        // Long enough for a question, were it not to wait.
+        thread::sleep(Duration::from_millis(100));
+        assert_eq!(run.board.status().question, None, "it is asked once the run goes on");
+        run.go_on();
+        run.await_question();
+        thread::sleep(Duration::from_millis(100));
+        assert!(!shown.is_finished(), "nobody has answered");
+        run.go_on();
+        shown.join().unwrap().unwrap();
+        assert_eq!(run.board.status().question, None);
+    }
+
+    #[test]
+    fn a_run_that_is_ended_meanwhile_is_no_answer() {
+        let (run, mut projector) = run();
+        let shown = thread::spawn(move || (projector.show(&Pattern::White), projector));
+        run.await_question();
+        run.orders.give(Order::Cancel);
+        let (shown, mut projector) = shown.join().unwrap();
+        assert!(shown.unwrap_err().to_string().contains("ended before"));
+        // Nobody is asked for more, and told only of the light that is left.
+        let mut events = run.board.subscribe();
+        assert!(projector.show(&Pattern::White).is_err());
+        assert!(events.try_recv().is_err());
+        run.operator.dismiss();
+        assert!(projector.blank().is_err());
+        assert!(matches!(events.try_recv(), Ok(Event::Ask { text }) if text.contains("is over")));
+        drop(projector);
+    }
+}

@@ -1,0 +1,79 @@
+//! What a plan would do on a plane rig, as far as it does not depend on the procedure.
+
+use raysweep_config::ConfigError;
+use raysweep_core::CameraCapabilities;
+use raysweep_pipeline::{DemuxFold, Point};
+use raysweep_processing::plane::PlaneTask;
+
+/// Condition number from which on noise is amplified more than the prior can hold.
+const ILL_CONDITIONED: f64 = 1e9;
+
+/// The model that a task's points make on its rig.
+pub struct Model {
+    /// First and last relative row that light is told apart from.
+    pub reach_rows: (i32, i32),
+    /// Of the system that is solved for a pixel in the middle of the frame.
+    pub condition: f64,
+    /// VSYNC periods that a frame of each point takes.
+    pub periods: Vec<u64>,
+}
+
+impl Model {
+    /// The model of a task whose plan has its points in this table.
+    ///
+    /// # Errors
+    /// When the points make no model on this rig, or ask what the camera cannot do.
+    pub fn of(task: &PlaneTask, camera: &CameraCapabilities, table: &str) -> Result<Self, ConfigError> {
+        let no_model = |message: String| task.refuse(&[table], message);
+        let geometry = &task.geometry;
+        let demux = DemuxFold::new(task.demux_options()?, &task.schedule, geometry)
+            .map_err(|error| no_model(error.to_string()))?
+            .demux()
+            .map_err(|error| no_model(error.to_string()))?;
+        let condition = demux.condition(geometry.height / 2).map_err(|error| no_model(error.to_string()))?;
+        let reach = demux.reach();
+        for point in &task.schedule.points {
+            let shot = geometry.shot(point, camera.trigger_latency_us);
+            camera.allows(&shot.settings).map_err(no_model)?;
+        }
+        let periods = task.schedule.points.iter().map(|point| periods(task, camera, point)).collect();
+        // JSON has no infinity.
+        Ok(Self { reach_rows: (*reach.start(), *reach.end()), condition: condition.min(f64::MAX), periods })
+    }
+
+    /// How many relative rows light is told apart from.
+    pub fn reach(&self) -> u64 {
+        let (first, last) = self.reach_rows;
+        (first..=last).count() as u64
+    }
+
+    /// What an operator should know of it.
+    pub fn warnings(&self, task: &PlaneTask) -> Vec<String> {
+        let (geometry, condition) = (&task.geometry, self.condition);
+        let mut warnings = Vec::new();
+        if condition > ILL_CONDITIONED {
+            warnings.push(format!(
+                "condition number {condition:.1e}: raise alpha or take delays that overlap more"
+            ));
+        }
+        let brightest_rows = task
+            .schedule
+            .points
+            .iter()
+            .map(|point| (point.exposure_us / geometry.raster.row_time_us).min(geometry.raster.rows as f64))
+            .fold(0.0, f64::max);
+        let headroom = geometry.saturation_dn / geometry.white_dn;
+        if headroom < 1.2 {
+            warnings.push(format!(
+                "a pixel saturates at {headroom:.2} of a white one over {brightest_rows:.0} rows: lower camera.white_dn (gain, aperture) to leave room for indirect light"
+            ));
+        }
+        warnings
+    }
+}
+
+/// VSYNC periods that each frame of a point takes.
+pub fn periods(task: &PlaneTask, camera: &CameraCapabilities, point: &Point) -> u64 {
+    let shot = task.geometry.shot(point, camera.trigger_latency_us);
+    u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))
+}

@@ -1,0 +1,327 @@
+//! The acquisition of points on the plane rig, which sweeps and films share: devices opened, passes made until nothing is
+//! missing, everything closed again.
+
+pub mod foresight;
+mod sink;
+
+use std::sync::Arc;
+use std::sync::mpsc::Receiver;
+use std::time::Duration;
+
+use raysweep_core::{
+    Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
+    SettingsLatency, Shown, Vsync,
+};
+use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Policy, Role, Sink, Stage};
+use raysweep_processing::plane::{PlaneTask, place};
+use raysweep_proto::RunState;
+use raysweep_session::ledger::State;
+
+pub use self::sink::{PointSink, Verdict};
+use crate::devices::camera::{
+    Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Line, Pass, Work,
+};
+use crate::devices::operator::Operator;
+use crate::devices::vsync::VsyncThread;
+use crate::rig::{Devices, Pace, Rig};
+use crate::run::board::StatusBoard;
+use crate::run::error::RunError;
+use crate::run::life::Run;
+use crate::run::orders::Orders;
+
+/// So many passes in a row that bring no point end a run.
+const FRUITLESS_PASSES: u32 = 8;
+/// The rest after the first of them, twice as long after each: together twelve seconds, in which a disturbance may pass.
+const FIRST_REST: Duration = Duration::from_millis(100);
+/// Events that may wait for the assembler.
+const QUEUE_EVENTS: usize = 64;
+
+/// Turns the light off when it goes out of scope, on every way out.
+struct Lit {
+    projector: Box<dyn Projector>,
+    /// Who works the projector, if it is a person; ends after it.
+    operator: Option<Operator>,
+}
+
+impl Lit {
+    /// Shows a pattern, or nothing; `None` where the run was ended while its operator was to do it.
+    fn show(&mut self, pattern: Option<&Pattern>, orders: &Orders) -> Result<Option<Shown>, DeviceError> {
+        let shown = match pattern {
+            Some(pattern) => self.projector.show(pattern),
+            None => self.projector.blank(),
+        };
+        match shown {
+            Err(_) if self.operator.is_some() && !orders.go_on() => Ok(None),
+            shown => shown.map(Some),
+        }
+    }
+}
+
+impl Drop for Lit {
+    fn drop(&mut self) {
+        if let Some(operator) = &self.operator {
+            operator.dismiss();
+        }
+        match self.projector.blank() {
+            Ok(_) => {}
+            // As with every run: the operator has been told.
+            Err(error) if self.operator.is_some() => tracing::warn!(%error, "projector not known to be dark"),
+            Err(error) => tracing::error!(%error, "projector not blanked"),
+        }
+    }
+}
+
+/// The devices of a rig, opened for a run.
+pub struct Opened {
+    task: Arc<PlaneTask>,
+    camera: Box<dyn Camera>,
+    vsync: Box<dyn Vsync>,
+    projector: Lit,
+    clock: Clock,
+    assembler: AssemblerConfig,
+    orders: Arc<Orders>,
+    board: Arc<StatusBoard>,
+    /// Who sets the pace.
+    pub pace: Pace,
+}
+
+/// What acquisition leaves behind.
+pub struct Taken<S> {
+    /// The pipeline's sink, which has taken everything.
+    pub sink: S,
+    /// When the frames that points waited for were exposed.
+    pub exposures: Exposures,
+    /// How late settings take effect, as a probe has found.
+    pub latency: Option<SettingsLatency>,
+    /// Why acquisition ended early, if a device did it.
+    pub fault: Option<RunError>,
+}
+
+impl Opened {
+    /// Opens all devices.
+    ///
+    /// # Errors
+    /// The first that does not open; a camera of another size than the task's.
+    pub fn open(rig: &Rig, task: &Arc<PlaneTask>, run: &Run) -> Result<Self, RunError> {
+        let Devices { camera, vsync, projector, questions, clock, pace } = rig.open()?;
+        let operator = questions
+            .map(|questions| Operator::start(questions, run.orders.clone(), run.board.clone()))
+            .transpose()?;
+        let projector = Lit { projector, operator };
+        let (geometry, capabilities) = (&task.geometry, camera.capabilities());
+        let (found, expected) =
+            ((capabilities.height, capabilities.width), (geometry.height, geometry.width));
+        if found != expected {
+            return Err(RunError::OtherCamera { found, expected });
+        }
+        let assembler = AssemblerConfig {
+            camera: capabilities.clone(),
+            raster: geometry.raster,
+            first_row: geometry.first_row,
+            max_jitter_us: task.max_jitter_us,
+            edge_gate_us: rig.file.vsync.gate_us,
+        };
+        let (task, orders, board) = (task.clone(), run.orders.clone(), run.board.clone());
+        Ok(Self { task, camera, vsync, projector, clock, assembler, orders, board, pace })
+    }
+
+    /// What the camera can do.
+    pub fn camera(&self) -> &CameraCapabilities {
+        &self.assembler.camera
+    }
+
+    /// Runs the threads of devices and pipeline while `points` makes passes. Units go through `stages` into `sink`, of
+    /// which so many are under way at a time; `results` is the other end of the sink's verdicts.
+    ///
+    /// # Errors
+    /// When a thread cannot be started, or the pipeline fails.
+    pub fn acquire<S: Sink + 'static>(
+        self,
+        stages: Arc<[Box<dyn Stage>]>,
+        units_under_way: usize,
+        sink: S,
+        results: &Receiver<Verdict>,
+        points: impl FnOnce(&mut Passes<'_>) -> Result<(), RunError>,
+    ) -> Result<Taken<S>, RunError> {
+        let Self { task, camera, vsync, projector, clock, assembler, orders, board, pace } = self;
+        let config = PipelineConfig {
+            queue_events: QUEUE_EVENTS,
+            policy: match pace {
+                Pace::Pipeline => Policy::Wait,
+                Pace::Devices => Policy::Fail,
+            },
+            units_under_way,
+            worker_threads: 0,
+        };
+        let trigger_latency_us = assembler.camera.trigger_latency_us;
+        let vsync_line = assembler.line();
+        let (pipeline, input) = Pipeline::start(config, assembler, stages, sink)?;
+        let vsync =
+            VsyncThread::start(vsync, vsync_line, pace, board.clone(), input.clone(), orders.clone())?;
+        let line = line_of(&task, trigger_latency_us);
+        let camera = CameraThread::start(camera, Drive { clock, pace, line }, input, orders.clone())?;
+        let _ = board.go(RunState::Armed);
+        let mut passes = Passes {
+            task: &task,
+            camera: &camera,
+            vsync: &vsync,
+            projector,
+            results,
+            orders: &orders,
+            pace,
+            trigger_latency_us,
+        };
+        let _ = board.go(RunState::Running);
+        let acquired = passes
+            .probe()
+            .map(|()| board.set_settings_latency(camera.latency()))
+            .and_then(|()| points(&mut passes));
+        let _ = board.go(RunState::Draining);
+        drop(passes);
+        let latency = camera.latency();
+        let imaged = camera.join();
+        let watched = vsync.join();
+        let sink = pipeline.join()?;
+        // What failed first is the cause; what it brought down comes after.
+        let (exposures, imaged) = match imaged {
+            Ok(exposures) => (exposures, Ok(())),
+            Err(error) => (Exposures::default(), Err(error)),
+        };
+        let device = watched.and(imaged).err().map(RunError::from);
+        Ok(Taken { sink, exposures, latency, fault: device.or(acquired.err()) })
+    }
+}
+
+/// The line that triggers the camera through a task's settings. Dark points have a pass of their own.
+fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> Line {
+    let lit = task.schedule.points.iter().filter(|point| !matches!(point.role, Role::Dark(_)));
+    let settings: Vec<CameraSettings> =
+        lit.map(|point| task.geometry.shot(point, trigger_latency_us).settings).collect();
+    Line::new(task.geometry.raster.period_us, task.max_jitter_us, &settings)
+}
+
+/// Those of a task's points that the ledger does not know as stored, with the number of their next attempt.
+pub fn missing(task: &PlaneTask, state: &State) -> Vec<SettingsId> {
+    (0..)
+        .zip(&task.schedule.points)
+        .filter_map(|(ordinal, point)| {
+            let (array, index) = place(point.role);
+            let attempt = state.next_attempt(array, index);
+            state.point(array, index).is_none().then_some(SettingsId { point: ordinal, attempt })
+        })
+        .collect()
+}
+
+/// Passes over the points, while the devices' threads run.
+pub struct Passes<'a> {
+    task: &'a PlaneTask,
+    camera: &'a CameraThread,
+    vsync: &'a VsyncThread,
+    projector: Lit,
+    results: &'a Receiver<Verdict>,
+    orders: &'a Orders,
+    pace: Pace,
+    trigger_latency_us: f64,
+}
+
+impl Passes<'_> {
+    /// Finds out how late settings take effect, where there are several.
+    fn probe(&self) -> Result<(), RunError> {
+        let mut settings = self.task.settings().map(|(_, point)| *point);
+        let Some(first) = settings.next().filter(|_| settings.next().is_some() && self.orders.go_on()) else {
+            return Ok(());
+        };
+        let shot = self.task.geometry.shot(&first, self.trigger_latency_us);
+        let probed = self.camera.acquire(Work::Probe(shot.settings)).map_err(|Gone| RunError::Interrupted)?;
+        self.results.iter().find(|verdict| matches!(verdict, Verdict::Flushed));
+        Ok(probed?)
+    }
+
+    /// Acquires points until none of them is missing, or the run is told to end.
+    ///
+    /// # Errors
+    /// When a device fails, or points fail again and again.
+    pub fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
+        let mut todo: Vec<Attempt> = missing.into_iter().map(|id| self.attempt(id)).collect();
+        let mut fruitless = 0;
+        loop {
+            let before = todo.len();
+            let mut counts = Counts::default();
+            let (dark, lit): (Vec<_>, Vec<_>) =
+                todo.into_iter().partition(|attempt| matches!(attempt.point.role, Role::Dark(_)));
+            todo = Vec::new();
+            if !dark.is_empty() {
+                let Some(shown) = self.projector.show(None, self.orders)? else { return Ok(()) };
+                todo.extend(self.pass(dark, shown, &mut counts)?);
+            }
+            if !lit.is_empty() && self.orders.go_on() {
+                let white = self.projector.show(Some(&Pattern::White), self.orders)?;
+                let Some(shown) = white else { return Ok(()) };
+                todo.extend(self.pass(lit, shown, &mut counts)?);
+            }
+            if todo.is_empty() || !self.orders.go_on() {
+                return Ok(());
+            }
+            fruitless = if todo.len() < before { 0 } else { fruitless + 1 };
+            if fruitless == FRUITLESS_PASSES {
+                let interrupted = todo.iter().filter(|attempt| attempt.interruptions > 0).count();
+                let (points, passes) = (todo.len(), FRUITLESS_PASSES);
+                return Err(RunError::Hopeless { points, passes, counts, interrupted });
+            }
+            if fruitless > 0 && self.pace == Pace::Devices {
+                self.orders.rest(FIRST_REST * (1 << (fruitless - 1)));
+            }
+            // As long as nobody watches the line, no point has a chance.
+            self.vsync.await_watcher(self.orders);
+        }
+    }
+
+    fn attempt(&self, id: SettingsId) -> Attempt {
+        let point = self.task.schedule.points[id.point as usize];
+        let shot = self.task.geometry.shot(&point, self.trigger_latency_us);
+        Attempt { id, point, shot, interruptions: 0 }
+    }
+
+    /// Has the camera take a film under white light.
+    ///
+    /// # Errors
+    /// When a device fails.
+    pub fn film(&mut self, settings: Vec<FilmSetting>, cycles: u32) -> Result<(), RunError> {
+        let white = self.projector.show(Some(&Pattern::White), self.orders)?;
+        let Some(shown) = white else { return Ok(()) };
+        let film = FilmPass { settings, cycles, not_before_ns: shown.not_before_ns };
+        let acquired = self.camera.acquire(Work::Film(film)).map_err(|Gone| RunError::Interrupted)?;
+        self.results.iter().find(|verdict| matches!(verdict, Verdict::Flushed));
+        Ok(acquired?)
+    }
+
+    /// Whether the run goes on.
+    pub fn go_on(&self) -> bool {
+        self.orders.go_on()
+    }
+
+    /// Makes attempts under one picture; returns those to make next, and adds up what became of their frames.
+    fn pass(
+        &self,
+        attempts: Vec<Attempt>,
+        shown: Shown,
+        counts: &mut Counts,
+    ) -> Result<Vec<Attempt>, RunError> {
+        let pass = Pass { attempts: attempts.clone(), not_before_ns: shown.not_before_ns };
+        let acquired = self.camera.acquire(Work::Pass(pass)).map_err(|Gone| RunError::Interrupted)?;
+        let mut again = Vec::new();
+        // The sink closes the channel when it ends, so this waits for nothing that cannot come.
+        for verdict in self.results {
+            match verdict {
+                Verdict::Failed(id, failure, of_attempt) => {
+                    let failed = attempts.iter().filter(|attempt| attempt.id == id);
+                    again.extend(failed.map(|attempt| attempt.after(failure)));
+                    counts.add(&of_attempt);
+                }
+                Verdict::Flushed => break,
+            }
+        }
+        acquired?;
+        Ok(again)
+    }
+}

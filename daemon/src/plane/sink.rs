@@ -1,0 +1,150 @@
+//! The pipeline's sink: data first, then the ledger's line, then the folds.
+
+use std::sync::Arc;
+use std::sync::mpsc::Sender;
+
+use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
+use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
+use raysweep_processing::plane::{PlaneTask, place};
+use raysweep_processing::sweep::Processing;
+use raysweep_proto::Event;
+use raysweep_session::ledger::{Entry, Ledger, PointEntry};
+use raysweep_session::stack::Stack;
+
+use crate::live::LiveEstimate;
+use crate::run::board::StatusBoard;
+use crate::run::orders::{Order, Orders};
+use crate::run::progress::ProgressMeter;
+
+/// What the run is told of its points, in order.
+#[derive(Debug)]
+pub enum Verdict {
+    /// An attempt failed, or its data could not be stored.
+    Failed(SettingsId, Failure, Counts),
+    /// The pass is over.
+    Flushed,
+}
+
+/// Stores the points that the pipeline delivers.
+pub struct PointSink {
+    pub task: Arc<PlaneTask>,
+    pub stack: Stack,
+    pub ledger: Ledger,
+    pub processing: Processing,
+    /// Until the pipeline has ended.
+    pub verdicts: Option<Sender<Verdict>>,
+    pub orders: Arc<Orders>,
+    pub board: Arc<StatusBoard>,
+    pub progress: ProgressMeter,
+    pub vsync: Option<VsyncStats>,
+    /// Until the pipeline has ended: then the machine is for the results.
+    pub live: Option<LiveEstimate>,
+    /// The first failure to write, which ends the run.
+    pub write_error: Option<raysweep_session::Error>,
+}
+
+impl Sink for PointSink {
+    fn take(&mut self, item: Ordered) {
+        match item {
+            Ordered::Unit(unit, image) => {
+                if let Err(error) = self.store(&unit) {
+                    tracing::error!(%error, point = unit.id.point, "point not stored");
+                    self.note_write_error(error);
+                    let mut counts = unit.counts.clone();
+                    counts.forfeit(LossCause::WriterError);
+                    self.fail(unit.id, Failure::Interrupted, counts);
+                    return;
+                }
+                self.progress.stored += 1;
+                self.progress.counts.add(&unit.counts);
+                match image {
+                    Ok(image) => {
+                        self.processing.push(&unit, &image);
+                        if let Some(live) = &self.live
+                            && let Some(snapshot) = self.processing.snapshot()
+                        {
+                            live.offer(snapshot);
+                        }
+                    }
+                    Err(error) => self.note_stage_error(&unit, &error),
+                }
+                self.board.publish(Event::Progress(self.progress.shown()));
+            }
+            Ordered::Failed(id, failure, counts) => self.fail(id, failure, counts),
+            Ordered::Flushed(outside, vsync) => {
+                if outside != Counts::default() {
+                    self.progress.counts.add(&outside);
+                    self.append(&Entry::Outside { counts: outside });
+                }
+                self.vsync = Some(vsync);
+                self.board.publish(Event::Progress(self.progress.shown()));
+                self.board.publish(Event::Vsync(vsync));
+                self.tell(Verdict::Flushed);
+            }
+        }
+    }
+
+    fn end(&mut self) {
+        self.verdicts = None;
+        self.live = None;
+    }
+}
+
+impl PointSink {
+    fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
+        let point = self.task.schedule.points[unit.id.point as usize];
+        let (array, index) = place(point.role);
+        let crc32 = self.stack.write(array, index, unit.sum.view())?;
+        self.ledger.append(&Entry::Point(PointEntry {
+            array,
+            index,
+            attempt: unit.id.attempt,
+            frames: unit.frames,
+            exposure_us: unit.exposure_us,
+            delay_us: point.delay_us,
+            delays_us: unit.delays_us.clone(),
+            counts: unit.counts.clone(),
+            crc32,
+        }))
+    }
+
+    fn fail(&mut self, id: SettingsId, failure: Failure, counts: Counts) {
+        let (array, index) = place(self.task.schedule.points[id.point as usize].role);
+        self.progress.counts.add(&counts);
+        if counts.lost_total() > 0 {
+            self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() });
+        }
+        let (attempt, of_attempt) = (id.attempt, counts.clone());
+        self.append(&match failure {
+            Failure::Losses => Entry::AttemptFailed { array, index, attempt, counts: of_attempt },
+            Failure::Interrupted => Entry::AttemptInterrupted { array, index, attempt, counts: of_attempt },
+        });
+        self.tell(Verdict::Failed(id, failure, counts));
+    }
+
+    fn tell(&self, verdict: Verdict) {
+        if let Some(verdicts) = &self.verdicts {
+            let _ = verdicts.send(verdict);
+        }
+    }
+
+    pub fn note_write_error(&mut self, error: raysweep_session::Error) {
+        self.orders.give(Order::Fault);
+        self.write_error.get_or_insert(error);
+    }
+
+    fn note_stage_error(&mut self, unit: &Unit, error: &StageError) {
+        tracing::error!(%error, point = unit.id.point, "stored, but left out of the results");
+        let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
+        self.processing.problems.push(error.to_string());
+        self.append(&Entry::StageFailed { array, index, attempt: unit.id.attempt, error: error.to_string() });
+    }
+
+    /// Appends what no data hangs on: a failure ends the run, but there is nothing to take back.
+    pub fn append(&mut self, entry: &Entry) {
+        if let Err(error) = self.ledger.append(entry) {
+            tracing::error!(%error, "ledger not written");
+            self.note_write_error(error);
+        }
+    }
+}

@@ -1,0 +1,261 @@
+//! Dark frames, flat field, calibration planes, then the scene.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use raysweep_config::BatchesPlan;
+use raysweep_core::{Counts, FramePool, SettingsId, Subject};
+use raysweep_pipeline::dots::{DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
+use raysweep_pipeline::{Policy, Registry};
+use raysweep_processing::batches::{CorrectOptions, DotTask, flat};
+use raysweep_proto::RunState;
+use raysweep_session::Session;
+use raysweep_session::dots::RawFrames;
+use raysweep_session::ledger::Ledger;
+use raysweep_transport::dots::{DotsError, FlatField};
+
+use super::sink::{BatchSink, RawSink, Stored, Writing};
+use crate::devices::dots::camera::Refused;
+use crate::devices::dots::motion::Motion;
+use crate::devices::dots::play::Player;
+use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
+use crate::rig::{DotDevices, DotRig, Pace};
+use crate::run::error::RunError;
+use crate::run::life::Run;
+use crate::run::orders::Orders;
+
+/// What acquisition leaves behind.
+pub struct Acquired {
+    /// The session.
+    pub session: Session,
+    /// Its ledger, still locked.
+    pub ledger: Ledger,
+    /// What single dots and batches met.
+    pub problems: Vec<String>,
+    /// Why acquisition ended early, if a fault ended it.
+    pub fault: Option<RunError>,
+}
+
+/// Acquires all batches.
+///
+/// # Errors
+/// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
+pub fn acquire(
+    rig: &DotRig,
+    task: &Arc<DotTask>,
+    registry: &Registry,
+    mut run: Run,
+) -> Result<Acquired, RunError> {
+    run.note_beginning()?;
+    let earlier = task.earlier_flat_field(&run.data)?;
+    let rate_hz = task.batches.camera_rate_hz();
+    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = rig.open(&run.data, rate_hz)?;
+    let mut motion = Motion::new(mirror);
+    let shape = task.shape;
+    let found = (camera.capabilities().height, camera.capabilities().width);
+    if found != (shape.height(), shape.width()) {
+        return Err(RunError::OtherCamera { found, expected: (shape.height(), shape.width()) });
+    }
+    if let Some(Err(error)) = run.live.as_ref().map(|outlet| outlet.file.clear()) {
+        tracing::warn!(%error, "the live file still shows the run before");
+    }
+    camera.configure(SettingsId { point: 0, attempt: 0 }, &task.camera_settings())?;
+    let storage = BatchSink::start(Writing {
+        task: task.clone(),
+        dots: run.session.dots()?,
+        ledger: run.ledger,
+        board: run.board.clone(),
+        orders: run.orders.clone(),
+        live: run.live,
+    })?;
+    let frame_bytes = task.format.frame_bytes(shape.pixels());
+    let waiting = frames_waiting(pace, rate_hz, frame_bytes);
+    camera.arm()?;
+    let _ = run.board.go(RunState::Armed);
+    let _ = run.board.go(RunState::Running);
+    let mut passes = Passes {
+        task,
+        registry,
+        session: &run.session,
+        earlier,
+        orders: &run.orders,
+        storage: &storage,
+        waiting,
+        player: Player {
+            orders: &run.orders,
+            board: &run.board,
+            motion: &mut motion,
+            camera: &mut *camera,
+            pool: FramePool::new(waiting + FRAMES_AT_WORK, frame_bytes),
+            stand,
+            clock,
+            pace,
+        },
+    };
+    let passed = passes.all();
+    let _ = run.board.go(RunState::Draining);
+    // Light off before anything else ends.
+    drop(motion);
+    if let Err(error) = camera.disarm() {
+        tracing::warn!(%error, "camera not disarmed");
+    }
+    let Stored { ledger, problems, error } = storage.finish()?;
+    let fault = error.map(RunError::from).or(passed.err());
+    Ok(Acquired { session: run.session, ledger, problems, fault })
+}
+
+struct Passes<'a> {
+    task: &'a DotTask,
+    registry: &'a Registry,
+    session: &'a Session,
+    /// The flat field of an earlier session, if the plan names one.
+    earlier: Option<FlatField>,
+    orders: &'a Orders,
+    storage: &'a BatchSink,
+    /// Frames that may wait for the workers.
+    waiting: usize,
+    player: Player<'a>,
+}
+
+impl Passes<'_> {
+    /// Dark frames, flat field, planes, scene.
+    fn all(&mut self) -> Result<(), RunError> {
+        let plan = &self.task.batches;
+        let Some(mut sensor) = self.sensor()? else { return Ok(()) };
+        let mut raw = match plan.keep_raw {
+            true => {
+                let (rows, columns) = (self.task.shape.height(), self.task.shape.width());
+                let frames = RawFrames::create(&self.session.raw_path(), rows, columns)?;
+                Some(RawSink::new(frames, self.task.format, self.task.shape.values()))
+            }
+            false => None,
+        };
+        let mut first_batch = 0;
+        let planes = plan.calibration.iter().enumerate().map(|(index, plane)| (Some(index), plane.batches));
+        for (plane, batches) in planes.chain([(None, plan.count)]) {
+            self.player.place(plane.map_or(Subject::Scene, Subject::Plane), plan.calibration.len())?;
+            if !self.orders.go_on() {
+                break;
+            }
+            (sensor, raw) = self.pass(sensor, raw, first_batch, plane, batches)?;
+            first_batch += batches as usize;
+        }
+        match raw {
+            Some(raw) => Ok(raw.finish()?),
+            None => Ok(()),
+        }
+    }
+
+    /// What is known of the sensor before the first dot; nothing if the run was told to end.
+    fn sensor(&mut self) -> Result<Option<Sensor>, RunError> {
+        let (task, plan) = (self.task, &self.task.batches);
+        let CorrectOptions { hot_sigmas, background_batches, .. } = task.correct;
+        let (shape, saturation_dn) = (task.shape, task.saturation_dn());
+        let mut dark = DarkRun::new(shape, saturation_dn, plan.dark_frames, background_batches)?;
+        if !self.without_light(plan.dark_frames, &mut |frame| dark.push(frame))? {
+            return Ok(None);
+        }
+        let field = match plan.flat_frames {
+            0 => self.earlier.take(),
+            frames => {
+                self.player.place(Subject::Diffuser, plan.calibration.len())?;
+                let mut run = FlatRun::new(shape, saturation_dn, frames);
+                if !self.orders.go_on() || !self.without_light(frames, &mut |frame| run.push(frame))? {
+                    return Ok(None);
+                }
+                Some(run.finish(&dark, hot_sigmas, task.sampling())?)
+            }
+        };
+        let sensor = dark.finish(hot_sigmas, field.as_ref(), task.sampling())?;
+        if field.is_some() {
+            flat::keep(self.session, &sensor.correction)?;
+        }
+        Ok(Some(sensor))
+    }
+
+    /// Takes frames while the mirror's light is off, until `push` wants no more; whether the run goes on.
+    fn without_light(
+        &mut self,
+        wanted: u32,
+        push: &mut (dyn FnMut(&[u16]) -> Result<bool, DotsError> + Send),
+    ) -> Result<bool, RunError> {
+        let task = self.task;
+        let path = task.path.clone().with_light(|_| 0);
+        let (mut counts, mut failed, mut frames) = (vec![0; task.shape.values()], None, 0);
+        let has_enough = AtomicBool::new(false);
+        let rounds = task.batches.dark_rounds(wanted);
+        let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+            // Whoever waits for the camera's last frame sees some more.
+            if !has_enough.load(Ordering::Relaxed) {
+                let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
+                let pushed = match unpacked {
+                    Ok(()) => push(&counts).map_err(RunError::from),
+                    Err(error) => Err(RunError::Frame(error.to_string())),
+                };
+                match pushed {
+                    Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
+                    Err(error) => {
+                        failed = Some(error);
+                        return Err(Refused::Closed);
+                    }
+                }
+            }
+            frames += 1 + arrival.lost_before.iter().map(|loss| loss.frames).sum::<u64>();
+            Ok(())
+        })?;
+        frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
+        // No batch waits for any of them.
+        self.storage.outside(Counts { expected: frames, settling: frames, ..Counts::default() });
+        match failed {
+            Some(failed) => Err(failed),
+            None => Ok(self.orders.go_on()),
+        }
+    }
+
+    /// Takes the batches of one plane or of the scene.
+    fn pass(
+        &mut self,
+        sensor: Sensor,
+        raw: Option<RawSink>,
+        first_batch: usize,
+        plane: Option<usize>,
+        batches: u32,
+    ) -> Result<(Sensor, Option<RawSink>), RunError> {
+        let (task, plan) = (self.task, &self.task.batches);
+        let Sensor { correction, background, floor } = sensor;
+        let stage = task.stage(self.registry, &correction)?;
+        let config = DotsFlowConfig {
+            scan: task.scan(batches),
+            format: task.format,
+            saturation_dn: task.saturation_dn(),
+            stage: stage.into(),
+            correction: correction.clone(),
+            background,
+            floor,
+            threads: 0,
+            queue_frames: self.waiting,
+            policy: match self.player.pace {
+                Pace::Pipeline => Policy::Wait,
+                Pace::Devices => Policy::Fail,
+            },
+        };
+        let (flow, mut input) = DotsFlow::start(config, self.storage.sink(first_batch, plane, raw))?;
+        let blind = flow.is_blind();
+        let rounds = BatchesPlan::rounds(batches);
+        let frames = u64::from(rounds) * u64::from(plan.dots);
+        let played =
+            self.player.play(&task.path, rounds, frames, &blind, &mut |arrival| Ok(input.offer(arrival)?));
+        drop(input);
+        let Gathered { sink, background, error } = flow.join()?;
+        let mut rest = Counts::default();
+        for Loss { frames, cause } in played? {
+            rest.expected += frames;
+            rest.lose(cause, frames);
+        }
+        self.storage.outside(rest);
+        if let Some(error) = error.filter(|_| self.orders.go_on()) {
+            return Err(error.into());
+        }
+        Ok((Sensor { correction, background, floor }, sink.into_raw()))
+    }
+}

@@ -1,0 +1,89 @@
+//! Batches of a flying dot.
+
+mod acquire;
+mod check;
+mod sink;
+
+use std::sync::Arc;
+
+use raysweep_config::{BatchesPlan, ConfigError, Plan};
+use raysweep_pipeline::Registry;
+use raysweep_processing::batches::{DotTask, keep_patterns, make};
+use raysweep_proto::{ErrorCode, RpcError};
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, EndState, Entry};
+use raysweep_session::stack::{Contents, StackShape};
+
+use self::acquire::{Acquired, acquire};
+use crate::procedure::lab::Lab;
+use crate::rig::DotRig;
+use crate::run::error::RunError;
+use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+
+/// Batches on a rig.
+struct BatchesRun {
+    rig: Arc<DotRig>,
+    task: Arc<DotTask>,
+    registry: Arc<Registry>,
+}
+
+/// Foresees batches.
+///
+/// # Errors
+/// For a plan that cannot be run on this rig.
+pub fn foresee(
+    lab: &Lab<'_>,
+    rig: &Arc<DotRig>,
+    plan: &Plan,
+    own: BatchesPlan,
+) -> Result<Foreseen, ConfigError> {
+    let task = DotTask::new(plan, own, &rig.file, lab.camera.format, lab.size(), lab.data)?;
+    let shape = StackShape {
+        contents: Contents::Batches { batches: task.batches.total(), dots: task.batches.dots as usize },
+        rows: lab.camera.height,
+        columns: lab.camera.width,
+    };
+    Ok(Foreseen {
+        report: check::check(&task, lab, rig.pace())?,
+        kind: plan.procedure.kind(),
+        name: plan.name.clone(),
+        shape,
+        first_row: 0,
+        instead: "take fewer or smaller frames",
+        procedure: Box::new(BatchesRun {
+            rig: rig.clone(),
+            task: Arc::new(task),
+            registry: lab.registry.clone(),
+        }),
+    })
+}
+
+impl Procedure for BatchesRun {
+    fn keep(&self, session: &Session) -> Result<(), RpcError> {
+        keep_patterns(session, &self.task).map_err(|error| RpcError::new(ErrorCode::InvalidPlan, error))?;
+        match &self.task.predistortion {
+            Some(predistortion) => predistortion
+                .keep(session)
+                .map_err(|error| RpcError::new(ErrorCode::Storage, error.to_string())),
+            None => Ok(()),
+        }
+    }
+
+    fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
+        let Self { rig, task, registry } = *self;
+        let orders = run.orders.clone();
+        let Acquired { session, mut ledger, mut problems, fault } = acquire(&rig, &task, &registry, run)?;
+        let stored = ledger.state().stored_points();
+        let state = end_state(fault.as_ref(), &orders);
+        let end = EndEntry {
+            error: fault.map(|fault| fault.to_string()),
+            ..end_entry(state, stored, task.batches.total() - stored)
+        };
+        ledger.append(&Entry::End(end.clone()))?;
+        if state == EndState::Complete {
+            let go_on = || orders.go_on();
+            problems = make(&session, ledger.state(), &task, &rig.file, &task.specs, problems, &go_on)?;
+        }
+        Ok(Ended { end, warnings: problems })
+    }
+}

@@ -1,0 +1,311 @@
+//! From the pipeline to the disk: a batch's data first, then the ledger's line, then its picture.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::{self, JoinHandle};
+
+use raysweep_core::{Counts, Frame, LossCause, PixelFormat};
+use raysweep_pipeline::PipelineError;
+use raysweep_pipeline::dots::{Cut, CutSink};
+use raysweep_processing::batches::{DotTask, from_stored, to_stored};
+use raysweep_proto::{BatchStored, Event};
+use raysweep_session::dots::{BatchEntry, Dots, RawFrames};
+use raysweep_session::ledger::{Entry, Ledger};
+use raysweep_transport::dots::product::floodlit;
+use serde_json::{Map, Value, json};
+
+use crate::live::{FLOODLIT, Outlet};
+use crate::run::board::StatusBoard;
+use crate::run::orders::{Order, Orders};
+use crate::run::progress::ProgressMeter;
+
+/// Batches that may wait for the disk.
+const WAITING_BATCHES: usize = 4;
+/// A batch that lacks more than one in so many of its dots is not stored.
+const MOST_MISSING: usize = 10;
+
+/// What goes to the writer.
+enum Item {
+    /// A batch, its index in `dots.zarr`, and the plane that it shows.
+    Batch(Box<Cut>, usize, Option<usize>),
+    /// Frames that belong to none.
+    Outside(Counts),
+}
+
+/// The writer's thread as the run sees it.
+pub struct BatchSink {
+    items: SyncSender<Item>,
+    thread: JoinHandle<Writer>,
+}
+
+/// What the writer leaves behind.
+pub struct Stored {
+    /// The ledger, still locked.
+    pub ledger: Ledger,
+    /// What single dots met.
+    pub problems: Vec<String>,
+    /// The first failure to write, which ended the run.
+    pub error: Option<raysweep_session::Error>,
+}
+
+/// Everything that the writer needs.
+pub struct Writing {
+    /// The plan on its rig.
+    pub task: Arc<DotTask>,
+    /// Where batches go.
+    pub dots: Dots,
+    /// What knows of them.
+    pub ledger: Ledger,
+    /// Told of each.
+    pub board: Arc<StatusBoard>,
+    /// Ended when the disk refuses.
+    pub orders: Arc<Orders>,
+    /// Where floodlit images are shown, if anywhere.
+    pub live: Option<Outlet>,
+}
+
+struct Writer {
+    writing: Writing,
+    progress: ProgressMeter,
+    first_ns: Option<i64>,
+    problems: Vec<String>,
+    error: Option<raysweep_session::Error>,
+}
+
+impl BatchSink {
+    /// Starts the writer.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(writing: Writing) -> Result<Self, PipelineError> {
+        let (items, inbox) = sync_channel(WAITING_BATCHES);
+        let planned = writing.task.batches.total();
+        let progress = ProgressMeter::new(0, planned);
+        let writer = Writer { writing, progress, first_ns: None, problems: Vec::new(), error: None };
+        let thread = thread::Builder::new()
+            .name("dots-writer".into())
+            .spawn(move || writer.run(&inbox))
+            .map_err(|source| PipelineError::Spawn { name: "dots-writer", source: source.into() })?;
+        Ok(Self { items, thread })
+    }
+
+    /// The sink of a pass whose first batch has this index; raw frames go to `raw`, if anywhere.
+    pub fn sink(&self, first_batch: usize, plane: Option<usize>, raw: Option<RawSink>) -> PassSink {
+        PassSink { items: self.items.clone(), first_batch, plane, raw }
+    }
+
+    /// Takes note of frames that belong to no batch.
+    pub fn outside(&self, counts: Counts) {
+        let _ = self.items.send(Item::Outside(counts));
+    }
+
+    /// Waits until everything is written.
+    ///
+    /// # Errors
+    /// When the writer panicked.
+    pub fn finish(self) -> Result<Stored, PipelineError> {
+        drop(self.items);
+        let Writer { writing, problems, error, .. } =
+            self.thread.join().map_err(|_panic| PipelineError::Panicked("dots-writer"))?;
+        Ok(Stored { ledger: writing.ledger, problems, error })
+    }
+}
+
+/// What takes a pass' batches off the pipeline.
+pub struct PassSink {
+    items: SyncSender<Item>,
+    first_batch: usize,
+    plane: Option<usize>,
+    raw: Option<RawSink>,
+}
+
+/// Where raw frames go.
+pub struct RawSink {
+    frames: RawFrames,
+    format: PixelFormat,
+    counts: Vec<u16>,
+    /// Frames of the passes before.
+    before: u64,
+    error: Option<raysweep_session::Error>,
+}
+
+impl RawSink {
+    /// Keeps frames of this format and so many pixels.
+    pub fn new(frames: RawFrames, format: PixelFormat, pixels: usize) -> Self {
+        Self { frames, format, counts: vec![0; pixels], before: 0, error: None }
+    }
+
+    /// Ends the file.
+    ///
+    /// # Errors
+    /// When the disk has refused, now or before.
+    pub fn finish(self) -> raysweep_session::Result<()> {
+        match self.error {
+            Some(error) => Err(error),
+            None => self.frames.finish(),
+        }
+    }
+
+    fn keep(&mut self, frame: &Frame) {
+        // A frame that cannot be unpacked has no counts to keep; its place is kept.
+        if self.format.unpack_into(&frame.data, &mut self.counts).is_err() {
+            self.counts.fill(0);
+        }
+        let kept = self.frames.push(&self.counts);
+        self.note(kept);
+    }
+
+    fn note(&mut self, done: raysweep_session::Result<()>) {
+        if let (Err(error), None) = (done, &self.error) {
+            tracing::error!(%error, "raw frames are no longer kept");
+            self.error = Some(error);
+        }
+    }
+}
+
+impl PassSink {
+    /// Gives back where raw frames go.
+    pub fn into_raw(self) -> Option<RawSink> {
+        self.raw.map(|mut raw| {
+            raw.before = raw.frames.len();
+            raw
+        })
+    }
+}
+
+impl CutSink for PassSink {
+    fn take(&mut self, cut: Cut) {
+        let batch = self.first_batch + cut.batch as usize;
+        // The writer outlives the pass, or has panicked, which its join tells.
+        let _ = self.items.send(Item::Batch(Box::new(cut), batch, self.plane));
+    }
+
+    fn outside(&mut self, counts: Counts) {
+        let _ = self.items.send(Item::Outside(counts));
+    }
+
+    fn frame(&mut self, frame: &Frame) {
+        if let Some(raw) = self.raw.as_mut().filter(|raw| raw.error.is_none()) {
+            raw.keep(frame);
+        }
+    }
+
+    fn fate(&mut self, arrival: u64, id: u64, place: Option<(u32, u32)>) {
+        let first_batch = self.first_batch;
+        if let Some(raw) = self.raw.as_mut().filter(|raw| raw.error.is_none()) {
+            let place = place.map(|(batch, index)| (first_batch + batch as usize, index as usize));
+            let noted = raw.frames.note(raw.before + arrival, id, place);
+            raw.note(noted);
+        }
+    }
+}
+
+impl Writer {
+    fn run(mut self, inbox: &Receiver<Item>) -> Self {
+        for item in inbox {
+            match item {
+                Item::Batch(cut, batch, plane) => self.batch(*cut, batch, plane),
+                Item::Outside(counts) if counts == Counts::default() => {}
+                Item::Outside(counts) => {
+                    self.progress.counts.add(&counts);
+                    self.append(&Entry::Outside { counts });
+                }
+            }
+            self.writing.board.publish(Event::Progress(self.progress.shown()));
+        }
+        self
+    }
+
+    fn batch(&mut self, cut: Cut, batch: usize, plane: Option<usize>) {
+        let Cut { columns, seen, mut counts, duplicates, start_ns, problem, .. } = cut;
+        let task = self.writing.task.clone();
+        if let Some(problem) = problem {
+            self.problems.push(format!("batch {batch}: {problem}"));
+        }
+        let missing: Vec<usize> = (0..seen.len()).filter(|&dot| task.is_scene(dot) && !seen[dot]).collect();
+        if missing.len() * MOST_MISSING > seen.len() {
+            counts.cancelled += std::mem::take(&mut counts.averaged);
+            self.progress.counts.add(&counts);
+            self.problems.push(format!("batch {batch} lacks {} dots and is not stored", missing.len()));
+            return self.append(&Entry::BatchLost { batch, counts });
+        }
+        let first_ns = *self.first_ns.get_or_insert(start_ns);
+        let start_s = (start_ns - first_ns) as f64 * 1e-9;
+        let empty = (0..seen.len()).filter(|&dot| seen[dot] && columns.discs[dot] == 0).count();
+        let capped = columns.capped.iter().filter(|&&capped| capped).count();
+        let stored = to_stored(columns, seen);
+        let entry = BatchEntry {
+            batch,
+            plane,
+            start_s,
+            missing,
+            empty,
+            capped,
+            duplicates,
+            counts: counts.clone(),
+            crc32: stored.crc32(),
+        };
+        let attributes = json!({ "batch": batch, "plane": plane, "start_s": start_s });
+        let attributes = attributes.as_object().cloned().unwrap_or_default();
+        let written = self.writing.dots.write(batch, &stored, attributes);
+        match written.and_then(|()| self.writing.ledger.append(&Entry::Batch(entry.clone()))) {
+            Ok(()) => {
+                self.progress.stored += 1;
+                self.progress.counts.add(&counts);
+            }
+            Err(error) => {
+                tracing::error!(%error, batch, "batch not stored");
+                self.fail(error);
+                counts.forfeit(LossCause::WriterError);
+                self.progress.counts.add(&counts);
+                return self.append(&Entry::BatchLost { batch, counts });
+            }
+        }
+        match from_stored(task.shape, stored) {
+            Ok((columns, _)) => self.show(&entry, &floodlit(&columns)),
+            Err(error) => self.problems.push(format!("batch {batch}: {error}")),
+        }
+    }
+
+    /// Tells of a batch, with its floodlit image in the live file.
+    fn show(&self, entry: &BatchEntry, floodlit: &ndarray::Array3<f32>) {
+        let image = floodlit.index_axis(ndarray::Axis(2), 0);
+        let sequence = self.writing.live.as_ref().and_then(|Outlet { file, session, .. }| {
+            let entries = [
+                ("axes", json!(["t", "s"])),
+                ("units", json!("camera counts above the background, summed over all dots")),
+                ("session", json!(session)),
+                ("batch", json!(entry.batch)),
+                ("plane", json!(entry.plane)),
+                ("start_s", json!(entry.start_s)),
+            ];
+            let metadata: Map<String, Value> =
+                entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
+            let shown = file.publish(FLOODLIT, image.view().into_dyn(), &metadata);
+            shown.map_err(|error| tracing::warn!(%error, "a floodlit image is not shown")).ok()
+        });
+        self.writing.board.publish(Event::Batch(BatchStored {
+            batch: entry.batch,
+            plane: entry.plane,
+            start_s: entry.start_s,
+            missing: entry.missing.len(),
+            empty: entry.empty,
+            capped: entry.capped,
+            duplicates: entry.duplicates,
+            floodlit: f64::from(image.mean().unwrap_or(0.0)),
+            sequence,
+        }));
+    }
+
+    fn fail(&mut self, error: raysweep_session::Error) {
+        self.writing.orders.give(Order::Fault);
+        self.error.get_or_insert(error);
+    }
+
+    fn append(&mut self, entry: &Entry) {
+        if let Err(error) = self.writing.ledger.append(entry) {
+            tracing::error!(%error, "ledger not written");
+            self.fail(error);
+        }
+    }
+}

@@ -1,0 +1,229 @@
+//! Films: the settings of a cycle again and again, a transport of each cycle.
+
+mod check;
+mod cycle;
+mod sink;
+mod worker;
+
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+
+use raysweep_config::{ConfigError, FilmPlan, Plan};
+use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
+use raysweep_pipeline::{CycleOrder, Point, Role, Stage};
+use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
+use raysweep_processing::plane::manifest;
+use raysweep_processing::sweep::Processing;
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
+use raysweep_session::stack::{Contents, StackShape};
+
+use self::cycle::CyclePlan;
+use self::sink::{CycleTiming, Cycles, FilmSink};
+use self::worker::{Account, Solving, Worker};
+use crate::devices::camera::{Exposures, FilmSetting};
+use crate::plane::{Opened, PointSink, Taken, missing};
+use crate::procedure::lab::Lab;
+use crate::rig::{Pace, Rig};
+use crate::run::error::RunError;
+use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::orders::Orders;
+use crate::run::progress::ProgressMeter;
+
+/// Cycles between the assembler and the disk: while one is stored, frames of the next ones come.
+const CYCLES_UNDER_WAY: usize = 4;
+
+/// A film on a rig.
+struct FilmRun {
+    rig: Arc<Rig>,
+    film: FilmTask,
+    stages: Arc<[Box<dyn Stage>]>,
+}
+
+/// Foresees a film.
+///
+/// # Errors
+/// For a plan that cannot be run on this rig.
+pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Result<Foreseen, ConfigError> {
+    if plan.products.is_some() {
+        let message = "kind = \"film\" has no [[product]]: each cycle has its transport; leave it out";
+        return Err(plan.places.error(&["product"], message));
+    }
+    let first_row = rig.first_row(lab.camera);
+    let film = FilmTask::new(plan, own, &rig.file, first_row, lab.size());
+    let stages = film.stages(lab.registry)?;
+    let shape = StackShape {
+        contents: Contents::Film {
+            cycles: film.points(),
+            settings: film.task.settings().count(),
+            exposures: film.task.schedule.dark_len(),
+        },
+        rows: lab.camera.height,
+        columns: lab.camera.width,
+    };
+    Ok(Foreseen {
+        report: check::check(&film, lab)?,
+        kind: plan.procedure.kind(),
+        name: plan.name.clone(),
+        shape,
+        first_row,
+        instead: "take fewer settings",
+        procedure: Box::new(FilmRun { rig: rig.clone(), film, stages }),
+    })
+}
+
+impl Procedure for FilmRun {
+    fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
+        let orders = run.orders.clone();
+        let acquired = self.acquire(run)?;
+        conclude(acquired, &self.film, &self.rig, &orders)
+    }
+}
+
+/// What acquisition leaves behind.
+struct Acquired {
+    session: Session,
+    /// Still locked.
+    ledger: Ledger,
+    /// What could not be done, and why.
+    problems: Vec<String>,
+    vsync: Option<VsyncStats>,
+    exposures: Exposures,
+    latency: Option<SettingsLatency>,
+    /// Why acquisition ended early, if a fault ended it.
+    fault: Option<RunError>,
+}
+
+impl FilmRun {
+    /// Takes the dark image, then the film.
+    fn acquire(&self, mut run: Run) -> Result<Acquired, RunError> {
+        run.note_beginning()?;
+        let (film, task) = (&self.film, &self.film.task);
+        let opened = Opened::open(&self.rig, task, &run)?;
+        let stack = run.session.stack()?;
+        let is_setting =
+            |id: &SettingsId| matches!(task.schedule.points[id.point as usize].role, Role::Sweep(_));
+        // A film is never resumed: none of its cycles is there yet.
+        let mut missing = missing(task, run.ledger.state());
+        missing.retain(|id| !is_setting(id));
+        let cycles = CyclePlan::new(task, opened.camera());
+        let account = Arc::new(Account::new(film.points()));
+        let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
+        let (verdicts, results) = channel();
+        let processing = Processing {
+            stages: self.stages.clone(),
+            folds: Vec::new(),
+            products: Vec::new(),
+            problems: Vec::new(),
+        };
+        let planned = missing.len() + film.points();
+        let points = PointSink {
+            task: task.clone(),
+            stack,
+            ledger: run.ledger,
+            processing,
+            verdicts: Some(verdicts),
+            orders: run.orders,
+            board: run.board.clone(),
+            progress: ProgressMeter::new(0, planned),
+            vsync: None,
+            // A film is its own running estimate.
+            live: None,
+            write_error: None,
+        };
+        let sink = FilmSink { points, film: frames };
+        let under_way = CYCLES_UNDER_WAY * cycles.shots.len();
+        let taken = opened.acquire(self.stages.clone(), under_way, sink, &results, |passes| {
+            passes.acquire(missing)?;
+            match passes.go_on() {
+                true => passes.film(self.settings(&cycles), film.film.cycles),
+                false => Ok(()),
+            }
+        })?;
+        let Taken { sink: FilmSink { mut points, film: frames }, exposures, latency, fault } = taken;
+        let solved = frames.finish();
+        let summary = account.summary();
+        points.append(&Entry::Film(summary.clone()));
+        run.board.set_film(summary);
+        match solved {
+            Ok(ended) => ended?,
+            Err(error) => points.note_write_error(error),
+        }
+        Ok(Acquired {
+            session: run.session,
+            ledger: points.ledger,
+            problems: points.processing.problems,
+            vsync: points.vsync,
+            exposures,
+            latency,
+            fault: points.write_error.map(RunError::from).or(fault),
+        })
+    }
+
+    /// The settings in the order in which a cycle takes them.
+    fn settings(&self, cycles: &CyclePlan) -> Vec<FilmSetting> {
+        let points: Vec<(u32, Point)> =
+            self.film.task.settings().map(|(ordinal, point)| (ordinal, *point)).collect();
+        let CycleOrder { settings, periods } = &cycles.order;
+        let before = periods.iter().cycle().skip(periods.len() - 1);
+        let settings = settings.iter().zip(before).map(|(&setting, &periods_from_last)| {
+            let (ordinal, point) = points[setting];
+            FilmSetting { ordinal, point, shot: cycles.shots[setting], periods_from_last }
+        });
+        settings.collect()
+    }
+
+    /// The film's part of the sink, with the solver's thread behind it.
+    fn cycles(
+        &self,
+        run: &Run,
+        cycle_plan: &CyclePlan,
+        camera: &CameraCapabilities,
+        pace: Pace,
+        account: &Arc<Account>,
+    ) -> Result<Cycles, RunError> {
+        let (film, task) = (&self.film, &self.film.task);
+        let solver = film.solver()?;
+        let transports = create_transports(&run.session, film, solver.reach_rows())?;
+        if let Some(Err(error)) = run.live.as_ref().map(|outlet| outlet.file.clear()) {
+            tracing::warn!(%error, "the live file still shows the run before");
+        }
+        let worker = Worker::start(Solving {
+            solver,
+            transports,
+            live: run.live.clone(),
+            board: run.board.clone(),
+            account: account.clone(),
+            orders: run.orders.clone(),
+            pace,
+        })?;
+        let rolling_us = task.geometry.height.saturating_sub(1) as f64 * camera.row_time_us;
+        let timing = CycleTiming {
+            cycle_ns: f64::from(cycle_plan.order.cycle_periods()) * task.geometry.raster.period_us * 1e3,
+            frame_ns: ns_from_us(film.film.exposure_us + rolling_us),
+        };
+        Ok(Cycles::new(task, run.session.film()?, worker, account.clone(), pace, timing))
+    }
+}
+
+/// Writes a film's report: its transports are there already, so one that was ended early is as good as a short one.
+fn conclude(acquired: Acquired, film: &FilmTask, rig: &Rig, orders: &Orders) -> Result<Ended, RunError> {
+    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
+    let state = end_state(fault.as_ref(), orders);
+    let stored = ledger.state().stored_points();
+    let end = EndEntry {
+        error: fault.map(|fault| fault.to_string()),
+        vsync,
+        final_s: exposures.until.map(|until| until.elapsed().as_secs_f64()),
+        light_s: exposures.light_s(),
+        settings_latency: latency,
+        ..end_entry(state, stored, film.points() - stored)
+    };
+    ledger.append(&Entry::End(end.clone()))?;
+    if state != EndState::Faulted {
+        write_report(&session, ledger.state(), film, &problems)?;
+        manifest::write(&session, ledger.state(), &film.task, &rig.file)?;
+    }
+    problems.extend(shortcomings(ledger.state()));
+    Ok(Ended { end, warnings: problems })
+}

@@ -1,0 +1,116 @@
+//! Where plans are run: a rig, its camera, and the room there is for sessions.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use raysweep_core::CameraCapabilities;
+use raysweep_pipeline::Registry;
+use raysweep_processing::memory::available_bytes;
+use raysweep_proto::CheckReport;
+use raysweep_session::durable;
+
+use crate::rig::{DotRig, Rig};
+
+/// Where a plan is to be run.
+pub struct Lab<'a> {
+    /// The rig.
+    pub rig: &'a LabRig,
+    /// Its camera, as it was when the daemon began.
+    pub camera: &'a CameraCapabilities,
+    /// Where sessions are kept.
+    pub data: &'a Path,
+    /// Stages by their names.
+    pub registry: &'a Arc<Registry>,
+    /// Results that would take more memory are made some camera rows at a time; none: more than is free.
+    pub memory_limit_bytes: Option<u64>,
+}
+
+/// The daemon's rig.
+#[derive(Clone)]
+pub enum LabRig {
+    /// Raster projector and rolling-shutter camera.
+    Plane(Arc<Rig>),
+    /// Mirror and fast camera.
+    Dots(Arc<DotRig>),
+}
+
+impl LabRig {
+    /// The rig file's text.
+    pub fn text(&self) -> &str {
+        match self {
+            Self::Plane(rig) => &rig.text,
+            Self::Dots(rig) => &rig.text,
+        }
+    }
+}
+
+impl Lab<'_> {
+    /// What results may take.
+    pub fn memory_free_bytes(&self) -> u64 {
+        available_bytes(self.memory_limit_bytes)
+    }
+
+    /// What is free where sessions are, or will be.
+    pub fn disk_free_bytes(&self) -> u64 {
+        let existing = self.data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
+        durable::available_bytes(existing).unwrap_or(u64::MAX)
+    }
+
+    /// The rig's camera when it makes this many frames a second.
+    pub fn camera_at(&self, rate_hz: f64) -> CameraCapabilities {
+        let exposure_us = *self.camera.exposure_us.start()..=1e6 / rate_hz;
+        CameraCapabilities { exposure_us, ..self.camera.clone() }
+    }
+
+    /// Rows and columns of its frames.
+    pub fn size(&self) -> (usize, usize) {
+        (self.camera.height, self.camera.width)
+    }
+}
+
+/// What a session and its results take, and what there is.
+pub struct Room {
+    pub memory_bytes: u64,
+    pub memory_free_bytes: u64,
+    pub disk_bytes: u64,
+    pub disk_free_bytes: u64,
+}
+
+impl Room {
+    /// Where there is too little.
+    pub fn warnings(&self) -> Vec<String> {
+        let needs = [
+            ("memory", self.memory_bytes, self.memory_free_bytes),
+            ("disk", self.disk_bytes, self.disk_free_bytes),
+        ];
+        let short = needs.into_iter().filter(|(_, needed, free)| needed > free);
+        let warning = |(what, needed, free)| {
+            let (needed, free) = (needed / 1_000_000, free / 1_000_000);
+            format!("{needed} MB of {what} are needed and {free} MB are free: the run would be refused")
+        };
+        short.map(warning).collect()
+    }
+
+    /// A report that says this and nothing else yet.
+    pub fn report(&self) -> CheckReport {
+        let Self { memory_bytes, memory_free_bytes, disk_bytes, disk_free_bytes } = *self;
+        CheckReport {
+            points: 0,
+            extra_points: 0,
+            frames: 0,
+            light_s: 0.0,
+            memory_bytes,
+            memory_free_bytes,
+            disk_bytes,
+            disk_free_bytes,
+            reach_rows: None,
+            condition: None,
+            // Worked out on request alone: a run must not wait for it.
+            advice: None,
+            film: None,
+            batches: None,
+            response: None,
+            warnings: Vec::new(),
+        }
+    }
+}

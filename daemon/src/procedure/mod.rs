@@ -1,0 +1,77 @@
+//! The procedures by which light is measured, one folder each. Nothing here knows more than one of them but
+//! [`foresee`], which picks the plan's.
+
+mod batches;
+mod film;
+pub mod lab;
+mod response;
+mod sweep;
+
+use raysweep_config::{ConfigError, Plan, Procedure};
+use raysweep_session::ledger::SessionEntry;
+
+use self::lab::{Lab, LabRig};
+use crate::run::life::Foreseen;
+
+/// What a plan would do on the lab's rig.
+///
+/// # Errors
+/// For a plan that cannot be run on it, with the places in the text.
+pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
+    let plan = Plan::parse(text)?;
+    match (lab.rig, plan.procedure.clone()) {
+        (LabRig::Plane(rig), Procedure::Sweep(own)) => {
+            sweep::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+        }
+        (LabRig::Plane(rig), Procedure::Film(own)) => film::foresee(lab, rig, &plan, own),
+        (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
+        (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
+        (LabRig::Plane(_), _) => {
+            Err(of_another_rig(&plan, "a plane rig runs plans of kind \"sweep\" and \"film\""))
+        }
+        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Film(_)) => {
+            Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\""))
+        }
+    }
+}
+
+fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {
+    plan.places.error(&["kind"], format!("kind = \"{}\": {what}", plan.procedure.kind()))
+}
+
+/// What is left to do of a session that was begun with this plan.
+///
+/// # Errors
+/// Where nothing of it can be done later; where the plan cannot be run on this rig.
+pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<Foreseen, Unresumable> {
+    let plan = Plan::parse(text)?;
+    match (lab.rig, plan.procedure.clone()) {
+        (LabRig::Plane(rig), Procedure::Sweep(own)) => {
+            let size = (begun.shape.rows, begun.shape.columns);
+            Ok(sweep::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+        }
+        (_, Procedure::Film(_)) => Err(Unresumable::Past(
+            "a film cannot be resumed: its time has passed. `raysweep process` makes the transports of the cycles that are there; run the plan again for another film",
+        )),
+        (_, Procedure::Batches(_)) => Err(Unresumable::Past(
+            "batches cannot be resumed: their time has passed. `raysweep process` makes the products of those that are there; run the plan again for more",
+        )),
+        (_, Procedure::Response(_)) => {
+            Err(Unresumable::Past("the records of a mirror's axes cannot be resumed: run the plan again"))
+        }
+        (LabRig::Dots(_), Procedure::Sweep(_)) => {
+            Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())
+        }
+    }
+}
+
+/// Why a session cannot be resumed.
+#[derive(Debug, thiserror::Error)]
+pub enum Unresumable {
+    /// What it measured is over.
+    #[error("{0}")]
+    Past(&'static str),
+    /// Its plan cannot be run.
+    #[error(transparent)]
+    Plan(#[from] ConfigError),
+}

@@ -1,0 +1,244 @@
+//! A run that finds out how a mirror answers: dark frames, then a chirp of each axis, on a plane.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use raysweep_core::{Counts, FramePool, SettingsId, Subject};
+use raysweep_pipeline::dots::{Arrival, DarkRun, Loss, Sensor};
+use raysweep_processing::batches::sampling;
+use raysweep_processing::response::{AXES, DotFinder, Record, ResponseTask};
+use raysweep_proto::{Event, RunState};
+use raysweep_session::Session;
+use raysweep_session::ledger::{AxisEntry, Entry, Ledger};
+
+use crate::devices::dots::FRAMES_AT_WORK;
+use crate::devices::dots::camera::Refused;
+use crate::devices::dots::motion::Motion;
+use crate::devices::dots::play::Player;
+use crate::rig::{DotDevices, DotRig};
+use crate::run::error::RunError;
+use crate::run::life::Run;
+use crate::run::progress::ProgressMeter;
+
+/// Standard deviations beyond the others' from which on a pixel is hot.
+const HOT_SIGMAS: f64 = 8.0;
+/// Batches of dark frames that their mean is worth.
+const BACKGROUND_BATCHES: u32 = 64;
+
+/// What acquisition leaves behind.
+pub struct Recorded {
+    /// The session.
+    pub session: Session,
+    /// Its ledger, still locked.
+    pub ledger: Ledger,
+    /// Why acquisition ended early, if a fault ended it.
+    pub fault: Option<RunError>,
+}
+
+/// Records both axes.
+///
+/// # Errors
+/// When the run could not begin. A fault on the way is in [`Recorded::fault`]: what was recorded is kept.
+pub fn acquire(rig: &DotRig, task: &Arc<ResponseTask>, mut run: Run) -> Result<Recorded, RunError> {
+    run.note_beginning()?;
+    let rate_hz = task.response.camera_rate_hz;
+    let DotDevices { mut camera, mirror, stand, clock, pace, .. } = rig.open(&run.data, rate_hz)?;
+    let mut motion = Motion::new(mirror);
+    let found = (camera.capabilities().height, camera.capabilities().width);
+    let expected = (task.shape.height(), task.shape.width());
+    if found != expected {
+        return Err(RunError::OtherCamera { found, expected });
+    }
+    camera.configure(SettingsId { point: 0, attempt: 0 }, &task.camera_settings())?;
+    camera.arm()?;
+    let _ = run.board.go(RunState::Armed);
+    let _ = run.board.go(RunState::Running);
+    let (orders, board) = (run.orders.clone(), run.board.clone());
+    let mut player = Player {
+        orders: &orders,
+        board: &board,
+        motion: &mut motion,
+        camera: &mut *camera,
+        pool: FramePool::new(FRAMES_AT_WORK, task.format.frame_bytes(task.shape.pixels())),
+        stand,
+        clock,
+        pace,
+    };
+    let mut recorder = Recorder { task: task.clone(), run };
+    let passed = recorder.passes(&mut player);
+    let _ = board.go(RunState::Draining);
+    // Light off before anything else ends.
+    drop(motion);
+    if let Err(error) = camera.disarm() {
+        tracing::warn!(%error, "camera not disarmed");
+    }
+    let Run { session, ledger, .. } = recorder.run;
+    Ok(Recorded { session, ledger, fault: passed.err() })
+}
+
+/// Takes the records, and stores them.
+struct Recorder {
+    task: Arc<ResponseTask>,
+    run: Run,
+}
+
+impl Recorder {
+    fn passes(&mut self, player: &mut Player<'_>) -> Result<(), RunError> {
+        let mut progress = ProgressMeter::new(0, AXES.len());
+        player.place(Subject::Plane(0), 1)?;
+        if !self.run.orders.go_on() {
+            return Ok(());
+        }
+        let sensor = self.sensor(player, &mut progress)?;
+        let Some(sensor) = sensor.filter(|_| self.run.orders.go_on()) else { return Ok(()) };
+        let finder = DotFinder::new(self.task.shape, self.task.region.clone(), &sensor);
+        for axis in 0..AXES.len() {
+            self.run.orders.wait_while_paused();
+            if !self.run.orders.go_on() {
+                break;
+            }
+            self.axis(axis, player, &finder, &mut progress)?;
+        }
+        Ok(())
+    }
+
+    /// What is known of the sensor in the dark; nothing if the run was told to end.
+    fn sensor(
+        &mut self,
+        player: &mut Player<'_>,
+        progress: &mut ProgressMeter,
+    ) -> Result<Option<Sensor>, RunError> {
+        let (task, orders) = (self.task.clone(), self.run.orders.clone());
+        let wanted = task.response.dark_frames;
+        let mut dark = DarkRun::new(task.shape, task.saturation_dn(), wanted, BACKGROUND_BATCHES)?;
+        let path = task.paths[0].clone().with_light(|_| 0);
+        let rounds = wanted.div_ceil(task.frames() as u32) + 1;
+        let has_enough = AtomicBool::new(false);
+        let mut arrivals = Arrivals::new(&task);
+        let after = player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
+            arrivals.take(&arrival, |_, counts| {
+                if !has_enough.load(Ordering::Relaxed) {
+                    has_enough.store(!dark.push(counts)?, Ordering::Relaxed);
+                }
+                Ok(())
+            })
+        })?;
+        let counts = arrivals.account(&after, 0)?;
+        // No record waits for any of them.
+        let settling = Counts { settling: counts.cancelled, cancelled: 0, ..counts };
+        self.append(&Entry::Outside { counts: settling.clone() }, settling, progress)?;
+        match orders.go_on() {
+            true => Ok(Some(dark.finish(HOT_SIGMAS, None, sampling(task.format))?)),
+            false => Ok(None),
+        }
+    }
+
+    /// Records the chirp of one axis.
+    fn axis(
+        &mut self,
+        axis: usize,
+        player: &mut Player<'_>,
+        finder: &DotFinder,
+        progress: &mut ProgressMeter,
+    ) -> Result<(), RunError> {
+        let task = self.task.clone();
+        let mut record = Record::new(task.commanded_deg(axis));
+        let frames = record.commanded_deg.len();
+        let (mut came, mut shown) = (0, 0);
+        let mut arrivals = Arrivals::new(&task);
+        let never = AtomicBool::new(false);
+        let after = player.play(&task.paths[axis], 1, frames as u64, &never, &mut |arrival| {
+            arrivals.take(&arrival, |frame, counts| {
+                if frame < frames {
+                    came += 1;
+                    if let Some(place) = finder.find(counts) {
+                        record.note(frame, place);
+                        shown += 1;
+                    }
+                }
+                Ok(())
+            })
+        })?;
+        let counts = arrivals.account(&after, shown)?;
+        if !self.run.orders.go_on() {
+            // A record that was cut short is none.
+            let counts = Counts { cancelled: counts.cancelled + counts.averaged, averaged: 0, ..counts };
+            return self.append(&Entry::Outside { counts: counts.clone() }, counts, progress);
+        }
+        record.write(&self.run.session, axis, &task)?;
+        progress.stored += 1;
+        let empty = came - shown as usize;
+        let entry = AxisEntry { axis, frames, lost: frames - came, empty, counts: counts.clone() };
+        self.append(&Entry::Axis(entry), counts, progress)
+    }
+
+    fn append(
+        &mut self,
+        entry: &Entry,
+        counts: Counts,
+        progress: &mut ProgressMeter,
+    ) -> Result<(), RunError> {
+        self.run.ledger.append(entry)?;
+        progress.counts.add(&counts);
+        self.run.board.publish(Event::Progress(progress.shown()));
+        Ok(())
+    }
+}
+
+/// The frames of a path by their ids, unpacked into one buffer, and where its triggers went.
+struct Arrivals<'a> {
+    task: &'a ResponseTask,
+    pixels: Vec<u16>,
+    /// Ids of the first and of the newest frame.
+    ids: Option<(u64, u64)>,
+    counts: Counts,
+    failed: Option<RunError>,
+}
+
+impl<'a> Arrivals<'a> {
+    fn new(task: &'a ResponseTask) -> Self {
+        let pixels = vec![0; task.shape.values()];
+        Self { task, pixels, ids: None, counts: Counts::default(), failed: None }
+    }
+
+    /// Unpacks a frame that is new and hands it on with its number, counted from the first that came.
+    fn take(
+        &mut self,
+        arrival: &Arrival,
+        each: impl FnOnce(usize, &[u16]) -> Result<(), RunError>,
+    ) -> Result<(), Refused> {
+        self.lose(&arrival.lost_before);
+        let seq = arrival.frame.stamp.seq;
+        if self.ids.is_some_and(|(_, newest)| seq <= newest) {
+            return Ok(());
+        }
+        let first = self.ids.map_or(seq, |(first, _)| first);
+        self.ids = Some((first, seq));
+        self.counts.expected += 1;
+        self.counts.cancelled += 1;
+        let unpacked = self.task.format.unpack_into(&arrival.frame.data, &mut self.pixels);
+        let done = unpacked
+            .map_err(|error| RunError::Frame(error.to_string()))
+            .and_then(|()| each((seq - first) as usize, &self.pixels));
+        done.map_err(|error| {
+            self.failed = Some(error);
+            Refused::Closed
+        })
+    }
+
+    fn lose(&mut self, losses: &[Loss]) {
+        for loss in losses {
+            self.counts.expected += loss.frames;
+            self.counts.lose(loss.cause, loss.frames);
+        }
+    }
+
+    /// Where the triggers went: `used` of the frames into a record, the others nowhere.
+    fn account(mut self, after: &[Loss], used: u64) -> Result<Counts, RunError> {
+        self.lose(after);
+        let Self { mut counts, failed, .. } = self;
+        counts.cancelled -= used;
+        counts.averaged += used;
+        failed.map_or(Ok(counts), Err)
+    }
+}

@@ -1,0 +1,232 @@
+//! Sweeps: points under all delays and exposures, then one transport.
+
+mod advice;
+mod check;
+
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+use std::time::{Duration, Instant};
+
+use raysweep_config::{ConfigError, Plan, SweepPlan};
+use raysweep_core::{CameraCapabilities, SettingsLatency, VsyncStats};
+use raysweep_processing::memory::{MemoryNeed, available_bytes};
+use raysweep_processing::plane::manifest;
+use raysweep_processing::sweep::{
+    Overview, Processing, Results, SweepTask, warnings, write_products, write_report,
+};
+use raysweep_proto::CheckReport;
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
+use raysweep_session::stack::{Contents, StackShape};
+
+use crate::devices::camera::Exposures;
+use crate::live::{LiveEstimate, Outlet};
+use crate::plane::{Opened, PointSink, Taken, missing};
+use crate::procedure::lab::Lab;
+use crate::rig::Rig;
+use crate::run::error::RunError;
+use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::orders::Orders;
+use crate::run::progress::ProgressMeter;
+
+/// Units between the assembler and the disk.
+const UNITS_UNDER_WAY: usize = 8;
+
+/// A sweep on a rig.
+struct SweepRun {
+    rig: Arc<Rig>,
+    camera: CameraCapabilities,
+    sweep: SweepTask,
+    processing: Processing,
+    /// Whether the results are made some camera rows at a time.
+    in_strips: bool,
+}
+
+/// Foresees a sweep on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its row 0.
+///
+/// # Errors
+/// For a plan that cannot be run on this rig.
+pub fn foresee(
+    lab: &Lab<'_>,
+    rig: &Arc<Rig>,
+    plan: &Plan,
+    own: SweepPlan,
+    first_row: usize,
+    size: (usize, usize),
+) -> Result<Foreseen, ConfigError> {
+    let sweep = SweepTask::new(plan, own, &rig.file, first_row, size);
+    let mut processing = sweep.processing(lab.registry)?;
+    let report = check::check(&sweep, &processing.products, lab)?;
+    let memory = MemoryNeed::of_sweep(&sweep.task, &processing.products)
+        .map_err(|error| sweep.task.refuse(&["sweep"], error.to_string()))?;
+    let in_strips = memory.in_strips(available_bytes(lab.memory_limit_bytes));
+    if in_strips {
+        processing.keep_no_images();
+    }
+    let shape = StackShape {
+        contents: Contents::Sweep { points: sweep.points(), exposures: sweep.task.schedule.dark_len() },
+        rows: size.0,
+        columns: size.1,
+    };
+    Ok(Foreseen {
+        report,
+        kind: plan.procedure.kind(),
+        name: plan.name.clone(),
+        shape,
+        first_row,
+        instead: "even some camera rows at a time; make shorter sequences",
+        procedure: Box::new(SweepRun {
+            rig: rig.clone(),
+            camera: lab.camera.clone(),
+            sweep,
+            processing,
+            in_strips,
+        }),
+    })
+}
+
+impl Procedure for SweepRun {
+    fn advise(&self, report: &mut CheckReport) {
+        match advice::advise(&self.sweep, &self.rig.file, &self.camera) {
+            Ok(advice) => report.advice = Some(advice),
+            Err(none) => report.warnings.push(none.to_string()),
+        }
+    }
+
+    fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
+        let Self { rig, sweep, processing, in_strips, .. } = *self;
+        let (orders, live) = (run.orders.clone(), run.live.clone());
+        let acquired = acquire(&rig, &sweep, processing, run)?;
+        conclude(acquired, in_strips, &sweep, &rig, &orders, live.as_ref())
+    }
+}
+
+/// What acquisition leaves behind.
+struct Acquired {
+    session: Session,
+    /// Still locked.
+    ledger: Ledger,
+    /// Its folds have seen every stored point.
+    processing: Processing,
+    vsync: Option<VsyncStats>,
+    exposures: Exposures,
+    latency: Option<SettingsLatency>,
+    /// Why acquisition ended early, if a fault ended it.
+    fault: Option<RunError>,
+}
+
+/// Acquires what is missing.
+fn acquire(
+    rig: &Rig,
+    sweep: &SweepTask,
+    mut processing: Processing,
+    mut run: Run,
+) -> Result<Acquired, RunError> {
+    run.note_beginning()?;
+    let task = &sweep.task;
+    let opened = Opened::open(rig, task, &run)?;
+    let stack = run.session.stack()?;
+    let state = run.ledger.state().clone();
+    let mut missing = missing(task, &state);
+    if run.is_resumed {
+        missing.extend(processing.feed_stored(task, &state, &stack, &|| run.orders.go_on()));
+        missing.sort_by_key(|id| id.point);
+        // What is damaged is about to be mended.
+        processing.problems.clear();
+    }
+    let planned = task.schedule.points.len();
+    let (verdicts, results) = channel();
+    let stages = processing.stages.clone();
+    let sink = PointSink {
+        task: task.clone(),
+        stack,
+        ledger: run.ledger,
+        processing,
+        verdicts: Some(verdicts),
+        orders: run.orders,
+        board: run.board,
+        progress: ProgressMeter::new(planned - missing.len(), planned),
+        vsync: None,
+        live: run.live.and_then(start_live),
+        write_error: None,
+    };
+    let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
+    let Taken { sink, exposures, latency, fault } = taken;
+    Ok(Acquired {
+        session: run.session,
+        ledger: sink.ledger,
+        processing: sink.processing,
+        vsync: sink.vsync,
+        exposures,
+        latency,
+        fault: sink.write_error.map(RunError::from).or(fault),
+    })
+}
+
+/// Starts the running estimate; a run is none the worse without.
+fn start_live(outlet: Outlet) -> Option<LiveEstimate> {
+    let started = outlet.file.clear().map_err(Into::into).and_then(|()| LiveEstimate::start(outlet));
+    started.map_err(|error| tracing::warn!(%error, "no live estimate of this run")).ok()
+}
+
+/// Makes the results of what was acquired, unless it is told to end: then there are none yet, so that it ends soon.
+fn conclude(
+    acquired: Acquired,
+    in_strips: bool,
+    sweep: &SweepTask,
+    rig: &Rig,
+    orders: &Orders,
+    live: Option<&Outlet>,
+) -> Result<Ended, RunError> {
+    let task = &*sweep.task;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
+    let whole = fault.is_none() && missing(task, ledger.state()).is_empty();
+    let began = Instant::now();
+    let make = || match in_strips {
+        true => Results::in_strips(processing, &session, ledger.state(), task, &|| orders.go_on()),
+        false => Results::whole(processing, &session, task, &|| orders.go_on()),
+    };
+    let mut results = whole.then(make).transpose()?;
+    let computed = began.elapsed();
+    let state = match (end_state(fault.as_ref(), orders), &results) {
+        (EndState::Complete, None) => EndState::Faulted,
+        (state, _) => state,
+    };
+    let stored = ledger.state().stored_points();
+    let mut end = EndEntry {
+        error: fault.map(|fault| fault.to_string()),
+        vsync,
+        light_s: exposures.light_s(),
+        settings_latency: latency,
+        ..end_entry(state, stored, sweep.points() - stored)
+    };
+    if let (EndState::Complete, Some(results)) = (state, &mut results) {
+        results.write_transport()?;
+        end.final_s = exposures.until.map(|until| until.elapsed().as_secs_f64());
+        let overview = results.overview();
+        if let Some((live, overview)) = live.zip(overview.as_ref()) {
+            show_last(live, overview, stored, computed);
+        }
+        write_products(&session, task, &results.products)?;
+        ledger.append(&Entry::End(end.clone()))?;
+        write_report(&session, ledger.state(), sweep, results, overview.as_ref())?;
+        manifest::write(&session, ledger.state(), task, &rig.file)?;
+        let (computed_s, written_s) = (computed.as_secs_f64(), (began.elapsed() - computed).as_secs_f64());
+        tracing::info!(computed_s, written_s, final_s = end.final_s, "results made");
+    } else {
+        ledger.append(&Entry::End(end.clone()))?;
+    }
+    let warnings = results.map_or_else(Vec::new, |Results { products, mut problems, .. }| {
+        problems.extend(warnings(&products));
+        problems
+    });
+    Ok(Ended { end, warnings })
+}
+
+/// Shows the result where the estimates before it were shown.
+fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) {
+    let Overview { epipolar, non_epipolar, total, .. } = overview;
+    if let Err(error) = live.show_images([epipolar, non_epipolar, total], points, took, true) {
+        tracing::warn!(%error, "the result is not among the live images");
+    }
+}

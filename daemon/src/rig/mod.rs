@@ -1,0 +1,319 @@
+//! The factory: from a rig file to open devices.
+
+mod dots;
+mod simulated;
+mod vsync;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::Receiver;
+use std::time::Duration;
+
+use raysweep_config::rig::plane::{CameraDriver, DrmSection, ProjectorDriver};
+use raysweep_config::rig::vsync::VsyncDriver;
+use raysweep_config::{AnyRigFile, ConfigError, RigFile};
+use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
+use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
+use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
+use raysweep_drivers::projector::external::{External, Request};
+use raysweep_sim::PlaneRig;
+
+use self::simulated::{Simulated, simulate};
+
+pub use self::dots::{DotDevices, DotRig, Stand};
+
+/// Why a rig cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The file cannot be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file is no rig.
+    #[error("{0}")]
+    Config(String),
+    /// A device cannot be opened.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}
+
+/// A rig of either kind.
+pub enum AnyRig {
+    /// Raster projector and rolling-shutter camera.
+    Plane(Rig),
+    /// Mirror and fast camera.
+    Dots(DotRig),
+}
+
+impl From<Rig> for AnyRig {
+    fn from(rig: Rig) -> Self {
+        Self::Plane(rig)
+    }
+}
+
+impl From<DotRig> for AnyRig {
+    fn from(rig: DotRig) -> Self {
+        Self::Dots(rig)
+    }
+}
+
+impl AnyRig {
+    /// Reads a rig file of whatever kind.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let source = Source::read(path)?;
+        match AnyRigFile::parse(&source.text).map_err(|error| source.shown(&error))? {
+            AnyRigFile::Plane(file) => Rig::of(*file, source).map(Self::Plane),
+            AnyRigFile::Dots(file) => DotRig::of(*file, source).map(Self::Dots),
+        }
+    }
+}
+
+/// The text of a rig file, and where it is from.
+struct Source<'a> {
+    path: &'a Path,
+    text: String,
+}
+
+impl<'a> Source<'a> {
+    fn read(path: &'a Path) -> Result<Self, RigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| RigError::Read { path: path.to_owned(), source })?;
+        Ok(Self { path, text })
+    }
+
+    /// The folder from which the file's paths go.
+    fn folder(&self) -> &Path {
+        self.path.parent().unwrap_or(Path::new("."))
+    }
+
+    fn shown(&self, error: &ConfigError) -> RigError {
+        RigError::Config(error.render(&self.path.display().to_string(), &self.text))
+    }
+}
+
+/// A plane rig whose devices can be opened, one run at a time.
+pub struct Rig {
+    /// What its file says.
+    pub file: RigFile,
+    /// The file's text, as sessions keep it.
+    pub text: String,
+    /// The simulated rig, where any of its devices is simulated.
+    sim: Option<Arc<PlaneRig>>,
+}
+
+/// The open devices of a rig.
+pub struct Devices {
+    /// The camera.
+    pub camera: Box<dyn Camera>,
+    /// The watcher of the VSYNC line.
+    pub vsync: Box<dyn Vsync>,
+    /// The projector.
+    pub projector: Box<dyn Projector>,
+    /// What the projector asks of its operator, where one works it.
+    pub questions: Option<Receiver<Request>>,
+    /// The clock that their stamps are on.
+    pub clock: Clock,
+    /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
+    pub pace: Pace,
+}
+
+/// Who sets the pace of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Pace {
+    /// The devices wait until there is room.
+    Pipeline,
+    /// Frames come whether there is room or not.
+    Devices,
+}
+
+impl Rig {
+    /// Reads a rig file and builds what can be built before devices are opened.
+    ///
+    /// # Errors
+    /// With file, line and field.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let source = Source::read(path)?;
+        let file = RigFile::parse(&source.text).map_err(|error| source.shown(&error))?;
+        Self::of(file, source)
+    }
+
+    fn of(mut file: RigFile, source: Source<'_>) -> Result<Self, RigError> {
+        file.sim.bench = file.sim.bench.map(|bench| source.folder().join(bench));
+        let simulate = || {
+            simulate(&file, source.folder()).map_err(|error| {
+                let path: Vec<&str> = ["sim"].into_iter().chain(error.key().split('.')).collect();
+                source.shown(&file.places.error(&path, error.to_string()))
+            })
+        };
+        let sim = file.has_simulated_device().then(simulate).transpose()?;
+        Ok(Self { sim: sim.map(Arc::new), file, text: source.text })
+    }
+
+    /// Projector row that row 0 of its camera sees.
+    pub fn first_row(&self, camera: &CameraCapabilities) -> usize {
+        let RigFile { camera: section, projector, sim, .. } = &self.file;
+        let is_simulated = section.driver == CameraDriver::Sim || sim.bench.is_some();
+        if let Some(sim) = self.sim.as_ref().filter(|_| is_simulated) {
+            return sim.first_row();
+        }
+        let middle = projector.rows.saturating_sub(self.projector_rows_of(camera)) / 2;
+        section.first_projector_row.unwrap_or(middle)
+    }
+
+    /// How many projector rows the rows of a camera look along.
+    fn projector_rows_of(&self, camera: &CameraCapabilities) -> usize {
+        (camera.height.saturating_sub(1) as f64 * self.file.camera.row_pitch).round() as usize + 1
+    }
+
+    /// Whether the camera's rows lie within the projector's.
+    fn check_rows(&self, camera: &CameraCapabilities) -> Result<(), RigError> {
+        let (first, rows) = (self.first_row(camera), self.projector_rows_of(camera));
+        let projector_rows = self.file.projector.rows;
+        if first + rows <= projector_rows {
+            return Ok(());
+        }
+        Err(RigError::Config(format!(
+            "the camera's {} rows look along {rows} projector rows from {first} on, of {projector_rows}: read out a smaller region of its sensor, lower camera.row_pitch or set camera.first_projector_row",
+            camera.height
+        )))
+    }
+
+    /// The simulated rig, where any of its devices is simulated.
+    pub fn simulated(&self) -> Option<&PlaneRig> {
+        self.sim.as_deref()
+    }
+
+    /// Opens all devices.
+    ///
+    /// # Errors
+    /// The first device that does not open.
+    pub fn open(&self) -> Result<Devices, RigError> {
+        self.check_pace()?;
+        let mut simulated = Simulated::open(self)?;
+        let vsync = match vsync::open(&self.file.vsync)? {
+            Some(real) => real,
+            None => simulated.vsync()?,
+        };
+        let (projector, questions): (Box<dyn Projector>, _) = match self.file.projector.driver {
+            ProjectorDriver::Drm => (Box::new(self.open_drm()?), None),
+            ProjectorDriver::External => {
+                // A run that waits for its operator can be cancelled, so no patience ends before the operator's.
+                let (projector, questions) = External::new(Duration::MAX);
+                (Box::new(projector), Some(questions))
+            }
+            ProjectorDriver::Sim => (simulated.projector()?, None),
+        };
+        // Real devices know no time but the machine's, also where others of the rig are simulated.
+        let (camera, clock) = match self.file.camera.driver {
+            CameraDriver::Sim => simulated.camera()?,
+            CameraDriver::Aravis => (self.open_aravis()?, Clock::real()),
+            CameraDriver::V4l2 => (self.open_v4l2()?, Clock::real()),
+        };
+        self.check_rows(camera.capabilities())?;
+        let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
+        let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
+        Ok(Devices { camera, vsync, projector, questions, clock, pace })
+    }
+
+    /// Real devices know no time but the machine's, so a simulated camera beside them must keep to it.
+    fn check_pace(&self) -> Result<(), RigError> {
+        let RigFile { camera, vsync, projector, sim, .. } = &self.file;
+        let real = vsync.driver != VsyncDriver::Sim || projector.driver != ProjectorDriver::Sim;
+        if real && camera.driver == CameraDriver::Sim && !sim.realtime {
+            let message = "sim.realtime = false: a simulated camera beside a real VSYNC line or projector runs by the host's clock; set sim.realtime = true";
+            return Err(RigError::Config(message.into()));
+        }
+        Ok(())
+    }
+
+    fn open_drm(&self) -> Result<DrmProjector, RigError> {
+        let DrmSection { card, connector, settle_frames } = self.file.projector.drm.clone();
+        let config = DrmConfig { card, connector, timing: Timing::HD_720P60, settle_frames };
+        Ok(DrmProjector::open(&config)?)
+    }
+
+    fn open_v4l2(&self) -> Result<Box<dyn Camera>, RigError> {
+        let RigFile { camera, vsync, .. } = &self.file;
+        let Some(config) = camera.v4l2.clone() else {
+            return Err(RigError::Config("[camera.v4l2] is missing".into()));
+        };
+        let setup = V4l2Setup {
+            config,
+            format: camera.pixel_format,
+            row_time_us: self.file.camera_row_time_us(),
+            trigger_period_us: vsync.period_us,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(v4l2::open(setup)?))
+    }
+
+    #[cfg(feature = "aravis")]
+    fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
+        use raysweep_drivers::camera::aravis::{AravisCamera, RigFacts};
+
+        let RigFile { camera, vsync, .. } = &self.file;
+        let facts = RigFacts {
+            format: camera.pixel_format,
+            row_time_us: self.file.camera_row_time_us(),
+            trigger_period_us: vsync.period_us,
+            trigger_margin_us: vsync.gate_us,
+            reopen: Duration::from_secs_f64(camera.reopen_s),
+        };
+        Ok(Box::new(AravisCamera::open(&camera.aravis, facts)?))
+    }
+
+    #[cfg(not(feature = "aravis"))]
+    fn open_aravis(&self) -> Result<Box<dyn Camera>, RigError> {
+        Err(built_without_aravis())
+    }
+}
+
+#[cfg(not(feature = "aravis"))]
+fn built_without_aravis() -> RigError {
+    RigError::Config(
+        "camera.driver = \"aravis\": this raysweepd was built without the feature `aravis`; build it with `cargo build --release --features aravis`, which needs libaravis-dev and libusb-1.0-0-dev".into(),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_rig_of_real_devices_has_no_simulation_that_must_fit_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let load = |driver: &str| {
+            let text = format!(
+                "kind = \"plane\"\n[camera]\ndriver = \"v4l2\"\nfirst_projector_row = 650\n[camera.v4l2]\ndevice = \"/nowhere\"\nwidth = 8\nheight = 8\n\
+                 [vsync]\ndriver = \"fx2lafw\"\n[projector]\ndriver = \"{driver}\"\n"
+            );
+            let path = folder.path().join("rig.toml");
+            std::fs::write(&path, text).unwrap();
+            Rig::load(&path)
+        };
+        assert!(load("external").unwrap().simulated().is_none());
+        // The simulated scene has 128 rows, and the projector 720.
+        let Err(error) = load("sim") else { panic!("the scene does not fit") };
+        assert!(error.to_string().contains("sim.scene has 128 rows"), "{error}");
+    }
+
+    #[test]
+    fn a_bench_stands_beside_the_rig_file_and_goes_with_a_camera_on_a_wire() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        let text = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
+                    [sim]\nbench = \"bench.sock\"\nscene_rows = 8\nscene_columns = 8\n";
+        std::fs::write(&path, text).unwrap();
+        let rig = Rig::load(&path).unwrap();
+        assert_eq!(rig.file.sim.bench, Some(folder.path().join("bench.sock")));
+        let Err(error) = rig.open() else { panic!("the camera cannot be in both processes") };
+        assert!(error.to_string().contains("camera.driver"), "{error}");
+    }
+}

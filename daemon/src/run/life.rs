@@ -1,0 +1,158 @@
+//! From a plan that is possible to the run's last word: the life that all procedures share.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use raysweep_pipeline::message_of;
+use raysweep_proto::{CheckReport, Event, RpcError, RunState};
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
+use raysweep_session::stack::StackShape;
+
+use super::board::StatusBoard;
+use super::error::RunError;
+use super::orders::{Order, Orders};
+use crate::live::Outlet;
+
+/// A plan on the daemon's rig, and what it would do.
+pub struct Foreseen {
+    /// What it would do.
+    pub report: CheckReport,
+    /// The name of its procedure.
+    pub kind: &'static str,
+    /// Names its session.
+    pub name: String,
+    /// What its session is made for.
+    pub shape: StackShape,
+    /// Projector row that row 0 of the camera sees; 0 on a dot rig.
+    pub first_row: usize,
+    /// What to do where it needs more memory than there is.
+    pub instead: &'static str,
+    /// What does it.
+    pub procedure: Box<dyn Procedure>,
+}
+
+/// What distinguishes one procedure from the others.
+pub trait Procedure: Send {
+    /// Adds what is worked out on request alone: a run must not wait for it.
+    fn advise(&self, _report: &mut CheckReport) {}
+
+    /// Puts into a new session what the run's results will need.
+    ///
+    /// # Errors
+    /// When it cannot be had, or the disk refuses.
+    fn keep(&self, _session: &Session) -> Result<(), RpcError> {
+        Ok(())
+    }
+
+    /// Acquires what is missing and makes the results.
+    ///
+    /// # Errors
+    /// When the run could not begin, or its results cannot be written. A fault on the way is in [`Ended::end`]: what was
+    /// acquired is kept.
+    fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError>;
+}
+
+/// What every run needs.
+pub struct Run {
+    /// Its session.
+    pub session: Session,
+    /// Its ledger, locked for this run.
+    pub ledger: Ledger,
+    /// Whether earlier runs have stored points of it.
+    pub is_resumed: bool,
+    /// The daemon's data folder, where the mirror's state is kept.
+    pub data: PathBuf,
+    /// What it is told.
+    pub orders: Arc<Orders>,
+    /// What it tells.
+    pub board: Arc<StatusBoard>,
+    /// Where its images are shown while it goes on, if anywhere.
+    pub live: Option<Outlet>,
+}
+
+impl Run {
+    /// Notes in the ledger that the run begins.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn note_beginning(&mut self) -> Result<(), RunError> {
+        let started = jiff::Timestamp::now();
+        Ok(self.ledger.append(&Entry::Run { started, resumed: self.is_resumed })?)
+    }
+}
+
+/// How a run ended.
+pub struct Ended {
+    /// As the ledger has it.
+    pub end: EndEntry,
+    /// What an operator should know.
+    pub warnings: Vec<String>,
+}
+
+/// The run's thread: acquires, makes the results, and says how it ended. Nothing it meets leaves the daemon stuck.
+pub fn conduct(procedure: Box<dyn Procedure>, run: Run, points: usize) {
+    let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
+    tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
+    let ended = catch_unwind(AssertUnwindSafe(|| procedure.measure(run)))
+        .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
+    finish(ended, points, &board, &dir);
+}
+
+/// Says how a run of so many points ended.
+fn finish(ended: Result<Ended, RunError>, points: usize, board: &StatusBoard, dir: &Path) {
+    let Ended { end, warnings } = ended.unwrap_or_else(|error| {
+        let stored = Session::open(dir).and_then(|session| session.state());
+        let stored = stored.map_or(0, |state| state.stored_points());
+        let end = end_entry(EndState::Faulted, stored, points - stored);
+        Ended { end: EndEntry { error: Some(error.to_string()), ..end }, warnings: Vec::new() }
+    });
+    let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
+    if let Some(error) = &end.error {
+        tracing::error!(%error, session = %dir.display(), "run faulted");
+        board.set_error(error.clone());
+    }
+    tracing::info!(session = %dir.display(), state = end.state.name(), stored = end.stored, missing = end.missing, "run ended");
+    let report = dir.join("report.html");
+    let finished = Event::Finished {
+        session: dir.to_owned(),
+        state: end.state.name().into(),
+        error: end.error,
+        report: report.exists().then_some(report),
+        stored: end.stored,
+        missing: end.missing,
+        film: board.status().film,
+        warnings,
+        final_s: end.final_s,
+        light_s: end.light_s,
+    };
+    if board.status().state != RunState::Draining && state == RunState::Idle {
+        let _ = board.go(RunState::Draining);
+    }
+    let _ = board.go(state);
+    board.publish(finished);
+}
+
+/// How a run ended that was acquired with or without a fault.
+pub fn end_state(fault: Option<&RunError>, orders: &Orders) -> EndState {
+    match fault {
+        Some(_) => EndState::Faulted,
+        None if orders.now() == Order::Cancel => EndState::Cancelled,
+        None => EndState::Complete,
+    }
+}
+
+/// The end of a run of which nothing else is known.
+pub fn end_entry(state: EndState, stored: usize, missing: usize) -> EndEntry {
+    EndEntry {
+        state,
+        error: None,
+        stored,
+        missing,
+        vsync: None,
+        final_s: None,
+        light_s: None,
+        settings_latency: None,
+    }
+}

@@ -1,0 +1,380 @@
+//! The daemon's core: a rig, a data folder, and at most one run.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+
+use raysweep_config::ConfigError;
+use raysweep_core::CameraCapabilities;
+use raysweep_pipeline::Registry;
+use raysweep_proto::{
+    CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
+    Started, Status,
+};
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndState, Ledger, SessionEntry};
+use tokio::sync::broadcast;
+
+use crate::control::Control;
+use crate::live::{LiveFile, Outlet};
+use crate::mirror;
+use crate::procedure::lab::{Lab, LabRig};
+use crate::procedure::{Unresumable, foresee, foresee_rest};
+use crate::rig::{AnyRig, RigError};
+use crate::run::board::{StatusBoard, WrongState};
+use crate::run::life::{Foreseen, Run, conduct};
+use crate::run::orders::{Order, Orders};
+
+/// At which rate a dot rig's camera is opened to see that it is there; each run opens it at its own.
+const LEAST_FRAME_RATE_HZ: f64 = 100.0;
+
+/// The daemon's core: a rig, a data folder, and at most one run.
+pub struct Runner {
+    rig: LabRig,
+    /// The rig's camera, as it was when the daemon began.
+    camera: CameraCapabilities,
+    data: PathBuf,
+    registry: Arc<Registry>,
+    board: Arc<StatusBoard>,
+    live: Option<Arc<LiveFile>>,
+    memory_limit_bytes: Option<u64>,
+    current: Mutex<Option<Current>>,
+    /// Set once, when no further run may begin.
+    closed: AtomicBool,
+}
+
+/// The run under way, or the last one.
+struct Current {
+    orders: Arc<Orders>,
+    thread: JoinHandle<()>,
+}
+
+impl Runner {
+    /// A daemon for `rig` that keeps its sessions in `data`. Opens all devices once, to know that they are there; each
+    /// run opens them anew, and between runs they are free for other programs.
+    ///
+    /// # Errors
+    /// The first device that does not open.
+    pub fn new(rig: impl Into<AnyRig>, data: PathBuf, registry: Registry) -> Result<Self, RigError> {
+        let (rig, camera, kind) = match rig.into() {
+            AnyRig::Plane(rig) => {
+                let camera = rig.open()?.camera.capabilities().clone();
+                (LabRig::Plane(Arc::new(rig)), camera, "plane")
+            }
+            AnyRig::Dots(rig) => {
+                let camera = rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone();
+                (LabRig::Dots(Arc::new(rig)), camera, "dots")
+            }
+        };
+        Ok(Self {
+            rig,
+            camera,
+            data,
+            registry: Arc::new(registry),
+            board: Arc::new(StatusBoard::new(kind)),
+            live: None,
+            memory_limit_bytes: None,
+            current: Mutex::default(),
+            closed: AtomicBool::new(false),
+        })
+    }
+
+    /// The same, with a file for the running estimates of its runs.
+    #[must_use]
+    pub fn with_live(mut self, file: LiveFile) -> Self {
+        self.board.set_live(file.path().to_owned());
+        self.live = Some(Arc::new(file));
+        self
+    }
+
+    /// The same; results that would take more memory than this are made some camera rows at a time. Without, that is
+    /// what is free when a run begins.
+    #[must_use]
+    pub fn with_memory_limit(mut self, bytes: u64) -> Self {
+        self.memory_limit_bytes = Some(bytes);
+        self
+    }
+
+    /// The rig's camera.
+    pub fn camera(&self) -> &CameraCapabilities {
+        &self.camera
+    }
+
+    fn lab(&self) -> Lab<'_> {
+        Lab {
+            rig: &self.rig,
+            camera: &self.camera,
+            data: &self.data,
+            registry: &self.registry,
+            memory_limit_bytes: self.memory_limit_bytes,
+        }
+    }
+
+    fn foresee(&self, plan: &str) -> Result<Foreseen, RpcError> {
+        foresee(&self.lab(), plan).map_err(|error| invalid_plan(&error))
+    }
+
+    /// Ends the run under way, if there is one, waits for it, and lets none begin any more.
+    pub fn shut_down(&self) {
+        self.closed.store(true, Ordering::Relaxed);
+        let current = self.current.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(Current { orders, thread }) = current {
+            orders.give(Order::Cancel);
+            if thread.join().is_err() {
+                tracing::error!("the run's thread panicked");
+            }
+        }
+    }
+
+    fn order(&self, order: Order, from: &[RunState], to: Option<RunState>) -> Result<(), RpcError> {
+        let current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = self.board.status().state;
+        let Some(current) = current.as_ref().filter(|_| from.contains(&state)) else {
+            let what = format!("the daemon is {}: no run in progress", name_of(state));
+            return Err(RpcError::new(ErrorCode::NotRunning, what));
+        };
+        if let Some(to) = to {
+            self.board.go(to).map_err(wrong_state)?;
+        }
+        current.orders.give(order);
+        Ok(())
+    }
+
+    /// Claims the daemon for a run, prepares it and starts its thread; on any error the daemon is free again.
+    fn start(
+        &self,
+        begin: impl FnOnce() -> Result<(Started, Current), RpcError>,
+    ) -> Result<Started, RpcError> {
+        let mut current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
+        if self.closed.load(Ordering::Relaxed) {
+            return Err(RpcError::new(ErrorCode::Busy, "the daemon is ending: start it again first"));
+        }
+        self.board.go(RunState::Preparing).map_err(wrong_state)?;
+        if let Some(last) = current.take() {
+            // Its thread has nothing left to do once the state allowed a new run.
+            let _ = last.thread.join();
+        }
+        match begin() {
+            Ok((started, run)) => {
+                *current = Some(run);
+                Ok(started)
+            }
+            Err(error) => {
+                // Nothing has begun, so nothing has failed.
+                let _ = self.board.go(RunState::Idle);
+                Err(error)
+            }
+        }
+    }
+
+    /// Starts the thread of a run.
+    fn spawn(
+        &self,
+        foreseen: Foreseen,
+        session: Session,
+        ledger: Ledger,
+        is_resumed: bool,
+    ) -> Result<(Started, Current), RpcError> {
+        let dir = session.dir().to_owned();
+        self.board.set_session(dir.clone());
+        let orders = Arc::new(Orders::default());
+        let run = Run {
+            session,
+            ledger,
+            is_resumed,
+            data: self.data.clone(),
+            orders: orders.clone(),
+            board: self.board.clone(),
+            live: self.outlet(&dir),
+        };
+        let Foreseen { procedure, shape, .. } = foreseen;
+        let thread = thread::Builder::new()
+            .name("run".into())
+            .spawn(move || conduct(procedure, run, shape.points()))
+            .map_err(|error| RpcError::new(ErrorCode::Internal, format!("no thread for the run: {error}")))?;
+        Ok((Started { session: dir }, Current { orders, thread }))
+    }
+
+    fn outlet(&self, dir: &Path) -> Option<Outlet> {
+        let session = dir.display().to_string();
+        let outlet = |file: &Arc<LiveFile>| Outlet { file: file.clone(), board: self.board.clone(), session };
+        self.live.as_ref().map(outlet)
+    }
+
+    /// Whether disk and memory suffice; `instead` is what to do where memory does not.
+    fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
+        if report.disk_bytes > report.disk_free_bytes {
+            let what = format!(
+                "the session needs {} MB, {} has {} MB: free some space or give the daemon another --data",
+                report.disk_bytes / 1_000_000,
+                self.data.display(),
+                report.disk_free_bytes / 1_000_000
+            );
+            return Err(RpcError::new(ErrorCode::Storage, what));
+        }
+        if report.memory_bytes > report.memory_free_bytes {
+            let what = format!(
+                "the run needs {} MB of memory, {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
+                report.memory_bytes / 1_000_000,
+                report.memory_free_bytes / 1_000_000
+            );
+            return Err(RpcError::new(ErrorCode::Storage, what));
+        }
+        Ok(())
+    }
+
+    fn begin(&self, params: &RunParams) -> Result<(Started, Current), RpcError> {
+        let foreseen = self.foresee(&params.plan)?;
+        self.check_room(&foreseen.report, foreseen.instead)?;
+        let entry = SessionEntry {
+            format: raysweep_session::ledger::FORMAT,
+            name: foreseen.name.clone(),
+            kind: foreseen.kind.into(),
+            operator: params.operator.clone(),
+            sample: params.sample.clone(),
+            note: params.note.clone(),
+            tags: params.tags.clone(),
+            created: jiff::Timestamp::now(),
+            software: raysweep_processing::SOFTWARE.into(),
+            shape: foreseen.shape,
+            first_row: foreseen.first_row,
+        };
+        let (session, ledger) = Session::create(&self.data, entry, &params.plan, self.rig.text())
+            .map_err(|error| storage(&error))?;
+        foreseen.procedure.keep(&session)?;
+        self.spawn(foreseen, session, ledger, false)
+    }
+
+    fn go_on_with(&self, params: &ResumeParams) -> Result<(Started, Current), RpcError> {
+        let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
+        let session =
+            Session::open(&self.data.join(&params.session)).map_err(|error| no_session(error.to_string()))?;
+        let read = |path: PathBuf| {
+            std::fs::read_to_string(&path)
+                .map_err(|error| no_session(format!("cannot read {}: {error}", path.display())))
+        };
+        let plan = read(session.plan_path())?;
+        if read(session.rig_path())? != self.rig.text() {
+            return Err(no_session(format!(
+                "{} was taken on another rig file than the daemon's: start the daemon with {}",
+                session.dir().display(),
+                session.rig_path().display()
+            )));
+        }
+        let begun = session.state().map_err(|error| storage(&error))?.session;
+        let foreseen = foresee_rest(&self.lab(), &plan, &begun).map_err(|error| match error {
+            Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
+            Unresumable::Plan(error) => invalid_plan(&error),
+        })?;
+        let ledger = session.resume().map_err(|error| storage(&error))?;
+        self.spawn(foreseen, session, ledger, true)
+    }
+}
+
+impl Control for Runner {
+    fn status(&self) -> Status {
+        let guard = match &self.rig {
+            LabRig::Plane(_) => mirror::light_guard(&self.data, None),
+            LabRig::Dots(rig) => rig.light_guard(&self.data),
+        };
+        Status { mirror: mirror::status(&self.data, &guard), ..self.board.status() }
+    }
+
+    fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
+        let Foreseen { mut report, procedure, .. } = self.foresee(plan)?;
+        procedure.advise(&mut report);
+        Ok(report)
+    }
+
+    fn run(&self, params: RunParams) -> Result<Started, RpcError> {
+        self.start(|| self.begin(&params))
+    }
+
+    fn resume(&self, params: ResumeParams) -> Result<Started, RpcError> {
+        self.start(|| self.go_on_with(&params))
+    }
+
+    fn pause(&self) -> Result<(), RpcError> {
+        self.order(Order::Pause, &[RunState::Running], Some(RunState::Paused))
+    }
+
+    fn go_on(&self) -> Result<(), RpcError> {
+        self.order(Order::Go, &[RunState::Paused], Some(RunState::Running))
+    }
+
+    fn cancel(&self) -> Result<(), RpcError> {
+        let during =
+            [RunState::Preparing, RunState::Armed, RunState::Running, RunState::Paused, RunState::Draining];
+        self.order(Order::Cancel, &during, None)
+    }
+
+    fn arm_light(&self) -> Result<(), RpcError> {
+        mirror::arm_light(&self.data)
+    }
+
+    fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
+        let listing = raysweep_session::list(&self.data).map_err(|error| storage(&error))?;
+        let readable = listing.sessions.into_iter().map(|session| SessionInfo {
+            session: session.dir,
+            name: session.name,
+            created: session.created.to_string(),
+            stored: session.stored,
+            points: session.points,
+            state: session.end.map_or("unfinished", EndState::name).into(),
+        });
+        let unreadable = listing.unreadable.into_iter().map(|(dir, error)| SessionInfo {
+            session: dir,
+            name: error.to_string(),
+            created: String::new(),
+            stored: 0,
+            points: 0,
+            state: "unreadable".into(),
+        });
+        Ok(readable.chain(unreadable).collect())
+    }
+
+    fn events(&self) -> broadcast::Receiver<Event> {
+        self.board.subscribe()
+    }
+}
+
+fn invalid_plan(error: &ConfigError) -> RpcError {
+    let mut rpc = RpcError::new(ErrorCode::InvalidPlan, error.to_string());
+    if let Some(data) = &mut rpc.data {
+        let span =
+            |mistake: &raysweep_config::Mistake| mistake.span.clone().map(|span| (span.start, span.end));
+        data.field.clone_from(&error.first().field);
+        data.span = span(error.first());
+        data.mistakes = error
+            .mistakes()
+            .map(|mistake| Mistake {
+                message: mistake.message.clone(),
+                field: mistake.field.clone(),
+                span: span(mistake),
+            })
+            .collect();
+    }
+    rpc
+}
+
+fn storage(error: &raysweep_session::Error) -> RpcError {
+    RpcError::new(ErrorCode::Storage, error.to_string())
+}
+
+fn wrong_state(WrongState(state): WrongState) -> RpcError {
+    let what = format!("the daemon is {}: wait for the run's end, or cancel it", name_of(state));
+    RpcError::new(ErrorCode::Busy, what)
+}
+
+fn name_of(state: RunState) -> &'static str {
+    match state {
+        RunState::Idle => "idle",
+        RunState::Preparing => "preparing a run",
+        RunState::Armed => "armed",
+        RunState::Running => "running",
+        RunState::Paused => "paused",
+        RunState::Draining => "finishing a run",
+        RunState::Faulted => "faulted",
+    }
+}
