@@ -4,19 +4,25 @@
 //! Nothing here needs a rig, a socket or a device.
 
 pub mod batches;
+mod export;
 pub mod film;
 pub mod memory;
 pub mod mirror_response;
 pub mod plane;
 mod report;
 pub mod response;
-mod session;
 mod stored;
 pub mod sweep;
 
-use raysweep_core::PixelFormat;
+use std::path::Path;
 
-pub use session::{export, process, process_asked};
+use raysweep_config::{Plan, Procedure};
+use raysweep_core::PixelFormat;
+use raysweep_session::Session;
+
+use self::stored::read;
+
+pub use export::export;
 pub use stored::{Asked, ProcessError, Processed, Stored};
 
 /// Name and version, as sessions keep it.
@@ -29,4 +35,32 @@ const SATURATION: f64 = 0.97;
 /// Counts from which on a pixel of this format is overexposed: wells may be full before the converter is.
 pub(crate) fn saturation_dn(format: PixelFormat) -> f64 {
     SATURATION * f64::from(format.max_value())
+}
+
+/// Makes the products of a session again, with the plan and the rig file that lie in it: the same bits as the run's.
+///
+/// # Errors
+/// When the session is being written by a run, or cannot be read.
+pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
+    process_asked(dir, &Asked::default())
+}
+
+/// [`process`], and products that the plan does not name. Files of products that are not made now stay.
+///
+/// # Errors
+/// Those of [`process`]; and when a product cannot be had of this session, before anything is written.
+pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessError> {
+    let session = Session::open(dir)?;
+    let ledger = session.resume()?;
+    let path = session.plan_path();
+    let plan_text = read(&path)?;
+    let plan = Plan::parse(&plan_text)
+        .map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &plan_text)))?;
+    let stored = Stored { session: &session, state: ledger.state(), plan: &plan, plan_text: &plan_text };
+    match plan.procedure.clone() {
+        Procedure::Sweep(own) => sweep::process(&stored, own, asked),
+        Procedure::Film(own) => film::process(&stored, own, asked),
+        Procedure::Batches(own) => batches::process(&stored, own, asked),
+        Procedure::Response(own) => response::process(&stored, own, asked),
+    }
 }

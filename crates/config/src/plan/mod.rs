@@ -70,28 +70,13 @@ impl Kind {
 
     /// Reads and checks its table.
     fn read(self, document: &mut Document<'_>) -> Option<Procedure> {
-        Some(match self {
-            Self::Sweep => {
-                let plan: SweepPlan = document.take_or_default(self.name())?;
-                plan.check(document);
-                Procedure::Sweep(plan)
-            }
-            Self::Film => {
-                let plan: FilmPlan = document.take_or_default(self.name())?;
-                plan.check(document);
-                Procedure::Film(plan)
-            }
-            Self::Batches => {
-                let plan: BatchesPlan = document.take_or_default(self.name())?;
-                plan.check(document);
-                Procedure::Batches(plan)
-            }
-            Self::Response => {
-                let plan: ResponsePlan = document.take_or_default(self.name())?;
-                plan.check(document);
-                Procedure::Response(plan)
-            }
-        })
+        let table = self.name();
+        match self {
+            Self::Sweep => read(document, table, SweepPlan::check, Procedure::Sweep),
+            Self::Film => read(document, table, FilmPlan::check, Procedure::Film),
+            Self::Batches => read(document, table, BatchesPlan::check, Procedure::Batches),
+            Self::Response => read(document, table, ResponsePlan::check, Procedure::Response),
+        }
     }
 
     /// The stage of a plan that names none.
@@ -102,6 +87,17 @@ impl Kind {
             Self::Response => None,
         }
     }
+}
+
+fn read<'a, T: Deserialize<'a> + Default>(
+    document: &mut Document<'a>,
+    table: &str,
+    check: impl FnOnce(&T, &mut Document<'a>),
+    procedure: impl FnOnce(T) -> Procedure,
+) -> Option<Procedure> {
+    let plan: T = document.take_or_default(table)?;
+    check(&plan, document);
+    Some(procedure(plan))
 }
 
 impl Procedure {
@@ -151,7 +147,8 @@ impl Plan {
         tables::check_stages(stages.iter().flatten(), &mut document);
         tables::check_products(products.iter().flatten(), &mut document);
         let stages = stages.unwrap_or_else(|| default_stages.into_iter().collect());
-        document.refuse_others(&["kind", "name", "stage", "product", "sweep", "film", "batches", "response"]);
+        let known = ["kind", "name", "stage", "product"].into_iter().chain(Kind::ALL.map(Kind::name));
+        document.refuse_others(&known.collect::<Vec<_>>());
         let places = document.places().clone();
         document.finish(procedure.map(|procedure| Self { name, procedure, stages, products, places }))
     }

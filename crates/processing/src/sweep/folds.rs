@@ -3,24 +3,23 @@
 use std::any::Any;
 use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    Assembly, Findings, Fold, FoldError, ImageRows, InStrips, Product, ProductSpec, Snapshot, Stage, Strip,
+    Assembly, Findings, Fold, FoldError, ImageRows, InStrips, Product, ProductSpec, Snapshot, Strip,
     Unit, message_of, run_stages,
 };
 use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::{Stack, crc32};
 
-use crate::plane::{PlaneTask, place, unit_of};
+use crate::plane::{PlaneTask, Stages, place, unit_of};
 
 /// The stages, folds and products of a plan.
 pub struct Processing {
     /// Work on each unit alone.
-    pub stages: Arc<[Box<dyn Stage>]>,
+    pub stages: Stages,
     /// Work on all units in order.
     pub folds: Vec<Box<dyn Fold>>,
     /// What is made of the transport of the folds.
@@ -30,6 +29,11 @@ pub struct Processing {
 }
 
 impl Processing {
+    /// Stages alone: nothing is made of all units together.
+    pub fn without_folds(stages: Stages) -> Self {
+        Self { stages, folds: Vec::new(), products: Vec::new(), problems: Vec::new() }
+    }
+
     /// Passes points that are stored already through the stages into the folds, for as long as `go_on` says yes. A
     /// point whose stage fails is left out, and named among the problems; so are points whose data are damaged, which
     /// are returned: they must be acquired again.

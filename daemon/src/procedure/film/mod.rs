@@ -110,18 +110,12 @@ impl FilmRun {
         let account = Arc::new(Account::new(film.points()));
         let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
         let (verdicts, results) = channel();
-        let processing = Processing {
-            stages: self.stages.clone(),
-            folds: Vec::new(),
-            products: Vec::new(),
-            problems: Vec::new(),
-        };
         let planned = missing.len() + film.points();
         let points = PointSink {
             task: task.clone(),
             stack,
             ledger: run.ledger,
-            processing,
+            processing: Processing::without_folds(self.stages.clone()),
             verdicts: Some(verdicts),
             orders: run.orders,
             board: run.board.clone(),

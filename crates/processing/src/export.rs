@@ -1,40 +1,10 @@
-//! Products made again from what a session holds, and sessions copied out for others.
+//! Sessions copied out for others.
 
 use std::path::Path;
 
-use raysweep_config::{Plan, Procedure};
 use raysweep_session::Session;
 
-use crate::stored::{Asked, ProcessError, Processed, Stored, read};
-use crate::{batches, film, response, sweep};
-
-/// Makes the products of a session again, with the plan and the rig file that lie in it: the same bits as the run's.
-///
-/// # Errors
-/// When the session is being written by a run, or cannot be read.
-pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
-    process_asked(dir, &Asked::default())
-}
-
-/// [`process`], and products that the plan does not name. Files of products that are not made now stay.
-///
-/// # Errors
-/// Those of [`process`]; and when a product cannot be had of this session, before anything is written.
-pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessError> {
-    let session = Session::open(dir)?;
-    let ledger = session.resume()?;
-    let path = session.plan_path();
-    let plan_text = read(&path)?;
-    let plan = Plan::parse(&plan_text)
-        .map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &plan_text)))?;
-    let stored = Stored { session: &session, state: ledger.state(), plan: &plan, plan_text: &plan_text };
-    match plan.procedure.clone() {
-        Procedure::Sweep(own) => sweep::process(&stored, own, asked),
-        Procedure::Film(own) => film::process(&stored, own, asked),
-        Procedure::Batches(own) => batches::process(&stored, own, asked),
-        Procedure::Response(own) => response::process(&stored, own, asked),
-    }
-}
+use crate::stored::ProcessError;
 
 /// Copies a session's products, report and manifest into `to`, a folder that is made and must not exist.
 ///
