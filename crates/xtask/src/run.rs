@@ -1,16 +1,21 @@
 //! Running other programs.
 
+use std::ffi::OsStr;
 use std::io::{ErrorKind, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Result with an error message for the terminal.
 pub type Done<T = ()> = Result<T, String>;
 
-/// The project's root folder.
-pub fn root() -> &'static Path {
+/// The project's root folder: of the checkout in which `cargo xtask` was called, which need not be the one that was
+/// compiled, where several share a target folder.
+pub fn root() -> PathBuf {
+    let manifest =
+        std::env::var_os("CARGO_MANIFEST_DIR").unwrap_or_else(|| env!("CARGO_MANIFEST_DIR").into());
     // The manifest is in crates/xtask, two folders below the root.
-    Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap_or(Path::new("."))
+    Path::new(&manifest).ancestors().nth(2).unwrap_or(Path::new(".")).to_owned()
 }
 
 /// Cargo's target folder.
@@ -34,6 +39,17 @@ pub fn cargo() -> Command {
     command
 }
 
+/// The program that a shell would start for a name.
+pub fn program(name: &str) -> Option<PathBuf> {
+    program_on(&std::env::var_os("PATH").unwrap_or_default(), name)
+}
+
+fn program_on(path: &OsStr, name: &str) -> Option<PathBuf> {
+    std::env::split_paths(path).map(|folder| folder.join(name)).find(|file| {
+        file.metadata().is_ok_and(|about| about.is_file() && about.permissions().mode() & 0o111 != 0)
+    })
+}
+
 /// Prints a line. A reader that has closed the pipe is not an error.
 pub fn say(line: &str) -> Done {
     match writeln!(std::io::stdout(), "{line}") {
@@ -54,4 +70,26 @@ fn shown(command: &Command) -> String {
     let name = Path::new(command.get_program()).file_name().unwrap_or(command.get_program());
     let arguments = command.get_args().map(|argument| argument.to_string_lossy().into_owned());
     [name.to_string_lossy().into_owned()].into_iter().chain(arguments).collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_program_is_a_file_that_may_be_executed() {
+        let folder = std::env::temp_dir().join(format!("raysweep-path-{}", std::process::id()));
+        let (first, second) = (folder.join("first"), folder.join("second"));
+        std::fs::create_dir_all(first.join("folder")).unwrap();
+        std::fs::create_dir_all(&second).unwrap();
+        for (file, mode) in [(first.join("tool"), 0o644), (second.join("tool"), 0o755)] {
+            std::fs::write(&file, "").unwrap();
+            std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
+        }
+        let path = std::env::join_paths([&first, &second]).unwrap();
+        assert_eq!(program_on(&path, "tool"), Some(second.join("tool")));
+        assert_eq!(program_on(&path, "folder"), None);
+        assert_eq!(program_on(&path, "nothing"), None);
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
 }

@@ -132,7 +132,7 @@ fn copy_of_commits(folder: &Path) -> Done<PathBuf> {
     }
     run(Command::new("git")
         .args(["clone", "--quiet", "--bare", "--no-local"])
-        .args([root(), &copy])
+        .args([&root(), &copy])
         .stdin(Stdio::null()))?;
     Ok(copy)
 }

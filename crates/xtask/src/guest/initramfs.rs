@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use super::kernel::Kernel;
-use crate::run::Done;
+use crate::run::{Done, program};
 
 /// Modules needed before the host's folders are mounted.
 const BOOT_MODULES: [&str; 3] = ["virtio_pci", "9pnet_virtio", "9p"];
@@ -39,12 +39,13 @@ poweroff -f
 
 /// Writes the initramfs: an uncompressed cpio archive in `newc` format.
 pub fn write(path: &Path, kernel: &Kernel) -> Done {
+    let busybox = program("busybox").ok_or("no busybox on the path: install busybox-static")?;
     let mut archive = Archive::default();
     for folder in ["bin", "lib"] {
         archive.folder(folder);
     }
     archive.file("init", INIT.as_bytes());
-    archive.file("bin/busybox", &read(&busybox()?)?);
+    archive.file("bin/busybox", &read(&busybox)?);
     let release = format!("lib/modules/{}", kernel.release());
     let unpacked = kernel.modules.join(kernel.release());
     archive.file(&format!("{release}/modules.dep"), &read(&unpacked.join("modules.dep"))?);
@@ -52,14 +53,6 @@ pub fn write(path: &Path, kernel: &Kernel) -> Done {
         archive.file(&format!("{release}/{file}"), &read(&unpacked.join(&file))?);
     }
     std::fs::write(path, archive.finish()).map_err(|error| format!("{}: {error}", path.display()))
-}
-
-fn busybox() -> Done<std::path::PathBuf> {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    std::env::split_paths(&path)
-        .map(|folder| folder.join("busybox"))
-        .find(|file| file.exists())
-        .ok_or_else(|| "no busybox on the path: install busybox-static".to_owned())
 }
 
 fn read(path: &Path) -> Done<Vec<u8>> {

@@ -98,8 +98,8 @@ const TESTS: &[GuestTest] = &[
 
 /// Runs the given tests, or all.
 pub fn guest(names: &[&str]) -> Done {
-    packages::install()?;
     let tests = chosen(names)?;
+    packages::install()?;
     let folder = target().join("guest");
     let kernel = Kernel::fetch(&folder)?;
     let executables = build(&tests)?;

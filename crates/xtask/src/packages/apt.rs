@@ -17,16 +17,24 @@ pub fn update() -> Done {
     apt_get(&["update"])
 }
 
-/// Whether a package of this name can be installed.
-pub fn has_candidate(name: &str) -> bool {
+/// Those of the names whose packages can be installed.
+pub fn candidates<'a>(names: impl IntoIterator<Item = &'a String>) -> Vec<String> {
     // The output is parsed below, so it must not be translated.
-    let policy = Command::new("apt-cache").args(["policy", name]).env("LC_ALL", "C").output();
-    policy.is_ok_and(|output| candidate(&String::from_utf8_lossy(&output.stdout)).is_some())
+    let policy = Command::new("apt-cache").arg("policy").args(names).env("LC_ALL", "C").output();
+    policy.map_or(Vec::new(), |output| with_candidate(&String::from_utf8_lossy(&output.stdout)))
 }
 
-fn candidate(policy: &str) -> Option<&str> {
-    let version = policy.lines().find_map(|line| line.trim().strip_prefix("Candidate: "));
-    version.filter(|&version| version != "(none)")
+/// Names in apt's answer, each of which stands above the versions of its package.
+fn with_candidate(policy: &str) -> Vec<String> {
+    let (mut all, mut name) = (Vec::new(), "");
+    for line in policy.lines() {
+        if !line.starts_with(' ') {
+            name = line.trim_end_matches(':');
+        } else if line.trim().strip_prefix("Candidate: ").is_some_and(|version| version != "(none)") {
+            all.push(name.to_owned());
+        }
+    }
+    all
 }
 
 /// Installs packages.
@@ -34,12 +42,13 @@ pub fn install(names: &[String]) -> Done {
     eprintln!("installing them through apt");
     let names_of: Vec<&str> = names.iter().map(String::as_str).collect();
     apt_get(&[&INSTALL, names_of.as_slice()].concat())
-        .map_err(|error| format!("{error}\ninstall them by hand:\n  {}", by_hand(names)))
+        .map_err(|error| format!("{error}\ninstall them by hand:\n  {}", by_hand(names, true)))
 }
 
 /// Commands for installing packages by hand; package lists that are only partly updated may be sufficient.
-pub fn by_hand(names: &[String]) -> String {
-    format!("apt-get update; apt-get {} {}", INSTALL.join(" "), names.join(" "))
+pub fn by_hand(names: &[String], is_root: bool) -> String {
+    let commands = format!("apt-get update; apt-get {} {}", INSTALL.join(" "), names.join(" "));
+    if is_root { commands } else { format!("sudo sh -c '{commands}'") }
 }
 
 fn apt_get(arguments: &[&str]) -> Done {
@@ -53,10 +62,11 @@ mod tests {
 
     #[test]
     fn a_candidate_is_a_version() {
-        let policy =
-            |version| format!("name:\n  Installed: (none)\n  Candidate: {version}\n  Version table:\n");
-        assert_eq!(candidate(&policy("1:14.0.6-12")), Some("1:14.0.6-12"));
-        assert_eq!(candidate(&policy("(none)")), None);
-        assert_eq!(candidate(""), None);
+        let policy = |name, version| {
+            format!("{name}:\n  Installed: (none)\n  Candidate: {version}\n  Version table:\n     1:14 500\n")
+        };
+        let said = [policy("a-14", "1:14.0.6-12"), policy("awk", "(none)"), policy("b", "2")].concat();
+        assert_eq!(with_candidate(&said), ["a-14", "b"]);
+        assert!(with_candidate("").is_empty());
     }
 }

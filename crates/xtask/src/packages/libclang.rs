@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use super::elf;
+use crate::run::Done;
 
 /// Search path; each `*` matches the rest of one folder name.
 const FOLDERS: [&str; 7] = [
@@ -18,16 +19,33 @@ const FOLDERS: [&str; 7] = [
     "usr/lib*",
 ];
 
-/// Whether bindgen finds libclang on this system.
-pub fn is_there() -> bool {
+/// Fails if bindgen does not find libclang on this system.
+pub fn check() -> Done {
     if let Some(place) = std::env::var_os("LIBCLANG_PATH").map(PathBuf::from) {
-        // It is then the only place searched: the file, or its folder. Build scripts, which search it, run in other
-        // folders, so the path must be absolute.
-        return place.is_absolute() && (is_libclang(&place) || has_libclang(&place));
+        return only_in(&place).map_err(|error| format!("LIBCLANG_PATH={}: {error}", place.display()));
     }
-    let Some(llvm_folders) = llvm_folders() else { return false };
+    let llvm_folders = llvm_folders()?;
     let listed = ["LD_LIBRARY_PATH", "LIBRARY_PATH"].map(|name| listed(std::env::var_os(name))).concat();
-    is_in(Path::new("/"), &[llvm_folders, listed].concat())
+    if is_in(Path::new("/"), &[llvm_folders, listed].concat()) {
+        return Ok(());
+    }
+    Err("no libclang.so of this architecture in the folders of libraries below /usr and /usr/local, nor where \
+         llvm-config, LD_LIBRARY_PATH and LIBRARY_PATH point"
+        .to_owned())
+}
+
+/// Searches only this place: the file, or its folder.
+fn only_in(place: &Path) -> Done {
+    if !place.is_absolute() {
+        return Err(
+            "must be an absolute path: build scripts, which search there, run in other folders".to_owned()
+        );
+    }
+    if is_libclang(place) || has_libclang(place) {
+        return Ok(());
+    }
+    Err("no libclang.so of this architecture there, the only place searched while the variable is set"
+        .to_owned())
 }
 
 /// Whether libclang is in one of these folders, or below `root` in one of the system's library folders.
@@ -40,14 +58,16 @@ fn listed(variable: Option<OsString>) -> Vec<PathBuf> {
     variable.map(|list| std::env::split_paths(&list).collect()).unwrap_or_default()
 }
 
-/// Library folders of the LLVM that `llvm-config` belongs to. `None`: clang-sys fails at this point.
-fn llvm_folders() -> Option<Vec<PathBuf>> {
+/// Library folders of the LLVM that `llvm-config` belongs to.
+fn llvm_folders() -> Done<Vec<PathBuf>> {
     let program = std::env::var_os("LLVM_CONFIG_PATH").unwrap_or_else(|| "llvm-config".into());
-    let Ok(output) = Command::new(program).arg("--prefix").output() else { return Some(Vec::new()) };
-    if !output.status.success() {
-        return Some(Vec::new());
+    match Command::new(&program).arg("--prefix").output() {
+        Ok(output) if output.status.success() => folders_below(&String::from_utf8_lossy(&output.stdout))
+            .ok_or_else(|| {
+                format!("`{} --prefix` prints nothing, on which clang-sys fails", program.display())
+            }),
+        _ => Ok(Vec::new()),
     }
-    folders_below(&String::from_utf8_lossy(&output.stdout))
 }
 
 /// Folders below the prefix printed by `llvm-config --prefix`; clang-sys assumes that the output is not empty.
@@ -173,5 +193,15 @@ mod tests {
             listed(Some(std::env::join_paths([Path::new("/nowhere"), &root.0.join("opt/lib")]).unwrap()));
         assert!(is_in(&root.0.join("opt"), &folders));
         assert!(is_libclang(&root.0.join("opt/lib/libclang.so")));
+    }
+
+    #[test]
+    fn a_place_that_is_searched_alone_is_a_file_or_its_folder() {
+        let root = Root::new("alone");
+        root.put("lib/libclang.so", &elf::own_header());
+        assert_eq!(only_in(&root.0.join("lib")), Ok(()));
+        assert_eq!(only_in(&root.0.join("lib/libclang.so")), Ok(()));
+        assert!(only_in(&root.0).unwrap_err().contains("the only place searched"));
+        assert!(only_in(Path::new("lib")).unwrap_err().contains("absolute"));
     }
 }

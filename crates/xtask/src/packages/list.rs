@@ -1,12 +1,10 @@
 //! The list of packages, `tests/packages.txt`.
 
 use super::probe::Probe;
-use crate::run::Done;
+use crate::run::{Done, root};
 
 /// Path of the list in the project.
 pub const PATH: &str = "tests/packages.txt";
-
-const TEXT: &str = include_str!("../../../../tests/packages.txt");
 
 /// One line of the list.
 #[derive(Debug, PartialEq)]
@@ -20,41 +18,69 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// Whether all probes succeed.
-    pub fn is_there(&self) -> bool {
-        self.probes.iter().all(Probe::holds)
-    }
-
-    /// The package's names, formatted for display.
-    pub fn name(&self) -> String {
-        self.names.join(" or ")
+    /// Fails, and tells why, if a probe fails.
+    pub fn check(&self) -> Done {
+        let failed: Vec<_> = self.probes.iter().filter_map(|probe| probe.check().err()).collect();
+        if failed.is_empty() { Ok(()) } else { Err(failed.join("; ")) }
     }
 }
 
 /// Reads the project's list.
 pub fn entries() -> Done<Vec<Entry>> {
-    parse(TEXT)
+    let path = root().join(PATH);
+    let bytes = std::fs::read(&path).map_err(|error| format!("{}: {error}", path.display()))?;
+    parse(&bytes)
 }
 
-fn parse(text: &str) -> Done<Vec<Entry>> {
-    let lines = text.lines().enumerate().map(|(index, line)| (index + 1, line.trim()));
-    lines
-        .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
-        .map(|(number, line)| entry(line).map_err(|error| format!("{PATH}, line {number}: {error}")))
-        .collect()
+fn parse(bytes: &[u8]) -> Done<Vec<Entry>> {
+    let mut entries: Vec<Entry> = Vec::new();
+    for (index, line) in bytes.split(|&byte| byte == b'\n').enumerate() {
+        let failed = |error: String| format!("{PATH}, line {}: {error}", index + 1);
+        let line = std::str::from_utf8(line).map_err(|error| failed(format!("not UTF-8: {error}")))?.trim();
+        if line.is_empty() || line.starts_with('#') {
+            continue;
+        }
+        let entry = entry(line).map_err(failed)?;
+        if let Some(name) = entry.names.iter().find(|name| entries.iter().any(|it| it.names.contains(name))) {
+            return Err(failed(format!("package: `{name}` stands in an earlier line too: expected it once")));
+        }
+        entries.push(entry);
+    }
+    if entries.is_empty() {
+        return Err(format!("{PATH}: expected a line for each package, found none"));
+    }
+    Ok(entries)
 }
 
 fn entry(line: &str) -> Done<Entry> {
-    let mut fields = line.splitn(3, char::is_whitespace).map(str::trim);
-    let (Some(names), Some(probes), Some(why)) = (fields.next(), fields.next(), fields.next()) else {
-        return Err(format!("`{line}` is not a package, what shows that it is there, and why it is needed"));
-    };
-    let names: Vec<String> = names.split('|').map(str::to_owned).collect();
-    if names.iter().any(String::is_empty) {
-        return Err(format!("`{}` has an empty name", names.join("|")));
+    if line.starts_with('\u{feff}') {
+        return Err("begins with a byte order mark: save the file as UTF-8 without one".to_owned());
     }
-    let probes = probes.split(',').map(Probe::parse).collect::<Done<_>>()?;
+    let fields = line.split_once(char::is_whitespace).and_then(|(names, rest)| {
+        let (probes, why) = rest.trim_start().split_once(char::is_whitespace)?;
+        Some((names, probes, why.trim_start()))
+    });
+    let (names, probes, why) = fields.ok_or_else(|| {
+        format!("`{line}`: expected a package, what shows that it is there, and why it is needed")
+    })?;
+    let names = names.split('|').map(package).collect::<Done<Vec<_>>>()?;
+    if names.iter().enumerate().any(|(index, name)| names[..index].contains(name)) {
+        return Err(format!("package: `{}` has a name twice: expected each once", names.join("|")));
+    }
+    let probes = probes.split(',').map(Probe::parse).collect::<Done<_>>();
+    let probes = probes.map_err(|error| format!("what shows that it is there: {error}"))?;
     Ok(Entry { names, probes, why: why.to_owned() })
+}
+
+/// Names are given to apt, which would take others for options.
+fn package(name: &str) -> Done<String> {
+    let letter = |letter: char| letter.is_ascii_lowercase() || letter.is_ascii_digit();
+    if name.starts_with(letter) && name.chars().all(|it| letter(it) || "+-.".contains(it)) {
+        return Ok(name.to_owned());
+    }
+    Err(format!(
+        "package: `{name}`: expected a name of small letters, digits and any of +-., first a letter or digit"
+    ))
 }
 
 #[cfg(test)]
@@ -63,24 +89,31 @@ mod tests {
 
     #[test]
     fn a_line_is_names_probes_and_a_reason() {
-        let entries = parse("# comment\n\na|b static:x,libclang what for, in words\n").unwrap();
+        let entries = parse(b"# comment\r\n\na|b  static:x,libclang  what for, in words\r\n").unwrap();
         let [entry] = entries.as_slice() else { panic!("{entries:?}") };
         assert_eq!(entry.names, ["a", "b"]);
         assert_eq!(entry.probes, [Probe::Static("x".to_owned()), Probe::Libclang]);
-        assert_eq!((entry.why.as_str(), entry.name().as_str()), ("what for, in words", "a or b"));
+        assert_eq!(entry.why, "what for, in words");
     }
 
     #[test]
-    fn a_bad_line_is_told_by_its_number() {
+    fn a_bad_line_is_told_by_its_number_and_field() {
         for (line, what) in [
-            ("gcc cc", "why"),
-            ("a||b cc why", "empty name"),
-            ("a nonsense:x why", "nonsense"),
-            ("a b, why", "``"),
+            ("gcc cc", "expected a package, what shows that it is there, and why"),
+            ("a||b cc why", "package: ``: expected"),
+            ("-y cc why", "package: `-y`: expected"),
+            ("Gcc cc why", "package: `Gcc`: expected"),
+            ("a|a cc why", "package: `a|a` has a name twice"),
+            ("x|other cc why", "package: `other` stands in an earlier line"),
+            ("a nonsense:x why", "what shows that it is there: `nonsense:x`"),
+            ("a b, why", "what shows that it is there: ``"),
+            ("\u{feff}a b why", "byte order mark"),
         ] {
-            let error = parse(&format!("# comment\n{line}\n")).unwrap_err();
+            let error = parse(format!("other cc why\n{line}\n").as_bytes()).unwrap_err();
             assert!(error.starts_with("tests/packages.txt, line 2: ") && error.contains(what), "{error}");
         }
+        assert!(parse(b"a b why\na b \xff\n").unwrap_err().contains("line 2: not UTF-8"));
+        assert!(parse(b"# comment\n").unwrap_err().contains("found none"));
     }
 
     #[test]

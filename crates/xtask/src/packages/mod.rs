@@ -11,52 +11,81 @@ use crate::run::{Done, say};
 use list::{Entry, PATH};
 
 /// Advice for systems other than those of the list.
-const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install what serves the same purposes\n\
-                         by its own means: `cargo xtask packages` tells what is found";
+const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install by its own means what serves the same\n\
+                         purposes, until `cargo xtask packages` finds all; then run `cargo xtask test --no-guest`";
 
-/// Why a package may be installed without being found by programs.
-const SHADOWED: &str = "another program of the same name may come first on the path, or an environment variable may name another folder";
-
-/// Prints the list's entries, and whether they are present.
-pub fn print() -> Done {
-    for entry in list::entries()? {
-        let state = if entry.is_there() { "present" } else { "missing" };
-        say(&format!("{state} {}: {}", entry.names.join("|"), entry.why))?;
-    }
-    Ok(())
+/// An entry that is not there.
+struct Missing {
+    entry: Entry,
+    /// What was looked for, and why it is not found.
+    reason: String,
 }
 
-/// Installs what is missing, or prints how to.
+/// Prints the list's entries, missing ones last; fails if there are any, and tells how to install them.
+pub fn print() -> Done {
+    let entries = list::entries()?;
+    let all = entries.len();
+    let known = apt::candidates(entries.iter().flat_map(|entry| &entry.names));
+    let name = |entry: &Entry| first_of(entry, &known).cloned().unwrap_or(entry.names.join("|"));
+    let width = entries.iter().map(|entry| name(entry).len()).max().unwrap_or(0);
+    let line = |state, entry: &Entry| format!("{state}  {:width$}  {}", name(entry), entry.why);
+    let (present, missing) = sorted(entries);
+    for entry in &present {
+        say(&line("present", entry))?;
+    }
+    for Missing { entry, reason } in &missing {
+        say(&line("missing", entry))?;
+        say(&format!("         {:width$}  ({reason})", ""))?;
+    }
+    match missing.len() {
+        0 => say(&format!("all {all} present")),
+        few => Err(format!("{few} of {all} missing\n{}", advice(&missing, &known))),
+    }
+}
+
+/// Installs what is missing, or tells how to.
 pub fn install() -> Done {
-    let missing = missing(list::entries()?);
+    let missing = sorted(list::entries()?).1;
     if missing.is_empty() {
         return Ok(());
     }
-    if !apt::is_there() {
-        return Err(format!(
-            "these packages are missing, and this system has no apt-get to install them with:\n{}\n{ELSEWHERE}",
-            lines(&missing)
-        ));
+    let listed = format!("missing:\n{}", lines(&missing));
+    if !apt::is_there() || !is_root() {
+        return Err(format!("{listed}\n{}", advice(&missing, &candidates(&missing))));
     }
-    eprintln!("missing:\n{}", lines(&missing));
-    if !is_root() {
-        return Err(for_root(&missing, apt::has_candidate));
-    }
+    eprintln!("{listed}");
     // If one of several sources is unreachable, another may still have what is missing.
     if let Err(error) = apt::update() {
         eprintln!("{error}; going on with the lists that there are");
     }
-    apt::install(&chosen(&missing, apt::has_candidate)?)?;
-    still_missing(&self::missing(missing))
+    apt::install(&chosen(&missing, &candidates(&missing))?)?;
+    still_missing(&sorted(missing.into_iter().map(|it| it.entry)).1)
 }
 
-fn missing(entries: Vec<Entry>) -> Vec<Entry> {
-    entries.into_iter().filter(|entry| !entry.is_there()).collect()
+/// The entries that are there and those that are not.
+fn sorted(entries: impl IntoIterator<Item = Entry>) -> (Vec<Entry>, Vec<Missing>) {
+    let (mut present, mut missing) = (Vec::new(), Vec::new());
+    for entry in entries {
+        match entry.check() {
+            Ok(()) => present.push(entry),
+            Err(reason) => missing.push(Missing { entry, reason }),
+        }
+    }
+    (present, missing)
+}
+
+fn candidates(missing: &[Missing]) -> Vec<String> {
+    apt::candidates(missing.iter().flat_map(|it| &it.entry.names))
+}
+
+/// The first name of an entry that apt knows.
+fn first_of<'a>(entry: &'a Entry, known: &[String]) -> Option<&'a String> {
+    entry.names.iter().find(|name| known.contains(name))
 }
 
 /// The first installable name of each entry, or an error that lists the entries without one.
-fn chosen(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Done<Vec<String>> {
-    let (names, unknown) = choices(missing, can_be_installed);
+fn chosen(missing: &[Missing], known: &[String]) -> Done<Vec<String>> {
+    let (names, unknown) = choices(missing, known);
     if unknown.is_empty() {
         return Ok(names);
     }
@@ -66,11 +95,16 @@ fn chosen(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Done<Ve
     ))
 }
 
-/// Message for users who may not install: the command to run. Apt's lists may never have been fetched, which only root
-/// can do, so packages missing from them are not an error yet.
-fn for_root(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> String {
-    let (names, unknown) = choices(missing, can_be_installed);
-    let mut said = format!("only root may install packages; run\n  sudo sh -c '{}'", apt::by_hand(&names));
+/// How this system's user installs what is missing.
+fn advice(missing: &[Missing], known: &[String]) -> String {
+    if apt::is_there() { by_hand(missing, known, is_root()) } else { ELSEWHERE.to_owned() }
+}
+
+/// The command to run. Apt's lists may never have been fetched, which only root can do, so packages missing from them
+/// are not an error yet.
+fn by_hand(missing: &[Missing], known: &[String], is_root: bool) -> String {
+    let (names, unknown) = choices(missing, known);
+    let mut said = format!("install with\n  {}", apt::by_hand(&names, is_root));
     if !unknown.is_empty() {
         said += &format!(
             "\napt's lists do not have these yet, by any name:\n{}\nif they still lack one after the update, run this again for \
@@ -78,67 +112,66 @@ fn for_root(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> Strin
             lines(unknown)
         );
     }
-    said + "\nif they are installed already: " + SHADOWED
+    said
 }
 
 /// The first installable name of each entry, or else its first name; and the entries without an installable name.
-fn choices(missing: &[Entry], can_be_installed: impl Fn(&str) -> bool) -> (Vec<String>, Vec<&Entry>) {
-    let known = |entry: &Entry| entry.names.iter().find(|name| can_be_installed(name)).cloned();
-    let choices: Vec<_> = missing.iter().map(|entry| (entry, known(entry))).collect();
-    let unknown = choices.iter().filter(|(_, known)| known.is_none()).map(|&(entry, _)| entry).collect();
-    let name = |(entry, known): (&Entry, Option<String>)| known.or_else(|| entry.names.first().cloned());
-    (choices.into_iter().filter_map(name).collect(), unknown)
+fn choices<'a>(missing: &'a [Missing], known: &[String]) -> (Vec<String>, Vec<&'a Missing>) {
+    let unknown = missing.iter().filter(|it| first_of(&it.entry, known).is_none()).collect();
+    let name = |it: &Missing| first_of(&it.entry, known).or(it.entry.names.first()).cloned();
+    (missing.iter().filter_map(name).collect(), unknown)
 }
 
 /// Fails if programs still do not find what the installed packages provide.
-fn still_missing(entries: &[Entry]) -> Done {
-    if entries.is_empty() {
+fn still_missing(missing: &[Missing]) -> Done {
+    if missing.is_empty() {
         return Ok(());
     }
     Err(format!(
-        "these packages are installed, yet what {PATH} has them for is not found:\n{}\n{SHADOWED}",
-        lines(entries)
+        "these packages are installed, yet what {PATH} has them for is not found:\n{}",
+        lines(missing)
     ))
 }
 
-fn lines<'a>(entries: impl IntoIterator<Item = &'a Entry>) -> String {
-    let line = |entry: &Entry| format!("  {}: {}", entry.name(), entry.why);
-    entries.into_iter().map(line).collect::<Vec<_>>().join("\n")
+fn lines<'a>(missing: impl IntoIterator<Item = &'a Missing>) -> String {
+    let line = |it: &Missing| format!("  {}: {} ({})", it.entry.names.join(" or "), it.entry.why, it.reason);
+    missing.into_iter().map(line).collect::<Vec<_>>().join("\n")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn entry(names: &[&str], why: &str) -> Entry {
-        let names = names.iter().map(|&name| name.to_owned()).collect();
-        Entry { names, probes: Vec::new(), why: why.to_owned() }
+    fn missing(names: &[&str], why: &str) -> Missing {
+        let entry = Entry { names: strings(names), probes: Vec::new(), why: why.to_owned() };
+        Missing { entry, reason: "no program".to_owned() }
+    }
+
+    fn strings(words: &[&str]) -> Vec<String> {
+        words.iter().map(|&word| word.to_owned()).collect()
     }
 
     #[test]
     fn the_first_name_that_a_release_knows_is_taken() {
-        let missing = [entry(&["a-14", "a-19"], "reads"), entry(&["b"], "writes")];
-        let chosen_of =
-            |known: &[&str]| chosen(&missing, |name| known.contains(&name)).map(|names| names.join(" "));
+        let missing = [missing(&["a-14", "a-19"], "reads"), missing(&["b"], "writes")];
+        let chosen_of = |known: &[&str]| chosen(&missing, &strings(known)).map(|names| names.join(" "));
         assert_eq!(chosen_of(&["a-14", "a-19", "b"]).unwrap(), "a-14 b");
         assert_eq!(chosen_of(&["a-19", "b"]).unwrap(), "a-19 b");
         let error = chosen_of(&["b"]).unwrap_err();
-        assert!(error.contains("a-14 or a-19: reads") && error.contains(PATH), "{error}");
+        assert!(error.contains("a-14 or a-19: reads (no program)") && error.contains(PATH), "{error}");
         assert!(!error.contains("writes"), "{error}");
     }
 
     #[test]
-    fn who_is_not_root_is_told_a_command_whatever_apt_knows() {
-        let missing = [entry(&["a-14", "a-19"], "reads"), entry(&["b"], "writes")];
-        let told = |known: &[&str]| for_root(&missing, |name| known.contains(&name));
-        let command = |names: &str| {
-            format!("sudo sh -c 'apt-get update; apt-get install --yes --no-install-recommends {names}'\n")
-        };
-        let all = told(&["a-19", "b"]);
-        assert!(all.contains(&command("a-19 b")) && all.ends_with(SHADOWED), "{all}");
-        assert!(!all.contains("lists"), "{all}");
-        let none = told(&[]);
-        assert!(none.contains(&command("a-14 b")) && none.ends_with(SHADOWED), "{none}");
+    fn a_command_is_told_whatever_apt_knows_and_to_others_than_root_with_sudo() {
+        let missing = [missing(&["a-14", "a-19"], "reads"), missing(&["b"], "writes")];
+        let told = |known: &[&str], is_root| by_hand(&missing, &strings(known), is_root);
+        let command = "apt-get update; apt-get install --yes --no-install-recommends";
+        let all = ["a-19", "b"];
+        assert_eq!(told(&all, true), format!("install with\n  {command} a-19 b"));
+        assert_eq!(told(&all, false), format!("install with\n  sudo sh -c '{command} a-19 b'"));
+        let none = told(&[], false);
+        assert!(none.contains(&format!("sudo sh -c '{command} a-14 b'\n")), "{none}");
         assert!(none.contains("a-14 or a-19: reads") && none.contains(ELSEWHERE), "{none}");
     }
 }

@@ -1,12 +1,13 @@
 //! Checks whether a package is present, by using it as the build or the tests do.
 
-use std::ffi::OsStr;
-use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::ffi::OsString;
+use std::fmt::Display;
+use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::process::{Command, Stdio};
 
 use super::{elf, libclang};
-use crate::run::Done;
+use crate::run::{Done, program};
 
 /// A requirement that a package fulfils.
 #[derive(Debug, PartialEq)]
@@ -19,8 +20,8 @@ pub enum Probe {
     Compiles(Language),
     /// Python of at least this version that can create environments with pip.
     Python { major: u32, minor: u32 },
-    /// A C library with development files, and its minimum version.
-    PkgConfig { library: String, version: Option<String> },
+    /// The program pkg-config, and what it must find: a C library with development files, `NAME` or `NAME >= VERSION`.
+    PkgConfig(Option<String>),
     /// The library that bindgen loads at run time.
     Libclang,
 }
@@ -35,70 +36,170 @@ pub enum Language {
 impl Probe {
     /// Parses a probe of the list.
     pub fn parse(word: &str) -> Done<Self> {
+        let named = |name: &str| match is_name(name) {
+            true => Ok(name.to_owned()),
+            false => Err(format!("`{word}`: expected a name of letters, digits and any of +-._")),
+        };
         match word.split_once(':') {
             None if word == "libclang" => Ok(Self::Libclang),
-            None if !word.is_empty() => Ok(Self::Program(word.to_owned())),
-            Some(("static", name)) => Ok(Self::Static(name.to_owned())),
+            None if word == "pkg-config" => Ok(Self::PkgConfig(None)),
+            None => Ok(Self::Program(named(word)?)),
+            Some(("static", name)) => Ok(Self::Static(named(name)?)),
             Some(("compiles", "c")) => Ok(Self::Compiles(Language::C)),
             Some(("compiles", "c++")) => Ok(Self::Compiles(Language::Cpp)),
             Some(("python", version)) => python(version),
-            Some(("pkg-config", library)) => Ok(match library.split_once(">=") {
-                Some((library, version)) => {
-                    Self::PkgConfig { library: library.to_owned(), version: Some(version.to_owned()) }
+            Some(("pkg-config", library)) => {
+                let Some((name, version)) = library.split_once(">=") else {
+                    return Ok(Self::PkgConfig(Some(named(library)?)));
+                };
+                if !is_name(version) || !version.starts_with(|first: char| first.is_ascii_digit()) {
+                    return Err(format!("`{word}`: expected a version like 0.8.25"));
                 }
-                None => Self::PkgConfig { library: library.to_owned(), version: None },
-            }),
+                Ok(Self::PkgConfig(Some(format!("{} >= {version}", named(name)?))))
+            }
             _ => Err(format!(
-                "`{word}` is not a program, static:NAME, compiles:c, compiles:c++, python:VERSION, \
-                 pkg-config:LIBRARY[>=VERSION] or libclang"
+                "`{word}`: expected a program, static:NAME, compiles:c, compiles:c++, python:VERSION, \
+                 pkg-config, pkg-config:LIBRARY[>=VERSION] or libclang"
             )),
         }
     }
 
-    /// Whether the requirement is fulfilled.
-    pub fn holds(&self) -> bool {
+    /// Fails, and tells why, if the requirement is not fulfilled.
+    pub fn check(&self) -> Done {
+        let found = |name: &str| program(name).ok_or_else(|| format!("no program `{name}` on the path"));
         match self {
-            Self::Program(name) => program(name).is_some(),
-            Self::Static(name) => program(name).is_some_and(|path| is_static(&path)),
-            Self::Compiles(language) => compiles(*language),
-            Self::Python { major, minor } => succeeds(Command::new("python3").args([
-                "-c",
-                &format!(
-                    "import sys, venv, ensurepip, ssl, zlib; sys.exit(sys.version_info < ({major}, {minor}))"
-                ),
-            ])),
-            Self::PkgConfig { library, version } => {
-                let is_new_enough = version.as_ref().is_none_or(|version| {
-                    succeeds(
-                        Command::new("pkg-config").arg(format!("--atleast-version={version}")).arg(library),
-                    )
-                });
-                // Unlike `--exists`, querying the flags also requires the libraries that it depends on.
-                is_new_enough && succeeds(Command::new("pkg-config").args(["--cflags", "--libs", library]))
+            Self::Program(name) => found(name).map(|_| ()),
+            Self::Static(name) => {
+                let path = found(name)?;
+                let error = || format!("{} is not a static program: it needs libraries", path.display());
+                is_static(&path).then_some(()).ok_or_else(error)
             }
-            Self::Libclang => libclang::is_there(),
+            Self::Compiles(language) => compiles(*language),
+            Self::Python { major, minor } => Tool::new("python3", None).run(
+                &[
+                    "-c",
+                    &format!(
+                        "import sys\n\
+                         if sys.version_info < ({major}, {minor}):\n    \
+                             sys.exit(f'{{sys.executable}} is {{sys.version.split()[0]}}, older than {major}.{minor}')\n\
+                         import venv, ensurepip, ssl, zlib"
+                    ),
+                ],
+                "",
+            ),
+            Self::PkgConfig(library) => pkg_config(library.as_deref()),
+            Self::Libclang => libclang::check(),
         }
     }
+}
+
+/// Whether a word can name a program, a library or a version.
+fn is_name(word: &str) -> bool {
+    word.starts_with(|first: char| first.is_ascii_alphanumeric())
+        && word.chars().all(|letter| letter.is_ascii_alphanumeric() || "+-._".contains(letter))
 }
 
 fn python(version: &str) -> Done<Probe> {
     let number = |text: &str| text.parse().ok();
     version
         .split_once('.')
+        .filter(|_| is_name(version))
         .and_then(|(major, minor)| Some(Probe::Python { major: number(major)?, minor: number(minor)? }))
-        .ok_or_else(|| format!("`{version}` is not a version of Python like 3.11"))
+        .ok_or_else(|| format!("`python:{version}`: expected a version like 3.11"))
 }
 
-/// The program that a shell would start for a name.
-fn program(name: &str) -> Option<PathBuf> {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    program_on(&path, name)
+/// A program of the build, by the name that crates start it by.
+struct Tool {
+    /// The program and its first arguments.
+    words: Vec<OsString>,
+    /// The environment variable and its value, or else the program.
+    shown: String,
 }
 
-fn program_on(path: &OsStr, name: &str) -> Option<PathBuf> {
-    std::env::split_paths(path).map(|folder| folder.join(name)).find(|file| {
-        file.metadata().is_ok_and(|about| about.is_file() && about.permissions().mode() & 0o111 != 0)
-    })
+impl Tool {
+    fn new(name: &str, variable: Option<(String, OsString)>) -> Self {
+        match variable {
+            Some((variable, value)) => {
+                Self { shown: format!("{variable}={}", value.display()), words: vec![value] }
+            }
+            None => Self { words: vec![name.into()], shown: name.to_owned() },
+        }
+    }
+
+    /// A compiler; its variable may also hold arguments, or the compiler after a wrapper.
+    fn compiler(name: &str, variable: &str) -> Self {
+        let mut tool =
+            Self::new(name, set(variable).filter(|(_, value)| !value.to_string_lossy().trim().is_empty()));
+        if let [value] = tool.words.as_slice()
+            && !Path::new(value).exists()
+        {
+            tool.words = value.to_string_lossy().split_whitespace().map(OsString::from).collect();
+        }
+        tool
+    }
+
+    /// Runs it with this input. What it prints is the error if it fails.
+    fn run(&self, arguments: &[&str], input: &str) -> Done {
+        let failed = |why: &dyn Display| format!("{}: {why}", self.shown);
+        let [program, first @ ..] = self.words.as_slice() else { return Err(failed(&"no program")) };
+        let started = Command::new(program)
+            .args(first)
+            .args(arguments)
+            // What it prints is read below, so it must not be translated.
+            .env("LC_ALL", "C")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn();
+        let mut process = started.map_err(|error| match error.kind() {
+            ErrorKind::NotFound => failed(&"no such program"),
+            _ => failed(&error),
+        })?;
+        if let Some(mut stdin) = process.stdin.take() {
+            // A program that does not read its input also fails with an exit status.
+            let _ = stdin.write_all(input.as_bytes());
+        }
+        let output = process.wait_with_output().map_err(|error| failed(&error))?;
+        if output.status.success() {
+            return Ok(());
+        }
+        Err(failed(&essence(&String::from_utf8_lossy(&output.stderr)).unwrap_or(&output.status.to_string())))
+    }
+}
+
+/// The line that tells most of what a failed program has printed.
+fn essence(said: &str) -> Option<&str> {
+    let tells = |line: &&str| line.contains("fatal error") || line.contains("cannot find");
+    let last = || said.lines().rfind(|line| !line.trim().is_empty());
+    said.lines().find(tells).or_else(last).map(str::trim)
+}
+
+/// The variable by which the crates `cc` and `pkg-config` are told of a tool for the machine that builds, and its value.
+fn set(variable: &str) -> Option<(String, OsString)> {
+    let libc = if cfg!(target_env = "musl") { "musl" } else { "gnu" };
+    let target = format!("{}-unknown-linux-{libc}", std::env::consts::ARCH);
+    let names = [
+        format!("{variable}_{target}"),
+        format!("{variable}_{}", target.replace('-', "_")),
+        format!("HOST_{variable}"),
+        variable.to_owned(),
+    ];
+    names.into_iter().find_map(|name| std::env::var_os(&name).map(|value| (name, value)))
+}
+
+/// Asks for a library, or only starts the program.
+fn pkg_config(library: Option<&str>) -> Done {
+    let variable = set("PKG_CONFIG");
+    // Unlike `--exists`, querying the flags also requires the libraries that it depends on.
+    let arguments = library.map_or(vec!["--version"], |library| {
+        vec!["--cflags", "--libs", "--print-errors", "--short-errors", library]
+    });
+    let name = if program("pkg-config").is_none() && program("pkgconf").is_some() {
+        "pkgconf"
+    } else {
+        "pkg-config"
+    };
+    Tool::new(name, variable).run(&arguments, "")
 }
 
 fn is_static(path: &Path) -> bool {
@@ -124,30 +225,19 @@ fn program_headers(bytes: &[u8]) -> Option<Vec<u32>> {
     (0..count).map(|index| u32_at(start + index * size)).collect()
 }
 
-/// Compiles and links an empty program with the default compiler of crates and cargo.
-fn compiles(language: Language) -> bool {
+/// Compiles and links an empty program.
+fn compiles(language: Language) -> Done {
     let (compiler, kind, source) = match language {
-        Language::C => {
-            ("cc", "c", "#include <stdio.h>\n#include <linux/types.h>\nint main(void) { return 0; }\n")
+        Language::C => (
+            Tool::compiler("cc", "CC"),
+            "c",
+            "#include <stdio.h>\n#include <linux/types.h>\nint main(void) { return 0; }\n",
+        ),
+        Language::Cpp => {
+            (Tool::compiler("c++", "CXX"), "c++", "#include <vector>\nint main() { return 0; }\n")
         }
-        Language::Cpp => ("c++", "c++", "#include <vector>\nint main() { return 0; }\n"),
     };
-    let compiler = Command::new(compiler)
-        .args(["-x", kind, "-o", "/dev/null", "-"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn();
-    let Ok(mut compiler) = compiler else { return false };
-    if let Some(mut input) = compiler.stdin.take() {
-        // A compiler that does not read its input also fails with an exit status.
-        let _ = std::io::Write::write_all(&mut input, source.as_bytes());
-    }
-    compiler.wait().is_ok_and(|status| status.success())
-}
-
-fn succeeds(command: &mut Command) -> bool {
-    command.stdin(Stdio::null()).output().is_ok_and(|output| output.status.success())
+    compiler.run(&["-x", kind, "-o", "/dev/null", "-"], source)
 }
 
 #[cfg(test)]
@@ -161,31 +251,49 @@ mod tests {
         assert_eq!(parse("libclang"), Probe::Libclang);
         assert_eq!(parse("compiles:c++"), Probe::Compiles(Language::Cpp));
         assert_eq!(parse("python:3.11"), Probe::Python { major: 3, minor: 11 });
-        assert_eq!(
-            parse("pkg-config:a-0.8>=0.8.25"),
-            Probe::PkgConfig { library: "a-0.8".to_owned(), version: Some("0.8.25".to_owned()) }
-        );
-        assert_eq!(parse("pkg-config:a"), Probe::PkgConfig { library: "a".to_owned(), version: None });
-        for word in ["", "compiles:d", "python:3", "python:3.x", "file:/a"] {
-            assert!(Probe::parse(word).is_err(), "{word}");
+        assert_eq!(parse("pkg-config"), Probe::PkgConfig(None));
+        assert_eq!(parse("pkg-config:a"), Probe::PkgConfig(Some("a".to_owned())));
+        assert_eq!(parse("pkg-config:a-0.8>=0.8.25"), Probe::PkgConfig(Some("a-0.8 >= 0.8.25".to_owned())));
+    }
+
+    #[test]
+    fn what_is_no_probe_is_told_what_is_expected() {
+        for (word, expected) in [
+            ("", "a name"),
+            ("/usr/bin/xz", "a name"),
+            ("static:", "a name"),
+            ("static:bin/xz", "a name"),
+            ("pkg-config:", "a name"),
+            ("pkg-config:--all", "a name"),
+            ("pkg-config:>=1", "a name"),
+            ("pkg-config:a>=", "a version"),
+            ("pkg-config:a>=new", "a version"),
+            ("python:3", "a version"),
+            ("python:3.x", "a version"),
+            ("python:+3.11", "a version"),
+            ("compiles:d", "a program, static:NAME, compiles:c, compiles:c++"),
+            ("file:/a", "a program, static:NAME"),
+        ] {
+            let error = Probe::parse(word).unwrap_err();
+            assert!(error.starts_with(&format!("`{word}`: expected {expected}")), "{error}");
         }
     }
 
     #[test]
-    fn a_program_is_a_file_that_may_be_executed() {
-        let folder = std::env::temp_dir().join(format!("raysweep-probe-{}", std::process::id()));
-        let (first, second) = (folder.join("first"), folder.join("second"));
-        std::fs::create_dir_all(first.join("folder")).unwrap();
-        std::fs::create_dir_all(&second).unwrap();
-        for (file, mode) in [(first.join("tool"), 0o644), (second.join("tool"), 0o755)] {
-            std::fs::write(&file, "").unwrap();
-            std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
-        }
-        let path = std::env::join_paths([&first, &second]).unwrap();
-        assert_eq!(program_on(&path, "tool"), Some(second.join("tool")));
-        assert_eq!(program_on(&path, "folder"), None);
-        assert_eq!(program_on(&path, "nothing"), None);
-        std::fs::remove_dir_all(&folder).unwrap();
+    fn a_tool_that_fails_says_by_which_variable_and_why() {
+        let tool = |words: &str| Tool {
+            words: words.split(' ').map(OsString::from).collect(),
+            shown: format!("CC={words}"),
+        };
+        assert_eq!(tool("/nonexistent").run(&[], ""), Err("CC=/nonexistent: no such program".to_owned()));
+        assert_eq!(tool("env sh").run(&["-c", "read line; test $line = word"], "word\n"), Ok(()));
+        let error = tool("sh -c").run(&["echo first; echo last >&2; exit 1"], "").unwrap_err();
+        assert_eq!(error, "CC=sh -c: last");
+        let error = tool("sh").run(&["-c", "exit 3"], "").unwrap_err();
+        assert_eq!(error, "CC=sh: exit status: 3");
+        let said =
+            "In file included\n<stdin>:1:10: fatal error: stdio.h: No such file\ncompilation terminated.\n";
+        assert_eq!(essence(said), Some("<stdin>:1:10: fatal error: stdio.h: No such file"));
     }
 
     #[test]
