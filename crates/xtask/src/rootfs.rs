@@ -20,18 +20,70 @@ done
 /// Prepended to each script; defines the function `mount_system ROOT`.
 const PRELUDE: &str = include_str!("rootfs.sh");
 
-/// Why this machine does not allow it, or `None`.
+/// Why this machine does not allow it, and what to do, or `None`.
 pub fn forbidden() -> Option<String> {
     let tried = Command::new("unshare").args(namespaces()).args(["chroot", "/", "true"]).output();
-    match tried {
-        Ok(output) if output.status.success() => None,
-        Ok(output) => Some(format!(
-            "a root file system of one's own takes chroot and namespaces: be root on a machine that permits them, or a user with \
-             user namespaces, newuidmap and lines in /etc/subuid and /etc/subgid; {}",
-            String::from_utf8_lossy(&output.stderr).trim()
-        )),
-        Err(error) => Some(format!("cannot start unshare: {error}")),
+    let said = match tried {
+        Ok(output) if output.status.success() => return None,
+        Ok(output) => String::from_utf8_lossy(&output.stderr).trim().to_owned(),
+        Err(error) => return Some(format!("cannot start unshare: {error}")),
+    };
+    let (lacking, remedy) = if is_root() {
+        (
+            lacking_as_root(),
+            "permit it, as containers do with `--cap-add`, or use a machine that is no container",
+        )
+    } else {
+        (lacking_as_user(), "permit it, or be root")
+    };
+    let lacking: String = lacking.iter().map(|it| format!("\n  {it}")).collect();
+    Some(format!("this machine forbids chroot or namespaces ({said}); {remedy}{lacking}"))
+}
+
+/// Capabilities that root needs and this one, probably in a container, has not got.
+fn lacking_as_root() -> Vec<String> {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let effective = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
+    let Some(mask) = effective.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()) else {
+        return Vec::new();
+    };
+    let all = [(18, "CAP_SYS_CHROOT"), (21, "CAP_SYS_ADMIN")];
+    all.iter()
+        .filter(|(bit, _)| mask >> bit & 1 == 0)
+        .map(|(_, name)| format!("root has no {name} here"))
+        .collect()
+}
+
+/// Conditions of user namespaces that do not hold, each with its remedy.
+fn lacking_as_user() -> Vec<String> {
+    let mut lacking = Vec::new();
+    if Command::new("newuidmap").output().is_err() {
+        lacking.push("no program `newuidmap`: apt-get install uidmap".to_owned());
     }
+    let id = |option| Command::new("id").arg(option).output().map_or(Vec::new(), |output| output.stdout);
+    let [name, uid] =
+        ["-un", "-u"].map(|option| String::from_utf8_lossy(id(option).trim_ascii()).into_owned());
+    let has_range = |file| {
+        let lines = std::fs::read_to_string(file).unwrap_or_default();
+        lines.lines().any(|line| line.split(':').next().is_some_and(|owner| owner == name || owner == uid))
+    };
+    if !has_range("/etc/subuid") || !has_range("/etc/subgid") {
+        lacking.push(format!(
+            "no line for {name} in /etc/subuid or /etc/subgid: sudo usermod --add-subuids 100000-165535 --add-subgids \
+             100000-165535 {name}"
+        ));
+    }
+    for (setting, forbids, permits) in [
+        ("user.max_user_namespaces", "0", "10000"),
+        ("kernel.unprivileged_userns_clone", "0", "1"),
+        ("kernel.apparmor_restrict_unprivileged_userns", "1", "0"),
+    ] {
+        let file = format!("/proc/sys/{}", setting.replace('.', "/"));
+        if std::fs::read_to_string(file).is_ok_and(|value| value.trim() == forbids) {
+            lacking.push(format!("{setting}={forbids}: sudo sysctl {setting}={permits}"));
+        }
+    }
+    lacking
 }
 
 /// A script running as root in its own mount and process namespaces.

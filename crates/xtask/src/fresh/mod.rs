@@ -1,13 +1,13 @@
 //! `cargo xtask fresh`: runs the README's two commands on a bare Debian with only Rust and a C compiler.
 
 use std::fs::{File, TryLockError};
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
 use crate::rootfs::{self, Running};
-use crate::run::{Done, root, run, say, target};
+use crate::run::{Done, program, root, run, say, target};
 
 const SCRIPT: &str = include_str!("inside.sh");
 
@@ -29,15 +29,10 @@ const NETWORK: [&str; 6] = ["http_proxy", "https_proxy", "no_proxy", "HTTP_PROXY
 /// Tries the given releases, or all; prints one line for each at the end.
 pub fn fresh(numbers: &[&str]) -> Done {
     let releases = chosen(numbers)?;
-    for (program, package) in PROGRAMS {
-        if Command::new(program).arg("--version").output().is_err() {
-            return Err(format!("`cargo xtask fresh` needs {program}: apt-get install {package}"));
-        }
-    }
+    let rust = found()?;
     if let Some(why) = rootfs::forbidden() {
         return Err(format!("fresh: SKIPPED: {why}"));
     }
-    let rust = sysroot()?;
     tell_uncommitted()?;
     let tried = releases.iter().map(|release| attempt(release, &rust)).collect::<Done<Vec<Attempt>>>()?;
     for Attempt { line, .. } in &tried {
@@ -49,12 +44,28 @@ pub fn fresh(numbers: &[&str]) -> Done {
     }
 }
 
-fn chosen(numbers: &[&str]) -> Done<Vec<&'static Release>> {
-    if let Some(unknown) = numbers.iter().find(|&&number| RELEASES.iter().all(|known| known.number != number))
-    {
-        return Err(format!("`{unknown}` is not 12 or 13, the releases of Debian that there are to try"));
+fn chosen(words: &[&str]) -> Done<Vec<&'static Release>> {
+    let names = |release: &Release, word: &str| [release.number, release.suite].contains(&word);
+    if let Some(unknown) = words.iter().find(|word| !RELEASES.iter().any(|release| names(release, word))) {
+        return Err(format!(
+            "`{unknown}` is no release to try: write 12 (bookworm), 13 (trixie), or nothing for both, as in `cargo xtask \
+             fresh 12`"
+        ));
     }
-    Ok(RELEASES.iter().filter(|known| numbers.is_empty() || numbers.contains(&known.number)).collect())
+    let is_chosen = |release: &&Release| words.is_empty() || words.iter().any(|word| names(release, word));
+    Ok(RELEASES.iter().filter(is_chosen).collect())
+}
+
+/// Finds what is needed on this machine, or names all that is missing; returns the folder of the Rust toolchain.
+fn found() -> Done<String> {
+    let missing = PROGRAMS.iter().filter(|(name, _)| program(name).is_none());
+    let missing = missing.map(|(name, package)| format!("no program `{name}`: apt-get install {package}"));
+    let rust = sysroot();
+    let missing: Vec<String> = missing.chain(rust.clone().err()).collect();
+    if missing.is_empty() {
+        return rust;
+    }
+    Err(format!("`cargo xtask fresh` lacks:\n  {}", missing.join("\n  ")))
 }
 
 /// Result for a release.
@@ -139,12 +150,18 @@ fn copy_of_commits(folder: &Path) -> Done<PathBuf> {
 
 /// Folder of the current Rust toolchain: its programs and libraries.
 fn sysroot() -> Done<String> {
-    let rustc = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let (rustc, shown) = match std::env::var_os("RUSTC") {
+        Some(rustc) => (rustc.clone(), format!("RUSTC={}", rustc.display())),
+        None => ("rustc".into(), "rustc".to_owned()),
+    };
     let output = Command::new(rustc).args(["--print", "sysroot"]).current_dir(root()).output();
-    let output = output.map_err(|error| format!("cannot start rustc: {error}"))?;
+    let output = output.map_err(|error| match error.kind() {
+        ErrorKind::NotFound => format!("{shown}: no such program; Rust is at https://rustup.rs"),
+        _ => format!("{shown}: {error}"),
+    })?;
     if !output.status.success() {
         let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-        return Err(format!("`rustc --print sysroot` ended with {}: {said}", output.status));
+        return Err(format!("{shown}: `--print sysroot` ended with {}: {said}", output.status));
     }
     let sysroot = String::from_utf8_lossy(&output.stdout).trim().to_owned();
     lendable(Path::new(&sysroot))?;
@@ -156,13 +173,13 @@ fn lendable(sysroot: &Path) -> Done {
     let shown = sysroot.display();
     if sysroot.canonicalize().is_ok_and(|sysroot| sysroot == Path::new("/usr")) {
         return Err(format!(
-            "the root is lent the folder in which Rust lies; yours lies in {shown}, with all other programs: `cargo xtask \
-             fresh` needs a Rust in a folder of its own, as rustup installs it"
+            "a Rust in a folder of its own, which the bare Debian is lent: yours lies in {shown}, with all other programs; \
+             install it from https://rustup.rs"
         ));
     }
     if !sysroot.join("bin/cargo").is_file() {
         return Err(format!(
-            "{shown}, where rustc lies, has no bin/cargo: `cargo xtask fresh` needs both in one folder, as rustup installs them"
+            "rustc and cargo in one folder: {shown}, where rustc lies, has no bin/cargo; install both from https://rustup.rs"
         ));
     }
     Ok(())
@@ -184,6 +201,7 @@ mod tests {
         };
         assert_eq!(suites(&[]), ["bookworm", "trixie"]);
         assert_eq!(suites(&["13"]), ["trixie"]);
+        assert_eq!(suites(&["bookworm"]), ["bookworm"]);
         assert!(chosen(&["12", "11"]).err().unwrap().contains("`11`"));
     }
 
