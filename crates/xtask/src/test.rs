@@ -12,6 +12,7 @@ pub enum Guest {
 
 /// Installs missing packages, then checks format, lints, fuzz targets, tests, doc tests, and tests in the kernel guest.
 pub fn test(wanted: Guest) -> Done {
+    has_components()?;
     packages::install()?;
     // Packages that read our files in practice.
     let python = python::environment("python", "requirements.txt")?;
@@ -28,4 +29,14 @@ pub fn test(wanted: Guest) -> Done {
             Ok(())
         }
     }
+}
+
+/// Fails without rustfmt or clippy, which `rustup` can leave out, before anything is installed or built.
+fn has_components() -> Done {
+    let starts =
+        |name: &&str| cargo().args([*name, "--version"]).output().is_ok_and(|it| it.status.success());
+    if ["fmt", "clippy"].iter().all(starts) {
+        return Ok(());
+    }
+    Err("`cargo xtask test` needs rustfmt and clippy: rustup component add rustfmt clippy".to_owned())
 }
