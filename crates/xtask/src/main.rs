@@ -15,32 +15,43 @@ mod test;
 
 use std::process::ExitCode;
 
+use run::say;
 use test::Guest;
 
 const USAGE: &str = "\
 usage: cargo xtask <command>
 
-  demo    build, run the paper's sweep on the simulated rig, write a report
-  test    install what the tests need, then format, lints, tests, the guest's too; --no-guest leaves these out
-  packages
-          what the tests need of Debian, and whether it is there
-  fresh   demo and test of the last commit on a bare Debian 12 and 13, each in a root file system made for it; [12|13]... only
-          those
-  guest   the drivers' tests against real kernel drivers, in a QEMU guest; [TEST...] runs only those
-  bench   measure: without a name, tells which benchmarks there are";
+  demo               builds, runs the paper's sweep on the simulated rig, writes a report
+  test [--no-guest]  installs what the tests need, checks format, lints and tests, the guest's last;
+                     --no-guest leaves those out
+  packages           what the tests need of Debian, what of it is missing, and how to install it
+  fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 and 13, or one of them
+  guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
+  bench [NAME]       measures; without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {
-    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<String> =
+        std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let asks_for_help =
+        arguments.first() == Some(&"help") || arguments.iter().any(|word| ["--help", "-h"].contains(word));
     let done = match arguments.as_slice() {
+        ["bench", ..] if asks_for_help => bench::bench(&[]),
+        _ if asks_for_help => say(USAGE),
         ["demo"] => demo::demo(),
-        ["test"] => test::test(Guest::Run),
-        ["test", "--no-guest"] => test::test(Guest::Skip),
-        ["fresh", numbers @ ..] => fresh::fresh(numbers),
+        ["test", options @ ..] => match options.iter().find(|&&option| option != "--no-guest") {
+            Some(unknown) => Err(format!("`{unknown}` is not an option of test; there is --no-guest")),
+            None => test::test(if options.is_empty() { Guest::Run } else { Guest::Skip }),
+        },
         ["packages"] => packages::print(),
+        [command @ ("demo" | "packages"), unknown, ..] => {
+            Err(format!("`{unknown}` is not an option of {command}; it has none"))
+        }
+        ["fresh", releases @ ..] => fresh::fresh(releases),
         ["guest", names @ ..] => guest::guest(names),
         ["bench", arguments @ ..] => bench::bench(arguments),
-        _ => Err(USAGE.to_owned()),
+        [unknown, ..] => Err(format!("`{unknown}` is not a command\n{USAGE}")),
+        [] => Err(USAGE.to_owned()),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
