@@ -25,7 +25,7 @@ usage: cargo xtask <command>
   test [--no-guest]  installs what the tests need, checks format, lints and tests, the guest's last;
                      --no-guest leaves those out
   packages           what the tests need of Debian, what of it is missing, and how to install it
-  fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 and 13, or one of them
+  fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 and 13, or on one
   guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
   bench [NAME]       measures; without a name, tells which benchmarks there are";
 
