@@ -4,6 +4,7 @@
 //! Nothing here needs a rig, a socket or a device.
 
 pub mod batches;
+pub mod darks;
 mod export;
 pub mod film;
 pub mod memory;
@@ -62,5 +63,6 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
         Procedure::Film(own) => film::process(&stored, own, asked),
         Procedure::Batches(own) => batches::process(&stored, own, asked),
         Procedure::Response(own) => response::process(&stored, own, asked),
+        Procedure::Darks(own) => darks::process(&stored, own, asked),
     }
 }

@@ -2,6 +2,7 @@
 //! [`foresee`], which picks the plan's.
 
 mod batches;
+mod darks;
 mod film;
 pub mod lab;
 mod response;
@@ -23,13 +24,16 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
             sweep::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
         }
+        (LabRig::Plane(rig), Procedure::Darks(own)) => {
+            darks::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+        }
         (LabRig::Plane(rig), Procedure::Film(own)) => film::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
         (LabRig::Plane(_), _) => {
-            Err(of_another_rig(&plan, "a plane rig runs plans of kind \"sweep\" and \"film\""))
+            Err(of_another_rig(&plan, "a plane rig runs plans of kind \"sweep\", \"film\" and \"darks\""))
         }
-        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Film(_)) => {
+        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_)) => {
             Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\""))
         }
     }
@@ -50,6 +54,10 @@ pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<F
             let size = (begun.shape.rows, begun.shape.columns);
             Ok(sweep::foresee(lab, rig, &plan, own, begun.first_row, size)?)
         }
+        (LabRig::Plane(rig), Procedure::Darks(own)) => {
+            let size = (begun.shape.rows, begun.shape.columns);
+            Ok(darks::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+        }
         (_, Procedure::Film(_)) => Err(Unresumable::Past(
             "a film cannot be resumed: its time has passed. `raysweep process` makes the transports of the cycles that are there; run the plan again for another film",
         )),
@@ -59,7 +67,7 @@ pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<F
         (_, Procedure::Response(_)) => {
             Err(Unresumable::Past("the records of a mirror's axes cannot be resumed: run the plan again"))
         }
-        (LabRig::Dots(_), Procedure::Sweep(_)) => {
+        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_)) => {
             Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())
         }
     }

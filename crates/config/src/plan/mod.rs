@@ -1,6 +1,7 @@
 //! `plan.toml`: what to acquire and what to make of it.
 
 mod batches;
+mod darks;
 mod film;
 mod response;
 mod sweep;
@@ -10,6 +11,7 @@ use serde::Deserialize;
 use serde_json::Map;
 
 pub use self::batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
+pub use self::darks::DarksPlan;
 pub use self::film::FilmPlan;
 pub use self::response::ResponsePlan;
 pub use self::sweep::{Axis, SweepPlan};
@@ -43,6 +45,8 @@ pub enum Procedure {
     Batches(BatchesPlan),
     /// Chirps of a mirror, from which its resonances are identified.
     Response(ResponsePlan),
+    /// Images without light.
+    Darks(DarksPlan),
 }
 
 /// The procedures by the names that plans use.
@@ -53,10 +57,11 @@ enum Kind {
     Film,
     Batches,
     Response,
+    Darks,
 }
 
 impl Kind {
-    const ALL: [Self; 4] = [Self::Sweep, Self::Film, Self::Batches, Self::Response];
+    const ALL: [Self; 5] = [Self::Sweep, Self::Film, Self::Batches, Self::Response, Self::Darks];
 
     /// Its name in plans, which is also that of its table.
     fn name(self) -> &'static str {
@@ -65,6 +70,7 @@ impl Kind {
             Self::Film => "film",
             Self::Batches => "batches",
             Self::Response => "response",
+            Self::Darks => "darks",
         }
     }
 
@@ -76,6 +82,7 @@ impl Kind {
             Self::Film => read(document, table, FilmPlan::check, Procedure::Film),
             Self::Batches => read(document, table, BatchesPlan::check, Procedure::Batches),
             Self::Response => read(document, table, ResponsePlan::check, Procedure::Response),
+            Self::Darks => read(document, table, DarksPlan::check, Procedure::Darks),
         }
     }
 
@@ -84,7 +91,7 @@ impl Kind {
         match self {
             Self::Sweep | Self::Film => Some("demux"),
             Self::Batches => Some("denoise"),
-            Self::Response => None,
+            Self::Response | Self::Darks => None,
         }
     }
 }
@@ -108,6 +115,7 @@ impl Procedure {
             Self::Film(_) => Kind::Film,
             Self::Batches(_) => Kind::Batches,
             Self::Response(_) => Kind::Response,
+            Self::Darks(_) => Kind::Darks,
         };
         kind.name()
     }

@@ -1,0 +1,61 @@
+//! `[darks]`: images without light.
+
+use serde::Deserialize;
+
+use super::Axis;
+use crate::document::Document;
+
+/// `[darks]`: two images of each exposure, whose difference tells the noise.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DarksPlan {
+    /// Exposures.
+    pub exposure_us: Axis,
+    /// Frames averaged in each image.
+    pub frames: u32,
+    /// Pixels whose dark level lies more than this many standard deviations above the others' are hot.
+    pub hot_sigmas: f64,
+}
+
+impl Default for DarksPlan {
+    fn default() -> Self {
+        Self { exposure_us: Axis::List(vec![100.0, 1000.0, 10_000.0]), frames: 16, hot_sigmas: 8.0 }
+    }
+}
+
+/// Most exposures.
+const MAX_EXPOSURES: usize = 256;
+
+impl DarksPlan {
+    pub(super) fn check(&self, document: &mut Document<'_>) {
+        let exposures = self.exposure_us.len();
+        if !(1..=MAX_EXPOSURES).contains(&exposures) {
+            let message =
+                format!("darks.exposure_us has {exposures} values: 1 to {MAX_EXPOSURES} are allowed");
+            document.refuse(&["darks", "exposure_us"], message);
+        } else if let Some(value) =
+            self.exposure_us.values().into_iter().find(|us| !(us.is_finite() && *us > 0.0))
+        {
+            let message = format!("darks.exposure_us contains {value}: give microseconds greater than 0");
+            document.refuse(&["darks", "exposure_us"], message);
+        }
+        document.check_count(&["darks", "frames"], self.frames.into(), 1..=65_536);
+        document.check_range(&["darks", "hot_sigmas"], self.hot_sigmas, 1.0..=1000.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::plan::tests::refused;
+
+    #[test]
+    fn bad_plans_are_refused_with_field_and_place() {
+        refused(&[
+            ("kind = \"darks\"\n[darks]\nexposure_us = []", "darks.exposure_us", "1 to 256"),
+            ("kind = \"darks\"\n[darks]\nexposure_us = [0]", "darks.exposure_us", "greater than 0"),
+            ("kind = \"darks\"\n[darks]\nframes = 0", "darks.frames", "1 to 65536"),
+            ("kind = \"darks\"\n[darks]\nhot_sigmas = nan", "darks.hot_sigmas", "1 to 1000"),
+            ("kind = \"darks\"\n[[stage]]\nname = \"demux\"", "stage", "leave it out"),
+        ]);
+    }
+}

@@ -1,0 +1,45 @@
+//! What dark images would take, before anything moves.
+
+use raysweep_config::ConfigError;
+use raysweep_processing::darks::DarksTask;
+use raysweep_proto::CheckReport;
+
+use crate::plane::foresight::periods;
+use crate::procedure::lab::{Lab, Room};
+
+/// Images in the memory at once, with those of an exposure and the report's, in bytes a pixel.
+const BYTES_PER_PX: u64 = 64;
+/// Report and everything else that is small.
+const OTHER_BYTES: u64 = 5_000_000;
+
+/// Foresees dark images.
+///
+/// # Errors
+/// For an exposure that the camera cannot have.
+pub fn check(darks: &DarksTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError> {
+    let task = &*darks.task;
+    let (mut frames, mut light_periods) = (0, 0);
+    for point in &task.schedule.points {
+        let shot = task.geometry.shot(point, lab.camera.trigger_latency_us);
+        let refused = |message| task.refuse(&["darks", "exposure_us"], format!("darks.{message}"));
+        lab.camera.allows(&shot.settings).map_err(refused)?;
+        frames += u64::from(point.frames);
+        light_periods += u64::from(point.frames) * periods(task, lab.camera, point);
+    }
+    let pixels = (task.geometry.height * task.geometry.width) as u64;
+    let images = darks.points() as u64;
+    let room = Room {
+        // The means of all exposures are written as one sequence.
+        memory_bytes: pixels * (BYTES_PER_PX + 8 * images),
+        memory_free_bytes: lab.memory_free_bytes(),
+        disk_bytes: pixels * 4 * 2 * images + OTHER_BYTES,
+        disk_free_bytes: lab.disk_free_bytes(),
+    };
+    Ok(CheckReport {
+        points: darks.points(),
+        frames,
+        light_s: light_periods as f64 * task.geometry.raster.period_us * 1e-6,
+        warnings: room.warnings(),
+        ..room.report()
+    })
+}

@@ -1,0 +1,96 @@
+//! Dark images of the plane rig's camera.
+
+mod check;
+
+use std::sync::Arc;
+use std::sync::mpsc::channel;
+
+use raysweep_config::plan::DarksPlan;
+use raysweep_config::{ConfigError, Plan};
+use raysweep_processing::darks::{DarksTask, make};
+use raysweep_processing::sweep::Processing;
+use raysweep_session::ledger::{EndEntry, EndState, Entry};
+use raysweep_session::stack::{Contents, StackShape};
+
+use crate::plane::{Opened, PointSink, Taken, missing};
+use crate::procedure::lab::Lab;
+use crate::rig::Rig;
+use crate::run::error::RunError;
+use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::progress::ProgressMeter;
+
+/// Images between the assembler and the disk.
+const UNITS_UNDER_WAY: usize = 8;
+
+/// Dark images on a rig.
+struct DarksRun {
+    rig: Arc<Rig>,
+    darks: DarksTask,
+}
+
+/// Foresees dark images on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its
+/// row 0.
+///
+/// # Errors
+/// For a plan that cannot be run on this rig.
+pub fn foresee(
+    lab: &Lab<'_>,
+    rig: &Arc<Rig>,
+    plan: &Plan,
+    own: DarksPlan,
+    first_row: usize,
+    size: (usize, usize),
+) -> Result<Foreseen, ConfigError> {
+    let darks = DarksTask::new(plan, own, &rig.file, first_row, size);
+    Ok(Foreseen {
+        report: check::check(&darks, lab)?,
+        kind: plan.procedure.kind(),
+        name: plan.name.clone(),
+        shape: StackShape {
+            contents: Contents::Darks { images: darks.points() },
+            rows: size.0,
+            columns: size.1,
+        },
+        first_row,
+        instead: "take fewer exposures",
+        procedure: Box::new(DarksRun { rig: rig.clone(), darks }),
+    })
+}
+
+impl Procedure for DarksRun {
+    fn measure(self: Box<Self>, mut run: Run) -> Result<Ended, RunError> {
+        run.note_beginning()?;
+        let Self { rig, darks } = *self;
+        let opened = Opened::open(&rig, &darks.task, &run)?;
+        let missing = missing(&darks.task, run.ledger.state());
+        let (verdicts, results) = channel();
+        let stages: Arc<[_]> = Arc::new([]);
+        let sink = PointSink {
+            task: darks.task.clone(),
+            stack: run.session.stack()?,
+            ledger: run.ledger,
+            processing: Processing::without_folds(stages.clone()),
+            verdicts: Some(verdicts),
+            orders: run.orders.clone(),
+            board: run.board,
+            progress: ProgressMeter::new(darks.points() - missing.len(), darks.points()),
+            vsync: None,
+            live: None,
+            write_error: None,
+        };
+        let taken =
+            opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
+        let Taken { sink: PointSink { mut ledger, vsync, write_error, .. }, fault, .. } = taken;
+        let fault = write_error.map(RunError::from).or(fault);
+        let state = end_state(fault.as_ref(), &run.orders);
+        let stored = ledger.state().stored_points();
+        let error = fault.map(|fault| fault.to_string());
+        let end = EndEntry { error, vsync, ..end_entry(state, stored, darks.points() - stored) };
+        ledger.append(&Entry::End(end.clone()))?;
+        let warnings = match state {
+            EndState::Complete => make(&run.session, ledger.state(), &darks, &rig.file)?,
+            EndState::Cancelled | EndState::Faulted => Vec::new(),
+        };
+        Ok(Ended { end, warnings })
+    }
+}
