@@ -7,8 +7,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    Assembly, Findings, Fold, FoldError, ImageRows, InStrips, Product, ProductSpec, Snapshot, Strip,
-    Unit, message_of, run_stages,
+    Assembly, Findings, Fold, FoldError, ImageRows, InStrips, Product, ProductSpec, Snapshot, Strip, Unit,
+    message_of, run_stages,
 };
 use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
