@@ -194,8 +194,9 @@ impl Ended {
     fn accounted_for(self) -> Self {
         let (_, state) = self.open();
         assert!(state.counts.balanced(), "{:?}", state.counts);
-        match state.session.shape.contents {
-            Contents::Sweep { .. } | Contents::Darks { .. } => {}
+        let array = match state.session.shape.contents {
+            Contents::Sweep { .. } => ArrayName::Sum,
+            Contents::Darks { .. } => ArrayName::Dark,
             Contents::Film { .. } => {
                 assert!(state.cycles().all(|cycle| cycle.counts.balanced()));
                 return self;
@@ -208,10 +209,10 @@ impl Ended {
                 assert!(state.axes().all(|axis| axis.counts.balanced()));
                 return self;
             }
-        }
-        let (stored, missing) = (state.stored(ArrayName::Sum).count(), state.missing(ArrayName::Sum).count());
+        };
+        let (stored, missing) = (state.stored(array).count(), state.missing(array).count());
         assert_eq!(stored + missing, state.session.shape.points());
-        assert!(state.stored(ArrayName::Sum).all(|point| point.counts.balanced()));
+        assert!(state.stored(array).all(|point| point.counts.balanced()));
         self
     }
 

@@ -97,7 +97,13 @@ fn mirror(mirror: &MirrorStatus) -> String {
 /// `check`
 pub(super) fn check(report: &CheckReport) -> String {
     let mut rows = vec![
-        ("points", format!("{}, and {} of dark and regular images", report.points, report.extra_points)),
+        (
+            "points",
+            match report.extra_points {
+                0 => report.points.to_string(),
+                extra => format!("{}, and {extra} of dark and regular images", report.points),
+            },
+        ),
         ("frames", report.frames.to_string()),
         ("light", format!("at least {}", duration(report.light_s))),
         ("memory", BinaryBytes(report.memory_bytes).to_string()),

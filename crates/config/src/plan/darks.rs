@@ -46,7 +46,15 @@ impl DarksPlan {
 
 #[cfg(test)]
 mod tests {
-    use crate::plan::tests::refused;
+    use super::DarksPlan;
+    use crate::plan::tests::{documented, refused};
+    use crate::plan::{Plan, Procedure};
+
+    #[test]
+    fn the_default_is_the_documented_one() {
+        let documented = Plan::parse(documented("darks")).unwrap();
+        assert_eq!(documented.procedure, Procedure::Darks(DarksPlan::default()));
+    }
 
     #[test]
     fn bad_plans_are_refused_with_field_and_place() {
