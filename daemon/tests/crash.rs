@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -157,13 +159,11 @@ fn fifty_kills_and_resumes_end_like_a_run_without_any() {
     assert_eq!(expected.points.len(), 9 + 4 + 1);
     daemon.kill();
 
-    let mut seed = 0x1234_5678_9ABC_DEF0_u64;
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
     let (mut killed_within, mut resumed_points) = (0, Vec::new());
     for _ in 0..50 {
-        // Xorshift. The time of the kill is anywhere in the run: up to 3 ms after any line of its ledger.
-        seed ^= seed << 13;
-        seed ^= seed >> 7;
-        seed ^= seed << 17;
+        // The time of the kill is anywhere in the run: up to 3 ms after any line of its ledger.
+        let seed = random.next_u64();
         let (line, later) = (1 + seed as usize % lines, Duration::from_micros(seed / 1000 % 3000));
         let crashed = folder(RIG);
         let mut daemon = Daemon::start(crashed.path());

@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -200,15 +202,9 @@ fn a_line_that_rings_has_one_edge() {
 
 #[test]
 fn any_bytes_are_samples() {
-    let mut state = 1_u64;
-    let block = |len: usize, state: &mut u64| {
-        let next = |_| {
-            *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (*state >> 56) as u8
-        };
-        (0..len).map(next).collect::<Vec<u8>>()
-    };
-    let blocks = (0..1000).map(|k| block(10_000 + k % 7, &mut state)).collect();
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
+    let mut block = |len: usize| (0..len).map(|_| random.next_u64() as u8).collect::<Vec<u8>>();
+    let blocks = (0..1000).map(|k| block(10_000 + k % 7)).collect();
     let config = Fx2LafwConfig { quiet_us: 0.0, ..Fx2LafwConfig::default() };
     let mut analyser = Fx2Lafw::new(Bytes(blocks, 0), &config).unwrap();
     let mut changes = 0_u64;

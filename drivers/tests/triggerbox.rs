@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -85,11 +87,8 @@ fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
 /// more.
 #[test]
 fn ten_million_bytes_of_noise_are_accounted_for() {
-    let mut state = 5_u64;
-    let mut next = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        state >> 33
-    };
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(5);
+    let mut next = || random.next_u64();
     let alphabet = b"PV\x07\x00\x01\x0e\x10";
     let mut receiver = Receiver::default();
     let (mut pushed, mut replies) = (0, 0);

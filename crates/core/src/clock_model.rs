@@ -158,21 +158,22 @@ impl ClockModel {
 
 #[cfg(test)]
 mod tests {
+    use rand_xoshiro::Xoshiro256PlusPlus;
+    use rand_xoshiro::rand_core::{Rng, SeedableRng};
+
     use super::*;
 
     /// A device whose clock shows 0 at `start_ns` and runs slow by `rate`, and a host with pseudorandom round trips:
     /// uniformly distributed durations, and occasionally a long and asymmetric one.
     struct Bench {
-        state: u64,
+        random: Xoshiro256PlusPlus,
         start_ns: i64,
         rate: f64,
     }
 
     impl Bench {
         fn uniform(&mut self) -> f64 {
-            self.state =
-                self.state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (self.state >> 11) as f64 / (1_u64 << 53) as f64
+            (self.random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
         }
 
         fn device_ns(&self, host_ns: i64) -> i64 {
@@ -194,7 +195,7 @@ mod tests {
     }
 
     fn bench(seed: u64) -> Bench {
-        Bench { state: seed, start_ns: 5_000_000_000_000, rate: 37e-6 }
+        Bench { random: Xoshiro256PlusPlus::seed_from_u64(seed), start_ns: 5_000_000_000_000, rate: 37e-6 }
     }
 
     #[test]

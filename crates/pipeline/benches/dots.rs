@@ -4,6 +4,8 @@
 //!
 //! `cargo xtask bench dots --live [--json]`
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::error::Error;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -46,12 +48,10 @@ impl Memory {
     fn new() -> Result<Self, Box<dyn Error>> {
         let shape = FrameShape::new(SIDE_PX, SIDE_PX, 1)?;
         let frame = |number: usize| {
-            let mut state = (number as u64 + 1).wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+            let mut random = Xoshiro256PlusPlus::seed_from_u64(number as u64);
             let mut counts: Vec<u16> = (0..shape.pixels())
                 .map(|_| {
-                    state ^= state << 13;
-                    state ^= state >> 7;
-                    state ^= state << 17;
+                    let state = random.next_u64();
                     // The sum of four uniform numbers approximates normal noise of 3 counts.
                     100 + (0..4).map(|byte| (state >> (8 * byte) & 0xff) as f32 / 49.0).sum::<f32>() as u16
                 })

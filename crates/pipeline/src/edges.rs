@@ -287,7 +287,7 @@ mod tests {
     /// classified as true are true.
     #[test]
     fn no_false_edge_is_taken_wherever_it_lies() {
-        let mut random = Normal(3);
+        let mut random = Normal::new(3);
         let mut edges = Vec::new();
         let mut truth = std::collections::BTreeMap::new();
         for k in 0..50_000_i64 {

@@ -218,20 +218,23 @@ impl Allan {
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use rand_xoshiro::Xoshiro256PlusPlus;
+    use rand_xoshiro::rand_core::{Rng, SeedableRng};
+
     use super::*;
 
     const PERIOD_NS: i64 = 16_666_667;
 
-    /// Generator of standard normal numbers (SplitMix64, Box-Muller).
-    pub struct Normal(pub u64);
+    /// Generator of standard normal numbers (Box-Muller).
+    pub struct Normal(Xoshiro256PlusPlus);
 
     impl Normal {
+        pub fn new(seed: u64) -> Self {
+            Self(Xoshiro256PlusPlus::seed_from_u64(seed))
+        }
+
         pub fn uniform(&mut self) -> f64 {
-            self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-            let mut z = self.0;
-            z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-            z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-            ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+            (self.0.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
         }
 
         pub fn next(&mut self) -> f64 {
@@ -242,7 +245,7 @@ pub(crate) mod tests {
 
     /// A line that is 80 ppm off its nominal period and drifts by 1 ppm per minute, with every 100th edge missing.
     fn line(jitter_ns: f64, edges: i64) -> Regularity {
-        let mut normal = Normal(7);
+        let mut normal = Normal::new(7);
         let mut regularity = Regularity::new(PERIOD_NS);
         for index in (0..edges).filter(|index| index % 100 != 50) {
             let minutes = index as f64 / 3600.0;

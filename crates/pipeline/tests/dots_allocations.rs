@@ -4,6 +4,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 #![allow(unsafe_code, reason = "an allocator that counts")]
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -57,15 +59,8 @@ impl CutSink for Ledger {
 
 /// A frame with noise, and light around `centre`.
 fn counts(seed: u64, centre: Option<(usize, usize)>) -> Vec<u16> {
-    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
-    let mut counts: Vec<u16> = (0..SIDE * SIDE)
-        .map(|_| {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
-            100 + (state >> 61) as u16
-        })
-        .collect();
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
+    let mut counts: Vec<u16> = (0..SIDE * SIDE).map(|_| 100 + (random.next_u64() >> 61) as u16).collect();
     if let Some((row, column)) = centre {
         for pixel in
             (row - 2..row + 3).flat_map(|row| (column - 2..column + 3).map(move |column| row * SIDE + column))

@@ -243,28 +243,26 @@ pub fn process(
 
 #[cfg(test)]
 mod tests {
+    use rand_xoshiro::Xoshiro256PlusPlus;
+    use rand_xoshiro::rand_core::{Rng, SeedableRng};
+
     use super::*;
 
-    /// A sequence without structure between neighbours, uniform from -0.5 to 0.5.
-    fn uniform(seed: u64) -> f32 {
-        let mut x = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((x ^ (x >> 31)) >> 40) as f32 / (1 << 24) as f32 - 0.5
+    /// An image of numbers that are uniform from -0.5 to 0.5.
+    fn uniform(seed: u64) -> Array2<f32> {
+        let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
+        Array2::from_shape_simple_fn((200, 200), || (random.next_u64() >> 40) as f32 / (1 << 24) as f32 - 0.5)
     }
 
     #[test]
     fn noise_is_told_from_pattern_and_hot_pixels_are_found() {
-        let size = (200, 200);
-        let pattern = |t: usize, s: usize| 64.0 + 6.0 * uniform((t * 1000 + s) as u64);
+        let pattern = uniform(1) * 6.0 + 64.0;
         let image = |seed: u64| {
-            let mut image = Array2::from_shape_fn(size, |(t, s)| {
-                pattern(t, s) + 2.0 * uniform(seed + (t * 1000 + s) as u64)
-            });
+            let mut image = &pattern + &(uniform(seed) * 2.0);
             image[[7, 9]] = 300.0;
             image
         };
-        let level = Level::of(100.0, [image(1 << 32), image(2 << 32)], 4, 8.0);
+        let level = Level::of(100.0, [image(2), image(3)], 4, 8.0);
         assert_eq!(level.hot, [(7, 9)]);
         // A uniform distribution of width w has the standard deviation w / sqrt(12); a frame's is that of four, doubled.
         let [noise_dn, pattern_dn] = [2.0 * 2.0, 6.0].map(|width: f64| width / 12_f64.sqrt());

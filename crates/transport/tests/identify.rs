@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::f64::consts::TAU;
 use std::ops::RangeInclusive;
 
@@ -17,11 +19,8 @@ const BAND: RangeInclusive<f64> = 100.0..=900.0;
 fn measure(config: MechanicsConfig, noise_deg: f64) -> (Vec<f64>, [Vec<f64>; 2]) {
     let commanded = chirp(&BAND, 0.1, 0.8, 0.3, RATE_HZ);
     let mut mechanics = Mechanics::new(config, RATE_HZ);
-    let mut noise = 1_u64;
-    let mut uniform = || {
-        noise = noise.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (noise >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
-    };
+    let mut noise = Xoshiro256PlusPlus::seed_from_u64(1);
+    let mut uniform = || (noise.next_u64() >> 11) as f64 / (1_u64 << 53) as f64 - 0.5;
     let mut measured = [Vec::new(), Vec::new()];
     for &command in &commanded {
         let moved = mechanics.hold(Tilt::new(command, command)).deg();

@@ -1,37 +1,31 @@
 //! The parsers of replies with 10 million bytes of seeded noise, and with replies between noise.
 
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use raysweep_drivers::mirror::playzerx::protocol::{Reply, parse_response};
 use raysweep_drivers::mirror::{MtiReply, OptotuneReply, parse_mti, parse_optotune};
 use raysweep_drivers::serial::wire::{LONGEST_REPLY, Parsed, Receiver};
 
 const BYTES: usize = 10_000_000;
 
-/// SplitMix64.
-struct Noise(u64);
+struct Noise(Xoshiro256PlusPlus);
 
 impl Noise {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        z ^ (z >> 31)
-    }
-
     /// Uniform bytes, or bytes that occur in replies: these get further into a parser.
     fn byte(&mut self, alphabet: &[u8]) -> u8 {
-        let random = self.next();
+        let random = self.0.next_u64();
         if random & 0x300 == 0 { random as u8 } else { alphabet[(random >> 16) as usize % alphabet.len()] }
     }
 }
 
 /// Feeds noise in pieces of every size; every byte must be accounted for, and no bytes may accumulate.
 fn survives<R>(parse: impl Fn(&[u8]) -> Parsed<R> + Copy, alphabet: &[u8], length: impl Fn(&R) -> usize) {
-    let mut noise = Noise(alphabet.len() as u64);
+    let mut noise = Noise(Xoshiro256PlusPlus::seed_from_u64(alphabet.len() as u64));
     let mut receiver = Receiver::default();
     let (mut pushed, mut in_replies) = (0_usize, 0_usize);
     while pushed < BYTES {
-        let piece: Vec<u8> = (0..1 + noise.next() as usize % 40).map(|_| noise.byte(alphabet)).collect();
+        let piece: Vec<u8> =
+            (0..1 + noise.0.next_u64() as usize % 40).map(|_| noise.byte(alphabet)).collect();
         receiver.push(&piece);
         pushed += piece.len();
         while let Some(reply) = receiver.next(parse) {
@@ -50,12 +44,13 @@ fn finds<R: PartialEq + std::fmt::Debug>(
     replies: &[(&[u8], R)],
     garbage: &[u8],
 ) {
-    let mut noise = Noise(99);
+    let mut noise = Noise(Xoshiro256PlusPlus::seed_from_u64(99));
     let mut receiver = Receiver::default();
     let mut garbage_bytes = 0;
     for round in 0..20_000 {
-        let count = noise.next() as usize % 8;
-        let mut bytes: Vec<u8> = (0..count).map(|_| garbage[noise.next() as usize % garbage.len()]).collect();
+        let count = noise.0.next_u64() as usize % 8;
+        let mut bytes: Vec<u8> =
+            (0..count).map(|_| garbage[noise.0.next_u64() as usize % garbage.len()]).collect();
         garbage_bytes += bytes.len() as u64;
         let (reply_bytes, reply) = &replies[round % replies.len()];
         bytes.extend_from_slice(reply_bytes);

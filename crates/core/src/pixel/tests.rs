@@ -1,4 +1,6 @@
 use super::*;
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 
 /// Vectors worked out by hand from the figures of PFNC 2.4, GigE Vision 2.0 (pixel payload formats) and MIPI CSI-2 as
 /// documented by V4L2 (Y10P, Y12P): each bit of the first pixels is where the figure shows it.
@@ -38,14 +40,8 @@ fn bit_orders_are_the_standards() {
 
 /// Bytes without a pattern that could hide a wrong shuffle.
 fn noise(length: usize) -> Vec<u8> {
-    let mut state = 0x2545_F491_4F6C_DD1D_u64;
-    let mut next = || {
-        state ^= state << 13;
-        state ^= state >> 7;
-        state ^= state << 17;
-        (state >> 32) as u8
-    };
-    (0..length).map(|_| next()).collect()
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
+    (0..length).map(|_| random.next_u64() as u8).collect()
 }
 
 #[test]

@@ -1,3 +1,5 @@
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::sync::Arc;
 
 use raysweep_core::{Counts, Frame, FramePool, FrameStamp, LossCause, PixelFormat};
@@ -32,15 +34,8 @@ fn scan(batches: u32) -> Scan {
 
 /// The frame's counts at a step of the scan: dots wander over the frame, the trailing one lands in its corner.
 fn counts(step: u64) -> Vec<u16> {
-    let mut state = step.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
-    let mut counts: Vec<u16> = (0..HEIGHT * WIDTH)
-        .map(|_| {
-            state ^= state << 13;
-            state ^= state >> 7;
-            state ^= state << 17;
-            100 + (state >> 61) as u16
-        })
-        .collect();
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(step);
+    let mut counts: Vec<u16> = (0..HEIGHT * WIDTH).map(|_| 100 + (random.next_u64() >> 61) as u16).collect();
     let index = (step % u64::from(DOTS)) as usize;
     let centre = match index as u32 {
         TRAILING => Some((3, 60)),

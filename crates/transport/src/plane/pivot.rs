@@ -374,6 +374,8 @@ fn exchange_most(y: &[f64], free_costs: bool, free: &mut [f64], exchanged: &mut 
 mod tests {
     use ndarray::{Array2, ArrayView2, s};
     use proptest::prelude::*;
+    use rand_xoshiro::Xoshiro256PlusPlus;
+    use rand_xoshiro::rand_core::{Rng, SeedableRng};
 
     use super::super::{Prior, Slot, SlotKind};
     use super::*;
@@ -411,12 +413,8 @@ mod tests {
     }
 
     fn random(seed: u64) -> impl FnMut() -> f64 {
-        // A linear congruential generator (Knuth's MMIX) is random enough for weights.
-        let mut state = seed.wrapping_mul(2).wrapping_add(1);
-        move || {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-            (state >> 11) as f64 / (1_u64 << 53) as f64
-        }
+        let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
+        move || (random.next_u64() >> 11) as f64 / (1_u64 << 53) as f64
     }
 
     proptest! {

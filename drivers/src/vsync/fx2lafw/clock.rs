@@ -104,17 +104,20 @@ impl SampleClock {
 
 #[cfg(test)]
 mod tests {
+    use rand_xoshiro::Xoshiro256PlusPlus;
+    use rand_xoshiro::rand_core::{Rng, SeedableRng};
+
     use super::*;
 
     #[test]
     fn a_busy_host_moves_no_stamp() {
         // 30 ppm fast, transfers every 4 ms, at least 100 us late and mostly later, some by 20 ms.
         let mut clock = SampleClock::new(100_000);
-        let mut state = 1_u64;
+        let mut random = Xoshiro256PlusPlus::seed_from_u64(1);
         let truth_ns = |device_ns: i64| 7_000_000_000_000 + (device_ns as f64 * (1.0 + 30e-6)) as i64;
         let mut worst_ns = 0;
         for k in 1..5000_i64 {
-            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            let state = random.next_u64();
             let late_ns = match state >> 60 {
                 0..4 => 0,
                 15 => 20_000_000,
