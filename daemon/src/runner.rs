@@ -246,7 +246,7 @@ impl Runner {
         self.spawn(foreseen, session, ledger, false)
     }
 
-    fn go_on_with(&self, params: &ResumeParams) -> Result<(Started, Current), RpcError> {
+    fn resume_session(&self, params: &ResumeParams) -> Result<(Started, Current), RpcError> {
         let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
         let session =
             Session::open(&self.data.join(&params.session)).map_err(|error| no_session(error.to_string()))?;
@@ -262,12 +262,12 @@ impl Runner {
                 session.rig_path().display()
             )));
         }
-        let begun = session.state().map_err(|error| storage(&error))?.session;
-        let foreseen = foresee_rest(&self.lab(), &plan, &begun).map_err(|error| match error {
-            Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
-            Unresumable::Plan(error) => invalid_plan(&error),
-        })?;
         let ledger = session.resume().map_err(|error| storage(&error))?;
+        let foreseen =
+            foresee_rest(&self.lab(), &plan, &ledger.state().session).map_err(|error| match error {
+                Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
+                Unresumable::Plan(error) => invalid_plan(&error),
+            })?;
         self.spawn(foreseen, session, ledger, true)
     }
 }
@@ -292,7 +292,7 @@ impl Control for Runner {
     }
 
     fn resume(&self, params: ResumeParams) -> Result<Started, RpcError> {
-        self.start(|| self.go_on_with(&params))
+        self.start(|| self.resume_session(&params))
     }
 
     fn pause(&self) -> Result<(), RpcError> {

@@ -69,4 +69,11 @@ fn what_is_missing_is_acquired_again() {
         resumed.error
     );
     assert_eq!(fs::read(whole.session.join("products/dark.npy")).unwrap(), dark);
+
+    // What is damaged is named, and acquired again too.
+    fs::write(whole.session.join("stack.zarr/dark/c.3.0.0"), b"nothing of this kind").unwrap();
+    let problems = raysweep_processing::process(&whole.session).unwrap().problems;
+    assert!(problems.len() == 1 && problems[0].contains("dark 3 is damaged"), "{problems:?}");
+    assert_eq!(bench.resume(&whole.session).state, "complete");
+    assert_eq!(raysweep_processing::process(&whole.session).unwrap().problems, [""; 0]);
 }

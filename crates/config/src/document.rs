@@ -10,7 +10,7 @@ use toml::de::{DeTable, DeValue};
 
 use crate::{ConfigError, Mistake};
 
-/// A value that no device can be opened with.
+/// A value of a device's table that no device can be opened with: its key, and a message that follows the key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{key}{message}")]
 pub struct Fault {
@@ -121,7 +121,7 @@ impl<'a> Document<'a> {
         }
     }
 
-    /// The same for counts.
+    /// Notes a mistake unless a count is within its range, both ends included.
     pub fn check_count(&mut self, path: &[&str], value: u64, allowed: RangeInclusive<u64>) {
         if !allowed.contains(&value) {
             let (low, high) = (allowed.start(), allowed.end());

@@ -16,7 +16,7 @@ use crate::plane::{PlaneTask, manifest};
 use crate::report::{accounts, subtitle};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// Without light, a frame is as good whenever it was triggered within the edge's own gate.
+/// Without light, a frame is as good a millisecond late.
 const MAX_JITTER_US: f64 = 1000.0;
 /// Standard deviation of a normal distribution over its median absolute deviation.
 const SIGMA_PER_MAD: f32 = 1.4826;
@@ -77,7 +77,7 @@ impl Level {
         let median = median(&mut values);
         let mut distances: Vec<f32> = image.iter().map(|value| (value - median).abs()).collect();
         let sigma = SIGMA_PER_MAD * self::median(&mut distances);
-        // Images of whole counts may have no spread at all.
+        // At least half a count: images of whole counts may have no spread at all.
         let limit = median + hot_sigmas as f32 * sigma.max(0.5);
         let hot = image.indexed_iter().filter(|(_, value)| **value > limit).map(|(place, _)| place).collect();
         let noise_dn = (of_mean * f64::from(frames)).sqrt();
@@ -114,10 +114,17 @@ pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -
     Ok(problems)
 }
 
+/// The stored images that are damaged and must be taken again.
+pub fn damaged(stack: &Stack, state: &State, task: &DarksTask) -> Vec<usize> {
+    let stored = (0..task.points()).filter(|&image| state.point(ArrayName::Dark, image).is_some());
+    stored.filter(|&image| read(stack, state, image).is_err()).collect()
+}
+
 /// The mean of an image's frames, or why it cannot be used.
 fn read(stack: &Stack, state: &State, index: usize) -> std::result::Result<Array2<f32>, String> {
     let entry = state.point(ArrayName::Dark, index).ok_or_else(|| format!("dark {index} is missing"))?;
-    let damaged = |why: String| format!("dark {index} is damaged ({why})");
+    let damaged =
+        |why: String| format!("dark {index} is damaged ({why}): `raysweep resume` acquires it again");
     let sum = stack.read_point(ArrayName::Dark, index).map_err(|error| damaged(error.to_string()))?;
     if crc32(sum.view()) != entry.crc32 {
         return Err(damaged("its checksum is not the ledger's".into()));

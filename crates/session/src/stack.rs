@@ -407,11 +407,15 @@ fn create_array(
 ) -> Result<Array<DurableStore>> {
     let to_u64 = |axes: [usize; 3]| axes.map(|len| len as u64).to_vec();
     let array_shape = [shape.len(name), shape.rows, shape.columns];
+    let first_axis = match shape.contents {
+        Contents::Darks { .. } => "image",
+        _ => name.first_axis(),
+    };
     let mut builder =
         ArrayBuilder::new(to_u64(array_shape), to_u64(shape.shard()), data_type::uint32(), 0u32);
     zarr::with_codecs(&mut builder)
         .subchunk_shape(to_u64(shape.chunk()))
-        .dimension_names(Some([name.first_axis(), "t", "s"]))
+        .dimension_names(Some([first_axis, "t", "s"]))
         .attributes(into_map(json!({ "units": "DN" })));
     zarr::create_array(store, name.as_str(), &builder)
 }

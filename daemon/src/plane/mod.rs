@@ -12,7 +12,7 @@ use raysweep_core::{
     Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
     SettingsLatency, Shown, Vsync,
 };
-use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Policy, Role, Sink, Stage};
+use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, Policy, Role, Sink, Stage};
 use raysweep_processing::plane::{PlaneTask, place};
 use raysweep_proto::RunState;
 use raysweep_session::ledger::State;
@@ -194,9 +194,14 @@ impl Opened {
 
 /// The line that triggers the camera through a task's settings. Dark points have a pass of their own.
 fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> Line {
-    let lit = task.schedule.points.iter().filter(|point| !matches!(point.role, Role::Dark(_)));
-    let settings: Vec<CameraSettings> =
-        lit.map(|point| task.geometry.shot(point, trigger_latency_us).settings).collect();
+    let points = &task.schedule.points;
+    let is_lit = |point: &&Point| !matches!(point.role, Role::Dark(_));
+    let all_dark = !points.iter().any(|point| is_lit(&point));
+    let settings: Vec<CameraSettings> = points
+        .iter()
+        .filter(|point| all_dark || is_lit(point))
+        .map(|point| task.geometry.shot(point, trigger_latency_us).settings)
+        .collect();
     Line::new(task.geometry.raster.period_us, task.max_jitter_us, &settings)
 }
 

@@ -5,8 +5,7 @@ use std::sync::mpsc::Sender;
 
 use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
 use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
-use raysweep_processing::plane::{PlaneTask, place};
-use raysweep_processing::sweep::Processing;
+use raysweep_processing::plane::{PlaneTask, Processing, place};
 use raysweep_proto::Event;
 use raysweep_session::ledger::{Entry, Ledger, PointEntry};
 use raysweep_session::stack::Stack;

@@ -30,7 +30,7 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
         (LabRig::Plane(rig), Procedure::Film(own)) => film::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
-        (LabRig::Plane(_), _) => {
+        (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => {
             Err(of_another_rig(&plan, "a plane rig runs plans of kind \"sweep\", \"film\" and \"darks\""))
         }
         (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_)) => {

@@ -105,7 +105,7 @@ fn finish(ended: Result<Ended, RunError>, points: usize, board: &StatusBoard, di
     let Ended { end, warnings } = ended.unwrap_or_else(|error| {
         let stored = Session::open(dir).and_then(|session| session.state());
         let stored = stored.map_or(0, |state| state.stored_points());
-        let end = end_entry(EndState::Faulted, stored, points - stored);
+        let end = end_entry(EndState::Faulted, stored, points.saturating_sub(stored));
         Ended { end: EndEntry { error: Some(error.to_string()), ..end }, warnings: Vec::new() }
     });
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };

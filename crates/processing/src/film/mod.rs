@@ -29,9 +29,6 @@ pub struct FilmTask {
 
 impl FilmTask {
     /// A film on a rig; see [`PlaneTask::new`].
-    ///
-    /// # Errors
-    /// Where the plan names products, which are made of sweeps.
     pub fn new(plan: &Plan, film: FilmPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
         let task = PlaneTask::new(plan, schedule(&film), film.max_jitter_us, rig, first_row, size);
         Self { film, task: Arc::new(task) }

@@ -40,12 +40,14 @@ pub fn write(session: &Session, state: &State, task: &PlaneTask, rig: &RigFile) 
     Ok(())
 }
 
-/// The exposures of the sweep as the hardware took them.
+/// The exposures as the hardware took them: the sweep's, or, where there is none, those of the dark images.
 fn taken_exposures(state: &State, schedule: &Schedule) -> Vec<f64> {
+    let is_sweep = |role: Role| matches!(role, Role::Sweep(_));
+    let is_any = !schedule.points.iter().any(|point| is_sweep(point.role));
     let mut exposures: Vec<f64> = schedule
         .points
         .iter()
-        .filter(|point| matches!(point.role, Role::Sweep(_)))
+        .filter(|point| is_any || is_sweep(point.role))
         .filter_map(|point| {
             let (array, index) = place(point.role);
             state.point(array, index).map(|entry| entry.exposure_us)

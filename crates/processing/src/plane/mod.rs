@@ -1,10 +1,12 @@
 //! What procedures of the plane rig have in common: points, and the model that turns counts into light.
 
 pub mod manifest;
+mod processing;
 pub mod report;
 
 use std::sync::Arc;
 
+pub use self::processing::Processing;
 use ndarray::Array2;
 use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};

@@ -1,6 +1,5 @@
 //! Sweeps: from images under many delays and exposures to one light transport.
 
-mod folds;
 mod report;
 mod results;
 mod strips;
@@ -10,15 +9,12 @@ use std::sync::Arc;
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{ConfigError, Places, Plan, ProductTable, RigFile, SweepPlan};
 use raysweep_pipeline::{Point, ProductSpec, Registry, Role, Schedule};
-use raysweep_session::ledger::State;
-use raysweep_session::stack::ArrayName;
 
-pub use self::folds::Processing;
 pub use self::report::warnings;
 pub use self::results::{Results, write_products, write_report};
 pub use self::strips::Overview;
 use crate::memory::{MemoryNeed, available_bytes};
-use crate::plane::{PlaneTask, manifest};
+use crate::plane::{PlaneTask, Processing, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
 /// Fewest frames of a dark image: its noise is in all images of its exposure, so it should hardly have any.
@@ -198,12 +194,8 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     manifest::write(session, state, task, &rig)?;
     Ok(Processed {
         report: session.report_path(),
-        stored: stored_points(state),
+        stored: state.stored_points(),
         points: shape.points(),
         problems: results.problems,
     })
-}
-
-fn stored_points(state: &State) -> usize {
-    state.stored(ArrayName::Sum).count()
 }

@@ -8,8 +8,8 @@ use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::strips::{Overview, StoredImages};
-use super::{Processing, SweepTask, report};
-use crate::plane::PlaneTask;
+use super::{SweepTask, report};
+use crate::plane::{PlaneTask, Processing};
 
 /// What was made of a sweep.
 pub struct Results {

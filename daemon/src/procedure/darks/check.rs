@@ -21,7 +21,9 @@ pub fn check(darks: &DarksTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigErro
     let (mut frames, mut light_periods) = (0, 0);
     for point in &task.schedule.points {
         let shot = task.geometry.shot(point, lab.camera.trigger_latency_us);
-        let refused = |message| task.refuse(&["darks", "exposure_us"], format!("darks.{message}"));
+        let refused = |message| {
+            task.refuse(&["darks"], format!("dark images are triggered as a sweep's are: {message}"))
+        };
         lab.camera.allows(&shot.settings).map_err(refused)?;
         frames += u64::from(point.frames);
         light_periods += u64::from(point.frames) * periods(task, lab.camera, point);

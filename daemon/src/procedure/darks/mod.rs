@@ -7,10 +7,11 @@ use std::sync::mpsc::channel;
 
 use raysweep_config::plan::DarksPlan;
 use raysweep_config::{ConfigError, Plan};
-use raysweep_processing::darks::{DarksTask, make};
-use raysweep_processing::sweep::Processing;
+use raysweep_core::SettingsId;
+use raysweep_processing::darks::{DarksTask, damaged, make};
+use raysweep_processing::plane::Processing;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
-use raysweep_session::stack::{Contents, StackShape};
+use raysweep_session::stack::{ArrayName, Contents, StackShape};
 
 use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
@@ -62,12 +63,21 @@ impl Procedure for DarksRun {
         run.note_beginning()?;
         let Self { rig, darks } = *self;
         let opened = Opened::open(&rig, &darks.task, &run)?;
-        let missing = missing(&darks.task, run.ledger.state());
+        let (stack, state) = (run.session.stack()?, run.ledger.state());
+        let mut missing = missing(&darks.task, state);
+        if run.is_resumed {
+            let again = damaged(&stack, state, &darks);
+            missing.extend(again.into_iter().map(|image| SettingsId {
+                point: image as u32,
+                attempt: state.next_attempt(ArrayName::Dark, image),
+            }));
+            missing.sort_by_key(|id| id.point);
+        }
         let (verdicts, results) = channel();
         let stages: Arc<[_]> = Arc::new([]);
         let sink = PointSink {
             task: darks.task.clone(),
-            stack: run.session.stack()?,
+            stack,
             ledger: run.ledger,
             processing: Processing::without_folds(stages.clone()),
             verdicts: Some(verdicts),
@@ -80,12 +90,17 @@ impl Procedure for DarksRun {
         };
         let taken =
             opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
-        let Taken { sink: PointSink { mut ledger, vsync, write_error, .. }, fault, .. } = taken;
+        let Taken { sink: PointSink { mut ledger, vsync, write_error, .. }, latency, fault, .. } = taken;
         let fault = write_error.map(RunError::from).or(fault);
         let state = end_state(fault.as_ref(), &run.orders);
         let stored = ledger.state().stored_points();
         let error = fault.map(|fault| fault.to_string());
-        let end = EndEntry { error, vsync, ..end_entry(state, stored, darks.points() - stored) };
+        let end = EndEntry {
+            error,
+            vsync,
+            settings_latency: latency,
+            ..end_entry(state, stored, darks.points() - stored)
+        };
         ledger.append(&Entry::End(end.clone()))?;
         let warnings = match state {
             EndState::Complete => make(&run.session, ledger.state(), &darks, &rig.file)?,

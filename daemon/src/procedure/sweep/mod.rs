@@ -10,10 +10,8 @@ use std::time::{Duration, Instant};
 use raysweep_config::{ConfigError, Plan, SweepPlan};
 use raysweep_core::{CameraCapabilities, SettingsLatency, VsyncStats};
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
-use raysweep_processing::plane::manifest;
-use raysweep_processing::sweep::{
-    Overview, Processing, Results, SweepTask, warnings, write_products, write_report,
-};
+use raysweep_processing::plane::{Processing, manifest};
+use raysweep_processing::sweep::{Overview, Results, SweepTask, warnings, write_products, write_report};
 use raysweep_proto::CheckReport;
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};

@@ -14,7 +14,7 @@ use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::{Stack, crc32};
 
-use crate::plane::{PlaneTask, Stages, place, unit_of};
+use super::{PlaneTask, Stages, place, unit_of};
 
 /// The stages, folds and products of a plan.
 pub struct Processing {
