@@ -1,4 +1,4 @@
-//! Dark images of the plane rig's camera: mean, noise and hot pixels at each exposure, after EMVA 1288.
+//! Dark images of the plane rig's camera: mean, noise and hot pixels at each exposure, according to EMVA 1288.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use crate::plane::{PlaneTask, manifest};
 use crate::report::{accounts, subtitle};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// Without light, a frame is as good whenever it was triggered within the edge's own gate.
+/// Without light, the exact trigger time does not matter, as long as it lies within the edge's own gate.
 const MAX_JITTER_US: f64 = 1000.0;
 /// Standard deviation of a normal distribution over its median absolute deviation.
 const SIGMA_PER_MAD: f32 = 1.4826;
@@ -26,7 +26,7 @@ const SIGMA_PER_MAD: f32 = 1.4826;
 pub struct DarksTask {
     /// The plan's own table.
     pub darks: DarksPlan,
-    /// The images: two of each exposure, one after the other.
+    /// The images: two of each exposure, in succession.
     pub task: Arc<PlaneTask>,
 }
 
@@ -45,19 +45,19 @@ impl DarksTask {
         Self { darks, task: Arc::new(task) }
     }
 
-    /// How many images it stores.
+    /// Number of images to store.
     pub fn points(&self) -> usize {
         self.task.schedule.points.len()
     }
 }
 
-/// What the two images of an exposure tell, in camera counts.
+/// Results of the two images of an exposure, in camera counts.
 struct Level {
     exposure_us: f64,
     /// Mean of both images, `[t, s]`.
     image: Array2<f32>,
     mean_dn: f64,
-    /// Spread of the pixels' means, without the noise that is left in them.
+    /// Spatial standard deviation of the pixels' means, corrected for the remaining temporal noise.
     pattern_dn: f64,
     /// Temporal noise of a single frame.
     noise_dn: f64,
@@ -65,7 +65,7 @@ struct Level {
 }
 
 impl Level {
-    /// From two images of `frames` frames each.
+    /// Computes them from two images of `frames` frames each.
     fn of(exposure_us: f64, [a, b]: [Array2<f32>; 2], frames: u32, hot_sigmas: f64) -> Self {
         let variance = |image: &Array2<f32>| image.mapv(f64::from).var(0.0);
         // EMVA 1288, equation 30: the pattern cancels in the difference.
@@ -77,7 +77,7 @@ impl Level {
         let median = median(&mut values);
         let mut distances: Vec<f32> = image.iter().map(|value| (value - median).abs()).collect();
         let sigma = SIGMA_PER_MAD * self::median(&mut distances);
-        // Images of whole counts may have no spread at all.
+        // Images of integer counts may have zero spread.
         let limit = median + hot_sigmas as f32 * sigma.max(0.5);
         let hot = image.indexed_iter().filter(|(_, value)| **value > limit).map(|(place, _)| place).collect();
         let noise_dn = (of_mean * f64::from(frames)).sqrt();
@@ -90,10 +90,10 @@ fn median(values: &mut [f32]) -> f32 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Makes images, table, report and manifest; returns what could not be made, and why.
+/// Makes images, table, report and manifest; returns the problems.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -> Result<Vec<String>> {
     let (stack, mut problems) = (session.stack()?, Vec::new());
     let DarksPlan { exposure_us, frames, hot_sigmas } = &task.darks;
@@ -114,7 +114,7 @@ pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -
     Ok(problems)
 }
 
-/// The mean of an image's frames, or why it cannot be used.
+/// The mean over an image's frames, or why it cannot be used.
 fn read(stack: &Stack, state: &State, index: usize) -> std::result::Result<Array2<f32>, String> {
     let entry = state.point(ArrayName::Dark, index).ok_or_else(|| format!("dark {index} is missing"))?;
     let damaged = |why: String| format!("dark {index} is damaged ({why})");
@@ -219,10 +219,10 @@ fn report(
     }
 }
 
-/// Makes the products of stored dark images again.
+/// Reprocesses stored dark images.
 ///
 /// # Errors
-/// When products are asked for, or the disk refuses.
+/// When products are asked for, or the session cannot be written.
 pub fn process(
     stored: &Stored<'_>,
     darks: DarksPlan,
@@ -245,7 +245,7 @@ pub fn process(
 mod tests {
     use super::*;
 
-    /// A sequence without structure between neighbours, uniform from -0.5 to 0.5.
+    /// Pseudorandom numbers, uniform from -0.5 to 0.5, uncorrelated between neighbours.
     fn uniform(seed: u64) -> f32 {
         let mut x = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
         x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -266,7 +266,8 @@ mod tests {
         };
         let level = Level::of(100.0, [image(1 << 32), image(2 << 32)], 4, 8.0);
         assert_eq!(level.hot, [(7, 9)]);
-        // A uniform distribution of width w has the standard deviation w / sqrt(12); a frame's is that of four, doubled.
+        // A uniform distribution of width w has the standard deviation w / sqrt(12); a frame's noise is twice that of
+        // a mean of four.
         let [noise_dn, pattern_dn] = [2.0 * 2.0, 6.0].map(|width: f64| width / 12_f64.sqrt());
         assert!((level.noise_dn / noise_dn - 1.0).abs() < 0.02, "{} against {noise_dn}", level.noise_dn);
         let hot = (300.0_f64 - 64.0).powi(2) / 40_000.0;
