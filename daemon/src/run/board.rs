@@ -16,7 +16,7 @@ pub struct StatusBoard {
     events: broadcast::Sender<Event>,
 }
 
-/// A transition to this state is not allowed from the current one.
+/// The current state, from which the requested transition is not allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WrongState(pub RunState);
 

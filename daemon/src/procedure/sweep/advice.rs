@@ -143,8 +143,8 @@ impl<'a> Limits<'a> {
         }
     }
 
-    /// The settings of a grid whose images are usable; `None` if the camera cannot take the grid, if it takes longer
-    /// than the plan, or if it saturates more points.
+    /// The settings of a grid whose images are usable; `None` if the camera cannot take the grid, or if it needs more
+    /// frames or time than the plan or saturates more points.
     fn usable(&self, grid: &SweepGrid) -> Option<Vec<Setting>> {
         let other = self.with_grid(grid)?;
         let geometry = &other.task.geometry;
