@@ -90,7 +90,7 @@ impl KeptResponse {
 /// The model that a run's path is predistorted with, and its origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Predistortion {
-    /// Of x and y.
+    /// Responses of the axes, x and y.
     pub responses: [SecondOrder; 2],
     /// The identified response; `None` if the rig file states the values.
     kept: Option<KeptResponse>,
