@@ -1,44 +1,44 @@
-//! The daemon as its server sees it: everything a client can ask for.
+//! The daemon's interface to its server: everything that a client can request.
 
 use raysweep_proto::{CheckReport, Event, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status};
 use tokio::sync::broadcast;
 
-/// What a client can ask of a daemon. Calls may block on the disk; none waits for a run.
+/// What a client can request of a daemon. Calls may block on the disk; none waits for a run.
 pub trait Control: Send + Sync + 'static {
-    /// What the daemon is doing.
+    /// The daemon's current state.
     fn status(&self) -> Status;
 
-    /// What a plan would do.
+    /// Checks a plan and predicts its run.
     ///
     /// # Errors
-    /// `InvalidPlan`, with the place in its text.
+    /// `InvalidPlan`, with the position in the plan's text.
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError>;
 
-    /// Begins a run.
+    /// Starts a run.
     ///
     /// # Errors
     /// `Busy`, `InvalidPlan`, `Device`, `Storage`.
     fn run(&self, params: RunParams) -> Result<Started, RpcError>;
 
-    /// Begins to acquire what a session lacks.
+    /// Starts to acquire what is missing in a session.
     ///
     /// # Errors
     /// `Busy`, `NoSession`, `Device`, `Storage`.
     fn resume(&self, params: ResumeParams) -> Result<Started, RpcError>;
 
-    /// Holds the run before its next point.
+    /// Pauses the run before its next point.
     ///
     /// # Errors
     /// `NotRunning`.
     fn pause(&self) -> Result<(), RpcError>;
 
-    /// Goes on after [`Control::pause`].
+    /// Continues after [`Control::pause`].
     ///
     /// # Errors
     /// `NotRunning`.
     fn go_on(&self) -> Result<(), RpcError>;
 
-    /// Ends the run in order; what was acquired is kept.
+    /// Ends the run cleanly; acquired data are kept.
     ///
     /// # Errors
     /// `NotRunning`.
@@ -56,6 +56,6 @@ pub trait Control: Send + Sync + 'static {
     /// `Storage`.
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError>;
 
-    /// Everything that happens from now on.
+    /// Subscribes to all events from now on.
     fn events(&self) -> broadcast::Receiver<Event>;
 }

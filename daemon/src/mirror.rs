@@ -1,4 +1,4 @@
-//! Where a daemon keeps what it knows of its mirror, and what it tells of it.
+//! Location of the mirror's state in the daemon's data folder, and its status for clients.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -7,20 +7,20 @@ use std::process::{Command, Stdio};
 use raysweep_drivers::mirror::{Guardian, LightGuard, LightState, MirrorReport};
 use raysweep_proto::{ErrorCode, MirrorStatus, RpcError};
 
-/// The mirror's state in the packaged daemon's data folder.
+/// Path of the mirror's state in the packaged daemon's data folder.
 pub const DEFAULT_STATE: &str = "/var/lib/raysweep/mirror.json";
 
-/// The mirror's state in a data folder.
+/// Path of the mirror's state in a data folder.
 pub fn state_file(data: &Path) -> PathBuf {
     data.join("mirror.json")
 }
 
-/// Who permits light: the rig's interlock, or, without one, the operator.
+/// The guard that permits light: the rig's interlock or, without one, the operator.
 pub fn light_guard(data: &Path, interlock: Option<PathBuf>) -> LightGuard {
     LightGuard { armed_file: data.join("light-armed"), interlock }
 }
 
-/// Starts the process that parks the mirror of a data folder should this one be killed.
+/// Starts the process that parks the mirror of a data folder if this one is killed.
 ///
 /// # Errors
 /// When the client `raysweep` is not beside the daemon or cannot be started.
@@ -30,7 +30,7 @@ pub fn guardian(data: &Path) -> io::Result<Guardian> {
     Guardian::start(command)
 }
 
-/// Takes the operator's word.
+/// Records the operator's permission.
 pub(crate) fn arm_light(data: &Path) -> Result<(), RpcError> {
     let file = light_guard(data, None).armed_file;
     raysweep_drivers::mirror::arm_light(&file).map_err(|error| {
@@ -40,7 +40,7 @@ pub(crate) fn arm_light(data: &Path) -> Result<(), RpcError> {
     })
 }
 
-/// The mirror as its files tell; none where none was ever moved.
+/// The mirror's status according to its files; `None` if it was never moved.
 pub(crate) fn status(data: &Path, guard: &LightGuard) -> Option<MirrorStatus> {
     let state = state_file(data);
     if !state.exists() {

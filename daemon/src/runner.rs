@@ -26,13 +26,13 @@ use crate::run::board::{StatusBoard, WrongState};
 use crate::run::life::{Foreseen, Run, conduct};
 use crate::run::orders::{Order, Orders};
 
-/// At which rate a dot rig's camera is opened to see that it is there; each run opens it at its own.
+/// Frame rate at which a dot rig's camera is opened to check that it is present; each run opens it at its own rate.
 const LEAST_FRAME_RATE_HZ: f64 = 100.0;
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
     rig: LabRig,
-    /// The rig's camera, as it was when the daemon began.
+    /// Capabilities of the rig's camera when the daemon started.
     camera: CameraCapabilities,
     data: PathBuf,
     registry: Arc<Registry>,
@@ -40,22 +40,22 @@ pub struct Runner {
     live: Option<Arc<LiveFile>>,
     memory_limit_bytes: Option<u64>,
     current: Mutex<Option<Current>>,
-    /// Set once, when no further run may begin.
+    /// Set once, when no more runs may begin.
     closed: AtomicBool,
 }
 
-/// The run under way, or the last one.
+/// The run in progress, or the last one.
 struct Current {
     orders: Arc<Orders>,
     thread: JoinHandle<()>,
 }
 
 impl Runner {
-    /// A daemon for `rig` that keeps its sessions in `data`. Opens all devices once, to know that they are there; each
-    /// run opens them anew, and between runs they are free for other programs.
+    /// A daemon for `rig` that stores its sessions in `data`. Opens all devices once, to check that they are present;
+    /// each run opens them again, and between runs they are free for other programs.
     ///
     /// # Errors
-    /// The first device that does not open.
+    /// The first device that cannot be opened.
     pub fn new(rig: impl Into<AnyRig>, data: PathBuf, registry: Registry) -> Result<Self, RigError> {
         let (rig, camera, kind) = match rig.into() {
             AnyRig::Plane(rig) => {
@@ -80,7 +80,7 @@ impl Runner {
         })
     }
 
-    /// The same, with a file for the running estimates of its runs.
+    /// Adds a file for the running estimates of its runs.
     #[must_use]
     pub fn with_live(mut self, file: LiveFile) -> Self {
         self.board.set_live(file.path().to_owned());
@@ -88,15 +88,15 @@ impl Runner {
         self
     }
 
-    /// The same; results that would take more memory than this are made some camera rows at a time. Without, that is
-    /// what is free when a run begins.
+    /// Sets a memory limit: results that need more are made in strips of camera rows. The default is the memory that
+    /// is free when a run begins.
     #[must_use]
     pub fn with_memory_limit(mut self, bytes: u64) -> Self {
         self.memory_limit_bytes = Some(bytes);
         self
     }
 
-    /// The rig's camera.
+    /// Capabilities of the rig's camera.
     pub fn camera(&self) -> &CameraCapabilities {
         &self.camera
     }
@@ -115,7 +115,7 @@ impl Runner {
         foresee(&self.lab(), plan).map_err(|error| invalid_plan(&error))
     }
 
-    /// Ends the run under way, if there is one, waits for it, and lets none begin any more.
+    /// Ends the run in progress, if any, waits for it, and allows no more runs.
     pub fn shut_down(&self) {
         self.closed.store(true, Ordering::Relaxed);
         let current = self.current.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -141,7 +141,7 @@ impl Runner {
         Ok(())
     }
 
-    /// Claims the daemon for a run, prepares it and starts its thread; on any error the daemon is free again.
+    /// Reserves the daemon for a run, prepares it and starts its thread; after an error, the daemon is free again.
     fn start(
         &self,
         begin: impl FnOnce() -> Result<(Started, Current), RpcError>,
@@ -152,7 +152,7 @@ impl Runner {
         }
         self.board.go(RunState::Preparing).map_err(wrong_state)?;
         if let Some(last) = current.take() {
-            // Its thread has nothing left to do once the state allowed a new run.
+            // The thread of the last run had nothing left to do once the state allowed a new run.
             let _ = last.thread.join();
         }
         match begin() {
@@ -161,7 +161,7 @@ impl Runner {
                 Ok(started)
             }
             Err(error) => {
-                // Nothing has begun, so nothing has failed.
+                // The run has not begun, so it has not failed.
                 let _ = self.board.go(RunState::Idle);
                 Err(error)
             }
@@ -202,7 +202,7 @@ impl Runner {
         self.live.as_ref().map(outlet)
     }
 
-    /// Whether disk and memory suffice; `instead` is what to do where memory does not.
+    /// Checks that disk and memory suffice; `instead` advises the user if memory does not.
     fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(

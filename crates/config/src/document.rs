@@ -1,4 +1,4 @@
-//! A TOML text, parsed once: its tables are decoded one by one, and each check adds what it finds.
+//! Parses a TOML text once, decodes its tables one by one, and collects the mistakes that checks find.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -14,12 +14,12 @@ use crate::{ConfigError, Mistake};
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{key}{message}")]
 pub struct Fault {
-    /// The key, from the device's table on.
+    /// Path of the key, relative to the device's table.
     pub key: &'static str,
     pub(crate) message: String,
 }
 
-/// The faults of values that are beyond their ranges, both ends of which are allowed.
+/// The faults of values outside their ranges, which include both ends.
 pub(crate) fn out_of_range<const N: usize>(
     rules: [(&'static str, f64, RangeInclusive<f64>); N],
 ) -> impl Iterator<Item = Fault> {
@@ -29,7 +29,7 @@ pub(crate) fn out_of_range<const N: usize>(
     })
 }
 
-/// A text while it is being read.
+/// A text that is being read.
 pub(crate) struct Document<'a> {
     tables: DeTable<'a>,
     places: Places,
@@ -40,7 +40,7 @@ impl<'a> Document<'a> {
     /// Parses a text.
     ///
     /// # Errors
-    /// A syntax error; nothing else can be told of such a text.
+    /// A syntax error, in which case nothing else is checked.
     pub fn parse(text: &'a str) -> Result<Self, ConfigError> {
         let table = DeTable::parse(text).map_err(|error| {
             ConfigError::from(Mistake { message: error.message().into(), field: None, span: error.span() })
@@ -49,12 +49,12 @@ impl<'a> Document<'a> {
         Ok(Self { tables: table.into_inner(), places, mistakes: Vec::new() })
     }
 
-    /// Where its values stand.
+    /// Positions of its values.
     pub fn places(&self) -> &Places {
         &self.places
     }
 
-    /// Decodes the value of a key of the file, if there is one. What cannot be decoded is a mistake.
+    /// Decodes the value of a key of the file, if present. A value that cannot be decoded is a mistake.
     pub fn take<T: Deserialize<'a>>(&mut self, key: &str) -> Option<T> {
         let (_, value) = self.tables.remove_entry(key)?;
         match T::deserialize(toml::de::ValueDeserializer::from(value)) {
@@ -69,12 +69,12 @@ impl<'a> Document<'a> {
         }
     }
 
-    /// Decodes the value of a key, or takes the default where the key is left out.
+    /// Decodes the value of a key; returns the default if the key is missing.
     pub fn take_or_default<T: Deserialize<'a> + Default>(&mut self, key: &str) -> Option<T> {
         if self.tables.contains_key(key) { self.take(key) } else { Some(T::default()) }
     }
 
-    /// Decodes the value of a key that must be there; `example` shows what to write.
+    /// Decodes the value of a required key; `example` shows what to write.
     pub fn require<T: Deserialize<'a>>(&mut self, key: &str, example: &str) -> Option<T> {
         if !self.tables.contains_key(key) {
             self.refuse(&[key], format!("missing field `{key}`: add {example}"));
@@ -82,7 +82,7 @@ impl<'a> Document<'a> {
         self.take(key)
     }
 
-    /// What is left of the file are keys that nothing has asked for.
+    /// Refuses the remaining keys of the file, which nothing has asked for.
     pub fn refuse_others(&mut self, known: &[&str]) {
         let others: Vec<String> = self.tables.keys().map(|key| key.get_ref().to_string()).collect();
         for key in others.iter().filter(|key| !known.contains(&key.as_str())) {
@@ -91,7 +91,7 @@ impl<'a> Document<'a> {
         }
     }
 
-    /// Whether none of these values has been refused, so that rules between them mean something.
+    /// Whether none of these values has been refused, so that rules between them can be checked.
     pub fn is_sound(&self, paths: &[&[&str]]) -> bool {
         let is_refused = |path: &&[&str]| {
             let field = path.join(".");
@@ -100,12 +100,12 @@ impl<'a> Document<'a> {
         !paths.iter().any(is_refused)
     }
 
-    /// Notes a mistake about the value at a path of keys.
+    /// Records a mistake about the value at a path of keys.
     pub fn refuse(&mut self, path: &[&str], message: impl Into<String>) {
         self.mistakes.push(self.places.mistake(path, message));
     }
 
-    /// Notes what is wrong with a device's table.
+    /// Records the faults of a device's table.
     pub fn refuse_all(&mut self, table: &[&str], faults: Vec<Fault>) {
         for Fault { key, message } in faults {
             let path: Vec<&str> = table.iter().copied().chain(key.split('.')).collect();
@@ -113,7 +113,7 @@ impl<'a> Document<'a> {
         }
     }
 
-    /// Notes a mistake unless a value is within its range, both ends included.
+    /// Records a mistake unless a value is within its range, both ends included.
     pub fn check_range(&mut self, path: &[&str], value: f64, allowed: RangeInclusive<f64>) {
         if !allowed.contains(&value) {
             let (low, high) = (allowed.start(), allowed.end());
@@ -129,14 +129,14 @@ impl<'a> Document<'a> {
         }
     }
 
-    /// Notes a mistake unless a value is finite and more than zero.
+    /// Records a mistake unless a value is finite and greater than zero.
     pub fn check_positive(&mut self, path: &[&str], value: f64, unit: &str) {
         if !(value > 0.0 && value.is_finite()) {
             self.refuse(path, format!("{} = {value}: give {unit} greater than 0", path.join(".")));
         }
     }
 
-    /// The end of reading: what was read, unless there were mistakes.
+    /// Finishes reading: returns the value, unless there were mistakes.
     ///
     /// # Errors
     /// All mistakes.
@@ -144,13 +144,13 @@ impl<'a> Document<'a> {
         match (ConfigError::of(self.mistakes), read) {
             (None, Some(read)) => Ok(read),
             (Some(error), _) => Err(error),
-            // Nothing fails to be read without a mistake.
+            // Reading never fails without a mistake.
             (None, None) => Err(ConfigError::of_field("kind", "the file cannot be read")),
         }
     }
 }
 
-/// Where the values of a TOML text stand, for errors that are found later.
+/// Positions of the values in a TOML text, for errors that are found later.
 #[derive(Clone, Default)]
 pub struct Places {
     root: Place,
@@ -174,8 +174,8 @@ impl Places {
         path.iter().try_fold(&self.root, |place, key| place.inside.get(*key)).is_some()
     }
 
-    /// A mistake about the value at a path of keys (of an array: numbers). Where the text has no such value, it points
-    /// at the deepest table on the way to it.
+    /// A mistake about the value at a path of keys (for arrays, indices). If the text has no such value, the mistake
+    /// points to the deepest table on the way to it.
     pub fn mistake(&self, path: &[&str], message: impl Into<String>) -> Mistake {
         let mut place = &self.root;
         for key in path {
@@ -187,13 +187,13 @@ impl Places {
         Mistake { message: message.into(), field: Some(path.join(".")), span: Some(place.value.clone()) }
     }
 
-    /// [`Self::mistake`] alone as an error.
+    /// An error with this [`Self::mistake`] only.
     pub fn error(&self, path: &[&str], message: impl Into<String>) -> ConfigError {
         self.mistake(path, message).into()
     }
 
-    /// The path of the innermost key or value that a span begins in. The text of a table need not lie within that of the
-    /// table around it.
+    /// The path of the innermost key or value that a span begins in. The text of a table need not lie within that of
+    /// its parent table.
     fn path_at(&self, span: &Range<usize>) -> Option<String> {
         let (_, path) =
             self.root.inside.iter().filter_map(|(key, place)| place.narrowest(key, span.start)).min()?;
@@ -202,7 +202,7 @@ impl Places {
 }
 
 impl Place {
-    /// The shortest key or value at a byte of the text, with its length and path: this one's, or of one inside it.
+    /// The shortest key or value at a byte of the text, with its length and path: the one at `path` or one inside it.
     fn narrowest(&self, path: &str, byte: usize) -> Option<(usize, String)> {
         let own = [&self.key, &self.value].into_iter().filter(|text| text.contains(&byte));
         let own = own.map(|text| (text.len(), path.to_owned())).min();
@@ -237,7 +237,7 @@ impl Place {
     }
 }
 
-/// Two files of the same values are the same, wherever these stand.
+/// Files with the same values are equal, regardless of positions.
 impl fmt::Debug for Places {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Places")

@@ -1,4 +1,4 @@
-//! What is wrong with a rig or plan file, and where.
+//! Mistakes in a rig or plan file, with their positions.
 
 use std::fmt;
 use std::ops::Range;
@@ -6,15 +6,15 @@ use std::ops::Range;
 /// One mistake in a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mistake {
-    /// Field, value, what is allowed, what to do.
+    /// Names the field and value, says what is allowed and what to do.
     pub message: String,
-    /// The path of the field, `sweep.delay_us.count` for example, where one is meant.
+    /// The path of the field, for example `sweep.delay_us.count`, if there is one.
     pub field: Option<String>,
-    /// Bytes of the text that it is about.
+    /// Byte range in the text.
     pub span: Option<Range<usize>>,
 }
 
-/// Everything that is wrong with a rig or plan file: at least one mistake, in the order of the text.
+/// All mistakes in a rig or plan file: at least one, in the order of the text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ConfigError {
     first: Mistake,
@@ -22,12 +22,12 @@ pub struct ConfigError {
 }
 
 impl ConfigError {
-    /// An error that has no place in a text.
+    /// An error without a position in a text.
     pub fn of_field(field: &str, message: impl Into<String>) -> Self {
         Mistake { message: message.into(), field: Some(field.into()), span: None }.into()
     }
 
-    /// The mistakes that a file has, if it has any.
+    /// An error with these mistakes; `None` if there are none.
     pub(crate) fn of(mut mistakes: Vec<Mistake>) -> Option<Self> {
         mistakes.sort_by_key(|mistake| mistake.span.as_ref().map(|span| span.start));
         let mut mistakes = mistakes.into_iter();
@@ -44,7 +44,7 @@ impl ConfigError {
         std::iter::once(&self.first).chain(&self.others)
     }
 
-    /// The mistakes with the name of their file, the line and the line's text, for logs and plain output.
+    /// Formats the mistakes with file name, line number and the line's text, for logs and plain output.
     pub fn render(&self, file: &str, text: &str) -> String {
         let rendered = self.mistakes().map(|Mistake { message, span, .. }| {
             let Some(span) = span.clone().filter(|span| span.start <= text.len()) else {

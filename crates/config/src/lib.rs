@@ -1,5 +1,5 @@
 //! Rig and plan files: plain types, read from TOML. Unknown keys are refused, and every mistake is reported with its
-//! place in the text.
+//! position in the text.
 //!
 //! Drivers, simulator and processing take what they need from these types; nothing here opens a device or computes.
 

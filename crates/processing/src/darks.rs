@@ -1,4 +1,4 @@
-//! Dark images of the plane rig's camera: mean, noise and hot pixels at each exposure, after EMVA 1288.
+//! Dark images of the plane rig's camera: mean, noise and hot pixels at each exposure, according to EMVA 1288.
 
 use std::sync::Arc;
 
@@ -26,7 +26,7 @@ const SIGMA_PER_MAD: f32 = 1.4826;
 pub struct DarksTask {
     /// The plan's own table.
     pub darks: DarksPlan,
-    /// The images: two of each exposure, one after the other.
+    /// The images: two of each exposure, in succession.
     pub task: Arc<PlaneTask>,
 }
 
@@ -45,19 +45,19 @@ impl DarksTask {
         Self { darks, task: Arc::new(task) }
     }
 
-    /// How many images it stores.
+    /// Number of images to store.
     pub fn points(&self) -> usize {
         self.task.schedule.points.len()
     }
 }
 
-/// What the two images of an exposure tell, in camera counts.
+/// Results of the two images of an exposure, in camera counts.
 struct Level {
     exposure_us: f64,
     /// Mean of both images, `[t, s]`.
     image: Array2<f32>,
     mean_dn: f64,
-    /// Spread of the pixels' means, without the noise that is left in them.
+    /// Spatial standard deviation of the pixels' means, corrected for the remaining temporal noise.
     pattern_dn: f64,
     /// Temporal noise of a single frame.
     noise_dn: f64,
@@ -65,7 +65,7 @@ struct Level {
 }
 
 impl Level {
-    /// From two images of `frames` frames each.
+    /// Computes them from two images of `frames` frames each.
     fn of(exposure_us: f64, [a, b]: [Array2<f32>; 2], frames: u32, hot_sigmas: f64) -> Self {
         let variance = |image: &Array2<f32>| image.mapv(f64::from).var(0.0);
         // EMVA 1288, equation 30: the pattern cancels in the difference.
@@ -90,10 +90,10 @@ fn median(values: &mut [f32]) -> f32 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Makes images, table, report and manifest; returns what could not be made, and why.
+/// Makes images, table, report and manifest; returns the problems.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -> Result<Vec<String>> {
     let (stack, mut problems) = (session.stack()?, Vec::new());
     let DarksPlan { exposure_us, frames, hot_sigmas } = &task.darks;
@@ -226,10 +226,10 @@ fn report(
     }
 }
 
-/// Makes the products of stored dark images again.
+/// Reprocesses stored dark images.
 ///
 /// # Errors
-/// When products are asked for, or the disk refuses.
+/// When products are asked for, or the session cannot be written.
 pub fn process(
     stored: &Stored<'_>,
     darks: DarksPlan,
@@ -271,7 +271,8 @@ mod tests {
         };
         let level = Level::of(100.0, [image(2), image(3)], 4, 8.0);
         assert_eq!(level.hot, [(7, 9)]);
-        // A uniform distribution of width w has the standard deviation w / sqrt(12); a frame's is that of four, doubled.
+        // A uniform distribution of width w has the standard deviation w / sqrt(12); a frame's noise is twice that of
+        // a mean of four.
         let [noise_dn, pattern_dn] = [2.0 * 2.0, 6.0].map(|width: f64| width / 12_f64.sqrt());
         assert!((level.noise_dn / noise_dn - 1.0).abs() < 0.02, "{} against {noise_dn}", level.noise_dn);
         let hot = (300.0_f64 - 64.0).powi(2) / 40_000.0;

@@ -1,4 +1,4 @@
-//! Sessions copied out for others.
+//! Exports sessions for use elsewhere.
 
 use std::path::Path;
 
@@ -6,7 +6,7 @@ use raysweep_session::Session;
 
 use crate::stored::ProcessError;
 
-/// Copies a session's products, report and manifest into `to`, a folder that is made and must not exist.
+/// Copies a session's products, report and manifest into the new folder `to`, which must not exist.
 ///
 /// # Errors
 /// When the session cannot be read or `to` cannot be written.
@@ -22,7 +22,7 @@ pub fn export(dir: &Path, to: &Path) -> Result<usize, ProcessError> {
         let entries = std::fs::read_dir(dir).into_iter().flatten().flatten();
         entries.map(|entry| entry.path()).collect::<Vec<_>>()
     };
-    // Videos have folders of their own.
+    // Each video has its own folder.
     let products = listed(&session.products_path());
     files.extend(products.iter().filter(|path| path.is_dir()).flat_map(|dir| listed(dir)));
     files.extend(products);

@@ -1,7 +1,7 @@
-//! Makes products and reports of stored sessions. A run calls the same functions, so its results and those that are made
-//! again have the same bits.
+//! Makes products and reports from stored sessions. Runs call the same functions, so offline results are
+//! bit-identical to those of the run.
 //!
-//! Nothing here needs a rig, a socket or a device.
+//! Needs no rig, socket or device.
 
 pub mod batches;
 pub mod darks;
@@ -26,19 +26,19 @@ use self::stored::read;
 pub use export::export;
 pub use stored::{Asked, ProcessError, Processed, Stored};
 
-/// Name and version, as sessions keep it.
+/// Name and version that are recorded in sessions.
 pub const SOFTWARE: &str = concat!("raysweepd ", env!("CARGO_PKG_VERSION"));
 
-/// Share of the converter's range from which on a mean counts as saturated: the noise of single frames must not have
-/// been cut off.
+/// A mean counts as saturated from this share of the converter's range on: the noise of single frames must not be
+/// clipped.
 const SATURATION: f64 = 0.97;
 
-/// Counts from which on a pixel of this format is overexposed: wells may be full before the converter is.
+/// Counts from which on a pixel of this format is overexposed: wells may be full before the converter saturates.
 pub(crate) fn saturation_dn(format: PixelFormat) -> f64 {
     SATURATION * f64::from(format.max_value())
 }
 
-/// Makes the products of a session again, with the plan and the rig file that lie in it: the same bits as the run's.
+/// Makes the products of a session again, with its own plan and rig file: bit-identical to those of the run.
 ///
 /// # Errors
 /// When the session is being written by a run, or cannot be read.
@@ -46,10 +46,10 @@ pub fn process(dir: &Path) -> Result<Processed, ProcessError> {
     process_asked(dir, &Asked::default())
 }
 
-/// [`process`], and products that the plan does not name. Files of products that are not made now stay.
+/// Like [`process`], with products that the plan does not name. Files of products that are not made now are kept.
 ///
 /// # Errors
-/// Those of [`process`]; and when a product cannot be had of this session, before anything is written.
+/// Those of [`process`]; and when a product cannot be made from this session, before anything is written.
 pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessError> {
     let session = Session::open(dir)?;
     let ledger = session.resume()?;

@@ -1,4 +1,4 @@
-//! How much memory results take, and whether they are made in one piece.
+//! Estimates the memory that results need, and decides whether to make them in strips.
 
 use raysweep_pipeline::{ProductSpec, rows_to_choose_by};
 use raysweep_session::STRIP_ROWS;
@@ -6,35 +6,35 @@ use raysweep_transport::plane::{PlaneError, Setting, objectives_bytes, reach};
 
 use crate::plane::PlaneTask;
 
-/// What the results of a task take.
+/// Memory that the results of a task need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MemoryNeed {
-    /// With stack and transport whole.
+    /// With the whole stack and transport in memory.
     pub whole_bytes: u64,
-    /// With some camera rows of them at a time; of a film, whose cycles are small, no less.
+    /// With a strip of camera rows at a time; for a film, whose cycles are small, the same as `whole_bytes`.
     pub strips_bytes: u64,
 }
 
 impl MemoryNeed {
-    /// Foresees a sweep that makes `products`.
+    /// Estimates a sweep that makes `products`.
     ///
     /// # Errors
-    /// When the plan makes no model on its rig.
+    /// When the plan gives no model on its rig.
     pub fn of_sweep(task: &PlaneTask, products: &[ProductSpec]) -> Result<Self, PlaneError> {
         let Solver { reach_rows, solver_bytes, pixels, .. } = Solver::of(task)?;
         let geometry = &task.geometry;
         let strip_px = (geometry.height.min(STRIP_ROWS) * geometry.width) as u64;
-        // More rows than those of a strip and its halo.
+        // An upper bound for the rows of a strip and its halo.
         let chosen_by_px = (rows_to_choose_by(geometry.height).len() * geometry.width) as u64;
-        // The stack twice while it changes hands or is coupled, and where pixels are valid.
+        // The stack twice while it is handed over or coupled, and the mask of valid pixels.
         let stack_bytes_per_px = 9 * task.schedule.points.len() as u64;
-        // The transport and its copy on the way to the disk.
+        // The transport and its copy for the disk.
         let transport_bytes_per_px = 8 * reach_rows;
         let images = products.iter().map(|product| product.images(geometry) as u64);
-        // Each image once, the largest sequence twice more: as EXR's channels and as the file's bytes.
+        // Each image once; the largest sequence twice more: as EXR channels and as the file's bytes.
         let product_images = images.clone().sum::<u64>() + 2 * images.max().unwrap_or(0);
         let product_bytes = 4 * pixels * product_images;
-        // Sums of the transport for the report, and single images on their way from the disk through the stages.
+        // Sums of the transport for the report, and single images that are read and pass through the stages.
         let shown_bytes = 4 * pixels * (5 + 5);
         Ok(Self {
             whole_bytes: pixels * (stack_bytes_per_px + transport_bytes_per_px)
@@ -48,29 +48,30 @@ impl MemoryNeed {
         })
     }
 
-    /// Foresees a film.
+    /// Estimates a film.
     ///
     /// # Errors
-    /// When the plan makes no model on its rig.
+    /// When the plan gives no model on its rig.
     pub fn of_film(task: &PlaneTask) -> Result<Self, PlaneError> {
         let Solver { settings, reach_rows, solver_bytes, pixels } = Solver::of(task)?;
-        // Frames and images of the cycles under way, a stack and its mask, the transport and its copies to the disk.
+        // Frames and images of the cycles in progress, a stack and its mask, the transport and its copies for the
+        // disk.
         let bytes = pixels * (80 * settings + 16 * reach_rows) + solver_bytes;
         Ok(Self { whole_bytes: bytes, strips_bytes: bytes })
     }
 
-    /// Whether the results are made strip by strip, to take no more than this.
+    /// Whether the results must be made in strips to stay within `available_bytes`.
     pub fn in_strips(&self, available_bytes: u64) -> bool {
         self.whole_bytes > available_bytes && self.strips_bytes < self.whole_bytes
     }
 
-    /// What they take if they should take no more than this.
+    /// Memory needed if `available_bytes` should not be exceeded.
     pub fn bytes(&self, available_bytes: u64) -> u64 {
         if self.in_strips(available_bytes) { self.strips_bytes } else { self.whole_bytes }
     }
 }
 
-/// What the memory of a solver follows from.
+/// The sizes that determine a solver's memory.
 struct Solver {
     settings: u64,
     reach_rows: u64,
@@ -91,7 +92,7 @@ impl Solver {
     }
 }
 
-/// What results may take: `limit_bytes`, or else what the system says it can still give to programs.
+/// Memory that results may use: `limit_bytes`, or else what the system reports as available.
 pub fn available_bytes(limit_bytes: Option<u64>) -> u64 {
     limit_bytes.or_else(free_bytes).unwrap_or(u64::MAX)
 }

@@ -1,4 +1,4 @@
-//! The response that a run has found, where the runs that follow find it.
+//! Stores the mirror response that a run has identified, for later runs.
 
 use std::path::{Path, PathBuf};
 
@@ -12,16 +12,16 @@ use raysweep_transport::dots::identify::{Identified, Resonance};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-/// The file in the daemon's data folder; a session's has the same name.
+/// Path of the file in the daemon's data folder or a session's folder.
 pub fn path_in(folder: &Path) -> PathBuf {
     folder.join("mirror-response.json")
 }
 
-/// `mirror-response.json`
+/// Contents of `mirror-response.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KeptResponse {
-    /// When its session was begun.
+    /// Start of the session that identified it.
     pub identified: Timestamp,
     /// Name of that session's folder.
     pub session: String,
@@ -31,19 +31,19 @@ pub struct KeptResponse {
     pub y: AxisResponse,
 }
 
-/// One axis.
+/// Response of one axis.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AxisResponse {
-    /// Its resonance.
+    /// Resonance frequency.
     pub f0_hz: f64,
-    /// Its quality factor.
+    /// Quality factor.
     pub q: f64,
-    /// How late it answers, from the first frame's exposure on.
+    /// Delay of the response, counted from the first frame's exposure.
     pub delay_s: f64,
-    /// Share of the measured movement that this does not explain.
+    /// Share of the measured movement that the model does not explain.
     pub residual: f64,
-    /// The band in which it was found to hold.
+    /// Band in which the model was found to hold.
     pub band_hz: [f64; 2],
 }
 
@@ -55,7 +55,7 @@ impl From<&Identified> for AxisResponse {
 }
 
 impl KeptResponse {
-    /// What was found in a session.
+    /// The response identified in a session.
     pub fn new(session: &Session, state: &State, [x, y]: [&Identified; 2]) -> Self {
         let name = session.dir().file_name().unwrap_or(session.dir().as_os_str());
         Self {
@@ -66,10 +66,10 @@ impl KeptResponse {
         }
     }
 
-    /// Writes it: all of it or nothing, durably.
+    /// Writes the file atomically and durably.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<()> {
         let mut text = serde_json::to_vec_pretty(self).map_err(|error| Error::Codec {
             action: "encode",
@@ -87,20 +87,21 @@ impl KeptResponse {
     }
 }
 
-/// What a run's path is distorted by beforehand, and from where that is known.
+/// The model that a run's path is predistorted with, and its origin.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Predistortion {
-    /// Of x and y.
+    /// Responses of the axes, x and y.
     pub responses: [SecondOrder; 2],
-    /// What was identified; none where the rig file states it.
+    /// The identified response; `None` if the rig file states the values.
     kept: Option<KeptResponse>,
 }
 
 impl Predistortion {
-    /// As the rig file wants it; what was identified lies in `folder`, the daemon's data or a session's.
+    /// The predistortion that the rig file asks for; an identified response is read from `folder`, the daemon's data
+    /// or a session's.
     ///
     /// # Errors
-    /// When what was identified is to be used and cannot be read.
+    /// When the identified response is to be used and cannot be read.
     pub fn of(rig: &DotRigFile, folder: &Path) -> std::result::Result<Option<Self>, ConfigError> {
         match rig.mirror.as_ref().and_then(|mirror| mirror.response) {
             None => Ok(None),
@@ -123,15 +124,15 @@ impl Predistortion {
         }
     }
 
-    /// Keeps what was identified with the session whose path it distorted.
+    /// Stores the identified response in the session whose path it predistorted.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the session cannot be written.
     pub fn keep(&self, session: &Session) -> Result<()> {
         self.kept.as_ref().map_or(Ok(()), |kept| kept.write(&session.mirror_response_path()))
     }
 
-    /// For the manifest.
+    /// Its entry in the manifest.
     pub fn to_json(&self) -> Value {
         let [x, y] = self.responses;
         match &self.kept {

@@ -1,11 +1,11 @@
-//! What the reports of all procedures have in common.
+//! Shared by the reports of all procedures.
 
 use raysweep_core::SettingsLatency;
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Block, NoteLevel, Table};
 
-/// When, by whom and of what a session was taken.
+/// Date, operator, sample, tags, note and folder of a session.
 pub(crate) fn subtitle(state: &State, session: &Session) -> String {
     let entry = &state.session;
     let parts = [
@@ -19,7 +19,7 @@ pub(crate) fn subtitle(state: &State, session: &Session) -> String {
     parts.into_iter().flatten().collect::<Vec<_>>().join(" · ")
 }
 
-/// Where the frames went, and what the VSYNC line was like.
+/// Frame counts, and statistics of the VSYNC line.
 pub(crate) fn accounts(state: &State) -> Vec<Block> {
     let counts = &state.counts;
     let mut rows = vec![

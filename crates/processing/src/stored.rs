@@ -1,4 +1,4 @@
-//! A stored session that is being processed, and what comes of it.
+//! A stored session that is being processed, and the results.
 
 use std::path::{Path, PathBuf};
 
@@ -15,53 +15,53 @@ pub enum ProcessError {
     /// Its plan or rig file cannot be read.
     #[error("{0}")]
     Config(String),
-    /// A product that was asked for cannot be had.
+    /// A requested product cannot be made.
     #[error("{0}")]
     Product(String),
-    /// The results do not fit into the memory, in strips either.
+    /// The results do not fit into memory, not even in strips.
     #[error(
         "the results take {} MB of memory even some camera rows at a time, and {} MB may be used: raise --memory, make shorter sequences, or end other programs",
         needed_bytes / 1_000_000,
         available_bytes / 1_000_000
     )]
     Memory {
-        /// What they take.
+        /// Memory needed.
         needed_bytes: u64,
-        /// What they may take.
+        /// Memory allowed.
         available_bytes: u64,
     },
     /// A file cannot be copied.
     #[error("cannot copy to {}: {source}", path.display())]
     Copy {
-        /// Where to.
+        /// Destination.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
 }
 
-/// What was made.
+/// Results of processing.
 #[derive(Debug, Clone)]
 pub struct Processed {
-    /// The report.
+    /// Path of the report.
     pub report: PathBuf,
-    /// Points of the sweep, or cycles of the film, that went into it.
+    /// Points of the sweep, or cycles of the film, that were used.
     pub stored: usize,
-    /// All of them.
+    /// Points or cycles in the plan.
     pub points: usize,
     /// What could not be made, and why.
     pub problems: Vec<String>,
 }
 
-/// Products that are asked for beside a session's plan.
+/// Products requested in addition to a session's plan.
 #[derive(Debug, Clone, Default)]
 pub struct Asked {
-    /// The keys of a `[[product]]` each, with commas between them.
+    /// One entry per product: the keys of a `[[product]]`, separated by commas.
     pub products: Vec<String>,
-    /// Whether the plan's own products are left as they lie there.
+    /// Make only these, and leave the plan's own products as they are.
     pub only: bool,
-    /// Results that would take more memory than this are made some camera rows at a time, and are the same; none: more
-    /// than is free.
+    /// Memory limit; results that need more are made in strips of camera rows, with the same values. `None`: the
+    /// memory that is free.
     pub memory_limit_bytes: Option<u64>,
 }
 
@@ -69,7 +69,7 @@ pub struct Asked {
 pub struct Stored<'a> {
     /// Its folder.
     pub session: &'a Session,
-    /// What its ledger knows.
+    /// State according to its ledger.
     pub state: &'a State,
     /// Its plan.
     pub plan: &'a Plan,
@@ -77,7 +77,7 @@ pub struct Stored<'a> {
 }
 
 impl Stored<'_> {
-    /// An error in the session's plan.
+    /// Wraps an error in the session's plan.
     pub(crate) fn in_plan(&self, error: &ConfigError) -> ProcessError {
         let path = self.session.plan_path().display().to_string();
         ProcessError::Config(error.render(&path, self.plan_text))
@@ -106,7 +106,7 @@ impl Stored<'_> {
     }
 }
 
-/// The text of a session's file.
+/// Reads a text file of a session.
 pub(crate) fn read(path: &Path) -> Result<String, ProcessError> {
     std::fs::read_to_string(path)
         .map_err(|error| ProcessError::Config(format!("cannot read {}: {error}", path.display())))

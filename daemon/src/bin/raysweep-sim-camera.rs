@@ -1,4 +1,4 @@
-//! A simulated GigE Vision camera before the simulated rig of a rig file, or before test pictures.
+//! A simulated GigE Vision camera that views the simulated rig of a rig file, or delivers test images.
 
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
@@ -76,7 +76,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     wait_for_ever()
 }
 
-/// Says that clients may come, for whoever started the camera from a script.
+/// Announces that clients may connect, for scripts that start the camera.
 fn announce(arguments: &Arguments) {
     println!("listening on {}", arguments.address);
 }
@@ -87,7 +87,7 @@ fn wait_for_ever() -> ! {
     }
 }
 
-/// Reads `KEY=VALUE` words as the lines of a TOML table.
+/// Parses `KEY=VALUE` words as lines of a TOML table.
 fn table<T: DeserializeOwned>(flag: &str, words: &[String]) -> Result<T, String> {
     toml::from_str(&words.join("\n")).map_err(|error| format!("--{flag}: {error}"))
 }

@@ -1,4 +1,4 @@
-//! The daemon: owns a rig, serves a socket, and ends in order.
+//! The daemon: owns a rig, serves a socket, and shuts down cleanly.
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -70,10 +70,10 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
         prepare_data(&arguments.data).map_err(|error| {
             format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
         })?;
-        // Before a mirror's driver is opened, which refuses one that was left behind.
+        // Must come before opening a mirror's driver, which refuses a mirror that was left unparked.
         park_left_behind(&arguments.data);
     }
-    // It outlives the runner, and so the mirror's driver.
+    // Outlives the runner, and so the mirror's driver.
     let _guardian = match &rig {
         AnyRig::Dots(rig) if !arguments.check && rig.has_real_mirror() => Some(
             mirror::guardian(&arguments.data)
@@ -106,13 +106,13 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     });
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let served = runtime.block_on(serve(arguments, runner.clone()));
-    // A server that failed leaves a run behind; after an orderly end there is none.
+    // If the server failed, a run may still be in progress; after a clean shutdown there is none.
     runner.shut_down();
     runtime.shutdown_timeout(Duration::from_secs(1));
     served
 }
 
-/// The live file where it was asked for; else beside the socket, if it can be made there: no run needs it.
+/// The live file at the requested path; by default beside the socket, where failure is tolerated: no run needs it.
 fn live_file(arguments: &Arguments) -> Result<Option<LiveFile>, LiveError> {
     if let Some(path) = &arguments.live {
         return LiveFile::create(path).map(Some);
@@ -121,17 +121,17 @@ fn live_file(arguments: &Arguments) -> Result<Option<LiveFile>, LiveError> {
     Ok(made.map_err(|error| tracing::warn!(%error, "there will be no live images")).ok())
 }
 
-/// A mirror that a daemon before this one has left somewhere goes to the origin before anything else happens.
+/// Moves a mirror that an earlier daemon left off-centre to the origin, before anything else happens.
 fn park_left_behind(data: &Path) {
     match park(&mirror::state_file(data)) {
         Ok(Parked::Already) => {}
         Ok(parked) => tracing::warn!(?parked, "parked a mirror that was left behind"),
-        // Runs that need no mirror can go on; the mirror's driver refuses to open until it is parked.
+        // Runs without a mirror can continue; the mirror's driver refuses to open until it is parked.
         Err(error) => tracing::error!(%error, "a mirror that was left behind is not parked"),
     }
 }
 
-/// Makes the data folder where it is missing, and makes sure that sessions can be kept in it.
+/// Creates the data folder if it is missing, and checks that sessions can be stored in it.
 fn prepare_data(folder: &Path) -> std::io::Result<()> {
     std::fs::create_dir_all(folder)?;
     let probe = folder.join(format!(".raysweepd-{}", std::process::id()));
@@ -157,7 +157,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
             }
             tracing::info!("ending in order");
             let _ = sd_notify::notify(&[NotifyState::Stopping]);
-            // Clients are served until the run has ended, so that they learn how.
+            // Keep serving clients until the run has ended, so that they learn the result.
             let _ = tokio::task::spawn_blocking(move || runner.shut_down()).await;
         }
     };
@@ -169,7 +169,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
     Ok(served?)
 }
 
-/// Tells systemd that the daemon lives, as often as its unit asks, and only if it still answers.
+/// Notifies systemd's watchdog as often as the unit asks, but only while the daemon still responds.
 async fn feed_watchdog(runner: Arc<Runner>) {
     let Some(interval) = sd_notify::watchdog_enabled() else { return };
     loop {

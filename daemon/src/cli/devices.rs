@@ -1,4 +1,4 @@
-//! Cameras that answer, and what they are set to; needs no daemon.
+//! Cameras that respond, and their settings; needs no daemon.
 
 use std::path::PathBuf;
 
@@ -50,7 +50,7 @@ mod with_aravis {
 
     use super::{CameraCommand, Exit, Failure, Printer};
 
-    /// Lists the cameras that answer.
+    /// Lists the cameras that respond.
     pub fn devices(printer: Printer) -> Result<Exit, Failure> {
         printer.print(&discover(), |found| table(found))?;
         Ok(Exit::Done)

@@ -1,8 +1,8 @@
-//! How the command ends.
+//! Exit codes of the command.
 
 use std::process::ExitCode;
 
-/// How the command ends.
+/// Result of the command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Exit {
     Done = 0,

@@ -1,4 +1,4 @@
-//! What can go wrong, for people, for programs, and as an exit code.
+//! Failures, as text for people, as JSON for programs, and as exit codes.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ use super::exit::Exit;
 use crate::live::LiveError;
 use raysweep_processing::ProcessError;
 
-/// Why the command did not do what it was asked for.
+/// Why the command failed.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum Failure {
     #[error(transparent)]
@@ -52,7 +52,7 @@ pub(super) enum Failure {
     Output(io::Error),
 }
 
-/// What the daemon found wrong with a plan, with the plan's text.
+/// A problem that the daemon found in a plan, with the plan's text.
 #[derive(Debug, thiserror::Error, Diagnostic)]
 #[error("{error}")]
 pub(super) struct PlanProblem {
@@ -66,7 +66,7 @@ pub(super) struct PlanProblem {
 }
 
 impl Failure {
-    /// The failure of a call that carried a plan's text.
+    /// The failure of a call that sent a plan's text.
     pub fn of_plan(error: ClientError, path: &Path, text: &str) -> Self {
         match error {
             ClientError::Rpc(error) if error.name() == Some(ErrorCode::InvalidPlan) => {
@@ -90,7 +90,7 @@ impl Failure {
         }
     }
 
-    /// Tells the user, and says how to exit. A reader that has closed our output wants to hear no more.
+    /// Reports the failure and returns the exit code. If the reader has closed our output, nothing is printed.
     pub fn report(self, json: bool) -> Exit {
         let exit = self.exit();
         let gone = matches!(&self, Self::Output(error) if error.kind() == io::ErrorKind::BrokenPipe);
@@ -98,7 +98,7 @@ impl Failure {
             _ if gone => {}
             failure if json => {
                 use io::Write as _;
-                // With the output gone too, the exit code is all that is left to say.
+                // If the output is gone too, only the exit code remains.
                 let _ = writeln!(io::stdout(), "{}", json!({ "error": failure.for_programs() }));
             }
             Self::Plan(problem) => eprintln!("{:?}", miette::Report::new(*problem)),

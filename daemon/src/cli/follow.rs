@@ -1,4 +1,4 @@
-//! Following a run to its end.
+//! Follows a run to its end.
 
 use std::io;
 use std::path::Path;
@@ -12,18 +12,18 @@ use super::exit::Exit;
 use super::failure::Failure;
 use super::view::View;
 
-/// How long an interrupt may wait for an event that does not come.
+/// How long handling of an interrupt may be delayed while no event arrives.
 const PATIENCE: Duration = Duration::from_millis(100);
 
-/// What Ctrl-C means.
+/// The effect of Ctrl-C.
 pub(super) enum OnInterrupt {
-    /// The first asks the daemon, over this connection, to cancel the run; the second leaves the run to it.
+    /// The first asks the daemon, over this connection, to cancel the run; the second detaches from it.
     Cancel(Client),
-    /// The first leaves the run to the daemon.
+    /// The first detaches from the run, which continues.
     Leave,
 }
 
-/// Ctrl-C, noticed instead of deadly.
+/// Catches Ctrl-C instead of letting it end the process.
 pub(super) struct Interrupts {
     /// Driven only by [`Interrupts::pending`].
     runtime: Runtime,
@@ -31,7 +31,7 @@ pub(super) struct Interrupts {
 }
 
 impl Interrupts {
-    /// From here on SIGINT ends the process no more.
+    /// From here on, SIGINT no longer ends the process.
     pub fn new() -> io::Result<Self> {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_io().build()?;
         let signal = {
@@ -41,11 +41,11 @@ impl Interrupts {
         Ok(Self { runtime, signal })
     }
 
-    /// Whether Ctrl-C was pressed since the last time this was asked.
+    /// Whether Ctrl-C was pressed since the last call.
     fn pending(&mut self) -> bool {
         let Self { runtime, signal } = self;
         runtime.block_on(async {
-            // Yielding gives the runtime its one chance to look for signals.
+            // Yielding lets the runtime poll for signals.
             tokio::select! {
                 biased;
                 _ = signal.recv() => true,
@@ -55,7 +55,7 @@ impl Interrupts {
     }
 }
 
-/// Shows what happens until the run of `session` has ended.
+/// Shows events until the run of `session` has ended.
 pub(super) fn follow(
     mut events: Subscription,
     session: &Path,

@@ -1,4 +1,4 @@
-//! `preview`: the running estimate as a picture.
+//! `preview`: the running estimate as an image.
 
 use std::fs;
 use std::io::{self, Write};
@@ -16,15 +16,15 @@ use super::failure::Failure;
 use super::printer::Printer;
 use crate::live::{EPIPOLAR, INDIRECT, LiveError, LiveImage, LiveReader};
 
-/// How often a picture that is followed is looked after.
+/// Polling interval for newer images.
 const PACE: Duration = Duration::from_millis(200);
-/// Columns between the two pictures.
+/// Columns between the two images.
 const GAP_PX: usize = 4;
-/// Share of pixels, in percent, that a picture's scale does not overexpose.
+/// Percentile of the pixels that maps to white in an image.
 const PERCENTILE: f64 = 99.5;
 
-/// Writes epipolar and indirect light, side by side and each on its own scale, as a PNG file; with `follow` again
-/// whenever there is a newer estimate, until the daemon or the run ends.
+/// Writes epipolar and indirect light, side by side and each on its own scale, as a PNG file; with `follow`, repeats
+/// this for every newer estimate until the daemon or the run ends.
 pub(super) fn preview(socket: &Path, output: &Path, follow: bool, printer: Printer) -> Result<Exit, Failure> {
     let mut client = Client::connect(socket)?;
     let file = client.status()?.live.ok_or(Failure::NoLiveImage)?;
@@ -37,7 +37,7 @@ pub(super) fn preview(socket: &Path, output: &Path, follow: bool, printer: Print
                 let picture = side_by_side(epipolar, &indirect)?;
                 replace(output, &picture)?;
                 tell(&indirect, output, printer)?;
-                // The first may be the result of a run long over.
+                // The first image may be the result of an earlier run.
                 if !first && indirect.metadata.get("last") == Some(&Value::Bool(true)) {
                     return Ok(Exit::Done);
                 }
@@ -48,7 +48,7 @@ pub(super) fn preview(socket: &Path, output: &Path, follow: bool, printer: Print
         if !follow {
             return Ok(Exit::Done);
         }
-        // Who follows learns here that the daemon is gone: a removed file never changes.
+        // Detects that the daemon is gone: a removed file never changes.
         client.status()?;
         thread::sleep(PACE);
     }
@@ -58,7 +58,8 @@ pub(super) fn preview(socket: &Path, output: &Path, follow: bool, printer: Print
 fn pair(reader: &LiveReader) -> Result<Option<(LiveImage, LiveImage)>, LiveError> {
     let indirect = reader.newest(INDIRECT)?;
     let epipolar = reader.newest(EPIPOLAR)?;
-    // The writer publishes one after the other: two of different estimates are a pair a moment later.
+    // The writer publishes the images one after the other: if they belong to different estimates, the pair is
+    // complete a moment later.
     let of_one = |(epipolar, indirect): &(LiveImage, LiveImage)| {
         epipolar.sequence + 1 == indirect.sequence && epipolar.image.shape() == indirect.image.shape()
     };
@@ -80,7 +81,7 @@ fn side_by_side(epipolar: LiveImage, indirect: &LiveImage) -> Result<Vec<u8>, Fa
         .map_err(raysweep_processing::ProcessError::from)?)
 }
 
-/// In one step, so that a viewer that watches the file never sees half a picture.
+/// Replaces the file atomically, so that a viewer never sees half an image.
 fn replace(output: &Path, png: &[u8]) -> Result<(), Failure> {
     let failed = |source| Failure::Write { path: output.to_owned(), source };
     let mut name = output.as_os_str().to_owned();

@@ -1,4 +1,4 @@
-//! Results as text for people.
+//! Formats results as text for people.
 
 use std::path::Path;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use raysweep_proto::{
 
 use raysweep_processing::Processed;
 
-/// `status`
+/// Text of `status`.
 pub(super) fn status(status: &Status) -> String {
     let mut rows = vec![
         ("daemon", format!("{}, {} rig", status.version, status.rig)),
@@ -61,7 +61,7 @@ pub(super) fn status(status: &Status) -> String {
     block(&rows)
 }
 
-/// `park`, for programs.
+/// Result of `park`, for programs.
 pub(super) fn parked_name(parked: Parked) -> serde_json::Value {
     match parked {
         Parked::Already => serde_json::json!({ "parked": "already" }),
@@ -70,7 +70,7 @@ pub(super) fn parked_name(parked: Parked) -> serde_json::Value {
     }
 }
 
-/// `park`
+/// Text of `park`.
 pub(super) fn parked(parked: Parked) -> String {
     match parked {
         Parked::Already => "the mirror is parked, as it was".into(),
@@ -94,7 +94,7 @@ fn mirror(mirror: &MirrorStatus) -> String {
     format!("{place}, light {laser}; {word}")
 }
 
-/// `check`
+/// Text of `check`.
 pub(super) fn check(report: &CheckReport) -> String {
     let mut rows = vec![
         (
@@ -176,7 +176,7 @@ pub(super) fn check(report: &CheckReport) -> String {
     better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.sweep.trim_end()))
 }
 
-/// What `check` expects and advises; the better sweep's table stands after the rows.
+/// Expected errors and advice of `check`; the better sweep's table follows the rows.
 fn advice(advice: &SweepAdvice) -> Vec<(&'static str, String)> {
     let SweepAdvice { noise, prior, expected, better } = advice;
     let source = match noise.source {
@@ -217,13 +217,13 @@ fn errors(expected: &ExpectedError) -> String {
     )
 }
 
-/// A small number with two digits that say something.
+/// Formats a small number with two significant digits.
 fn short(value: f64) -> String {
     let decimals = if value > 0.0 { (1.0 - value.log10().floor()).clamp(0.0, 12.0) } else { 0.0 };
     format!("{value:.*}", decimals as usize)
 }
 
-/// `sessions`
+/// Text of `sessions`.
 pub(super) fn sessions(sessions: &[SessionInfo]) -> String {
     if sessions.is_empty() {
         return "no sessions".into();
@@ -244,7 +244,7 @@ pub(super) fn sessions(sessions: &[SessionInfo]) -> String {
     rows.iter().map(line).collect::<Vec<_>>().join("\n")
 }
 
-/// `describe`
+/// Text of `describe`.
 pub(super) fn description(description: &Description) -> String {
     let mut lines = vec![format!("raysweepd {}", description.version), String::new(), "methods".into()];
     lines.extend(description.methods.iter().map(|method| {
@@ -264,7 +264,7 @@ pub(super) fn description(description: &Description) -> String {
     lines.join("\n")
 }
 
-/// How a run has ended.
+/// Text for the end of a run.
 pub(super) fn ending(
     session: &Path,
     state: &str,
@@ -286,7 +286,7 @@ pub(super) fn ending(
     lines.join("\n")
 }
 
-/// How a film has ended.
+/// Text for the end of a film.
 pub(super) fn film_ending(session: &Path, state: &str, report: Option<&Path>, film: &FilmSummary) -> String {
     let mut lines = vec![format!("{state}: {}", self::film(film))];
     lines.push(format!("session: {}", session.display()));
@@ -294,7 +294,7 @@ pub(super) fn film_ending(session: &Path, state: &str, report: Option<&Path>, fi
     lines.join("\n")
 }
 
-/// How a film goes, or went.
+/// Text for the progress or result of a film.
 pub(super) fn film(film: &FilmSummary) -> String {
     let mut parts = vec![format!("{} of {} cycles stored", film.cycles_stored, film.cycles_planned)];
     parts.extend(film.cycles_per_s.map(|pace| format!("{pace:.2} a second")));
@@ -308,7 +308,7 @@ pub(super) fn film(film: &FilmSummary) -> String {
     parts.join(", ")
 }
 
-/// `process`
+/// Text of `process`.
 pub(super) fn processed(made: &Processed) -> String {
     let mut lines: Vec<_> = made.problems.iter().map(|problem| format!("not made: {problem}")).collect();
     lines.push(format!("made from {} of {} points", made.stored, made.points));
@@ -316,14 +316,14 @@ pub(super) fn processed(made: &Processed) -> String {
     lines.join("\n")
 }
 
-/// Rate, losses and time left.
+/// Rate, losses and remaining time.
 pub(super) fn pace(progress: &Progress) -> String {
     let left =
         progress.left_s.map_or_else(|| "time left unknown".into(), |left| format!("{} left", duration(left)));
     format!("{:.0} frames/s  {}  {left}", progress.frames_per_s, progress.counts.losses())
 }
 
-/// A state in a word or two.
+/// Text for a state.
 pub(super) fn state(state: RunState) -> &'static str {
     match state {
         RunState::Idle => "idle",
@@ -348,7 +348,7 @@ fn duration(seconds: f64) -> String {
     }
 }
 
-/// Rows of a word and what belongs to it.
+/// Formats rows of a label and its value.
 fn block(rows: &[(&str, String)]) -> String {
     rows.iter().map(|(word, text)| format!("{word:10} {text}")).collect::<Vec<_>>().join("\n")
 }

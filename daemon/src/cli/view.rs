@@ -1,4 +1,4 @@
-//! A run as it is seen: a bar on a terminal, lines elsewhere, JSON for programs.
+//! Displays a run: a bar on a terminal, lines elsewhere, JSON for programs.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -8,25 +8,25 @@ use raysweep_proto::{Event, FilmEstimate, Progress, RunState};
 
 use super::show;
 
-/// How often progress is told where it cannot be drawn.
+/// Interval between progress lines where no bar can be drawn.
 const PACE: Duration = Duration::from_secs(5);
 
 const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} points  {msg}";
 
-/// How a run's events are shown.
+/// Displays a run's events.
 pub(super) struct View {
     place: Place,
-    /// Points that the newest live estimate is made from.
+    /// Points in the newest live estimate.
     live: Option<usize>,
 }
 
-/// Where they are shown.
+/// Where the events are displayed.
 enum Place {
-    /// Drawn on standard error.
+    /// A progress bar on standard error.
     Bar(ProgressBar),
-    /// Told on standard error, at times.
+    /// Occasional lines on standard error.
     Lines {
-        /// When progress was last told.
+        /// When progress was last printed.
         told: Option<Instant>,
     },
     /// Each event as a line on standard output.
@@ -34,18 +34,18 @@ enum Place {
 }
 
 impl View {
-    /// The view that suits where we print.
+    /// The view that suits our output.
     pub fn new(json: bool) -> Self {
         Self { place: Place::new(json), live: None }
     }
 
-    /// Shows an event; what a run came to goes to standard output, all else to standard error.
+    /// Displays an event; the result of a run goes to standard output, everything else to standard error.
     pub fn show(&mut self, event: &Event) -> io::Result<()> {
         if let Place::Json = self.place {
             return writeln!(io::stdout(), "{}", serde_json::to_string(event)?);
         }
         match event {
-            // How the run has ended is told in a moment.
+            // The result of the run is displayed in a moment.
             Event::State { state: RunState::Idle | RunState::Faulted, .. } => {}
             Event::State { state, .. } => self.state(*state),
             Event::Progress(progress) => self.progress(progress),
@@ -93,7 +93,7 @@ impl View {
         Ok(())
     }
 
-    /// Says something beside the run's events.
+    /// Displays a note besides the run's events.
     pub fn note(&mut self, text: &str) {
         match &self.place {
             Place::Bar(bar) => bar.suspend(|| eprintln!("{text}")),
@@ -109,7 +109,7 @@ impl View {
     }
 
     fn film(&mut self, estimate: &FilmEstimate) {
-        // Lines would be too many; how the film goes stands in the bar and in `raysweep status`.
+        // Too many for lines; the film's progress is shown in the bar and by `raysweep status`.
         if let Place::Bar(bar) = &self.place {
             bar.set_message(show::film(&estimate.film));
         }

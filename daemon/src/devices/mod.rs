@@ -1,4 +1,4 @@
-//! The threads that own devices while a run goes on.
+//! The threads that own the devices during a run.
 
 pub mod camera;
 pub mod dots;

@@ -1,4 +1,5 @@
-//! The operator of a projector that no driver reaches: its driver's questions hold the run, `continue` answers them.
+//! The operator of a projector without a driver: the projector's questions pause the run, and `continue` answers
+//! them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,17 +13,17 @@ use raysweep_proto::Event;
 use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
 
-/// The thread that puts the projector's questions to the operator. It ends with the projector.
+/// The thread that passes the projector's questions to the operator. It ends with the projector.
 pub struct Operator {
     dismissed: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Operator {
-    /// Puts `questions` to the operator of a run.
+    /// Starts passing `questions` to the operator of a run.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the thread cannot be started.
     pub fn start(
         questions: Receiver<Request>,
         orders: Arc<Orders>,
@@ -46,7 +47,7 @@ impl Operator {
         Ok(Self { dismissed, thread: Some(thread) })
     }
 
-    /// From now on the operator is told what to do, and nobody waits until it is done.
+    /// From now on, the operator is only told what to do; nobody waits for it.
     pub fn dismiss(&self) {
         self.dismissed.store(true, Ordering::Relaxed);
     }
@@ -55,16 +56,16 @@ impl Operator {
 impl Drop for Operator {
     fn drop(&mut self) {
         if let Some(thread) = self.thread.take() {
-            // A panic of it has been logged, and refuses what was asked.
+            // A panic has already been logged; the pending request is refused.
             let _ = thread.join();
         }
     }
 }
 
-/// Holds the run until the operator lets it go on.
+/// Pauses the run until the operator continues it.
 fn ask(question: Request, orders: &Orders, board: &StatusBoard) {
     let text = task(&question.wanted);
-    // Who lets a run go on that was held for another reason does not answer this.
+    // The run may be paused for another reason: continuing from that pause does not answer this question.
     orders.wait_while_paused();
     orders.give(Order::Pause);
     if orders.go_on() {
@@ -78,7 +79,7 @@ fn ask(question: Request, orders: &Orders, board: &StatusBoard) {
     }
 }
 
-/// Says what is left to do once the run is over.
+/// Tells the operator what remains to be done after the run.
 fn tell(question: Request, board: &StatusBoard) {
     let text = task(&question.wanted);
     board.publish(Event::Ask { text: format!("{text}: the run is over and does not wait for it") });
@@ -103,7 +104,7 @@ mod tests {
 
     use super::*;
 
-    /// A run under way, and the operator that its projector asks.
+    /// A run in progress, and the operator that its projector asks.
     struct Run {
         board: Arc<StatusBoard>,
         orders: Arc<Orders>,
@@ -111,7 +112,7 @@ mod tests {
     }
 
     impl Drop for Run {
-        /// Lets nobody wait for ever where a test fails.
+        /// Keeps a failed test from waiting forever.
         fn drop(&mut self) {
             self.orders.give(Order::Cancel);
         }
@@ -128,7 +129,7 @@ mod tests {
     }
 
     impl Run {
-        /// What the socket's `continue` does.
+        /// Does what the socket's `continue` does.
         fn go_on(&self) {
             self.board.go(RunState::Running).unwrap();
             self.orders.give(Order::Go);
@@ -151,7 +152,7 @@ mod tests {
         run.orders.give(Order::Pause);
         run.board.go(RunState::Paused).unwrap();
         let shown = thread::spawn(move || projector.show(&Pattern::White));
-        // Long enough for a question, were it not to wait.
+        // Long enough for a question to come up if the operator's thread did not wait.
         thread::sleep(Duration::from_millis(100));
         assert_eq!(run.board.status().question, None, "it is asked once the run goes on");
         run.go_on();
@@ -171,7 +172,7 @@ mod tests {
         run.orders.give(Order::Cancel);
         let (shown, mut projector) = shown.join().unwrap();
         assert!(shown.unwrap_err().to_string().contains("ended before"));
-        // Nobody is asked for more, and told only of the light that is left.
+        // The operator is asked nothing more, and only told about the light that is still on.
         let mut events = run.board.subscribe();
         assert!(projector.show(&Pattern::White).is_err());
         assert!(events.try_recv().is_err());

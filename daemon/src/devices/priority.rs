@@ -1,16 +1,16 @@
-//! Who goes first when the cores are short: devices before the pipeline, the pipeline before solvers.
+//! Thread priorities: devices before the pipeline, the pipeline before solvers.
 
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
     set_thread_priority_and_policy, thread_native_id,
 };
 
-/// SCHED_FIFO priority of threads that serve devices: below those of the kernel's interrupt threads, 50.
+/// SCHED_FIFO priority of device threads: below the kernel's interrupt threads, which have 50.
 const DEVICE: u8 = 40;
-/// Of 0 to 99, where 50 is nice 0: nice 9.
+/// On a scale of 0 to 99, where 50 is nice 0; corresponds to nice 9.
 const COMPUTING: u8 = 25;
 
-/// Has the calling thread, which serves a device and mostly sleeps, run as soon as it wakes: SCHED_FIFO, where the unit
+/// Lets the calling thread, which serves a device and mostly sleeps, run as soon as it wakes: SCHED_FIFO, if the unit
 /// or the user's limits allow it (`LimitRTPRIO`).
 pub fn for_device(device: &str) {
     let priority = ThreadPriorityValue::try_from(DEVICE).map(ThreadPriority::Crossplatform);
@@ -25,7 +25,7 @@ pub fn for_device(device: &str) {
     }
 }
 
-/// Has the calling thread, which computes for long, give way to those that capture.
+/// Makes the calling thread, which computes for a long time, yield to the threads that capture.
 pub fn for_computing() {
     let priority = ThreadPriorityValue::try_from(COMPUTING).map(ThreadPriority::Crossplatform);
     let set = priority.map(thread_priority::set_current_thread_priority);

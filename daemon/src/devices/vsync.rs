@@ -1,4 +1,4 @@
-//! The VSYNC watcher's thread: hands edges on and shows once a second what the line is like.
+//! The VSYNC watcher's thread: forwards edges and publishes the state of the line once a second.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,13 +15,13 @@ use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
 
 const POLL: Duration = Duration::from_millis(100);
-/// How often the line is shown.
+/// Interval between published states of the line.
 const SHOWN_EVERY: Duration = Duration::from_secs(1);
 
-/// The watcher's thread as the run sees it.
+/// Handle of the watcher's thread.
 pub struct VsyncThread {
     stop: Arc<AtomicBool>,
-    /// Whether the watcher's device is being opened again.
+    /// Whether the watcher's device is being reopened.
     is_lost: Arc<AtomicBool>,
     thread: Option<JoinHandle<Result<(), DeviceError>>>,
 }
@@ -30,13 +30,13 @@ impl Drop for VsyncThread {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         if let Some(thread) = self.thread.take() {
-            // Whoever wants to know how it ended has joined it.
+            // The result is only needed by callers of `join`.
             let _ = thread.join();
         }
     }
 }
 
-/// Ends the run unless it is told that the watcher ended as it should: also where the watcher panics.
+/// Ends the run, even if the watcher panics, unless it is told that the watcher ended normally.
 struct Alarm {
     orders: Arc<Orders>,
     armed: bool,
@@ -50,8 +50,8 @@ impl Drop for Alarm {
     }
 }
 
-/// The line while it is watched. Its tracker knows nothing of the assembler's, which sees the same edges when it gets to
-/// them: what is shown must not wait for frames.
+/// The state of the line while it is watched. Its tracker is independent of the assembler's, which sees the same
+/// edges later: the published state must not wait for frames.
 struct Meter {
     tracker: EdgeTracker,
     board: Arc<StatusBoard>,
@@ -73,10 +73,10 @@ impl Meter {
 }
 
 impl VsyncThread {
-    /// Starts to watch.
+    /// Starts watching.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the thread cannot be started.
     pub fn start(
         mut vsync: Box<dyn Vsync>,
         line: Line,
@@ -119,7 +119,8 @@ impl VsyncThread {
         Ok(Self { stop, is_lost, thread: Some(thread) })
     }
 
-    /// Waits while the watcher's device is being opened again, unless the run ends. One that stays away ends it.
+    /// Waits while the watcher's device is being reopened, unless the run ends. If the device does not come back, the
+    /// run ends.
     pub fn await_watcher(&self, orders: &Orders) {
         while self.is_lost.load(Ordering::Relaxed) && orders.go_on() {
             thread::sleep(POLL);
@@ -129,7 +130,7 @@ impl VsyncThread {
     /// Ends the thread.
     ///
     /// # Errors
-    /// What the watcher failed with, if it did.
+    /// The watcher's error, if it failed.
     pub fn join(mut self) -> Result<(), DeviceError> {
         self.stop.store(true, Ordering::Relaxed);
         let Some(thread) = self.thread.take() else { return Ok(()) };

@@ -1,4 +1,4 @@
-//! The running estimate: a thread that solves what is there so far while the sweep goes on.
+//! The running estimate: a thread that solves the data so far while the sweep continues.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -16,23 +16,23 @@ use super::{EPIPOLAR, INDIRECT, LiveError, LiveFile, TOTAL};
 use crate::devices::priority;
 use crate::run::board::StatusBoard;
 
-/// Between two estimates, at least: no display or subscriber wants more.
+/// Minimum pause between two estimates: no display or subscriber needs more.
 const REST: Duration = Duration::from_millis(100);
 
-/// Where the estimates of a run are shown.
+/// Where the estimates of a run are published.
 #[derive(Clone)]
 pub struct Outlet {
     /// The file that clients map.
     pub file: Arc<LiveFile>,
-    /// Who tells subscribers.
+    /// The board that notifies subscribers.
     pub board: Arc<StatusBoard>,
-    /// The session's folder, as the metadata name it.
+    /// The session's folder, as named in the metadata.
     pub session: String,
 }
 
 impl Outlet {
-    /// Shows a transport that was estimated from `points` of the sweep within `took`; `last` says that it is the
-    /// sweep's result.
+    /// Publishes a transport that was estimated from `points` of the sweep within `took`; `last` marks the sweep's
+    /// final result.
     ///
     /// # Errors
     /// Those of [`LiveFile::publish`].
@@ -48,7 +48,7 @@ impl Outlet {
         self.show_images([&epipolar, &indirect, &total], points, took, last)
     }
 
-    /// [`Self::show`] of the transport's epipolar light, all other light, and both.
+    /// Like [`Self::show`], given the transport's epipolar light, all other light, and both.
     ///
     /// # Errors
     /// Those of [`LiveFile::publish`].
@@ -79,14 +79,14 @@ impl Outlet {
     }
 }
 
-/// The thread `live`. It takes the newest snapshot, solves it on one thread of its own and rests as long as that took,
-/// so that it never has more than half a processor. Dropping this ends it within the time of a camera row.
+/// The thread `live`. It takes the newest snapshot, solves it on a single thread, and then rests for as long as that
+/// took, so that it uses at most half a processor. Dropping this ends the thread within the time of one camera row.
 pub struct LiveEstimate {
     inbox: Arc<Inbox>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// The newest snapshot; what it replaces is dropped.
+/// Holds the newest snapshot; older ones are dropped.
 #[derive(Default)]
 struct Inbox {
     content: Mutex<Content>,
@@ -103,7 +103,7 @@ impl LiveEstimate {
     /// Starts the thread.
     ///
     /// # Errors
-    /// What the system said, where it gives no thread.
+    /// The system's error, if the thread cannot be started.
     pub fn start(outlet: Outlet) -> Result<Self, Box<dyn std::error::Error + Send + Sync>> {
         let pool = ThreadPoolBuilder::new()
             .num_threads(1)
@@ -118,9 +118,9 @@ impl LiveEstimate {
         Ok(Self { inbox, thread: Some(thread) })
     }
 
-    /// Hands over what there is now, in place of a snapshot that was not begun. Never waits for the estimate.
+    /// Hands over a snapshot, replacing one that was not started. Never waits for the estimate.
     pub fn offer(&self, snapshot: Box<dyn Snapshot>) {
-        // The one before is dropped after the lock is released.
+        // The previous snapshot is dropped after the lock is released.
         let _before = self.inbox.lock().snapshot.replace(snapshot);
         self.inbox.changed.notify_one();
     }
@@ -141,13 +141,13 @@ impl Inbox {
         self.content.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits until the end or for so long; whether it is not the end.
+    /// Waits for `pause` or until the end; returns false at the end.
     fn rest(&self, pause: Duration) -> bool {
         let rested = self.changed.wait_timeout_while(self.lock(), pause, |content| !content.ended);
         !rested.unwrap_or_else(PoisonError::into_inner).0.ended
     }
 
-    /// Waits for a snapshot; nothing at the end.
+    /// Waits for a snapshot; `None` at the end.
     fn next(&self) -> Option<Box<dyn Snapshot>> {
         let waiting = |content: &mut Content| content.snapshot.is_none() && !content.ended;
         let mut content =
@@ -204,7 +204,7 @@ mod tests {
         }
     }
 
-    /// An estimate that tells when it begins and ends when it may.
+    /// An estimate that signals its start and waits for permission to end.
     struct Scripted {
         points: usize,
         begun: Sender<usize>,

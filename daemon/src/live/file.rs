@@ -1,4 +1,4 @@
-//! The writer of the live file. [`raysweep_proto::live`] has its layout.
+//! Writes the live file. Its layout is in [`raysweep_proto::live`].
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Read};
@@ -18,20 +18,20 @@ use super::LiveError;
 
 /// Owner may write, group may read.
 const MODE: u32 = 0o640;
-/// Slots of the file: so many names less one may be in it at once.
+/// Slots of the file: it can hold one name less than this at once.
 const SLOTS: usize = 8;
-/// Pixels of a slot; larger images are reduced.
+/// Pixels per slot; larger images are downsampled.
 const SLOT_PIXELS: usize = 1 << 20;
-/// Where slots start, a page, so that they can be mapped one by one.
+/// Offset of the first slot: one page, so that slots can be mapped one by one.
 const FIRST_SLOT: u64 = 4096;
 
-/// A file of fixed size with the newest images by name. Written with plain positioned writes: in the page cache they
-/// are seen at once by whoever reads or maps the file. Removed when dropped.
+/// A file of fixed size with the newest image of each name. Written with plain positioned writes: in the page cache,
+/// readers and mappings see them at once. Removed when dropped.
 pub struct LiveFile {
     path: PathBuf,
     file: File,
     slot_pixels: usize,
-    /// Held while an image is copied into the page cache: its publishers are worker threads, never a device's.
+    /// Held while an image is copied into the page cache: only worker threads publish, never device threads.
     slots: Mutex<Slots>,
 }
 
@@ -39,9 +39,9 @@ pub struct LiveFile {
 struct Slots {
     /// Images published so far.
     sequence: u64,
-    /// What each slot holds: its lock, the image's sequence (0: none) and name.
+    /// Contents of each slot: lock value, sequence number of the image (0: none), and name.
     held: [Held; SLOTS],
-    /// Metadata and pixels on their way to the file.
+    /// Buffer for the metadata and pixels to write.
     bytes: Vec<u8>,
 }
 
@@ -53,8 +53,8 @@ struct Held {
 }
 
 impl Slots {
-    /// The slot to write next: the oldest that is not the newest of its name, so that a reader of any name has the time
-    /// of a whole image; with more names than slots, the oldest of all.
+    /// The slot to write next: the oldest that is not the newest of its name, so that readers of any name have the
+    /// time of a whole image; with more names than slots, the oldest of all.
     fn next(&self) -> usize {
         let newest_of_its_name = |held: &Held| {
             held.sequence > 0
@@ -67,10 +67,10 @@ impl Slots {
 }
 
 impl LiveFile {
-    /// Makes the file, readable for the owner's group. One that a dead daemon left is replaced.
+    /// Creates the file, readable for the owner's group. A file left by a dead daemon is replaced.
     ///
     /// # Errors
-    /// [`LiveError::Taken`], [`LiveError::NotLive`] where something else has this name, [`LiveError::Io`].
+    /// [`LiveError::Taken`], [`LiveError::NotLive`] if something else has this name, [`LiveError::Io`].
     pub fn create(path: &Path) -> Result<Self, LiveError> {
         Self::with_slots_of(SLOT_PIXELS, path)
     }
@@ -86,7 +86,7 @@ impl LiveFile {
             .open(path)
             .map_err(failed())?;
         let live = Self { path: path.to_owned(), file, slot_pixels, slots: Mutex::new(Slots::default()) };
-        // The lock tells the next daemon that this one lives; the mode must not hang on the umask.
+        // The lock shows the next daemon that this one is alive; the mode must not depend on the umask.
         live.file.try_lock().map_err(|error| failed()(error.into()))?;
         live.file.set_permissions(fs::Permissions::from_mode(MODE)).map_err(failed())?;
         live.file.set_len(live.offset_of(SLOTS)).map_err(failed())?;
@@ -100,7 +100,7 @@ impl LiveFile {
         Ok(live)
     }
 
-    /// Where it is.
+    /// Path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -113,12 +113,12 @@ impl LiveFile {
         FIRST_SLOT + slot as u64 * self.slot_bytes()
     }
 
-    /// Shows an image of one to four axes, the last two of which are rows and columns, under a name; returns its
-    /// sequence number. Never waits for readers. One that is too large for a slot is averaged over blocks of its rows
-    /// and columns; the metadata then have `reduced_by`, the blocks' side in pixels.
+    /// Publishes an image of one to four axes, the last two of which are rows and columns, under a name; returns its
+    /// sequence number. Never waits for readers. An image that is too large for a slot is averaged over blocks of
+    /// rows and columns; the metadata then have `reduced_by`, the side of the blocks in pixels.
     ///
     /// # Errors
-    /// [`LiveError::Refused`] for a name, metadata or a shape that the file has no room for; [`LiveError::Io`].
+    /// [`LiveError::Refused`] for a name, metadata or shape that does not fit into the file; [`LiveError::Io`].
     pub fn publish(
         &self,
         name: &str,
@@ -172,7 +172,7 @@ impl LiveFile {
         Ok(sequence)
     }
 
-    /// Takes all images away: they are those of another run.
+    /// Removes all images, which belong to an earlier run.
     ///
     /// # Errors
     /// [`LiveError::Io`].
@@ -188,7 +188,7 @@ impl LiveFile {
         Ok(())
     }
 
-    /// The order is what readers rely on: lock odd, everything, lock even.
+    /// Readers rely on this order: lock odd, contents, lock even.
     fn write_slot(&self, index: usize, header: &[u8; SLOT_HEADER_BYTES], bytes: &[u8]) -> io::Result<()> {
         let at = self.offset_of(index);
         let (even, rest) = header.split_at(8);
@@ -209,7 +209,7 @@ impl Drop for LiveFile {
     }
 }
 
-/// Removes the file of a daemon that lives no more.
+/// Removes the file of a dead daemon.
 fn remove_stale(path: &Path) -> Result<(), LiveError> {
     let failed = || LiveError::io("replace", path);
     match fs::symlink_metadata(path) {
@@ -264,7 +264,7 @@ fn header(
     header
 }
 
-/// The side of the blocks that an image must be averaged over to have so many pixels.
+/// The side of the blocks that an image must be averaged over to have at most `pixels` pixels.
 fn reduction(shape: &[usize], pixels: usize) -> usize {
     let (planes, image) = shape.split_at(shape.len().saturating_sub(2));
     let len = |side: usize| {
@@ -287,7 +287,7 @@ fn averaged(image: ArrayViewD<f32>, side: usize) -> ArrayD<f32> {
     if last == 0 { narrow } else { along(narrow.view(), Axis(last - 1)) }
 }
 
-/// `CLOCK_MONOTONIC`, which the stamps of frames are on; 0 if the system has none.
+/// `CLOCK_MONOTONIC`, the clock of the frames' timestamps; 0 if the system has none.
 fn host_ns() -> i64 {
     clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(0, |now| now.tv_sec() * 1_000_000_000 + now.tv_nsec())
 }

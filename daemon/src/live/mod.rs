@@ -1,6 +1,7 @@
 //! The live view: a running estimate of the transport, in a file that clients map.
 //!
-//! Nothing here is part of the measurement: what is slow or fails costs pictures, never a frame or a bit of the results.
+//! Nothing here is part of the measurement: slowness or failure costs live images, never a frame or a bit of the
+//! results.
 
 mod estimate;
 mod file;
@@ -13,41 +14,41 @@ pub(crate) use estimate::{LiveEstimate, Outlet};
 pub use file::LiveFile;
 pub use reader::{LiveImage, LiveReader};
 
-/// Names of the images that a sweep's estimate is shown by.
+/// Name of the image of a sweep's epipolar light.
 pub const EPIPOLAR: &str = "epipolar";
-/// Light from all other rows.
+/// Name of the image of the light from all other rows.
 pub const INDIRECT: &str = "indirect";
-/// All light.
+/// Name of the image of all light.
 pub const TOTAL: &str = "total";
 
-/// Name of the image that a flying dot's newest batch is shown by.
+/// Name of the image of a flying dot's newest batch.
 pub const FLOODLIT: &str = "floodlit";
 
 /// Why there are no live images.
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
-    /// The system refused to make it.
+    /// The file cannot be created.
     #[error("cannot make {}: {source}; its folder must exist and be writable, or choose another --live", path.display())]
     Make {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The system refused.
+    /// An operation on the file failed.
     #[error("cannot {what} {}: {source}", path.display())]
     Io {
-        /// What was tried.
+        /// The operation.
         what: &'static str,
-        /// With which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// Another daemon writes there.
+    /// Another daemon writes the file.
     #[error("another raysweepd writes {}: stop it, or choose another --live", .0.display())]
     Taken(PathBuf),
-    /// Something else is there.
+    /// The path exists, but is not a live file.
     #[error("{} is no live file: {why}", path.display())]
     NotLive {
         /// The file.
@@ -55,15 +56,15 @@ pub enum LiveError {
         /// What is wrong with it.
         why: String,
     },
-    /// An image that has no place in the file.
+    /// An image that does not fit into the file.
     #[error("live image {name:?}: {why}")]
     Refused {
-        /// Its name.
+        /// Name of the image.
         name: String,
-        /// What is wrong, what is allowed.
+        /// What is wrong and what is allowed.
         why: String,
     },
-    /// The writer was always ahead.
+    /// The writer overwrote the image during every attempt to read it.
     #[error("{} was written too often to be read: try again", .0.display())]
     Outrun(PathBuf),
 }

@@ -1,4 +1,4 @@
-//! A reader of the live file, as a client of any language may write it.
+//! Reads the live file; clients in other languages can be written in the same way.
 
 use std::fs::File;
 use std::os::unix::fs::FileExt;
@@ -12,19 +12,19 @@ use serde_json::{Map, Value};
 
 use super::LiveError;
 
-/// Attempts at an image that is overwritten while it is read.
+/// Attempts at reading an image that is being overwritten.
 const ATTEMPTS: usize = 100;
 
-/// An image as it was published.
+/// A published image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LiveImage {
-    /// Counts the images of the file.
+    /// Sequence number among all images of the file.
     pub sequence: u64,
     /// When it was written, on `CLOCK_MONOTONIC`.
     pub host_ns: i64,
     /// Its pixels, usually `[t, s]`.
     pub image: ArrayD<f32>,
-    /// What its publisher said of it.
+    /// Metadata from its publisher.
     pub metadata: Map<String, Value>,
 }
 
@@ -44,7 +44,7 @@ impl LiveReader {
     /// Opens a live file.
     ///
     /// # Errors
-    /// [`LiveError::Io`] where there is none, [`LiveError::NotLive`] where it has another layout.
+    /// [`LiveError::Io`] if the file cannot be read, [`LiveError::NotLive`] if it has another layout.
     pub fn open(path: &Path) -> Result<Self, LiveError> {
         let file = File::open(path).map_err(LiveError::io("open", path))?;
         let mut header = [0; HEADER_BYTES];
@@ -65,7 +65,7 @@ impl LiveReader {
     /// The newest image of a name, if there is one.
     ///
     /// # Errors
-    /// [`LiveError::Io`], [`LiveError::NotLive`], and [`LiveError::Outrun`] where it was overwritten again and again.
+    /// [`LiveError::Io`], [`LiveError::NotLive`], and [`LiveError::Outrun`] if it was overwritten in every attempt.
     pub fn newest(&self, name: &str) -> Result<Option<LiveImage>, LiveError> {
         for _ in 0..ATTEMPTS {
             let mut newest: Option<(u64, Header)> = None;
@@ -96,7 +96,7 @@ impl LiveReader {
         Ok(header)
     }
 
-    /// The image behind a header, unless its checksum says that it is another.
+    /// The image that belongs to a header; `None` if its checksum does not match.
     fn image(&self, at: u64, header: &Header) -> Result<Option<LiveImage>, LiveError> {
         let not_live = |why: &str| LiveError::NotLive { path: self.path.clone(), why: why.into() };
         let read = |from: u64, bytes: usize| {

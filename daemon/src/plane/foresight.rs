@@ -1,28 +1,28 @@
-//! What a plan would do on a plane rig, as far as it does not depend on the procedure.
+//! Predicts a plan's run on a plane rig, as far as that is independent of the procedure.
 
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
 use raysweep_pipeline::{DemuxFold, Point};
 use raysweep_processing::plane::PlaneTask;
 
-/// Condition number from which on noise is amplified more than the prior can hold.
+/// Condition number from which on noise is amplified more than the prior can compensate.
 const ILL_CONDITIONED: f64 = 1e9;
 
-/// The model that a task's points make on its rig.
+/// The model that a task's points give on its rig.
 pub struct Model {
-    /// First and last relative row that light is told apart from.
+    /// First and last relative row whose light can be distinguished.
     pub reach_rows: (i32, i32),
-    /// Of the system that is solved for a pixel in the middle of the frame.
+    /// Condition number of the system that is solved for a pixel in the middle of the frame.
     pub condition: f64,
-    /// VSYNC periods that a frame of each point takes.
+    /// VSYNC periods per frame, for each point.
     pub periods: Vec<u64>,
 }
 
 impl Model {
-    /// The model of a task whose plan has its points in this table.
+    /// The model of a task whose points are in this table of the plan.
     ///
     /// # Errors
-    /// When the points make no model on this rig, or ask what the camera cannot do.
+    /// When the points give no model on this rig, or exceed what the camera can do.
     pub fn of(task: &PlaneTask, camera: &CameraCapabilities, table: &str) -> Result<Self, ConfigError> {
         let no_model = |message: String| task.refuse(&[table], message);
         let geometry = &task.geometry;
@@ -41,13 +41,13 @@ impl Model {
         Ok(Self { reach_rows: (*reach.start(), *reach.end()), condition: condition.min(f64::MAX), periods })
     }
 
-    /// How many relative rows light is told apart from.
+    /// Number of relative rows whose light can be distinguished.
     pub fn reach(&self) -> u64 {
         let (first, last) = self.reach_rows;
         (first..=last).count() as u64
     }
 
-    /// What an operator should know of it.
+    /// Warnings for the operator.
     pub fn warnings(&self, task: &PlaneTask) -> Vec<String> {
         let (geometry, condition) = (&task.geometry, self.condition);
         let mut warnings = Vec::new();
@@ -72,7 +72,7 @@ impl Model {
     }
 }
 
-/// VSYNC periods that each frame of a point takes.
+/// VSYNC periods per frame of a point.
 pub fn periods(task: &PlaneTask, camera: &CameraCapabilities, point: &Point) -> u64 {
     let shot = task.geometry.shot(point, camera.trigger_latency_us);
     u64::from(camera.periods_per_frame(&shot.settings, task.geometry.raster.period_us))

@@ -1,5 +1,5 @@
-//! The acquisition of points on the plane rig, which sweeps and films share: devices opened, passes made until nothing is
-//! missing, everything closed again.
+//! Acquisition of points on the plane rig, which sweeps and films share: opens the devices, makes passes until
+//! nothing is missing, and closes everything again.
 
 pub mod foresight;
 mod sink;
@@ -29,22 +29,23 @@ use crate::run::error::RunError;
 use crate::run::life::Run;
 use crate::run::orders::Orders;
 
-/// So many passes in a row that bring no point end a run.
+/// This many consecutive passes without any point end a run.
 const FRUITLESS_PASSES: u32 = 8;
-/// The rest after the first of them, twice as long after each: together twelve seconds, in which a disturbance may pass.
+/// The rest after the first of these passes; it doubles each time, to twelve seconds in all, in which a disturbance
+/// may pass.
 const FIRST_REST: Duration = Duration::from_millis(100);
-/// Events that may wait for the assembler.
+/// Capacity of the assembler's event queue.
 const QUEUE_EVENTS: usize = 64;
 
 /// Turns the light off when it goes out of scope, on every way out.
 struct Lit {
     projector: Box<dyn Projector>,
-    /// Who works the projector, if it is a person; ends after it.
+    /// The operator thread, if a person operates the projector; it outlives the projector.
     operator: Option<Operator>,
 }
 
 impl Lit {
-    /// Shows a pattern, or nothing; `None` where the run was ended while its operator was to do it.
+    /// Shows a pattern, or nothing; `None` if the run was ended while waiting for the operator.
     fn show(&mut self, pattern: Option<&Pattern>, orders: &Orders) -> Result<Option<Shown>, DeviceError> {
         let shown = match pattern {
             Some(pattern) => self.projector.show(pattern),
@@ -64,7 +65,7 @@ impl Drop for Lit {
         }
         match self.projector.blank() {
             Ok(_) => {}
-            // As with every run: the operator has been told.
+            // As after every run: the operator has been told.
             Err(error) if self.operator.is_some() => tracing::warn!(%error, "projector not known to be dark"),
             Err(error) => tracing::error!(%error, "projector not blanked"),
         }
@@ -81,19 +82,19 @@ pub struct Opened {
     assembler: AssemblerConfig,
     orders: Arc<Orders>,
     board: Arc<StatusBoard>,
-    /// Who sets the pace.
+    /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
 }
 
-/// What acquisition leaves behind.
+/// Result of acquisition.
 pub struct Taken<S> {
-    /// The pipeline's sink, which has taken everything.
+    /// The pipeline's sink, which has received everything.
     pub sink: S,
     /// When the frames that points waited for were exposed.
     pub exposures: Exposures,
-    /// How late settings take effect, as a probe has found.
+    /// The settings latency that a probe measured.
     pub latency: Option<SettingsLatency>,
-    /// Why acquisition ended early, if a device did it.
+    /// The device error that ended acquisition early, if any.
     pub fault: Option<RunError>,
 }
 
@@ -101,7 +102,7 @@ impl Opened {
     /// Opens all devices.
     ///
     /// # Errors
-    /// The first that does not open; a camera of another size than the task's.
+    /// The first device that cannot be opened; a camera whose size differs from the task's.
     pub fn open(rig: &Rig, task: &Arc<PlaneTask>, run: &Run) -> Result<Self, RunError> {
         let Devices { camera, vsync, projector, questions, clock, pace } = rig.open()?;
         let operator = questions
@@ -125,13 +126,13 @@ impl Opened {
         Ok(Self { task, camera, vsync, projector, clock, assembler, orders, board, pace })
     }
 
-    /// What the camera can do.
+    /// Capabilities of the camera.
     pub fn camera(&self) -> &CameraCapabilities {
         &self.assembler.camera
     }
 
-    /// Runs the threads of devices and pipeline while `points` makes passes. Units go through `stages` into `sink`, of
-    /// which so many are under way at a time; `results` is the other end of the sink's verdicts.
+    /// Runs the threads of devices and pipeline while `points` makes passes. Units go through `stages` into `sink`,
+    /// at most the given number of them at a time; `results` is the other end of the sink's verdicts.
     ///
     /// # Errors
     /// When a thread cannot be started, or the pipeline fails.
@@ -182,7 +183,7 @@ impl Opened {
         let imaged = camera.join();
         let watched = vsync.join();
         let sink = pipeline.join()?;
-        // What failed first is the cause; what it brought down comes after.
+        // The first failure is the cause; the others are consequences.
         let (exposures, imaged) = match imaged {
             Ok(exposures) => (exposures, Ok(())),
             Err(error) => (Exposures::default(), Err(error)),
@@ -192,7 +193,7 @@ impl Opened {
     }
 }
 
-/// The line that triggers the camera through a task's settings. Dark points have a pass of their own.
+/// The line that triggers the camera through a task's settings. Dark points have their own pass.
 fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> Line {
     let points = &task.schedule.points;
     let is_lit = |point: &&Point| !matches!(point.role, Role::Dark(_));
@@ -205,7 +206,7 @@ fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> Line {
     Line::new(task.geometry.raster.period_us, task.max_jitter_us, &settings)
 }
 
-/// Those of a task's points that the ledger does not know as stored, with the number of their next attempt.
+/// The points of a task that the ledger does not list as stored, with the number of their next attempt.
 pub fn missing(task: &PlaneTask, state: &State) -> Vec<SettingsId> {
     (0..)
         .zip(&task.schedule.points)
@@ -217,7 +218,7 @@ pub fn missing(task: &PlaneTask, state: &State) -> Vec<SettingsId> {
         .collect()
 }
 
-/// Passes over the points, while the devices' threads run.
+/// Makes passes over the points while the devices' threads run.
 pub struct Passes<'a> {
     task: &'a PlaneTask,
     camera: &'a CameraThread,
@@ -230,7 +231,7 @@ pub struct Passes<'a> {
 }
 
 impl Passes<'_> {
-    /// Finds out how late settings take effect, where there are several.
+    /// Measures the settings latency, if the task has several settings.
     fn probe(&self) -> Result<(), RunError> {
         let mut settings = self.task.settings().map(|(_, point)| *point);
         let Some(first) = settings.next().filter(|_| settings.next().is_some() && self.orders.go_on()) else {
@@ -242,10 +243,10 @@ impl Passes<'_> {
         Ok(probed?)
     }
 
-    /// Acquires points until none of them is missing, or the run is told to end.
+    /// Acquires points until none is missing or the run is told to end.
     ///
     /// # Errors
-    /// When a device fails, or points fail again and again.
+    /// When a device fails, or points fail repeatedly.
     pub fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
         let mut todo: Vec<Attempt> = missing.into_iter().map(|id| self.attempt(id)).collect();
         let mut fruitless = 0;
@@ -276,7 +277,7 @@ impl Passes<'_> {
             if fruitless > 0 && self.pace == Pace::Devices {
                 self.orders.rest(FIRST_REST * (1 << (fruitless - 1)));
             }
-            // As long as nobody watches the line, no point has a chance.
+            // No point can succeed while the line is not watched.
             self.vsync.await_watcher(self.orders);
         }
     }
@@ -287,7 +288,7 @@ impl Passes<'_> {
         Attempt { id, point, shot, interruptions: 0 }
     }
 
-    /// Has the camera take a film under white light.
+    /// Takes a film with the camera, under white light.
     ///
     /// # Errors
     /// When a device fails.
@@ -300,12 +301,12 @@ impl Passes<'_> {
         Ok(acquired?)
     }
 
-    /// Whether the run goes on.
+    /// Whether the run continues.
     pub fn go_on(&self) -> bool {
         self.orders.go_on()
     }
 
-    /// Makes attempts under one picture; returns those to make next, and adds up what became of their frames.
+    /// Makes attempts with one projected image; returns the next attempts, and adds up the frame counts.
     fn pass(
         &self,
         attempts: Vec<Attempt>,
@@ -315,7 +316,7 @@ impl Passes<'_> {
         let pass = Pass { attempts: attempts.clone(), not_before_ns: shown.not_before_ns };
         let acquired = self.camera.acquire(Work::Pass(pass)).map_err(|Gone| RunError::Interrupted)?;
         let mut again = Vec::new();
-        // The sink closes the channel when it ends, so this waits for nothing that cannot come.
+        // The sink closes the channel when it ends, so this cannot wait forever.
         for verdict in self.results {
             match verdict {
                 Verdict::Failed(id, failure, of_attempt) => {

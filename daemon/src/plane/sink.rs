@@ -1,4 +1,4 @@
-//! The pipeline's sink: data first, then the ledger's line, then the folds.
+//! The pipeline's sink: data first, then the ledger entry, then the folds.
 
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
@@ -15,7 +15,7 @@ use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
 use crate::run::progress::ProgressMeter;
 
-/// What the run is told of its points, in order.
+/// What the run is told about its points, in order.
 #[derive(Debug)]
 pub enum Verdict {
     /// An attempt failed, or its data could not be stored.
@@ -30,15 +30,15 @@ pub struct PointSink {
     pub stack: Stack,
     pub ledger: Ledger,
     pub processing: Processing,
-    /// Until the pipeline has ended.
+    /// `None` once the pipeline has ended.
     pub verdicts: Option<Sender<Verdict>>,
     pub orders: Arc<Orders>,
     pub board: Arc<StatusBoard>,
     pub progress: ProgressMeter,
     pub vsync: Option<VsyncStats>,
-    /// Until the pipeline has ended: then the machine is for the results.
+    /// `None` once the pipeline has ended: then the processor is needed for the results.
     pub live: Option<LiveEstimate>,
-    /// The first failure to write, which ends the run.
+    /// The first write error, which ends the run.
     pub write_error: Option<raysweep_session::Error>,
 }
 
@@ -139,7 +139,7 @@ impl PointSink {
         self.append(&Entry::StageFailed { array, index, attempt: unit.id.attempt, error: error.to_string() });
     }
 
-    /// Appends what no data hangs on: a failure ends the run, but there is nothing to take back.
+    /// Appends an entry that no stored data depend on: a failure ends the run, but nothing must be undone.
     pub fn append(&mut self, entry: &Entry) {
         if let Err(error) = self.ledger.append(entry) {
             tracing::error!(%error, "ledger not written");

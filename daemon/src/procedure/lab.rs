@@ -1,4 +1,4 @@
-//! Where plans are run: a rig, its camera, and the room there is for sessions.
+//! The environment of a plan: a rig, its camera, and the free space for sessions.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -11,17 +11,17 @@ use raysweep_session::durable;
 
 use crate::rig::{DotRig, Rig};
 
-/// Where a plan is to be run.
+/// The environment in which a plan is to be run.
 pub struct Lab<'a> {
     /// The rig.
     pub rig: &'a LabRig,
-    /// Its camera, as it was when the daemon began.
+    /// Its camera's capabilities when the daemon started.
     pub camera: &'a CameraCapabilities,
-    /// Where sessions are kept.
+    /// Folder of the sessions.
     pub data: &'a Path,
-    /// Stages by their names.
+    /// Stages by name.
     pub registry: &'a Arc<Registry>,
-    /// Results that would take more memory are made some camera rows at a time; none: more than is free.
+    /// Memory limit; results that need more are made in strips of camera rows. `None`: the memory that is free.
     pub memory_limit_bytes: Option<u64>,
 }
 
@@ -45,30 +45,30 @@ impl LabRig {
 }
 
 impl Lab<'_> {
-    /// What results may take.
+    /// Memory that results may use.
     pub fn memory_free_bytes(&self) -> u64 {
         available_bytes(self.memory_limit_bytes)
     }
 
-    /// What is free where sessions are, or will be.
+    /// Free disk space where sessions are, or will be.
     pub fn disk_free_bytes(&self) -> u64 {
         let existing = self.data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
         durable::available_bytes(existing).unwrap_or(u64::MAX)
     }
 
-    /// The rig's camera when it makes this many frames a second.
+    /// Capabilities of the rig's camera at this frame rate.
     pub fn camera_at(&self, rate_hz: f64) -> CameraCapabilities {
         let exposure_us = *self.camera.exposure_us.start()..=1e6 / rate_hz;
         CameraCapabilities { exposure_us, ..self.camera.clone() }
     }
 
-    /// Rows and columns of its frames.
+    /// Rows and columns of the frames.
     pub fn size(&self) -> (usize, usize) {
         (self.camera.height, self.camera.width)
     }
 }
 
-/// What a session and its results take, and what there is.
+/// Disk space and memory that a session and its results need, and what is available.
 pub struct Room {
     pub memory_bytes: u64,
     pub memory_free_bytes: u64,
@@ -77,7 +77,7 @@ pub struct Room {
 }
 
 impl Room {
-    /// Where there is too little.
+    /// Warnings where there is too little.
     pub fn warnings(&self) -> Vec<String> {
         let needs = [
             ("memory", self.memory_bytes, self.memory_free_bytes),
@@ -91,7 +91,7 @@ impl Room {
         short.map(warning).collect()
     }
 
-    /// A report that says this and nothing else yet.
+    /// A report with these figures and nothing else yet.
     pub fn report(&self) -> CheckReport {
         let Self { memory_bytes, memory_free_bytes, disk_bytes, disk_free_bytes } = *self;
         CheckReport {
@@ -105,7 +105,7 @@ impl Room {
             disk_free_bytes,
             reach_rows: None,
             condition: None,
-            // Worked out on request alone: a run must not wait for it.
+            // Computed only on request: a run must not wait for it.
             advice: None,
             film: None,
             batches: None,

@@ -1,5 +1,5 @@
-//! The procedures by which light is measured, one folder each. Nothing here knows more than one of them but
-//! [`foresee`], which picks the plan's.
+//! The measurement procedures, one folder each. Nothing here depends on more than one of them, except [`foresee`],
+//! which chooses the plan's.
 
 mod batches;
 mod darks;
@@ -14,10 +14,10 @@ use raysweep_session::ledger::SessionEntry;
 use self::lab::{Lab, LabRig};
 use crate::run::life::Foreseen;
 
-/// What a plan would do on the lab's rig.
+/// Predicts a plan's run on the lab's rig.
 ///
 /// # Errors
-/// For a plan that cannot be run on it, with the places in the text.
+/// For a plan that cannot be run on it, with the positions in the text.
 pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse(text)?;
     match (lab.rig, plan.procedure.clone()) {
@@ -43,10 +43,10 @@ fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {
     plan.places.error(&["kind"], format!("kind = \"{}\": {what}", plan.procedure.kind()))
 }
 
-/// What is left to do of a session that was begun with this plan.
+/// Predicts the rest of a session that was begun with this plan.
 ///
 /// # Errors
-/// Where nothing of it can be done later; where the plan cannot be run on this rig.
+/// If nothing can be resumed, or the plan cannot be run on this rig.
 pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<Foreseen, Unresumable> {
     let plan = Plan::parse(text)?;
     match (lab.rig, plan.procedure.clone()) {
@@ -76,7 +76,7 @@ pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<F
 /// Why a session cannot be resumed.
 #[derive(Debug, thiserror::Error)]
 pub enum Unresumable {
-    /// What it measured is over.
+    /// The event that it recorded is over.
     #[error("{0}")]
     Past(&'static str),
     /// Its plan cannot be run.

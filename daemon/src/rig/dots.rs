@@ -1,4 +1,4 @@
-//! From the file of a dot rig to its open devices.
+//! Opens the devices of a dot rig according to its rig file.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -19,44 +19,44 @@ use crate::mirror;
 
 /// A dot rig whose devices can be opened, one run at a time.
 pub struct DotRig {
-    /// What its file says.
+    /// Contents of its rig file.
     pub file: DotRigFile,
-    /// The file's text, as sessions keep it.
+    /// The file's text, which sessions store.
     pub text: String,
     sim: Option<Arc<DotsRig>>,
-    /// The file's folder, from which its paths go.
+    /// The file's folder, which its paths are relative to.
     folder: PathBuf,
 }
 
 /// The open devices of a dot rig.
 pub struct DotDevices {
-    /// The camera, one dot a frame.
+    /// The camera, with one dot per frame.
     pub camera: Box<dyn Camera>,
-    /// The mirror and its light; none where frames come from a recording.
+    /// The mirror and its light; `None` if the frames come from a recording.
     pub mirror: Option<Box<dyn Mirror>>,
-    /// Who puts planes and scene before the camera.
+    /// Places planes and scene in front of the camera.
     pub stand: Stand,
-    /// The clock that the camera's stamps are on.
+    /// The clock of the camera's timestamps.
     pub clock: Clock,
-    /// Whether the camera waits for the pipeline or frames come as they come.
+    /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
-    /// What really happens, of a simulated camera: for tests alone.
+    /// Ground truth of a simulated camera, for tests only.
     pub truth: Option<DotsTruth>,
 }
 
-/// Who puts planes and scene before the camera.
+/// Who or what places planes and scene in front of the camera.
 #[derive(Clone)]
 pub enum Stand {
-    /// The simulator, at a word.
+    /// The simulator, immediately.
     Simulated(SubjectSwitch),
     /// An operator: the run must wait for one.
     Operator,
-    /// Nobody: it was done when the frames were recorded, in the plan's order.
+    /// Nobody: the recording contains them in the plan's order.
     Recorded,
 }
 
 impl Stand {
-    /// Puts it there, where that needs nobody; `false` if an operator must do it.
+    /// Places a subject if this needs no person; `false` if an operator must do it.
     ///
     /// # Errors
     /// `OutOfRange` for a plane that the rig does not have.
@@ -70,7 +70,7 @@ impl Stand {
 }
 
 impl DotRig {
-    /// Reads a rig file and builds what can be built before devices are opened.
+    /// Reads a rig file and builds what can be built without opening devices.
     ///
     /// # Errors
     /// With file, line and field.
@@ -103,12 +103,12 @@ impl DotRig {
         Ok(Self { file, text: source.text, sim, folder })
     }
 
-    /// The simulated rig, where its camera is simulated.
+    /// The simulated rig, if the camera is simulated.
     pub fn simulated(&self) -> Option<&DotsRig> {
         self.sim.as_deref()
     }
 
-    /// Who sets the pace of a run.
+    /// Whether the devices or the pipeline set the pace of a run.
     pub fn pace(&self) -> Pace {
         let has_own_mirror =
             self.file.mirror.as_ref().is_some_and(|mirror| mirror.driver != MirrorDriver::Sim);
@@ -122,11 +122,11 @@ impl DotRig {
         if waits { Pace::Pipeline } else { Pace::Devices }
     }
 
-    /// Opens all devices; the mirror's driver keeps its state in the daemon's data folder. A camera that sets its own
-    /// pace makes `frame_rate_hz` frames a second.
+    /// Opens all devices; the mirror's driver stores its state in the daemon's data folder. A camera with an internal
+    /// frame clock runs at `frame_rate_hz` frames per second.
     ///
     /// # Errors
-    /// The first device that does not open.
+    /// The first device that cannot be opened.
     pub fn open(&self, data: &Path, frame_rate_hz: f64) -> Result<DotDevices, RigError> {
         let mirror = self.open_mirror(data)?;
         if let Some(sim) = &self.sim {
@@ -155,10 +155,10 @@ impl DotRig {
         Ok(DotDevices { camera, mirror, stand, clock: Clock::real(), pace: self.pace(), truth: None })
     }
 
-    /// Opens the mirror alone, if it has a driver of its own, which keeps its state in the daemon's data folder.
+    /// Opens only the mirror, if it has its own driver, which stores its state in the daemon's data folder.
     ///
     /// # Errors
-    /// When it does not open.
+    /// When it cannot be opened.
     pub fn open_mirror(&self, data: &Path) -> Result<Option<Box<dyn Mirror>>, RigError> {
         let Some(section) = &self.file.mirror else { return Ok(None) };
         let (state, light) = (mirror::state_file(data), self.light_guard(data));
@@ -183,12 +183,12 @@ impl DotRig {
         }))
     }
 
-    /// Who permits light on this rig.
+    /// The guard that permits light on this rig.
     pub fn light_guard(&self, data: &Path) -> LightGuard {
         mirror::light_guard(data, self.file.mirror.as_ref().and_then(|mirror| mirror.interlock.clone()))
     }
 
-    /// Whether a real mirror moves real light.
+    /// Whether the mirror and its light are real.
     pub fn has_real_mirror(&self) -> bool {
         self.file.mirror.as_ref().is_some_and(|mirror| mirror.driver != MirrorDriver::Sim)
     }

@@ -1,4 +1,4 @@
-//! The factory: from a rig file to open devices.
+//! Opens the devices of a rig according to its rig file.
 
 mod dots;
 mod simulated;
@@ -28,12 +28,12 @@ pub enum RigError {
     /// The file cannot be read.
     #[error("cannot read {}: {source}", path.display())]
     Read {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file is no rig.
+    /// The file is not a valid rig file.
     #[error("{0}")]
     Config(String),
     /// A device cannot be opened.
@@ -62,7 +62,7 @@ impl From<DotRig> for AnyRig {
 }
 
 impl AnyRig {
-    /// Reads a rig file of whatever kind.
+    /// Reads a rig file of either kind.
     ///
     /// # Errors
     /// With file, line and field.
@@ -75,7 +75,7 @@ impl AnyRig {
     }
 }
 
-/// The text of a rig file, and where it is from.
+/// The text of a rig file and its path.
 struct Source<'a> {
     path: &'a Path,
     text: String,
@@ -88,7 +88,7 @@ impl<'a> Source<'a> {
         Ok(Self { path, text })
     }
 
-    /// The folder from which the file's paths go.
+    /// The folder that the file's paths are relative to.
     fn folder(&self) -> &Path {
         self.path.parent().unwrap_or(Path::new("."))
     }
@@ -100,11 +100,11 @@ impl<'a> Source<'a> {
 
 /// A plane rig whose devices can be opened, one run at a time.
 pub struct Rig {
-    /// What its file says.
+    /// Contents of its rig file.
     pub file: RigFile,
-    /// The file's text, as sessions keep it.
+    /// The file's text, which sessions store.
     pub text: String,
-    /// The simulated rig, where any of its devices is simulated.
+    /// The simulated rig, if any device is simulated.
     sim: Option<Arc<PlaneRig>>,
 }
 
@@ -116,25 +116,25 @@ pub struct Devices {
     pub vsync: Box<dyn Vsync>,
     /// The projector.
     pub projector: Box<dyn Projector>,
-    /// What the projector asks of its operator, where one works it.
+    /// The projector's requests to its operator, if a person operates it.
     pub questions: Option<Receiver<Request>>,
-    /// The clock that their stamps are on.
+    /// The clock of their timestamps.
     pub clock: Clock,
-    /// Whether the devices wait for the pipeline (a virtual clock does) or frames come as they come.
+    /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
 }
 
-/// Who sets the pace of a run.
+/// What sets the pace of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pace {
-    /// The devices wait until there is room.
+    /// The pipeline: the devices, on a virtual clock or a recording, wait until there is room.
     Pipeline,
-    /// Frames come whether there is room or not.
+    /// The devices: frames arrive whether there is room or not.
     Devices,
 }
 
 impl Rig {
-    /// Reads a rig file and builds what can be built before devices are opened.
+    /// Reads a rig file and builds what can be built without opening devices.
     ///
     /// # Errors
     /// With file, line and field.
@@ -167,12 +167,12 @@ impl Rig {
         section.first_projector_row.unwrap_or(middle)
     }
 
-    /// How many projector rows the rows of a camera look along.
+    /// Number of projector rows that the camera's rows span.
     fn projector_rows_of(&self, camera: &CameraCapabilities) -> usize {
         (camera.height.saturating_sub(1) as f64 * self.file.camera.row_pitch).round() as usize + 1
     }
 
-    /// Whether the camera's rows lie within the projector's.
+    /// Checks that the camera's rows lie within the projector's.
     fn check_rows(&self, camera: &CameraCapabilities) -> Result<(), RigError> {
         let (first, rows) = (self.first_row(camera), self.projector_rows_of(camera));
         let projector_rows = self.file.projector.rows;
@@ -185,7 +185,7 @@ impl Rig {
         )))
     }
 
-    /// The simulated rig, where any of its devices is simulated.
+    /// The simulated rig, if any device is simulated.
     pub fn simulated(&self) -> Option<&PlaneRig> {
         self.sim.as_deref()
     }
@@ -193,7 +193,7 @@ impl Rig {
     /// Opens all devices.
     ///
     /// # Errors
-    /// The first device that does not open.
+    /// The first device that cannot be opened.
     pub fn open(&self) -> Result<Devices, RigError> {
         self.check_pace()?;
         let mut simulated = Simulated::open(self)?;
@@ -204,13 +204,13 @@ impl Rig {
         let (projector, questions): (Box<dyn Projector>, _) = match self.file.projector.driver {
             ProjectorDriver::Drm => (Box::new(self.open_drm()?), None),
             ProjectorDriver::External => {
-                // A run that waits for its operator can be cancelled, so no patience ends before the operator's.
+                // A run that waits for its operator can be cancelled, so there is no need for a timeout.
                 let (projector, questions) = External::new(Duration::MAX);
                 (Box::new(projector), Some(questions))
             }
             ProjectorDriver::Sim => (simulated.projector()?, None),
         };
-        // Real devices know no time but the machine's, also where others of the rig are simulated.
+        // Real devices use the host's clock, even if others of the rig are simulated.
         let (camera, clock) = match self.file.camera.driver {
             CameraDriver::Sim => simulated.camera()?,
             CameraDriver::Aravis => (self.open_aravis()?, Clock::real()),
@@ -222,7 +222,7 @@ impl Rig {
         Ok(Devices { camera, vsync, projector, questions, clock, pace })
     }
 
-    /// Real devices know no time but the machine's, so a simulated camera beside them must keep to it.
+    /// Real devices use the host's clock, so simulated devices beside them must run in real time.
     fn check_pace(&self) -> Result<(), RigError> {
         let RigFile { camera, vsync, projector, sim, .. } = &self.file;
         let real = vsync.driver != VsyncDriver::Sim || projector.driver != ProjectorDriver::Sim;

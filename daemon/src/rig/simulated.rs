@@ -1,4 +1,5 @@
-//! The simulated devices of a plane rig: all of one world, on one clock, in this process or on a bench in another.
+//! The simulated devices of a plane rig: all in one simulation, on one clock, in this process or in a separate bench
+//! process.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +11,7 @@ use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimError};
 
 use super::{Rig, RigError};
 
-/// Makes the simulated rig that a file describes; scenes lie beside it, in `folder`.
+/// Builds the simulated rig that a file describes; scene paths are relative to `folder`.
 pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimError> {
     let setup = PlaneSetup {
         raster: file.raster(),
@@ -24,18 +25,18 @@ pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimErr
     PlaneRig::new(file.sim.clone(), setup, folder)
 }
 
-/// The devices of a simulated rig, to be taken one by one; those that real ones stand in for are dropped.
+/// The devices of a simulated rig, to be taken one by one; those with a real counterpart are dropped.
 #[derive(Default)]
 pub(super) struct Simulated {
     camera: Option<(Box<dyn Camera>, Clock)>,
     vsync: Option<Box<dyn Vsync>>,
     projector: Option<Box<dyn Projector>>,
-    /// Where another process has them.
+    /// Socket of the bench process, if the devices are simulated there.
     bench: Option<PathBuf>,
 }
 
 impl Simulated {
-    /// Opens what is simulated of a rig, which may be nothing.
+    /// Opens the simulated devices of a rig, if any.
     pub(super) fn open(rig: &Rig) -> Result<Self, RigError> {
         match (&rig.file.sim.bench, rig.simulated()) {
             (Some(_), _) if rig.file.camera.driver == CameraDriver::Sim => {
@@ -52,7 +53,7 @@ impl Simulated {
         }
     }
 
-    /// The camera, and the clock of its stamps.
+    /// The camera, and the clock of its timestamps.
     pub(super) fn camera(&mut self) -> Result<(Box<dyn Camera>, Clock), RigError> {
         self.camera.take().ok_or_else(|| not_simulated("camera"))
     }

@@ -10,10 +10,11 @@ use raysweep_drivers::vsync::pps::Pps;
 use raysweep_drivers::vsync::reopen::Reopened;
 use raysweep_drivers::vsync::triggerbox::TriggerBox;
 
-/// Opens the watcher that a rig names; `None`: the simulated one. Where it is unplugged within a run, it is opened again.
+/// Opens the watcher that a rig file names; `None`: the simulated one. If it is unplugged during a run, it is
+/// reopened.
 ///
 /// # Errors
-/// As its driver.
+/// Those of its driver.
 pub fn open(section: &VsyncSection) -> Result<Option<Box<dyn Vsync>>, DeviceError> {
     let patience = Duration::from_secs_f64(section.reopen_s);
     let watcher = match section.driver {

@@ -1,4 +1,4 @@
-//! What the daemon shows of itself: one place that holds the state and tells everybody who listens.
+//! The daemon's published state: holds it and notifies all subscribers.
 
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -7,7 +7,7 @@ use raysweep_core::{ClockQuality, FilmSummary, SettingsLatency};
 use raysweep_proto::{Event, RunState, Status};
 use tokio::sync::broadcast;
 
-/// Events that a slow subscriber may lag behind before it misses some.
+/// Number of events by which a slow subscriber may lag before it misses some.
 const EVENTS: usize = 1024;
 
 /// The daemon's state as its clients see it.
@@ -16,12 +16,12 @@ pub struct StatusBoard {
     events: broadcast::Sender<Event>,
 }
 
-/// A state that cannot follow the present one.
+/// The current state, from which the requested transition is not allowed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WrongState(pub RunState);
 
 impl StatusBoard {
-    /// An idle daemon for a rig of this kind.
+    /// The board of an idle daemon for a rig of this kind.
     pub fn new(rig: &str) -> Self {
         let status = Status {
             version: env!("CARGO_PKG_VERSION").into(),
@@ -45,39 +45,39 @@ impl StatusBoard {
         self.status.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// What clients see.
+    /// The status that clients see.
     pub fn status(&self) -> Status {
         self.lock().clone()
     }
 
-    /// Everything from now on.
+    /// Subscribes to all events from now on.
     pub fn subscribe(&self) -> broadcast::Receiver<Event> {
         self.events.subscribe()
     }
 
-    /// Goes to another state, if that may follow the present one.
+    /// Changes to another state, if that may follow the current one.
     ///
     /// # Errors
-    /// The present state, where it may not.
+    /// The current state, if the transition is not allowed.
     pub fn go(&self, next: RunState) -> Result<(), WrongState> {
         let mut status = self.lock();
         if !status.state.may_become(next) {
             return Err(WrongState(status.state));
         }
         status.state = next;
-        // Whatever comes after it has answered it, or needs no answer.
+        // Every transition means that the question was answered, or needs no answer.
         status.question = None;
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
             (status.film, status.settings_latency, status.vsync_clock) = (None, None, None);
         }
         let event = Event::State { state: next, session: status.session.clone() };
-        // Sent under the lock, so that subscribers see states in their true order.
+        // Sent under the lock, so that subscribers see states in their actual order.
         let _ = self.events.send(event);
         Ok(())
     }
 
-    /// Holds the run for an operator who is to do something, unless it is about to end.
+    /// Pauses the run for a task of the operator, unless the run is about to end.
     pub fn ask(&self, task: &str) {
         let mut status = self.lock();
         if status.state.may_become(RunState::Paused) {
@@ -92,37 +92,37 @@ impl StatusBoard {
         }
     }
 
-    /// Names the session of the run that is being prepared.
+    /// Sets the session of the run that is being prepared.
     pub fn set_session(&self, session: PathBuf) {
         self.lock().session = Some(session);
     }
 
-    /// Notes how a film went.
+    /// Sets the summary of a film.
     pub fn set_film(&self, film: FilmSummary) {
         self.lock().film = Some(film);
     }
 
-    /// Notes how late the camera's settings take effect.
+    /// Sets the latency of the camera's settings.
     pub fn set_settings_latency(&self, latency: Option<SettingsLatency>) {
         self.lock().settings_latency = latency;
     }
 
-    /// Notes how well the clock of the VSYNC line's watcher is known.
+    /// Sets the quality of the VSYNC watcher's clock.
     pub fn set_vsync_clock(&self, clock: Option<ClockQuality>) {
         self.lock().vsync_clock = clock;
     }
 
-    /// Names the file with the live images.
+    /// Sets the path of the live file.
     pub fn set_live(&self, file: PathBuf) {
         self.lock().live = Some(file);
     }
 
-    /// Notes why a run faulted.
+    /// Sets the error of a faulted run.
     pub fn set_error(&self, error: String) {
         self.lock().error = Some(error);
     }
 
-    /// Tells everybody, and keeps what `status` shows.
+    /// Sends an event, and updates what `status` shows.
     pub fn publish(&self, event: Event) {
         let mut status = self.lock();
         match &event {

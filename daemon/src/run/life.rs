@@ -1,4 +1,4 @@
-//! From a plan that is possible to the run's last word: the life that all procedures share.
+//! The life of a run, which all procedures share: from a checked plan to the final report.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -15,33 +15,33 @@ use super::error::RunError;
 use super::orders::{Order, Orders};
 use crate::live::Outlet;
 
-/// A plan on the daemon's rig, and what it would do.
+/// A plan on the daemon's rig, and the prediction of its run.
 pub struct Foreseen {
-    /// What it would do.
+    /// The prediction.
     pub report: CheckReport,
-    /// The name of its procedure.
+    /// Name of the procedure.
     pub kind: &'static str,
-    /// Names its session.
+    /// Name of the session.
     pub name: String,
-    /// What its session is made for.
+    /// Shape of the session's stack.
     pub shape: StackShape,
-    /// Projector row that row 0 of the camera sees; 0 on a dot rig.
+    /// Projector row that camera row 0 sees; 0 on a dot rig.
     pub first_row: usize,
-    /// What to do where it needs more memory than there is.
+    /// Advice for the user if memory is insufficient.
     pub instead: &'static str,
-    /// What does it.
+    /// The procedure that carries it out.
     pub procedure: Box<dyn Procedure>,
 }
 
-/// What distinguishes one procedure from the others.
+/// The part of a run that differs between procedures.
 pub trait Procedure: Send {
-    /// Adds what is worked out on request alone: a run must not wait for it.
+    /// Adds what is computed only on request: a run must not wait for it.
     fn advise(&self, _report: &mut CheckReport) {}
 
-    /// Puts into a new session what the run's results will need.
+    /// Stores in a new session what the run's results will need.
     ///
     /// # Errors
-    /// When it cannot be had, or the disk refuses.
+    /// When it is not available or cannot be written.
     fn keep(&self, _session: &Session) -> Result<(), RpcError> {
         Ok(())
     }
@@ -49,8 +49,8 @@ pub trait Procedure: Send {
     /// Acquires what is missing and makes the results.
     ///
     /// # Errors
-    /// When the run could not begin, or its results cannot be written. A fault on the way is in [`Ended::end`]: what was
-    /// acquired is kept.
+    /// When the run could not begin, or its results cannot be written. A fault during acquisition is in
+    /// [`Ended::end`]: what was acquired is kept.
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError>;
 }
 
@@ -60,23 +60,23 @@ pub struct Run {
     pub session: Session,
     /// Its ledger, locked for this run.
     pub ledger: Ledger,
-    /// Whether earlier runs have stored points of it.
+    /// Whether earlier runs have stored points in the session.
     pub is_resumed: bool,
-    /// The daemon's data folder, where the mirror's state is kept.
+    /// The daemon's data folder, which has the mirror's state.
     pub data: PathBuf,
-    /// What it is told.
+    /// Orders to the run.
     pub orders: Arc<Orders>,
-    /// What it tells.
+    /// State and events published by the run.
     pub board: Arc<StatusBoard>,
-    /// Where its images are shown while it goes on, if anywhere.
+    /// Where live images are published during the run, if anywhere.
     pub live: Option<Outlet>,
 }
 
 impl Run {
-    /// Notes in the ledger that the run begins.
+    /// Records in the ledger that the run begins.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the ledger cannot be written.
     pub fn note_beginning(&mut self) -> Result<(), RunError> {
         let started = jiff::Timestamp::now();
         Ok(self.ledger.append(&Entry::Run { started, resumed: self.is_resumed })?)
@@ -85,13 +85,14 @@ impl Run {
 
 /// How a run ended.
 pub struct Ended {
-    /// As the ledger has it.
+    /// The ledger's entry.
     pub end: EndEntry,
-    /// What an operator should know.
+    /// Warnings for the operator.
     pub warnings: Vec<String>,
 }
 
-/// The run's thread: acquires, makes the results, and says how it ended. Nothing it meets leaves the daemon stuck.
+/// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon
+/// stuck.
 pub fn conduct(procedure: Box<dyn Procedure>, run: Run, points: usize) {
     let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
     tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
@@ -100,7 +101,7 @@ pub fn conduct(procedure: Box<dyn Procedure>, run: Run, points: usize) {
     finish(ended, points, &board, &dir);
 }
 
-/// Says how a run of so many points ended.
+/// Reports the end of a run with this many points.
 fn finish(ended: Result<Ended, RunError>, points: usize, board: &StatusBoard, dir: &Path) {
     let Ended { end, warnings } = ended.unwrap_or_else(|error| {
         let stored = Session::open(dir).and_then(|session| session.state());
@@ -134,7 +135,7 @@ fn finish(ended: Result<Ended, RunError>, points: usize, board: &StatusBoard, di
     board.publish(finished);
 }
 
-/// How a run ended that was acquired with or without a fault.
+/// The end state of a run, given its fault, if any, and its orders.
 pub fn end_state(fault: Option<&RunError>, orders: &Orders) -> EndState {
     match fault {
         Some(_) => EndState::Faulted,
@@ -143,7 +144,7 @@ pub fn end_state(fault: Option<&RunError>, orders: &Orders) -> EndState {
     }
 }
 
-/// The end of a run of which nothing else is known.
+/// The end entry of a run without further results.
 pub fn end_entry(state: EndState, stored: usize, missing: usize) -> EndEntry {
     EndEntry {
         state,

@@ -1,4 +1,4 @@
-//! The life of a run, whatever it measures.
+//! The life of a run, whatever its procedure.
 
 pub mod board;
 pub mod error;

@@ -1,22 +1,22 @@
-//! What the run is told from outside while it acquires.
+//! Orders given to a run from outside while it acquires.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// The latest word.
+/// An order to a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
     /// Acquire.
     Go,
-    /// Hold before the next point.
+    /// Pause before the next point.
     Pause,
-    /// End in order; what was acquired is kept.
+    /// End cleanly; what was acquired is kept.
     Cancel,
-    /// A device has failed: end in order.
+    /// A device has failed: end cleanly.
     Fault,
 }
 
-/// The order in force, shared between the run's threads and whoever gives it.
+/// The order in force, shared between the run's threads and those that give orders.
 pub struct Orders {
     order: Mutex<Order>,
     changed: Condvar,
@@ -38,12 +38,12 @@ impl Orders {
         *self.lock()
     }
 
-    /// Whether acquisition goes on, now or after a pause.
+    /// Whether acquisition continues, now or after a pause.
     pub fn go_on(&self) -> bool {
         matches!(self.now(), Order::Go | Order::Pause)
     }
 
-    /// Gives an order. The first order to end stands: nothing makes an ending run go on.
+    /// Gives an order. The first order to end is final.
     pub fn give(&self, order: Order) {
         let mut now = self.lock();
         if matches!(*now, Order::Go | Order::Pause) {
@@ -52,13 +52,13 @@ impl Orders {
         }
     }
 
-    /// Waits for a while, unless the run ends.
+    /// Waits for `time`, unless the run ends.
     pub fn rest(&self, time: Duration) {
         let ends = |now: &mut Order| matches!(now, Order::Go | Order::Pause);
         let _ = self.changed.wait_timeout_while(self.lock(), time, ends);
     }
 
-    /// Waits until the order is no longer to pause.
+    /// Waits while the order is to pause.
     pub fn wait_while_paused(&self) {
         let mut now = self.lock();
         while *now == Order::Pause {

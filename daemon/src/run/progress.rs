@@ -1,18 +1,18 @@
-//! How far a run is, and how fast it goes.
+//! Progress and speed of a run.
 
 use std::time::Instant;
 
 use raysweep_core::Counts;
 use raysweep_proto::Progress;
 
-/// How fast a run goes.
+/// Measures a run's progress.
 pub struct ProgressMeter {
     began: Instant,
     stored_before: usize,
     /// Points stored in this run.
     pub stored: usize,
     planned: usize,
-    /// What became of its frames.
+    /// Frame counts of this run.
     pub counts: Counts,
 }
 
@@ -22,7 +22,7 @@ impl ProgressMeter {
         Self { began: Instant::now(), stored_before, stored: 0, planned, counts: Counts::default() }
     }
 
-    /// How far the run is.
+    /// The progress so far, for display.
     pub fn shown(&self) -> Progress {
         let elapsed_s = self.began.elapsed().as_secs_f64();
         let left = self.planned.saturating_sub(self.stored_before + self.stored);

@@ -1,4 +1,4 @@
-//! Who may do what: roles from the credentials that the kernel gives of a peer (`SO_PEERCRED`, unix(7)).
+//! Permissions: derives roles from the peer credentials that the kernel provides (`SO_PEERCRED`, unix(7)).
 
 use std::ffi::CString;
 use std::io;
@@ -16,7 +16,7 @@ pub struct Peer {
     pub gid: u32,
 }
 
-/// Tells operators from observers. Operators are root, the daemon's own user and the members of one group;
+/// Distinguishes operators from observers. Operators are root, the daemon's own user and the members of one group;
 /// everybody else who can open the socket is an observer.
 #[derive(Debug, Clone)]
 pub struct Access {
@@ -34,20 +34,20 @@ impl Access {
         })
     }
 
-    /// As [`Access::new`], with another way to tell who is at the far end.
+    /// Like [`Access::new`], with another way to identify the peer.
     pub fn identified_by(operators: Option<String>, identify: fn(&UnixStream) -> io::Result<Peer>) -> Self {
         Self { operators, owner: geteuid(), identify }
     }
 
-    /// Who is at the far end of a connection.
+    /// The user at the far end of a connection.
     ///
     /// # Errors
-    /// When the kernel does not say.
+    /// When the kernel does not provide the credentials.
     pub(super) fn peer(&self, stream: &UnixStream) -> io::Result<Peer> {
         (self.identify)(stream)
     }
 
-    /// What a user may do. Asks the user database, which may block.
+    /// The role of a user. Queries the user database, which may block.
     pub fn role(&self, peer: Peer) -> Role {
         let uid = Uid::from_raw(peer.uid);
         if uid.is_root() || uid == self.owner {
@@ -64,7 +64,7 @@ impl Access {
         }
     }
 
-    /// The answer to an observer who calls what only operators may.
+    /// The error for an observer who calls a method reserved for operators.
     pub(super) fn forbidden(&self, method: Method, peer: Peer) -> RpcError {
         let name = method.name();
         let message = format!("`{name}` is for operators, and user number {} is an observer", peer.uid);
@@ -83,7 +83,7 @@ fn is_member(peer: Peer, group: &str) -> nix::Result<bool> {
         return Ok(true);
     }
     let Some(user) = User::from_uid(Uid::from_raw(peer.uid))? else { return Ok(false) };
-    // A name that the user database itself gave holds no NUL.
+    // A name from the user database contains no NUL.
     let Ok(name) = CString::new(user.name) else { return Ok(false) };
     Ok(getgrouplist(&name, user.gid)?.contains(&group.gid))
 }
@@ -92,7 +92,7 @@ fn is_member(peer: Peer, group: &str) -> nix::Result<bool> {
 mod tests {
     use super::*;
 
-    /// Nobody's number on every system; its groups are none of those used here.
+    /// The user `nobody` on every system; its groups are not used here.
     const STRANGER: Peer = Peer { uid: 65534, gid: 65534 };
 
     fn access(group: Option<&str>) -> Access {
@@ -114,7 +114,7 @@ mod tests {
     fn a_member_drives_by_primary_group_and_by_the_groups_list() {
         assert_eq!(access(Some("root")).role(Peer { gid: 0, ..STRANGER }), Role::Operator, "primary group");
         assert_eq!(access(None).role(Peer { gid: 0, ..STRANGER }), Role::Observer, "no group is set");
-        // Whoever /etc/group names as a member beyond its primary group, if this machine has anybody.
+        // Members that /etc/group lists beyond their primary group, if this machine has any.
         let text = std::fs::read_to_string("/etc/group").unwrap();
         let members = text.lines().filter_map(|line| {
             let fields: Vec<_> = line.split(':').collect();

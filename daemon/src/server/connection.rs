@@ -1,4 +1,4 @@
-//! One client: its lines in, its answers and events out.
+//! One client: reads its lines, and sends responses and events.
 
 use std::io;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use tokio_util::sync::CancellationToken;
 use super::access::Peer;
 use super::{Desk, dispatch};
 
-/// Serves a client until it hangs up, breaks the rules of lines, does not read, or `stop`.
+/// Serves a client until it hangs up, violates the line protocol, stops reading, or `stop` is set.
 pub(super) async fn attend(stream: UnixStream, desk: Arc<Desk>, stop: CancellationToken) {
     let peer = match desk.access.peer(&stream) {
         Ok(peer) => peer,
@@ -27,7 +27,7 @@ pub(super) async fn attend(stream: UnixStream, desk: Arc<Desk>, stop: Cancellati
         }
     };
     let asked = desk.clone();
-    // Looking groups up may ask a server over the network.
+    // Looking up groups may query a server over the network.
     let role = tokio::task::spawn_blocking(move || asked.access.role(peer)).await.unwrap_or(Role::Observer);
     tracing::debug!(uid = peer.uid, ?role, "a client has connected");
     let (reader, writer) = stream.into_split();
@@ -117,7 +117,7 @@ impl Connection {
         }
     }
 
-    /// Sends the events that wait: how a run ended is among them when the daemon is stopped during one.
+    /// Sends the pending events: if the daemon is stopped during a run, they include the end of that run.
     async fn farewell(&mut self) -> io::Result<()> {
         let Some(mut events) = self.events.take() else { return Ok(()) };
         loop {
@@ -138,7 +138,7 @@ impl Connection {
     }
 }
 
-/// The next event; for who has not subscribed there is none, ever.
+/// The next event; never returns for a client that has not subscribed.
 async fn next_event(events: &mut Option<broadcast::Receiver<Event>>) -> Result<Event, RecvError> {
     match events {
         Some(events) => events.recv().await,
@@ -164,7 +164,7 @@ enum Line {
     End,
 }
 
-/// The lines of a client, each at most so long.
+/// The lines of a client, with limited length.
 struct Lines {
     reader: OwnedReadHalf,
     codec: LinesCodec,
@@ -176,8 +176,8 @@ impl Lines {
         Self { reader, codec: LinesCodec::new_with_max_length(max_bytes), buffer: BytesMut::new() }
     }
 
-    /// The next line; nothing is lost when the wait for it is given up. What stands before the end without a line
-    /// feed counts as a line, so that a one-line script need not send one; half a message is no JSON anyway.
+    /// The next line; cancel-safe. Text at the end without a line feed counts as a line, so that a one-line script
+    /// need not send one; a truncated message is not valid JSON anyway.
     async fn next(&mut self) -> io::Result<Line> {
         let mut ended = false;
         loop {

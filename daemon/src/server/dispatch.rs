@@ -1,4 +1,4 @@
-//! From a method's name and parameters to a call of the daemon.
+//! Maps a method's name and parameters to a call of the daemon.
 
 use raysweep_proto::{
     CheckParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams, describe, params,
@@ -9,15 +9,15 @@ use tokio::sync::broadcast;
 
 use crate::control::Control;
 
-/// What came of a call.
+/// Result of a call.
 pub(super) struct Reply {
     /// The method's result.
     pub result: Value,
-    /// For `subscribe`: what is to be sent from now on.
+    /// For `subscribe`: the events to send from now on.
     pub events: Option<broadcast::Receiver<Event>>,
 }
 
-/// Carries a call out; may block.
+/// Executes a call; may block.
 pub(super) fn carry_out(
     control: &dyn Control,
     method: Method,
@@ -47,7 +47,7 @@ fn none(given: Map<String, Value>) -> Result<(), RpcError> {
     params::<Empty>(given).map(|Empty {}| ())
 }
 
-/// The result of a method that has nothing to say.
+/// The result of a method that returns nothing.
 fn done((): ()) -> Result<Value, RpcError> {
     value(Empty {})
 }

@@ -1,4 +1,4 @@
-//! Where clients come in: a socket of our own, or one that the service manager holds for us.
+//! The listening socket: our own, or one passed by the service manager.
 
 use std::fs;
 use std::io::{self, ErrorKind};
@@ -11,41 +11,41 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use nix::sys::socket::{getsockopt, sockopt::AcceptConn};
 use tokio::net::UnixListener;
 
-/// Owner and group may connect; who of them may drive is decided by [`super::Access`].
+/// Owner and group may connect; [`super::Access`] decides which of them may operate the rig.
 const SOCKET_MODE: u32 = 0o660;
 
-/// Why nobody can be listened to.
+/// Why the daemon cannot listen.
 #[derive(Debug, thiserror::Error)]
 pub enum ListenError {
-    /// Another daemon is there.
+    /// Another daemon is listening there.
     #[error("another raysweepd listens on {}: stop it, or choose another --socket", .0.display())]
     Taken(PathBuf),
-    /// Something else is there.
+    /// The path exists, but is not a socket.
     #[error("{} exists and is no socket: remove it, or choose another --socket", .0.display())]
     NotASocket(PathBuf),
-    /// The socket cannot be made.
+    /// The socket cannot be created.
     #[error("cannot listen on {}: {source}; its folder must exist and be writable", path.display())]
     Bind {
-        /// Where.
+        /// Path of the socket.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// What the service manager handed over is of no use.
+    /// The socket passed by the service manager is unusable.
     #[error("socket activation: {0}")]
     Inherited(String),
 }
 
-/// A listening socket. Must be made within a tokio runtime.
+/// A listening socket. Must be created within a tokio runtime.
 #[derive(Debug)]
 pub struct Listening {
-    /// To be given to [`super::serve`].
+    /// For [`super::serve`].
     pub listener: UnixListener,
-    /// The socket's file, if it is ours to remove.
+    /// The socket's file, if we must remove it.
     pub file: Option<SocketFile>,
 }
 
-/// The file of a socket that we made; it is removed when this is dropped.
+/// The file of a socket that we created; it is removed when this is dropped.
 #[derive(Debug)]
 pub struct SocketFile(PathBuf);
 
@@ -58,7 +58,7 @@ impl Drop for SocketFile {
 }
 
 impl Listening {
-    /// Makes a socket with mode 0660. One that a dead daemon left is replaced.
+    /// Creates a socket with mode 0660. A socket left by a dead daemon is replaced.
     ///
     /// # Errors
     /// [`ListenError::Taken`], [`ListenError::NotASocket`], [`ListenError::Bind`].
@@ -71,7 +71,7 @@ impl Listening {
         Ok(Self { listener, file: Some(file) })
     }
 
-    /// Takes over the socket that the service manager passes (`LISTEN_FDS`, sd_listen_fds(3)); nothing if it passes
+    /// Takes over the socket that the service manager passes (`LISTEN_FDS`, sd_listen_fds(3)); `None` if it passes
     /// none, or if it was taken already.
     ///
     /// # Errors
@@ -96,7 +96,7 @@ impl Listening {
             reason = "nothing safe turns the number of an inherited descriptor into its owner"
         )]
         // SAFETY: `listen_fds` found our own process id in LISTEN_PID and could set a flag of this descriptor, so it
-        // is open and was passed to us to own; `TAKEN` sees to it that nobody else in this process owns it.
+        // is open and was passed to us to own; `TAKEN` ensures that nothing else in this process owns it.
         let fd = unsafe { OwnedFd::from_raw_fd(fd) };
         if !getsockopt(&fd, AcceptConn).unwrap_or(false) {
             let message =
@@ -114,7 +114,7 @@ impl Listening {
     }
 }
 
-/// Removes a socket on which nobody listens.
+/// Removes a socket that nobody listens on.
 fn remove_stale(path: &Path) -> Result<(), ListenError> {
     let Ok(metadata) = fs::symlink_metadata(path) else { return Ok(()) };
     if !metadata.file_type().is_socket() {
@@ -124,7 +124,7 @@ fn remove_stale(path: &Path) -> Result<(), ListenError> {
         Err(error) if error.kind() == ErrorKind::ConnectionRefused => {
             fs::remove_file(path).map_err(|source| ListenError::Bind { path: path.to_owned(), source })
         }
-        // A full queue and a lack of permission too mean that somebody is there.
+        // A full queue or a lack of permission also means that somebody is listening.
         _ => Err(ListenError::Taken(path.to_owned())),
     }
 }
@@ -143,7 +143,7 @@ mod tests {
         assert!(taken.to_string().starts_with("another raysweepd listens on"), "{taken}");
         StdStream::connect(&path).expect("the first is still there");
 
-        // A daemon that is killed removes nothing.
+        // A killed daemon removes nothing.
         let Listening { listener, file } = first;
         std::mem::forget(file);
         drop(listener);

@@ -1,8 +1,8 @@
-//! The socket: JSON-RPC 2.0, one message a line, for several clients at once.
+//! The socket: JSON-RPC 2.0, one message per line, for several clients at once.
 //!
-//! One task serves one client, one request after the other, so that at most [`Limits::clients`] calls are under way.
-//! Calls run on tokio's blocking threads; events come over a broadcast channel that never waits for a reader, so
-//! that no client slows the run.
+//! One task serves one client, one request after another, so that at most [`Limits::clients`] calls are in progress.
+//! Calls run on tokio's blocking threads; events arrive over a broadcast channel that never waits for a reader, so
+//! that no client slows down the run.
 
 mod access;
 mod connection;
@@ -24,10 +24,10 @@ pub use self::access::{Access, Peer};
 pub use self::listen::{ListenError, Listening, SocketFile};
 use crate::control::Control;
 
-/// How long after the end clients may take to read what is left for them.
+/// How long clients may take, after shutdown, to read what is left for them.
 const FAREWELL: Duration = Duration::from_secs(2);
 
-/// What the server bounds.
+/// Limits of the server.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// The longest request, without its line feed.
@@ -48,18 +48,18 @@ impl Default for Limits {
     }
 }
 
-/// What every client's task needs.
+/// Shared by the tasks of all clients.
 struct Desk {
     control: Arc<dyn Control>,
     access: Access,
     limits: Limits,
 }
 
-/// Serves clients until `shutdown`; then every subscriber still gets the events that wait for it, and all
-/// connections are closed within about 2 s.
+/// Serves clients until `shutdown`; then every subscriber still receives its pending events, and all connections are
+/// closed within about 2 s.
 ///
 /// # Errors
-/// When the listener cannot accept any more. A client's misfortune is only its own.
+/// When the listener cannot accept any more. Errors of a single client affect only that client.
 pub async fn serve(
     listener: UnixListener,
     control: Arc<dyn Control>,
@@ -69,10 +69,10 @@ pub async fn serve(
     serve_within(Limits::default(), listener, control, access, shutdown).await
 }
 
-/// As [`serve`], within other limits.
+/// Like [`serve`], with other limits.
 ///
 /// # Errors
-/// As [`serve`].
+/// Those of [`serve`].
 pub async fn serve_within(
     limits: Limits,
     listener: UnixListener,
@@ -113,7 +113,7 @@ pub async fn serve_within(
     outcome
 }
 
-/// Whether accepting may succeed later: the client went again, or descriptors or memory are short.
+/// Whether accepting may succeed later: the client has disconnected, or descriptors or memory are short.
 fn passes(error: &io::Error) -> bool {
     let errno = error.raw_os_error().map(Errno::from_raw);
     matches!(
@@ -129,7 +129,7 @@ fn passes(error: &io::Error) -> bool {
     )
 }
 
-/// Tells a client that there is no place for it. A new socket's buffer is empty, so that this does not wait.
+/// Tells a client that the server is full. A new socket's buffer is empty, so this does not wait.
 async fn turn_away(mut stream: UnixStream, limits: Limits) {
     let message =
         format!("{} clients are connected already; end one of them, or try again later", limits.clients);

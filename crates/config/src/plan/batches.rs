@@ -1,33 +1,33 @@
-//! `[batches]`: what a dot rig's mirror scans and its camera takes.
+//! `[batches]`: the path of a dot rig's mirror and the frames that its camera takes.
 
 use raysweep_core::{MirrorLimits, MirrorPath, MirrorPoint, PathError, RasterScan, Tilt};
 use serde::Deserialize;
 
 use crate::document::Document;
 
-/// `[batches]`: the mirror goes round its path once a batch, the camera takes a frame of each dot.
+/// `[batches]`: the mirror completes its path once per batch, and the camera takes one frame per dot.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BatchesPlan {
-    /// Batches of the scene.
+    /// Number of batches of the scene.
     pub count: u32,
-    /// Frames of a batch.
+    /// Number of frames per batch.
     pub dots: u32,
-    /// Frames a second; left out: what gives `dots` frames in the time of the mirror's path.
+    /// Frames per second; default: the rate that gives `dots` frames in the duration of the mirror's path.
     pub camera_rate_hz: Option<f64>,
     /// Exposure of each frame.
     pub exposure_us: f64,
-    /// Index of the frame that shows the trailing dot; left out: the last.
+    /// Index of the frame that shows the trailing dot; default: the last.
     pub trailing_index: Option<u32>,
-    /// Where it lands: first row, row after the last, first column, column after the last.
+    /// Region where the trailing dot lands: first row, row after the last, first column, column after the last.
     pub trailing_region: [usize; 4],
-    /// Indices of the frames whose light goes to the beam dump.
+    /// Indices of the frames whose light goes into the beam dump.
     pub background_indices: Vec<u32>,
-    /// Frames without light before the first batch: what is known of the sensor.
+    /// Frames without light before the first batch, to calibrate the sensor.
     pub dark_frames: u32,
-    /// Frames of even light after them, for the flat field; 0: none.
+    /// Evenly lit frames after the dark frames, for the flat field; 0: none.
     pub flat_frames: u32,
-    /// Whether the raw frames are kept, 16 bits a pixel.
+    /// Whether to store the raw frames, with 16 bits per pixel.
     pub keep_raw: bool,
     /// `[batches.path]`
     pub path: PathPlan,
@@ -35,41 +35,41 @@ pub struct BatchesPlan {
     pub calibration: Vec<PlanePlan>,
 }
 
-/// `[batches.path]`: where the mirror points in the time of a batch.
+/// `[batches.path]`: the mirror's path during a batch.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PathPlan {
-    /// Its shape; the other keys are for some of them.
+    /// Shape of the path; some of the other keys apply only to certain shapes.
     pub shape: Shape,
-    /// Largest mechanical tilt to either side, x and y.
+    /// Largest mechanical tilt in either direction, x and y.
     pub amplitude_deg: [f64; 2],
-    /// Of a raster: crossings, an even number.
+    /// Raster: number of crossings in x, even.
     pub lines: u32,
-    /// Of a raster: share of the batch in which y goes back.
+    /// Raster: fraction of the batch in which y flies back.
     pub flyback: f64,
-    /// Of a Lissajous figure: whole cycles a batch, x and y.
+    /// Lissajous figure: whole cycles per batch, x and y.
     pub cycles: [u32; 2],
-    /// Of a spiral: turns out and back.
+    /// Spiral: turns outwards and back.
     pub turns: u32,
-    /// Of points: mechanical tilts x, y, in degrees; between them the mirror stays.
+    /// Points: mechanical tilts x, y, in degrees; the mirror holds each until the next.
     pub points_deg: Vec<[f64; 2]>,
-    /// Samples a batch; of points: as many as there are points.
+    /// Samples per batch; for points, the number of points.
     pub samples: usize,
-    /// Samples a second.
+    /// Samples per second.
     pub rate_hz: f64,
 }
 
-/// Shapes of paths by their names in plans.
+/// Shapes of paths, by their names in plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Shape {
-    /// x to and fro as a sine, y down and back.
+    /// x back and forth as a sine, y down and back.
     Raster,
-    /// Sines of both axes.
+    /// Sines on both axes.
     Lissajous,
     /// From the centre out and back.
     Spiral,
-    /// As listed.
+    /// A list of points.
     Points,
 }
 
@@ -77,14 +77,14 @@ pub enum Shape {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlanePlan {
-    /// How many.
+    /// Number of batches.
     pub batches: u32,
-    /// Where it stands, from the mirror on; for the report.
+    /// Distance of the plane from the mirror; for the report.
     pub depth_mm: Option<f64>,
 }
 
 impl Default for BatchesPlan {
-    /// The paper's: 2250 dots at 13,500 a second, 39,000 samples a second.
+    /// The paper's values: 2250 dots at 13,500 per second, 39,000 samples per second.
     fn default() -> Self {
         Self {
             count: 12,
@@ -119,15 +119,15 @@ impl Default for PathPlan {
     }
 }
 
-/// Most batches: six hours at six a second.
+/// Maximum number of batches: six hours at six per second.
 const MAX_BATCHES: u64 = 129_600;
-/// Most frames of a batch.
+/// Maximum number of frames per batch.
 const MAX_DOTS: u64 = 1 << 16;
-/// Camera and mirror may disagree by this much of a frame a batch; more, and no index is certain.
+/// Camera and mirror may drift apart by this fraction of a frame per batch; beyond it, indices are ambiguous.
 const RATE_TOLERANCE_FRAMES: f64 = 0.5;
 
-/// Batches that are played beside those that are wanted: the first has no beginning, the next two may pass before the
-/// trailing dot is known.
+/// Batches that are played in addition to the requested ones: the first lacks its beginning, and the next two may
+/// pass before the trailing dot is known.
 const SPARE_BATCHES: u32 = 2;
 
 impl BatchesPlan {
@@ -183,7 +183,7 @@ impl BatchesPlan {
         }
     }
 
-    /// Whether camera and mirror keep pace.
+    /// Checks that camera and mirror keep pace.
     fn check_rate(&self, document: &mut Document<'_>) {
         let (dots, duration_s) = (self.dots, self.path.duration_s());
         if !(duration_s > 0.0 && duration_s.is_finite()) {
@@ -218,17 +218,17 @@ impl BatchesPlan {
         self.trailing_index.unwrap_or(self.dots.saturating_sub(1))
     }
 
-    /// Frames a second.
+    /// Frames per second.
     pub fn camera_rate_hz(&self) -> f64 {
         self.camera_rate_hz.unwrap_or(f64::from(self.dots) / self.path.duration_s())
     }
 
-    /// Batches of the calibration planes and of the scene.
+    /// Number of batches of the calibration planes and the scene.
     pub fn total(&self) -> usize {
         self.count as usize + self.calibration.iter().map(|plane| plane.batches as usize).sum::<usize>()
     }
 
-    /// The calibration plane that a batch shows; none: the scene.
+    /// The calibration plane that a batch shows; `None`: the scene.
     pub fn plane_of(&self, batch: usize) -> Option<usize> {
         let mut end = 0;
         self.calibration.iter().position(|plane| {
@@ -237,20 +237,21 @@ impl BatchesPlan {
         })
     }
 
-    /// Times that the path is played so that so many batches are whole.
+    /// Number of times that the path is played to get `batches` complete batches.
     pub fn rounds(batches: u32) -> u32 {
         batches + SPARE_BATCHES
     }
 
-    /// Times that the path is played, without light, for so many frames of the sensor's calibration.
+    /// Number of times that the path is played, without light, to get `frames` frames for the calibration of the
+    /// sensor.
     pub fn dark_rounds(&self, frames: u32) -> u32 {
         if frames == 0 { 0 } else { frames.div_ceil(self.dots) + 1 }
     }
 
-    /// The path of one batch, with the light off where it goes to the beam dump.
+    /// The path of one batch, with the light off where it goes into the beam dump.
     ///
     /// # Errors
-    /// The first of the mirror's limits that the path would break.
+    /// The first of the mirror's limits that the path would exceed.
     pub fn mirror_path(&self, limits: &MirrorLimits) -> Result<MirrorPath, PathError> {
         let path = self.path.path(limits)?;
         let (samples, dots) = (path.points().len() as u64, u64::from(self.dots));
@@ -263,7 +264,8 @@ impl BatchesPlan {
 }
 
 impl PathPlan {
-    /// Limits are the mirror's affair; a shape that is none is the plan's, and no mirror has infinite ones.
+    /// Checks only that the shape is valid. The mirror's limits are checked elsewhere; they are finite, so they also
+    /// exclude infinite tilts.
     fn check(&self, document: &mut Document<'_>) {
         if !(self.rate_hz > 0.0 && self.rate_hz.is_finite()) {
             let message =
@@ -283,7 +285,7 @@ impl PathPlan {
         if self.shape == Shape::Points { self.points_deg.len() } else { self.samples }
     }
 
-    /// Time of a batch.
+    /// Duration of a batch.
     pub fn duration_s(&self) -> f64 {
         self.samples() as f64 / self.rate_hz
     }

@@ -5,13 +5,13 @@ use serde::Deserialize;
 use super::Axis;
 use crate::document::Document;
 
-/// `[darks]`: two images of each exposure, whose difference tells the noise.
+/// `[darks]`: two images at each exposure; the noise is computed from their difference.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DarksPlan {
-    /// Exposures.
+    /// Exposure times.
     pub exposure_us: Axis,
-    /// Frames averaged in each image.
+    /// Frames averaged per image.
     pub frames: u32,
     /// Pixels whose dark level lies more than this many standard deviations above the others' are hot.
     pub hot_sigmas: f64,
@@ -23,7 +23,7 @@ impl Default for DarksPlan {
     }
 }
 
-/// Most exposures.
+/// Maximum number of exposures.
 const MAX_EXPOSURES: usize = 256;
 
 impl DarksPlan {

@@ -5,22 +5,22 @@ use serde::Deserialize;
 use super::Axis;
 use crate::document::Document;
 
-/// `[film]`: one frame under each delay, cycle after cycle without pause. In which order a cycle takes its delays is
-/// for the camera to say, not for the plan.
+/// `[film]`: one frame at each delay, cycle after cycle without a pause. The order of the delays within a cycle
+/// depends on the camera, not on the plan.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FilmPlan {
-    /// t_d.
+    /// Delays t_d.
     pub delay_us: Axis,
-    /// t_e, one for all: cameras may take long to change it.
+    /// Exposure t_e, the same for all frames: cameras may take long to change it.
     pub exposure_us: f64,
-    /// How many cycles.
+    /// Number of cycles.
     pub cycles: u32,
-    /// Frames whose measured delay is further off do not count; their cycle is incomplete.
+    /// Frames whose measured delay deviates by more than this are dropped; their cycle is incomplete.
     pub max_jitter_us: f64,
 }
 
-/// 15 delays, dense near zero where most of the light is: 1500 us x (k/7)^1.7 to either side.
+/// 15 delays, dense near zero, where most of the light is: 1500 us x (k/7)^1.7 in both directions.
 const DENSE_US: [f64; 15] = [
     -1500.0, -1154.0, -847.0, -579.0, -355.0, -178.0, -55.0, 0.0, 55.0, 178.0, 355.0, 579.0, 847.0, 1154.0,
     1500.0,
@@ -32,9 +32,9 @@ impl Default for FilmPlan {
     }
 }
 
-/// Most cycles of a film: six hours at four a second.
+/// Maximum number of cycles of a film: six hours at four per second.
 const MAX_CYCLES: u64 = 86_400;
-/// Most settings of a cycle.
+/// Maximum number of settings per cycle.
 const MAX_SETTINGS: usize = 256;
 impl FilmPlan {
     pub(super) fn check(&self, document: &mut Document<'_>) {

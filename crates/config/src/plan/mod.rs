@@ -1,4 +1,4 @@
-//! `plan.toml`: what to acquire and what to make of it.
+//! `plan.toml`: what to acquire, and which products to make.
 
 mod batches;
 mod darks;
@@ -22,34 +22,34 @@ use crate::{ConfigError, Places};
 /// A plan.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// Names the session; left out: its kind does.
+    /// Name of the session; default: the plan's kind.
     pub name: String,
     /// `kind`, with the table of that name.
     pub procedure: Procedure,
-    /// `[[stage]]`: stages in order, then folds; left out: [`Procedure::default_stage`].
+    /// `[[stage]]`: stages in order, then folds; default: [`Procedure::default_stage`].
     pub stages: Vec<StageTable>,
-    /// `[[product]]`: what to make of the transport; left out: the procedure's defaults.
+    /// `[[product]]`: products to make from the transport; default: the procedure's own.
     pub products: Option<Vec<ProductTable>>,
-    /// Where all that stands in the text.
+    /// Positions of the values in the text.
     pub places: Places,
 }
 
-/// The procedures by which light is measured.
+/// The measurement procedures.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Procedure {
     /// A delay-exposure sweep of the plane rig.
     Sweep(SweepPlan),
-    /// A short sweep again and again, each time with a light transport of its own.
+    /// A repeated short sweep, with a light transport for each repetition.
     Film(FilmPlan),
     /// Batches of frames of a flying dot.
     Batches(BatchesPlan),
     /// Chirps of a mirror, from which its resonances are identified.
     Response(ResponsePlan),
-    /// Images without light.
+    /// Dark images.
     Darks(DarksPlan),
 }
 
-/// The procedures by the names that plans use.
+/// The procedures, by their names in plans.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Kind {
@@ -63,7 +63,7 @@ enum Kind {
 impl Kind {
     const ALL: [Self; 5] = [Self::Sweep, Self::Film, Self::Batches, Self::Response, Self::Darks];
 
-    /// Its name in plans, which is also that of its table.
+    /// Its name in plans, which is also the name of its table.
     fn name(self) -> &'static str {
         match self {
             Self::Sweep => "sweep",
@@ -86,7 +86,7 @@ impl Kind {
         }
     }
 
-    /// The stage of a plan that names none.
+    /// The default stage of a plan that names none.
     fn default_stage(self) -> Option<&'static str> {
         match self {
             Self::Sweep | Self::Film => Some("demux"),
@@ -125,7 +125,7 @@ impl Plan {
     /// Reads a plan.
     ///
     /// # Errors
-    /// Everything that keeps it from being run, with the places in the text.
+    /// Everything that makes the plan invalid, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
         let Some(kind) = document.require::<Kind>("kind", "kind = \"sweep\", for instance") else {
@@ -177,7 +177,7 @@ mod tests {
         blocks.find(|block| block.contains(&format!("kind = \"{kind}\""))).unwrap()
     }
 
-    /// Each text has one mistake: this field, and a message that contains this.
+    /// Checks that each text has one mistake: about this field, with a message that contains this.
     pub(super) fn refused(cases: &[(&str, &str, &str)]) {
         for (text, field, expected) in cases {
             let error = Plan::parse(text).unwrap_err();

@@ -1,38 +1,38 @@
-//! `[response]`: the chirp by which a dot rig finds out how its mirror answers.
+//! `[response]`: the chirp that identifies the response of a dot rig's mirror.
 
 use serde::Deserialize;
 
 use crate::document::Document;
 
-/// `[response]`: one axis after the other plays a chirp about the origin while the camera follows the dot on a plane.
+/// `[response]`: each axis in turn plays a chirp about the origin while the camera tracks the dot on a plane.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ResponsePlan {
-    /// Where the chirp begins and ends: the resonances of both axes lie between.
+    /// Start and end frequency of the chirp: the resonances of both axes lie between them.
     pub band_hz: [f64; 2],
-    /// Its amplitude, mechanical.
+    /// Mechanical amplitude of the chirp.
     pub amplitude_deg: f64,
-    /// The largest quality factor that an axis may have: it bounds how far the mirror moves at its resonance.
+    /// The largest quality factor that an axis may have: it limits how far the mirror moves at its resonance.
     pub max_q: f64,
-    /// How long the chirp lasts.
+    /// Duration of the chirp.
     pub chirp_s: f64,
-    /// How long the mirror stands at the origin after it, until the ringing has died down.
+    /// How long the mirror rests at the origin afterwards, until the ringing has died down.
     pub rest_s: f64,
-    /// Samples a second of the mirror.
+    /// Samples per second of the mirror.
     pub rate_hz: f64,
-    /// Frames a second.
+    /// Frames per second.
     pub camera_rate_hz: f64,
     /// Exposure of each frame.
     pub exposure_us: f64,
     /// Frames without light before the first chirp.
     pub dark_frames: u32,
-    /// Where the dot is looked for: first row, row after the last, first column, column after the last; left out:
+    /// Region to search for the dot: first row, row after the last, first column, column after the last; default:
     /// everywhere.
     pub region: Option<[usize; 4]>,
 }
 
 impl Default for ResponsePlan {
-    /// For Mirrorcle's A7B2.3-3600AL and the paper's camera.
+    /// Values for Mirrorcle's A7B2.3-3600AL and the paper's camera.
     fn default() -> Self {
         Self {
             band_hz: [100.0, 900.0],
@@ -49,7 +49,8 @@ impl Default for ResponsePlan {
     }
 }
 
-/// Samples, and frames, that a period of the band's upper end has at least: fewer would not show its movement.
+/// Minimum number of samples, and of frames, per period at the band's upper end: fewer would not resolve the
+/// movement.
 const LEAST_A_PERIOD: f64 = 4.0;
 
 impl ResponsePlan {
@@ -93,7 +94,7 @@ impl ResponsePlan {
         }
     }
 
-    /// Time of one axis.
+    /// Duration of one axis.
     pub fn duration_s(&self) -> f64 {
         self.chirp_s + self.rest_s
     }

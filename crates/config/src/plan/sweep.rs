@@ -8,13 +8,13 @@ use crate::document::Document;
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SweepPlan {
-    /// t_d.
+    /// Delays t_d.
     pub delay_us: Axis,
-    /// t_e.
+    /// Exposures t_e.
     pub exposure_us: Axis,
-    /// Frames averaged at each point.
+    /// Frames averaged per point.
     pub average: u32,
-    /// Frames whose measured delay is further off do not count and are taken again.
+    /// Frames whose measured delay deviates by more than this are dropped and taken again.
     pub max_jitter_us: f64,
 }
 
@@ -37,15 +37,15 @@ impl Default for SweepPlan {
     deny_unknown_fields
 )]
 pub enum Axis {
-    /// These, in this order.
+    /// A list of values, in this order.
     List(Vec<f64>),
-    /// Evenly spaced, both ends included.
+    /// Evenly spaced values, both ends included.
     Range {
         /// First value.
         start: f64,
         /// Last value.
         stop: f64,
-        /// How many.
+        /// Number of values.
         count: usize,
     },
 }
@@ -62,7 +62,7 @@ impl Axis {
         }
     }
 
-    /// How many values there are.
+    /// Number of values.
     #[allow(clippy::len_without_is_empty, reason = "an axis without values is refused")]
     pub fn len(&self) -> usize {
         match self {
@@ -72,15 +72,15 @@ impl Axis {
     }
 }
 
-/// Most values along an axis.
+/// Maximum number of values along an axis.
 const MAX_AXIS: u64 = 1024;
-/// Most points of a sweep.
+/// Maximum number of points of a sweep.
 const MAX_POINTS: usize = 8192;
-/// Most frames of a point: their sum fits 32 bits at 16 bits a pixel.
+/// Maximum number of frames of a point: with 16 bits per pixel, their sum fits into 32 bits.
 const MAX_AVERAGE: u64 = 65_536;
 
 impl SweepPlan {
-    /// Whether a plan may have this table.
+    /// Whether this table is valid in a plan.
     pub fn is_possible(&self) -> bool {
         let Ok(mut document) = Document::parse("") else { return false };
         self.check(&mut document);

@@ -1,4 +1,4 @@
-//! `[[stage]]` and `[[product]]`: a name or kind, and options that whoever makes it reads.
+//! `[[stage]]` and `[[product]]`: a name or kind, with options that the stage or product reads itself.
 
 use serde::Deserialize;
 use serde_json::{Map, Value};
@@ -9,9 +9,9 @@ use crate::{ConfigError, Places};
 /// One `[[stage]]`: its name and the options that the stage itself reads.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct StageTable {
-    /// The name it is registered by.
+    /// The name under which the stage is registered.
     pub name: String,
-    /// Everything else in its table.
+    /// All other keys of its table.
     #[serde(flatten)]
     pub options: Map<String, Value>,
 }
@@ -21,14 +21,14 @@ pub struct StageTable {
 pub struct ProductTable {
     /// The kind of product.
     pub kind: String,
-    /// Names its files; left out: the kind and its options do.
+    /// Base name of its files; default: derived from the kind and options.
     pub name: Option<String>,
-    /// Everything else in its table.
+    /// All other keys of its table.
     #[serde(flatten)]
     pub options: Map<String, Value>,
 }
 
-/// Options have passed through a form without NaN and infinity, in which these are null; TOML has no null.
+/// Finds an option that is NaN or infinite: these have become null in conversion, which TOML itself does not have.
 fn not_finite(options: &Map<String, Value>) -> Option<&str> {
     options.iter().find(|(_, value)| value.is_null()).map(|(key, _)| key.as_str())
 }
@@ -54,11 +54,11 @@ pub(super) fn check_products<'a>(
     }
 }
 
-/// The products that a command line argument asks for, the keys of a `[[product]]` with commas between them; and the
-/// document that the argument stands for, with its places, so that errors can point into it.
+/// The products that a command line argument asks for: the keys of a `[[product]]`, separated by commas. Also returns
+/// the document that the argument represents, with the positions of its values, so that errors can point into it.
 ///
 /// # Errors
-/// The document beside what is wrong with it.
+/// The document and what is wrong with it.
 pub fn products_of_argument(
     argument: &str,
 ) -> Result<(Vec<ProductTable>, Places, String), (ConfigError, String)> {

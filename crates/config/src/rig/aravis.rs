@@ -100,7 +100,7 @@ const MAX_PACKET_BYTES: u32 = 65_507;
 const MIN_PACKET_BYTES: u32 = 576;
 
 impl AravisConfig {
-    /// The camera's address or name, of which there is exactly one.
+    /// The camera's address or name, whichever is given.
     pub fn device(&self) -> Option<&str> {
         match (&self.address, &self.name) {
             (Some(device), None) | (None, Some(device)) => Some(device),
@@ -113,7 +113,7 @@ impl AravisConfig {
         self.trigger_source != "off"
     }
 
-    /// What can be told without the camera to be impossible.
+    /// Faults that can be found without the camera.
     pub fn faults(&self) -> Vec<Fault> {
         let packet_bytes = f64::from(MIN_PACKET_BYTES)..=f64::from(MAX_PACKET_BYTES);
         let rules = [

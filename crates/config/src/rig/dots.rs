@@ -1,4 +1,4 @@
-//! `rig.toml` of a dot rig: a mirror that moves one spot of light, and a camera that takes a frame of each place.
+//! `rig.toml` of a dot rig: a mirror that moves one spot of light, and a camera that takes one frame per position.
 
 use std::path::PathBuf;
 
@@ -18,11 +18,11 @@ use crate::{ConfigError, Places};
 pub struct DotRigFile {
     /// `[camera]`
     pub camera: DotCameraSection,
-    /// `[mirror]`; left out where frames come from a recording.
+    /// `[mirror]`; absent if the frames come from a recording.
     pub mirror: Option<MirrorSection>,
     /// `[sim]`, for the driver `sim`.
     pub sim: DotSimSection,
-    /// Where all that stands in the text.
+    /// Positions of the values in the text.
     pub places: Places,
 }
 
@@ -34,17 +34,17 @@ pub struct DotSimSection {
     pub dots: DotsConfig,
 }
 
-/// Drivers of a dot rig's camera by the names that rig files use.
+/// Drivers of a dot rig's camera, by their names in rig files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DotCameraDriver {
     /// The simulated rig.
     Sim,
-    /// Frames that were recorded before.
+    /// Previously recorded frames.
     Replay,
     /// GigE Vision and USB3 Vision through libaravis.
     Aravis,
-    /// Cameras of the Linux kernel.
+    /// Cameras supported by the Linux kernel (V4L2).
     V4l2,
 }
 
@@ -52,19 +52,19 @@ pub enum DotCameraDriver {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DotCameraSection {
-    /// Which driver opens it.
+    /// The driver that opens it.
     pub driver: DotCameraDriver,
-    /// How frames are packed.
+    /// Pixel format of the frames.
     #[serde(default = "default_pixel_format")]
     pub pixel_format: PixelFormat,
-    /// Counts, above black, of a white plane in the dot's middle; left out: 2500 of 4096 of the format's.
+    /// Counts, above black, of a white plane at the centre of the dot; default: 2500 of 4096, scaled to the format.
     white_dn: Option<f64>,
     /// The exposure that `white_dn` is for.
     #[serde(default = "default_white_exposure_us")]
     pub white_exposure_us: f64,
-    /// Counts without light; left out: 64 of 4096 of the format's.
+    /// Counts without light; default: 64 of 4096, scaled to the format.
     black_dn: Option<f64>,
-    /// How long a camera that stops answering within a run may stay away.
+    /// How long to wait, in a run, for a camera that has stopped responding.
     #[serde(default = "default_reopen_s")]
     pub reopen_s: f64,
     /// `[camera.aravis]`, for the driver `aravis`.
@@ -77,7 +77,7 @@ pub struct DotCameraSection {
 }
 
 impl DotCameraSection {
-    /// Counts, above black, of a white plane in the dot's middle.
+    /// Counts, above black, of a white plane at the centre of the dot.
     pub fn white_dn(&self) -> f64 {
         self.white_dn.unwrap_or_else(|| default_white_dn(self.pixel_format))
     }
@@ -88,7 +88,7 @@ impl DotCameraSection {
     }
 }
 
-/// Drivers of mirrors by the names that rig files use.
+/// Mirror drivers, by their names in rig files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MirrorDriver {
@@ -103,7 +103,7 @@ pub enum MirrorDriver {
 }
 
 impl MirrorDriver {
-    /// As rig files call it.
+    /// Its name in rig files.
     pub fn name(self) -> &'static str {
         match self {
             Self::Sim => "sim",
@@ -118,7 +118,7 @@ impl MirrorDriver {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MirrorSection {
-    /// Which driver opens it.
+    /// The driver that opens it.
     pub driver: MirrorDriver,
     /// Its serial port, for all drivers but `sim`.
     pub port: Option<PathBuf>,
@@ -131,20 +131,21 @@ pub struct MirrorSection {
     /// Angle between the beam and the mirror's normal at rest.
     #[serde(default)]
     pub incidence_deg: f64,
-    /// What the mirror survives.
+    /// Limits that protect the mirror from damage.
     #[serde(default = "default_limits")]
     pub limits: MirrorLimits,
-    /// What an MTI controller drives the mirror with.
+    /// Drive parameters of an MTI controller.
     #[serde(default)]
     pub drive: MtiDrive,
-    /// The most that the mirror takes of it, from its data sheet.
+    /// The maximum drive parameters of the mirror, from its data sheet.
     #[serde(default)]
     pub max_drive: MtiDrive,
-    /// How the axes answer; paths are then distorted beforehand so that the mirror follows them.
+    /// Response of the axes; if given, paths are predistorted so that the mirror follows them.
     pub response: Option<ResponseKey>,
-    /// A file that begins with `1` while the interlock is closed, such as a GPIO's value; left out: the operator's word.
+    /// A file that starts with `1` while the interlock is closed, such as a GPIO's value; default: the operator
+    /// permits light.
     pub interlock: Option<PathBuf>,
-    /// The port whose RTS line enables the laser, for the driver `optotune`.
+    /// The port whose RTS line enables the laser; for the driver `optotune`.
     pub laser_port: Option<PathBuf>,
 }
 
@@ -155,17 +156,17 @@ pub struct MirrorSection {
     expecting = "\"identified\", or [{ f0_hz = .., q = .. }, { f0_hz = .., q = .. }] of x and y"
 )]
 pub enum ResponseKey {
-    /// As a plan of kind `response` has found it.
+    /// The response that a run of kind `response` has identified.
     Found(Identified),
-    /// As stated here, x and y.
+    /// Responses stated here, for x and y.
     Stated([SecondOrder; 2]),
 }
 
-/// The word `identified`.
+/// Accepts only the word `identified`.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Identified {
-    /// It has no other.
+    /// Use the response that was identified.
     Identified,
 }
 
@@ -173,27 +174,27 @@ pub enum Identified {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PlayzerXLink {
-    /// Over USB, as a virtual serial port: faster than any rate needs.
+    /// Over USB, as a virtual serial port: fast enough for any rate.
     #[default]
     VirtualCom,
-    /// Over a UART at 921,600 baud: 10 bits a byte, 9 bytes a sample, 10,240 samples/s at most.
+    /// Over a UART at 921,600 baud: with 10 bits per byte and 9 bytes per sample, at most 10,240 samples/s.
     Uart,
 }
 
-/// What an MTI controller drives a mirror with.
+/// Drive parameters of an MTI controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct MtiDrive {
-    /// Bias, 0..=100 V.
+    /// Bias voltage, 0..=100 V.
     pub bias_v: u32,
-    /// Largest difference between the electrodes of an axis, 0..=200 V.
+    /// Largest voltage difference between the electrodes of an axis, 0..=200 V.
     pub difference_v: u32,
     /// -3 dB frequency of the controller's low-pass, 50..=15,000 Hz.
     pub bandwidth_hz: u32,
 }
 
 impl MtiDrive {
-    /// The most that Mirrorcle's A7B2.3-3600AL takes.
+    /// Maximum for Mirrorcle's A7B2.3-3600AL.
     pub const A7B2_3_3600AL: Self = Self { bias_v: 80, difference_v: 150, bandwidth_hz: 200 };
 }
 
@@ -218,7 +219,7 @@ impl DotRigFile {
     /// Reads a rig file.
     ///
     /// # Errors
-    /// Everything that is wrong with it, with the places in the text.
+    /// All mistakes, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
         match document.require("kind", "kind = \"dots\"") {
@@ -229,7 +230,7 @@ impl DotRigFile {
         Self::read(document)
     }
 
-    /// The rig of a document whose kind is [`RigKind::Dots`].
+    /// Reads a document whose kind is [`RigKind::Dots`].
     pub(super) fn read(mut document: Document<'_>) -> Result<Self, ConfigError> {
         let camera: Option<DotCameraSection> = document.require("camera", "a table [camera] with a driver");
         let has_mirror = document.places().has(&["mirror"]);
@@ -250,7 +251,7 @@ impl DotRigFile {
         document.finish(Some(rig))
     }
 
-    /// What its mirror's paths must keep to.
+    /// Limits of its mirror's paths.
     pub fn limits(&self) -> MirrorLimits {
         self.mirror.as_ref().map_or_else(default_limits, |mirror| mirror.limits)
     }
@@ -260,7 +261,7 @@ impl DotRigFile {
         MechanicalDeg(self.mirror.as_ref().map_or(0.0, |mirror| mirror.incidence_deg))
     }
 
-    /// What holds between its tables.
+    /// Checks rules that involve several tables.
     fn check(&self, document: &mut Document<'_>) {
         match &self.mirror {
             None if self.camera.driver != DotCameraDriver::Replay => {

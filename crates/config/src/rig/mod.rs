@@ -1,4 +1,4 @@
-//! `rig.toml`: what a rig is made of.
+//! `rig.toml`: the devices of a rig.
 
 pub mod aravis;
 pub mod dots;
@@ -27,17 +27,17 @@ pub enum RigKind {
 
 /// A rig file of either kind.
 pub enum AnyRigFile {
-    /// A plane rig's.
+    /// File of a plane rig.
     Plane(Box<RigFile>),
-    /// A dot rig's.
+    /// File of a dot rig.
     Dots(Box<DotRigFile>),
 }
 
 impl AnyRigFile {
-    /// Reads a rig file of the kind that it names.
+    /// Reads a rig file of either kind.
     ///
     /// # Errors
-    /// Everything that is wrong with it, with the places in the text.
+    /// All mistakes, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
         match document.require("kind", "kind = \"plane\" or kind = \"dots\"") {
@@ -52,12 +52,12 @@ impl AnyRigFile {
 pub(super) fn default_reopen_s() -> f64 {
     60.0
 }
-/// 2500 of the 4096 counts of 12 bit, in a format's own counts.
+/// 2500 of the 4096 counts of 12 bits, scaled to a format.
 pub(super) fn default_white_dn(format: PixelFormat) -> f64 {
     2500.0 / 4096.0 * full_scale_dn(format)
 }
 
-/// 64 of the 4096 counts of 12 bit.
+/// 64 of the 4096 counts of 12 bits, scaled to a format.
 pub(super) fn default_black_dn(format: PixelFormat) -> f64 {
     64.0 / 4096.0 * full_scale_dn(format)
 }

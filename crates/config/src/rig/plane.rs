@@ -1,4 +1,4 @@
-//! `rig.toml`: what the rig is made of and what is known of its timing.
+//! `rig.toml` of a plane rig: its devices and their timing.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ use crate::document::Document;
 use crate::sim::{SimConfig, Spot as SimSpot};
 use crate::{ConfigError, Places};
 
-/// A rig.
+/// A plane rig.
 #[derive(Debug, Clone)]
 pub struct RigFile {
     /// `[camera]`
@@ -26,11 +26,11 @@ pub struct RigFile {
     pub projector: ProjectorSection,
     /// `[sim]`, for the driver `sim`.
     pub sim: SimConfig,
-    /// Where all that stands in the text.
+    /// Positions of the values in the text.
     pub places: Places,
 }
 
-/// Drivers of cameras by the names that rig files use.
+/// Camera drivers, by their names in rig files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CameraDriver {
@@ -38,11 +38,11 @@ pub enum CameraDriver {
     Sim,
     /// GigE Vision and USB3 Vision through libaravis.
     Aravis,
-    /// Cameras of the Linux kernel.
+    /// Cameras supported by the Linux kernel (V4L2).
     V4l2,
 }
 
-/// Drivers of projectors by the names that rig files use.
+/// Projector drivers, by their names in rig files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ProjectorDriver {
@@ -50,7 +50,7 @@ pub enum ProjectorDriver {
     Sim,
     /// A display output of this machine.
     Drm,
-    /// The operator, asked through the daemon's clients.
+    /// The operator, who is asked through the daemon's clients.
     External,
 }
 
@@ -60,9 +60,9 @@ pub enum ProjectorDriver {
 pub struct DrmSection {
     /// The graphics card.
     pub card: PathBuf,
-    /// The output by the kernel's name; left out: the first with a display.
+    /// The kernel's name of the output; default: the first with a display.
     pub connector: Option<String>,
-    /// Video frames from a flip until the picture is certain to be in the light.
+    /// Video frames from a page flip until the projector certainly shows the image.
     pub settle_frames: u32,
 }
 
@@ -76,9 +76,9 @@ impl Default for DrmSection {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CameraSection {
-    /// Which driver opens it.
+    /// The driver that opens it.
     pub driver: CameraDriver,
-    /// How long a camera that stops answering within a run may stay away.
+    /// How long to wait, in a run, for a camera that has stopped responding.
     #[serde(default = "default_reopen_s")]
     pub reopen_s: f64,
     /// `[camera.aravis]`, for the driver `aravis`.
@@ -86,25 +86,26 @@ pub struct CameraSection {
     pub aravis: AravisConfig,
     /// `[camera.v4l2]`, for the driver `v4l2`.
     pub v4l2: Option<V4l2Config>,
-    /// Counts, above black, of a white pixel in the time of one projector row; left out: 2500 of 4096 of the format's.
+    /// Counts, above black, of a white pixel in the time of one projector row; default: 2500 of 4096, scaled to the
+    /// format.
     white_dn: Option<f64>,
-    /// Counts without light; left out: 64 of 4096 of the format's.
+    /// Counts without light; default: 64 of 4096, scaled to the format.
     black_dn: Option<f64>,
-    /// Electrons per count; left out: see [`RigFile::noise`].
+    /// Electrons per count; default: see [`RigFile::noise`].
     electrons_per_dn: Option<f64>,
-    /// Electrons of noise in a dark sample; left out: see [`RigFile::noise`].
+    /// Electrons of noise in a dark sample; default: see [`RigFile::noise`].
     read_noise_e: Option<f64>,
-    /// How frames are packed.
+    /// Pixel format of the frames.
     #[serde(default = "default_pixel_format")]
     pub pixel_format: PixelFormat,
-    /// From the start of one row's exposure to the next row's; left out: `row_pitch` times the projector's row time.
+    /// From the start of one row's exposure to the next row's; default: `row_pitch` times the projector's row time.
     pub row_time_us: Option<f64>,
-    /// Projector rows from one camera row to the next, on the epipolar planes.
+    /// Projector rows per camera row, on the epipolar planes.
     #[serde(default = "default_row_pitch")]
     pub row_pitch: f64,
-    /// Projector row that camera row 0 sees; left out: the camera's rows are the middle of the projector's.
+    /// Projector row that camera row 0 sees; default: the camera's rows are centred on the projector's.
     pub first_projector_row: Option<usize>,
-    /// Projector columns, 0 to 1 over its width, that the image's left and right edges see; left out: not known.
+    /// Projector columns, 0 to 1 across its width, that the image's left and right edges see; default: unknown.
     pub projector_columns: Option<[f64; 2]>,
 }
 
@@ -120,29 +121,29 @@ impl CameraSection {
     }
 }
 
-/// How the noise of a camera is known.
+/// Origin of a camera's noise figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum NoiseSource {
-    /// The rig file states it.
+    /// Stated in the rig file.
     Stated,
-    /// The simulator's own.
+    /// Taken from the simulator.
     Simulated,
-    /// Typical values are assumed.
+    /// Typical values.
     Assumed,
 }
 
-/// The figures that a camera's noise follows from.
+/// A camera's noise figures.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraNoise {
-    /// Electrons per count; infinitely many where light brings no noise.
+    /// Electrons per count; infinite if there is no photon noise.
     pub electrons_per_dn: f64,
     /// Electrons of noise in a dark sample.
     pub read_noise_e: f64,
-    /// How they are known.
+    /// Origin of the figures.
     pub source: NoiseSource,
 }
 
-/// Electrons over the full scale of a typical camera [A].
+/// Electrons at full scale of a typical camera [A].
 const TYPICAL_FULL_SCALE_E: f64 = 8000.0;
 /// Electrons of read noise of a typical camera [A].
 const TYPICAL_READ_NOISE_E: f64 = 15.0;
@@ -151,12 +152,12 @@ const TYPICAL_READ_NOISE_E: f64 = 15.0;
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProjectorSection {
-    /// Which driver shows pictures.
+    /// The driver that shows images.
     pub driver: ProjectorDriver,
     /// `[projector.drm]`, for the driver `drm`: 1280x720 at 60 Hz.
     #[serde(default)]
     pub drm: DrmSection,
-    /// Rows that it draws.
+    /// Number of rows.
     #[serde(default = "default_rows")]
     pub rows: usize,
     /// From one row to the next.
@@ -165,47 +166,48 @@ pub struct ProjectorSection {
     /// From the VSYNC edge to the start of row 0.
     #[serde(default = "default_first_row_us")]
     pub first_row_us: f64,
-    /// Measured start of each row's light and end of the last's, from `first_row_us` on; left out: rows of one row time.
+    /// Measured start of each row's light and end of the last's, relative to `first_row_us`; default: rows of one row
+    /// time.
     pub row_table: Option<Vec<f64>>,
-    /// Standard deviation of the beam over rows, 0 for an ideal one; left out: not known.
+    /// Standard deviation of the beam in rows, 0 for an ideal one; default: unknown.
     pub beam_sigma_rows: Option<f64>,
-    /// How the light of a row is drawn.
+    /// How a row is lit.
     #[serde(default)]
     pub spot: SpotKind,
-    /// Which way a flying spot runs; left out: not known.
+    /// Scan direction of a flying spot; default: unknown.
     pub scan: Option<ScanKind>,
 }
 
-/// How the light of a row is drawn.
+/// How a row is lit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum SpotKind {
-    /// Over the row's whole time.
+    /// During the whole time of the row.
     #[default]
     Uniform,
-    /// At the moment the spot passes.
+    /// At the moment when the spot passes.
     Flying,
 }
 
-/// Which way a flying spot runs.
+/// Scan direction of a flying spot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ScanKind {
-    /// Nobody knows.
+    /// Not known.
     Unknown,
     /// Every row from the first column to the last.
     OneWay,
-    /// Odd rows backwards.
+    /// Odd rows in the reverse direction.
     Bidirectional,
 }
-/// Rectified rows of the same height.
+/// For rectified rows of equal height.
 fn default_row_pitch() -> f64 {
     1.0
 }
 fn default_rows() -> usize {
     720
 }
-/// 720p60 with its 750 lines.
+/// 720p60 with 750 lines in total.
 fn default_row_time_us() -> f64 {
     22.22
 }
@@ -214,18 +216,18 @@ fn default_first_row_us() -> f64 {
     555.5
 }
 
-/// Largest number of rows a raster projector is taken to have.
+/// Maximum number of rows of a raster projector.
 const MAX_ROWS: u64 = 8192;
 
-/// Part of the row time by which camera and projector may differ. The model follows the drift of the delay; beyond this
-/// a sweep would no longer be one around the epipolar planes of all rows.
+/// Fraction by which the row times of camera and projector may differ. The model follows the drift of the delay;
+/// beyond this limit, a sweep would no longer cover the epipolar planes of all rows.
 const ROW_TIME_TOLERANCE: f64 = 0.01;
 
 impl RigFile {
     /// Reads a rig file.
     ///
     /// # Errors
-    /// Everything that is wrong with it, with the places in the text.
+    /// All mistakes, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
         match document.require("kind", "kind = \"plane\"") {
@@ -236,7 +238,7 @@ impl RigFile {
         Self::read(document)
     }
 
-    /// The rig of a document whose kind is [`RigKind::Plane`].
+    /// Reads a document whose kind is [`RigKind::Plane`].
     pub(super) fn read(mut document: Document<'_>) -> Result<Self, ConfigError> {
         let camera: Option<CameraSection> = document.require("camera", "a table [camera] with a driver");
         let vsync: Option<VsyncSection> = document.require("vsync", "a table [vsync] with a driver");
@@ -279,7 +281,7 @@ impl RigFile {
         }
     }
 
-    /// The camera's row time: as stated, or that which keeps pace with the projector.
+    /// The camera's row time: as stated, or else the one that keeps pace with the projector.
     pub fn camera_row_time_us(&self) -> f64 {
         self.camera.row_time_us.unwrap_or_else(|| self.pace_us())
     }
@@ -289,7 +291,8 @@ impl RigFile {
         self.camera.row_pitch * self.projector.row_time_us
     }
 
-    /// The camera's noise: as stated; what is left out of it as the simulator makes it, of other cameras typical values.
+    /// The camera's noise: as stated; missing figures come from the simulator for a simulated camera, else typical
+    /// values.
     pub fn noise(&self) -> CameraNoise {
         let (camera, sensor) = (&self.camera, &self.sim.sensor);
         let unstated = if camera.driver != CameraDriver::Sim {
@@ -299,7 +302,7 @@ impl RigFile {
                 source: NoiseSource::Assumed,
             }
         } else if sensor.noise {
-            // The simulator counts its electrons on a scale of 12 bit.
+            // The simulator defines its electrons per count on a 12-bit scale.
             let electrons_per_dn = sensor.electrons_per_dn * 4096.0 / full_scale_dn(camera.pixel_format);
             CameraNoise {
                 electrons_per_dn,
@@ -321,7 +324,7 @@ impl RigFile {
         }
     }
 
-    /// What holds between its tables.
+    /// Checks rules that involve several tables.
     fn check(&self, document: &mut Document<'_>) {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
         if !document.is_sound(&[

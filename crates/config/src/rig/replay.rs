@@ -18,7 +18,7 @@ pub struct ReplayConfig {
     /// Bytes at the beginning of each raw file to skip.
     #[serde(default)]
     pub header_bytes: u64,
-    /// Packing of pixels in raw files, if it is none of the camera's pixel formats.
+    /// Packing of pixels in raw files, if it differs from the pixel format.
     #[serde(default)]
     pub packing: RawPacking,
     /// Playback speed.

@@ -63,7 +63,7 @@ impl V4l2Config {
         }
     }
 
-    /// What can be told without the camera to be impossible.
+    /// Faults that can be found without the camera.
     pub fn faults(&self) -> Vec<Fault> {
         let unit_us = |control: &Option<TimeControl>| control.as_ref().and_then(|c| c.unit_us).unwrap_or(1.0);
         let rules = [
@@ -87,7 +87,7 @@ impl V4l2Config {
 fn default_buffers() -> u32 {
     8
 }
-/// In Linux's sensor drivers, a new exposure applies at the latest to the second frame after the one in progress.
+/// With Linux's sensor drivers, a new exposure applies at the latest to the second frame after the one in progress.
 fn default_late_frames() -> u32 {
     3
 }

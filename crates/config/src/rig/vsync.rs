@@ -1,4 +1,4 @@
-//! `[vsync]`: what watches the VSYNC line.
+//! `[vsync]`: the device that watches the VSYNC line.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -7,7 +7,7 @@ use serde::Deserialize;
 
 use crate::document::{Document, Fault, out_of_range};
 
-/// Drivers by the names that rig files use.
+/// VSYNC drivers, by their names in rig files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VsyncDriver {
@@ -19,7 +19,7 @@ pub enum VsyncDriver {
     Pps,
     /// A logic analyser with sigrok's firmware.
     Fx2Lafw,
-    /// strawlab's triggerbox, which makes the VSYNC.
+    /// strawlab's triggerbox, which generates the VSYNC.
     TriggerBox,
 }
 
@@ -27,15 +27,15 @@ pub enum VsyncDriver {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct VsyncSection {
-    /// Which driver watches the line.
+    /// The driver that watches the line.
     pub driver: VsyncDriver,
-    /// From one edge to the next.
+    /// Time from one edge to the next.
     #[serde(default = "default_period_us")]
     pub period_us: f64,
-    /// An edge this far from where the one before puts it is not the projector's.
+    /// An edge that deviates by more than this from the prediction is not the projector's.
     #[serde(default = "default_gate_us")]
     pub gate_us: f64,
-    /// How long a watcher that is unplugged within a run may stay away.
+    /// How long to wait, in a run, for a watcher that was unplugged.
     #[serde(default = "default_reopen_s")]
     pub reopen_s: f64,
     /// `[vsync.modemline]`
@@ -90,12 +90,12 @@ pub struct ModemLineConfig {
     /// The line that carries the VSYNC.
     #[serde(default)]
     pub line: ModemLineInput,
-    /// Which change of it is the edge.
+    /// The transition that counts as the edge.
     #[serde(default)]
     pub edge: Polarity,
 }
 
-/// A modem line that the VSYNC may be wired to.
+/// A modem line for the VSYNC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ModemLineInput {
@@ -110,14 +110,14 @@ pub enum ModemLineInput {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PpsConfig {
-    /// The source, `/dev/pps0`.
+    /// The source, such as `/dev/pps0`.
     pub source: PathBuf,
-    /// Which change of the line is the edge.
+    /// The transition that counts as the edge.
     #[serde(default)]
     pub edge: Polarity,
 }
 
-/// Which change of the line is the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
+/// The transition that counts as the VSYNC edge. TTL converters invert: a line at 0 V is asserted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Polarity {
@@ -132,17 +132,17 @@ pub enum Polarity {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Fx2LafwConfig {
-    /// Firmware to load into an analyser that has none, as sigrok's packages install it.
+    /// Firmware to load into an analyser that has none, such as the file that sigrok's packages install.
     pub firmware: Option<PathBuf>,
-    /// Samples a second: 48 or 30 MHz over a whole number.
+    /// Samples per second: 48 or 30 MHz divided by an integer.
     pub sample_rate_hz: u32,
-    /// Inputs, 0 to 7, by the names of their signals; `vsync` is one of them.
+    /// Inputs, 0 to 7, by signal name; one of them is `vsync`.
     pub channels: BTreeMap<String, u8>,
-    /// Which change of the VSYNC is its edge.
+    /// The transition of the VSYNC that counts as its edge.
     pub edge: Slope,
     /// A signal must have been quiet for this long before a change counts: lines ring.
     pub quiet_us: f64,
-    /// From a sample to its transfer's arrival when nothing delays it.
+    /// From a sample to the arrival of its transfer without extra delay.
     pub latency_us: f64,
 }
 
@@ -174,10 +174,10 @@ impl Fx2LafwConfig {
     pub const VSYNC: &str = "vsync";
     /// The analyser's two clocks.
     const CLOCKS_HZ: [u32; 2] = [48_000_000, 30_000_000];
-    /// The rates that a clock, divided, can give.
+    /// Sample rates that a divided clock can provide.
     const RATES_HZ: std::ops::RangeInclusive<u32> = 20_000..=24_000_000;
 
-    /// What can be told without the analyser to be impossible.
+    /// Faults that can be found without the analyser.
     pub fn faults(&self) -> Vec<Fault> {
         let Self { sample_rate_hz, channels, quiet_us, latency_us, .. } = self;
         let rules = [("quiet_us", *quiet_us, 0.0..=1000.0), ("latency_us", *latency_us, 0.0..=10_000.0)];
@@ -210,12 +210,12 @@ impl Fx2LafwConfig {
 pub struct TriggerBoxConfig {
     /// Its serial port.
     pub port: PathBuf,
-    /// What lies between the port and the box.
+    /// The connection between the port and the box.
     #[serde(default)]
     pub link: TriggerBoxLink,
 }
 
-/// How bytes get to the box.
+/// How bytes reach the box.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum TriggerBoxLink {

@@ -1,4 +1,4 @@
-//! `[sim]`: what a simulated rig is made of.
+//! `[sim]`: the parameters of a simulated rig.
 
 mod dots;
 mod plane;

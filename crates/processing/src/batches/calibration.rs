@@ -1,4 +1,4 @@
-//! What the batches of the calibration planes tell of the dots.
+//! Calibration of the dots from the batches of the calibration planes.
 
 use ndarray::{Array2, Array3};
 use raysweep_session::dots::Dots;
@@ -13,35 +13,35 @@ use serde_json::{Map, json};
 
 use super::from_stored;
 
-/// Share of its peak from which on a pixel tells where a dot is.
+/// A pixel belongs to a dot's spot from this share of the dot's peak on.
 const FOOTPRINT_LEVEL: f64 = 0.5;
-/// Share of its peak from which on a pixel is one of the dot's when it comes to which dots overlap. What the rims of the
-/// others leave counts as global light: at a half that was a tenth of all light on the simulated V-groove.
+/// A pixel counts towards the overlap of dots from this share of a dot's peak on. Light from the rims of the other
+/// dots counts as global light: at one half, that was a tenth of all light on the simulated V-groove.
 const OVERLAP_LEVEL: f64 = 0.1;
 
-/// The dots as the calibration planes show them.
+/// Calibration of the dots from the planes.
 pub(super) struct Calibration {
-    /// Where they land on the first plane, the mean over its batches.
+    /// Positions on the first plane, averaged over its batches.
     pub centroids: Centroids,
-    /// Which of them share pixels there.
+    /// Dots that share pixels on the first plane.
     pub confusion: Confusion,
-    /// How strongly they together cover each pixel.
+    /// How strongly all dots together cover each pixel.
     pub coverage: Array3<f32>,
-    /// Light of each on the plane.
+    /// Light of each dot on the plane.
     pub energies: Vec<f64>,
-    /// The epipolar geometry of a dot's place on the first plane and the camera, or why there is none.
+    /// The epipolar geometry between a dot's position on the first plane and the camera, or why there is none.
     pub fundamental: std::result::Result<Fundamental, String>,
-    /// Root mean square distance of the second plane's dots from their lines.
+    /// Root mean square distance of the second plane's dots from their epipolar lines.
     pub epipolar_px: Option<f64>,
-    /// Radius of a dot on the plane, if any can be told from its surroundings.
+    /// Radius of a dot on the plane, if any dot stands out from its surroundings.
     pub radius_px: Option<f64>,
-    /// Dots whose spread is not one piece.
+    /// Number of dots whose spot is not one connected piece.
     pub not_unimodal: usize,
-    /// From the first batch of the first plane to its others.
+    /// Drift from the first batch of the first plane to each of its other batches.
     pub drifts: Vec<(usize, Drift)>,
 }
 
-/// A stored batch, if it is sound; what is wrong with it otherwise.
+/// Reads a stored batch; the error says what is wrong with it.
 pub(super) fn read_batch(
     dots: &Dots,
     shape: FrameShape,
@@ -56,7 +56,7 @@ pub(super) fn read_batch(
 }
 
 impl Calibration {
-    /// From the stored batches of the planes; none where there are none.
+    /// Calibrates from the stored batches of the planes; `None` without planes.
     pub fn of(dots: &Dots, shape: FrameShape, state: &State, problems: &mut Vec<String>) -> Option<Self> {
         let mut batches_of = |plane: usize| {
             let entries = state.batches().filter(|entry| entry.plane == Some(plane));
@@ -86,7 +86,7 @@ impl Calibration {
         let drifts = all.iter().skip(1).map(|(number, later)| Ok((*number, later.drift_from(&all[0].1)?)));
         let drifts = drifts.collect::<std::result::Result<_, DotsError>>()?;
         let centroids = mean(all.into_iter().map(|(_, centroids)| centroids).collect());
-        // One batch serves for what a mean would smear: the last, which is nearest to the scene.
+        // One batch is used where averaging would blur: the last one, which is nearest in time to the scene.
         let plane = &first[first.len() - 1].1;
         let spreads = PointSpreads::new(plane)?;
         let not_unimodal = spreads.unimodal.iter().filter(|unimodal| !**unimodal).count();
@@ -109,7 +109,7 @@ impl Calibration {
         })
     }
 
-    /// The confusion matrix as an image `[dot, dot]`, in pixels.
+    /// The confusion matrix as an image `[dot, dot]`; entries are counts of pixels.
     pub fn confusion_image(&self) -> Array2<f32> {
         let dots = self.confusion.dots();
         let (offsets, neighbours, overlaps) = self.confusion.arrays();
@@ -122,7 +122,7 @@ impl Calibration {
         image
     }
 
-    /// Writes what the products were made with: `confusion`, `coverage`, and a table of the `dots`.
+    /// Writes the data that the products are based on: `confusion`, `coverage`, and a table of the `dots`.
     pub fn write(&self, session: &Session) -> Result<()> {
         let files = session.products();
         let about = |text: &str, axes: &[&str]| {
@@ -157,7 +157,7 @@ impl Calibration {
     }
 }
 
-/// Means of the places of dots over batches in which they are seen.
+/// Mean positions of the dots over the batches that show them.
 fn mean(batches: Vec<Centroids>) -> Centroids {
     let mut mean = batches[0].clone();
     for (dot, xy) in mean.xy.iter_mut().enumerate() {
@@ -168,9 +168,9 @@ fn mean(batches: Vec<Centroids>) -> Centroids {
     mean
 }
 
-/// The fundamental matrix from the places of the dots on two planes. A dot's place on the first plane stands for its
-/// direction: all its points at other depths lie on one line through it. So the mirror's angles need not be known, nor
-/// how well it follows its path.
+/// The fundamental matrix from the positions of the dots on two planes. A dot's position on the first plane stands
+/// for its direction: the points along that direction project onto one line. So neither the mirror's angles nor its
+/// tracking accuracy need to be known.
 fn epipolar_geometry(
     first: &Centroids,
     second: Option<&Centroids>,
@@ -213,7 +213,7 @@ mod tests {
         first.xy = (0..100)
             .map(|dot| Some([20.0 + 20.0 * f64::from(dot % 10), 20.0 + 20.0 * f64::from(dot / 10)]))
             .collect();
-        // Places farther away move towards an epipole at (600, 90), by shares that hang on the place.
+        // Positions farther away move towards an epipole at (600, 90), by a share that depends on the position.
         let mut second = first.clone();
         for xy in second.xy.iter_mut().flatten() {
             let share = 0.05 + 1e-4 * (xy[0] + 2.0 * xy[1]);

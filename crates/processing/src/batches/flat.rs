@@ -1,4 +1,4 @@
-//! The flat field between a run, its session, and later runs.
+//! Passes the flat field between a run, its session, and later runs.
 
 use std::path::Path;
 
@@ -9,10 +9,10 @@ use raysweep_transport::dots::{Correction, FlatField};
 
 use super::DotTask;
 
-/// Keeps the gains that the run's columns are made with.
+/// Stores the gains that are applied to the run's columns.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn keep(session: &Session, correction: &Correction) -> Result<()> {
     let size = (correction.shape().height(), correction.shape().width());
     let mut repaired = Array2::from_elem(size, false);
@@ -25,10 +25,10 @@ pub fn keep(session: &Session, correction: &Correction) -> Result<()> {
 }
 
 impl DotTask {
-    /// The flat field of the earlier session that the plan names, if it names one; sessions lie in `data`.
+    /// Loads the flat field of the earlier session that the plan names, if any; sessions are in `data`.
     ///
     /// # Errors
-    /// When that session has none, or one of another size.
+    /// When that session has no flat field, or one of another size.
     pub fn earlier_flat_field(&self, data: &Path) -> Result<Option<FlatField>> {
         let Some(dir) = &self.correct.flat_field else { return Ok(None) };
         let size = [self.shape.height(), self.shape.width()];

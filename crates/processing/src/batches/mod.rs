@@ -1,4 +1,4 @@
-//! Batches of a flying dot: what a plan amounts to, and what is made of the columns.
+//! Batches of a flying dot: checks a plan and processes the columns.
 
 mod calibration;
 pub mod flat;
@@ -22,7 +22,7 @@ pub use self::results::{keep_patterns, make};
 use crate::mirror_response::Predistortion;
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// A plan of batches on a dot rig: everything that acquisition and processing have in common.
+/// A plan of batches on a dot rig: everything that acquisition and processing share.
 pub struct DotTask {
     /// The plan's name.
     pub name: String,
@@ -30,22 +30,22 @@ pub struct DotTask {
     pub batches: BatchesPlan,
     /// Size of the frames.
     pub shape: FrameShape,
-    /// How they are packed.
+    /// Pixel format of the frames.
     pub format: PixelFormat,
-    /// What the mirror is told to do in a batch.
+    /// The commanded mirror path of a batch.
     pub path: MirrorPath,
-    /// By what that was distorted beforehand.
+    /// Model that the path was predistorted with, if any.
     pub predistortion: Option<Predistortion>,
-    /// What is made of the batches.
+    /// The products to make.
     pub specs: Vec<DotSpec>,
-    /// What is known and done of single pixels.
+    /// Corrections of single pixels.
     pub correct: CorrectOptions,
     denoise: StageTable,
     stages: Vec<StageTable>,
     places: Places,
 }
 
-/// What has no options.
+/// For stages without options.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NoOptions {}
@@ -54,11 +54,11 @@ struct NoOptions {}
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct CorrectOptions {
-    /// An earlier session whose flat field serves: its folder, or its name within the daemon's data folder.
+    /// Earlier session whose flat field is used: its folder, or its name within the daemon's data folder.
     pub flat_field: Option<PathBuf>,
-    /// Pixels whose dark level or noise lies so many standard deviations beyond the others' are hot.
+    /// Pixels whose dark level or noise lies more than this many standard deviations beyond the others' are hot.
     pub hot_sigmas: f64,
-    /// Batches that the rolling background is worth.
+    /// Number of batches that the rolling background averages over.
     pub background_batches: u32,
 }
 
@@ -69,11 +69,11 @@ impl Default for CorrectOptions {
 }
 
 impl DotTask {
-    /// A plan on a rig with a camera of this size (rows, columns). `folder` has what was identified of the rig's mirror,
-    /// if the rig file wants that: the daemon's data, or the session.
+    /// A plan on a rig with a camera of this size (rows, columns). `folder`, the daemon's data folder or the session,
+    /// holds the identified mirror response, if the rig file uses it.
     ///
     /// # Errors
-    /// With the place in the plan's text, for what this rig cannot do.
+    /// With the position in the plan's text, for what this rig cannot do.
     pub fn new(
         plan: &Plan,
         batches: BatchesPlan,
@@ -118,7 +118,7 @@ impl DotTask {
         })
     }
 
-    /// What the pipeline is to cut out of the frames of one pass of `batches` batches.
+    /// What the pipeline extracts from the frames of one pass of `batches` batches.
     pub fn scan(&self, batches: u32) -> Scan {
         scan(&self.batches, self.shape, batches)
     }
@@ -139,7 +139,7 @@ impl DotTask {
         self.scan(1).is_scene(dot as u32)
     }
 
-    /// How the camera is set.
+    /// Camera settings for the batches.
     pub fn camera_settings(&self) -> CameraSettings {
         let exposure_us = self.batches.exposure_us;
         CameraSettings { shutter: Shutter::Global, exposure_us, trigger_delay_us: 0.0 }
@@ -150,15 +150,15 @@ impl DotTask {
         crate::saturation_dn(self.format) as u16
     }
 
-    /// How the sensor samples colour.
+    /// The sensor's colour sampling.
     pub fn sampling(&self) -> Sampling {
         sampling(self.format)
     }
 
-    /// What makes columns of frames.
+    /// The stage that makes columns from frames.
     ///
     /// # Errors
-    /// For a stage that is unknown, or options that it does not take.
+    /// For an unknown stage, or options that it does not take.
     pub fn stage(
         &self,
         registry: &Registry,
@@ -172,7 +172,7 @@ impl DotTask {
     }
 }
 
-/// What the pipeline is to cut out of the frames of one pass of `count` batches.
+/// What the pipeline extracts from the frames of one pass of `count` batches.
 fn scan(plan: &BatchesPlan, shape: FrameShape, count: u32) -> Scan {
     let [top, bottom, left, right] = plan.trailing_region;
     Scan {
@@ -185,7 +185,7 @@ fn scan(plan: &BatchesPlan, shape: FrameShape, count: u32) -> Scan {
     }
 }
 
-/// How a sensor with this format samples colour.
+/// Colour sampling of a sensor with this format.
 pub fn sampling(format: PixelFormat) -> Sampling {
     match format.mosaic.red() {
         None => Sampling::Full,
@@ -193,7 +193,7 @@ pub fn sampling(format: PixelFormat) -> Sampling {
     }
 }
 
-/// The stages of a plan: `correct`, if it is named, and one that makes columns.
+/// The stages of a plan: `correct`, if the plan has it, and the one that makes columns.
 fn stages(plan: &Plan, batches: &BatchesPlan) -> Result<(CorrectOptions, StageTable), ConfigError> {
     let (mut correct, mut denoise) = (CorrectOptions::default(), None);
     for (index, stage) in plan.stages.iter().enumerate() {
@@ -228,23 +228,23 @@ fn stages(plan: &Plan, batches: &BatchesPlan) -> Result<(CorrectOptions, StageTa
     Ok((correct, denoise.unwrap_or_else(default)))
 }
 
-/// A stored batch as the products take it; which of its dots show the scene.
+/// Converts a stored batch for the products; also returns which of its dots show the scene.
 pub fn from_stored(shape: FrameShape, columns: BatchColumns) -> Result<(Batch, Vec<bool>), DotsError> {
     let BatchColumns { word_offsets, words, masks, values, residual, discs, capped, seen } = columns;
     let arrays = BatchArrays { word_offsets, words, masks, values, residual, discs, capped };
     Ok((Batch::new(shape, arrays)?, seen))
 }
 
-/// The way back.
+/// The inverse of [`from_stored`].
 pub fn to_stored(arrays: BatchArrays, seen: Vec<bool>) -> BatchColumns {
     let BatchArrays { word_offsets, words, masks, values, residual, discs, capped } = arrays;
     BatchColumns { word_offsets, words, masks, values, residual, discs, capped, seen }
 }
 
-/// Makes the products of stored batches again.
+/// Reprocesses stored batches.
 ///
 /// # Errors
-/// When they cannot be had of them, before anything is written; when the disk refuses.
+/// When a product cannot be made from them, before anything is written; when the session cannot be written.
 pub fn process(stored: &Stored<'_>, batches: BatchesPlan, asked: &Asked) -> Result<Processed, ProcessError> {
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.dot_rig()?;

@@ -1,4 +1,4 @@
-//! What a plan makes of batches: one video each, an image a batch of the scene.
+//! The products of batches: one video each, with an image per batch of the scene.
 
 use std::path::PathBuf;
 
@@ -19,7 +19,7 @@ use super::calibration::Calibration;
 /// A `[[product]]` of a plan of batches.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DotSpec {
-    /// Names its files.
+    /// Base name of its files.
     pub name: String,
     kind: Kind,
 }
@@ -36,9 +36,9 @@ enum Kind {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct Lighting {
-    /// A pattern without a file.
+    /// A built-in pattern.
     pattern: Pattern,
-    /// A PNG or NPY file, in place of it.
+    /// A PNG or NPY file, used instead of `pattern`.
     image: Option<PathBuf>,
 }
 
@@ -48,13 +48,13 @@ impl Default for Lighting {
     }
 }
 
-/// Lighting patterns without a file.
+/// Built-in lighting patterns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Pattern {
     /// All dots.
     White,
-    /// A warm bar that goes from left to right in the course of the video, before a dim blue.
+    /// A warm bar that moves from left to right over the video, on a dim blue background.
     Sweep,
     /// Red and blue squares, eight across.
     Checks,
@@ -65,11 +65,11 @@ enum Pattern {
 #[serde(deny_unknown_fields, default)]
 struct Separation {
     method: Method,
-    /// Of `epipolar`: the paper's d_thresh, in pixels of a frame that is 1024 wide; left out: a dot's radius.
+    /// `epipolar`: the paper's d_thresh, in pixels of a frame that is 1024 wide; default: the radius of a dot.
     distance_px: Option<f64>,
-    /// Of `epipolar`: softness beyond it, in the same pixels.
+    /// `epipolar`: softness beyond it, in the same pixels.
     sigma_px: f64,
-    /// Of `epipolar`: the mask as the paper prints it.
+    /// `epipolar`: use the mask exactly as the paper prints it.
     printed: bool,
     /// Divide the direct light by how strongly the dots together cover each pixel.
     compensate: bool,
@@ -90,9 +90,9 @@ impl Default for Separation {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 enum Method {
-    /// Extremes over images that lack one dot.
+    /// Extremes over the images that each lack one dot.
     Naive,
-    /// Without all dots that share pixels of the plane with the brightest one.
+    /// As naive, but without all dots that share pixels of the plane with the brightest one.
     Neighbours,
     /// By distance from the dot's epipolar line.
     Epipolar,
@@ -112,19 +112,19 @@ impl Method {
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 struct DualSize {
-    /// Height and width; left out: about a pixel a dot.
+    /// Height and width; default: about one pixel per dot.
     size_px: Option<[usize; 2]>,
 }
 
-/// What is the same for all images of a video.
+/// One image of the scene: what all products of it share.
 pub(super) struct Scene<'a> {
-    /// What the planes tell; none without planes.
+    /// The calibration; `None` without planes.
     pub calibration: Option<&'a Calibration>,
-    /// Number of the image, from 0, and of all.
+    /// Index of the image, from 0, and number of images.
     pub image: (usize, usize),
-    /// Which dots of the batch show the scene.
+    /// For each dot of the batch, whether it shows the scene.
     pub seen: &'a [bool],
-    /// All dots together.
+    /// Sum of all dots.
     pub light: &'a Array3<f32>,
 }
 
@@ -132,10 +132,10 @@ const NO_PLANE: &str =
     "it needs a calibration plane: add [[batches.calibration]], and see that its batches are stored";
 
 impl DotSpec {
-    /// The products that a plan names, or else what its calibration allows.
+    /// The products that the plan names; by default, those that its calibration allows.
     ///
     /// # Errors
-    /// With the place in the plan's text.
+    /// With the position in the plan's text.
     pub fn all(plan: &Plan, batches: &BatchesPlan) -> Result<Vec<Self>, ConfigError> {
         let Some(tables) = &plan.products else { return Ok(Self::defaults(batches.calibration.len())) };
         let mut specs: Vec<Self> = Vec::new();
@@ -156,10 +156,10 @@ impl DotSpec {
         Ok(specs)
     }
 
-    /// The products that an argument of the command line asks for: the keys of a `[[product]]` with commas between them.
+    /// Parses a command line argument that asks for products: the keys of a `[[product]]`, separated by commas.
     ///
     /// # Errors
-    /// What cannot be had.
+    /// What is wrong with the argument.
     pub fn of_argument(argument: &str) -> Result<Vec<Self>, String> {
         let (tables, _, _) =
             products_of_argument(argument).map_err(|(error, text)| error.render("--product", &text))?;
@@ -231,7 +231,7 @@ impl DotSpec {
         Ok(Self { name, kind })
     }
 
-    /// The file with its lighting pattern, if it has one.
+    /// File of its lighting pattern, if it has one.
     pub fn pattern_file(&self) -> Option<&PathBuf> {
         match &self.kind {
             Kind::Relight(lighting) => lighting.image.as_ref(),
@@ -239,7 +239,7 @@ impl DotSpec {
         }
     }
 
-    /// The names of its videos and what they show.
+    /// Names and descriptions of its videos.
     pub fn videos(&self) -> Vec<(String, String)> {
         let name = &self.name;
         match &self.kind {
@@ -267,7 +267,7 @@ impl DotSpec {
         }
     }
 
-    /// One image of each of its videos, `[t, s, channels]`.
+    /// Computes one image of each of its videos, `[t, s, channels]`.
     ///
     /// # Errors
     /// When the calibration does not allow it.
@@ -325,7 +325,7 @@ impl DotSpec {
             Kind::Dual(DualSize { size_px }) => {
                 let calibration = calibrated()?;
                 let mut centroids = calibration.centroids.clone();
-                // A dot that was lost is as dark as one that met nothing: it is filled in, not shown.
+                // A lost dot is as dark as a dot that hit nothing: interpolate it instead of showing it.
                 let lost = centroids.xy.iter_mut().zip(scene.seen).filter(|(_, seen)| !**seen);
                 lost.for_each(|(xy, _)| *xy = None);
                 let shape = batch.shape();
@@ -342,7 +342,7 @@ impl DotSpec {
 }
 
 impl Pattern {
-    /// `[row, column, channels]`
+    /// Draws the pattern for an image of the video, `[row, column, channels]`.
     fn draw(self, image: usize, images: usize) -> Array3<f32> {
         const SIDE: usize = 64;
         match self {
@@ -368,7 +368,7 @@ pub(super) fn read_pattern(spec: &DotSpec, path: &std::path::Path) -> Result<Arr
     pattern::read(path).map_err(|error| format!("product {}: {error}", spec.name))
 }
 
-/// All light of a batch.
+/// Sum of all light in a batch.
 pub(super) fn light_of(batch: &Batch) -> Array3<f32> {
     floodlit(batch)
 }

@@ -12,14 +12,14 @@ use super::DotTask;
 use super::calibration::Calibration;
 use crate::report::{accounts, subtitle};
 
-/// Some images of a video: each with its label and its scale.
+/// Selected images of a video, each with its label and scale.
 pub(super) struct Strip {
     pub name: String,
     pub about: String,
     pub images: Vec<(String, Array3<f32>, ToneMap)>,
 }
 
-/// Share of pixels, in percent, that a picture's scale does not overexpose.
+/// Percentile of the pixels that maps to white in a picture.
 const PERCENTILE: f64 = 99.5;
 
 /// Makes the report.
@@ -65,7 +65,7 @@ fn facts(state: &State, task: &DotTask) -> Vec<(String, String)> {
     .to_vec()
 }
 
-/// How uneven the sensor was found, if the run knew.
+/// Non-uniformity of the sensor, if the run measured it.
 fn flat_field(session: &Session, task: &DotTask) -> Result<Option<(String, String)>> {
     let dots = session.dots()?;
     if !dots.has_flat() {

@@ -1,4 +1,4 @@
-//! From stored batches to videos, report and manifest: the same after a run and offline.
+//! Makes videos, report and manifest from stored batches: the same after a run and offline.
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
@@ -20,13 +20,13 @@ use super::product::{DotSpec, Scene, light_of, read_pattern};
 use super::report::{self, Strip};
 use crate::mirror_response::Predistortion;
 
-/// Images of a video that the report shows.
+/// Number of images of a video in the report.
 const SHOWN: usize = 6;
 
-/// Makes the calibration, the videos, the report and the manifest; returns what could not be made, and why.
+/// Makes the calibration, the videos, the report and the manifest; returns the problems.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn make(
     session: &Session,
     state: &State,
@@ -48,7 +48,7 @@ pub fn make(
             Err(problem) => problems.push(problem),
         }
     }
-    // A video's length is known before its first image, so batches are checked before they are drawn.
+    // A video's length must be known before its first image, so all batches are checked first.
     let mut sound: Vec<&BatchEntry> = Vec::new();
     for entry in state.batches().filter(|entry| entry.plane.is_none()) {
         match read_batch(&dots, task.shape, entry) {
@@ -100,7 +100,8 @@ pub fn make(
     Ok(problems)
 }
 
-/// Keeps the lighting patterns of a plan in its session, so that its products can be made again from the session alone.
+/// Copies the lighting patterns of a plan into its session, so that its products can be made again from the session
+/// alone.
 ///
 /// # Errors
 /// What is wrong with a pattern.
@@ -117,14 +118,14 @@ pub fn keep_patterns(session: &Session, task: &DotTask) -> std::result::Result<(
     Ok(())
 }
 
-/// The patterns of a product: as kept in the session, or else, of one that the plan does not name, its file's.
+/// The patterns of a product: the copy in the session or, for a product that the plan does not name, the file.
 fn patterns_of(session: &Session, spec: &DotSpec) -> std::result::Result<Option<Array4<f32>>, String> {
     let Some(file) = spec.pattern_file() else { return Ok(None) };
     let kept = session.pattern_path(&spec.name);
     read_pattern(spec, if kept.exists() { &kept } else { file }).map(Some)
 }
 
-/// A product under way.
+/// A video that is being written.
 struct Video<'a> {
     spec: &'a DotSpec,
     patterns: Option<Array4<f32>>,
@@ -163,7 +164,7 @@ impl Video<'_> {
     }
 }
 
-/// Makes video files of PNG sequences, where ffmpeg is installed.
+/// Encodes PNG sequences as video files, where ffmpeg is installed.
 struct Encoder {
     problems: Vec<String>,
 }
@@ -175,7 +176,7 @@ impl Encoder {
         let ended = Command::new("ffmpeg")
             .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
             .arg(products.join(name).join("%04d.png"))
-            // Players want even sides and colours at half the resolution.
+            // Players need even sides and half-resolution chroma.
             .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"])
             .arg(&target)
             .stdin(Stdio::null())
@@ -196,7 +197,7 @@ impl Encoder {
     }
 }
 
-/// What every video says of itself.
+/// Metadata that all videos share.
 fn common(task: &DotTask, about: &str, channels: usize) -> Map<String, Value> {
     let axes: &[&str] = if channels == 1 { &["k", "t", "s"] } else { &["k", "t", "s", "rgb"] };
     let entries = [

@@ -1,4 +1,4 @@
-//! Films: a light transport of each cycle of a few settings.
+//! Films: one light transport per cycle of a few settings.
 
 mod process;
 mod report;
@@ -15,7 +15,7 @@ pub use self::process::process;
 pub use self::report::{shortcomings, write as write_report};
 use crate::plane::PlaneTask;
 
-/// Frames of the dark image: its noise is in every cycle, so there are many.
+/// Frames of the dark image: its noise enters every cycle, so it averages many.
 const DARK_FRAMES: u32 = 32;
 
 /// A film on a plane rig.
@@ -34,15 +34,15 @@ impl FilmTask {
         Self { film, task: Arc::new(task) }
     }
 
-    /// How many cycles it stores.
+    /// Number of cycles to store.
     pub fn points(&self) -> usize {
         self.film.cycles as usize
     }
 
-    /// The stages that the plan names. Each cycle has a transport of its own, which no fold over the whole run makes.
+    /// The stages that the plan names. Each cycle has its own transport, so folds over the whole run are refused.
     ///
     /// # Errors
-    /// With the place in the plan's text of the stage that cannot be made.
+    /// With the position in the plan's text of the stage that cannot be made.
     pub fn stages(&self, registry: &Registry) -> std::result::Result<Arc<[Box<dyn Stage>]>, ConfigError> {
         let (stages, _) = self.task.made_stages(registry, |fold, _| {
             let name = fold.name();
@@ -51,10 +51,10 @@ impl FilmTask {
         Ok(stages)
     }
 
-    /// What makes transports of the cycles.
+    /// The solver that computes the transport of each cycle.
     ///
     /// # Errors
-    /// When delays and exposure make no model on this rig.
+    /// When the delays and exposure give no model on this rig.
     pub fn solver(&self) -> std::result::Result<FilmSolver, ConfigError> {
         let task = &self.task;
         FilmSolver::new(task.demux_options()?, &task.schedule, &task.geometry)
@@ -62,8 +62,8 @@ impl FilmTask {
     }
 }
 
-/// The dark image, then the settings of one cycle in the plan's order. There is no regular image: what it would check
-/// has moved on.
+/// The dark image, then the settings of one cycle in the plan's order. There is no regular image: by the time it
+/// could be compared, the scene has moved.
 fn schedule(film: &FilmPlan) -> Schedule {
     let exposure_us = film.exposure_us;
     let dark = Point { role: Role::Dark(0), delay_us: 0.0, exposure_us, frames: DARK_FRAMES };
@@ -72,10 +72,10 @@ fn schedule(film: &FilmPlan) -> Schedule {
     Schedule { points: std::iter::once(dark).chain(settings).collect() }
 }
 
-/// Makes the empty series of a film's transports, in place of what is there.
+/// Creates the empty series of a film's transports; replaces an existing one.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn create_transports(
     session: &Session,
     task: &FilmTask,

@@ -1,4 +1,4 @@
-//! Offline: the transports of a film made again from its stored frames.
+//! Offline processing: recomputes the transports of a film from its stored frames.
 
 use std::sync::Arc;
 
@@ -16,10 +16,10 @@ use super::{FilmTask, write_report};
 use crate::plane::{manifest, unit_of};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// Makes the transports of a stored film again.
+/// Recomputes the transports of a stored film.
 ///
 /// # Errors
-/// When the film has no products to ask for, or the disk refuses.
+/// When products are asked for (films have none), or the session cannot be written.
 pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Processed, ProcessError> {
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
@@ -41,7 +41,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     })
 }
 
-/// Makes the transports of all stored cycles; returns what could not be made, and why.
+/// Computes the transports of all stored cycles; returns the problems.
 fn make_transports(
     session: &Session,
     task: &FilmTask,
@@ -101,7 +101,7 @@ fn frame_unit(ordinal: u32, entry: &CycleEntry, delay_us: f64, sum: Array2<u32>)
     }
 }
 
-/// The stored dark image after all stages, if it is sound.
+/// The stored dark image after all stages, if it is intact.
 fn dark_image(
     session: &Session,
     state: &State,

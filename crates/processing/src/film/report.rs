@@ -1,4 +1,4 @@
-//! The report of a film: some of its cycles at a glance, and how well it kept its pace.
+//! The report of a film: selected cycles, and how well it kept its pace.
 
 use ndarray::{Array2, ArrayView2, Axis, s};
 use raysweep_core::Percentiles;
@@ -15,13 +15,13 @@ use crate::report::{accounts, subtitle};
 
 /// Cycles on the contact sheet.
 const SHOWN: usize = 8;
-/// Share of pixels, in percent, that a picture's scale does not overexpose.
+/// Percentile of the pixels that maps to white in a picture.
 const PERCENTILE: f64 = 99.5;
 
 /// Writes the report of a film.
 ///
 /// # Errors
-/// When its transports cannot be read or the disk refuses.
+/// When its transports cannot be read or the report cannot be written.
 pub fn write(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<()> {
     let page = make(session, state, task, problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())
@@ -46,7 +46,7 @@ fn make(session: &Session, state: &State, task: &FilmTask, problems: &[String]) 
     })
 }
 
-/// What makes the film less than it was to be.
+/// Ways in which the film falls short of its plan.
 pub fn shortcomings(state: &State) -> Vec<String> {
     let Some(film) = &state.film else { return Vec::new() };
     let mut texts = Vec::new();
@@ -84,7 +84,7 @@ fn facts(state: &State, task: &FilmTask) -> Vec<(String, String)> {
     .to_vec()
 }
 
-/// The epipolar and the indirect image of some cycles, evenly spread.
+/// The epipolar and the indirect image of some cycles, evenly spaced.
 fn cycles(session: &Session, state: &State) -> Result<Section> {
     let transports = TransportFilm::open(&session.transport_film_path()).ok();
     let stored: Vec<_> = state.cycles().collect();
@@ -93,11 +93,11 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
     let mut images: Vec<[Array2<f32>; 2]> = Vec::new();
     for place in 0..shown {
         let entry = stored[place * (stored.len() - 1) / (shown - 1).max(1)];
-        // What is damaged stands among the problems.
+        // Damaged cycles are listed among the problems.
         let read = transports.as_ref().and_then(|film| film.read(entry.cycle).ok().flatten());
         let own_row = transports.as_ref().and_then(|film| film.attributes().get("u_min")?.as_i64());
         if let (Some(transport), Some(u_min)) = (read, own_row) {
-            // Delays that are all long reach no pixel's own row.
+            // If all delays are long, no pixel's own row is in range.
             let own_row = usize::try_from(-u_min).ok().filter(|&own_row| own_row < transport.len_of(Axis(0)));
             let epipolar = match own_row {
                 Some(own_row) => transport.slice(s![own_row, .., ..]).to_owned(),

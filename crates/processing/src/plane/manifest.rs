@@ -10,10 +10,10 @@ use serde_json::{Map, json};
 
 use super::{PlaneTask, place};
 
-/// Writes the manifest, which comes last.
+/// Writes the manifest, the last file of a session.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn write(session: &Session, state: &State, task: &PlaneTask, rig: &RigFile) -> Result<()> {
     let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
     let mut settings = Map::new();

@@ -1,4 +1,4 @@
-//! What procedures of the plane rig have in common: points, and the model that turns counts into light.
+//! Shared by the procedures of the plane rig: points, and the model that turns counts into light.
 
 pub mod manifest;
 mod processing;
@@ -19,25 +19,25 @@ use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
 use serde_json::{Map, Value, json};
 
-/// The points of a plan on a plane rig: everything that acquisition and processing have in common.
+/// The points of a plan on a plane rig: everything that acquisition and processing share.
 #[derive(Clone)]
 pub struct PlaneTask {
     /// The plan's name.
     pub name: String,
-    /// What is done to each image.
+    /// Stages that process each image.
     pub stages: Vec<StageTable>,
-    /// Frames whose measured delay is further off do not count.
+    /// Frames whose measured delay deviates by more than this are dropped.
     pub max_jitter_us: f64,
-    /// The points.
+    /// The points to acquire.
     pub schedule: Schedule,
-    /// What turns counts into light transport.
+    /// The model that turns counts into light transport.
     pub geometry: SweepGeometry,
     places: Places,
 }
 
 impl PlaneTask {
-    /// The points of `plan` on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its
-    /// row 0.
+    /// The points of `plan` on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
+    /// `first_row`.
     pub fn new(
         plan: &Plan,
         schedule: Schedule,
@@ -74,10 +74,10 @@ impl PlaneTask {
         self.places.error(path, message)
     }
 
-    /// The options of `demux` as the plan states them.
+    /// The options of `demux` in the plan.
     ///
     /// # Errors
-    /// When it has others.
+    /// When the plan has options that `demux` does not know.
     pub fn demux_options(&self) -> Result<DemuxOptions, ConfigError> {
         let Some(stage) = self.stages.iter().find(|stage| stage.name == "demux") else {
             return Ok(DemuxOptions::default());
@@ -89,7 +89,7 @@ impl PlaneTask {
     /// The stages and folds that the plan names.
     ///
     /// # Errors
-    /// With the place in the plan of the stage that cannot be made, or that `refused` gives a reason against.
+    /// With the position in the plan of a stage that cannot be made, or that `refused` gives a reason against.
     pub(crate) fn made_stages(
         &self,
         registry: &Registry,
@@ -115,7 +115,7 @@ impl PlaneTask {
         Ok((stages.into(), folds))
     }
 
-    /// What every product says of itself.
+    /// Metadata that all products share.
     pub(crate) fn metadata(&self) -> Map<String, Value> {
         let geometry = &self.geometry;
         let prior = self.stages.iter().find(|stage| stage.name == "demux");
@@ -136,10 +136,10 @@ impl PlaneTask {
     }
 }
 
-/// What is done to each image, in order.
+/// The stages that process each image, in order.
 pub type Stages = Arc<[Box<dyn Stage>]>;
 
-/// When within its row a pixel's direct light arrives.
+/// Distribution over time of a pixel's direct light within its row.
 fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
     match (kind, scan) {
         (SpotKind::Uniform, _) => Spot::Uniform,
@@ -149,7 +149,7 @@ fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
     }
 }
 
-/// Where in the stack a point lies.
+/// Position of a point in the stack.
 pub fn place(role: Role) -> (ArrayName, usize) {
     match role {
         Role::Sweep(index) => (ArrayName::Sum, index as usize),
@@ -158,7 +158,7 @@ pub fn place(role: Role) -> (ArrayName, usize) {
     }
 }
 
-/// A stored point as the pipeline gave it.
+/// A stored point, in the form in which the pipeline delivered it.
 pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.attempt },

@@ -1,4 +1,4 @@
-//! The stages and folds of a plan at work, and the products that are made of what they give.
+//! Runs the stages and folds of a plan, and makes products from their results.
 
 use std::any::Any;
 use std::fmt::Display;
@@ -18,25 +18,25 @@ use super::{PlaneTask, Stages, place, unit_of};
 
 /// The stages, folds and products of a plan.
 pub struct Processing {
-    /// Work on each unit alone.
+    /// Stages, which process each unit alone.
     pub stages: Stages,
-    /// Work on all units in order.
+    /// Folds, which process all units in order.
     pub folds: Vec<Box<dyn Fold>>,
-    /// What is made of the transport of the folds.
+    /// Products made from the transport of the folds.
     pub products: Vec<ProductSpec>,
-    /// What could not be done so far, and why.
+    /// What has failed so far, and why.
     pub problems: Vec<String>,
 }
 
 impl Processing {
-    /// Stages alone: nothing is made of all units together.
+    /// Stages alone: the units are not combined.
     pub fn without_folds(stages: Stages) -> Self {
         Self { stages, folds: Vec::new(), products: Vec::new(), problems: Vec::new() }
     }
 
-    /// Passes points that are stored already through the stages into the folds, for as long as `go_on` says yes. A
-    /// point whose stage fails is left out, and named among the problems; so are points whose data are damaged, which
-    /// are returned: they must be acquired again.
+    /// Passes stored points through the stages into the folds, while `go_on` returns true. A point whose stage fails
+    /// is left out and listed among the problems; so are points with damaged data, which are returned because they
+    /// must be acquired again.
     pub fn feed_stored(
         &mut self,
         task: &PlaneTask,
@@ -71,7 +71,7 @@ impl Processing {
         damaged
     }
 
-    /// Gives the folds a unit's image. A fold that panics is out, with its products; the others go on.
+    /// Gives the folds a unit's image. A fold that panics is dropped, with its products; the others continue.
     pub fn push(&mut self, unit: &Unit, image: &Array2<f32>) {
         let problems = &mut self.problems;
         self.folds.retain_mut(|fold| {
@@ -80,19 +80,19 @@ impl Processing {
         });
     }
 
-    /// What the first fold that estimates while units come has so far.
+    /// Snapshot of the first fold that provides interim estimates.
     pub fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
-        // A picture for between is no reason to lose a fold, let alone the run.
+        // A failed snapshot must not cost the fold, let alone the run.
         self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
     }
 
-    /// Keeps no images from now on: [`Self::finish_in_strips`] reads them again.
+    /// Stops the folds from keeping images: [`Self::finish_in_strips`] reads them again.
     pub fn keep_no_images(&mut self) {
         self.folds.iter_mut().for_each(|fold| fold.keep_no_images());
     }
 
-    /// [`Self::finish`] and [`Self::make_named`] after [`Self::keep_no_images`]: the transport goes into `write`, strip by strip, and is not among
-    /// the products.
+    /// [`Self::finish`] and [`Self::make_named`] after [`Self::keep_no_images`]: the transport goes to `write`, strip
+    /// by strip, and is not among the products.
     pub fn finish_in_strips(
         mut self,
         images: &dyn ImageRows,
@@ -120,7 +120,7 @@ impl Processing {
             match caught(&name, || fold.finish_in_strips(strips, go_on)) {
                 Ok(made) => products.extend(made),
                 Err(problem) => {
-                    // Images of which rows are lacking are none.
+                    // Drop images that lack rows.
                     assemblies.clear();
                     self.problems.push(problem);
                 }
@@ -136,7 +136,7 @@ impl Processing {
         (products, self.problems)
     }
 
-    /// The products of all folds. Ends early soon after `go_on` says no.
+    /// The products of all folds. Returns early, soon after `go_on` returns false.
     pub fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
         let mut products = Vec::new();
         for fold in &mut self.folds {
@@ -149,7 +149,7 @@ impl Processing {
         products
     }
 
-    /// The products that the plan names, if the folds have made what they are made of.
+    /// The products that the plan names, if the folds have made what they need.
     pub fn make_named(&mut self, made: &[Product], go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
         let transport = made.iter().find_map(|product| match product {
             Product::Transport(transport) => Some(&**transport),
@@ -171,7 +171,7 @@ impl Processing {
     }
 }
 
-/// What `make` gives; as a problem, what kept `name` from being made: an error or a panic.
+/// Runs `make`; turns an error or a panic into a problem that says what kept `name` from being made.
 fn caught<T, E: Display>(name: &str, make: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
     match catch_unwind(AssertUnwindSafe(make)) {
         Ok(made) => made.map_err(|error| error.to_string()),

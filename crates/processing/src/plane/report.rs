@@ -1,4 +1,4 @@
-//! What the reports of a plane rig's procedures have in common.
+//! Shared by the reports of the plane rig's procedures.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use raysweep_session::report::{Block, Plot, Series, SeriesStyle};
 
 use super::PlaneTask;
 
-/// How far the delays of single frames lay from those wanted: over time, and how often.
+/// Deviations of single frames from the commanded delay: over time, and as a histogram.
 pub(crate) fn jitter(deviations_us: &[f64]) -> Vec<Plot> {
     let mut histogram: BTreeMap<i64, f64> = BTreeMap::new();
     for us in deviations_us {
@@ -39,7 +39,7 @@ pub(crate) fn jitter(deviations_us: &[f64]) -> Vec<Plot> {
     ]
 }
 
-/// What the rig and the plan said, so that reports can be compared.
+/// Settings of the rig and the plan, so that reports can be compared.
 pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
     let geometry = &task.geometry;
     let stages = task.stages.iter().map(|stage| {
@@ -69,7 +69,7 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
     Block::Facts(entries.map(|(key, value)| (key.to_owned(), value)).to_vec())
 }
 
-/// When rows are lit and exposed, as the model takes it.
+/// When rows are lit and exposed, according to the model.
 fn row_times(geometry: &SweepGeometry) -> String {
     let table = if geometry.row_table_us.is_some() { ", by the measured table" } else { "" };
     format!(
@@ -78,7 +78,7 @@ fn row_times(geometry: &SweepGeometry) -> String {
     )
 }
 
-/// How a row's light spreads in space and time, as the model takes it.
+/// How a row's light spreads in space and time, according to the model.
 fn beam(geometry: &SweepGeometry) -> String {
     let spot = match geometry.spot {
         Spot::Uniform => "rows lit evenly",

@@ -1,4 +1,4 @@
-//! From the record of an axis to its resonance.
+//! Identifies the resonance of an axis from its record.
 
 use raysweep_config::ResponsePlan;
 use raysweep_session::ledger::State;
@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 
 use super::{AXES, Record};
 
-/// Share of the frames that must show the dot: the places of the others are drawn between their neighbours.
+/// Share of the frames that must show the dot; the others are interpolated linearly.
 const LEAST_SHOWN: f64 = 0.9;
 
 /// Why the response of an axis is not known.
@@ -21,41 +21,41 @@ pub enum ResponseError {
         "axis {axis}: {shown} of the {frames} frames of its chirp show the dot, {needed} are needed; {lost} never came. See that the plane is before the camera, the light on, response.exposure_us long enough, response.region where the dot is, and that the camera keeps up"
     )]
     Unseen {
-        /// Which axis.
+        /// Name of the axis.
         axis: &'static str,
-        /// Frames that show it.
+        /// Frames that show the dot.
         shown: usize,
-        /// All frames.
+        /// Frames of the chirp.
         frames: usize,
-        /// How many must.
+        /// Frames that must show the dot.
         needed: usize,
-        /// Frames that never came.
+        /// Frames that were lost.
         lost: usize,
     },
     /// The dot's movement shows no resonance.
     #[error("axis {axis}, under whose chirp the dot moved by {rms_px:.3} px (rms): {source}")]
     Refused {
-        /// Which axis.
+        /// Name of the axis.
         axis: &'static str,
-        /// The dot's movement.
+        /// Root mean square of the dot's movement.
         rms_px: f64,
-        /// What is wrong with it.
+        /// Why the fit was refused.
         source: IdentifyError,
     },
 }
 
-/// What is known of an axis.
+/// Results of an axis.
 pub struct Axis {
-    /// Its resonance, or why it is not known; the gain is in pixels per degree.
+    /// Its resonance, or why it could not be identified; the gain is in pixels per degree.
     pub found: std::result::Result<Identified, ResponseError>,
-    /// What the record says without a model, in pixels per degree; empty where too few frames show the dot.
+    /// Measured transfer function, without a model, in pixels per degree; empty where too few frames show the dot.
     pub measured: Vec<Transfer>,
 }
 
-/// Finds an axis' resonance in its record.
+/// Identifies an axis' resonance from its record.
 ///
 /// # Errors
-/// Never of what the record shows: that is in [`Axis::found`].
+/// None at present: why an axis could not be identified is in [`Axis::found`].
 pub fn analyse(record: Record, axis: usize, state: &State, plan: &ResponsePlan) -> Result<Axis> {
     let name = AXES[axis];
     let lost = state.axes().find(|entry| entry.axis == axis).map_or(0, |entry| entry.lost);
@@ -85,7 +85,7 @@ pub fn analyse(record: Record, axis: usize, state: &State, plan: &ResponsePlan) 
     Ok(Axis { found, measured })
 }
 
-/// Draws a straight line over a gap; at an end of the track the value beside it.
+/// Interpolates linearly over a gap; at an end of the track, repeats the nearest value.
 fn bridge(track: &mut [f64], gap: std::ops::Range<usize>) {
     let before = gap.start.checked_sub(1).map(|at| track[at]);
     let after = track.get(gap.end).copied();
@@ -96,7 +96,7 @@ fn bridge(track: &mut [f64], gap: std::ops::Range<usize>) {
     }
 }
 
-/// Takes away the straight line that fits best: the place at rest, and drift.
+/// Subtracts the straight line that fits best: the rest position and drift.
 fn level(track: &mut [f64]) {
     let count = track.len() as f64;
     let middle = (count - 1.0) / 2.0;
@@ -114,13 +114,13 @@ fn level(track: &mut [f64]) {
 }
 
 impl Axis {
-    /// What the model makes of the measured frequencies, where there is one.
+    /// The fitted model at the measured frequencies, if there is one.
     pub fn fitted(&self) -> Vec<Transfer> {
         let Ok(found) = &self.found else { return Vec::new() };
         self.measured.iter().map(|measured| found.at(measured.hz)).collect()
     }
 
-    /// What an operator should know of a resonance that was found.
+    /// A warning for the operator about an identified resonance.
     pub fn warning(&self, name: &str) -> Option<String> {
         let [low_hz, high_hz] = self.found.as_ref().ok()?.band_hz;
         let is_narrowed = self.measured.first().is_some_and(|lowest| low_hz > lowest.hz);
@@ -134,7 +134,7 @@ impl Axis {
     /// Writes the table `response_x` or `response_y` among the session's products, if there is a spectrum.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the session cannot be written.
     pub fn write_spectrum(&self, session: &Session, name: &str) -> Result<()> {
         if self.measured.is_empty() {
             return Ok(());

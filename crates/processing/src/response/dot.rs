@@ -1,25 +1,25 @@
-//! Where the dot is in a frame.
+//! Finds the dot in a frame.
 
 use raysweep_pipeline::dots::Sensor;
 use raysweep_transport::dots::{FrameShape, Region};
 
-/// A pixel so many standard deviations above the dark is the dot's: of a million frames' pixels hardly one by chance.
+/// A pixel this many standard deviations above the dark level is lit: by chance, about one pixel in 10^9 is.
 const LIT_SIGMAS: f64 = 6.0;
-/// Fewer pixels are no dot.
+/// Fewer lit pixels than this do not count as a dot.
 const FEWEST_PX: usize = 4;
 
-/// Finds the dot above the dark background.
+/// Locates the dot against the dark background.
 pub struct DotFinder {
     width: usize,
     region: Region,
     /// Mean counts without light, `[row, column]`.
     dark_dn: Vec<f32>,
-    /// Counts beyond which a pixel is lit; hot pixels never are.
+    /// Counts above which a pixel is lit; hot pixels never are.
     limit_dn: Vec<u16>,
 }
 
 impl DotFinder {
-    /// A finder that looks within a region of frames from this sensor.
+    /// A finder for a region of frames from this sensor.
     pub fn new(shape: FrameShape, region: Region, sensor: &Sensor) -> Self {
         let dark_dn = sensor.background.mean().to_vec();
         let above_dn = sensor.floor.mean.abs() + LIT_SIGMAS * sensor.floor.sigma;
@@ -31,8 +31,8 @@ impl DotFinder {
         Self { width: shape.width(), region, dark_dn, limit_dn }
     }
 
-    /// Row and column of the dot, in pixels, 0 in the middle of the first: the mean place of the light of all lit
-    /// pixels. None where hardly any pixel is lit, or most are.
+    /// Row and column of the dot, in pixels, 0 at the centre of the first pixel: the centroid of the light of all lit
+    /// pixels. `None` if hardly any pixel is lit, or most are.
     pub fn find(&self, frame: &[u16]) -> Option<[f64; 2]> {
         let Region { rows, columns } = &self.region;
         let (mut light, mut moments, mut lit) = (0.0, [0.0; 2], 0);

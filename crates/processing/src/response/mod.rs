@@ -1,4 +1,4 @@
-//! How a dot rig's mirror answers: chirps, the dot's way over a plane, and the resonances that it shows.
+//! Identifies a dot rig's mirror: chirps, the dot's track on a plane, and the resonances in it.
 
 mod analysis;
 mod dot;
@@ -21,7 +21,7 @@ pub use self::record::Record;
 use crate::mirror_response::{self, KeptResponse};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// A mirror's axes by the names that files and messages use.
+/// Names of a mirror's axes in files and messages.
 pub const AXES: [&str; 2] = ["x", "y"];
 
 /// A plan of chirps on a dot rig.
@@ -32,11 +32,11 @@ pub struct ResponseTask {
     pub response: ResponsePlan,
     /// Size of the frames.
     pub shape: FrameShape,
-    /// How they are packed.
+    /// Pixel format of the frames.
     pub format: PixelFormat,
-    /// Where the dot is looked for.
+    /// Region to search for the dot.
     pub region: Region,
-    /// What the mirror plays, the chirp of x first.
+    /// Mirror paths; the chirp of x comes first.
     pub paths: [MirrorPath; 2],
     places: Places,
 }
@@ -45,7 +45,7 @@ impl ResponseTask {
     /// A plan on a rig with a camera of this size (rows, columns).
     ///
     /// # Errors
-    /// With the place in the plan's text, for what this rig cannot do.
+    /// With the position in the plan's text, for what this rig cannot do.
     pub fn new(
         plan: &Plan,
         response: ResponsePlan,
@@ -75,7 +75,7 @@ impl ResponseTask {
         self.places.error(path, message)
     }
 
-    /// How the camera is set.
+    /// Camera settings for the records.
     pub fn camera_settings(&self) -> CameraSettings {
         let exposure_us = self.response.exposure_us;
         CameraSettings { shutter: Shutter::Global, exposure_us, trigger_delay_us: 0.0 }
@@ -86,47 +86,47 @@ impl ResponseTask {
         crate::saturation_dn(self.format) as u16
     }
 
-    /// Frames of an axis' record.
+    /// Number of frames in the record of one axis.
     pub fn frames(&self) -> usize {
         path::frames(&self.response, &self.paths[0])
     }
 
-    /// What each frame's angle was commanded to be, in degrees.
+    /// The commanded angle of each frame, in degrees.
     pub fn commanded_deg(&self, axis: usize) -> Vec<f64> {
         path::commanded_deg(&self.response, &self.paths[axis], axis)
     }
 }
 
-/// What the records of a session show.
+/// Results of a session's records.
 pub struct Findings {
     axes: [Axis; 2],
 }
 
 impl Findings {
-    /// From the records that the ledger knows.
+    /// Analyses the records that the ledger lists.
     ///
     /// # Errors
-    /// When a record cannot be read, or is not there.
+    /// When a record cannot be read or is missing.
     pub fn of(session: &Session, state: &State, task: &ResponseTask) -> Result<Self> {
         let axis = |axis: usize| analyse(Record::read(session, axis)?, axis, state, &task.response);
         Ok(Self { axes: [axis(0)?, axis(1)?] })
     }
 
-    /// Why the mirror's response is not known, if it is not.
+    /// Why the mirror's response could not be identified, if so.
     pub fn refusal(&self) -> Option<&ResponseError> {
         self.axes.iter().find_map(|axis| axis.found.as_ref().err())
     }
 
-    /// What an operator should know of what was found.
+    /// Warnings for the operator about the results.
     pub fn warnings(&self) -> Vec<String> {
         self.axes.iter().zip(AXES).filter_map(|(axis, name)| axis.warning(name)).collect()
     }
 
-    /// Keeps the response in the session's folder; in `data` too, if it is given, where later runs take it from.
-    /// Nothing is written of an axis that was refused, nor of the other.
+    /// Stores the response in the session's folder and, if given, in `data`, where later runs find it. If one axis
+    /// was refused, nothing is written for either.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When a file cannot be written.
     pub fn keep(&self, session: &Session, state: &State, data: Option<&Path>) -> Result<()> {
         let [Ok(x), Ok(y)] = self.axes.each_ref().map(|axis| axis.found.as_ref()) else { return Ok(()) };
         let kept = KeptResponse::new(session, state, [x, y]);
@@ -138,7 +138,7 @@ impl Findings {
     /// Writes spectra, report and manifest.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the session cannot be written.
     pub fn write(
         &self,
         session: &Session,
@@ -155,10 +155,10 @@ impl Findings {
     }
 }
 
-/// Makes the report of stored records again. The file that later runs read is left alone: it is the newest run's.
+/// Remakes the report of stored records. The file that later runs read is left alone: it belongs to the newest run.
 ///
 /// # Errors
-/// When an axis is missing, or products are asked for; when the disk refuses.
+/// When an axis is missing, products are asked for, or the session cannot be written.
 pub fn process(
     stored: &Stored<'_>,
     response: ResponsePlan,

@@ -1,17 +1,17 @@
-//! The chirp as the mirror plays it and as each frame sees it.
+//! The chirp: the mirror path, and the commanded angle of each frame.
 
 use raysweep_config::ResponsePlan;
 use raysweep_core::{MirrorLimits, MirrorPath, PathError, Tilt};
 use raysweep_transport::dots::identify::chirp;
 
-/// The paths of both axes, x first, lit all the way.
+/// The paths of both axes, x first, with the light always on.
 ///
 /// # Errors
 /// The key of `[response]` and what is wrong, for a chirp that would take the mirror beyond its limits.
 pub fn paths(plan: &ResponsePlan, limits: &MirrorLimits) -> Result<[MirrorPath; 2], (&'static str, String)> {
     let refused = |message| Err(("amplitude_deg", message));
     let ResponsePlan { amplitude_deg, max_q, band_hz: [low_hz, high_hz], .. } = *plan;
-    // Limits of paths hold for what is commanded; at its resonance the mirror moves Q times as far.
+    // Path limits apply to the command; at its resonance the mirror moves Q times as far.
     let tilt_deg = amplitude_deg * max_q;
     if tilt_deg > limits.max_tilt.0 {
         return refused(format!(
@@ -40,15 +40,15 @@ pub fn paths(plan: &ResponsePlan, limits: &MirrorLimits) -> Result<[MirrorPath; 
     })
 }
 
-/// Frames of one axis whose exposures end within its path.
+/// Number of frames of one axis whose exposures end within its path.
 pub fn frames(plan: &ResponsePlan, path: &MirrorPath) -> usize {
     let duration_s = path.points().len() as f64 / path.rate_hz();
-    // An exposure that ends with the path is within it, whatever rounding says.
+    // An exposure that ends exactly with the path must count, despite rounding.
     ((duration_s - plan.exposure_us * 1e-6) * plan.camera_rate_hz + 1e-6).floor() as usize + 1
 }
 
-/// What each frame's angle was commanded to be, in degrees: the mean of the path's samples over its exposure, each
-/// held until the next.
+/// The commanded angle of each frame, in degrees: the mean of the path's samples over its exposure, each held until
+/// the next.
 pub fn commanded_deg(plan: &ResponsePlan, path: &MirrorPath, axis: usize) -> Vec<f64> {
     let samples_per_frame = path.rate_hz() / plan.camera_rate_hz;
     let exposure_samples = plan.exposure_us * 1e-6 * path.rate_hz();
@@ -88,7 +88,7 @@ mod tests {
 
     #[test]
     fn a_frame_is_commanded_the_mean_over_its_exposure() {
-        // 2.5 samples a frame, of which 2 are exposed.
+        // 2.5 samples per frame, of which 2 are exposed.
         let plan =
             parse("[response]\nband_hz = [1, 2]\nrate_hz = 25\ncamera_rate_hz = 10\nexposure_us = 80000")
                 .unwrap();
@@ -115,7 +115,7 @@ mod tests {
             ("amplitude_deg = 0.014\nmax_q = 500", "amplitude_deg", "7 degrees at its resonance, 6.5"),
             ("amplitude_deg = 0.015", "amplitude_deg", "max_slew_deg_per_s"),
             ("chirp_s = 4", "chirp_s", "131072"),
-            // What limits hold for what is commanded: rms beyond the bandwidth of 200 Hz.
+            // This limit applies to the command: rms beyond the bandwidth of 200 Hz.
             ("amplitude_deg = 0.5\nmax_q = 2", "amplitude_deg", "above the bandwidth"),
         ] {
             let (found, message) = refused(more);

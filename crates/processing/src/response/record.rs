@@ -1,4 +1,4 @@
-//! What was commanded and where the dot was, frame by frame.
+//! Commanded angle and dot position, frame by frame.
 
 use std::ops::Range;
 
@@ -8,23 +8,23 @@ use serde_json::{Map, Value, json};
 
 use super::{AXES, ResponseTask};
 
-/// The record of one axis; frames are known by their ids, so one that is lost shifts none.
+/// The record of one axis, indexed by frame number, so that a lost frame shifts none of the others.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
     /// Mean of the path's samples over each frame's exposure.
     pub commanded_deg: Vec<f64>,
-    /// Rows and columns of the dot's middle; NaN where a frame did not come or shows no dot.
+    /// Row and column of the dot's centre; NaN where a frame was lost or shows no dot.
     pub track_px: [Vec<f64>; 2],
 }
 
 impl Record {
-    /// A record without any frame yet.
+    /// A record without any frames yet.
     pub fn new(commanded_deg: Vec<f64>) -> Self {
         let nowhere = vec![f64::NAN; commanded_deg.len()];
         Self { commanded_deg, track_px: [nowhere.clone(), nowhere] }
     }
 
-    /// Notes where a frame shows the dot.
+    /// Records the dot's position in a frame.
     pub fn note(&mut self, frame: usize, place: [f64; 2]) {
         for (track, place) in self.track_px.iter_mut().zip(place) {
             track[frame] = place;
@@ -36,7 +36,7 @@ impl Record {
         !self.track_px[0][frame].is_nan()
     }
 
-    /// The frames between which the record has none, or none with a dot.
+    /// Ranges of frames that were lost or show no dot.
     pub fn gaps(&self) -> Vec<Range<usize>> {
         let mut gaps: Vec<Range<usize>> = Vec::new();
         for frame in (0..self.commanded_deg.len()).filter(|&frame| !self.shows(frame)) {
@@ -51,7 +51,7 @@ impl Record {
     /// Writes the table `chirp_x` or `chirp_y` among the session's products.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the session cannot be written.
     pub fn write(&self, session: &Session, axis: usize, task: &ResponseTask) -> Result<()> {
         let [rows, columns] = &self.track_px;
         let table = [
@@ -75,7 +75,7 @@ impl Record {
     /// Reads it back, in the precision of the file.
     ///
     /// # Errors
-    /// When there is none, or it is damaged.
+    /// When it is missing or damaged.
     pub fn read(session: &Session, axis: usize) -> Result<Self> {
         let name = name(axis);
         let table: Array2<f32> = session.products().read_image(&name)?;

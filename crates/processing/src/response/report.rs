@@ -1,4 +1,4 @@
-//! The report and the manifest of a session that identified a mirror.
+//! Report and manifest of a session that identified a mirror.
 
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
@@ -84,7 +84,7 @@ fn figures(found: &Identified) -> Table {
 
 fn plots(axis: &Axis) -> Vec<Plot> {
     let fitted = axis.fitted();
-    // A delay would turn the phase round many times.
+    // The delay is removed: it would wrap the phase many times.
     let delay_s = axis.found.as_ref().map_or(0.0, |found| found.delay_s);
     let phase_rad = |at: &Transfer| (at.phase_rad + TAU * at.hz * delay_s + PI).rem_euclid(TAU) - PI;
     let plot = |title: &str, y_label: &str, value: &dyn Fn(&Transfer) -> f64| {
@@ -109,7 +109,7 @@ fn plots(axis: &Axis) -> Vec<Plot> {
 /// Writes the manifest.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn write_manifest(
     session: &Session,
     state: &State,

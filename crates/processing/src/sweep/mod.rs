@@ -1,4 +1,4 @@
-//! Sweeps: from images under many delays and exposures to one light transport.
+//! Sweeps: computes one light transport from images at many delays and exposures.
 
 mod report;
 mod results;
@@ -17,7 +17,7 @@ use crate::memory::{MemoryNeed, available_bytes};
 use crate::plane::{PlaneTask, Processing, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// Fewest frames of a dark image: its noise is in all images of its exposure, so it should hardly have any.
+/// Minimum number of frames of a dark image: its noise enters all images of its exposure, so it must be small.
 const MIN_DARK_AVERAGE: u32 = 8;
 
 /// A sweep on a plane rig.
@@ -38,7 +38,7 @@ impl SweepTask {
         Self { sweep, task: Arc::new(task), products: plan.products.clone() }
     }
 
-    /// The same task with another sweep, where a plan may have that and the products can be made of it.
+    /// The same task with another sweep, if the plan allows it and the products can be made from it.
     pub fn with_sweep(&self, sweep: SweepPlan) -> Option<Self> {
         let is_possible = sweep.is_possible();
         let mut task = (*self.task).clone();
@@ -47,7 +47,7 @@ impl SweepTask {
         (is_possible && other.products().is_ok()).then_some(other)
     }
 
-    /// How many images it stores beside dark and regular ones.
+    /// Number of images to store, without dark and regular ones.
     pub fn points(&self) -> usize {
         self.task.schedule.sweep_len()
     }
@@ -55,7 +55,7 @@ impl SweepTask {
     /// The stages, folds and products that the plan names.
     ///
     /// # Errors
-    /// With the place in the plan's text of the stage or product that cannot be made.
+    /// With the position in the plan's text of the stage or product that cannot be made.
     pub fn processing(&self, registry: &Registry) -> Result<Processing, ConfigError> {
         let (stages, folds) = self.task.made_stages(registry, |fold, others| {
             let name = fold.name();
@@ -63,12 +63,12 @@ impl SweepTask {
             is_second
                 .then(|| format!("{name} stands twice: its products would overwrite each other; keep one"))
         })?;
-        // After the folds, which refuse a rig that no product could be made on.
+        // After the folds: they refuse a rig on which no product could be made.
         let products = self.products()?;
         Ok(Processing { stages, folds, products, problems: Vec::new() })
     }
 
-    /// What is made of the transport: the products that the plan names.
+    /// The products that the plan names, made from the transport.
     fn products(&self) -> Result<Vec<ProductSpec>, ConfigError> {
         let Some(tables) = &self.products else { return Ok(ProductSpec::defaults()) };
         if !tables.is_empty() && !self.task.stages.iter().any(|stage| stage.name == "demux") {
@@ -115,8 +115,8 @@ fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
     Schedule { points }
 }
 
-/// Appends the product that a table asks for to others. `refuse` makes an error about a value of the document in which
-/// it is product `index`.
+/// Appends the product that a table asks for to the others. `refuse` makes an error about a value of the document in
+/// which the product has the number `index`.
 fn append_product(
     specs: &mut Vec<ProductSpec>,
     table: &ProductTable,
@@ -144,7 +144,7 @@ fn append_product(
     Ok(())
 }
 
-/// Appends the products that a command line argument asks for: the keys of a `[[product]]` with commas between them.
+/// Appends the products that a command line argument asks for: the keys of a `[[product]]`, separated by commas.
 fn append_argument(specs: &mut Vec<ProductSpec>, argument: &str, task: &PlaneTask) -> Result<(), String> {
     let shown = |(error, text): (ConfigError, String)| error.render("--product", &text);
     let (tables, places, text): (_, Places, _) = products_of_argument(argument).map_err(shown)?;
@@ -158,7 +158,7 @@ fn append_argument(specs: &mut Vec<ProductSpec>, argument: &str, task: &PlaneTas
 /// Makes the products of a stored sweep again.
 ///
 /// # Errors
-/// When they cannot be had of it, before anything is written; when the disk refuses.
+/// When a product cannot be made from it, before anything is written; when the session cannot be written.
 pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<Processed, ProcessError> {
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;

@@ -1,4 +1,4 @@
-//! From products to files.
+//! Writes the products to files.
 
 use raysweep_pipeline::{Findings, Product, Strip};
 use raysweep_session::ledger::State;
@@ -11,23 +11,23 @@ use super::strips::{Overview, StoredImages};
 use super::{SweepTask, report};
 use crate::plane::{PlaneTask, Processing};
 
-/// What was made of a sweep.
+/// The results of a sweep.
 pub struct Results {
-    /// Everything; the transport only if it was made in one piece.
+    /// All products; the transport only if it was made in one piece.
     pub products: Vec<Product>,
     /// What could not be made, and why.
     pub problems: Vec<String>,
-    /// The transport's files, not in place yet.
+    /// Writer of the transport's files, which are not in place yet.
     writer: Option<TransportWriter>,
-    /// The sums of a transport that was made in strips.
+    /// Sums of a transport that was made in strips.
     overview: Option<Overview>,
 }
 
 impl Results {
-    /// Makes them in one piece; ends early, and short of results, soon after `go_on` says no.
+    /// Makes the results in one piece. Soon after `go_on` returns false, it returns early with incomplete results.
     ///
     /// # Errors
-    /// When the disk refuses the transport.
+    /// When the transport cannot be written.
     pub fn whole(
         mut processing: Processing,
         session: &Session,
@@ -41,17 +41,18 @@ impl Results {
             writer.append(transport)?;
             Ok(Some(writer))
         };
-        // Somebody may be waiting for the transport, and the disk is slower than what is made of it.
+        // Write the transport while its products are made: it may be needed soon, and the disk is slower than the
+        // computation.
         let (writer, named) = rayon::join(write, || processing.make_named(&products, go_on));
         products.extend(named);
         products.retain(|product| !matches!(product, Product::Stack(_)));
         Ok(Self { products, problems: processing.problems, writer: writer?, overview: None })
     }
 
-    /// Makes them strip by strip from what is stored, of folds that have kept no images; otherwise as [`Self::whole`].
+    /// Makes the results strip by strip from stored images, with folds that keep none; otherwise as [`Self::whole`].
     ///
     /// # Errors
-    /// When the stack cannot be opened or the disk refuses the transport.
+    /// When the stack cannot be opened or the transport cannot be written.
     pub fn in_strips(
         processing: Processing,
         session: &Session,
@@ -85,15 +86,15 @@ impl Results {
         if let Some(error) = refused {
             return Err(error);
         }
-        // Where the fold broke off, rows are missing.
+        // Rows are missing if the fold stopped early.
         let (writer, overview) = written.filter(|(writer, _)| writer.is_whole()).unzip();
         Ok(Self { products, problems, writer, overview })
     }
 
-    /// Puts the transport in its place, as NPY and Zarr at the same time: somebody may be waiting for it.
+    /// Moves the transport into place, as NPY and Zarr at the same time: it may be needed soon.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the session cannot be written.
     pub fn write_transport(&mut self) -> Result<()> {
         self.writer.take().map_or(Ok(()), TransportWriter::commit)
     }
@@ -118,7 +119,8 @@ fn findings_in(products: &[Product]) -> Option<&Findings> {
     })
 }
 
-/// Writes a transport from its first camera row to its last, as NPY and Zarr; nothing is seen of it before the end.
+/// Writes a transport from its first camera row to its last, as NPY and Zarr; the files become visible only at the
+/// end.
 struct TransportWriter {
     npy: VolumeWriter,
     zarr: transport::Writer,
@@ -126,7 +128,7 @@ struct TransportWriter {
 }
 
 impl TransportWriter {
-    /// For a transport of which this is all, or some rows.
+    /// Creates a writer; `transport` is the whole transport or some rows of it.
     fn create(
         session: &Session,
         task: &PlaneTask,
@@ -172,7 +174,7 @@ impl TransportWriter {
 /// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY).
 ///
 /// # Errors
-/// When the disk refuses.
+/// When the session cannot be written.
 pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product]) -> Result<()> {
     let files = session.products();
     for product in products {
@@ -214,7 +216,7 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
     Ok(())
 }
 
-/// What the transport was found with.
+/// The model and settings that the transport was estimated with.
 fn model(found: &Findings) -> Map<String, Value> {
     let remarks: Map<String, Value> =
         found.remarks.iter().map(|(key, said)| ((*key).to_owned(), json!(said))).collect();
@@ -234,7 +236,7 @@ fn model(found: &Findings) -> Map<String, Value> {
 /// Writes the report.
 ///
 /// # Errors
-/// When the stack cannot be read or the disk refuses.
+/// When the stack cannot be read or the report cannot be written.
 pub fn write_report(
     session: &Session,
     state: &State,

@@ -1,4 +1,5 @@
-//! What is larger than the memory: images read again from the stack, the transport written and summed up as it comes.
+//! For data larger than memory: reads images from the stack again, and writes and sums up the transport strip by
+//! strip.
 
 use std::ops::Range;
 
@@ -10,15 +11,15 @@ use raysweep_transport::plane::Transport;
 
 use crate::plane::{PlaneTask, place, unit_of};
 
-/// The images of a session, as its folds were given them.
+/// The images of a session, as they were given to its folds.
 pub struct StoredImages<'a> {
     /// The plan on its rig.
     pub task: &'a PlaneTask,
-    /// What is stored.
+    /// State of the session.
     pub state: &'a State,
-    /// Where. That each point is what the ledger says was found when it was stored or fed to the folds.
+    /// Stored data. Each point was checked against the ledger when it was stored or fed to the folds.
     pub stack: &'a Stack,
-    /// What is done to each image.
+    /// Stages that process each image.
     pub stages: &'a [Box<dyn Stage>],
 }
 
@@ -41,7 +42,7 @@ impl ImageRows for StoredImages<'_> {
     }
 }
 
-/// Sums of a transport over relative rows, `[t, s]` each: what is shown of it without the transport itself.
+/// Sums of a transport over relative rows, `[t, s]` each: enough for the report without the transport itself.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Overview {
     /// Relative row of index 0 of its profiles.
@@ -59,7 +60,7 @@ pub struct Overview {
 }
 
 impl Overview {
-    /// Of a whole transport, or of some rows of one.
+    /// Sums of a whole transport, or of some rows of one.
     pub fn of(transport: &Transport) -> Self {
         Self {
             u_min: transport.u_min,
@@ -71,7 +72,7 @@ impl Overview {
         }
     }
 
-    /// Of `height` rows that are still to be put in.
+    /// Empty sums for `height` rows, to be filled with [`Self::put`].
     pub fn empty(height: usize, transport: &Transport) -> Self {
         let image = Array2::zeros((height, transport.saturated.ncols()));
         Self {
@@ -84,7 +85,7 @@ impl Overview {
         }
     }
 
-    /// Puts in the rows from `first_row` on, of which `transport` is.
+    /// Fills in the rows from `first_row` on with the sums of `transport`.
     pub fn put(&mut self, first_row: usize, transport: &Transport) {
         let rows = Self::of(transport);
         for (whole, part) in [

@@ -1,9 +1,9 @@
-//! What the camera has been told and has not yet shown: which frame has which settings, and when the next are to be
-//! written.
+//! Settings that the camera has been given but that are not yet in effect: which frame has which settings, and when
+//! the next ones must be written.
 //!
-//! A camera takes settings at a trigger, its latency of L frames later. Settings for frame n must therefore be written
-//! between the triggers of frames n - 1 - L and n - L, and frames reach the host when that time is all but over: when
-//! triggers are, the clock says, by the stamps of the frames before.
+//! A camera applies settings at a trigger, with a latency of L frames. Settings for frame n must therefore be written
+//! between the triggers of frames n - 1 - L and n - L, but the frames reach the host when that interval is almost
+//! over. Trigger times are therefore predicted by the clock from the timestamps of earlier frames.
 
 use std::collections::VecDeque;
 use std::ops::{Range, RangeInclusive};
@@ -15,30 +15,30 @@ use raysweep_pipeline::{EXPOSURE_TOLERANCE_US, Job};
 
 use super::triggers::Triggers;
 
-/// A sensor holds its registers so long after an exposure has begun. [A]
+/// A sensor has latched its registers by this time after an exposure has begun. [A]
 const HELD_AFTER_US: f64 = 500.0;
-/// Settings are written so long after the exposure before them has begun. [A]
+/// Settings are written this long after the previous exposure has begun. [A]
 const AFTER_START_US: f64 = 1_000.0;
-/// Nothing is written so shortly before a trigger, which might come first. [A]
+/// Nothing is written within this time before a trigger, which might come first. [A]
 const BEFORE_TRIGGER_US: f64 = 1_000.0;
-/// Frames that may be on their way to the host; a camera that owes more has missed a trigger, or is gone.
+/// Frames that may be in transit to the host; a camera that owes more has missed a trigger, or is gone.
 const FRAMES_UNDER_WAY: u64 = 4;
 
-/// What the settings of a run are like.
+/// Trigger line and settings of a run.
 #[derive(Debug, Clone, Copy)]
 pub struct Line {
     /// Nominal period of the triggers.
     pub period_us: f64,
-    /// Frames whose measured delay is further off do not count.
+    /// Frames whose measured delay deviates by more than this are dropped.
     pub max_jitter_us: f64,
-    /// Whether a frame's delay tells each settings of the plan from all others of the same exposure.
+    /// Whether a frame's delay distinguishes each of the plan's settings from all others of the same exposure.
     pub distinct: bool,
-    /// Whether all have the same exposure.
+    /// Whether all settings have the same exposure.
     pub has_one_exposure: bool,
 }
 
 impl Line {
-    /// A line whose camera is taken through these settings.
+    /// The line of a camera that goes through these settings.
     pub fn new(period_us: f64, max_jitter_us: f64, plan: &[CameraSettings]) -> Self {
         let phase_us = |settings: &CameraSettings| settings.trigger_delay_us.rem_euclid(period_us);
         let mut sorted: Vec<&CameraSettings> = plan.iter().collect();
@@ -59,65 +59,65 @@ impl Line {
         Self { period_us, max_jitter_us, distinct, has_one_exposure }
     }
 
-    /// How far a time is from a whole number of periods.
+    /// Distance of a time from the nearest whole number of periods.
     pub fn off_us(&self, time_us: f64) -> f64 {
         let since_us = time_us.rem_euclid(self.period_us);
         since_us.min(self.period_us - since_us)
     }
 }
 
-/// Settings that the camera has been given.
+/// Settings that were written to the camera.
 pub struct Written {
-    /// As the hardware took them.
+    /// The values that the hardware applied.
     pub settings: CameraSettings,
-    /// The first frame that has them, by the camera's word; the next settings end their time.
+    /// The first frame that has them, according to the camera; they stay until the next settings take effect.
     promised: FirstFrame,
-    /// The first frame to be triggered after they were written lies between these, by the stamps of frames.
+    /// Bounds, from timestamps, for the first frame that was triggered after they were written.
     next_seq: (u64, u64),
-    /// How many frames later than that they act, where it is known.
+    /// Number of frames after that one until they take effect, if known.
     late_frames: Option<u64>,
-    /// The first frame that has them if every trigger is answered.
+    /// The first frame that has them if the camera answers every trigger.
     planned_seq: u64,
-    /// Whether stamps may tell its frames from those of the settings before.
+    /// Whether timestamps may distinguish their frames from those of the previous settings.
     by_stamps: bool,
-    /// The first frame that was seen to have them.
+    /// The first frame that was observed to have them.
     seen_seq: u64,
-    /// From the first register's write to the last one's.
+    /// From the write of the first register to that of the last.
     written_ns: (i64, i64),
-    /// What they are for; nothing where they only lead from one to the next.
+    /// The job they are for; `None` if they only lead in to others.
     pub work: Option<Wanted>,
 }
 
 /// Frames that a job waits for.
 pub struct Wanted {
-    /// What the assembler is told of them.
+    /// The job as the assembler is told about it.
     pub job: Job,
-    /// Whether they are exposed with the projector's light.
+    /// Whether the frames are exposed with the projector's light on.
     pub is_lit: bool,
-    /// Whether the assembler has been told.
+    /// Whether the assembler has been told about the job.
     pub is_begun: bool,
     /// Whether it ended before its last frame.
     pub is_interrupted: bool,
-    /// How many frames in a row are the job's: of one that failed before, some more than it needs. A frame that is lost
-    /// on its way is one of them, so that which frames a job has does not depend on when the loss is noticed.
+    /// Number of consecutive frames of the job; a job that failed before gets some more than it needs. A frame that
+    /// is lost in transit counts, so that the frames of a job do not depend on when the loss is noticed.
     pub frames: u32,
-    /// How many more the settings stay for before others are written ahead of their last frame.
+    /// Number of additional frames for which the settings stay before the next are written ahead.
     pub margin_frames: u32,
-    /// Those of its frames that have been handed on or were lost on their way.
+    /// Frames of the job that have been handed on or were lost in transit.
     pub passed: u32,
-    /// Frames that may find no room before it is given up.
+    /// Frames that may still be dropped for lack of room before the job is given up.
     pub spare_frames: u32,
 }
 
 impl Wanted {
-    /// Whether it waits for no frame any more.
+    /// Whether it needs no more frames.
     pub fn is_complete(&self) -> bool {
         self.is_interrupted || self.passed >= self.frames || self.spare_frames == 0
     }
 }
 
 impl Written {
-    /// Whether no frame is waited for.
+    /// Whether these settings need no more frames.
     fn is_complete(&self, newest_seq: Option<u64>) -> bool {
         match &self.work {
             Some(wanted) => wanted.is_complete(),
@@ -125,19 +125,19 @@ impl Written {
         }
     }
 
-    /// The job, if it still waits for frames.
+    /// The job, if it still needs frames.
     pub fn open(&mut self) -> Option<&mut Wanted> {
         self.work.as_mut().filter(|wanted| !wanted.is_complete())
     }
 
-    /// The ids from `since_seq` on, below `seq`, that the job waited for and that never came.
+    /// The ids from `since_seq` on, below `seq`, of the job's frames that never arrived.
     pub fn lost(&self, since_seq: u64, seq: u64) -> Range<u64> {
         let Some(wanted) = self.work.as_ref().filter(|wanted| !wanted.is_complete()) else { return seq..seq };
         let first_seq = if wanted.passed > 0 { since_seq } else { self.certain().max(since_seq) };
         first_seq..seq.min(first_seq + u64::from(wanted.frames - wanted.passed))
     }
 
-    /// The first frame that may have the settings.
+    /// The first frame that may have these settings.
     pub fn earliest(&self) -> u64 {
         match self.promised {
             FirstFrame::Exactly(seq) => seq,
@@ -147,7 +147,7 @@ impl Written {
         }
     }
 
-    /// The first frame that is certain to have the settings.
+    /// The first frame that certainly has these settings.
     pub fn certain(&self) -> u64 {
         let known_seq = match (self.promised, self.late_frames) {
             (FirstFrame::Within { certain, .. }, Some(late_frames)) => {
@@ -158,12 +158,13 @@ impl Written {
         known_seq.min(self.seen_seq)
     }
 
-    /// The first frame that has the settings if all goes as planned.
+    /// The first frame that has these settings if everything goes as planned.
     fn planned(&self) -> u64 {
         self.planned_seq.clamp(self.earliest(), self.certain())
     }
 
-    /// Learns from a frame: its registers were held before these settings were written, or it was triggered after.
+    /// Narrows the bounds by a frame whose registers were latched before these settings were written, or that was
+    /// triggered after.
     fn learn(&mut self, seq: u64, held_ns: i64, trigger_ns: Option<i64>) {
         let (from_ns, to_ns) = self.written_ns;
         if held_ns <= from_ns {
@@ -174,21 +175,22 @@ impl Written {
     }
 }
 
-/// What a frame shows.
+/// What was learnt from a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Seen {
-    /// Which of the written settings it has, counted from those in force; nothing where it is not known.
+    /// Index of the frame's settings, counted from those in force; `None` if unknown.
     pub owner: Option<usize>,
-    /// Where its stamps say that and its id does not: when it was triggered if it has the settings in force instead.
+    /// Set if `owner` was found by timestamps, not by the frame id: the trigger time if the frame has the settings in
+    /// force instead.
     pub else_triggered_ns: Option<i64>,
-    /// Where it is the first with new settings: how many frames later than the next to be triggered when they were
-    /// written.
+    /// Set if this is the first frame with new settings: how many frames after the next trigger at the time of
+    /// writing.
     pub late_frames: Option<u32>,
-    /// The first frame after the one before that was seen; a later id than this one's own less one: frames were lost.
+    /// The id that follows the previous frame seen; frames were lost if it is less than this frame's id.
     pub since_seq: u64,
 }
 
-/// What has been written, from the settings in force on.
+/// The settings that were written, from those in force on.
 pub struct Ahead {
     camera: CameraCapabilities,
     line: Line,
@@ -196,13 +198,13 @@ pub struct Ahead {
     triggers: Triggers,
     newest_seq: Option<u64>,
     frames_carry_exposure: bool,
-    /// Whether the camera itself says which frame is the first.
+    /// Whether the camera itself reports the first frame exactly.
     camera_is_exact: bool,
     latency: Option<SettingsLatency>,
 }
 
 impl Ahead {
-    /// Nothing is known of what the camera was told before.
+    /// Starts without knowledge of the camera's earlier settings.
     pub fn new(camera: CameraCapabilities, line: Line) -> Self {
         Self {
             camera,
@@ -216,50 +218,50 @@ impl Ahead {
         }
     }
 
-    /// From now on settings are expected to act as late as a probe has found.
+    /// Sets the latency that a probe has measured.
     pub fn set_latency(&mut self, latency: SettingsLatency) {
         self.latency = Some(latency);
     }
 
-    /// Whether frames say under which exposure they were taken.
+    /// Whether frames carry their exposure time.
     pub fn frames_carry_exposure(&self) -> bool {
         self.frames_carry_exposure
     }
 
-    /// What is in force for certain, or was written first.
+    /// The settings that are certainly in force, or the first that were written.
     pub fn front(&mut self) -> Option<&mut Written> {
         self.written.front_mut()
     }
 
-    /// What was written after that.
+    /// The settings that were written after the front ones.
     pub fn second(&self) -> Option<&Written> {
         self.written.get(1)
     }
 
-    /// Takes what is in force out, since something later is.
+    /// Removes the settings in force, when later ones have replaced them.
     pub fn pop(&mut self) -> Option<Written> {
         self.written.pop_front()
     }
 
-    /// The time has passed in which frames tell when triggers are.
+    /// Forgets the trigger times, which are too old to predict from.
     pub fn lose_track(&mut self) {
         self.triggers.forget();
     }
 
-    /// Whether nothing that was written waits for a frame.
+    /// Whether no written settings wait for a frame.
     pub fn is_idle(&self) -> bool {
         self.written.iter().all(|written| written.is_complete(self.newest_seq))
     }
 
-    /// The job that waits for its first frame, if nothing before it does and the frame `seq` may have its settings.
+    /// The job that waits for its first frame, if no earlier job is open and frame `seq` may have its settings.
     pub fn opening(&mut self, seq: u64) -> Option<&mut Wanted> {
         let newest_seq = self.newest_seq;
         let next = self.written.iter_mut().find(|written| !written.is_complete(newest_seq))?;
         if seq < next.earliest() { None } else { next.open() }
     }
 
-    /// Whether frames cannot tell when the exposure of `next` acts, while their delays have told when settings do: the
-    /// exposure must then come first, and be certain.
+    /// Whether frames cannot show when the exposure of `next` takes effect, although their delays show it for other
+    /// settings: the exposure must then be changed first, until it is certain.
     pub fn needs_lead_in(&self, next: &CameraSettings) -> bool {
         let changes_exposure = |last: &Written| {
             let change_us = last.settings.exposure_us - next.exposure_us;
@@ -275,9 +277,9 @@ impl Ahead {
         self.latency.and_then(SettingsLatency::constant).map(u64::from)
     }
 
-    /// When settings are to be written after those written last, so that these have all their frames and no trigger is
-    /// waited for in vain; `i64::MAX`: not before another frame has come. `leads_in`: stamps may not tell from which
-    /// frame on they act.
+    /// When to write the next settings, so that the last ones get all their frames and no trigger is wasted;
+    /// `i64::MAX`: not before another frame arrives. `leads_in`: timestamps may not show from which frame on the next
+    /// settings are in effect.
     pub fn due_ns(&self, now_ns: i64, leads_in: bool) -> i64 {
         let Some(last) = self.written.back() else { return now_ns };
         let lead = self.constant_latency().filter(|_| !leads_in);
@@ -296,14 +298,14 @@ impl Ahead {
         }
     }
 
-    /// The last frame before which no other settings are to act: a job's last, and its margin.
+    /// The last frame before which other settings must not take effect: a job's last frame, plus its margin.
     fn end_seq(&self, written: &Written, wanted: &Wanted) -> u64 {
         let next_seq = self.newest_seq.map_or(0, |seq| seq + 1);
         let first_seq = if wanted.passed > 0 { next_seq } else { written.planned().max(next_seq) };
         first_seq + u64::from(wanted.frames - wanted.passed + wanted.margin_frames) - 1
     }
 
-    /// The first frame to be triggered after a moment, if every trigger is answered.
+    /// The first frame that is triggered after `time_ns`, if the camera answers every trigger.
     fn seq_after(&self, time_ns: i64) -> Option<u64> {
         let (known_seq, known_ns) = self.triggers.newest()?;
         let newest_seq = self.newest_seq.unwrap_or(known_seq);
@@ -316,7 +318,7 @@ impl Ahead {
             .map(|seq| seq + 1)
     }
 
-    /// From the trigger of the frame `seq` to that of the next.
+    /// Time from the trigger of frame `seq` to that of the next frame.
     fn step_ns(&self, seq: u64) -> i64 {
         let period_us = self.line.period_us - self.line.max_jitter_us;
         let (settings, next) = (self.settings_of(seq), self.settings_of(seq + 1));
@@ -324,7 +326,7 @@ impl Ahead {
         i64::from(periods) * self.triggers.period_ns()
     }
 
-    /// When the frame `seq` has been triggered and its exposure begun.
+    /// When frame `seq` has been triggered and its exposure has begun.
     fn after_trigger_ns(&self, seq: u64) -> i64 {
         let Some((known_seq, known_ns)) = self.triggers.newest() else { return i64::MAX };
         if seq > self.newest_seq.unwrap_or(0) + FRAMES_UNDER_WAY {
@@ -335,28 +337,28 @@ impl Ahead {
         trigger_ns + possible.map(|settings| self.window_ns(settings).0).max().unwrap_or(0)
     }
 
-    /// The settings that a frame will have if all goes as planned.
+    /// The settings that a frame will have if everything goes as planned.
     fn settings_of(&self, seq: u64) -> Option<&CameraSettings> {
         let planned = self.written.iter().rev().find(|written| written.planned() <= seq);
         planned.or(self.written.front()).map(|written| &written.settings)
     }
 
-    /// From when to when, after a trigger of a frame with these settings, others may be written.
+    /// The interval, relative to the trigger of a frame with these settings, in which others may be written.
     fn window_ns(&self, settings: &CameraSettings) -> (i64, i64) {
         let start_ns = ns_from_us(self.camera.trigger_latency_us + settings.trigger_delay_us);
         let from_ns = self.taken_ns(0, start_ns) + ns_from_us(AFTER_START_US);
         (from_ns, ns_from_us(self.line.period_us - BEFORE_TRIGGER_US))
     }
 
-    /// Notes settings that were written between two moments. Without `work` they only lead to others.
+    /// Records settings that were written in the interval `written_ns`. Without `work` they only lead in to others.
     pub fn push(&mut self, applied: Applied, written_ns: (i64, i64), work: Option<Wanted>) {
         self.camera_is_exact = matches!(applied.first_frame, FirstFrame::Exactly(_));
-        // Where latencies vary, stamps tell of all points alike or of none: which frames of a point count must not hang on
-        // the point before it, which a resumed run may not have taken.
+        // If latencies vary, timestamps must decide for all points or for none: which frames of a point count must
+        // not depend on the previous point, which a resumed run may not have acquired.
         let tell_alike =
             self.frames_carry_exposure || self.line.has_one_exposure || self.constant_latency().is_some();
         let by_stamps = work.is_none() || self.line.distinct && tell_alike;
-        // Where frames do not tell their exposure, the probe found out when delays act and no more than that.
+        // If frames do not carry their exposure, the probe measured only the latency of delays.
         let late_frames = self.constant_latency().filter(|_| work.is_some());
         let certain = applied.first_frame.certain();
         let planned_seq =
@@ -374,7 +376,7 @@ impl Ahead {
         });
     }
 
-    /// Looks at a frame.
+    /// Processes a frame.
     pub fn see(&mut self, stamp: &FrameStamp) -> Seen {
         let trigger_ns = self.trigger_of(stamp);
         self.learn(stamp.seq, stamp.exposure_start_ns, trigger_ns);
@@ -408,12 +410,12 @@ impl Ahead {
         }
     }
 
-    /// When a frame's settings are taken, at the latest.
+    /// Latest time at which a frame's settings are latched.
     fn taken_ns(&self, trigger_ns: i64, start_ns: i64) -> i64 {
         start_ns.min(trigger_ns + self.triggers.period_ns() / 2)
     }
 
-    /// When a frame was triggered, if all settings that fit its stamps agree on that.
+    /// When a frame was triggered, if all settings that fit its timestamps agree.
     fn trigger_of(&self, stamp: &FrameStamp) -> Option<i64> {
         let fitting = self.written.iter().filter(|written| self.fits(stamp, &written.settings));
         let mut triggers = fitting.map(|written| self.trigger_ns(stamp, &written.settings));
@@ -426,14 +428,14 @@ impl Ahead {
         stamp.exposure_start_ns - ns_from_us(self.camera.trigger_latency_us + settings.trigger_delay_us)
     }
 
-    /// Which settings a frame may have, by its id.
+    /// The settings that a frame may have, judging by its id.
     fn possible(&self, seq: u64) -> Option<RangeInclusive<usize>> {
         let latest = self.written.iter().rposition(|written| written.earliest() <= seq)?;
         let certain = self.written.iter().rposition(|written| written.certain() <= seq);
         Some(certain.unwrap_or(0)..=latest)
     }
 
-    /// Which settings a frame has: by its id, and where that leaves several, by its own exposure and delay.
+    /// The settings that a frame has: by its id and, if that is ambiguous, by its exposure and delay.
     fn owner(&self, stamp: &FrameStamp) -> Option<usize> {
         let candidates = self.possible(stamp.seq)?;
         if self.written[*candidates.end()].certain() <= stamp.seq {
@@ -452,7 +454,7 @@ impl Ahead {
         fitting.next().is_none().then_some(place)
     }
 
-    /// Whether a frame has the exposure and, to half the jitter that is allowed, the delay of these settings.
+    /// Whether a frame has the exposure of these settings and, within half the permitted jitter, their delay.
     fn fits(&self, stamp: &FrameStamp, settings: &CameraSettings) -> bool {
         let exposure_us = stamp.exposure_us.unwrap_or(settings.exposure_us);
         let off_ns = self.triggers.off_ns(self.trigger_ns(stamp, settings));

@@ -1,4 +1,4 @@
-//! The camera's thread: sets the camera for one point after the other and hands its frames on.
+//! The camera's thread: sets the camera for each point in turn and forwards its frames.
 
 mod ahead;
 mod probe;
@@ -27,18 +27,18 @@ use crate::run::orders::Orders;
 /// One attempt at a point.
 #[derive(Debug, Clone, Copy)]
 pub struct Attempt {
-    /// Point and attempt.
+    /// Ids of the point and the attempt.
     pub id: SettingsId,
     /// What to acquire.
     pub point: Point,
-    /// How to set the camera for it.
+    /// Camera settings for it.
     pub shot: Shot,
-    /// How often it, the attempt of this number, was interrupted in this run.
+    /// How often this attempt was interrupted during this run.
     pub interruptions: u32,
 }
 
 impl Attempt {
-    /// The attempt to make after this one has failed.
+    /// The next attempt after this one has failed.
     pub fn after(self, failure: Failure) -> Self {
         match failure {
             Failure::Losses => {
@@ -50,49 +50,49 @@ impl Attempt {
     }
 }
 
-/// Points to acquire under one picture of the projector.
+/// Points to acquire with one image on the projector.
 #[derive(Debug, Clone)]
 pub struct Pass {
-    /// In order.
+    /// Attempts, in order.
     pub attempts: Vec<Attempt>,
-    /// Frames exposed earlier may still see the picture before.
+    /// Frames exposed earlier may still show the previous image.
     pub not_before_ns: i64,
 }
 
-/// What the camera is for until its next flush.
+/// Work for the camera until its next flush.
 #[derive(Debug, Clone)]
 pub enum Work {
-    /// To find out how late settings take effect, by changes from and to these.
+    /// Measure the settings latency, by changing from and to these settings.
     Probe(CameraSettings),
-    /// Points, each until all its frames are there.
+    /// Points, each until all its frames have arrived.
     Pass(Pass),
     /// A film.
     Film(FilmPass),
 }
 
-/// Buffers for frames on their way to the assembler: more than it ever holds while it waits for edges.
+/// Number of frame buffers between camera and assembler: more than the assembler ever holds while it waits for edges.
 const POOL_BUFFERS: usize = 40;
-/// One wait for a frame; orders are looked at in between.
+/// Timeout of one wait for a frame; orders are checked in between.
 const POLL: Duration = Duration::from_millis(100);
-/// A camera without frames for so long, beyond the time that they take, has lost its trigger.
+/// A camera that delivers no frames for this long, beyond the frame time, has lost its trigger.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Frames that pass before a run's first point, and at most after a pass's last, so that the line is known around each
+/// Frames to skip before a run's first point, and at most after a pass's last, so that the line is known around each
 /// frame.
 const MARGIN_FRAMES: u32 = 6;
 
 /// How a pass ended.
 enum Ended {
-    /// Everything that it left is decided, or will be: the pipeline has its flush.
+    /// All of its points are decided, or will be: the pipeline has received the flush.
     Flushed(Result<(), DeviceError>),
-    /// The pipeline takes nothing any more.
+    /// The pipeline accepts nothing any more.
     NotFlushed,
 }
 
-/// The camera's thread or the pipeline has failed: no verdict comes any more.
+/// The camera's thread or the pipeline has failed: no more verdicts will come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Gone;
 
-/// The camera's thread as the run sees it.
+/// Handle of the camera's thread.
 pub struct CameraThread {
     work: SyncSender<Work>,
     ended: Receiver<Ended>,
@@ -100,17 +100,17 @@ pub struct CameraThread {
     thread: JoinHandle<Exposures>,
 }
 
-/// When frames were exposed that a point waited for.
+/// When the frames that points waited for were exposed.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Exposures {
-    /// When the last of them ended.
+    /// When the last of these exposures ended.
     pub until: Option<Instant>,
-    /// From the first to the end of the last of those with light, on the camera's clock.
+    /// From the start of the first lit exposure to the end of the last, on the camera's clock.
     lit_ns: Option<(i64, i64)>,
 }
 
 impl Exposures {
-    /// Seconds from the first frame with light to the end of the last.
+    /// Seconds from the start of the first lit exposure to the end of the last.
     pub fn light_s(&self) -> Option<f64> {
         self.lit_ns.map(|(from_ns, to_ns)| (to_ns - from_ns) as f64 * 1e-9)
     }
@@ -118,11 +118,11 @@ impl Exposures {
 
 /// How a run's camera is driven.
 pub struct Drive {
-    /// The clock that stamps are on.
+    /// The clock of the timestamps.
     pub clock: Clock,
-    /// Who sets the pace.
+    /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
-    /// The line that triggers it.
+    /// The line that triggers the camera.
     pub line: Line,
 }
 
@@ -130,7 +130,7 @@ impl CameraThread {
     /// Arms the camera on its own thread.
     ///
     /// # Errors
-    /// When the camera cannot be armed or the system gives no thread.
+    /// When the camera cannot be armed or the thread cannot be started.
     pub fn start(
         mut camera: Box<dyn Camera>,
         drive: Drive,
@@ -146,7 +146,7 @@ impl CameraThread {
             .spawn({
                 let latency = latency.clone();
                 move || {
-                    // On a virtual clock it computes frames all the time.
+                    // On a virtual clock, the camera computes frames all the time.
                     if drive.pace == Pace::Devices {
                         priority::for_device("camera");
                     }
@@ -166,11 +166,11 @@ impl CameraThread {
         Ok(Self { work, ended, latency, thread })
     }
 
-    /// Does some work and waits for its end. The verdicts on its points, the last of them that it is flushed, arrive
-    /// at the pipeline's sink, also when the camera failed (the inner error).
+    /// Does some work and waits until it ends. The verdicts on its points, followed by that on the flush, arrive at
+    /// the pipeline's sink, even if the camera failed (the inner error).
     ///
     /// # Errors
-    /// [`Gone`] when there will be no verdicts.
+    /// [`Gone`] if there will be no verdicts.
     pub fn acquire(&self, work: Work) -> Result<Result<(), DeviceError>, Gone> {
         self.work.send(work).map_err(|_closed| Gone)?;
         match self.ended.recv() {
@@ -179,12 +179,12 @@ impl CameraThread {
         }
     }
 
-    /// How late settings take effect, once a probe has found out.
+    /// The settings latency, once a probe has measured it.
     pub fn latency(&self) -> Option<SettingsLatency> {
         self.latency.get().copied()
     }
 
-    /// Disarms the camera and ends its thread; says when frames were exposed that a point waited for.
+    /// Disarms the camera and ends its thread; returns when the frames that points waited for were exposed.
     ///
     /// # Errors
     /// When the thread panicked.
@@ -203,34 +203,34 @@ struct Sequencer {
     input: Input<Event>,
     pace: Pace,
     pool: FramePool,
-    /// Takes the frames that there is no room for.
+    /// Receives frames that are dropped for lack of a buffer.
     spare: FrameBuf,
     orders: Arc<Orders>,
     warmed_up: bool,
-    /// The longest that a frame has taken so far, from its edge to its last row.
+    /// The longest time from edge to last row of any frame so far.
     longest_frame_us: f64,
     line: Line,
     ahead: Ahead,
-    /// Up to this frame the assembler knows what became of each; nothing after a pause, whose frames are nobody's.
+    /// The assembler knows the fate of every frame up to this one; `None` after a pause, whose frames do not count.
     told_seq: Option<u64>,
-    /// Settings written that no point asked for.
+    /// Number of settings written only to lead in to others.
     lead_ins: u32,
     exposures: Exposures,
 }
 
-/// A frame off the camera.
+/// A frame received from the camera.
 struct Received {
     stamp: FrameStamp,
     seen: Seen,
-    /// Nothing where no buffer was free.
+    /// `None` if no buffer was free.
     data: Option<FrameBuf>,
 }
 
-/// What became of a frame.
+/// Fate of a frame.
 enum Taken {
-    /// It is with the assembler.
+    /// Handed to the assembler.
     Passed,
-    /// There was no room for it.
+    /// Dropped for lack of room.
     Lost,
 }
 
@@ -259,9 +259,9 @@ impl Sequencer {
         }
     }
 
-    /// Always ends with a flush, so that nothing stays undecided.
+    /// Always ends with a flush, so that every point is decided.
     fn work(&mut self, work: Work, latency: &OnceLock<SettingsLatency>) -> Ended {
-        // Frames since the last work are nobody's: an operator may have taken minutes to change the picture.
+        // Frames since the last work do not count: an operator may have taken minutes to change the projected image.
         self.told_seq = None;
         let acquired = match work {
             Work::Probe(settings) => self.probe(&settings).map(|found| {
@@ -278,7 +278,7 @@ impl Sequencer {
         }
     }
 
-    /// Lets frames go by until the line is known and the picture is in the light.
+    /// Skips frames until the line is known and the projector shows the image.
     fn warm_up(&mut self, not_before_ns: i64) -> Result<(), DeviceError> {
         let margin = if self.warmed_up { 0 } else { MARGIN_FRAMES };
         self.pass_frames(margin, not_before_ns)?;
@@ -286,7 +286,7 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Lets frames go by: at least `frames` of them, and until exposures start at `not_before_ns` or later.
+    /// Skips at least `frames` frames, until exposures start at `not_before_ns` or later.
     fn pass_frames(&mut self, frames: u32, not_before_ns: i64) -> Result<(), DeviceError> {
         let mut left = frames;
         let mut watchdog = Watchdog::default();
@@ -306,7 +306,7 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Lets a frame go by.
+    /// Skips a frame.
     fn pass(&mut self, received: Received) -> Result<Taken, DeviceError> {
         for _ in 0..received.seen.owner.unwrap_or(0) {
             self.ahead.pop();
@@ -319,12 +319,12 @@ impl Sequencer {
         f64::from(periods) * self.line.period_us
     }
 
-    /// Notes a frame that a point waited for, which has just come.
+    /// Records the exposure of a frame that a point waited for and that has just arrived.
     fn note_exposure(&mut self, stamp: &FrameStamp, settings: &CameraSettings, is_lit: bool) {
         let capabilities = self.camera.capabilities();
         let rows_us = capabilities.height.saturating_sub(1) as f64 * capabilities.row_time_us;
         let end_ns = stamp.exposure_start_ns + ns_from_us(settings.exposure_us + rows_us);
-        // The camera's clock may be a virtual one, so that only its differences count.
+        // The camera's clock may be virtual, so only differences of its times count.
         let since = Duration::from_nanos((stamp.host_ns - end_ns).try_into().unwrap_or(0));
         self.exposures.until = Instant::now().checked_sub(since);
         if is_lit {
@@ -343,7 +343,7 @@ impl Sequencer {
         Ok(stamp.map(|stamp| Received { stamp, seen: self.ahead.see(&stamp), data }))
     }
 
-    /// Gives a frame to the assembler, or notes that there was no room for it.
+    /// Hands a frame to the assembler, or reports that there was no room for it.
     fn hand_on(
         &mut self,
         Received { stamp, data, .. }: Received,
@@ -360,7 +360,7 @@ impl Sequencer {
         }
     }
 
-    /// Tells the assembler why frames before `seq` never came, where the camera knows more than that they did not.
+    /// Tells the assembler why frames before `seq` never arrived, if the camera knows the reason.
     fn tell_losses(&mut self, seq: u64) -> Result<(), DeviceError> {
         let first = self.told_seq.map_or(seq, |told| told + 1);
         for lost in first..seq {
@@ -372,7 +372,7 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Only a frame that a point waits for is lost; the others are merely not looked at.
+    /// Only frames that a point waits for count as lost; others are merely skipped.
     fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
         let event = match label {
             Label::Counted | Label::CountedUnless { .. } => Event::Lost(stamp.seq, Some(cause)),
@@ -383,7 +383,7 @@ impl Sequencer {
     }
 }
 
-/// Notices a camera that gives no frames.
+/// Detects a camera that delivers no frames.
 #[derive(Default)]
 struct Watchdog {
     waited: Duration,
@@ -400,7 +400,7 @@ impl Watchdog {
         longest_frame_us: f64,
         state: DeviceState,
     ) -> Result<(), DeviceError> {
-        // A camera that its driver opens again comes back or ends the run itself.
+        // A camera that its driver is reopening either comes back or ends the run itself.
         if state == DeviceState::Lost {
             self.waited = Duration::ZERO;
             return Ok(());

@@ -1,4 +1,4 @@
-//! How late settings take effect, found out at the start of a run.
+//! Measures the settings latency at the start of a run.
 
 use std::time::Duration;
 
@@ -6,16 +6,17 @@ use raysweep_core::{CameraSettings, DeviceError, SettingsLatency};
 
 use super::{POLL, Sequencer, Watchdog};
 
-/// Changes of settings that are looked at: a latency that varies over four numbers of frames passes for constant once in
-/// 4^7.
+/// Number of observed changes of settings: a latency that varies over four numbers of frames passes for constant once
+/// in 4^7.
 const CHANGES: u32 = 8;
-/// Changes that must have shown when they acted; a false edge or a lost frame may hide it.
+/// Number of changes whose effect must have been seen; a false edge or a lost frame may hide it.
 const ENOUGH: usize = 4;
-/// By so much the exposure changes, where frames tell it.
+/// Factor by which the exposure changes, if frames carry it.
 const EXPOSURE_FACTOR: f64 = 1.25;
 
 impl Sequencer {
-    /// Changes settings to and fro and sees in the stamps of frames from which one on they act; nothing if too few tell.
+    /// Changes settings back and forth and finds, from the frames' timestamps, when they take effect; `None` if too
+    /// few changes could be seen.
     pub(super) fn probe(
         &mut self,
         settings: &CameraSettings,
@@ -27,7 +28,7 @@ impl Sequencer {
             other.exposure_us = longer_us;
         }
         let mut late_frames = Vec::with_capacity(CHANGES as usize);
-        // The first change does not count: nothing is known of what was before it.
+        // The first change does not count: the settings before it are unknown.
         for change in 0..=CHANGES {
             self.pass_until_due()?;
             self.pass_through(if change % 2 == 0 { settings } else { &other })?;
@@ -44,7 +45,7 @@ impl Sequencer {
         Ok(latency)
     }
 
-    /// Lets frames go by until settings may be written.
+    /// Skips frames until settings may be written.
     fn pass_until_due(&mut self) -> Result<(), DeviceError> {
         let mut watchdog = Watchdog::default();
         while self.orders.go_on() {
@@ -65,8 +66,8 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Lets frames go by until the settings written last are in force for certain; how many frames late they acted, if
-    /// that was seen.
+    /// Skips frames until the last settings are certainly in force; returns their latency in frames, if it was
+    /// observed.
     fn see_through(&mut self) -> Result<Option<u32>, DeviceError> {
         let mut watchdog = Watchdog::default();
         let mut late_frames = None;

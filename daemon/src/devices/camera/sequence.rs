@@ -1,5 +1,5 @@
-//! Sweeps and films: points one after the other while frames keep coming. The settings of each are written while frames
-//! of those before are still under way, so that no trigger goes by for want of them.
+//! Sweeps and films: one point after another while frames keep coming. The settings of each point are written while
+//! frames of earlier points are still in transit, so that no trigger is wasted.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,45 +13,46 @@ use super::{Attempt, MARGIN_FRAMES, POLL, Pass, Received, Sequencer, Taken, Watc
 use crate::rig::Pace;
 use crate::run::orders::Order;
 
-/// Settings that lead to others differ from them by so much delay: more than any jitter. [A]
+/// Lead-in settings differ from the following ones by this much delay: more than any jitter. [A]
 const LEAD_IN_US: f64 = 2_000.0;
-/// How often it is looked whether the last frames are decided.
+/// Interval at which to check whether the last frames are decided.
 const SETTLE_POLL: Duration = Duration::from_millis(2);
 
-/// A point that has failed, or was interrupted, oftener gets no more frames to spare: it has three times its own by then.
+/// Failures and interruptions beyond this number earn a point no more spare frames: by then it has three times its
+/// own.
 const MOST_SPARED_FOR: u32 = 8;
 
-/// A film to take under one picture of the projector.
+/// A film to take with one image on the projector.
 #[derive(Debug, Clone)]
 pub struct FilmPass {
-    /// The settings of a cycle, in the order in which it takes them.
+    /// The settings of a cycle, in order.
     pub settings: Vec<FilmSetting>,
-    /// How many cycles.
+    /// Number of cycles.
     pub cycles: u32,
-    /// Frames exposed earlier may still see the picture before.
+    /// Frames exposed earlier may still show the previous image.
     pub not_before_ns: i64,
 }
 
 /// One setting of a film's cycle.
 #[derive(Debug, Clone, Copy)]
 pub struct FilmSetting {
-    /// Its point's ordinal in the schedule.
+    /// Ordinal of its point in the schedule.
     pub ordinal: u32,
     /// What to acquire.
     pub point: Point,
-    /// How to set the camera for it.
+    /// Camera settings for it.
     pub shot: Shot,
-    /// VSYNC periods from the frame of the setting before to this one's.
+    /// VSYNC periods from the previous setting's frame to this one.
     pub periods_from_last: u32,
 }
 
-/// A place in the sequence.
+/// A position in the sequence.
 pub(super) struct Slot {
     pub attempt: Attempt,
     pub periods_from_last: Option<u32>,
-    /// Place in a film's cycle.
+    /// Position in a film's cycle.
     pub place: usize,
-    /// Whether a pause may come before it.
+    /// Whether the run may pause before it.
     pub may_hold: bool,
 }
 
@@ -73,14 +74,15 @@ impl FilmPass {
 }
 
 impl Sequencer {
-    /// Takes points. Each ends in a unit or a failure, in order.
+    /// Takes points in order. Each ends in a unit or a failure.
     pub(super) fn sweep(&mut self, pass: Pass) -> Result<(), DeviceError> {
         self.warm_up(pass.not_before_ns)?;
         let slot = |attempt| Slot { attempt, periods_from_last: None, place: 0, may_hold: true };
         self.sequence(pass.attempts.into_iter().map(slot))
     }
 
-    /// Takes a film: a sweep of one frame a point, again and again. What the camera does not by itself is written ahead.
+    /// Takes a film: a repeated sweep with one frame per point. What the camera's sequencer cannot do is written
+    /// ahead.
     pub(super) fn film(&mut self, film: &FilmPass) -> Result<(), DeviceError> {
         self.warm_up(film.not_before_ns)?;
         let mut slots = film.slots().peekable();
@@ -91,7 +93,7 @@ impl Sequencer {
     fn sequence(&mut self, slots: impl Iterator<Item = Slot>) -> Result<(), DeviceError> {
         let mut slots = slots.peekable();
         let mut watchdog = Watchdog::default();
-        // Settings that no point has come first, so that the frames of a point do not hang on what was before it.
+        // Start with settings that belong to no point, so that a point's frames do not depend on what came before.
         let mut is_led_in = false;
         let mut runs_on = false;
         while self.orders.go_on() {
@@ -140,10 +142,10 @@ impl Sequencer {
         self.settle()
     }
 
-    /// Lets frames go by until all points are decided.
+    /// Skips frames until all points are decided.
     fn settle(&mut self) -> Result<(), DeviceError> {
         if self.pace == Pace::Pipeline {
-            // Always as many, so that runs are equal to the bit.
+            // Always the same number, so that runs are bit-identical.
             return self.pass_frames(MARGIN_FRAMES, i64::MIN);
         }
         let decided = Arc::new(AtomicBool::new(false));
@@ -162,13 +164,13 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Sets the camera to what stamps tell from `settings`, at the same exposure.
+    /// Writes settings that timestamps can distinguish from `settings`, at the same exposure.
     fn lead_in(&mut self, settings: &CameraSettings) -> Result<(), DeviceError> {
         let apart = self.apart_from(settings);
         self.pass_through(&apart)
     }
 
-    /// These settings with another delay.
+    /// These settings with a different delay.
     pub(super) fn apart_from(&self, settings: &CameraSettings) -> CameraSettings {
         let delay_us = settings.trigger_delay_us;
         let range = &self.camera.capabilities().trigger_delay_us;
@@ -177,7 +179,7 @@ impl Sequencer {
         CameraSettings { trigger_delay_us: apart_us.unwrap_or(delay_us), ..*settings }
     }
 
-    /// Sets the camera to what no point asked for.
+    /// Writes settings that belong to no point.
     pub(super) fn pass_through(&mut self, settings: &CameraSettings) -> Result<(), DeviceError> {
         let id = SettingsId { point: u32::MAX, attempt: self.lead_ins };
         self.lead_ins += 1;
@@ -186,7 +188,7 @@ impl Sequencer {
 
     fn write(&mut self, slot: &Slot, runs_on: bool) -> Result<(), DeviceError> {
         let Attempt { id, point, shot, interruptions } = slot.attempt;
-        // The oftener a point failed, the more frames it has to spare.
+        // The more often a point failed, the more spare frames it gets.
         let spared = |failures: u32| failures.min(MOST_SPARED_FOR) * point.frames.div_ceil(4);
         self.configure(id, &shot.settings, |applied| {
             let job = Job {
@@ -202,14 +204,14 @@ impl Sequencer {
                 is_lit: !matches!(point.role, Role::Dark(_)),
                 is_begun: false,
                 is_interrupted: false,
-                // A film counts its cycles as attempts.
+                // In a film, the attempt is the number of the cycle.
                 frames: match slot.periods_from_last {
                     Some(_) => point.frames,
                     None => point.frames + spared(id.attempt),
                 },
                 margin_frames: spared(interruptions),
                 passed: 0,
-                // Frames that found no room are taken again within the attempt, but not for ever.
+                // Frames dropped for lack of room are repeated within the attempt, up to this limit.
                 spare_frames: 64 + 3 * point.frames,
             })
         })
@@ -230,7 +232,7 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Has the camera do something, which waits for one that is being opened again; nothing where the run ends meanwhile.
+    /// Runs an action on the camera, waiting while the camera is being reopened; `None` if the run ends meanwhile.
     pub(super) fn when_there<T>(
         &mut self,
         mut act: impl FnMut(&mut dyn Camera) -> Result<T, DeviceError>,
@@ -250,7 +252,7 @@ impl Sequencer {
         }
     }
 
-    /// Hands a frame on as that of the settings that it was exposed with. Jobs before it that lack frames are over.
+    /// Hands a frame on under the settings that it was exposed with. Earlier jobs that still lack frames are over.
     fn deliver(&mut self, received: Received) -> Result<(), DeviceError> {
         let (seq, seen) = (received.stamp.seq, received.seen);
         for _ in 0..seen.owner.unwrap_or(0) {
@@ -262,12 +264,12 @@ impl Sequencer {
         if is_owned {
             self.note_lost(seen.since_seq, seq)?;
         } else {
-            // One of a job's frames that may be another's: which frames it has must not depend on what comes after it.
+            // The frame may belong to this job or the next: which frames a job gets must not depend on what follows.
             self.note_lost(seen.since_seq, self.next_earliest(seq))?;
             self.interrupt_if(|wanted| wanted.passed > 0)?;
         }
         let Some(wanted) = self.ahead.front().filter(|_| is_owned).and_then(|front| front.open()) else {
-            // Exposed under settings that have their frames, or nobody knows under which.
+            // Exposed under settings that already have their frames, or under unknown settings.
             if let Some(next) = self.ahead.opening(seq)
                 && !std::mem::replace(&mut next.is_begun, true)
             {
@@ -300,14 +302,14 @@ impl Sequencer {
         Ok(())
     }
 
-    /// The first frame, up to `seq`, that may have had the settings after those in force: lost ones from there on are not
-    /// held against the job in force.
+    /// The first frame, up to `seq`, that may have had the next settings: frames lost from there on do not count
+    /// against the job in force.
     fn next_earliest(&self, seq: u64) -> u64 {
         self.ahead.second().map_or(seq, |next| next.earliest().min(seq))
     }
 
-    /// Tells of the frames from `since_seq` on, below `seq`, that the job in force waited for and that never came. A camera
-    /// that was away interrupts the job: these are not its frames.
+    /// Reports the frames from `since_seq` on, below `seq`, that the job in force waited for and that never arrived.
+    /// If the camera was lost meanwhile, the job is interrupted instead.
     fn note_lost(&mut self, since_seq: u64, seq: u64) -> Result<(), DeviceError> {
         let Some(front) = self.ahead.front() else { return Ok(()) };
         let lost = front.lost(since_seq, seq);
@@ -334,7 +336,7 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Ends the job in force before its last frame, if it waits for any.
+    /// Ends the job in force early, if it is open and `is_over` holds.
     fn interrupt_if(&mut self, is_over: impl FnOnce(&Wanted) -> bool) -> Result<(), DeviceError> {
         let wanted = self.ahead.front().and_then(|front| front.open());
         let Some(wanted) = wanted.filter(|wanted| is_over(wanted)) else { return Ok(()) };

@@ -1,10 +1,10 @@
-//! Films by the camera's own sequencer: it goes through the cycle's settings by itself, so that no frame hangs on a write
-//! that must come between two triggers.
+//! Films by the camera's own sequencer: the camera goes through the cycle's settings by itself, so that no frame
+//! depends on a write between two triggers.
 //!
-//! Each frame exposed has the set after that of the frame before, whether it arrives or not. So one number, the phase, says
-//! of every id which set it has. Where frames say their set, two in a row that say the same phase are believed. Else, and
-//! where it proves them wrong, it is that with which the stamps of a whole cycle of frames agree, and with no other. The
-//! assembler holds each frame's delay against its edge all the same.
+//! Each exposed frame has the set after that of the previous frame, whether it arrives or not. So a single number,
+//! the phase, maps every frame id to its set. If frames report their set, two consecutive frames that report the same
+//! phase are trusted. Otherwise, or if timestamps contradict the report, the phase is the only one that agrees with
+//! the timestamps of a whole cycle of frames. The assembler checks each frame's delay against its edge in any case.
 
 use std::iter::Peekable;
 
@@ -15,13 +15,13 @@ use super::sequence::{FilmPass, Slot};
 use super::{Line, POLL, Sequencer, Taken, Watchdog, closed};
 use crate::run::orders::Order;
 
-/// Frames further apart are not compared: the line's period is not known that well. [A]
+/// Frames further apart than this are not compared: the line's period is not known precisely enough. [A]
 const COMPARED_NS: i64 = 1_000_000_000;
-/// Cycles in which the phase must be found; the camera does something else otherwise.
+/// Number of cycles in which the phase must be found; otherwise the camera does not follow its sequence.
 const PATIENCE_CYCLES: usize = 8;
 
 impl Sequencer {
-    /// Takes slots of a film by the camera's own sequencer, as far as that can be used.
+    /// Takes slots of a film with the camera's own sequencer, as far as that is usable.
     pub(super) fn take_by_sets(
         &mut self,
         film: &FilmPass,
@@ -40,10 +40,10 @@ impl Sequencer {
             let longest_us = sets.iter().map(|settings| self.frame_us(settings)).fold(0.0, f64::max);
             self.longest_frame_us = self.longest_frame_us.max(longest_us);
             let taken = self.take_frames(slots, Phase::new(sets, self.line));
-            // What the stamps of its frames seemed to say, by the settings written before.
+            // The timestamps of its frames were interpreted under the settings written before.
             self.ahead.lose_track();
             let is_followed = taken?;
-            // Ends the sequence.
+            // Stops the sequencer.
             self.pass_through(&settings[0])?;
             if !is_followed {
                 tracing::warn!(
@@ -60,8 +60,8 @@ impl Sequencer {
         Ok(())
     }
 
-    /// Takes frames until every slot has its own, or a pause comes between two cycles; `false`: the camera does not go
-    /// through its sets.
+    /// Takes frames until every slot has its own, or a pause falls between two cycles; `false`: the camera does not
+    /// go through its sets.
     fn take_frames(
         &mut self,
         slots: &mut Peekable<impl Iterator<Item = Slot>>,
@@ -90,7 +90,7 @@ impl Sequencer {
                     self.told_seq = Some(lost_seq);
                 }
                 if cause == LossCause::CameraLost {
-                    // Its ids were made up, and its sequencer has begun anew.
+                    // Its ids were made up, and its sequencer has restarted.
                     phase.forget();
                     break;
                 }
@@ -118,23 +118,23 @@ impl Sequencer {
     }
 }
 
-/// Which set each frame has.
+/// Maps frames to sets.
 struct Phase {
-    /// The sets' settings, as the camera took them.
+    /// The settings of the sets, as the camera applied them.
     sets: Vec<CameraSettings>,
     line: Line,
-    /// The frame 0 has, or would have, the set of this number.
+    /// Index of the set of frame 0, even if that frame was not in the sequence.
     known: Option<usize>,
-    /// For each phase, how many frames in a row have agreed with it, each with the one before.
+    /// For each phase, the number of consecutive frames that agreed with it, each relative to the frame before.
     agreeing: Vec<usize>,
     newest: Option<FrameStamp>,
-    /// Whether stamps tell each phase from all others.
+    /// Whether timestamps distinguish each phase from all others.
     stamps_tell: bool,
-    /// The phase that the newest frame said.
+    /// The phase that the newest frame reported.
     said: Option<usize>,
-    /// Whether stamps have not proved such a word wrong.
+    /// Whether timestamps have not yet contradicted the reports.
     is_word_true: bool,
-    /// Frames that have been looked at without result.
+    /// Frames examined without result.
     in_vain: usize,
 }
 
@@ -153,11 +153,11 @@ impl Phase {
         }
     }
 
-    /// Whether the stamps of a cycle of frames differ by the phase that it has.
+    /// Whether the timestamps of a cycle of frames distinguish all phases.
     fn differ(sets: &[CameraSettings], line: &Line) -> bool {
         let delay_us = |place: usize| sets[place % sets.len()].trigger_delay_us;
         let step_us = |place: usize| delay_us(place + 1) - delay_us(place);
-        // Edges may be off by the jitter that is allowed, and so may what is asked of the frames.
+        // Edges may be off by the permitted jitter, and frames are compared with the same tolerance.
         let differs = |shift: usize| {
             (0..sets.len())
                 .any(|place| line.off_us(step_us(place + shift) - step_us(place)) > 2.0 * line.max_jitter_us)
@@ -174,18 +174,18 @@ impl Phase {
         ((seq % sets as u64) as usize + phase) % sets
     }
 
-    /// The phase in which the frame `seq` has a set, where there is such a set.
+    /// The phase in which frame `seq` has this set, if the set exists.
     fn phase_by(&self, set: usize, seq: u64) -> Option<usize> {
         let sets = self.sets.len();
         (set < sets).then(|| (sets + set - (seq % sets as u64) as usize) % sets)
     }
 
-    /// Nothing that was seen counts any more.
+    /// Discards all observations.
     fn forget(&mut self) {
         *self = Self::new(std::mem::take(&mut self.sets), self.line);
     }
 
-    /// Looks at a frame, and at the set that it says it has.
+    /// Processes a frame and the set that it reports.
     fn see(&mut self, stamp: &FrameStamp, said: Option<usize>) {
         let before = self.newest.replace(*stamp);
         let before = before.filter(|before| stamp.exposure_start_ns - before.exposure_start_ns < COMPARED_NS);
@@ -204,7 +204,7 @@ impl Phase {
             );
             (self.is_word_true, said) = (false, None);
         }
-        // A word that the frame before did not give is none: a sequence that stutters, or a frame from before it.
+        // A report counts only if the previous frame agreed: the sequence may stutter, or the frame may predate it.
         let by_word = said.filter(|_| self.said == said);
         self.said = said;
         self.known = by_word.or(by_stamps).or(self.known.filter(|_| said.is_none()));
@@ -216,7 +216,8 @@ impl Phase {
         self.in_vain > if can_tell { PATIENCE_CYCLES * self.sets.len() } else { 0 }
     }
 
-    /// Whether by a phase two frames were triggered whole periods apart and have the exposures that they say.
+    /// Whether, assuming this phase, two frames were triggered whole periods apart and have the exposures that they
+    /// report.
     fn agrees(&self, phase: usize, before: &FrameStamp, stamp: &FrameStamp) -> bool {
         let [first, second] = [before, stamp].map(|stamp| self.sets[self.set_by(phase, stamp.seq)]);
         let exposure_us = stamp.exposure_us.unwrap_or(second.exposure_us);
@@ -226,7 +227,7 @@ impl Phase {
             && (exposure_us - second.exposure_us).abs() <= EXPOSURE_TOLERANCE_US
     }
 
-    /// What the assembler is told of the frame `seq`, which has a slot's set; `before` is the frame of the slot before.
+    /// The assembler's job for frame `seq`, which has a slot's set; `before` is the frame of the previous slot.
     fn job(&self, slot: &Slot, seq: u64, before: Option<u64>) -> Job {
         let runs_on = before.is_some_and(|before| before + 1 == seq);
         Job {

@@ -1,4 +1,4 @@
-//! The sequencer on a camera that is played by a script, on a virtual clock.
+//! Tests the sequencer with a scripted camera on a virtual clock.
 
 mod ahead;
 mod sets;
@@ -14,37 +14,37 @@ use crate::run::orders::Order;
 const PERIOD_NS: i64 = 16_666_667;
 const LATENCY_US: f64 = 8.0;
 
-/// What the camera is like.
+/// Behaviour of the camera.
 #[derive(Clone, Copy)]
 struct Script {
-    /// Frames that settings are late, drawn in turn.
+    /// Latencies of settings in frames, used in turn.
     late: &'static [u64],
-    /// What it promises: the frame itself, or any up to so many frames later than the next.
+    /// What the camera promises: the exact frame, or a range up to this many frames after the next.
     promise: Option<u64>,
     /// Whether its frames carry their exposure.
     chunk: bool,
-    /// How much longer than asked for the host sleeps, in turn, in ms.
+    /// How much longer than requested the host sleeps, in turn, in ms.
     oversleep_ms: &'static [i64],
     /// Ids of frames that never arrive.
     lost: &'static [u64],
-    /// Frames that are held up on their way to the host, as resends do, by so many ms; those behind them wait.
+    /// Frames that are delayed in transit, as by resends, in ms; those behind them wait.
     held_up: &'static [(u64, i64)],
-    /// How many sets its sequencer has.
+    /// Number of sets of its sequencer.
     sets: usize,
-    /// Frames of a sequence that have the set of the frame before once more.
+    /// Frames of a sequence that repeat the set of the frame before.
     stutters: &'static [u64],
-    /// Whether its sequencer stays with the first set.
+    /// Whether its sequencer stays at the first set.
     stuck: bool,
-    /// Whether its frames say which set they have.
+    /// Which set its frames report.
     says: Says,
 }
 
-/// What frames say of the sequencer's set that they have.
+/// The sequencer's set that frames report.
 #[derive(Clone, Copy, PartialEq)]
 enum Says {
     Nothing,
     Truth,
-    /// The set of the frame after.
+    /// The set of the next frame.
     Next,
     /// Always the first.
     First,
@@ -63,20 +63,20 @@ const EXACT: Script = Script {
     says: Says::Nothing,
 };
 
-/// A camera whose every trigger is answered, and whose frames are on the host 18 ms after their exposure.
+/// A camera that answers every trigger and whose frames reach the host 18 ms after their exposure.
 struct Scripted {
     script: Script,
     clock: ClockHandle,
     capabilities: CameraCapabilities,
     written: Vec<(u64, CameraSettings)>,
-    /// From which frame on its sequencer goes through what.
+    /// First frame and sets of its sequence.
     sequence: Option<(u64, Vec<CameraSettings>)>,
     changes: usize,
     /// The frames at which settings were written or a sequence was begun.
     told: Arc<Mutex<Vec<u64>>>,
     sleeps: usize,
     next_seq: u64,
-    /// The settings of each frame, in truth.
+    /// The true settings of each frame.
     truth: Arc<Mutex<Vec<CameraSettings>>>,
 }
 
@@ -85,7 +85,7 @@ impl Scripted {
         self.clock.now_ns().unsigned_abs().div_ceil(PERIOD_NS.unsigned_abs())
     }
 
-    /// The sequencer's set that a frame has; the first of `sets` where it is not of the sequence.
+    /// The sequencer's set of a frame; the first of `sets` for frames outside the sequence.
     fn set_of(&self, seq: u64, (first_seq, sets): &(u64, Vec<CameraSettings>)) -> usize {
         let stutters = self.script.stutters.iter().filter(|stutter| **stutter <= seq).count();
         let taken = seq.saturating_sub(*first_seq) as usize;
@@ -116,7 +116,7 @@ impl Camera for Scripted {
         self.changes += 1;
         self.told.lock().unwrap().push(next_seq);
         if self.sequence.is_some() {
-            // What is on its way has its sets.
+            // Frames in transit keep their sets.
             let under_way: Vec<_> = (self.next_seq..first_seq).map(|seq| (seq, self.settings(seq))).collect();
             self.written.extend(under_way);
             self.sequence = None;
@@ -125,7 +125,7 @@ impl Camera for Scripted {
         self.written.push((first_seq, *settings));
         let first_frame = match self.script.promise {
             None => FirstFrame::Exactly(first_seq),
-            // A driver knows which frames it has handed on, and how many triggers there may have been since.
+            // A driver knows which frames it has delivered, and how many triggers there may have been since.
             Some(late) => FirstFrame::Within { earliest: self.next_seq, certain: next_seq + late },
         };
         Ok(Applied { actual: *settings, first_frame })
@@ -135,7 +135,7 @@ impl Camera for Scripted {
         if all.len() > self.script.sets {
             return Ok(None);
         }
-        // It keeps the settings before for some frames, as with any others.
+        // The previous settings stay for some frames, as with any others.
         let first_seq = self.next_trigger() + self.script.late[0];
         self.told.lock().unwrap().push(first_seq);
         self.sequence = Some((first_seq, all.to_vec()));
@@ -216,10 +216,10 @@ fn plan() -> Vec<CameraSettings> {
     [600.0, 900.0].iter().flat_map(|&exposure_us| delays().map(move |us| settings(us, exposure_us))).collect()
 }
 
-/// What the sequencer made of a plan.
+/// Result of playing a plan.
 struct Played {
     latency: Option<SettingsLatency>,
-    /// Point and id of each frame that was handed on as a point's.
+    /// Point and id of each frame that was handed on as a point's own.
     counted: Vec<(u32, u64)>,
     /// Points that ended without all their frames.
     short: Vec<u32>,
@@ -229,13 +229,13 @@ struct Played {
 }
 
 impl Played {
-    /// Frames from the first to the last that counted.
+    /// Number of frames from the first to the last that counted.
     fn frames(&self) -> u64 {
         let ids = || self.counted.iter().map(|(_, seq)| *seq);
         ids().max().unwrap() + 1 - ids().min().unwrap()
     }
 
-    /// Ids of frames that were taken for another point's.
+    /// Ids of frames that were attributed to the wrong point.
     fn wrong(&self, plan: &[CameraSettings]) -> Vec<u64> {
         let is_wrong = |&&(point, seq): &&(u32, u64)| self.truth[seq as usize] != plan[point as usize];
         self.counted.iter().filter(is_wrong).map(|(_, seq)| *seq).collect()
@@ -252,12 +252,12 @@ impl Played {
     }
 }
 
-/// Takes the plan as a sweep of `frames` a point or, in `cycles`, as a film.
+/// Plays the plan as a sweep with `frames` per point or, given `cycles`, as a film.
 fn play(script: Script, frames: u32, cycles: Option<u32>) -> Played {
     play_plan(&plan(), script, frames, cycles, None)
 }
 
-/// Takes a plan, with a pause after so many frames that counted.
+/// Plays a plan, with a pause after the given number of counted frames.
 fn play_plan(
     plan: &[CameraSettings],
     script: Script,

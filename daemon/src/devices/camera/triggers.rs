@@ -1,35 +1,35 @@
-//! When the camera is triggered, by the stamps of its frames.
+//! Predicts the camera's trigger times from the timestamps of its frames.
 
-/// A trigger this far from a whole number of periods after the one before is not the line's.
+/// A trigger this far from a whole number of periods after the previous one does not come from the line.
 const GATE_NS: i64 = 500_000;
-/// So many of those in a row mean that it was the one before that was not.
+/// This many of those in a row mean that the previous one was wrong instead.
 const RELOCK_AFTER: u32 = 3;
 
-/// The triggers of the newest frames.
+/// Trigger times of the newest frames.
 pub struct Triggers {
     period_ns: i64,
-    /// The newest frame whose settings are known, and when its trigger was.
+    /// The newest frame with known settings, and its trigger time.
     newest: Option<(u64, i64)>,
     astray: u32,
 }
 
 impl Triggers {
-    /// Triggers of which none is known.
+    /// Starts without known triggers.
     pub fn new(period_ns: i64) -> Self {
         Self { period_ns, newest: None, astray: 0 }
     }
 
-    /// Their nominal period.
+    /// The nominal period.
     pub fn period_ns(&self) -> i64 {
         self.period_ns
     }
 
-    /// The newest frame that was triggered by the line, and when.
+    /// The newest frame that the line triggered, and its trigger time.
     pub fn newest(&self) -> Option<(u64, i64)> {
         self.newest
     }
 
-    /// Notes the trigger of a frame.
+    /// Records the trigger of a frame.
     pub fn note(&mut self, seq: u64, trigger_ns: i64) {
         if self.off_ns(trigger_ns).is_some_and(|off_ns| off_ns > GATE_NS) && self.astray + 1 < RELOCK_AFTER {
             self.astray += 1;
@@ -38,19 +38,19 @@ impl Triggers {
         }
     }
 
-    /// What was known is too old.
+    /// Forgets the triggers, which are too old.
     pub fn forget(&mut self) {
         self.newest = None;
     }
 
-    /// How far a moment is from a whole number of periods after the newest trigger.
+    /// Distance of a time from a whole number of periods after the newest trigger.
     pub fn off_ns(&self, time_ns: i64) -> Option<i64> {
         let (_, trigger_ns) = self.newest?;
         let since_ns = (time_ns - trigger_ns).rem_euclid(self.period_ns);
         Some(since_ns.min(self.period_ns - since_ns))
     }
 
-    /// The first moment from `now_ns` on that lies within `window_ns` after a trigger.
+    /// The first time from `now_ns` on that lies within `window_ns` after a trigger.
     pub fn between_ns(&self, now_ns: i64, (from_ns, to_ns): (i64, i64)) -> i64 {
         let Some((_, trigger_ns)) = self.newest else { return now_ns };
         let since_ns = (now_ns - trigger_ns).rem_euclid(self.period_ns);

@@ -1,4 +1,4 @@
-//! The camera's part: frames off the camera and into the pipeline, and every exposure that comes to nothing.
+//! The camera's part: passes frames from the camera to the pipeline, and accounts for every exposure that is lost.
 
 use std::time::{Duration, Instant};
 
@@ -8,32 +8,32 @@ use raysweep_pipeline::dots::{Arrival, Loss};
 
 use crate::rig::Pace;
 
-/// One wait for a frame.
+/// Timeout of one wait for a frame.
 const POLL: Duration = Duration::from_millis(100);
-/// A camera without frames for so long has lost its trigger; by the host's time, since a virtual clock runs on while another
-/// thread is about to start the mirror.
+/// A camera without frames for this long has lost its trigger. Measured in host time, because a virtual clock runs on
+/// while another thread is about to start the mirror.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// Frames that are taken after the last trigger, at most: a camera that runs freely gives some for ever.
+/// Most frames that are taken after the last trigger: a free-running camera never stops.
 const MOST_REST_FRAMES: u32 = 1024;
-/// Ids that may be asked after one by one where many are missing at once.
+/// If more ids than this are missing at once, they are not looked up one by one.
 const MOST_ASKED: u64 = 1 << 16;
 
-/// What the taker of frames is told before each.
+/// What the caller wants next from the camera; asked before each frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wanted {
-    /// Frames, and waiting for them is an error after some time.
+    /// Frames; a long wait for one is an error.
     Frames,
-    /// What is still there: no more are triggered.
+    /// Frames that are still in transit: no more are triggered.
     Rest,
-    /// Nothing.
+    /// No more frames.
     Nothing,
 }
 
-/// A camera that is armed, and the memory for its frames.
+/// An armed camera, and the memory for its frames.
 pub struct Source<'a> {
     /// The camera.
     pub camera: &'a mut dyn Camera,
-    /// Buffers for frames under way.
+    /// Buffers for frames in transit.
     pub pool: &'a FramePool,
     /// Whether the camera waits for room.
     pub pace: Pace,
@@ -43,7 +43,7 @@ pub struct Source<'a> {
 pub enum Refused {
     /// There is no room, and the camera does not wait.
     Full(Arrival),
-    /// It takes nothing any more.
+    /// The pipeline is closed.
     Closed,
 }
 
@@ -57,16 +57,17 @@ impl From<QueueError<Arrival>> for Refused {
 }
 
 impl Source<'_> {
-    /// Reads the camera for nothing until `is_over`, or until it fails.
+    /// Reads and discards frames until `is_over`, or until the camera fails.
     pub fn idle(&mut self, is_over: &dyn Fn() -> bool) {
         let mut data = self.pool.spare();
         while !is_over() && self.camera.next_frame(&mut data, POLL).is_ok() {}
     }
 
-    /// Takes frames as long as `wanted` says and hands them to `deliver`; returns what was lost after the last.
+    /// Takes frames as long as `wanted` asks for them and hands them to `deliver`; returns what was lost after the
+    /// last one.
     ///
     /// # Errors
-    /// What the camera said, or that no frames come.
+    /// An error of the camera, or that no frames arrive.
     pub fn take(
         &mut self,
         wanted: &dyn Fn() -> Wanted,
@@ -107,7 +108,7 @@ impl Source<'_> {
             if let Some(last) = last.filter(|last| stamp.seq > last + 1) {
                 self.note_gap(last + 1, stamp.seq, &mut lost);
             }
-            // A frame that comes twice is no exposure of its own, whatever becomes of it.
+            // A frame that arrives twice is not a separate exposure.
             let is_new = last.is_none_or(|last| stamp.seq > last);
             last = last.max(Some(stamp.seq));
             if !has_room {
@@ -153,7 +154,7 @@ mod tests {
 
     use super::*;
 
-    /// Gives frames with these ids, then none.
+    /// Delivers frames with these ids, then none.
     struct Scripted(CameraCapabilities, std::vec::IntoIter<u64>);
 
     impl Camera for Scripted {
@@ -219,7 +220,7 @@ mod tests {
             })
             .unwrap();
         let loss = |frames, cause| Loss { frames, cause };
-        // 7 and its duplicate are held, so there is no buffer for 8, 9 and 12.
+        // Buffers are held by 7 and its duplicate, so there is none for 8, 9 and 12.
         assert_eq!(
             taken,
             [

@@ -1,4 +1,4 @@
-//! The devices of the dot rig: a mirror that plays a path while the camera takes a frame of each dot.
+//! The devices of the dot rig: a mirror that plays a path while the camera takes one frame per dot.
 
 pub mod camera;
 pub mod motion;
@@ -6,16 +6,16 @@ pub mod play;
 
 use crate::rig::Pace;
 
-/// Frames that may wait for the workers where the source waits for room.
+/// Queue length for frames if the source waits for room.
 const FEWEST_WAITING: usize = 24;
-/// How long a host may stand still, as virtual machines do, without loss of a frame; as far as memory goes.
+/// Stall of the host, as on virtual machines, that must cost no frame, as far as memory allows.
 const STANDSTILL_S: f64 = 0.2;
-/// Most memory for frames that wait.
+/// Upper limit of memory for queued frames.
 const MOST_WAITING_BYTES: usize = 1 << 30;
-/// Buffers of the frames under work, and of those of the beam dump that wait for their index.
+/// Buffers for frames in the workers, and for those of the beam dump that wait for their index.
 pub const FRAMES_AT_WORK: usize = 40;
 
-/// Frames of a camera that may wait for the workers.
+/// Queue length for frames between the camera and the workers.
 pub fn frames_waiting(pace: Pace, rate_hz: f64, frame_bytes: usize) -> usize {
     match pace {
         Pace::Pipeline => FEWEST_WAITING,

@@ -1,34 +1,34 @@
-//! The mirror's part: the one place from which it is driven, and parked on every way out.
+//! The mirror's part: the only place that drives it, and that parks it on every way out.
 
 use std::time::Duration;
 
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind, Mirror, MirrorPath, ns_from_us};
 
-/// Between two looks at a mirror that plays a path.
+/// Interval at which a mirror that plays a path is served.
 const FEED: Duration = Duration::from_millis(4);
 
-/// Share of the path's rate by which the controller's own may differ: drivers measure it while the mirror goes to the
-/// path's beginning, no better than this. Every batch is synchronised anew.
+/// Tolerance of the controller's sample rate, as a share of the path's rate. Drivers measure the rate while the
+/// mirror goes to the start of the path, and no more precisely than this. Every batch is synchronised anew.
 const RATE_TOLERANCE: f64 = 0.03;
 
-/// A mirror in a run, if the rig has one: parked with the light off when it goes out of scope, on every way out.
+/// The mirror of a run, if the rig has one: parked with the light off when it goes out of scope, on every way out.
 pub struct Motion(Option<Box<dyn Mirror>>);
 
 impl Motion {
-    /// Takes a mirror that is at rest.
+    /// Takes over a mirror that is at rest.
     pub fn new(mirror: Option<Box<dyn Mirror>>) -> Self {
         Self(mirror)
     }
 
-    /// Whether there is a mirror at all.
+    /// Whether there is a mirror.
     pub fn is_driven(&self) -> bool {
         self.0.is_some()
     }
 
-    /// Takes the mirror to the path's first point and begins to play it.
+    /// Moves the mirror to the path's first point and starts to play the path.
     ///
     /// # Errors
-    /// What the mirror's driver said, or a rate that the frames would not fit.
+    /// An error of the mirror's driver, or a sample rate that would not match the frames.
     pub fn start(&mut self, path: &MirrorPath, rounds: u32) -> Result<(), DeviceError> {
         let Some(mirror) = &mut self.0 else { return Ok(()) };
         let rate_hz = mirror.load(path)?;
@@ -42,10 +42,10 @@ impl Motion {
         mirror.start(rounds)
     }
 
-    /// Feeds the mirror until its path is over, or parks it as soon as `go_on` says no.
+    /// Feeds the mirror until its path is over, or parks it as soon as `go_on` returns false.
     ///
     /// # Errors
-    /// What the mirror's driver said.
+    /// An error of the mirror's driver.
     pub fn play(&mut self, clock: &Clock, go_on: &dyn Fn() -> bool) -> Result<(), DeviceError> {
         let Some(mirror) = &mut self.0 else { return Ok(()) };
         let clock = clock.register();

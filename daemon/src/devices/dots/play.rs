@@ -1,4 +1,4 @@
-//! A path played by the mirror while the camera takes its frames, and who puts what before the camera.
+//! Plays a path with the mirror while the camera takes its frames, and has the operator place subjects.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
@@ -15,7 +15,7 @@ use crate::run::board::StatusBoard;
 use crate::run::error::RunError;
 use crate::run::orders::{Order, Orders};
 
-/// The devices of a run, and who is told and tells.
+/// The devices of a run and its communication with the operator.
 pub struct Player<'a> {
     pub orders: &'a Orders,
     pub board: &'a StatusBoard,
@@ -28,7 +28,7 @@ pub struct Player<'a> {
 }
 
 impl Player<'_> {
-    /// Puts a subject before the camera, of so many planes; waits for the operator where that takes one.
+    /// Places a subject, one of `planes` planes or the scene, before the camera; waits for the operator if needed.
     ///
     /// # Errors
     /// For a plane that the rig does not have.
@@ -49,12 +49,12 @@ impl Player<'_> {
         Ok(())
     }
 
-    /// Plays a path `rounds` times while the camera takes its frames: until the path is over, or, without a mirror,
-    /// until `frames` have come; sooner if `enough` is set or the run is told to end. Returns what was
-    /// lost after the last frame.
+    /// Plays a path `rounds` times while the camera takes its frames. Ends with the path or, without a mirror, after
+    /// `frames` frames; earlier if `enough` is set or the run is told to end. Returns what was lost after the last
+    /// frame.
     ///
     /// # Errors
-    /// What mirror and camera said.
+    /// An error of the mirror or the camera.
     pub fn play(
         &mut self,
         path: &MirrorPath,
@@ -73,7 +73,7 @@ impl Player<'_> {
         let wanted = || {
             let is_over = match is_driven {
                 true => path_over.load(Ordering::Relaxed),
-                // The next frame of a recording is another pass'.
+                // The next frame of a recording belongs to another pass.
                 false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
             };
             match (orders.go_on(), is_over) {
@@ -91,14 +91,14 @@ impl Player<'_> {
             let camera = thread::Builder::new()
                 .name("camera".into())
                 .spawn_scoped(scope, || {
-                    // A simulated camera computes its frames here, which must give way to the workers.
+                    // A simulated camera computes its frames in this thread, which must yield to the workers.
                     if pace == Pace::Devices && !is_simulated {
                         priority::for_device("camera");
                     }
                     let over = SetOnDrop(&camera_over);
                     let taken = source.take(&wanted, &mut deliver);
                     drop(over);
-                    // A virtual clock stands still with a camera that nobody asks, and the mirror must come to rest.
+                    // A virtual clock stops if nobody reads the camera, but the mirror must come to rest.
                     source.idle(&|| path_over.load(Ordering::Relaxed));
                     taken
                 })
@@ -123,7 +123,7 @@ impl Player<'_> {
     }
 }
 
-/// Tells the other thread that this one is over, also where it panics.
+/// Tells the other thread that this one is over, even if it panics.
 struct SetOnDrop<'a>(&'a AtomicBool);
 
 impl Drop for SetOnDrop<'_> {

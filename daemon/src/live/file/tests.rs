@@ -97,7 +97,7 @@ fn a_living_daemons_file_and_what_is_no_live_file_are_left_alone() {
     show(&living, "a", &flat(1.0, 1, 1));
     assert!(matches!(LiveFile::create(&path), Err(LiveError::Taken(_))));
     assert!(LiveReader::open(&path).unwrap().newest("a").unwrap().is_some());
-    // A daemon that is killed removes nothing.
+    // A killed daemon removes nothing.
     let left = fs::read(&path).unwrap();
     drop(living);
     fs::write(&path, left).unwrap();
@@ -143,7 +143,7 @@ fn readers_that_race_the_writer_see_whole_images_only() {
         bytes
     };
     let images: Vec<_> = (0..10_u8).map(|value| bytes(value.into())).collect();
-    // Into one and the same slot, so that readers are often overtaken.
+    // All into the same slot, so that readers are often overtaken.
     let write = |sequence: u64| {
         let bytes = &images[sequence as usize % images.len()];
         let header = header("image", &SHAPE, 2 * sequence, sequence, 2, bytes, live.offset_of(0));

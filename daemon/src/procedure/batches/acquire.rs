@@ -24,22 +24,22 @@ use crate::run::error::RunError;
 use crate::run::life::Run;
 use crate::run::orders::Orders;
 
-/// What acquisition leaves behind.
+/// Result of acquisition.
 pub struct Acquired {
     /// The session.
     pub session: Session,
     /// Its ledger, still locked.
     pub ledger: Ledger,
-    /// What single dots and batches met.
+    /// Problems with single dots and batches.
     pub problems: Vec<String>,
-    /// Why acquisition ended early, if a fault ended it.
+    /// The fault that ended acquisition early, if any.
     pub fault: Option<RunError>,
 }
 
 /// Acquires all batches.
 ///
 /// # Errors
-/// When the run could not begin. A fault on the way is in [`Acquired::fault`]: what was acquired is kept.
+/// When the run could not begin. A later fault is in [`Acquired::fault`]: what was acquired is kept.
 pub fn acquire(
     rig: &DotRig,
     task: &Arc<DotTask>,
@@ -94,7 +94,7 @@ pub fn acquire(
     };
     let passed = passes.all();
     let _ = run.board.go(RunState::Draining);
-    // Light off before anything else ends.
+    // Turn the light off before anything else ends.
     drop(motion);
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
@@ -112,7 +112,7 @@ struct Passes<'a> {
     earlier: Option<FlatField>,
     orders: &'a Orders,
     storage: &'a BatchSink,
-    /// Frames that may wait for the workers.
+    /// Queue length for frames between the camera and the workers.
     waiting: usize,
     player: Player<'a>,
 }
@@ -146,7 +146,7 @@ impl Passes<'_> {
         }
     }
 
-    /// What is known of the sensor before the first dot; nothing if the run was told to end.
+    /// Calibrates the sensor before the first dot; `None` if the run was told to end.
     fn sensor(&mut self) -> Result<Option<Sensor>, RunError> {
         let (task, plan) = (self.task, &self.task.batches);
         let CorrectOptions { hot_sigmas, background_batches, .. } = task.correct;
@@ -173,7 +173,7 @@ impl Passes<'_> {
         Ok(Some(sensor))
     }
 
-    /// Takes frames while the mirror's light is off, until `push` wants no more; whether the run goes on.
+    /// Takes frames with the mirror's light off, until `push` needs no more; returns whether the run continues.
     fn without_light(
         &mut self,
         wanted: u32,
@@ -185,7 +185,7 @@ impl Passes<'_> {
         let has_enough = AtomicBool::new(false);
         let rounds = task.batches.dark_rounds(wanted);
         let lost = self.player.play(&path, rounds, wanted.into(), &has_enough, &mut |arrival| {
-            // Whoever waits for the camera's last frame sees some more.
+            // Some more frames arrive while waiting for the camera's last one.
             if !has_enough.load(Ordering::Relaxed) {
                 let unpacked = task.format.unpack_into(&arrival.frame.data, &mut counts);
                 let pushed = match unpacked {
@@ -204,7 +204,7 @@ impl Passes<'_> {
             Ok(())
         })?;
         frames += lost.iter().map(|loss| loss.frames).sum::<u64>();
-        // No batch waits for any of them.
+        // No batch needs these frames.
         self.storage.outside(Counts { expected: frames, settling: frames, ..Counts::default() });
         match failed {
             Some(failed) => Err(failed),

@@ -1,4 +1,4 @@
-//! What a plan of batches would do, before anything moves.
+//! Predicts a run of batches, before anything moves.
 
 use raysweep_config::{BatchesPlan, ConfigError};
 use raysweep_processing::batches::DotTask;
@@ -9,17 +9,17 @@ use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
 use crate::procedure::lab::{Lab, Room};
 use crate::rig::Pace;
 
-/// Bytes of a dot's column on the disk, beside its residual: measured on rendered scenes with dots of 32 pixels.
+/// Disk space of a dot's column in bytes, without its residual: measured on rendered scenes with dots of 32 pixels.
 const COLUMN_BYTES: u64 = 4600;
-/// Batches that the memory holds at once: two that wait for their indices, one under construction, some being written.
+/// Batches in memory at once: two that wait for their indices, one under construction, some being written.
 const BATCHES_IN_MEMORY: u64 = 8;
-/// Report, calibration and everything else.
+/// Disk space of report, calibration and everything else.
 const OTHER_BYTES: u64 = 20_000_000;
 
-/// Foresees batches.
+/// Predicts a run of batches.
 ///
 /// # Errors
-/// For what the camera, or a stage, cannot do, and a flat field that cannot be read.
+/// For what the camera or a stage cannot do, and a flat field that cannot be read.
 pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, ConfigError> {
     let plan = &task.batches;
     lab.camera_at(plan.camera_rate_hz())

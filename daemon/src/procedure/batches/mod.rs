@@ -20,14 +20,14 @@ use crate::rig::DotRig;
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
 
-/// Batches on a rig.
+/// A run of batches on a rig.
 struct BatchesRun {
     rig: Arc<DotRig>,
     task: Arc<DotTask>,
     registry: Arc<Registry>,
 }
 
-/// Foresees batches.
+/// Predicts a run of batches.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.

@@ -1,4 +1,4 @@
-//! From the pipeline to the disk: a batch's data first, then the ledger's line, then its picture.
+//! From the pipeline to the disk: a batch's data first, then the ledger entry, then its live image.
 
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -19,32 +19,32 @@ use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
 use crate::run::progress::ProgressMeter;
 
-/// Batches that may wait for the disk.
+/// Capacity of the queue of batches for the disk.
 const WAITING_BATCHES: usize = 4;
-/// A batch that lacks more than one in so many of its dots is not stored.
+/// A batch is not stored if more than one in this many of its dots is missing.
 const MOST_MISSING: usize = 10;
 
-/// What goes to the writer.
+/// An item for the writer.
 enum Item {
     /// A batch, its index in `dots.zarr`, and the plane that it shows.
     Batch(Box<Cut>, usize, Option<usize>),
-    /// Frames that belong to none.
+    /// Frames outside any batch.
     Outside(Counts),
 }
 
-/// The writer's thread as the run sees it.
+/// Handle of the writer's thread.
 pub struct BatchSink {
     items: SyncSender<Item>,
     thread: JoinHandle<Writer>,
 }
 
-/// What the writer leaves behind.
+/// Result of the writer.
 pub struct Stored {
     /// The ledger, still locked.
     pub ledger: Ledger,
-    /// What single dots met.
+    /// Problems with single dots.
     pub problems: Vec<String>,
-    /// The first failure to write, which ended the run.
+    /// The first write error, which ended the run.
     pub error: Option<raysweep_session::Error>,
 }
 
@@ -52,15 +52,15 @@ pub struct Stored {
 pub struct Writing {
     /// The plan on its rig.
     pub task: Arc<DotTask>,
-    /// Where batches go.
+    /// Where batches are stored.
     pub dots: Dots,
-    /// What knows of them.
+    /// The ledger that records them.
     pub ledger: Ledger,
-    /// Told of each.
+    /// Notified of each batch.
     pub board: Arc<StatusBoard>,
-    /// Ended when the disk refuses.
+    /// Told to end the run when a write fails.
     pub orders: Arc<Orders>,
-    /// Where floodlit images are shown, if anywhere.
+    /// Where floodlit images are published, if anywhere.
     pub live: Option<Outlet>,
 }
 
@@ -76,7 +76,7 @@ impl BatchSink {
     /// Starts the writer.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the thread cannot be started.
     pub fn start(writing: Writing) -> Result<Self, PipelineError> {
         let (items, inbox) = sync_channel(WAITING_BATCHES);
         let planned = writing.task.batches.total();
@@ -89,12 +89,12 @@ impl BatchSink {
         Ok(Self { items, thread })
     }
 
-    /// The sink of a pass whose first batch has this index; raw frames go to `raw`, if anywhere.
+    /// The sink of a pass whose first batch has this index; raw frames go to `raw`, if given.
     pub fn sink(&self, first_batch: usize, plane: Option<usize>, raw: Option<RawSink>) -> PassSink {
         PassSink { items: self.items.clone(), first_batch, plane, raw }
     }
 
-    /// Takes note of frames that belong to no batch.
+    /// Records frames that belong to no batch.
     pub fn outside(&self, counts: Counts) {
         let _ = self.items.send(Item::Outside(counts));
     }
@@ -111,7 +111,7 @@ impl BatchSink {
     }
 }
 
-/// What takes a pass' batches off the pipeline.
+/// Receives a pass' batches from the pipeline.
 pub struct PassSink {
     items: SyncSender<Item>,
     first_batch: usize,
@@ -119,26 +119,26 @@ pub struct PassSink {
     raw: Option<RawSink>,
 }
 
-/// Where raw frames go.
+/// Stores raw frames.
 pub struct RawSink {
     frames: RawFrames,
     format: PixelFormat,
     counts: Vec<u16>,
-    /// Frames of the passes before.
+    /// Number of frames in earlier passes.
     before: u64,
     error: Option<raysweep_session::Error>,
 }
 
 impl RawSink {
-    /// Keeps frames of this format and so many pixels.
+    /// Stores frames of this format and number of pixels.
     pub fn new(frames: RawFrames, format: PixelFormat, pixels: usize) -> Self {
         Self { frames, format, counts: vec![0; pixels], before: 0, error: None }
     }
 
-    /// Ends the file.
+    /// Completes the file.
     ///
     /// # Errors
-    /// When the disk has refused, now or before.
+    /// When a write fails, now or earlier.
     pub fn finish(self) -> raysweep_session::Result<()> {
         match self.error {
             Some(error) => Err(error),
@@ -147,7 +147,7 @@ impl RawSink {
     }
 
     fn keep(&mut self, frame: &Frame) {
-        // A frame that cannot be unpacked has no counts to keep; its place is kept.
+        // A frame that cannot be unpacked has no counts to store, but keeps its place.
         if self.format.unpack_into(&frame.data, &mut self.counts).is_err() {
             self.counts.fill(0);
         }
@@ -164,7 +164,7 @@ impl RawSink {
 }
 
 impl PassSink {
-    /// Gives back where raw frames go.
+    /// Returns the raw sink.
     pub fn into_raw(self) -> Option<RawSink> {
         self.raw.map(|mut raw| {
             raw.before = raw.frames.len();
@@ -176,7 +176,7 @@ impl PassSink {
 impl CutSink for PassSink {
     fn take(&mut self, cut: Cut) {
         let batch = self.first_batch + cut.batch as usize;
-        // The writer outlives the pass, or has panicked, which its join tells.
+        // The writer outlives the pass, or has panicked, which its join reports.
         let _ = self.items.send(Item::Batch(Box::new(cut), batch, self.plane));
     }
 
@@ -267,7 +267,7 @@ impl Writer {
         }
     }
 
-    /// Tells of a batch, with its floodlit image in the live file.
+    /// Announces a batch and publishes its floodlit image in the live file.
     fn show(&self, entry: &BatchEntry, floodlit: &ndarray::Array3<f32>) {
         let image = floodlit.index_axis(ndarray::Axis(2), 0);
         let sequence = self.writing.live.as_ref().and_then(|Outlet { file, session, .. }| {

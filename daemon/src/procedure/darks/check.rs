@@ -1,4 +1,4 @@
-//! What dark images would take, before anything moves.
+//! Predicts a run of dark images, before anything moves.
 
 use raysweep_config::ConfigError;
 use raysweep_processing::darks::DarksTask;
@@ -7,15 +7,15 @@ use raysweep_proto::CheckReport;
 use crate::plane::foresight::periods;
 use crate::procedure::lab::{Lab, Room};
 
-/// Images in the memory at once, with those of an exposure and the report's, in bytes a pixel.
+/// Images in memory at once, including those of an exposure and the report's, in bytes per pixel.
 const BYTES_PER_PX: u64 = 64;
-/// Report and everything else that is small.
+/// Disk space of the report and other small files.
 const OTHER_BYTES: u64 = 5_000_000;
 
-/// Foresees dark images.
+/// Predicts a run of dark images.
 ///
 /// # Errors
-/// For an exposure that the camera cannot have.
+/// For an exposure that the camera does not support.
 pub fn check(darks: &DarksTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError> {
     let task = &*darks.task;
     let (mut frames, mut light_periods) = (0, 0);

@@ -20,7 +20,7 @@ use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
 use crate::run::progress::ProgressMeter;
 
-/// Images between the assembler and the disk.
+/// Capacity of the queue of images between the assembler and the disk.
 const UNITS_UNDER_WAY: usize = 8;
 
 /// Dark images on a rig.
@@ -29,8 +29,8 @@ struct DarksRun {
     darks: DarksTask,
 }
 
-/// Foresees dark images on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its
-/// row 0.
+/// Predicts a run of dark images on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
+/// `first_row`.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.

@@ -1,4 +1,4 @@
-//! What a film would do, before anything moves.
+//! Predicts a film, before anything moves.
 
 use raysweep_config::ConfigError;
 use raysweep_core::{CameraCapabilities, Readout};
@@ -11,13 +11,13 @@ use super::cycle::CyclePlan;
 use crate::plane::foresight::Model;
 use crate::procedure::lab::{Lab, Room};
 
-/// Bytes of the report and everything else that is small.
+/// Disk space of the report and other small files, in bytes.
 const OTHER_BYTES: u64 = 10_000_000;
 
-/// Foresees a film.
+/// Predicts a film.
 ///
 /// # Errors
-/// When the plan makes no model on this rig.
+/// When the plan gives no model on this rig.
 pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError> {
     let task = &*film.task;
     let model = Model::of(task, lab.camera, "film")?;
@@ -55,7 +55,7 @@ pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError>
     })
 }
 
-/// What its cycles would do on this camera; `reach_rows` is how many rows its transports have.
+/// Predicts the cycles on this camera; `reach_rows` is the number of rows of the transports.
 fn of_cycles(film: &FilmTask, camera: &CameraCapabilities, reach_rows: u64) -> FilmCheck {
     let geometry = &film.task.geometry;
     let CyclePlan { shots, order } = CyclePlan::new(&film.task, camera);

@@ -1,4 +1,4 @@
-//! How the settings of a film's cycle are taken on a camera.
+//! How a camera takes the settings of a film's cycle.
 
 use raysweep_core::{CameraCapabilities, CameraSettings};
 use raysweep_pipeline::{CycleOrder, Shot};
@@ -8,12 +8,12 @@ use raysweep_processing::plane::PlaneTask;
 pub struct CyclePlan {
     /// The camera's settings, in the plan's order of the delays.
     pub shots: Vec<Shot>,
-    /// In which order they are taken.
+    /// The order in which they are taken.
     pub order: CycleOrder,
 }
 
 impl CyclePlan {
-    /// The fastest way to take the cycles of `task` on this camera.
+    /// The fastest way to take the cycles of `task` with this camera.
     pub fn new(task: &PlaneTask, camera: &CameraCapabilities) -> Self {
         let shots: Vec<Shot> =
             task.settings().map(|(_, point)| task.geometry.shot(point, camera.trigger_latency_us)).collect();

@@ -1,4 +1,4 @@
-//! Films: the settings of a cycle again and again, a transport of each cycle.
+//! Films: the settings of a cycle are repeated, and each cycle gives a transport.
 
 mod check;
 mod cycle;
@@ -29,7 +29,7 @@ use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
-/// Cycles between the assembler and the disk: while one is stored, frames of the next ones come.
+/// Cycles between the assembler and the disk: while one is stored, frames of the next ones arrive.
 const CYCLES_UNDER_WAY: usize = 4;
 
 /// A film on a rig.
@@ -39,7 +39,7 @@ struct FilmRun {
     stages: Arc<[Box<dyn Stage>]>,
 }
 
-/// Foresees a film.
+/// Predicts a film.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
@@ -79,17 +79,17 @@ impl Procedure for FilmRun {
     }
 }
 
-/// What acquisition leaves behind.
+/// Result of acquisition.
 struct Acquired {
     session: Session,
     /// Still locked.
     ledger: Ledger,
-    /// What could not be done, and why.
+    /// What has failed, and why.
     problems: Vec<String>,
     vsync: Option<VsyncStats>,
     exposures: Exposures,
     latency: Option<SettingsLatency>,
-    /// Why acquisition ended early, if a fault ended it.
+    /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
 }
 
@@ -102,7 +102,7 @@ impl FilmRun {
         let stack = run.session.stack()?;
         let is_setting =
             |id: &SettingsId| matches!(task.schedule.points[id.point as usize].role, Role::Sweep(_));
-        // A film is never resumed: none of its cycles is there yet.
+        // A film is never resumed, so no cycle has been stored yet.
         let mut missing = missing(task, run.ledger.state());
         missing.retain(|id| !is_setting(id));
         let cycles = CyclePlan::new(task, opened.camera());
@@ -120,7 +120,7 @@ impl FilmRun {
             board: run.board.clone(),
             progress: ProgressMeter::new(0, planned),
             vsync: None,
-            // A film is its own running estimate.
+            // A film's own transports serve as its live estimate.
             live: None,
             write_error: None,
         };
@@ -199,7 +199,7 @@ impl FilmRun {
     }
 }
 
-/// Writes a film's report: its transports are there already, so one that was ended early is as good as a short one.
+/// Writes a film's report. Its transports exist already, so a film that was ended early is like a short one.
 fn conclude(acquired: Acquired, film: &FilmTask, rig: &Rig, orders: &Orders) -> Result<Ended, RunError> {
     let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
     let state = end_state(fault.as_ref(), orders);

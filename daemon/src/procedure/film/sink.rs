@@ -1,4 +1,4 @@
-//! The sink's part in a film: frames into cycles, cycles to the disk and to the solver.
+//! The sink of a film: assembles frames into cycles and passes these to the disk and the solver.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -18,13 +18,13 @@ use crate::rig::Pace;
 
 /// The pipeline's sink of a film.
 pub struct FilmSink {
-    /// Takes what is not of the film: the dark image.
+    /// Receives what does not belong to the film: the dark image.
     pub points: PointSink,
-    /// Takes the film.
+    /// Receives the film.
     pub film: Cycles,
 }
 
-/// A film as its sink keeps it.
+/// The sink's state of a film.
 pub struct Cycles {
     film: Film,
     worker: Worker,
@@ -35,7 +35,7 @@ pub struct Cycles {
     first_ordinal: u32,
     settings: usize,
     dark: Option<Arc<Array2<f32>>>,
-    /// The cycle under way.
+    /// The cycle in progress.
     cycle: Option<Cycle>,
     /// The newest frame of each setting that has an image.
     newest: Vec<Option<FilmFrame>>,
@@ -44,7 +44,7 @@ pub struct Cycles {
     stored_span_ns: Option<(i64, i64)>,
 }
 
-/// What the times of a cycle follow from.
+/// The figures that a cycle's times are computed from.
 #[derive(Debug, Clone, Copy)]
 pub struct CycleTiming {
     /// VSYNC periods of a cycle, in nanoseconds.
@@ -54,7 +54,7 @@ pub struct CycleTiming {
 }
 
 impl Cycles {
-    /// The sink of a film of which nothing is there yet.
+    /// The sink of a film without any frames yet.
     pub fn new(
         task: &PlaneTask,
         film: Film,
@@ -80,18 +80,18 @@ impl Cycles {
         }
     }
 
-    /// Keeps the image without light, which every transport needs.
+    /// Stores the dark image, which every transport needs.
     pub fn note_dark(&mut self, image: &Array2<f32>) {
         self.dark = Some(Arc::new(image.clone()));
     }
 
-    /// Which setting of the cycle a point is, if it is one.
+    /// Index of a point among the cycle's settings, if it is one.
     pub fn setting_of(&self, id: SettingsId) -> Option<usize> {
         let setting = id.point.checked_sub(self.first_ordinal)? as usize;
         (setting < self.settings).then_some(setting)
     }
 
-    /// The cycle that `number` is; the one before it, if there is one, is over.
+    /// The cycle with this number; also returns the previous one, if any, which is over.
     fn cycle(&mut self, number: u32) -> (&mut Cycle, Option<Cycle>) {
         let over = self.cycle.take_if(|cycle| cycle.number != number);
         (self.cycle.get_or_insert_with(|| Cycle::new(number, self.settings)), over)
@@ -117,9 +117,9 @@ impl Cycles {
         })
     }
 
-    /// Offers the newest frame of every setting, once there is one of each.
+    /// Offers the newest frame of each setting to the solver, once all settings have one.
     fn offer_sliding(&self, number: u32, decided: usize) {
-        // On a virtual clock the machine is never the slower one, so nothing would say how often is often enough.
+        // On a virtual clock the machine is never too slow, so nothing would limit the rate.
         if self.pace == Pace::Pipeline {
             return;
         }
@@ -147,10 +147,10 @@ impl Cycles {
         });
     }
 
-    /// Waits for the transports of everything stored.
+    /// Waits for the transports of all stored cycles.
     ///
     /// # Errors
-    /// When the disk refused, or the solver's thread panicked.
+    /// When a write failed, or the solver's thread panicked.
     pub fn finish(self) -> raysweep_session::Result<Result<(), PipelineError>> {
         self.worker.finish()
     }
@@ -185,7 +185,7 @@ impl Sink for FilmSink {
 }
 
 impl FilmSink {
-    /// Takes a frame of the film, of this setting.
+    /// Receives a frame of the film with this setting.
     fn frame(&mut self, setting: usize, unit: &Unit, image: &Result<Array2<f32>, StageError>) {
         if let Err(error) = image {
             self.note_stage_error(unit, setting, error);
@@ -205,7 +205,7 @@ impl FilmSink {
         });
     }
 
-    /// Takes note of a frame of the film that is lost.
+    /// Records a lost frame of the film.
     fn frame_lost(&mut self, id: SettingsId, counts: &Counts) {
         if counts.lost_total() > 0 {
             let lost = Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() };
@@ -214,7 +214,7 @@ impl FilmSink {
         self.decided(id.attempt, |cycle| cycle.counts.add(counts));
     }
 
-    /// The fate of one more frame of a cycle is decided.
+    /// Records that the fate of another frame of a cycle is decided.
     fn decided(&mut self, number: u32, decide: impl FnOnce(&mut Cycle)) {
         let (cycle, over) = self.film.cycle(number);
         decide(cycle);
@@ -264,7 +264,7 @@ impl FilmSink {
         let (rows, columns) = frames[0].raw.dim();
         let mut raw = Array3::<u16>::zeros((frames.len(), rows, columns));
         for (frame, mut place) in frames.iter().zip(raw.axis_iter_mut(Axis(0))) {
-            // One frame of at most 16 bits a pixel.
+            // A single frame with at most 16 bits per pixel.
             place.zip_mut_with(&frame.raw, |place, &counts| *place = counts.min(u32::from(u16::MAX)) as u16);
         }
         film.film.write(cycle.number as usize, raw.view())?;
@@ -284,7 +284,7 @@ impl FilmSink {
         Ok(())
     }
 
-    /// The film has no further frames; a cycle that is not whole was cut short by a cancel or a fault.
+    /// The film has no further frames; an incomplete cycle was cut short by a cancel or a fault.
     fn film_over(&mut self) {
         let Some(mut cycle) = self.film.cycle.take() else { return };
         give_up(&mut cycle.counts, None);
@@ -304,7 +304,7 @@ fn images_of(frames: &[&FilmFrame]) -> Option<Vec<(Setting, Arc<Array2<f32>>)>> 
     frames.iter().map(|frame| Some((frame.setting.clone(), frame.image.clone()?))).collect()
 }
 
-/// The sound frames of a cycle that is not stored end in another column than those that are.
+/// Valid frames of a cycle that is not stored are counted separately from stored ones.
 fn give_up(counts: &mut Counts, cause: Option<LossCause>) {
     match cause {
         Some(cause) => counts.forfeit(cause),

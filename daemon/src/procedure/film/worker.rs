@@ -1,4 +1,4 @@
-//! The thread that makes light transports of a film's frames while the next ones arrive.
+//! The thread that computes light transports from a film's frames while the next ones arrive.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -19,10 +19,10 @@ use crate::rig::Pace;
 use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
 
-/// Cycles that may wait for the solver.
+/// Capacity of the solver's queue of cycles.
 const WAITING_CYCLES: usize = 4;
 
-/// One frame of each setting, to be made into a transport.
+/// One frame of each setting, from which a transport is computed.
 pub struct Exposed {
     /// The cycle of the newest frame.
     pub cycle: u32,
@@ -30,25 +30,25 @@ pub struct Exposed {
     pub frames: Vec<(Setting, Arc<Array2<f32>>)>,
     /// The image without light.
     pub dark: Arc<Array2<f32>>,
-    /// Start of the oldest exposure, after the film's first.
+    /// Start of the oldest exposure, in seconds after the film's first.
     pub start_s: f64,
     /// End of the newest exposure's last row, on the host's clock.
     pub end_ns: i64,
 }
 
-/// What the sink and the solver both know of the film.
+/// The film's statistics, shared by the sink and the solver.
 #[derive(Default)]
 pub struct Account(Mutex<Counted>);
 
 #[derive(Default)]
 struct Counted {
     summary: FilmSummary,
-    /// Of stored cycles, ascending.
+    /// Latencies of stored cycles, ascending.
     latencies_ms: Vec<f64>,
 }
 
 impl Account {
-    /// The account of a film of so many cycles.
+    /// Statistics of a film with this many cycles planned.
     pub fn new(cycles_planned: usize) -> Self {
         let summary = FilmSummary { cycles_planned, ..FilmSummary::default() };
         Self(Mutex::new(Counted { summary, latencies_ms: Vec::new() }))
@@ -58,7 +58,7 @@ impl Account {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes it.
+    /// Updates the statistics.
     pub fn note(&self, change: impl FnOnce(&mut FilmSummary)) {
         change(&mut self.lock().summary);
     }
@@ -70,17 +70,17 @@ impl Account {
         counted.summary.latency_ms = Percentiles::of_sorted(&counted.latencies_ms);
     }
 
-    /// The film so far.
+    /// Summary of the film so far.
     pub fn summary(&self) -> FilmSummary {
         self.lock().summary.clone()
     }
 }
 
-/// What waits for the solver.
+/// Work that waits for the solver.
 #[derive(Default)]
 struct Waiting {
     cycles: VecDeque<Exposed>,
-    /// The newest frames, and when the cycle under way will be complete.
+    /// The newest frames, and when the cycle in progress will be complete.
     sliding: Option<(Exposed, Instant)>,
     closed: bool,
 }
@@ -96,13 +96,13 @@ impl Inbox {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether a whole cycle waits.
+    /// Whether a complete cycle waits.
     fn has_cycle(&self) -> bool {
         !self.lock().cycles.is_empty()
     }
 
-    /// The next job, and whether it is a sliding one. Those are begun only where they should have ended before the next
-    /// cycle comes, at `solve_time` each; that they do not delay it where they have not is the solver's affair.
+    /// The next job, and whether it is a sliding one. A sliding job starts only if it should end, after `solve_time`,
+    /// before the next cycle arrives; otherwise the solver aborts it in favour of the cycle.
     fn next(&self, solve_time: Duration) -> Option<(Exposed, bool)> {
         let mut waiting = self.lock();
         loop {
@@ -126,23 +126,23 @@ impl Inbox {
 
 /// Everything that the solver's thread needs.
 pub struct Solving {
-    /// Makes the transports.
+    /// Computes the transports.
     pub solver: FilmSolver,
-    /// Where those of whole cycles are stored.
+    /// Where the transports of complete cycles are stored.
     pub transports: TransportFilm,
-    /// Where their views are shown, if anywhere.
+    /// Where images of them are published, if anywhere.
     pub live: Option<Outlet>,
-    /// Told of each.
+    /// Notified of each transport.
     pub board: Arc<StatusBoard>,
-    /// Counts them.
+    /// Counts the transports.
     pub account: Arc<Account>,
-    /// Ended when the disk refuses.
+    /// Told to end the run when a write fails.
     pub orders: Arc<Orders>,
-    /// Whether frames come in real time.
+    /// Whether frames arrive in real time.
     pub pace: Pace,
 }
 
-/// The solver's thread as the sink sees it. Dropping it ends the thread when its work is done.
+/// Handle of the solver's thread. Dropping it ends the thread when its work is done.
 pub struct Worker {
     inbox: Arc<Inbox>,
     pace: Pace,
@@ -151,10 +151,10 @@ pub struct Worker {
 }
 
 impl Worker {
-    /// Starts the thread, with workers of its own: those that frames pass must never wait for it.
+    /// Starts the thread, with its own workers: the workers that process frames must never wait for it.
     ///
     /// # Errors
-    /// When the system gives no thread.
+    /// When the thread cannot be started.
     pub fn start(solving: Solving) -> Result<Self, PipelineError> {
         let workers = rayon::ThreadPoolBuilder::new()
             .thread_name(|index| format!("film-{index}"))
@@ -173,7 +173,7 @@ impl Worker {
         Ok(Self { inbox, pace, account, thread: Some(thread) })
     }
 
-    /// Hands a whole cycle over. In real time one that finds the queue full has no transport for now.
+    /// Hands over a complete cycle. In real time, a cycle that finds the queue full gets no transport for now.
     pub fn cycle(&self, exposed: Exposed) {
         let mut waiting = self.inbox.lock();
         while waiting.cycles.len() >= WAITING_CYCLES && self.is_alive() {
@@ -187,7 +187,8 @@ impl Worker {
         self.inbox.changed.notify_all();
     }
 
-    /// Offers the newest frames, if there is time for them before `cycle_end`, when the cycle under way is complete.
+    /// Offers the newest frames, to be solved if there is time before `cycle_end`, when the cycle in progress is
+    /// complete.
     pub fn sliding(&self, exposed: Exposed, cycle_end: Instant) {
         self.inbox.lock().sliding = Some((exposed, cycle_end));
         self.inbox.changed.notify_all();
@@ -197,10 +198,10 @@ impl Worker {
         self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
     }
 
-    /// Waits until everything is made and stored.
+    /// Waits until all transports are computed and stored.
     ///
     /// # Errors
-    /// When the disk refused, or the thread panicked.
+    /// When a write failed, or the thread panicked.
     pub fn finish(mut self) -> raysweep_session::Result<Result<(), PipelineError>> {
         self.close();
         match self.thread.take().map(JoinHandle::join) {
@@ -220,7 +221,7 @@ impl Drop for Worker {
     fn drop(&mut self) {
         self.close();
         if let Some(thread) = self.thread.take() {
-            // Whoever wants to know how it ended has called `finish`.
+            // The result is only needed by callers of `finish`.
             let _ = thread.join();
         }
     }
@@ -235,7 +236,7 @@ impl Solving {
             let go_on = || !is_sliding || !inbox.has_cycle();
             let solved = workers.install(|| self.solver.solve(frames, dark, &go_on));
             if is_sliding && solved.is_err() && !go_on() {
-                // It has given way. That it was slower than those before is worth knowing.
+                // Aborted in favour of a cycle. Remember if it took longer than those before.
                 solve_time = solve_time.max(began.elapsed());
                 continue;
             }

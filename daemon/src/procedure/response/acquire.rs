@@ -1,4 +1,4 @@
-//! A run that finds out how a mirror answers: dark frames, then a chirp of each axis, on a plane.
+//! A run that identifies a mirror's response: dark frames, then a chirp of each axis, on a plane.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,25 +20,25 @@ use crate::run::error::RunError;
 use crate::run::life::Run;
 use crate::run::progress::ProgressMeter;
 
-/// Standard deviations beyond the others' from which on a pixel is hot.
+/// Pixels this many standard deviations beyond the others are hot.
 const HOT_SIGMAS: f64 = 8.0;
-/// Batches of dark frames that their mean is worth.
+/// Number of batches of dark frames that the background averages over.
 const BACKGROUND_BATCHES: u32 = 64;
 
-/// What acquisition leaves behind.
+/// Result of acquisition.
 pub struct Recorded {
     /// The session.
     pub session: Session,
     /// Its ledger, still locked.
     pub ledger: Ledger,
-    /// Why acquisition ended early, if a fault ended it.
+    /// The fault that ended acquisition early, if any.
     pub fault: Option<RunError>,
 }
 
 /// Records both axes.
 ///
 /// # Errors
-/// When the run could not begin. A fault on the way is in [`Recorded::fault`]: what was recorded is kept.
+/// When the run could not begin. A later fault is in [`Recorded::fault`]: what was recorded is kept.
 pub fn acquire(rig: &DotRig, task: &Arc<ResponseTask>, mut run: Run) -> Result<Recorded, RunError> {
     run.note_beginning()?;
     let rate_hz = task.response.camera_rate_hz;
@@ -67,7 +67,7 @@ pub fn acquire(rig: &DotRig, task: &Arc<ResponseTask>, mut run: Run) -> Result<R
     let mut recorder = Recorder { task: task.clone(), run };
     let passed = recorder.passes(&mut player);
     let _ = board.go(RunState::Draining);
-    // Light off before anything else ends.
+    // Turn the light off before anything else ends.
     drop(motion);
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
@@ -76,7 +76,7 @@ pub fn acquire(rig: &DotRig, task: &Arc<ResponseTask>, mut run: Run) -> Result<R
     Ok(Recorded { session, ledger, fault: passed.err() })
 }
 
-/// Takes the records, and stores them.
+/// Makes and stores the records.
 struct Recorder {
     task: Arc<ResponseTask>,
     run: Run,
@@ -102,7 +102,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// What is known of the sensor in the dark; nothing if the run was told to end.
+    /// Calibrates the sensor in the dark; `None` if the run was told to end.
     fn sensor(
         &mut self,
         player: &mut Player<'_>,
@@ -124,7 +124,7 @@ impl Recorder {
             })
         })?;
         let counts = arrivals.account(&after, 0)?;
-        // No record waits for any of them.
+        // No record needs these frames.
         let settling = Counts { settling: counts.cancelled, cancelled: 0, ..counts };
         self.append(&Entry::Outside { counts: settling.clone() }, settling, progress)?;
         match orders.go_on() {
@@ -161,7 +161,7 @@ impl Recorder {
         })?;
         let counts = arrivals.account(&after, shown)?;
         if !self.run.orders.go_on() {
-            // A record that was cut short is none.
+            // A record that was cut short does not count.
             let counts = Counts { cancelled: counts.cancelled + counts.averaged, averaged: 0, ..counts };
             return self.append(&Entry::Outside { counts: counts.clone() }, counts, progress);
         }
@@ -185,7 +185,7 @@ impl Recorder {
     }
 }
 
-/// The frames of a path by their ids, unpacked into one buffer, and where its triggers went.
+/// The frames of a path by their ids, unpacked into one buffer, and the account of its triggers.
 struct Arrivals<'a> {
     task: &'a ResponseTask,
     pixels: Vec<u16>,
@@ -201,7 +201,7 @@ impl<'a> Arrivals<'a> {
         Self { task, pixels, ids: None, counts: Counts::default(), failed: None }
     }
 
-    /// Unpacks a frame that is new and hands it on with its number, counted from the first that came.
+    /// Unpacks a frame, if it is new, and hands it on with its number, counted from the first that arrived.
     fn take(
         &mut self,
         arrival: &Arrival,
@@ -233,7 +233,7 @@ impl<'a> Arrivals<'a> {
         }
     }
 
-    /// Where the triggers went: `used` of the frames into a record, the others nowhere.
+    /// Accounts for the triggers: `used` of the frames went into a record, the others were not used.
     fn account(mut self, after: &[Loss], used: u64) -> Result<Counts, RunError> {
         self.lose(after);
         let Self { mut counts, failed, .. } = self;

@@ -1,4 +1,4 @@
-//! What a plan of chirps would do, before anything moves.
+//! Predicts a plan of chirps, before anything moves.
 
 use raysweep_config::ConfigError;
 use raysweep_processing::response::{AXES, ResponseTask};
@@ -7,14 +7,14 @@ use raysweep_proto::{CheckReport, ResponseCheck};
 use crate::devices::dots::FRAMES_AT_WORK;
 use crate::procedure::lab::{Lab, Room};
 
-/// Bytes of a frame's line in the records: three numbers, as text and as floats.
+/// Disk space of a frame's line in the records: three numbers, as text and as floats.
 const LINE_BYTES: u64 = 96;
-/// Report, spectra and everything else.
+/// Disk space of report, spectra and everything else, in bytes.
 const OTHER_BYTES: u64 = 2_000_000;
-/// Images without light that are summed at once, in bytes a pixel.
+/// Memory for the summation of dark images, in bytes per pixel.
 const DARK_BYTES: u64 = 64;
 
-/// Foresees the chirps.
+/// Predicts the run of the chirps.
 ///
 /// # Errors
 /// For what the camera cannot do.

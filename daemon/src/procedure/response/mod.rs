@@ -22,7 +22,7 @@ struct ResponseRun {
     task: Arc<ResponseTask>,
 }
 
-/// Foresees the chirps of a mirror.
+/// Predicts the run of a mirror's chirps.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
@@ -55,7 +55,7 @@ impl Procedure for ResponseRun {
         let findings = is_whole.then(|| Findings::of(&session, ledger.state(), &task)).transpose()?;
         if let Some(findings) = &findings {
             fault = findings.refusal().cloned().map(RunError::from);
-            // Before the ledger says that the run is complete.
+            // Must come before the ledger records the run as complete.
             findings.keep(&session, ledger.state(), Some(&data))?;
         }
         let state = match (&fault, is_whole) {

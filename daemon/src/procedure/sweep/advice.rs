@@ -1,4 +1,4 @@
-//! What errors a sweep must expect on this rig, and which sweep of the same length to take instead.
+//! Predicts the errors of a sweep on this rig, and searches for a better sweep of the same length.
 
 use raysweep_config::rig::plane::NoiseSource as KnownFrom;
 use raysweep_config::{Axis, RigFile, SweepPlan};
@@ -12,7 +12,7 @@ use raysweep_transport::plane::{PlaneError, RowTiming, Setting};
 
 use crate::plane::foresight::periods;
 
-/// Why nothing can be advised.
+/// Why no advice is possible.
 #[derive(Debug, thiserror::Error)]
 pub enum NoAdvice {
     /// Nothing is left to demultiplex.
@@ -20,17 +20,17 @@ pub enum NoAdvice {
         "no error can be foreseen: every point of the sweep saturates a white pixel, or begins or ends while a flying spot draws the direct row; lower camera.white_dn (gain, aperture) or move the delays by a row"
     )]
     NothingUsable,
-    /// It would take too long.
+    /// The prediction would take too long.
     #[error(
         "no error is foreseen and no other sweep looked for: {points} points over {rows} relative rows would take too long"
     )]
     TooLarge {
-        /// Of the sweep.
+        /// Points of the sweep.
         points: usize,
-        /// That it reaches.
+        /// Relative rows that it reaches.
         rows: usize,
     },
-    /// The plan makes no model.
+    /// The plan gives no model.
     #[error("no error can be foreseen: {0}")]
     NoModel(String),
 }
@@ -41,13 +41,14 @@ impl From<PlaneError> for NoAdvice {
     }
 }
 
-/// Multiplications, (points + rows) rows^2, of one foreseen error up to which two dozen of them take about a second.
+/// Limit of the work per predicted error in multiplications, (points + rows) rows^2; two dozen of them take about a
+/// second.
 const MAX_WORK: f64 = 1e9;
 
-/// Foresees a sweep, and looks for a better one that takes no more frames and no more time.
+/// Predicts a sweep's errors, and searches for a better one that takes no more frames and no more time.
 ///
 /// # Errors
-/// Where no error can be foreseen.
+/// If no error can be predicted.
 pub fn advise(
     sweep: &SweepTask,
     rig: &RigFile,
@@ -68,7 +69,7 @@ pub fn advise(
     let known = rig.noise();
     let white_dn = task.geometry.white_dn;
     let gain = 1.0 / (white_dn * known.electrons_per_dn);
-    // Rounding to counts errs by their twelfth, squared.
+    // Rounding to counts adds a variance of 1/12 count^2.
     let read = (known.read_noise_e * gain).hypot(12_f64.sqrt().recip() / white_dn);
     let dark = task.schedule.points.iter().find(|point| matches!(point.role, Role::Dark(_)));
     let dark_frames = dark.map(|point| point.frames);
@@ -106,18 +107,18 @@ pub fn advise(
     })
 }
 
-/// What another sweep must keep to.
+/// Limits that another sweep must observe.
 struct Limits<'a> {
     sweep: &'a SweepTask,
     camera: &'a CameraCapabilities,
     timing: &'a RowTiming,
-    /// Light from which on a pixel saturates, in white units.
+    /// Light at which a pixel saturates, in white units.
     ceiling: f64,
     /// Points of the plan's sweep that saturate a white pixel.
     saturated: usize,
     /// Frames of the whole plan.
     frames: u64,
-    /// VSYNC periods that they take.
+    /// VSYNC periods of these frames.
     periods: u64,
 }
 
@@ -142,8 +143,8 @@ impl<'a> Limits<'a> {
         }
     }
 
-    /// The settings of a grid whose images will serve; none where it cannot be taken, or not in the plan's time, or
-    /// saturates more than the plan.
+    /// The settings of a grid whose images are usable; `None` if the camera cannot take the grid, or if it needs more
+    /// frames or time than the plan or saturates more points.
     fn usable(&self, grid: &SweepGrid) -> Option<Vec<Setting>> {
         let other = self.with_grid(grid)?;
         let geometry = &other.task.geometry;
@@ -171,7 +172,7 @@ impl<'a> Limits<'a> {
         Some(settings)
     }
 
-    /// The task with another sweep, where that can be planned.
+    /// The task with another sweep, if that can be planned.
     fn with_grid(&self, grid: &SweepGrid) -> Option<SweepTask> {
         let axis = |values: &[f64]| Axis::List(values.to_vec());
         self.sweep.with_sweep(SweepPlan {
@@ -216,7 +217,7 @@ fn written(sweep: &SweepPlan) -> String {
     )
 }
 
-/// An axis as short as it goes.
+/// An axis in its shortest form.
 fn axis(values: &[f64]) -> String {
     if let [start, _, .., stop] = *values {
         let count = values.len();
@@ -265,7 +266,7 @@ mod tests {
         advise(&task(&rig, plan), &rig, camera)
     }
 
-    /// The plan with the sweep that is proposed in the place of its own, which stands last.
+    /// The plan with its sweep, which is its last table, replaced by the proposed one.
     fn proposed(advice: &SweepAdvice, plan: &str) -> String {
         let rest = plan.split("[sweep]").next().unwrap();
         format!("{rest}{}", advice.better.as_ref().unwrap().sweep)
@@ -295,13 +296,13 @@ mod tests {
         assert!(better.expected.profile < 0.9 * advice.expected.profile);
         assert!((advice.noise.dark - read).abs() < 1e-12);
 
-        // Who takes the advice hears nothing more.
+        // Following the advice gives no further advice.
         assert_eq!(advise(&other, &rig, &camera()).unwrap().better.map(|better| better.sweep), None);
     }
 
     #[test]
     fn a_flying_spot_costs_the_settings_on_the_direct_row() {
-        // With exposures of 600 us the delays of 300 us begin or end on the row.
+        // With exposures of 600 us, the delays of 300 us begin or end on the pixel's own row.
         let plan = "kind = \"sweep\"\n[sweep]\nexposure_us = [600]\ndelay_us = [-500, -300, 0, 300, 500]\n";
         let without = plan.replace("-300, ", "").replace("300, ", "");
         let flying = RIG.replace("[projector]\n", "[projector]\nspot = \"flying\"\n");
@@ -320,13 +321,14 @@ mod tests {
 
     #[test]
     fn no_more_points_saturate_than_in_the_plan() {
-        // 54 rows in 1200 us bring 0.16 beside the direct light, 27 rows in 600 us half as much.
+        // 54 rows in 1200 us add 0.16 to the direct light, 27 rows in 600 us half as much.
         let plan = "kind = \"sweep\"\n[sweep]\nexposure_us = [600, 1200]\n";
         let rig = |white_dn: f64| {
             let text = RIG.replace("[camera]\n", &format!("[camera]\nwhite_dn = {white_dn}\n"));
             RigFile::parse(&text).unwrap()
         };
-        // Saturation is at 3972 counts, of which 64 are black. Of the plan, 5 delays of 1200 us hold the own row.
+        // Saturation is at 3972 counts, of which 64 are black. In the plan, 5 delays at 1200 us include the pixel's
+        // own row.
         let usable = |white_dn: f64, delays: i32| {
             let (rig, camera) = (rig(white_dn), camera());
             let task = task(&rig, plan);
@@ -370,7 +372,7 @@ mod tests {
 
     #[test]
     fn what_takes_longer_is_not_proposed() {
-        // The grids that err less have more delays that are triggered late in the period.
+        // The grids with smaller errors have more delays that are triggered late in the period.
         let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -4000, stop = 4000, count = 37 }\nexposure_us = [600, 1200]\n";
         let fast = CameraCapabilities { readout: Readout::Overlapped, readout_us: 0.0, ..camera() };
         let rig = RigFile::parse(RIG).unwrap();

@@ -1,4 +1,4 @@
-//! What a sweep would do, before anything moves.
+//! Predicts a sweep, before anything moves.
 
 use raysweep_config::ConfigError;
 use raysweep_pipeline::ProductSpec;
@@ -10,13 +10,13 @@ use raysweep_session::STRIP_ROWS;
 use crate::plane::foresight::Model;
 use crate::procedure::lab::{Lab, Room};
 
-/// Bytes of the report and everything else that is small.
+/// Disk space of the report and other small files, in bytes.
 const OTHER_BYTES: u64 = 10_000_000;
 
-/// Foresees a sweep that makes `products`.
+/// Predicts a sweep that makes `products`.
 ///
 /// # Errors
-/// When the plan makes no model on this rig.
+/// When the plan gives no model on this rig.
 pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Result<CheckReport, ConfigError> {
     let task = &*sweep.task;
     let geometry = &task.geometry;

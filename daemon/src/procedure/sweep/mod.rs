@@ -1,4 +1,4 @@
-//! Sweeps: points under all delays and exposures, then one transport.
+//! Sweeps: acquires points at all delays and exposures, then computes one transport.
 
 mod advice;
 mod check;
@@ -27,7 +27,7 @@ use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
-/// Units between the assembler and the disk.
+/// Capacity of the queue of units between the assembler and the disk.
 const UNITS_UNDER_WAY: usize = 8;
 
 /// A sweep on a rig.
@@ -36,11 +36,11 @@ struct SweepRun {
     camera: CameraCapabilities,
     sweep: SweepTask,
     processing: Processing,
-    /// Whether the results are made some camera rows at a time.
+    /// Whether the results are made in strips of camera rows.
     in_strips: bool,
 }
 
-/// Foresees a sweep on a rig whose camera has `size` (rows, columns) and sees projector row `first_row` with its row 0.
+/// Predicts a sweep on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row `first_row`.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
@@ -99,17 +99,17 @@ impl Procedure for SweepRun {
     }
 }
 
-/// What acquisition leaves behind.
+/// Result of acquisition.
 struct Acquired {
     session: Session,
     /// Still locked.
     ledger: Ledger,
-    /// Its folds have seen every stored point.
+    /// Its folds have received every stored point.
     processing: Processing,
     vsync: Option<VsyncStats>,
     exposures: Exposures,
     latency: Option<SettingsLatency>,
-    /// Why acquisition ended early, if a fault ended it.
+    /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
 }
 
@@ -129,7 +129,7 @@ fn acquire(
     if run.is_resumed {
         missing.extend(processing.feed_stored(task, &state, &stack, &|| run.orders.go_on()));
         missing.sort_by_key(|id| id.point);
-        // What is damaged is about to be mended.
+        // Damaged points are about to be acquired again.
         processing.problems.clear();
     }
     let planned = task.schedule.points.len();
@@ -161,13 +161,13 @@ fn acquire(
     })
 }
 
-/// Starts the running estimate; a run is none the worse without.
+/// Starts the running estimate; the run works without it too.
 fn start_live(outlet: Outlet) -> Option<LiveEstimate> {
     let started = outlet.file.clear().map_err(Into::into).and_then(|()| LiveEstimate::start(outlet));
     started.map_err(|error| tracing::warn!(%error, "no live estimate of this run")).ok()
 }
 
-/// Makes the results of what was acquired, unless it is told to end: then there are none yet, so that it ends soon.
+/// Makes the results of the acquired data, unless the run is told to end: then it skips them to end soon.
 fn conclude(
     acquired: Acquired,
     in_strips: bool,
@@ -221,7 +221,7 @@ fn conclude(
     Ok(Ended { end, warnings })
 }
 
-/// Shows the result where the estimates before it were shown.
+/// Publishes the result where the earlier estimates were published.
 fn show_last(live: &Outlet, overview: &Overview, points: usize, took: Duration) {
     let Overview { epipolar, non_epipolar, total, .. } = overview;
     if let Err(error) = live.show_images([epipolar, non_epipolar, total], points, took, true) {

@@ -1,4 +1,5 @@
-//! How the transport was found: what the stack said of rig and scene, and the held-out error of the priors.
+//! How the transport was estimated: properties of rig and scene found in the stack, and the held-out error of the
+//! priors.
 
 use raysweep_pipeline::{Findings, Product, prior_name};
 use raysweep_session::report::{Block, NoteLevel, Section, Table};
@@ -28,7 +29,7 @@ pub(super) fn section(products: &[Product]) -> Option<Section> {
     })
 }
 
-/// The priors compared.
+/// Held-out error of the priors.
 fn curve(findings: &Findings) -> Option<Block> {
     let choice = findings.choice.as_ref()?;
     let row = |(index, candidate): (usize, &raysweep_transport::plane::calibrate::Candidate)| {

@@ -1,4 +1,4 @@
-//! The report of a sweep: what was taken, what came out, and how far to trust it.
+//! The report of a sweep: what was recorded, the results, and how far to trust them.
 
 mod findings;
 mod products;
@@ -18,7 +18,7 @@ use crate::plane::place;
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, subtitle};
 
-/// Share of pixels, in percent, that a picture's scale does not overexpose.
+/// Percentile of the pixels that maps to white in a picture.
 const PERCENTILE: f64 = 99.5;
 
 /// The same for the stack's indirect light, which is far dimmer and fills more of its images.
@@ -65,7 +65,7 @@ pub fn make(
     })
 }
 
-/// What the products say against themselves.
+/// Warnings about the products.
 pub fn warnings(products: &[Product]) -> Vec<String> {
     let warning = |product: &Product| match product {
         Product::Warning(text) => Some(text.clone()),
@@ -94,7 +94,7 @@ fn facts(state: &State, task: &SweepTask) -> Vec<(String, String)> {
     .to_vec()
 }
 
-/// Pixels worth a look: the brightest of each kind of light.
+/// Chooses pixels to plot: the brightest of each kind of light.
 fn mark(overview: &Overview) -> Vec<Marker> {
     let Overview { epipolar, near, middle, total, .. } = overview;
     let kinds = [epipolar.clone(), near - epipolar, middle - near, total - middle];
@@ -103,7 +103,7 @@ fn mark(overview: &Overview) -> Vec<Marker> {
         let brightest = image
             .indexed_iter()
             .filter(|((t, s), _)| {
-                // Far enough from the others to be told apart in the picture.
+                // Far enough from the others to be distinguished in the picture.
                 let apart = image.nrows().min(image.ncols()) / 10;
                 markers.iter().all(|marker| marker.row.abs_diff(*t).max(marker.column.abs_diff(*s)) > apart)
             })
@@ -115,7 +115,7 @@ fn mark(overview: &Overview) -> Vec<Marker> {
     markers
 }
 
-/// The marked pixels' light over the delay, and over relative rows from `u_min` on.
+/// Light of the marked pixels over the delay, and over relative rows from `u_min` on.
 fn profiles(
     sweep: &SweepImages<'_>,
     u_min: i32,
@@ -159,7 +159,7 @@ fn profiles(
     })
 }
 
-/// The sweep's images, read from the stack when they are needed.
+/// The sweep's images, read from the stack on demand.
 struct SweepImages<'a> {
     task: &'a SweepTask,
     state: &'a State,
@@ -187,12 +187,12 @@ impl SweepImages<'_> {
     fn mean(&self, role: Role) -> Result<Option<Array2<f32>>> {
         let (array, index) = place(role);
         let Some(entry) = self.state.point(array, index) else { return Ok(None) };
-        // What is damaged stands among the problems; the report shows it as missing.
+        // Damaged points are listed among the problems; the report shows them as missing.
         let Ok(sum) = self.stack.read_point(array, index) else { return Ok(None) };
         Ok(Some(sum.mapv(|sum| sum as f32 / entry.frames as f32)))
     }
 
-    /// Delay, and light of the marked pixels, of each image at an exposure.
+    /// Delay and light of the marked pixels, for each image at an exposure.
     fn at_exposure(&self, exposure_us: f64, markers: &[Marker]) -> Result<Vec<(f64, Vec<f32>)>> {
         let mut lights = Vec::new();
         for point in &self.task.task.schedule.points {
@@ -207,7 +207,7 @@ impl SweepImages<'_> {
         Ok(lights)
     }
 
-    /// Pixels of the sweep's images that the ledger knows.
+    /// Number of pixels in the sweep's images that the ledger lists.
     fn stored_px(&self) -> usize {
         let shape = &self.state.session.shape;
         self.state.stored(ArrayName::Sum).count() * shape.rows * shape.columns
@@ -216,7 +216,7 @@ impl SweepImages<'_> {
     fn contact_sheet(&self) -> Result<Section> {
         let (delays, exposures) = (self.task.sweep.delay_us.values(), self.task.sweep.exposure_us.values());
         let places = delays.len() * exposures.len();
-        // The sweep may be larger than the memory: one image at a time.
+        // The sweep may not fit into memory: read one image at a time.
         let mut samples = ToneSamples::new(self.stored_px());
         let mut thumbnails = Vec::with_capacity(places);
         for index in 0..places as u32 {
@@ -278,7 +278,7 @@ fn trust(state: &State, task: &SweepTask, products: &[Product]) -> Section {
     }
 }
 
-/// A number with four decimals at the most.
+/// Formats a number with at most four decimals.
 fn short(value: f64) -> String {
     format!("{value:.4}").trim_end_matches('0').trim_end_matches('.').to_owned()
 }

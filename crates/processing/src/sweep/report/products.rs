@@ -6,12 +6,12 @@ use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Secti
 
 use super::PERCENTILE;
 
-/// Pictures of a sequence side by side.
+/// Number of pictures of a sequence on a contact sheet.
 const SHEET_PICTURES: usize = 12;
-/// Pictures of a sequence one after the other; more would make the page heavy.
+/// Number of pictures in the animation of a sequence; more would make the page too large.
 const ANIMATION_PICTURES: usize = 48;
 
-/// The images, unless there are none.
+/// Section of the images, if there are any.
 pub(super) fn images(products: &[Product], markers: &[Marker]) -> Option<Section> {
     let pictures: Vec<Picture> = products
         .iter()
@@ -33,7 +33,7 @@ fn picture(image: &Array2<f32>, caption: &str) -> Picture {
     Picture::grey(image.view(), ToneMap::percentile(&[image.view()], PERCENTILE)).with_caption(caption)
 }
 
-/// A section for each sequence: some images side by side, more of them in motion.
+/// A section for each sequence: a contact sheet and an animation.
 pub(super) fn sequences(products: &[Product]) -> impl Iterator<Item = Section> {
     products.iter().filter_map(|product| match product {
         Product::Sequence { name, about, axis, at, images } => Some(sequence(name, about, axis, at, images)),
@@ -62,13 +62,13 @@ fn sequence(name: &str, about: &str, axis: &str, at: &[f64], images: &Array3<f32
     }
 }
 
-/// At most `most` of `len` indices, evenly spread, the first and the last among them.
+/// At most `most` of `len` indices, evenly spaced, including the first and the last.
 fn spread(len: usize, most: usize) -> Vec<usize> {
     let count = len.min(most);
     (0..count).map(|k| if count > 1 { k * (len - 1) / (count - 1) } else { k }).collect()
 }
 
-/// The delay profiles that were asked for, unless there are none.
+/// Section of the requested delay profiles, if there are any.
 pub(super) fn profiles(products: &[Product]) -> Option<Section> {
     let profiles: Vec<&Profile> = products
         .iter()

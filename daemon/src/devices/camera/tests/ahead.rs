@@ -1,4 +1,4 @@
-//! Settings written ahead: sweeps, and films of cameras without a sequencer.
+//! Settings written ahead: sweeps, and films with cameras without a sequencer.
 
 use super::*;
 
@@ -13,8 +13,8 @@ fn a_sweep_and_a_film_cost_no_frame_that_they_do_not_need() {
         let late_frames = late[0] as u32;
         let found = SettingsLatency { min_frames: late_frames, max_frames: late_frames };
         assert_eq!(sweep.latency, Some(found), "{what}");
-        // Where frames do not tell their exposure and the camera does not know, the one change of exposure costs the
-        // frames until it is certain, and the first of those.
+        // If frames do not carry their exposure and the camera does not report the first frame, the one change of
+        // exposure costs the frames until it is certain, and the first of those.
         let unknown = if promise.is_some() && !chunk { 3 + 1 } else { 0 };
         assert!((48..=48 + unknown).contains(&sweep.frames()), "{what}: {} frames", sweep.frames());
         let film = play(script, 1, Some(3));
@@ -33,7 +33,7 @@ fn settings_that_are_late_now_and_then_mislabel_nothing() {
         sweep.assert_true(&plan());
         assert_eq!(sweep.latency, Some(SettingsLatency { min_frames: 0, max_frames: 3 }));
         assert_eq!((sweep.counted.len(), sweep.short.len()), (48, 0));
-        // By their stamps, frames count as soon as they may: 1.4 frames a point are late on average.
+        // With timestamps, frames count as early as possible: on average, points are 1.4 frames late.
         let most = if chunk { 48 + 12 * 2 } else { 48 + 12 * 4 };
         assert!(sweep.frames() <= most, "exposure carried: {chunk}: {} frames", sweep.frames());
         let film = play(script, 1, Some(3));
@@ -67,7 +67,7 @@ fn a_host_that_wakes_later_still_costs_frames_and_no_settings() {
 #[test]
 fn a_lost_frame_costs_its_own_point_at_the_most() {
     for script in all_late() {
-        // Probe and lead-in are over by frame 70; the points are not before frame 95.
+        // Probe and lead-in are over by frame 70; the points end no earlier than frame 95.
         let script = Script { lost: &[75, 76, 82, 86, 88, 90], ..script };
         let sweep = play(script, 4, None);
         sweep.assert_true(&plan());
@@ -92,7 +92,7 @@ fn frames_that_are_held_up_on_their_way_keep_their_settings() {
             let sweep = play(script, 4, None);
             sweep.assert_true(&plan());
             assert_eq!((sweep.counted.len(), sweep.short.len()), (48, 0), "{what}");
-            // What two or three frames are late by, the clock bridges.
+            // The clock bridges delays of two or three frames.
             assert!(held_ms > 45 || sweep.frames() <= 48 + unknown, "{what}: {} frames", sweep.frames());
             let film = play(script, 1, Some(5));
             film.assert_true(&plan());
@@ -108,7 +108,7 @@ fn settings_that_stamps_tell_apart() {
     assert!(tells(&plan()));
     assert!(!tells(&[settings(100.0, 600.0), settings(149.0, 600.0)]));
     assert!(tells(&[settings(100.0, 600.0), settings(149.0, 900.0)]));
-    // A period apart, a delay is seen at the same distance from an edge.
+    // One period apart, two delays have the same distance from an edge.
     assert!(!tells(&[settings(100.0, 600.0), settings(16_740.0, 600.0)]));
 }
 

@@ -10,7 +10,7 @@ fn film_plan() -> Vec<CameraSettings> {
         .collect()
 }
 
-/// Sequencers whose frames say which set they have, and such whose stamps must tell.
+/// Sequencers whose frames report their set, and others whose phase only timestamps can show.
 fn sequencers() -> Vec<Script> {
     let says = [Says::Nothing, Says::Truth, Says::First];
     let scripts = all_late().into_iter().map(|script| Script { sets: 8, ..script });
@@ -20,15 +20,15 @@ fn sequencers() -> Vec<Script> {
 #[test]
 fn a_film_by_the_sequencer_is_told_nothing_while_it_runs() {
     for script in sequencers() {
-        // A host that is this late would cost a film that is written ahead frames.
+        // Such delays of the host would cost frames if the film were written ahead.
         let script = Script { oversleep_ms: &[0, 40, 3, 0, 0, 18, 1, 0, 25, 16, 2], ..script };
         let film = play_plan(&film_plan(), script, 1, Some(5), None);
         film.assert_true(&film_plan());
         assert_eq!((film.counted.len(), film.short.len(), film.frames()), (40, 0, 40), "{:?}", script.late);
         let ids: Vec<u64> = film.counted.iter().map(|(_, seq)| *seq).collect();
         assert!(!film.told.iter().any(|told| (ids[0]..=ids[39]).contains(told)), "{:?}", film.told);
-        // By their stamps, two cycles at the most until its place in the sequence is known and its cycle begins; one by
-        // their own word.
+        // With timestamps, it takes at most two cycles until the phase is known and the film's cycle begins; with
+        // reported sets, at most one.
         let begun = film.told.iter().filter(|told| **told < ids[0]).max().unwrap();
         let cycles = if script.says == Says::Truth { 1 } else { 2 };
         assert!(ids[0] - begun <= cycles * 8 + 6, "{begun} {ids:?}");
@@ -54,7 +54,7 @@ fn a_lost_frame_of_a_sequence_takes_its_set_with_it() {
 fn a_sequence_that_stutters_is_found_again() {
     let script = Script { sets: 8, stutters: &[120], ..EXACT };
     let film = play_plan(&film_plan(), script, 1, Some(20), None);
-    // What is wrong, the assembler sees by its delay: for less than two cycles.
+    // The assembler sees wrong frames by their delay: for less than two cycles.
     let wrong = film.wrong(&film_plan());
     assert!((1..=16).contains(&wrong.len()) && wrong[0] == 120, "{wrong:?}");
     assert_eq!(film.counted.len(), 160);
@@ -76,7 +76,7 @@ fn a_sequencer_that_says_wrong_sets_is_found_out_by_its_stamps() {
 #[test]
 fn a_pause_stops_the_sequence_and_a_cycle_is_whole_before_it() {
     let script = Script { sets: 8, ..EXACT };
-    // The order comes by the events, of which 64 may lie ahead.
+    // The pause order arrives through the events, of which 64 may be queued.
     let film = play_plan(&film_plan(), script, 1, Some(12), Some(11));
     film.assert_true(&film_plan());
     assert_eq!((film.counted.len(), film.short.len()), (96, 0));
@@ -102,7 +102,7 @@ fn a_film_that_the_sequencer_cannot_take_is_written_ahead() {
         film.assert_true(&film_plan());
         assert_eq!((film.counted.len(), film.frames()), (24, 24));
     }
-    // Delays all round a period in equal steps: any set might be the first, unless frames say it.
+    // Delays in equal steps around a period: any set might be the first, unless frames report their set.
     let round: Vec<_> = (0..6).map(|k| settings(f64::from(k) * PERIOD_NS as f64 / 6e3, 600.0)).collect();
     let film = play_plan(&round, Script { sets: 8, says: Says::Truth, ..EXACT }, 1, Some(3), None);
     film.assert_true(&round);
