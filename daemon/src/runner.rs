@@ -1,5 +1,6 @@
 //! The daemon's core: a rig, a data folder, and at most one run.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -7,7 +8,7 @@ use std::thread::{self, JoinHandle};
 
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::Registry;
+use raysweep_pipeline::{Registry, message_of};
 use raysweep_proto::{
     CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
     Started, Status,
@@ -155,7 +156,11 @@ impl Runner {
             // The thread of the last run had nothing left to do once the state allowed a new run.
             let _ = last.thread.join();
         }
-        match begin() {
+        let begun = catch_unwind(AssertUnwindSafe(begin)).unwrap_or_else(|panic| {
+            let what = format!("preparing the run met a defect: {}", message_of(&*panic));
+            Err(RpcError::new(ErrorCode::Internal, what))
+        });
+        match begun {
             Ok((started, run)) => {
                 *current = Some(run);
                 Ok(started)
@@ -268,6 +273,15 @@ impl Runner {
                 Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
                 Unresumable::Plan(error) => invalid_plan(&error),
             })?;
+        let begun = ledger.state().session.shape;
+        if foreseen.shape != begun {
+            let what = format!(
+                "{}: plan.toml is not the one that the session was begun with: it makes {:?}, the ledger has {begun:?}; restore the session's own plan.toml",
+                session.dir().display(),
+                foreseen.shape,
+            );
+            return Err(no_session(what));
+        }
         self.spawn(foreseen, session, ledger, true)
     }
 }

@@ -69,6 +69,11 @@ impl<'a> Document<'a> {
         }
     }
 
+    /// Removes a key without decoding it, and returns whether it was there.
+    pub fn drop_key(&mut self, key: &str) -> bool {
+        self.tables.remove_entry(key).is_some()
+    }
+
     /// Decodes the value of a key; returns the default if the key is missing.
     pub fn take_or_default<T: Deserialize<'a> + Default>(&mut self, key: &str) -> Option<T> {
         if self.tables.contains_key(key) { self.take(key) } else { Some(T::default()) }
@@ -87,7 +92,11 @@ impl<'a> Document<'a> {
         let others: Vec<String> = self.tables.keys().map(|key| key.get_ref().to_string()).collect();
         for key in others.iter().filter(|key| !known.contains(&key.as_str())) {
             let known = known.iter().map(|known| format!("`{known}`")).collect::<Vec<_>>().join(", ");
-            self.refuse(&[key], format!("unknown field `{key}`, expected one of {known}"));
+            let shown = key.escape_debug();
+            let mut mistake =
+                self.places.mistake(&[key], format!("unknown field `{shown}`, expected one of {known}"));
+            mistake.span = self.places.root.inside.get(key).map(|place| place.key.clone());
+            self.mistakes.push(mistake);
         }
     }
 

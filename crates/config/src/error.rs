@@ -21,6 +21,9 @@ pub struct ConfigError {
     others: Vec<Mistake>,
 }
 
+/// Mistakes of a file that are reported: more help nobody, and each is shown with its lines.
+const MOST_SHOWN: usize = 50;
+
 impl ConfigError {
     /// An error without a position in a text.
     pub fn of_field(field: &str, message: impl Into<String>) -> Self {
@@ -30,6 +33,11 @@ impl ConfigError {
     /// An error with these mistakes; `None` if there are none.
     pub(crate) fn of(mut mistakes: Vec<Mistake>) -> Option<Self> {
         mistakes.sort_by_key(|mistake| mistake.span.as_ref().map(|span| span.start));
+        let more = mistakes.len().saturating_sub(MOST_SHOWN);
+        mistakes.truncate(MOST_SHOWN);
+        if more > 0 {
+            mistakes.push(Mistake { message: format!("and {more} more"), field: None, span: None });
+        }
         let mut mistakes = mistakes.into_iter();
         Some(Self { first: mistakes.next()?, others: mistakes.collect() })
     }

@@ -89,13 +89,14 @@ impl Counts {
     /// Counts `frames` as lost to `cause`; zero frames add no entry.
     pub fn lose(&mut self, cause: LossCause, frames: u64) {
         if frames > 0 {
-            *self.lost.entry(cause).or_default() += frames;
+            let lost = self.lost.entry(cause).or_default();
+            *lost = lost.saturating_add(frames);
         }
     }
 
     /// Total number of lost frames.
     pub fn lost_total(&self) -> u64 {
-        self.lost.values().sum()
+        self.lost.values().fold(0, |sum, frames| sum.saturating_add(*frames))
     }
 
     /// The lost frames by cause, as text.
@@ -109,15 +110,16 @@ impl Counts {
 
     /// Whether every expected trigger is accounted for exactly once.
     pub fn balanced(&self) -> bool {
-        self.expected == self.averaged + self.settling + self.cancelled + self.lost_total()
+        let parts = [self.averaged, self.settling, self.cancelled, self.lost_total()];
+        parts.into_iter().try_fold(0_u64, u64::checked_add) == Some(self.expected)
     }
 
     /// Adds the counts of `other`.
     pub fn add(&mut self, other: &Counts) {
-        self.expected += other.expected;
-        self.averaged += other.averaged;
-        self.settling += other.settling;
-        self.cancelled += other.cancelled;
+        self.expected = self.expected.saturating_add(other.expected);
+        self.averaged = self.averaged.saturating_add(other.averaged);
+        self.settling = self.settling.saturating_add(other.settling);
+        self.cancelled = self.cancelled.saturating_add(other.cancelled);
         for (&cause, &frames) in &other.lost {
             self.lose(cause, frames);
         }

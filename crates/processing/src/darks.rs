@@ -8,7 +8,7 @@ use raysweep_config::{Plan, RigFile};
 use raysweep_pipeline::{Point, Role, Schedule};
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Block, NoteLevel, Picture, Report, Section, Table, ToneMap};
-use raysweep_session::stack::{ArrayName, Stack, crc32};
+use raysweep_session::stack::{ArrayName, Contents, Stack, crc32};
 use raysweep_session::{Result, Session, durable};
 use serde_json::json;
 
@@ -43,6 +43,11 @@ impl DarksTask {
         let schedule = Schedule { points: (0..).zip(pairs).map(image).collect() };
         let task = PlaneTask::new(plan, schedule, MAX_JITTER_US, rig, first_row, size);
         Self { darks, task: Arc::new(task) }
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        Contents::Darks { images: self.points() }
     }
 
     /// Number of images to store.
@@ -96,12 +101,12 @@ fn median(values: &mut [f32]) -> f32 {
 /// When the session cannot be written.
 pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -> Result<Vec<String>> {
     let (stack, mut problems) = (session.stack()?, Vec::new());
-    let DarksPlan { exposure_us, frames, hot_sigmas } = &task.darks;
+    let DarksPlan { exposure_us, hot_sigmas, .. } = &task.darks;
     let mut levels = Vec::new();
     for (index, exposure_us) in exposure_us.values().into_iter().enumerate() {
         let images = [2 * index, 2 * index + 1].map(|image| read(&stack, state, image));
         match images {
-            [Ok(a), Ok(b)] => levels.push(Level::of(exposure_us, [a, b], *frames, *hot_sigmas)),
+            [Ok((a, frames)), Ok((b, _))] => levels.push(Level::of(exposure_us, [a, b], frames, *hot_sigmas)),
             images => problems.extend(images.into_iter().filter_map(std::result::Result::err)),
         }
     }
@@ -121,7 +126,7 @@ pub fn damaged(stack: &Stack, state: &State, task: &DarksTask) -> Vec<usize> {
 }
 
 /// The mean of an image's frames, or why it cannot be used.
-fn read(stack: &Stack, state: &State, index: usize) -> std::result::Result<Array2<f32>, String> {
+fn read(stack: &Stack, state: &State, index: usize) -> std::result::Result<(Array2<f32>, u32), String> {
     let entry = state.point(ArrayName::Dark, index).ok_or_else(|| format!("dark {index} is missing"))?;
     let damaged =
         |why: String| format!("dark {index} is damaged ({why}): `raysweep resume` acquires it again");
@@ -129,7 +134,10 @@ fn read(stack: &Stack, state: &State, index: usize) -> std::result::Result<Array
     if crc32(sum.view()) != entry.crc32 {
         return Err(damaged("its checksum is not the ledger's".into()));
     }
-    Ok(sum.mapv(|sum| sum as f32 / entry.frames as f32))
+    if entry.frames == 0 {
+        return Err(damaged("the ledger says that it has no frames".into()));
+    }
+    Ok((sum.mapv(|sum| sum as f32 / entry.frames as f32), entry.frames))
 }
 
 fn write_products(session: &Session, task: &DarksTask, levels: &[Level]) -> Result<()> {
@@ -243,6 +251,7 @@ pub fn process(
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
     let task = DarksTask::new(plan, darks, &rig, state.session.first_row, (shape.rows, shape.columns));
+    stored.check_contents(task.contents())?;
     let problems = make(session, state, &task, &rig)?;
     let (report, points) = (session.report_path(), shape.points());
     Ok(Processed { report, stored: state.stored_points(), points, problems })

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use raysweep_config::{ConfigError, DotRigFile, Plan, RigFile};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
+use raysweep_session::stack::Contents;
 
 /// Why a session cannot be processed.
 #[derive(Debug, thiserror::Error)]
@@ -81,6 +82,21 @@ impl Stored<'_> {
     pub(crate) fn in_plan(&self, error: &ConfigError) -> ProcessError {
         let path = self.session.plan_path().display().to_string();
         ProcessError::Config(error.render(&path, self.plan_text))
+    }
+
+    /// Checks that the ledger stores what the plan makes.
+    ///
+    /// # Errors
+    /// When `plan.toml` is not the one that the session was begun with.
+    pub(crate) fn check_contents(&self, planned: Contents) -> Result<(), ProcessError> {
+        let stored = self.state.session.shape.contents;
+        if stored == planned {
+            return Ok(());
+        }
+        Err(ProcessError::Config(format!(
+            "{} is not the plan that the session was begun with: it makes {planned:?}, the ledger has {stored:?}; restore it",
+            self.session.plan_path().display()
+        )))
     }
 
     /// The rig file of a session of the plane rig.

@@ -135,6 +135,11 @@ enum Kind {
     Darks,
 }
 
+/// Most camera rows or columns.
+const MAX_SIDE_PX: usize = 1 << 16;
+/// Most points, and settings, dots or exposures of one.
+const MAX_POINTS: usize = 1 << 24;
+
 fn is_zero(count: &usize) -> bool {
     *count == 0
 }
@@ -240,11 +245,15 @@ impl StackShape {
             Contents::Darks { images } => ("images", vec![images]),
         };
         let found: Vec<usize> = counts.into_iter().chain([self.rows, self.columns]).collect();
-        if found.contains(&0) {
+        let is_side = |pixels| pixels <= MAX_SIDE_PX;
+        if found.iter().any(|len| !(1..=MAX_POINTS).contains(len))
+            || !is_side(self.rows)
+            || !is_side(self.columns)
+        {
             return Err(Error::Shape {
                 what: format!("the stack [{axes}, rows, columns]"),
                 found,
-                allowed: "at least 1 along each axis".into(),
+                allowed: format!("1 to {MAX_POINTS} along each axis, 1 to {MAX_SIDE_PX} rows and columns"),
             });
         }
         Ok(())

@@ -1,6 +1,5 @@
 //! Which files of a crate import which: `use` declarations and paths, traced through re-exports to the file that
-//! defines what is imported. Test modules do not count, nor do paths
-//! that begin with a child module.
+//! defines what is imported. Test modules do not count, nor do paths that begin with a child module.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -145,13 +145,16 @@ impl Plan {
         }
         let default_stages =
             kind.default_stage().map(|name| StageTable { name: name.into(), options: Map::new() });
-        for key in ["stage", "product"] {
-            if default_stages.is_none() && document.places().has(&[key]) {
+        let (mut stages, mut products): (Option<Vec<StageTable>>, Option<Vec<ProductTable>>) = (None, None);
+        if default_stages.is_some() {
+            (stages, products) = (document.take("stage"), document.take("product"));
+        } else {
+            for key in
+                ["stage", "product"].into_iter().filter(|key| document.drop_key(key)).collect::<Vec<_>>()
+            {
                 document.refuse(&[key], format!("kind = \"{own}\" has no [[{key}]]: leave it out"));
             }
         }
-        let stages: Option<Vec<StageTable>> = document.take("stage");
-        let products: Option<Vec<ProductTable>> = document.take("product");
         tables::check_stages(stages.iter().flatten(), &mut document);
         tables::check_products(products.iter().flatten(), &mut document);
         let stages = stages.unwrap_or_else(|| default_stages.into_iter().collect());

@@ -13,6 +13,7 @@ use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter}
 use raysweep_pipeline::Registry;
 use raysweep_pipeline::dots::{ColumnStage, Scan};
 use raysweep_session::dots::BatchColumns;
+use raysweep_session::stack::Contents;
 use raysweep_transport::dots::{Batch, BatchArrays, Correction, DotsError, FrameShape, Region, Sampling};
 use serde::Deserialize;
 use serde_json::Value;
@@ -116,6 +117,11 @@ impl DotTask {
             stages,
             places,
         })
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        Contents::Batches { batches: self.batches.total(), dots: self.batches.dots as usize }
     }
 
     /// What the pipeline extracts from the frames of one pass of `batches` batches.
@@ -252,6 +258,7 @@ pub fn process(stored: &Stored<'_>, batches: BatchesPlan, asked: &Asked) -> Resu
     let size = (shape.rows, shape.columns);
     let task = DotTask::new(plan, batches, &rig, rig.camera.pixel_format, size, session.dir())
         .map_err(|error| ProcessError::Config(error.to_string()))?;
+    stored.check_contents(task.contents())?;
     let mut specs = if asked.only { Vec::new() } else { task.specs.clone() };
     for argument in &asked.products {
         for spec in DotSpec::of_argument(argument).map_err(ProcessError::Product)? {

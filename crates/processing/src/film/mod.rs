@@ -8,6 +8,7 @@ use std::sync::Arc;
 use raysweep_config::{ConfigError, FilmPlan, Plan, RigFile};
 use raysweep_pipeline::{FilmSolver, Point, Registry, Role, Schedule, Stage};
 use raysweep_session::film::TransportFilm;
+use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
 use serde_json::json;
 
@@ -32,6 +33,12 @@ impl FilmTask {
     pub fn new(plan: &Plan, film: FilmPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
         let task = PlaneTask::new(plan, schedule(&film), film.max_jitter_us, rig, first_row, size);
         Self { film, task: Arc::new(task) }
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        let (settings, exposures) = (self.task.settings().count(), self.task.schedule.dark_len());
+        Contents::Film { cycles: self.points(), settings, exposures }
     }
 
     /// Number of cycles to store.

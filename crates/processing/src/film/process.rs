@@ -25,6 +25,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
     let task = FilmTask::new(plan, film, &rig, state.session.first_row, (shape.rows, shape.columns));
+    stored.check_contents(task.contents())?;
     let stages = task.stages(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {
         let message = "a film has no products to ask for: leave --product out";

@@ -11,6 +11,7 @@ use std::path::Path;
 use raysweep_config::{ConfigError, DotRigFile, Places, Plan, ResponsePlan};
 use raysweep_core::{CameraSettings, MirrorPath, PixelFormat, Shutter};
 use raysweep_session::ledger::State;
+use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
 use raysweep_transport::dots::{FrameShape, Region};
 
@@ -68,6 +69,11 @@ impl ResponseTask {
             .map_err(|(key, message)| plan.places.error(&["response", key], message))?;
         let (name, places) = (plan.name.clone(), plan.places.clone());
         Ok(Self { name, response, shape, format, region, paths, places })
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        Contents::Axes { axes: AXES.len() }
     }
 
     /// An error about a value of the plan.
@@ -182,6 +188,7 @@ pub fn process(
     let size = (shape.rows, shape.columns);
     let task = ResponseTask::new(plan, response, &rig, rig.camera.pixel_format, size)
         .map_err(|error| ProcessError::Config(error.to_string()))?;
+    stored.check_contents(task.contents())?;
     let findings = Findings::of(session, state, &task)?;
     findings.keep(session, state, None)?;
     findings.write(session, state, &task, &rig)?;

@@ -9,6 +9,7 @@ use std::sync::Arc;
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{ConfigError, Places, Plan, ProductTable, RigFile, SweepPlan};
 use raysweep_pipeline::{Point, ProductSpec, Registry, Role, Schedule};
+use raysweep_session::stack::Contents;
 
 pub use self::report::warnings;
 pub use self::results::{Results, write_products, write_report};
@@ -45,6 +46,11 @@ impl SweepTask {
         task.schedule = schedule(&sweep, task.geometry.raster.period_us);
         let other = Self { sweep, task: Arc::new(task), products: self.products.clone() };
         (is_possible && other.products().is_ok()).then_some(other)
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        Contents::Sweep { points: self.points(), exposures: self.task.schedule.dark_len() }
     }
 
     /// Number of images to store, without dark and regular ones.
@@ -164,6 +170,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
     let sweep = SweepTask::new(plan, sweep, &rig, state.session.first_row, (shape.rows, shape.columns));
+    stored.check_contents(sweep.contents())?;
     let task = &*sweep.task;
     let mut processing = sweep.processing(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
     if asked.only {

@@ -12,7 +12,7 @@ use raysweep_processing::batches::{DotTask, keep_patterns, make};
 use raysweep_proto::{ErrorCode, RpcError};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
-use raysweep_session::stack::{Contents, StackShape};
+use raysweep_session::stack::StackShape;
 
 use self::acquire::{Acquired, acquire};
 use crate::procedure::lab::Lab;
@@ -38,11 +38,7 @@ pub fn foresee(
     own: BatchesPlan,
 ) -> Result<Foreseen, ConfigError> {
     let task = DotTask::new(plan, own, &rig.file, lab.camera.format, lab.size(), lab.data)?;
-    let shape = StackShape {
-        contents: Contents::Batches { batches: task.batches.total(), dots: task.batches.dots as usize },
-        rows: lab.camera.height,
-        columns: lab.camera.width,
-    };
+    let shape = StackShape { contents: task.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {
         report: check::check(&task, lab, rig.pace())?,
         kind: plan.procedure.kind(),

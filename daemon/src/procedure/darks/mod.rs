@@ -11,7 +11,7 @@ use raysweep_core::SettingsId;
 use raysweep_processing::darks::{DarksTask, damaged, make};
 use raysweep_processing::plane::Processing;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
-use raysweep_session::stack::{ArrayName, Contents, StackShape};
+use raysweep_session::stack::{ArrayName, StackShape};
 
 use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
@@ -47,11 +47,7 @@ pub fn foresee(
         report: check::check(&darks, lab)?,
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
-        shape: StackShape {
-            contents: Contents::Darks { images: darks.points() },
-            rows: size.0,
-            columns: size.1,
-        },
+        shape: StackShape { contents: darks.contents(), rows: size.0, columns: size.1 },
         first_row,
         instead: "take fewer exposures",
         procedure: Box::new(DarksRun { rig: rig.clone(), darks }),

@@ -15,7 +15,7 @@ use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
-use raysweep_session::stack::{Contents, StackShape};
+use raysweep_session::stack::StackShape;
 
 use self::cycle::CyclePlan;
 use self::sink::{CycleTiming, Cycles, FilmSink};
@@ -51,15 +51,7 @@ pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Res
     let first_row = rig.first_row(lab.camera);
     let film = FilmTask::new(plan, own, &rig.file, first_row, lab.size());
     let stages = film.stages(lab.registry)?;
-    let shape = StackShape {
-        contents: Contents::Film {
-            cycles: film.points(),
-            settings: film.task.settings().count(),
-            exposures: film.task.schedule.dark_len(),
-        },
-        rows: lab.camera.height,
-        columns: lab.camera.width,
-    };
+    let shape = StackShape { contents: film.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {
         report: check::check(&film, lab)?,
         kind: plan.procedure.kind(),

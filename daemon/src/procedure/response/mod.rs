@@ -8,7 +8,7 @@ use std::sync::Arc;
 use raysweep_config::{ConfigError, Plan, ResponsePlan};
 use raysweep_processing::response::{AXES, Findings, ResponseTask};
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
-use raysweep_session::stack::{Contents, StackShape};
+use raysweep_session::stack::StackShape;
 
 use self::acquire::{Recorded, acquire};
 use crate::procedure::lab::Lab;
@@ -38,7 +38,7 @@ pub fn foresee(
         report: check::check(&task, lab)?,
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
-        shape: StackShape { contents: Contents::Axes { axes: AXES.len() }, rows, columns },
+        shape: StackShape { contents: task.contents(), rows, columns },
         first_row: 0,
         instead: "take smaller frames",
         procedure: Box::new(ResponseRun { rig: rig.clone(), task: Arc::new(task) }),

@@ -15,7 +15,7 @@ use raysweep_processing::sweep::{Overview, Results, SweepTask, warnings, write_p
 use raysweep_proto::CheckReport;
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
-use raysweep_session::stack::{Contents, StackShape};
+use raysweep_session::stack::StackShape;
 
 use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
@@ -61,11 +61,7 @@ pub fn foresee(
     if in_strips {
         processing.keep_no_images();
     }
-    let shape = StackShape {
-        contents: Contents::Sweep { points: sweep.points(), exposures: sweep.task.schedule.dark_len() },
-        rows: size.0,
-        columns: size.1,
-    };
+    let shape = StackShape { contents: sweep.contents(), rows: size.0, columns: size.1 };
     Ok(Foreseen {
         report,
         kind: plan.procedure.kind(),
