@@ -4,6 +4,32 @@
 //! A camera applies settings at a trigger, with a latency of L frames. Settings for frame n must therefore be written
 //! between the triggers of frames n - 1 - L and n - L, but the frames reach the host when that interval is almost
 //! over. Trigger times are therefore predicted by the clock from the timestamps of earlier frames.
+//!
+//! An example with L = 1. Job A has the frames 10 to 12 and job B those from 13 on, so B must be written (`w`) between
+//! the triggers of frames 11 and 12. Each frame arrives (`^`) when it has been exposed (`=`) and read out (`-`):
+//!
+//! ```text
+//! frame      10          11          12          13          14
+//! trigger    |           |           |           |           |
+//! exposure   :..====--   :..====--   :..====--   :.====--    :.====--      A waits longer than B after the trigger
+//! arrival              ^           ^           ^          ^           ^
+//! write                        w
+//! settings   A           A           A           B           B
+//! ```
+//!
+//! - Frame 10 arrives. It gives the time of its trigger, from which those of frames 11 and 12 are predicted. A still
+//!   needs two frames, so `end_seq` is 12, and `due_ns` is shortly after frame 11 has begun its exposure: by then its
+//!   settings are latched.
+//! - B is written. The camera promises only `Within { earliest: 11, certain: 14 }`. The newest frame to have arrived
+//!   is 10, so the next to be triggered after the write is 11 or later (`next_seq` is 11 to unknown); with L = 1, B
+//!   begins with frame 12 at the earliest. If the predicted triggers are right, it begins with 13 (`planned_seq`).
+//! - Frame 11 arrives. Its timestamp shows that it was latched before the write: the next frame was 12 or later, so B
+//!   begins with 13 or later.
+//! - Frame 12 arrives. Its timestamp shows that it was triggered after the write: the next frame was 12, so B begins
+//!   with 13 at the latest. Earliest and certain now agree, and frame 13 belongs to B by its id alone.
+//!
+//! If L varies, B begins with one of the frames 12 to 14. Each of those belongs to the settings whose exposure and
+//! delay its timestamps show; if they fit both or neither, the frame is dropped.
 
 use std::collections::VecDeque;
 use std::ops::{Range, RangeInclusive};
