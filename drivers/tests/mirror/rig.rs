@@ -73,14 +73,14 @@ impl Rig {
     /// Waits until the mirror is parked; checks that the light went off first and that there was no step on the way.
     /// Returns when that was.
     pub fn assert_parked(&self) -> Timing {
-        let deadline = Instant::now() + Duration::from_secs(10);
+        let deadline = Instant::now() + Duration::from_secs(60);
         loop {
             let parked = self.pty.look(|truth| truth.parked_since_ns.zip(truth.dark_since_ns));
             if let Some((parked_ns, dark_ns)) = parked {
                 assert!(dark_ns <= parked_ns);
                 break;
             }
-            assert!(Instant::now() < deadline, "not parked after 10 s");
+            assert!(Instant::now() < deadline, "not parked after a minute");
             std::thread::sleep(Duration::from_millis(5));
         }
         let truth = self.pty.truth();
