@@ -20,6 +20,7 @@
 
 pub mod advice;
 mod beam;
+pub mod board;
 pub mod calibrate;
 mod cholesky;
 mod coupling;

@@ -1,0 +1,1 @@
+//! Properties of each pixel from images of the board.

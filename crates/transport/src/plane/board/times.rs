@@ -1,0 +1,1 @@
+//! When each projector row is lit, from images of the white board.
