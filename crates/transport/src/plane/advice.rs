@@ -76,7 +76,7 @@ pub fn expected_error(
     noise: &Noise,
 ) -> Result<ExpectedError, PlaneError> {
     timing.check(settings)?;
-    let RowModel { slots, weights } = RowModel::new(timing, settings, reach, timing.camera_rows() / 2);
+    let RowModel { slots, weights } = RowModel::of_middle(timing, settings, reach);
     let differences = prior.differences(&slots);
     let smoothness = differences.t().dot(&differences) * prior.alpha();
     let n = slots.len();

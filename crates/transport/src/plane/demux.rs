@@ -214,26 +214,33 @@ impl Demux {
         let columns = transport.t.len_of(Axis(2));
         let expected = [self.reach.clone().count(), rows.len(), columns];
         check_shape("transport", "[reach, camera rows, columns]", transport.t.shape(), &expected)?;
+        self.timing.check_columns(columns)?;
         let mut images = Array3::zeros((self.settings.len(), rows.len(), columns));
         images.axis_iter_mut(Axis(1)).into_par_iter().zip(rows).enumerate().for_each(
             |(at, (mut image, &row))| {
-                let model = self.model(row);
                 let profiles = transport.t.index_axis(Axis(1), at);
-                let own = model
-                    .slots
-                    .iter()
-                    .zip(model.weights.columns())
-                    .filter(|(slot, _)| slot.kind == SlotKind::Own);
-                let mut sums = Array2::<f64>::zeros(image.dim());
-                for (slot, weights) in own {
-                    let light = profiles.row((slot.u - self.reach.start()) as usize);
-                    for (mut sums, &weight) in sums.rows_mut().into_iter().zip(weights) {
-                        if weight != 0.0 {
-                            sums.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+                for (model, columns) in
+                    RowModel::of_pixels(&self.timing, &self.settings, &self.reach, row, columns)
+                {
+                    let own = model
+                        .slots
+                        .iter()
+                        .zip(model.weights.columns())
+                        .filter(|(slot, _)| slot.kind == SlotKind::Own);
+                    let mut sums = Array2::<f64>::zeros((self.settings.len(), columns.len()));
+                    for (slot, weights) in own {
+                        let light =
+                            profiles.row((slot.u - self.reach.start()) as usize).select(Axis(0), &columns);
+                        for (mut sums, &weight) in sums.rows_mut().into_iter().zip(weights) {
+                            if weight != 0.0 {
+                                sums.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+                            }
                         }
                     }
+                    for (sums, &column) in sums.columns().into_iter().zip(&columns) {
+                        image.column_mut(column).zip_mut_with(&sums, |image, &sum| *image = sum as f32);
+                    }
                 }
-                image.zip_mut_with(&sums, |image, &sum| *image = sum as f32);
             },
         );
         Ok(images)

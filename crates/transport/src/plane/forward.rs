@@ -1,12 +1,16 @@
 use std::ops::RangeInclusive;
 
-use ndarray::{Array2, Array3, ArrayView3, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
+use super::response::{ResponseClass, collected};
 use super::{PlaneError, RowTiming, Setting};
 
 /// A row is an unknown if some setting collects at least this share of its dwell.
 pub const MIN_WEIGHT: f64 = 0.05;
+
+/// Steps of a pixel's measured place per projector row: pixels within one step share a model.
+pub(super) const PLACE_STEPS: f32 = 32.0;
 
 /// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings and
 /// camera rows, in the frame that the delays refer to, is at least [`MIN_WEIGHT`].
@@ -79,6 +83,72 @@ impl RowModel {
         let weights = Array2::from_shape_fn((settings.len(), rows.len()), |(n, slot)| seen[n][rows[slot].0]);
         Self { slots, weights }
     }
+
+    /// The models of the pixels of camera row `t`, each with its columns: one model for all, unless their responses
+    /// were measured.
+    pub(super) fn of_pixels(
+        timing: &RowTiming,
+        settings: &[Setting],
+        reach: &RangeInclusive<i32>,
+        t: usize,
+        columns: usize,
+    ) -> Vec<(Self, Vec<usize>)> {
+        let Some(response) = timing.response() else {
+            return vec![(Self::new(timing, settings, reach, t), (0..columns).collect())];
+        };
+        let drawn = drawn(timing, settings, t);
+        let classes = response.classes(t, 0..columns, PLACE_STEPS);
+        classes
+            .into_iter()
+            .map(|class| (Self::measured(drawn.view(), reach, &class), class.columns))
+            .collect()
+    }
+
+    /// The model of the pixel in the middle of the image, as a typical one.
+    pub(super) fn of_middle(timing: &RowTiming, settings: &[Setting], reach: &RangeInclusive<i32>) -> Self {
+        let t = timing.camera_rows() / 2;
+        let Some(response) = timing.response() else { return Self::new(timing, settings, reach, t) };
+        let (_, columns) = response.size();
+        let middle = std::iter::once(columns / 2);
+        let class = response.classes(t, middle, PLACE_STEPS).swap_remove(0);
+        Self::measured(drawn(timing, settings, t).view(), reach, &class)
+    }
+
+    /// The model of pixels with a measured response. `drawn` is the share of each projector row's dwell inside the
+    /// exposure of each setting, `[settings, projector rows]`; relative rows count from the pixels' own row.
+    pub(super) fn measured(
+        drawn: ArrayView2<f64>,
+        reach: &RangeInclusive<i32>,
+        class: &ResponseClass,
+    ) -> Self {
+        let (settings, projector_rows) = drawn.dim();
+        let weight = |n: usize, lit: i64| collected(drawn.row(n), &class.shares, lit);
+        let kind = |lit: i64| match i32::try_from(lit - class.own_row) {
+            Ok(u) if reach.contains(&u) => Some((u, SlotKind::Own)),
+            Ok(u) => {
+                let is_seen = (0..settings).any(|n| weight(n, lit) >= MIN_WEIGHT);
+                is_seen.then_some((u, SlotKind::Wrapped))
+            }
+            Err(_) => None,
+        };
+        let slots = (0..projector_rows as i64).filter_map(kind);
+        let (own, wrapped): (Vec<_>, Vec<_>) = slots.partition(|(_, kind)| *kind == SlotKind::Own);
+        let slots: Vec<Slot> = own.into_iter().chain(wrapped).map(|(u, kind)| Slot { u, kind }).collect();
+        let weights = Array2::from_shape_fn((settings, slots.len()), |(n, slot)| {
+            weight(n, class.own_row + i64::from(slots[slot].u))
+        });
+        Self { slots, weights }
+    }
+}
+
+/// The share of each projector row's dwell inside the exposure of camera row `t` for each setting,
+/// `[settings, projector rows]`.
+pub(super) fn drawn(timing: &RowTiming, settings: &[Setting], t: usize) -> Array2<f64> {
+    let mut drawn = Array2::zeros((settings.len(), timing.projector_rows()));
+    for (mut drawn, setting) in drawn.rows_mut().into_iter().zip(settings) {
+        drawn.iter_mut().zip(timing.drawn(t, setting)).for_each(|(to, share)| *to = share);
+    }
+    drawn
 }
 
 /// The image that the model predicts for one setting.

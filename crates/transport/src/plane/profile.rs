@@ -1,3 +1,5 @@
+use std::collections::BTreeSet;
+
 use ndarray::{ArrayView3, Axis, s};
 
 use super::{RowModel, RowTiming, Setting, Slot, SlotKind, Transport};
@@ -65,12 +67,17 @@ impl DelayProfile {
         let reach = transport.u_min..=transport.u_max();
         for of_row in pixels.chunk_by(|a, b| a[0] == b[0]) {
             let at = of_row[0][0];
-            let model = RowModel::new(timing, settings, &reach, first_row + at);
-            for (Slot { u, kind }, weights) in model.slots.iter().zip(model.weights.axis_iter(Axis(1))) {
-                if *kind == SlotKind::Own {
-                    let profiles = transport.t.slice(s![(u - transport.u_min) as usize, at, ..]);
-                    let of_slot: f64 = of_row.iter().map(|&[_, s]| f64::from(profiles[s])).sum();
-                    sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight * of_slot);
+            let columns = timing.response().map_or(transport.t.len_of(Axis(2)), |response| response.size().1);
+            let wanted: BTreeSet<usize> = of_row.iter().map(|&[_, s]| s).collect();
+            for (model, mut columns) in RowModel::of_pixels(timing, settings, &reach, first_row + at, columns)
+            {
+                columns.retain(|s| wanted.contains(s));
+                for (Slot { u, kind }, weights) in model.slots.iter().zip(model.weights.axis_iter(Axis(1))) {
+                    if *kind == SlotKind::Own {
+                        let profiles = transport.t.slice(s![(u - transport.u_min) as usize, at, ..]);
+                        let of_slot: f64 = columns.iter().map(|&s| f64::from(profiles[s])).sum();
+                        sums.iter_mut().zip(weights).for_each(|(sum, weight)| *sum += weight * of_slot);
+                    }
                 }
             }
         }

@@ -34,22 +34,31 @@ pub fn relight_rows(
 ) -> Result<Array2<f32>, PlaneError> {
     check_shape("weights", "[projector rows]", &[weights.len()], &[timing.projector_rows()])?;
     let (_, rows, columns) = transport.t.dim();
+    timing.check_columns(columns)?;
     let (end, camera_rows) = (first_row + rows, timing.camera_rows());
     if end > camera_rows {
         return Err(PlaneError::Rows { row: end - 1, camera_rows });
     }
 
+    let weight_of = |v: i64| usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
     let mut image = Array2::zeros((rows, columns));
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(at, mut image_row)| {
         let profiles = transport.t.index_axis(Axis(1), at);
         // In f64, because the light of thousands of dim rows adds up next to a bright one.
         let mut sum = Array1::<f64>::zeros(columns);
-        let u_of_row_0 = i64::from(timing.relative_row(0, first_row + at));
-        for (u, light) in (i64::from(transport.u_min)..).zip(profiles.outer_iter()) {
-            let v = u - u_of_row_0;
-            let weight = usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
-            if weight != 0.0 {
-                sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+        if let Some(response) = timing.response() {
+            let own_rows = response.own_rows(first_row + at);
+            for ((sum, profile), own_row) in sum.iter_mut().zip(profiles.columns()).zip(own_rows) {
+                let lit = (own_row + i64::from(transport.u_min)..).zip(profile);
+                *sum = lit.map(|(v, &light)| weight_of(v) * f64::from(light)).sum();
+            }
+        } else {
+            let own_row = timing.camera().own_row(first_row + at) as i64;
+            for (v, light) in (own_row + i64::from(transport.u_min)..).zip(profiles.outer_iter()) {
+                let weight = weight_of(v);
+                if weight != 0.0 {
+                    sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+                }
             }
         }
         image_row.zip_mut_with(&sum, |pixel, &sum| *pixel = sum as f32);

@@ -7,9 +7,10 @@ use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
 use rayon::prelude::*;
 
 use super::calibrate::FlyingSpot;
+use super::forward::{PLACE_STEPS, drawn};
 use super::pivot::RUN_PX;
 use super::quadratic::Quadratic;
-use super::{PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind};
+use super::{PixelResponse, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind};
 
 /// Number of pixels that are solved together: their vectors fit in the cache together with the model.
 const TILE_PX: usize = 512;
@@ -105,6 +106,10 @@ impl Objectives<'_> {
         go_on: &(dyn Fn() -> bool + Sync),
         work: &impl Work<T>,
     ) -> Result<(), PlaneError> {
+        if let Some(response) = self.timing.response() {
+            rows.iter().try_for_each(|row| self.timing.check_columns(row.columns))?;
+            return rows.par_iter_mut().try_for_each(|row| self.for_measured_row(response, row, go_on, work));
+        }
         // Neighbouring rows with the same model form a class. Classes are processed one at a time, so that factors
         // are kept no longer than needed.
         let mut classes: Vec<(RowModel, &mut [Row<T>])> = Vec::new();
@@ -121,6 +126,29 @@ impl Objectives<'_> {
 
     fn model(&self, t: usize) -> RowModel {
         RowModel::new(self.timing, self.settings, self.reach, t)
+    }
+
+    /// Processes a row whose pixels have measured responses: those that look at the same place between rows share an
+    /// objective. Direct light lies at `u = 0` by definition.
+    fn for_measured_row<T>(
+        &self,
+        response: &PixelResponse,
+        row: &mut Row<T>,
+        go_on: &(dyn Fn() -> bool + Sync),
+        work: &impl Work<T>,
+    ) -> Result<(), PlaneError> {
+        let drawn = drawn(self.timing, self.settings, row.t);
+        let direct = Direct { step: 0, weights: None };
+        for class in response.classes(row.t, 0..row.columns, PLACE_STEPS) {
+            if !go_on() {
+                return Err(PlaneError::Stopped);
+            }
+            let model = RowModel::measured(drawn.view(), self.reach, &class);
+            let problem = Problem::new(&model, &self.prior, &direct)?;
+            row.groups.insert(direct.clone(), class.columns);
+            self.for_group(&problem, &direct, std::slice::from_mut(row), work)?;
+        }
+        Ok(())
     }
 
     /// Processes rows with the same model.

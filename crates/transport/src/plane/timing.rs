@@ -1,7 +1,8 @@
 use std::cmp::Ordering::Less;
 use std::sync::Arc;
 
-use super::{Beam, PlaneError, Setting};
+use super::error::check_shape;
+use super::{Beam, PixelResponse, PlaneError, Setting};
 
 /// When each projector row is lit, how its light spreads, and which projector rows the camera's rows see.
 ///
@@ -24,6 +25,7 @@ pub struct RowTiming {
     row_starts_us: Arc<[f64]>,
     camera: CameraRows,
     beam: Beam,
+    response: Option<Arc<PixelResponse>>,
 }
 
 /// Which positions of the projector the camera's rows see, and when they are exposed.
@@ -79,7 +81,8 @@ impl RowTiming {
         }
         let row_starts_us = (0..=projector_rows).map(|v| v as f64 * row_time_us).collect();
         let camera = CameraRows { first_row: 0, rows: projector_rows, pitch: 1.0, row_time_us };
-        Self { row_time_us, period_us, row_starts_us, camera, beam: Beam::Ideal }.with_camera(camera)
+        Self { row_time_us, period_us, row_starts_us, camera, beam: Beam::Ideal, response: None }
+            .with_camera(camera)
     }
 
     /// The same projector with each row `v` lit from `starts_us[v]` to `starts_us[v + 1]`, relative to the nominal
@@ -115,6 +118,17 @@ impl RowTiming {
     pub fn with_beam(self, beam: Beam) -> Result<Self, PlaneError> {
         beam.check()?;
         Ok(Self { beam, ..self })
+    }
+
+    /// The same projector, seen by pixels whose places and responses were measured. They replace the beam, and the
+    /// camera's rows serve to count delays only.
+    ///
+    /// # Errors
+    /// [`PlaneError::Shape`] if the response does not have the camera's rows.
+    pub fn with_response(self, response: PixelResponse) -> Result<Self, PlaneError> {
+        let (rows, _) = response.size();
+        check_shape("response", "[camera rows]", &[rows], &[self.camera.rows])?;
+        Ok(Self { response: Some(Arc::new(response)), ..self })
     }
 
     /// The same projector, seen by `camera`.
@@ -186,6 +200,18 @@ impl RowTiming {
         self.beam
     }
 
+    /// Where each pixel looks and its response, if they were measured.
+    pub fn response(&self) -> Option<&PixelResponse> {
+        self.response.as_deref()
+    }
+
+    /// Checks that a stack has as many columns as the measured response, if there is one.
+    pub(super) fn check_columns(&self, columns: usize) -> Result<(), PlaneError> {
+        self.response.as_ref().map_or(Ok(()), |response| {
+            check_shape("stack", "[columns of the response]", &[columns], &[response.size().1])
+        })
+    }
+
     /// Which positions of the projector the camera's rows see, and when they are exposed.
     pub fn camera(&self) -> CameraRows {
         self.camera
@@ -221,6 +247,12 @@ impl RowTiming {
     /// VSYNC periods; shares exceed 1 only if it is longer than a period and sees the row more than once. `B` is the
     /// beam.
     pub fn weights(&self, t: usize, setting: &Setting) -> Vec<f64> {
+        self.beam.spread(self.drawn(t, setting))
+    }
+
+    /// The share of each projector row's dwell that falls inside the exposure of camera row `t`, `[projector_rows]`:
+    /// [`Self::weights`] without the beam.
+    pub(super) fn drawn(&self, t: usize, setting: &Setting) -> Vec<f64> {
         let rows = self.projector_rows();
         let (from_us, to_us) = self.exposed_us(t, setting);
         let first = ((from_us - self.row_starts_us[rows]) / self.period_us).ceil() as i32;
@@ -229,7 +261,7 @@ impl RowTiming {
         for frame in first..=last {
             self.shares_in_frame(t, frame, setting).for_each(|(v, share)| drawn[v] += share);
         }
-        self.beam.spread(drawn)
+        drawn
     }
 
     /// The share of each projector row's dwell that falls inside the exposure of camera row `t`, for rows that may be

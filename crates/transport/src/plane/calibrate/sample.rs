@@ -3,7 +3,9 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, ArrayView3, Axis, concatenate, s};
 use rayon::prelude::*;
 
-use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, reach};
+use super::super::forward::drawn;
+use super::super::response::{ResponseClass, collected};
+use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Shares, Slot, reach};
 use super::problem::RowProblem;
 use super::{CalibrateError, SpikeMap};
 
@@ -13,6 +15,10 @@ const PIXELS_PER_ROW: usize = 64;
 
 /// Samples with fewer pixels are not thinned.
 const MIN_PIXELS_TO_THIN: usize = 256;
+
+/// Steps of a pixel's measured place per projector row: coarser than for the solution, because each class is solved for
+/// several priors.
+const PLACE_STEPS: f32 = 8.0;
 
 /// A Gaussian beam is cut off here, as the tails beyond contain less than a millionth of the light.
 const BEAM_REACH_SIGMAS: f64 = 5.0;
@@ -42,7 +48,9 @@ pub(super) struct SampledClass {
     pub slots: Vec<Slot>,
     /// Weight of every projector row for the first pixel with an ideal beam, shape `[settings, projector rows]`.
     ideal: Array2<f64>,
-    own_row: usize,
+    own_row: i64,
+    /// The measured response of its pixels.
+    shares: Option<Shares>,
 }
 
 /// What is known or assumed about the light of the projector's rows.
@@ -108,11 +116,12 @@ impl Sample {
                 return Err(PlaneError::Shape { array, axes, actual, expected }.into());
             }
         }
+        timing.check_columns(columns)?;
         let usable = |at: usize, column: &usize| {
             valid.is_none_or(|valid| valid.slice(s![.., at, *column]).iter().all(|v| *v))
         };
         let unspread = timing.clone().with_beam(Beam::Ideal)?;
-        let rows: Vec<(RowModel, SampledClass)> = Self::rows_of(height)
+        let rows = Self::rows_of(height)
             .enumerate()
             .collect::<Vec<_>>()
             .into_par_iter()
@@ -136,16 +145,35 @@ impl Sample {
                 {
                     return Err(PlaneError::NotFinite { setting, row: t, column: columns[pixel] });
                 }
-                let model = RowModel::new(&unspread, &settings, &reach, t);
-                let slots = RowModel::new(&timing, &settings, &reach, t).slots;
-                let ideal = settings.iter().flat_map(|setting| unspread.weights(t, setting)).collect();
-                let ideal = Array2::from_shape_vec((settings.len(), timing.projector_rows()), ideal)
-                    .unwrap_or_default();
-                let own_row = timing.camera().own_row(t);
-                let pixels = columns.into_iter().map(|column| (t, column)).collect();
-                Ok((model, SampledClass { pixels, intensities, slots, ideal, own_row }))
+                let ideal = drawn(&timing, &settings, t);
+                let pixels = columns.iter().map(|&column| (t, column)).collect();
+                let Some(response) = timing.response() else {
+                    let model = RowModel::new(&unspread, &settings, &reach, t);
+                    let slots = RowModel::new(&timing, &settings, &reach, t).slots;
+                    let own_row = timing.camera().own_row(t) as i64;
+                    let class = SampledClass { pixels, intensities, slots, ideal, own_row, shares: None };
+                    return Ok(vec![(model, class)]);
+                };
+                let classes = response.classes(t, columns.iter().copied(), PLACE_STEPS);
+                let of_class = |class: ResponseClass| {
+                    let model = RowModel::measured(ideal.view(), &reach, &class);
+                    let ResponseClass { own_row, shares, columns: alike } = class;
+                    let kept: Vec<usize> =
+                        (0..columns.len()).filter(|&at| alike.contains(&columns[at])).collect();
+                    let class = SampledClass {
+                        pixels: alike.into_iter().map(|column| (t, column)).collect(),
+                        intensities: intensities.select(Axis(0), &kept),
+                        slots: model.slots.clone(),
+                        ideal: ideal.clone(),
+                        own_row,
+                        shares: Some(shares),
+                    };
+                    (model, class)
+                };
+                Ok(classes.into_iter().map(of_class).collect())
             })
-            .collect::<Result<_, _>>()?;
+            .collect::<Result<Vec<Vec<_>>, PlaneError>>()?
+            .concat();
         let mut classes: Vec<(RowModel, SampledClass)> = Vec::new();
         for (model, row) in rows.into_iter().filter(|(_, row)| !row.pixels.is_empty()) {
             match classes.last_mut() {
@@ -210,12 +238,18 @@ impl SampledClass {
     }
 
     /// `A`, shape `[settings, slots]`, with a Gaussian beam: a row receives light while the rows around it are drawn.
+    /// A measured response takes the place of the beam.
     pub fn weights(&self, beam_sigma_rows: f64) -> Array2<f64> {
+        if let Some(shares) = &self.shares {
+            return Array2::from_shape_fn((self.ideal.nrows(), self.slots.len()), |(n, slot)| {
+                collected(self.ideal.row(n), shares, self.own_row + i64::from(self.slots[slot].u))
+            });
+        }
         let beam = beam_shares(beam_sigma_rows);
         let projector_rows = self.ideal.ncols();
         let mut weights = Array2::zeros((self.ideal.nrows(), self.slots.len()));
         for (mut weights, slot) in weights.columns_mut().into_iter().zip(&self.slots) {
-            let lit = self.own_row as i64 + i64::from(slot.u);
+            let lit = self.own_row + i64::from(slot.u);
             for &(offset_rows, share) in &beam {
                 if let Ok(drawn) = usize::try_from(lit - offset_rows)
                     && drawn < projector_rows
