@@ -5,7 +5,8 @@
 
 use ndarray::{Array2, Array3, s};
 use raysweep_transport::plane::{
-    Demux, FIRST_RESPONSE_ROW, PixelResponse, Prior, RESPONSE_ROWS, RowTiming, Setting, Shares, relight,
+    CameraRows, Demux, FIRST_RESPONSE_ROW, PixelResponse, Prior, RESPONSE_ROWS, RowTiming, Setting, Shares,
+    Transport, relight,
 };
 
 const ROWS: usize = 160;
@@ -99,9 +100,13 @@ fn response() -> PixelResponse {
 /// Median over the pixels of the relative error of the profile.
 fn error(timing: RowTiming) -> f64 {
     let demux = Demux::new(timing, settings(), Prior::Split { alpha: 0.01, beta: 0.0 }).unwrap();
-    let transport = demux.solve(stack().view(), None).unwrap();
+    median_error(&demux.solve(stack().view(), None).unwrap())
+}
+
+fn median_error(transport: &Transport) -> f64 {
     let mut errors: Vec<f64> = Vec::new();
-    for (t, s) in (0..HEIGHT).flat_map(|t| (0..WIDTH).map(move |s| (t, s))) {
+    let (_, rows, columns) = transport.t.dim();
+    for (t, s) in (0..rows).flat_map(|t| (0..columns).map(move |s| (t, s))) {
         let (mut wrong, mut all) = (0.0, 0.0);
         for (index, &found) in transport.t.slice(s![.., t, s]).iter().enumerate() {
             let truth = light(t, s, transport.u_min + index as i32);
@@ -139,6 +144,35 @@ fn a_response_on_whole_rows_is_the_ideal_beam() {
     assert_eq!(nominal.t.dim(), measured.t.dim());
     assert!((&nominal.t - &measured.t).iter().all(|difference| difference.abs() < 1e-5));
     assert!((&nominal_images - &measured_images).iter().all(|difference| difference.abs() < 1e-4));
+}
+
+/// Camera rows of other pitch than the projector's look between its rows: their direct light is one spike still.
+#[test]
+fn camera_rows_between_projector_rows_keep_their_direct_light_in_one_row() {
+    for pitch in [0.75, 1.25, 1.5] {
+        let place = |t: usize| FIRST_ROW as f64 + pitch * t as f64;
+        let stack = Array3::from_shape_fn((settings().len(), HEIGHT, 4), |(n, t, s)| {
+            let setting = &settings()[n];
+            // The exposure follows the place at the projector's pace; a footprint one row high divides the light.
+            let centre_us = (place(t) + 0.5) * TAU_US + setting.delays_us[0];
+            let (from, to) = (centre_us - setting.exposure_us / 2.0, centre_us + setting.exposure_us / 2.0);
+            let (own, fraction) = (place(t).round(), place(t) - place(t).round());
+            let drawn = |v: f64| (((v + 1.0) * TAU_US).min(to) - (v * TAU_US).max(from)).max(0.0) / TAU_US;
+            let of_row = |u: i32| {
+                let v = own + f64::from(u);
+                let divided =
+                    drawn(v) * (1.0 - fraction.abs()) + drawn(v + fraction.signum()) * fraction.abs();
+                divided * light(t, s, u)
+            };
+            (-69..=70).map(of_row).sum::<f64>() as f32
+        });
+        let camera = CameraRows { first_row: FIRST_ROW, rows: HEIGHT, pitch, row_time_us: pitch * TAU_US };
+        let timing = RowTiming::new(ROWS, TAU_US, 10_000.0).unwrap().with_camera(camera).unwrap();
+        let demux = Demux::new(timing, settings(), Prior::Split { alpha: 0.01, beta: 0.0 }).unwrap();
+        let transport = demux.solve(stack.view(), None).unwrap();
+        let error = median_error(&transport);
+        assert!(error < 0.03, "pitch {pitch}: {error}");
+    }
 }
 
 #[test]

@@ -1,4 +1,5 @@
 use super::PlaneError;
+use super::response::{FIRST_RESPONSE_ROW, Shares};
 
 /// The spread of the light of one projector row over the rows of the scene.
 ///
@@ -48,6 +49,18 @@ impl Beam {
             }
             _ => Ok(()),
         }
+    }
+
+    /// The shares of the rows drawn around a row in its light, if a response is long enough for them.
+    pub(super) fn shares(&self) -> Option<Shares> {
+        let share = |d: f64| match *self {
+            Self::Ideal => f64::from(u8::from(d == 0.0)),
+            Self::Gaussian { sigma_rows } => (-(d / sigma_rows).powi(2) / 2.0).exp(),
+        };
+        let shares: Shares = std::array::from_fn(|index| share(index as f64 + f64::from(FIRST_RESPONSE_ROW)));
+        let total: f64 = shares.iter().sum();
+        let fits = TAIL_SIGMAS * self.sigma_rows() <= -f64::from(FIRST_RESPONSE_ROW);
+        fits.then(|| shares.map(|share| share / total))
     }
 
     /// Converts the weights of the drawn rows to those of the scene's rows: `A' = A B`, for one row of `A`. Both have

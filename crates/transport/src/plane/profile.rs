@@ -67,7 +67,7 @@ impl DelayProfile {
         let reach = transport.u_min..=transport.u_max();
         for of_row in pixels.chunk_by(|a, b| a[0] == b[0]) {
             let at = of_row[0][0];
-            let columns = timing.response().map_or(transport.t.len_of(Axis(2)), |response| response.size().1);
+            let columns = transport.t.len_of(Axis(2));
             let wanted: BTreeSet<usize> = of_row.iter().map(|&[_, s]| s).collect();
             for (model, mut columns) in RowModel::of_pixels(timing, settings, &reach, first_row + at, columns)
             {

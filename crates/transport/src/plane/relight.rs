@@ -47,7 +47,7 @@ pub fn relight_rows(
         // In f64, because the light of thousands of dim rows adds up next to a bright one.
         let mut sum = Array1::<f64>::zeros(columns);
         if let Some(response) = timing.response() {
-            let own_rows = response.own_rows(first_row + at);
+            let own_rows = response.own_rows(first_row + at, columns);
             for ((sum, profile), own_row) in sum.iter_mut().zip(profiles.columns()).zip(own_rows) {
                 let lit = (own_row + i64::from(transport.u_min)..).zip(profile);
                 *sum = lit.map(|(v, &light)| weight_of(v) * f64::from(light)).sum();

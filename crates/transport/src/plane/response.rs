@@ -26,9 +26,9 @@ pub const FIRST_RESPONSE_ROW: i32 = -7;
 /// definition, whatever the shape of the beam and wherever the pixel looks between two rows.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PixelResponse {
-    /// `[t, s]`, in projector rows.
+    /// `[t, s]`, in projector rows; one column stands for all.
     places: Array2<f32>,
-    /// `k(d)`, `[RESPONSE_ROWS, t, s]`; its sum over `d` is 1.
+    /// `k(d)`, `[RESPONSE_ROWS, t, s]` with the same columns; its sum over `d` is 1.
     shares: Array3<f32>,
 }
 
@@ -47,7 +47,7 @@ pub(super) struct ResponseClass {
 }
 
 impl PixelResponse {
-    /// A response from the place of each pixel, `[t, s]` in projector rows, and the shares of the rows `-7..=8` around
+    /// A response from the place of each pixel, `[t, s]` in projector rows (one column stands for all), and the shares of the rows `-7..=8` around
     /// the place's nearest row in the pixel's direct light, `[RESPONSE_ROWS, t, s]`.
     ///
     /// # Errors
@@ -55,6 +55,7 @@ impl PixelResponse {
     /// finite, or shares that do not add up to 1 within 2 %.
     pub fn new(places: Array2<f32>, shares: Array3<f32>) -> Result<Self, PlaneError> {
         let (rows, columns) = places.dim();
+        check_shape("place", "[camera rows, at least 1 column]", &[columns.max(1)], &[columns])?;
         check_shape(
             "response",
             "[16, camera rows, columns]",
@@ -114,9 +115,13 @@ impl PixelResponse {
         self.places.dim()
     }
 
-    /// The projector row nearest to the place of each pixel of camera row `t`, from which its relative rows count.
-    pub fn own_rows(&self, t: usize) -> impl Iterator<Item = i64> {
-        self.places.row(t).into_iter().map(|place| place.round() as i64)
+    /// The projector row nearest to the place of each of `columns` pixels of camera row `t`, from which its relative rows count.
+    pub fn own_rows(&self, t: usize, columns: usize) -> impl Iterator<Item = i64> {
+        (0..columns).map(move |s| self.places[[t, self.column(s)]].round() as i64)
+    }
+
+    fn column(&self, s: usize) -> usize {
+        s.min(self.places.ncols() - 1)
     }
 
     /// Some columns of camera row `t` by the place that they see, in classes of `1 / steps` of a row.
@@ -128,13 +133,13 @@ impl PixelResponse {
     ) -> Vec<ResponseClass> {
         let mut by_step: BTreeMap<(i64, i32), Vec<usize>> = BTreeMap::new();
         for column in columns {
-            let place = self.places[[t, column]];
+            let place = self.places[[t, self.column(column)]];
             let step = ((place - place.round()) * steps).round() as i32;
             by_step.entry((place.round() as i64, step)).or_default().push(column);
         }
         let class = |((own_row, _), columns): ((i64, i32), Vec<usize>)| {
             let mean = |d: usize| {
-                let sum: f64 = columns.iter().map(|&s| f64::from(self.shares[[d, t, s]])).sum();
+                let sum: f64 = columns.iter().map(|&s| f64::from(self.shares[[d, t, self.column(s)]])).sum();
                 sum / columns.len() as f64
             };
             ResponseClass { own_row, shares: std::array::from_fn(mean), columns }
@@ -167,7 +172,7 @@ mod tests {
         let response = PixelResponse::with_beam(places, &ideal()).unwrap();
         let of = |s: usize| -> Vec<f32> { (6..9).map(|d| response.shares()[[d, 0, s]]).collect() };
         assert_eq!((of(0), of(1), of(2)), (vec![0., 1., 0.], vec![0., 0.75, 0.25], vec![0.25, 0.75, 0.]));
-        assert_eq!(response.own_rows(0).collect::<Vec<_>>(), [10, 10, 10]);
+        assert_eq!(response.own_rows(0, 3).collect::<Vec<_>>(), [10, 10, 10]);
     }
 
     #[test]

@@ -1,6 +1,8 @@
 use std::cmp::Ordering::Less;
 use std::sync::Arc;
 
+use ndarray::Array2;
+
 use super::error::check_shape;
 use super::{Beam, PixelResponse, PlaneError, Setting};
 
@@ -25,7 +27,18 @@ pub struct RowTiming {
     row_starts_us: Arc<[f64]>,
     camera: CameraRows,
     beam: Beam,
-    response: Option<Arc<PixelResponse>>,
+    response: Response,
+}
+
+/// How pixels respond to the rows drawn around their own.
+#[derive(Debug, Clone, PartialEq)]
+enum Response {
+    /// As the beam spreads each row; every pixel looks at the middle of its own row.
+    Beam,
+    /// The same, but camera rows look between projector rows.
+    BetweenRows(Arc<PixelResponse>),
+    /// As measured.
+    Measured(Arc<PixelResponse>),
 }
 
 /// Which positions of the projector the camera's rows see, and when they are exposed.
@@ -81,7 +94,7 @@ impl RowTiming {
         }
         let row_starts_us = (0..=projector_rows).map(|v| v as f64 * row_time_us).collect();
         let camera = CameraRows { first_row: 0, rows: projector_rows, pitch: 1.0, row_time_us };
-        Self { row_time_us, period_us, row_starts_us, camera, beam: Beam::Ideal, response: None }
+        Self { row_time_us, period_us, row_starts_us, camera, beam: Beam::Ideal, response: Response::Beam }
             .with_camera(camera)
     }
 
@@ -117,7 +130,7 @@ impl RowTiming {
     /// Those of [`Beam::check`].
     pub fn with_beam(self, beam: Beam) -> Result<Self, PlaneError> {
         beam.check()?;
-        Ok(Self { beam, ..self })
+        Self { beam, ..self }.between_rows()
     }
 
     /// The same projector, seen by pixels whose places and responses were measured. They replace the beam, and the
@@ -128,7 +141,23 @@ impl RowTiming {
     pub fn with_response(self, response: PixelResponse) -> Result<Self, PlaneError> {
         let (rows, _) = response.size();
         check_shape("response", "[camera rows]", &[rows], &[self.camera.rows])?;
-        Ok(Self { response: Some(Arc::new(response)), ..self })
+        Ok(Self { response: Response::Measured(Arc::new(response)), ..self })
+    }
+
+    /// The response that follows from the beam, if the camera's rows look between projector rows. Beams of many rows
+    /// are left as they are: they blur what lies between rows.
+    fn between_rows(self) -> Result<Self, PlaneError> {
+        let camera = self.camera;
+        let is_between = (0..camera.rows).any(|t| camera.place(t).fract() != 0.0);
+        let response = match (self.response, self.beam.shares().filter(|_| is_between)) {
+            (Response::Measured(response), _) => Response::Measured(response),
+            (_, Some(shares)) => {
+                let places = Array2::from_shape_fn((camera.rows, 1), |(t, _)| camera.place(t) as f32);
+                Response::BetweenRows(Arc::new(PixelResponse::with_beam(places, &shares)?))
+            }
+            (_, None) => Response::Beam,
+        };
+        Ok(Self { response, ..self })
     }
 
     /// The same projector, seen by `camera`.
@@ -152,7 +181,7 @@ impl RowTiming {
         if camera.rows == 0 || end > projector_rows {
             return Err(PlaneError::Window { first_row: camera.first_row, end, projector_rows });
         }
-        Ok(Self { camera, ..self })
+        Self { camera, ..self }.between_rows()
     }
 
     /// The same projector, seen by `camera_rows` rows with the projector's pitch and row time, starting at projector
@@ -200,14 +229,26 @@ impl RowTiming {
         self.beam
     }
 
-    /// Where each pixel looks and its response, if they were measured.
+    /// Where each pixel looks and how it responds, if that was measured, or if the camera's rows look between projector
+    /// rows.
     pub fn response(&self) -> Option<&PixelResponse> {
-        self.response.as_deref()
+        match &self.response {
+            Response::Beam => None,
+            Response::BetweenRows(response) | Response::Measured(response) => Some(response),
+        }
+    }
+
+    /// The response, if it was measured.
+    pub fn measured_response(&self) -> Option<&PixelResponse> {
+        match &self.response {
+            Response::Measured(response) => Some(response),
+            Response::Beam | Response::BetweenRows(_) => None,
+        }
     }
 
     /// Checks that a stack has as many columns as the measured response, if there is one.
     pub(super) fn check_columns(&self, columns: usize) -> Result<(), PlaneError> {
-        self.response.as_ref().map_or(Ok(()), |response| {
+        self.measured_response().map_or(Ok(()), |response| {
             check_shape("stack", "[columns of the response]", &[columns], &[response.size().1])
         })
     }
@@ -313,13 +354,13 @@ impl RowTiming {
 
     /// By how much the exposure of camera row `t` is later than its setting's delay, relative to the nominal centre
     /// of its own row: zero for rows with the projector's pitch and row time.
-    fn exposure_shift_us(&self, t: usize) -> f64 {
+    pub(super) fn exposure_shift_us(&self, t: usize) -> f64 {
         let rows = self.camera.own_row(t) - self.camera.first_row;
         t as f64 * self.camera.row_time_us - rows as f64 * self.row_time_us
     }
 
     /// By how much row `v` begins later than nominally.
-    fn late_us(&self, v: usize) -> f64 {
+    pub(super) fn late_us(&self, v: usize) -> f64 {
         self.row_starts_us[v] - v as f64 * self.row_time_us
     }
 

@@ -49,6 +49,8 @@ pub(super) struct SampledClass {
     /// Weight of every projector row for the first pixel with an ideal beam, shape `[settings, projector rows]`.
     ideal: Array2<f64>,
     own_row: i64,
+    /// How far below its own row it looks, in rows.
+    fraction: f64,
     /// The measured response of its pixels.
     shares: Option<Shares>,
 }
@@ -147,11 +149,13 @@ impl Sample {
                 }
                 let ideal = drawn(&timing, &settings, t);
                 let pixels = columns.iter().map(|&column| (t, column)).collect();
-                let Some(response) = timing.response() else {
+                let Some(response) = timing.measured_response() else {
                     let model = RowModel::new(&unspread, &settings, &reach, t);
                     let slots = RowModel::new(&timing, &settings, &reach, t).slots;
                     let own_row = timing.camera().own_row(t) as i64;
-                    let class = SampledClass { pixels, intensities, slots, ideal, own_row, shares: None };
+                    let fraction = timing.camera().place(t) - own_row as f64;
+                    let class =
+                        SampledClass { pixels, intensities, slots, ideal, own_row, fraction, shares: None };
                     return Ok(vec![(model, class)]);
                 };
                 let classes = response.classes(t, columns.iter().copied(), PLACE_STEPS);
@@ -166,6 +170,7 @@ impl Sample {
                         slots: model.slots.clone(),
                         ideal: ideal.clone(),
                         own_row,
+                        fraction: 0.0,
                         shares: Some(shares),
                     };
                     (model, class)
@@ -177,7 +182,11 @@ impl Sample {
         let mut classes: Vec<(RowModel, SampledClass)> = Vec::new();
         for (model, row) in rows.into_iter().filter(|(_, row)| !row.pixels.is_empty()) {
             match classes.last_mut() {
-                Some((same, class)) if *same == model && class.slots == row.slots => class.append(row),
+                Some((same, class))
+                    if *same == model && class.slots == row.slots && class.fraction == row.fraction =>
+                {
+                    class.append(row)
+                }
                 _ => classes.push((model, row)),
             }
         }
@@ -245,13 +254,13 @@ impl SampledClass {
                 collected(self.ideal.row(n), shares, self.own_row + i64::from(self.slots[slot].u))
             });
         }
-        let beam = beam_shares(beam_sigma_rows);
+        let beam = between_rows(beam_shares(beam_sigma_rows), self.fraction);
         let projector_rows = self.ideal.ncols();
         let mut weights = Array2::zeros((self.ideal.nrows(), self.slots.len()));
         for (mut weights, slot) in weights.columns_mut().into_iter().zip(&self.slots) {
             let lit = self.own_row + i64::from(slot.u);
-            for &(offset_rows, share) in &beam {
-                if let Ok(drawn) = usize::try_from(lit - offset_rows)
+            for &(offset_rows, share) in beam.iter().rev() {
+                if let Ok(drawn) = usize::try_from(lit + offset_rows)
                     && drawn < projector_rows
                 {
                     weights.scaled_add(share, &self.ideal.column(drawn));
@@ -307,6 +316,18 @@ fn beam_shares(sigma_rows: f64) -> Vec<(i64, f64)> {
     let share = |offset: i64| (-0.5 * (offset as f64 / sigma_rows).powi(2)).exp();
     let total: f64 = (-reach..=reach).map(share).sum();
     (-reach..=reach).map(|offset| (offset, share(offset) / total)).collect()
+}
+
+/// The shares for a pixel that looks `fraction` of a row below its own row: its light is divided between the two rows.
+fn between_rows(beam: Vec<(i64, f64)>, fraction: f64) -> Vec<(i64, f64)> {
+    if fraction == 0.0 {
+        return beam;
+    }
+    let side = fraction.signum() as i64;
+    let divided = |(offset, share): (i64, f64)| {
+        [(offset, share * (1.0 - fraction.abs())), (offset + side, share * fraction.abs())]
+    };
+    beam.into_iter().flat_map(divided).collect()
 }
 
 /// `0..length` divided into at most `count` non-empty ranges of nearly the same length.

@@ -48,8 +48,27 @@ impl FlyingSpot {
     }
 }
 
+/// When the direct row of a camera row is drawn, relative to a delay of 0 of that camera row.
+struct DirectRow {
+    start_us: f64,
+    dwell_us: f64,
+}
+
+impl DirectRow {
+    fn of(timing: &RowTiming, t: usize) -> Self {
+        let row = timing.camera().own_row(t);
+        let (late_us, next_late_us) = (timing.late_us(row), timing.late_us(row + 1));
+        let row_time_us = timing.row_time_us();
+        Self {
+            start_us: late_us - row_time_us / 2.0 - timing.exposure_shift_us(t),
+            dwell_us: row_time_us + (next_late_us - late_us),
+        }
+    }
+}
+
 /// Settings that a flying spot makes unreliable if a pixel's projector column is unknown: those with an edge within
-/// half a row time plus half the jitter of the centre of the direct row, where the spot may or may not have passed.
+/// half a row time plus half the jitter of the centre of the direct row of any camera row, where the spot may or may
+/// not have passed.
 /// Indices in ascending order.
 ///
 /// With a projector that lights its rows uniformly, no settings need to be dropped.
@@ -66,14 +85,20 @@ pub fn settings_on_direct_row(
         let allowed = "finite and not negative: give the spread of the measured delays, in microseconds";
         return Err(PlaneError::OutOfRange { field: "jitter_us", value: jitter_us, allowed });
     }
-    let half_width_us = (timing.row_time_us() + jitter_us) / 2.0;
+    let rows: Vec<DirectRow> = (0..timing.camera_rows()).map(|t| DirectRow::of(timing, t)).collect();
+    let period_us = timing.period_us();
+    let is_on = |row: &DirectRow, edge_us: f64| {
+        // The direct row is drawn again in each period, and long exposures reach it.
+        let from_centre_us = edge_us - row.start_us - row.dwell_us / 2.0;
+        let distance_us = (from_centre_us - period_us * (from_centre_us / period_us).round()).abs();
+        distance_us < (row.dwell_us + jitter_us) / 2.0
+    };
     let on_row = |setting: &Setting| {
+        let half_us = setting.exposure_us / 2.0;
         setting.delays_us.iter().any(|delay_us| {
-            [delay_us - setting.exposure_us / 2.0, delay_us + setting.exposure_us / 2.0]
-                // The direct row is drawn again in each period, and long exposures reach it.
-                .map(|edge_us| (edge_us - timing.period_us() * (edge_us / timing.period_us()).round()).abs())
+            [delay_us - half_us, delay_us + half_us]
                 .iter()
-                .any(|distance_us| *distance_us < half_width_us)
+                .any(|&edge_us| rows.iter().any(|row| is_on(row, edge_us)))
         })
     };
     Ok((0..settings.len()).filter(|&n| on_row(&settings[n])).collect())
@@ -84,7 +109,7 @@ pub fn settings_on_direct_row(
 /// per period. It replaces the column of `A` at `u = 0`.
 ///
 /// `projector_column` is the column that the pixel sees, in 0..1 over the projector's width. Direct light arrives
-/// `tau (projector_column - 1/2)` after the centre of its row, or as much before it if the row is drawn backwards.
+/// after this share of its row's dwell, or as long before the row's end if the row is drawn backwards.
 ///
 /// # Errors
 /// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] for a column outside 0..=1.
@@ -102,7 +127,8 @@ pub fn spike_weights(
     }
     let backwards = scan == Scan::Bidirectional && timing.camera().own_row(t) % 2 == 1;
     let column = if backwards { 1.0 - projector_column } else { projector_column };
-    let moment_us = timing.row_time_us() * (column - 0.5);
+    let row = DirectRow::of(timing, t);
+    let moment_us = row.start_us + row.dwell_us * column;
     let weight = |setting: &Setting| {
         let passes = setting.delays_us.iter().map(|delay_us| {
             // The moments are a period apart: count those after the start, minus those after the end.
@@ -117,6 +143,7 @@ pub fn spike_weights(
 
 #[cfg(test)]
 mod tests {
+    use super::super::super::CameraRows;
     use super::*;
 
     fn timing() -> RowTiming {
@@ -155,6 +182,22 @@ mod tests {
         assert_eq!(weights(0, Scan::Bidirectional), weights(0, Scan::OneWay));
         assert_eq!(weights(1, Scan::Bidirectional), [0.0, 0.0, 1.0, 0.25, 3.0]);
         assert!(spike_weights(&timing(), &settings, 0, 1.5, Scan::OneWay).is_err());
+    }
+
+    #[test]
+    fn a_measured_table_and_a_slower_camera_move_the_spot() {
+        // Row 10 begins 7 us late and lasts 26 us; camera row 10 begins 10 * 0.5 us after the projector's row 10.
+        let mut starts_us: Vec<f64> = (0..=128).map(|v| f64::from(v) * 20.0).collect();
+        (starts_us[10], starts_us[11]) = (207.0, 233.0);
+        let camera = CameraRows { first_row: 0, rows: 128, pitch: 1.0, row_time_us: 20.5 };
+        let timing = timing().with_row_table(&starts_us).unwrap().with_camera(camera).unwrap();
+        // Nominally the row is drawn from -10 to 10 us; here from -10 + 7 - 5 = -8 to 18 us: column 0.75 at 11.5 us.
+        let settings = [310.0, 313.0].map(|delay_us| Setting::new(delay_us, 600.0));
+        assert_eq!(spike_weights(&timing, &settings, 10, 0.75, Scan::OneWay), Ok(vec![1.0, 0.0]));
+        assert_eq!(spike_weights(&timing, &settings, 10, 0.9, Scan::OneWay), Ok(vec![1.0, 1.0]));
+        // An edge at 15 us cuts this row, and no other: their rows are drawn from -10 - t / 2 to 10 - t / 2 us.
+        let cut = [315.0, 319.0].map(|delay_us| Setting::new(delay_us, 600.0));
+        assert_eq!(settings_on_direct_row(&timing, &cut, 0.0), Ok(vec![0]));
     }
 
     #[test]
