@@ -1,4 +1,5 @@
-//! Divides an image's pixels into tiles that share an objective, for [`super::Demux`] and [`super::Uncertainty`].
+//! Divides an image's pixels into tiles that share an objective, for [`super::Demux`] and
+//! [`super::super::Uncertainty`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -6,10 +7,11 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
 use rayon::prelude::*;
 
-use super::calibrate::FlyingSpot;
+use super::super::PlaneError;
+use super::super::model::{FlyingSpot, RowModel, RowTiming, Setting, Slot, SlotKind};
+use super::Prior;
 use super::pivot::RUN_PX;
 use super::quadratic::Quadratic;
-use super::{PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind};
 
 /// Number of pixels that are solved together: their vectors fit in the cache together with the model.
 const TILE_PX: usize = 512;
@@ -29,7 +31,7 @@ pub fn objectives_bytes(reach_rows: u64, threads: u64) -> u64 {
 
 /// The inputs of the objectives of all pixels.
 #[derive(Clone, Copy)]
-pub(super) struct Objectives<'a> {
+pub struct Objectives<'a> {
     pub timing: &'a RowTiming,
     pub settings: &'a [Setting],
     pub prior: Prior,
@@ -38,7 +40,7 @@ pub(super) struct Objectives<'a> {
 }
 
 /// A camera row and the data to process.
-pub(super) struct Row<'a, T> {
+pub struct Row<'a, T> {
     /// Its index in the camera.
     t: usize,
     columns: usize,
@@ -59,7 +61,7 @@ struct Direct {
 }
 
 /// The objective of pixels with the same direct light and the same valid samples.
-pub(super) struct Problem<'a> {
+pub struct Problem<'a> {
     pub model: &'a RowModel,
     /// The indices of the settings in use.
     pub settings: Vec<usize>,
@@ -71,7 +73,7 @@ pub(super) struct Problem<'a> {
 
 /// Direct light between two rows: one unknown, in the slot of row 0, that represents light in both rows.
 #[derive(Clone, Copy)]
-pub(super) struct Spike {
+pub struct Spike {
     /// The slot of row 0.
     pub own: usize,
     /// The slot of the row on the other side, if the projector has this row.
@@ -82,7 +84,7 @@ pub(super) struct Spike {
 
 /// Pixels that share an objective, each given by the index of its row and its column.
 #[derive(Default)]
-pub(super) struct Tile {
+pub struct Tile {
     pub pixels: Vec<(usize, usize)>,
     /// Lengths of the runs of pixels: neighbours in one row, so that an image solved in parts gives the same result
     /// as one solved as a whole.
@@ -90,7 +92,7 @@ pub(super) struct Tile {
 }
 
 /// The processing of a tile, whose pixels lie in these rows.
-pub(super) trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
+pub trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
 impl<T, F: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync> Work<T> for F {}
 
 impl Objectives<'_> {

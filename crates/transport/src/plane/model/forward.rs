@@ -3,7 +3,8 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
-use super::{PlaneError, RowTiming, Setting};
+use super::super::PlaneError;
+use super::{RowTiming, Setting};
 
 /// A row is an unknown if some setting collects at least this share of its dwell.
 pub const MIN_WEIGHT: f64 = 0.05;

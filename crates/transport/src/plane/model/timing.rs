@@ -1,7 +1,8 @@
 use std::cmp::Ordering::Less;
 use std::sync::Arc;
 
-use super::{Beam, PlaneError, Setting};
+use super::super::PlaneError;
+use super::{Beam, Setting};
 
 /// When each projector row is lit, how its light spreads, and which projector rows the camera's rows see.
 ///

@@ -1,6 +1,7 @@
 use ndarray::ArrayView1;
 
-use super::super::{PlaneError, RowTiming, Setting};
+use super::super::PlaneError;
+use super::{RowTiming, Setting};
 
 /// The direction in which a flying spot draws its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,0 +1,15 @@
+//! The forward model: which light of which projector row a camera row collects with a setting.
+
+mod beam;
+mod forward;
+mod setting;
+mod spot;
+mod timing;
+mod transport;
+
+pub use beam::Beam;
+pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
+pub use setting::{Setting, delay_us, offset_us};
+pub use spot::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};
+pub use timing::{CameraRows, RowTiming};
+pub use transport::Transport;
