@@ -5,7 +5,8 @@ use std::ops::RangeInclusive;
 use ndarray::{Array1, Array2, Axis};
 use rayon::prelude::*;
 
-use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SlotKind, cholesky, reach};
+use super::solve::cholesky;
+use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SlotKind, reach};
 
 /// Noise of the camera, in the units of the transport: 1 is the light that a white pixel collects in one row time.
 #[derive(Debug, Clone, Copy, PartialEq)]

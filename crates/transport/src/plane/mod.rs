@@ -17,46 +17,24 @@
 //! a [`Prior`]. [`Coupling`] averages similar pixels beforehand, based on a [`NoiseModel`], and [`Uncertainty`]
 //! computes the noise that remains in the result. [`calibrate`] estimates the model's parameters from the stack
 //! itself.
+//!
+//! The folders import each other in one direction: `solve` imports `model`; [`calibrate`], `products` and [`advice`]
+//! import both, and `noise`.
 
 pub mod advice;
-mod beam;
 pub mod board;
 pub mod calibrate;
-mod cholesky;
-mod coupling;
-mod demux;
-mod dense;
 mod error;
-mod forward;
-mod narrow;
+mod model;
 mod noise;
-mod pivot;
-mod prior;
-mod profile;
-mod quadratic;
-pub mod reference;
-mod relight;
-mod response;
-mod setting;
-mod simd;
-mod tiles;
-mod timing;
-mod transport;
-mod uncertainty;
+mod products;
+mod solve;
 
-pub use beam::Beam;
-pub use coupling::{Coupled, Coupling};
-pub use demux::Demux;
 pub use error::PlaneError;
-pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
-pub use noise::NoiseModel;
-pub use prior::Prior;
-pub use profile::DelayProfile;
-pub use relight::{relight, relight_rows};
-pub use response::{FIRST_RESPONSE_ROW, PixelResponse, RESPONSE_ROWS, Shares};
-pub use setting::{Setting, delay_us, offset_us};
-pub use simd::SimdLevel;
-pub use tiles::objectives_bytes;
-pub use timing::{CameraRows, RowTiming};
-pub use transport::Transport;
-pub use uncertainty::{Samples, Uncertainty};
+pub use model::{
+    Beam, CameraRows, FIRST_RESPONSE_ROW, MIN_WEIGHT, PixelResponse, RESPONSE_ROWS, RowModel, RowTiming,
+    Setting, Shares, Slot, SlotKind, Transport, delay_us, offset_us, predict, reach, relative_rows,
+};
+pub use noise::{Coupled, Coupling, NoiseModel};
+pub use products::{DelayProfile, Samples, Uncertainty, relight, relight_rows};
+pub use solve::{Demux, Prior, SimdLevel, objectives_bytes, reference};

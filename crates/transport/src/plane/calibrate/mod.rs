@@ -16,11 +16,10 @@ mod holdout;
 mod problem;
 mod sample;
 mod spike;
-mod spot;
 
+pub use super::model::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};
 pub use beam::{BeamEstimate, OpticsEstimate, beam_sigma, estimate_optics};
 pub use error::CalibrateError;
 pub use holdout::{Candidate, Choice, candidates, choose_prior};
 pub use sample::{Optics, Sample};
 pub use spike::{SpikeMap, spike_offset};
-pub use spot::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};

@@ -1,9 +1,10 @@
 use ndarray::{Array1, Array2, ArrayView2, Axis, s};
 use rayon::prelude::*;
 
-use super::super::pivot::{RUN_PX, Start, minimise};
-use super::super::quadratic::Quadratic;
-use super::super::{PlaneError, Prior, SimdLevel, cholesky};
+use super::super::solve::cholesky;
+use super::super::solve::pivot::{RUN_PX, Start, minimise};
+use super::super::solve::quadratic::Quadratic;
+use super::super::{PlaneError, Prior, SimdLevel};
 
 /// The objective of one camera row, for weights that vary during calibration.
 pub(super) struct RowProblem {

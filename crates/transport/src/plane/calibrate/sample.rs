@@ -3,8 +3,7 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, ArrayView3, Axis, concatenate, s};
 use rayon::prelude::*;
 
-use super::super::forward::drawn;
-use super::super::response::{ResponseClass, collected};
+use super::super::model::{ResponseClass, collected, drawn};
 use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Shares, Slot, reach};
 use super::problem::RowProblem;
 use super::{CalibrateError, SpikeMap};

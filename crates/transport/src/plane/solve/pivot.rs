@@ -25,10 +25,10 @@ const TOLERANCE: f64 = 1e-11;
 
 /// Length of runs for [`Start::Runs`]: shorter runs need more means to be solved, the pixels of longer ones differ
 /// more.
-pub(super) const RUN_PX: usize = 64;
+pub const RUN_PX: usize = 64;
 
 /// The initial set of free slots.
-pub(super) enum Start<'a> {
+pub enum Start<'a> {
     /// The given slots, `[pixels, slots]`.
     Free(ArrayView2<'a, bool>),
     /// The pixels form consecutive runs of these lengths. Each starts from the free slots of the minimum for its
@@ -38,12 +38,7 @@ pub(super) enum Start<'a> {
 
 /// Minimises `x'Hx - 2 c'x` over `x >= 0` for pixels that share `H`. `linear` contains their `c`, `[pixels, slots]`
 /// in standard layout; the result contains their `x`.
-pub(super) fn minimise(
-    simd: SimdLevel,
-    quadratic: &Quadratic,
-    linear: Array2<f64>,
-    start: &Start,
-) -> Array2<f64> {
+pub fn minimise(simd: SimdLevel, quadratic: &Quadratic, linear: Array2<f64>, start: &Start) -> Array2<f64> {
     if linear.is_empty() {
         return linear;
     }
@@ -73,7 +68,7 @@ pub(super) fn minimise(
 
 /// Minimises `x'Hx - 2 c'x` with `x = 0` in all slots that are not free and any sign of `x` in the others. `free` is
 /// `[pixels, slots]`; `linear` as in [`minimise`].
-pub(super) fn minimise_free(
+pub fn minimise_free(
     simd: SimdLevel,
     quadratic: &Quadratic,
     linear: Array2<f64>,
@@ -377,7 +372,8 @@ mod tests {
     use rand_xoshiro::Xoshiro256PlusPlus;
     use rand_xoshiro::rand_core::{Rng, SeedableRng};
 
-    use super::super::{Prior, Slot, SlotKind};
+    use super::super::super::{Slot, SlotKind};
+    use super::super::Prior;
     use super::*;
 
     fn slots(count: usize) -> Vec<Slot> {

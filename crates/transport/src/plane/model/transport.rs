@@ -2,7 +2,7 @@ use std::ops::RangeInclusive;
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 
-/// Plane-to-ray transport by relative row, as [`super::Demux`] estimates it.
+/// Plane-to-ray transport by relative row, as [`super::super::Demux`] estimates it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Transport {
     /// `T[u, t, s]`, shape `[U, camera_rows, columns]`: light from the projector row that lies `u_min + index` rows

@@ -3,8 +3,9 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 
-use super::error::check_shape;
-use super::{Beam, PixelResponse, PlaneError, Setting};
+use super::super::PlaneError;
+use super::super::error::check_shape;
+use super::{Beam, PixelResponse, Setting};
 
 /// When each projector row is lit, how its light spreads, and which projector rows the camera's rows see.
 ///
@@ -247,7 +248,7 @@ impl RowTiming {
     }
 
     /// Checks that a stack has as many columns as the measured response, if there is one.
-    pub(super) fn check_columns(&self, columns: usize) -> Result<(), PlaneError> {
+    pub(in super::super) fn check_columns(&self, columns: usize) -> Result<(), PlaneError> {
         self.measured_response().map_or(Ok(()), |response| {
             check_shape("stack", "[columns of the response]", &[columns], &[response.size().1])
         })

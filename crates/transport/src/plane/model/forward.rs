@@ -3,14 +3,15 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
+use super::super::PlaneError;
 use super::response::{ResponseClass, collected};
-use super::{PlaneError, RowTiming, Setting};
+use super::{RowTiming, Setting};
 
 /// A row is an unknown if some setting collects at least this share of its dwell.
 pub const MIN_WEIGHT: f64 = 0.05;
 
 /// Steps of a pixel's measured place per projector row: pixels within one step share a model.
-pub(super) const PLACE_STEPS: f32 = 32.0;
+const PLACE_STEPS: f32 = 32.0;
 
 /// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings and
 /// camera rows, in the frame that the delays refer to, is at least [`MIN_WEIGHT`].
@@ -86,7 +87,7 @@ impl RowModel {
 
     /// The models of the pixels of camera row `t`, each with its columns: one model for all, unless their responses
     /// were measured.
-    pub(super) fn of_pixels(
+    pub(in super::super) fn of_pixels(
         timing: &RowTiming,
         settings: &[Setting],
         reach: &RangeInclusive<i32>,
@@ -105,7 +106,11 @@ impl RowModel {
     }
 
     /// The model of the pixel in the middle of the image, as a typical one.
-    pub(super) fn of_middle(timing: &RowTiming, settings: &[Setting], reach: &RangeInclusive<i32>) -> Self {
+    pub(in super::super) fn of_middle(
+        timing: &RowTiming,
+        settings: &[Setting],
+        reach: &RangeInclusive<i32>,
+    ) -> Self {
         let t = timing.camera_rows() / 2;
         let Some(response) = timing.response() else { return Self::new(timing, settings, reach, t) };
         let (_, columns) = response.size();
@@ -116,7 +121,7 @@ impl RowModel {
 
     /// The model of pixels with a measured response. `drawn` is the share of each projector row's dwell inside the
     /// exposure of each setting, `[settings, projector rows]`; relative rows count from the pixels' own row.
-    pub(super) fn measured(
+    pub(in super::super) fn measured(
         drawn: ArrayView2<f64>,
         reach: &RangeInclusive<i32>,
         class: &ResponseClass,
@@ -143,7 +148,7 @@ impl RowModel {
 
 /// The share of each projector row's dwell inside the exposure of camera row `t` for each setting,
 /// `[settings, projector rows]`.
-pub(super) fn drawn(timing: &RowTiming, settings: &[Setting], t: usize) -> Array2<f64> {
+pub(in super::super) fn drawn(timing: &RowTiming, settings: &[Setting], t: usize) -> Array2<f64> {
     let mut drawn = Array2::zeros((settings.len(), timing.projector_rows()));
     for (mut drawn, setting) in drawn.rows_mut().into_iter().zip(settings) {
         drawn.iter_mut().zip(timing.drawn(t, setting)).for_each(|(to, share)| *to = share);

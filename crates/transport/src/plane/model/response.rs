@@ -2,8 +2,8 @@ use std::collections::BTreeMap;
 
 use ndarray::{Array2, Array3, ArrayView1, ArrayView2, ArrayView3};
 
-use super::PlaneError;
-use super::error::check_shape;
+use super::super::PlaneError;
+use super::super::error::check_shape;
 
 /// Number of drawn rows that a measured response covers.
 pub const RESPONSE_ROWS: usize = 16;
@@ -37,7 +37,7 @@ pub type Shares = [f64; RESPONSE_ROWS];
 
 /// Pixels of one camera row that look at nearly the same place between rows, and therefore share a model.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct ResponseClass {
+pub(in super::super) struct ResponseClass {
     /// The pixels' own row.
     pub own_row: i64,
     /// The mean of their responses.
@@ -125,7 +125,7 @@ impl PixelResponse {
     }
 
     /// Some columns of camera row `t` by the place that they see, in classes of `1 / steps` of a row.
-    pub(super) fn classes(
+    pub(in super::super) fn classes(
         &self,
         t: usize,
         columns: impl Iterator<Item = usize>,
@@ -150,7 +150,7 @@ impl PixelResponse {
 
 /// `A'` of a pixel with this response for one projector row: light of the row `lit`, collected while the rows around it
 /// are drawn. `drawn` is the share of each projector row's dwell inside the exposure.
-pub(super) fn collected(drawn: ArrayView1<f64>, shares: &Shares, lit: i64) -> f64 {
+pub(in super::super) fn collected(drawn: ArrayView1<f64>, shares: &Shares, lit: i64) -> f64 {
     let of_row = |(d, share): (usize, &f64)| {
         let row = usize::try_from(lit + d as i64 + i64::from(FIRST_RESPONSE_ROW)).ok()?;
         drawn.get(row).map(|drawn| share * drawn)

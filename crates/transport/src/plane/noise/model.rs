@@ -1,6 +1,6 @@
 use ndarray::{ArrayView2, ArrayView3, Axis, s};
 
-use super::PlaneError;
+use super::super::PlaneError;
 
 /// The noise of an image: read noise and shot noise, independent from sample to sample.
 ///
@@ -168,7 +168,7 @@ fn squared_differences<'a>(
 }
 
 /// Checks that masks and frame counts fit a stack.
-pub(super) fn check_shapes(
+pub fn check_shapes(
     stack: ArrayView3<f32>,
     valid: Option<ArrayView3<bool>>,
     frames: &[usize],

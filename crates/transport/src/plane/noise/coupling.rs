@@ -1,11 +1,11 @@
 use ndarray::{Array2, Array3, ArrayView3, ArrayViewMut1, ArrayViewMut2, Axis, s};
 use rayon::prelude::*;
 
-use super::noise::check_shapes;
-use super::{NoiseModel, PlaneError};
+use super::super::PlaneError;
+use super::{NoiseModel, check_shapes};
 
-/// Spatial coupling: averages neighbouring pixels of a stack that see the same kind of light, before [`super::Demux`]
-/// solves each pixel by itself.
+/// Spatial coupling: averages neighbouring pixels of a stack that see the same kind of light, before
+/// [`super::super::Demux`] solves each pixel by itself.
 ///
 /// Neighbours on one surface receive the same light from the same relative rows, except for their albedo. A
 /// neighbour's stack is therefore scaled to the pixel's own total over the settings, which cancels texture, and

@@ -3,12 +3,12 @@
 
 /// A matrix is not positive definite.
 #[derive(Debug)]
-pub(super) struct NotPositiveDefinite;
+pub struct NotPositiveDefinite;
 
 /// Replaces the lower triangle of the row-major `n` x `n` matrix `a` by its Cholesky factor; the upper triangle is
 /// not read.
 #[inline(always)]
-pub(super) fn factor(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
+pub fn factor(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
     for i in 0..n {
         let (above, rest) = a.split_at_mut(i * n);
         let row = &mut rest[..n];
@@ -26,7 +26,7 @@ pub(super) fn factor(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite>
 }
 
 /// Replaces `b` by the solution of `L L' x = b`, with `L` the factor of an `n` x `n` matrix.
-pub(super) fn solve(l: &[f64], n: usize, b: &mut [f64]) {
+pub fn solve(l: &[f64], n: usize, b: &mut [f64]) {
     for i in 0..n {
         let row = &l[i * n..i * n + i + 1];
         b[i] = (b[i] - dot(&row[..i], &b[..i])) / row[i];
@@ -42,7 +42,7 @@ pub(super) fn solve(l: &[f64], n: usize, b: &mut [f64]) {
 /// Replaces the lower triangle of the symmetric positive definite `n` x `n` matrix `a` by that of its inverse; the
 /// upper triangle is left undefined.
 #[inline(always)]
-pub(super) fn invert(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
+pub fn invert(a: &mut [f64], n: usize) -> Result<(), NotPositiveDefinite> {
     factor(a, n)?;
     // Row by row, so that all inner loops run along rows: first L^-1, which is also lower triangular,
     let mut inverse = vec![0.0; n * n];

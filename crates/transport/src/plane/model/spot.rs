@@ -1,6 +1,7 @@
 use ndarray::ArrayView1;
 
-use super::super::{PlaneError, RowTiming, Setting};
+use super::super::PlaneError;
+use super::{RowTiming, Setting};
 
 /// The direction in which a flying spot draws its rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -143,7 +144,7 @@ pub fn spike_weights(
 
 #[cfg(test)]
 mod tests {
-    use super::super::super::CameraRows;
+    use super::super::CameraRows;
     use super::*;
 
     fn timing() -> RowTiming {

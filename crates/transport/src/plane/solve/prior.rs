@@ -2,7 +2,8 @@ use std::str::FromStr;
 
 use ndarray::Array2;
 
-use super::{PlaneError, Slot};
+use super::super::PlaneError;
+use super::super::model::Slot;
 
 /// Prior of a pixel's profile `T(u)` in addition to `T >= 0`: the terms `alpha ||D T||^2 + beta sum(T)`.
 ///
@@ -116,7 +117,7 @@ impl FromStr for Prior {
 mod tests {
     use ndarray::array;
 
-    use super::super::SlotKind::{Own, Wrapped};
+    use super::super::super::model::SlotKind::{Own, Wrapped};
     use super::*;
 
     fn slots(own: &[i32], wrapped: &[i32]) -> Vec<Slot> {

@@ -1,4 +1,5 @@
-//! Divides an image's pixels into tiles that share an objective, for [`super::Demux`] and [`super::Uncertainty`].
+//! Divides an image's pixels into tiles that share an objective, for [`super::Demux`] and
+//! [`super::super::Uncertainty`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -6,11 +7,11 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
 use rayon::prelude::*;
 
-use super::calibrate::FlyingSpot;
-use super::forward::{PLACE_STEPS, drawn};
+use super::super::PlaneError;
+use super::super::model::{FlyingSpot, RowModel, RowTiming, Setting, Slot, SlotKind};
+use super::Prior;
 use super::pivot::RUN_PX;
 use super::quadratic::Quadratic;
-use super::{PixelResponse, PlaneError, Prior, RowModel, RowTiming, Setting, Slot, SlotKind};
 
 /// Number of pixels that are solved together: their vectors fit in the cache together with the model.
 const TILE_PX: usize = 512;
@@ -30,7 +31,7 @@ pub fn objectives_bytes(reach_rows: u64, threads: u64) -> u64 {
 
 /// The inputs of the objectives of all pixels.
 #[derive(Clone, Copy)]
-pub(super) struct Objectives<'a> {
+pub struct Objectives<'a> {
     pub timing: &'a RowTiming,
     pub settings: &'a [Setting],
     pub prior: Prior,
@@ -39,7 +40,7 @@ pub(super) struct Objectives<'a> {
 }
 
 /// A camera row and the data to process.
-pub(super) struct Row<'a, T> {
+pub struct Row<'a, T> {
     /// Its index in the camera.
     t: usize,
     columns: usize,
@@ -60,7 +61,7 @@ struct Direct {
 }
 
 /// The objective of pixels with the same direct light and the same valid samples.
-pub(super) struct Problem<'a> {
+pub struct Problem<'a> {
     pub model: &'a RowModel,
     /// The indices of the settings in use.
     pub settings: Vec<usize>,
@@ -72,7 +73,7 @@ pub(super) struct Problem<'a> {
 
 /// Direct light between two rows: one unknown, in the slot of row 0, that represents light in both rows.
 #[derive(Clone, Copy)]
-pub(super) struct Spike {
+pub struct Spike {
     /// The slot of row 0.
     pub own: usize,
     /// The slot of the row on the other side, if the projector has this row.
@@ -83,7 +84,7 @@ pub(super) struct Spike {
 
 /// Pixels that share an objective, each given by the index of its row and its column.
 #[derive(Default)]
-pub(super) struct Tile {
+pub struct Tile {
     pub pixels: Vec<(usize, usize)>,
     /// Lengths of the runs of pixels: neighbours in one row, so that an image solved in parts gives the same result
     /// as one solved as a whole.
@@ -91,7 +92,7 @@ pub(super) struct Tile {
 }
 
 /// The processing of a tile, whose pixels lie in these rows.
-pub(super) trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
+pub trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
 impl<T, F: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync> Work<T> for F {}
 
 impl Objectives<'_> {
@@ -106,9 +107,9 @@ impl Objectives<'_> {
         go_on: &(dyn Fn() -> bool + Sync),
         work: &impl Work<T>,
     ) -> Result<(), PlaneError> {
-        if let Some(response) = self.timing.response() {
+        if self.timing.response().is_some() {
             rows.iter().try_for_each(|row| self.timing.check_columns(row.columns))?;
-            return rows.par_iter_mut().try_for_each(|row| self.for_measured_row(response, row, go_on, work));
+            return rows.par_iter_mut().try_for_each(|row| self.for_responding_row(row, go_on, work));
         }
         // Neighbouring rows with the same model form a class. Classes are processed one at a time, so that factors
         // are kept no longer than needed.
@@ -128,24 +129,22 @@ impl Objectives<'_> {
         RowModel::new(self.timing, self.settings, self.reach, t)
     }
 
-    /// Processes a row whose pixels have measured responses: those that look at the same place between rows share an
-    /// objective. Direct light lies at `u = 0` by definition.
-    fn for_measured_row<T>(
+    /// Processes a row whose pixels have responses: those that look at the same place between rows share an objective.
+    /// Direct light lies at `u = 0` by definition.
+    fn for_responding_row<T>(
         &self,
-        response: &PixelResponse,
         row: &mut Row<T>,
         go_on: &(dyn Fn() -> bool + Sync),
         work: &impl Work<T>,
     ) -> Result<(), PlaneError> {
-        let drawn = drawn(self.timing, self.settings, row.t);
         let direct = Direct { step: 0, weights: None };
-        for class in response.classes(row.t, 0..row.columns, PLACE_STEPS) {
+        let models = RowModel::of_pixels(self.timing, self.settings, self.reach, row.t, row.columns);
+        for (model, columns) in models {
             if !go_on() {
                 return Err(PlaneError::Stopped);
             }
-            let model = RowModel::measured(drawn.view(), self.reach, &class);
             let problem = Problem::new(&model, &self.prior, &direct)?;
-            row.groups.insert(direct.clone(), class.columns);
+            row.groups.insert(direct.clone(), columns);
             self.for_group(&problem, &direct, std::slice::from_mut(row), work)?;
         }
         Ok(())

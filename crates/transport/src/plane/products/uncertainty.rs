@@ -2,11 +2,11 @@ use std::ops::RangeInclusive;
 
 use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, Axis};
 
-use super::error::check_shape;
-use super::noise::check_shapes;
-use super::pivot::minimise_free;
-use super::tiles::{Objectives, Problem, Row, Spike, Tile};
-use super::{NoiseModel, PlaneError, Prior, RowTiming, Setting, SimdLevel, SlotKind, Transport};
+use super::super::error::check_shape;
+use super::super::noise::check_shapes;
+use super::super::solve::pivot::minimise_free;
+use super::super::solve::tiles::{Objectives, Problem, Row, Spike, Tile};
+use super::super::{NoiseModel, PlaneError, Prior, RowTiming, Setting, SimdLevel, SlotKind, Transport};
 
 /// The uncertainty of a transport due to the noise of its stack.
 ///
@@ -39,10 +39,10 @@ pub struct Samples<'a> {
     pub stack: ArrayView3<'a, f32>,
     /// Which samples were used, of the same shape; `None` for all.
     pub valid: Option<ArrayView3<'a, bool>>,
-    /// [`super::Coupled::variance_ratio`] if the stack was coupled, `[t, s]`.
+    /// [`super::super::Coupled::variance_ratio`] if the stack was coupled, `[t, s]`.
     pub variance_ratio: Option<ArrayView2<'a, f32>>,
-    /// Assumed position of direct light, as in [`super::Demux::with_spike`] but for these rows alone, `[t, s]`;
-    /// `None` for row 0.
+    /// Assumed position of direct light, as in [`super::super::Demux::with_spike`] but for these rows alone,
+    /// `[t, s]`; `None` for row 0.
     pub u0_rows: Option<ArrayView2<'a, f32>>,
 }
 

@@ -1,8 +1,9 @@
 use ndarray::{Array1, Array2, ArrayView1, Axis};
 use rayon::prelude::*;
 
-use super::error::check_shape;
-use super::{PlaneError, RowTiming, Transport};
+use super::super::PlaneError;
+use super::super::error::check_shape;
+use super::super::model::{RowTiming, Transport};
 
 /// The image `[t, s]` for a projector that shows each of its rows with one weight, shape `[projector_rows]`:
 /// `sum over v of weights[v] T(v, t, s)`, 1.0 for a white surface under its own row at weight 1.

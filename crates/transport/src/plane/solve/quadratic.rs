@@ -1,9 +1,11 @@
 use aligned_vec::{AVec, avec};
 use ndarray::{Array2, ArrayView2, Axis, ShapeBuilder, aview2};
 
+use super::super::PlaneError;
+use super::super::model::Slot;
 use super::dense::MAX_LANES;
 use super::narrow::Narrow;
-use super::{PlaneError, Prior, Slot, cholesky};
+use super::{Prior, cholesky};
 
 /// Relative increase of the diagonal of `H`. Rows that the settings leave undetermined then have a unique solution,
 /// the smallest, and every factorisation succeeds. The minimum moves by far less than a sample's rounding.
@@ -16,7 +18,7 @@ const WELL_CONDITIONED: f64 = 1e7;
 /// The objective `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` of one camera row, as `T'HT - 2 c'T + I'I` with
 /// `H = A'A + alpha D'D` and `c = A'I - beta/2`.
 #[derive(Debug, Clone)]
-pub(super) struct Quadratic {
+pub struct Quadratic {
     h: Padded,
     /// The inverse of `H`.
     inverse: Padded,
@@ -103,7 +105,7 @@ impl Quadratic {
     }
 
     /// The parts of `H` for the chain solver, if there are few settings for many rows.
-    pub fn narrow(&self) -> Option<&Narrow> {
+    pub(super) fn narrow(&self) -> Option<&Narrow> {
         self.narrow.as_ref()
     }
 
@@ -123,12 +125,12 @@ impl Quadratic {
     }
 
     /// `H`, padded for gathering systems.
-    pub fn padded_h(&self) -> &Padded {
+    pub(super) fn padded_h(&self) -> &Padded {
         &self.h
     }
 
     /// The inverse, padded as [`Self::padded_h`].
-    pub fn padded_inverse(&self) -> &Padded {
+    pub(super) fn padded_inverse(&self) -> &Padded {
         &self.inverse
     }
 
@@ -192,7 +194,7 @@ fn invert(h: ArrayView2<f64>) -> Result<Array2<f64>, PlaneError> {
 mod tests {
     use ndarray::array;
 
-    use super::super::SlotKind::Own;
+    use super::super::super::model::SlotKind::Own;
     use super::*;
 
     fn slots() -> Vec<Slot> {

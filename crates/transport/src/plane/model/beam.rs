@@ -1,4 +1,4 @@
-use super::PlaneError;
+use super::super::PlaneError;
 use super::response::{FIRST_RESPONSE_ROW, Shares};
 
 /// The spread of the light of one projector row over the rows of the scene.

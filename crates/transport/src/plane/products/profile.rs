@@ -2,7 +2,7 @@ use std::collections::BTreeSet;
 
 use ndarray::{ArrayView3, Axis, s};
 
-use super::{RowModel, RowTiming, Setting, Slot, SlotKind, Transport};
+use super::super::model::{RowModel, RowTiming, Setting, Slot, SlotKind, Transport};
 
 /// Light as a function of the delay `t_d` at one exposure, by ascending delay.
 #[derive(Debug, Clone, PartialEq)]
@@ -96,7 +96,7 @@ impl DelayProfile {
 mod tests {
     use ndarray::{Array2, Array3};
 
-    use super::super::{predict, relative_rows};
+    use super::super::super::{predict, relative_rows};
     use super::*;
 
     const PIXELS: [[usize; 2]; 3] = [[3, 0], [3, 1], [7, 1]];

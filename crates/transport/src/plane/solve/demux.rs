@@ -4,13 +4,13 @@ use std::sync::Arc;
 use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axis, s};
 use rayon::prelude::*;
 
-use super::calibrate::FlyingSpot;
-use super::error::check_shape;
+use super::super::PlaneError;
+use super::super::error::check_shape;
+use super::super::model::{FlyingSpot, RowModel, RowTiming, Setting, SlotKind, Transport, reach};
 use super::pivot::{Start, minimise};
 use super::quadratic::Quadratic;
 use super::tiles::{Objectives, Problem, Row, Spike, Tile};
-
-use super::{PlaneError, Prior, RowModel, RowTiming, Setting, SimdLevel, SlotKind, Transport, reach};
+use super::{Prior, SimdLevel};
 
 /// Demultiplexes delay-exposure stacks: for each pixel, the exact minimiser of
 /// `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` over `T >= 0` (the paper's section 4).
