@@ -1,4 +1,4 @@
-//! The pipeline's sink: data first, then the ledger entry, then the folds.
+//! The pipeline's sink: data first, then the ledger entry, then the demultiplexer.
 
 use std::sync::Arc;
 use std::sync::mpsc::Sender;
@@ -62,7 +62,7 @@ impl Sink for PointSink {
                         if let Some(live) = &self.live
                             && let Some(snapshot) = self.processing.snapshot()
                         {
-                            live.offer(snapshot);
+                            live.offer(Box::new(snapshot));
                         }
                     }
                     Err(error) => self.note_stage_error(&unit, &error),

@@ -4,11 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::Registry;
 use raysweep_processing::memory::available_bytes;
 use raysweep_proto::CheckReport;
 use raysweep_session::durable;
 
+use crate::probes::Probes;
 use crate::rig::{DotRig, Rig};
 
 /// The environment in which a plan is to be run.
@@ -19,8 +19,8 @@ pub struct Lab<'a> {
     pub camera: &'a CameraCapabilities,
     /// Folder of the sessions.
     pub data: &'a Path,
-    /// Stages by name.
-    pub registry: &'a Arc<Registry>,
+    /// What tests insert.
+    pub probes: &'a Probes,
     /// Memory limit; results that need more are made in strips of camera rows. `None`: the memory that is free.
     pub memory_limit_bytes: Option<u64>,
 }

@@ -15,8 +15,9 @@ use raysweep_transport::dots::{
 use super::background::Backgrounds;
 use super::gather::{CutSink, Gatherer, Looked, Scan};
 use super::stage::{ColumnStage, ColumnWorker};
-use crate::pipeline::{PipelineError, message_of};
+use crate::pipeline::PipelineError;
 use crate::queue::{Input, Policy, QueueError};
+use crate::stage::message_of;
 
 /// Consecutive exposures without a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -15,7 +15,7 @@ mod stage;
 pub use dark::{DarkRun, FlatRun, Sensor};
 pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered, Loss};
 pub use gather::{Cut, CutSink, Scan};
-pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, DotStages};
+pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, column_stage};
 
 #[cfg(test)]
 mod tests;

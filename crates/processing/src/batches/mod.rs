@@ -7,11 +7,11 @@ mod report;
 mod results;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, DotRigFile, Places, Plan, StageTable};
 use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter};
-use raysweep_pipeline::Registry;
-use raysweep_pipeline::dots::{ColumnStage, Scan};
+use raysweep_pipeline::dots::{ColumnStage, Scan, column_stage};
 use raysweep_session::dots::BatchColumns;
 use raysweep_session::stack::Contents;
 use raysweep_transport::dots::{Batch, BatchArrays, Correction, DotsError, FrameShape, Region, Sampling};
@@ -165,15 +165,9 @@ impl DotTask {
     ///
     /// # Errors
     /// For an unknown stage, or options that it does not take.
-    pub fn stage(
-        &self,
-        registry: &Registry,
-        correction: &Correction,
-    ) -> Result<Box<dyn ColumnStage>, ConfigError> {
+    pub fn stage(&self, correction: &Correction) -> Result<Arc<dyn ColumnStage>, ConfigError> {
         let StageTable { name, options } = &self.denoise;
-        registry
-            .dots
-            .make(name, Value::Object(options.clone()), correction)
+        column_stage(name, Value::Object(options.clone()), correction)
             .map_err(|error| self.refuse_stage(name, error.to_string()))
     }
 }

@@ -6,7 +6,7 @@ mod report;
 use std::sync::Arc;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan, RigFile};
-use raysweep_pipeline::{FilmSolver, Point, Registry, Role, Schedule, Stage};
+use raysweep_pipeline::{FilmSolver, Point, Role, Schedule, Stages};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
@@ -46,15 +46,12 @@ impl FilmTask {
         self.film.cycles as usize
     }
 
-    /// The stages that the plan names. Each cycle has its own transport, so folds over the whole run are refused.
+    /// The stages that the plan names. Each cycle has its own transport, so its solver takes the place of `demux`.
     ///
     /// # Errors
     /// With the position in the plan's text of the stage that cannot be made.
-    pub fn stages(&self, registry: &Registry) -> std::result::Result<Arc<[Box<dyn Stage>]>, ConfigError> {
-        let (stages, _) = self.task.made_stages(registry, |fold, _| {
-            let name = fold.name();
-            (name != "demux").then(|| format!("{name} is not for films: their only fold is demux"))
-        })?;
+    pub fn stages(&self) -> std::result::Result<Stages, ConfigError> {
+        let (stages, _) = self.task.made_stages()?;
         Ok(stages)
     }
 

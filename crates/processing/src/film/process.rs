@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ndarray::{Array2, Axis};
 use raysweep_config::FilmPlan;
 use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Registry, Stage, Unit, run_stages};
+use raysweep_pipeline::{Stages, Unit, run_stages};
 use raysweep_session::Session;
 use raysweep_session::film::{CycleEntry, crc32};
 use raysweep_session::ledger::State;
@@ -26,7 +26,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let shape = state.session.shape;
     let task = FilmTask::new(plan, film, &rig, state.session.first_row, (shape.rows, shape.columns));
     stored.check_contents(task.contents())?;
-    let stages = task.stages(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
+    let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {
         let message = "a film has no products to ask for: leave --product out";
         return Err(ProcessError::Product(message.into()));
@@ -47,7 +47,7 @@ fn make_transports(
     session: &Session,
     task: &FilmTask,
     state: &State,
-    stages: &[Box<dyn Stage>],
+    stages: &Stages,
 ) -> raysweep_session::Result<Vec<String>> {
     let solver = match task.solver() {
         Ok(solver) => solver,
@@ -106,7 +106,7 @@ fn frame_unit(ordinal: u32, entry: &CycleEntry, delay_us: f64, sum: Array2<u32>)
 fn dark_image(
     session: &Session,
     state: &State,
-    stages: &[Box<dyn Stage>],
+    stages: &Stages,
 ) -> raysweep_session::Result<Option<Array2<f32>>> {
     let Some(entry) = state.point(ArrayName::Dark, 0) else { return Ok(None) };
     let sum = session.stack()?.read_point(ArrayName::Dark, 0)?;

@@ -12,8 +12,8 @@ use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    DemuxOptions, Entry, Fold, Point, Registry, RegistryError, Role, Scan, Schedule, Spot, Stage,
-    SweepGeometry, Unit,
+    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, Role, Scan, Schedule, Spot, Stages, SweepGeometry,
+    Unit,
 };
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
@@ -74,55 +74,54 @@ impl PlaneTask {
         self.places.error(path, message)
     }
 
+    /// The plan's stage `demux`.
+    pub(crate) fn demux_table(&self) -> Option<&StageTable> {
+        self.stages.iter().find(|stage| stage.name == DEMUX)
+    }
+
     /// The options of `demux` in the plan.
     ///
     /// # Errors
     /// When the plan has options that `demux` does not know.
     pub fn demux_options(&self) -> Result<DemuxOptions, ConfigError> {
-        let Some(stage) = self.stages.iter().find(|stage| stage.name == "demux") else {
-            return Ok(DemuxOptions::default());
-        };
+        let Some(stage) = self.demux_table() else { return Ok(DemuxOptions::default()) };
         serde_json::from_value(Value::Object(stage.options.clone()))
             .map_err(|error| self.refuse(&["stage"], format!("stage demux: {error}")))
     }
 
-    /// The stages and folds that the plan names.
+    /// The stages that the plan names, and what demultiplexes their images.
     ///
     /// # Errors
-    /// With the position in the plan of a stage that cannot be made, or that `refused` gives a reason against.
-    pub(crate) fn made_stages(
-        &self,
-        registry: &Registry,
-        refused: impl Fn(&dyn Fold, &[Box<dyn Fold>]) -> Option<String>,
-    ) -> Result<(Stages, Vec<Box<dyn Fold>>), ConfigError> {
-        let mut stages = Vec::new();
-        let mut folds: Vec<Box<dyn Fold>> = Vec::new();
-        for (index, stage) in self.stages.iter().enumerate() {
+    /// With the position in the plan of a stage that cannot be made, or of a second `demux`.
+    pub(crate) fn made_stages(&self) -> Result<(Stages, Option<DemuxFold>), ConfigError> {
+        let (mut stages, mut demux) = (Vec::new(), None);
+        for (index, table) in self.stages.iter().enumerate() {
             let place = index.to_string();
             let refuse = |message: String| self.refuse(&["stage", &place, "name"], message);
-            let options = Value::Object(stage.options.clone());
-            let made = registry
-                .make(&stage.name, options, &self.schedule, &self.geometry)
-                .map_err(|error: RegistryError| refuse(error.to_string()))?;
-            match made {
-                Entry::Stage(stage) => stages.push(stage),
-                Entry::Fold(fold) => match refused(&*fold, &folds) {
-                    Some(message) => return Err(refuse(message)),
-                    None => folds.push(fold),
-                },
+            let made = PlaneStage::new(&table.name, Value::Object(table.options.clone()));
+            match made.map_err(|error| refuse(error.to_string()))? {
+                PlaneStage::Image(stage) => stages.push(stage),
+                PlaneStage::Demux(options) => {
+                    let fold = DemuxFold::new(options, &self.schedule, &self.geometry)
+                        .map_err(|error| refuse(error.to_string()))?;
+                    if demux.replace(fold).is_some() {
+                        return Err(refuse(format!(
+                            "{DEMUX} stands twice: its products would overwrite each other; keep one"
+                        )));
+                    }
+                }
             }
         }
-        Ok((stages.into(), folds))
+        Ok((stages.into(), demux))
     }
 
     /// Metadata that all products share.
     pub(crate) fn metadata(&self) -> Map<String, Value> {
         let geometry = &self.geometry;
-        let prior = self.stages.iter().find(|stage| stage.name == "demux");
         let entries = [
             ("units", json!("1 = a white pixel lit by its own projector row")),
             ("plan", json!(self.name)),
-            ("demux", json!(prior.map(|stage| &stage.options))),
+            (DEMUX, json!(self.demux_table().map(|stage| &stage.options))),
             ("row_time_us", json!(geometry.raster.row_time_us)),
             ("row_table", json!(geometry.row_table_us.is_some())),
             ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
@@ -135,9 +134,6 @@ impl PlaneTask {
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
 }
-
-/// The stages that process each image, in order.
-pub type Stages = Arc<[Box<dyn Stage>]>;
 
 /// Distribution over time of a pixel's direct light within its row.
 fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {

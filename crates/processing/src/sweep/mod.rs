@@ -8,11 +8,11 @@ use std::sync::Arc;
 
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{ConfigError, Places, Plan, ProductTable, RigFile, SweepPlan};
-use raysweep_pipeline::{Point, ProductSpec, Registry, Role, Schedule};
+use raysweep_pipeline::{Point, ProductSpec, Role, Schedule};
 use raysweep_session::stack::Contents;
 
-pub use self::report::warnings;
-pub use self::results::{Results, write_products, write_report};
+pub use self::report::write as write_report;
+pub use self::results::{Results, write_products};
 pub use self::strips::Overview;
 use crate::memory::{MemoryNeed, available_bytes};
 use crate::plane::{PlaneTask, Processing, manifest};
@@ -58,26 +58,21 @@ impl SweepTask {
         self.task.schedule.sweep_len()
     }
 
-    /// The stages, folds and products that the plan names.
+    /// The stages and products that the plan names.
     ///
     /// # Errors
     /// With the position in the plan's text of the stage or product that cannot be made.
-    pub fn processing(&self, registry: &Registry) -> Result<Processing, ConfigError> {
-        let (stages, folds) = self.task.made_stages(registry, |fold, others| {
-            let name = fold.name();
-            let is_second = others.iter().any(|other| other.name() == name);
-            is_second
-                .then(|| format!("{name} stands twice: its products would overwrite each other; keep one"))
-        })?;
-        // After the folds: they refuse a rig on which no product could be made.
+    pub fn processing(&self) -> Result<Processing, ConfigError> {
+        let (stages, demux) = self.task.made_stages()?;
+        // After `demux`, which refuses a rig on which no product could be made.
         let products = self.products()?;
-        Ok(Processing { stages, folds, products, problems: Vec::new() })
+        Ok(Processing { stages, demux, products, problems: Vec::new() })
     }
 
     /// The products that the plan names, made from the transport.
     fn products(&self) -> Result<Vec<ProductSpec>, ConfigError> {
         let Some(tables) = &self.products else { return Ok(ProductSpec::defaults()) };
-        if !tables.is_empty() && !self.task.stages.iter().any(|stage| stage.name == "demux") {
+        if !tables.is_empty() && self.task.demux_table().is_none() {
             let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";
             return Err(self.task.refuse(&["product"], what));
         }
@@ -172,7 +167,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     let sweep = SweepTask::new(plan, sweep, &rig, state.session.first_row, (shape.rows, shape.columns));
     stored.check_contents(sweep.contents())?;
     let task = &*sweep.task;
-    let mut processing = sweep.processing(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
+    let mut processing = sweep.processing().map_err(|error| stored.in_plan(&error))?;
     if asked.only {
         processing.products.clear();
     }

@@ -25,7 +25,7 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
     lab.camera_at(plan.camera_rate_hz())
         .allows(&task.camera_settings())
         .map_err(|message| task.refuse(&["batches", "exposure_us"], format!("batches.{message}")))?;
-    task.stage(lab.registry, &Correction::none(task.shape))?;
+    task.stage(&Correction::none(task.shape))?;
     task.earlier_flat_field(lab.data)
         .map_err(|error| task.refuse_stage("correct", format!("stage correct: flat_field: {error}")))?;
     let planes: Vec<u32> = plan.calibration.iter().map(|plane| plane.batches).collect();

@@ -7,7 +7,6 @@ mod sink;
 use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, Plan};
-use raysweep_pipeline::Registry;
 use raysweep_processing::batches::{DotTask, keep_patterns, make};
 use raysweep_proto::{ErrorCode, RpcError};
 use raysweep_session::Session;
@@ -15,6 +14,7 @@ use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
 use self::acquire::{Acquired, acquire};
+use crate::probes::Probes;
 use crate::procedure::lab::Lab;
 use crate::rig::DotRig;
 use crate::run::error::RunError;
@@ -24,7 +24,7 @@ use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
 struct BatchesRun {
     rig: Arc<DotRig>,
     task: Arc<DotTask>,
-    registry: Arc<Registry>,
+    probes: Probes,
 }
 
 /// Predicts a run of batches.
@@ -49,7 +49,7 @@ pub fn foresee(
         procedure: Box::new(BatchesRun {
             rig: rig.clone(),
             task: Arc::new(task),
-            registry: lab.registry.clone(),
+            probes: lab.probes.clone(),
         }),
     })
 }
@@ -66,9 +66,9 @@ impl Procedure for BatchesRun {
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
-        let Self { rig, task, registry } = *self;
+        let Self { rig, task, probes } = *self;
         let orders = run.orders.clone();
-        let Acquired { session, mut ledger, mut problems, fault } = acquire(&rig, &task, &registry, run)?;
+        let Acquired { session, mut ledger, mut problems, fault } = acquire(&rig, &task, &probes, run)?;
         let stored = ledger.state().stored_points();
         let state = end_state(fault.as_ref(), &orders);
         let end = EndEntry {

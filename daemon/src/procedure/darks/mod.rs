@@ -75,7 +75,7 @@ impl Procedure for DarksRun {
             task: darks.task.clone(),
             stack,
             ledger: run.ledger,
-            processing: Processing::without_folds(stages.clone()),
+            processing: Processing::without_demux(stages.clone()),
             verdicts: Some(verdicts),
             orders: run.orders.clone(),
             board: run.board,

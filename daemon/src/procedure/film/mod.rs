@@ -10,7 +10,7 @@ use std::sync::mpsc::channel;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
-use raysweep_pipeline::{CycleOrder, Point, Role, Stage};
+use raysweep_pipeline::{CycleOrder, Point, Role, Stages};
 use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_session::Session;
@@ -36,7 +36,7 @@ const CYCLES_UNDER_WAY: usize = 4;
 struct FilmRun {
     rig: Arc<Rig>,
     film: FilmTask,
-    stages: Arc<[Box<dyn Stage>]>,
+    stages: Stages,
 }
 
 /// Predicts a film.
@@ -50,7 +50,7 @@ pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Res
     }
     let first_row = rig.first_row(lab.camera);
     let film = FilmTask::new(plan, own, &rig.file, first_row, lab.size());
-    let stages = film.stages(lab.registry)?;
+    let stages = lab.probes.after(&film.stages()?);
     let shape = StackShape { contents: film.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {
         report: check::check(&film, lab)?,
@@ -106,7 +106,7 @@ impl FilmRun {
             task: task.clone(),
             stack,
             ledger: run.ledger,
-            processing: Processing::without_folds(self.stages.clone()),
+            processing: Processing::without_demux(self.stages.clone()),
             verdicts: Some(verdicts),
             orders: run.orders,
             board: run.board.clone(),

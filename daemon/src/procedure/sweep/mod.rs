@@ -11,7 +11,7 @@ use raysweep_config::{ConfigError, Plan, SweepPlan};
 use raysweep_core::{CameraCapabilities, SettingsLatency, VsyncStats};
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
 use raysweep_processing::plane::{Processing, manifest};
-use raysweep_processing::sweep::{Overview, Results, SweepTask, warnings, write_products, write_report};
+use raysweep_processing::sweep::{Overview, Results, SweepTask, write_products, write_report};
 use raysweep_proto::CheckReport;
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
@@ -53,7 +53,8 @@ pub fn foresee(
     size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
     let sweep = SweepTask::new(plan, own, &rig.file, first_row, size);
-    let mut processing = sweep.processing(lab.registry)?;
+    let mut processing = sweep.processing()?;
+    processing.stages = lab.probes.after(&processing.stages);
     let report = check::check(&sweep, &processing.products, lab)?;
     let memory = MemoryNeed::of_sweep(&sweep.task, &processing.products)
         .map_err(|error| sweep.task.refuse(&["sweep"], error.to_string()))?;
@@ -100,7 +101,7 @@ struct Acquired {
     session: Session,
     /// Still locked.
     ledger: Ledger,
-    /// Its folds have received every stored point.
+    /// Its demultiplexer has received every stored point.
     processing: Processing,
     vsync: Option<VsyncStats>,
     exposures: Exposures,
@@ -210,11 +211,7 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    let warnings = results.map_or_else(Vec::new, |Results { products, mut problems, .. }| {
-        problems.extend(warnings(&products));
-        problems
-    });
-    Ok(Ended { end, warnings })
+    Ok(Ended { end, warnings: results.map_or_else(Vec::new, Results::into_warnings) })
 }
 
 /// Publishes the result where the earlier estimates were published.
