@@ -11,7 +11,8 @@ use raysweep_core::{
     ns_from_us, us_from_ns,
 };
 
-use crate::edges::{EdgeTracker, Found, Line, TrueEdge};
+use crate::edges::{EdgeTracker, Found, Line};
+use crate::regularity::TrueEdge;
 use crate::unit::Unit;
 
 /// One attempt at a point, with the camera's settings for it.

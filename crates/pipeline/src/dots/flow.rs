@@ -7,26 +7,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
-use raysweep_core::{Frame, LossCause, PixelFormat};
+use raysweep_core::{Frame, PixelFormat};
 use raysweep_transport::dots::{
     Background, BackgroundMean, Correction, DotsError, NoiseFloor, Observation, SparseColumn,
 };
 
 use super::background::Backgrounds;
-use super::gather::{CutSink, Gatherer, Looked, Scan};
+use super::gather::{CutSink, Gatherer, Looked, Loss, Scan};
 use super::stage::{ColumnStage, ColumnWorker};
 use crate::pipeline::PipelineError;
 use crate::queue::{Input, Policy, QueueError};
 use crate::stage::message_of;
-
-/// Consecutive exposures without a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Loss {
-    /// Their number.
-    pub frames: u64,
-    /// The cause.
-    pub cause: LossCause,
-}
 
 /// A frame, and the losses since the previous one.
 pub struct Arrival {

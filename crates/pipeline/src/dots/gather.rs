@@ -8,13 +8,20 @@ use raysweep_transport::dots::{
     SparseColumn, SyncSettings, Synchroniser, pulse_threshold,
 };
 
-use super::flow::Loss;
-
 /// Number of batches from which the trailing dot's brightness is learnt before the first batch is cut.
 const LEARNT_FROM_BATCHES: usize = 2;
 /// Largest distance of a waiting frame from its position expected from the last trailing dot: a drift of one frame
 /// per batch, over the two batches for which it may wait.
 const DRIFT_FRAMES: u64 = 2;
+
+/// Consecutive exposures without a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Loss {
+    /// Their number.
+    pub frames: u64,
+    /// The cause.
+    pub cause: LossCause,
+}
 
 /// The parameters of a scan.
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -13,8 +13,8 @@ mod gather;
 mod stage;
 
 pub use dark::{DarkRun, FlatRun, Sensor};
-pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered, Loss};
-pub use gather::{Cut, CutSink, Scan};
+pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered};
+pub use gather::{Cut, CutSink, Loss, Scan};
 pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, column_stage};
 
 #[cfg(test)]

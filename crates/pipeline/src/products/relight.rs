@@ -4,7 +4,7 @@ use ndarray::{Array1, Array3, Axis};
 use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
-use super::reach_of;
+use super::band::reach_of;
 use crate::product::Product;
 use crate::schedule::SweepGeometry;
 

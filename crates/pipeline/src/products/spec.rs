@@ -1,25 +1,13 @@
-//! Products by their names in plans: a `[[product]]` table is validated before anything moves. The product is
-//! computed from the transport and the stack at the end of the run or any time later.
+//! Products by their names in plans: a `[[product]]` table is validated before anything moves.
 
-mod assembly;
-mod band;
-mod profile;
-mod relight;
-mod uncertainty;
-
-use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
-use self::band::{Band, Width};
-use self::profile::{ProfileOptions, ProfileTable};
-use self::relight::Pattern;
-use crate::product::Product;
+use super::band::{Band, Width};
+use super::profile::{ProfileOptions, ProfileTable};
+use super::relight::Pattern;
 use crate::schedule::{Schedule, SweepGeometry};
-use crate::stack::SweepStack;
-
-pub use self::assembly::Assembly;
 
 /// Why a product is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -33,25 +21,16 @@ pub struct ProductError {
     pub what: String,
 }
 
-/// Why a product could not be computed.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("product {name}: {what}")]
-pub struct NotMade {
-    /// The product's name.
-    pub name: String,
-    /// What is missing, and what to do.
-    pub what: String,
-}
-
 /// A valid product, which can be computed from every sweep of its plan.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ProductSpec {
-    name: String,
-    kind: Kind,
+    pub(super) name: String,
+    pub(super) kind: ProductKind,
 }
 
+/// A kind of product, with its options.
 #[derive(Debug, Clone, PartialEq)]
-enum Kind {
+pub(super) enum ProductKind {
     Regular,
     Epipolar(Width),
     NonEpipolar(Width),
@@ -92,12 +71,12 @@ impl ProductSpec {
         let made = match kind {
             "regular" => {
                 let NoOptions {} = parse(kind, options)?;
-                Kind::Regular
+                ProductKind::Regular
             }
-            "epipolar" => Kind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
-            "non-epipolar" => Kind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
-            "band" => Kind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
-            "uncertainty" => Kind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "epipolar" => ProductKind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
+            "non-epipolar" => ProductKind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
+            "band" => ProductKind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "uncertainty" => ProductKind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
             "relight" => {
                 if options.len() != 1 {
                     let what = "give exactly one of rows, stripes and line".to_owned();
@@ -105,11 +84,11 @@ impl ProductSpec {
                 }
                 let pattern: Pattern = parse(kind, options)?;
                 pattern.check(geometry).map_err(|(path, what)| refused(path, what))?;
-                Kind::Relight(pattern)
+                ProductKind::Relight(pattern)
             }
             "delay-profile" => {
                 let table: ProfileTable = parse(kind, options)?;
-                Kind::DelayProfile(table.check(schedule, geometry).map_err(one)?)
+                ProductKind::DelayProfile(table.check(schedule, geometry).map_err(one)?)
             }
             _ => {
                 return Err(refused(vec!["kind".into()], format!("kind = {kind:?}: known are {KINDS}")));
@@ -126,12 +105,12 @@ impl ProductSpec {
     pub fn defaults() -> Vec<Self> {
         let spec = |name: &str, kind| Self { name: name.into(), kind };
         vec![
-            spec("regular", Kind::Regular),
-            spec("epipolar", Kind::Epipolar(Width::default())),
-            spec("non_epipolar", Kind::NonEpipolar(Width::default())),
-            spec("short_range", Kind::Band(Band::new(1, Some(10)))),
-            spec("long_range", Kind::Band(Band::new(11, None))),
-            spec("uncertainty", Kind::Uncertainty(Band::new(0, Some(0)))),
+            spec("regular", ProductKind::Regular),
+            spec("epipolar", ProductKind::Epipolar(Width::default())),
+            spec("non_epipolar", ProductKind::NonEpipolar(Width::default())),
+            spec("short_range", ProductKind::Band(Band::new(1, Some(10)))),
+            spec("long_range", ProductKind::Band(Band::new(11, None))),
+            spec("uncertainty", ProductKind::Uncertainty(Band::new(0, Some(0)))),
         ]
     }
 
@@ -143,28 +122,18 @@ impl ProductSpec {
     /// The number of its images on this rig.
     pub fn images(&self, geometry: &SweepGeometry) -> usize {
         match &self.kind {
-            Kind::Relight(pattern) => pattern.images(geometry),
-            Kind::DelayProfile(_) => 0,
-            Kind::Regular
-            | Kind::Epipolar(_)
-            | Kind::NonEpipolar(_)
-            | Kind::Band(_)
-            | Kind::Uncertainty(_) => 1,
+            ProductKind::Relight(pattern) => pattern.images(geometry),
+            ProductKind::DelayProfile(_) => 0,
+            ProductKind::Regular
+            | ProductKind::Epipolar(_)
+            | ProductKind::NonEpipolar(_)
+            | ProductKind::Band(_)
+            | ProductKind::Uncertainty(_) => 1,
         }
-    }
-
-    /// Computes the product.
-    ///
-    /// # Errors
-    /// If a required image was not taken, or saturates.
-    pub fn make(&self, stack: &SweepStack, transport: &Transport) -> Result<Product, NotMade> {
-        let mut assembly = Assembly::new(self.clone());
-        assembly.add(0, stack, transport)?;
-        assembly.finish()
     }
 }
 
-impl Kind {
+impl ProductKind {
     fn default_name(&self) -> String {
         match self {
             Self::Regular => "regular".into(),
@@ -176,11 +145,6 @@ impl Kind {
             Self::Uncertainty(band) => format!("uncertainty_{}", band.default_name()),
         }
     }
-}
-
-/// The reach of a transport as text, for products that are limited by it.
-fn reach_of(transport: &Transport) -> String {
-    format!("the sweep reaches u = {} to {}, beyond nothing is known", transport.u_min, transport.u_max())
 }
 
 fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Result<T, ProductError> {
@@ -213,6 +177,3 @@ fn checked_name(name: &str) -> Result<String, String> {
     }
     Ok(name.into())
 }
-
-#[cfg(test)]
-mod tests;

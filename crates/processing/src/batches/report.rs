@@ -8,8 +8,8 @@ use raysweep_session::report::{
 };
 use raysweep_session::{Result, Session};
 
-use super::DotTask;
 use super::calibration::Calibration;
+use super::task::DotTask;
 use crate::report::{accounts, subtitle};
 
 /// Selected images of a video, each with its label and scale.

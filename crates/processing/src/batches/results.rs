@@ -14,11 +14,12 @@ use raysweep_session::report::ToneMap;
 use raysweep_session::{Result, Session, manifest, pattern};
 use serde_json::{Map, Value, json};
 
-use super::DotTask;
 use super::calibration::{Calibration, read_batch};
 use super::product::{DotSpec, Scene, light_of, read_pattern};
 use super::report::{self, Strip};
+use super::task::DotTask;
 use crate::mirror_response::Predistortion;
+use crate::software::SOFTWARE;
 
 /// Number of images of a video in the report.
 const SHOWN: usize = 6;
@@ -205,7 +206,7 @@ fn common(task: &DotTask, about: &str, channels: usize) -> Map<String, Value> {
         ("axes", json!(axes)),
         ("plan", json!(task.name)),
         ("images_per_s", json!(1.0 / task.batches.path.duration_s())),
-        ("software", json!(crate::SOFTWARE)),
+        ("software", json!(SOFTWARE)),
     ];
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }

@@ -1,10 +1,4 @@
-//! Batches of a flying dot: checks a plan and processes the columns.
-
-mod calibration;
-pub mod flat;
-mod product;
-mod report;
-mod results;
+//! A plan of batches on a dot rig: its path, stages and products.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,16 +6,14 @@ use std::sync::Arc;
 use raysweep_config::{BatchesPlan, ConfigError, DotRigFile, Places, Plan, StageTable};
 use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter};
 use raysweep_pipeline::dots::{ColumnStage, Scan, column_stage};
-use raysweep_session::dots::BatchColumns;
 use raysweep_session::stack::Contents;
-use raysweep_transport::dots::{Batch, BatchArrays, Correction, DotsError, FrameShape, Region, Sampling};
+use raysweep_transport::dots::{Correction, FrameShape, Region, Sampling};
 use serde::Deserialize;
 use serde_json::Value;
 
-pub use self::product::DotSpec;
-pub use self::results::{keep_patterns, make};
+use super::product::DotSpec;
 use crate::mirror_response::Predistortion;
-use crate::stored::{Asked, ProcessError, Processed, Stored};
+use crate::saturation::saturation_dn;
 
 /// A plan of batches on a dot rig: everything that acquisition and processing share.
 pub struct DotTask {
@@ -45,11 +37,6 @@ pub struct DotTask {
     stages: Vec<StageTable>,
     places: Places,
 }
-
-/// For stages without options.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
-struct NoOptions {}
 
 /// Options of the stage `correct`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -153,7 +140,7 @@ impl DotTask {
 
     /// Counts from which on a pixel is overexposed.
     pub fn saturation_dn(&self) -> u16 {
-        crate::saturation_dn(self.format) as u16
+        saturation_dn(self.format) as u16
     }
 
     /// The sensor's colour sampling.
@@ -226,45 +213,4 @@ fn stages(plan: &Plan, batches: &BatchesPlan) -> Result<(CorrectOptions, StageTa
     }
     let default = || StageTable { name: "denoise".into(), options: serde_json::Map::new() };
     Ok((correct, denoise.unwrap_or_else(default)))
-}
-
-/// Converts a stored batch for the products; also returns which of its dots show the scene.
-pub fn from_stored(shape: FrameShape, columns: BatchColumns) -> Result<(Batch, Vec<bool>), DotsError> {
-    let BatchColumns { word_offsets, words, masks, values, residual, discs, capped, seen } = columns;
-    let arrays = BatchArrays { word_offsets, words, masks, values, residual, discs, capped };
-    Ok((Batch::new(shape, arrays)?, seen))
-}
-
-/// The inverse of [`from_stored`].
-pub fn to_stored(arrays: BatchArrays, seen: Vec<bool>) -> BatchColumns {
-    let BatchArrays { word_offsets, words, masks, values, residual, discs, capped } = arrays;
-    BatchColumns { word_offsets, words, masks, values, residual, discs, capped, seen }
-}
-
-/// Reprocesses stored batches.
-///
-/// # Errors
-/// When a product cannot be made from them, before anything is written; when the session cannot be written.
-pub fn process(stored: &Stored<'_>, batches: BatchesPlan, asked: &Asked) -> Result<Processed, ProcessError> {
-    let Stored { session, state, plan, .. } = stored;
-    let rig = stored.dot_rig()?;
-    let shape = state.session.shape;
-    let size = (shape.rows, shape.columns);
-    let task = DotTask::new(plan, batches, &rig, rig.camera.pixel_format, size, session.dir())
-        .map_err(|error| ProcessError::Config(error.to_string()))?;
-    stored.check_contents(task.contents())?;
-    let mut specs = if asked.only { Vec::new() } else { task.specs.clone() };
-    for argument in &asked.products {
-        for spec in DotSpec::of_argument(argument).map_err(ProcessError::Product)? {
-            specs.retain(|other| other.name != spec.name);
-            specs.push(spec);
-        }
-    }
-    let problems = make(session, state, &task, &rig, &specs, Vec::new(), &|| true)?;
-    Ok(Processed {
-        report: session.report_path(),
-        stored: state.stored_points(),
-        points: shape.points(),
-        problems,
-    })
 }

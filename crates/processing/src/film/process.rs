@@ -12,7 +12,8 @@ use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::Setting;
 
-use super::{FilmTask, write_report};
+use super::report;
+use super::task::{FilmTask, create_transports};
 use crate::plane::{manifest, unit_of};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
@@ -32,7 +33,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
         return Err(ProcessError::Product(message.into()));
     }
     let problems = make_transports(session, &task, state, &stages)?;
-    write_report(session, state, &task, &problems)?;
+    report::write(session, state, &task, &problems)?;
     manifest::write(session, state, &task.task, &rig)?;
     Ok(Processed {
         report: session.report_path(),
@@ -57,7 +58,7 @@ fn make_transports(
         return Ok(vec!["the dark image is missing or damaged: no transport can be made without it".into()]);
     };
     let film = session.film()?;
-    let transports = super::create_transports(session, task, solver.reach_rows())?;
+    let transports = create_transports(session, task, solver.reach_rows())?;
     let mut problems = Vec::new();
     for entry in state.cycles() {
         let frames = match film.read(entry.cycle) {

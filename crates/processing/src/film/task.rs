@@ -1,7 +1,4 @@
-//! Films: one light transport per cycle of a few settings.
-
-mod process;
-mod report;
+//! A film on a plane rig: its settings, stages and solver.
 
 use std::sync::Arc;
 
@@ -12,8 +9,6 @@ use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
 use serde_json::json;
 
-pub use self::process::process;
-pub use self::report::{shortcomings, write as write_report};
 use crate::plane::PlaneTask;
 
 /// Frames of the dark image: its noise enters every cycle, so it averages many.

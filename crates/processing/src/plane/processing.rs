@@ -15,7 +15,7 @@ use raysweep_session::ledger::State;
 use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::Transport;
 
-use super::{PlaneTask, place, unit_of};
+use super::task::{PlaneTask, place, unit_of};
 
 /// The stages and products of a plan.
 pub struct Processing {

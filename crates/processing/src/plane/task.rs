@@ -1,12 +1,7 @@
-//! Shared by the procedures of the plane rig: points, and the model that turns counts into light.
-
-pub mod manifest;
-mod processing;
-pub mod report;
+//! The points of a plan on the plane rig, and the model that turns counts into light.
 
 use std::sync::Arc;
 
-pub use self::processing::Processing;
 use ndarray::Array2;
 use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
@@ -18,6 +13,9 @@ use raysweep_pipeline::{
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
 use serde_json::{Map, Value, json};
+
+use crate::saturation::saturation_dn;
+use crate::software::SOFTWARE;
 
 /// The points of a plan on a plane rig: everything that acquisition and processing share.
 #[derive(Clone)]
@@ -58,7 +56,7 @@ impl PlaneTask {
             height: size.0,
             width: size.1,
             white_dn: rig.camera.white_dn(),
-            saturation_dn: crate::saturation_dn(rig.camera.pixel_format),
+            saturation_dn: saturation_dn(rig.camera.pixel_format),
         };
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
         Self { name, stages, max_jitter_us, schedule, geometry, places }
@@ -129,7 +127,7 @@ impl PlaneTask {
             ("row_pitch", json!(geometry.row_pitch)),
             ("camera_row_time_us", json!(geometry.camera_row_time_us)),
             ("white_dn", json!(geometry.white_dn)),
-            ("software", json!(crate::SOFTWARE)),
+            ("software", json!(SOFTWARE)),
         ];
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }

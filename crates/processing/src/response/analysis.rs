@@ -8,7 +8,9 @@ use raysweep_transport::dots::identify::{
 };
 use serde_json::{Map, Value, json};
 
-use super::{AXES, Record};
+use super::record::Record;
+use super::task::AXES;
+use crate::software::SOFTWARE;
 
 /// Share of the frames that must show the dot; the others are interpolated linearly.
 const LEAST_SHOWN: f64 = 0.9;
@@ -151,7 +153,7 @@ impl Axis {
             columns.push(("fitted_phase_rad", column(&fitted, |at| at.phase_rad)));
         }
         let about = "the dot's movement over the commanded tilt, in pixels per degree of the mirror; phases are those of the movement";
-        let entries = [("about", json!(about)), ("axis", json!(name)), ("software", json!(crate::SOFTWARE))];
+        let entries = [("about", json!(about)), ("axis", json!(name)), ("software", json!(SOFTWARE))];
         let metadata: Map<String, Value> =
             entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
         session.products().table(&format!("response_{name}"), &columns, &metadata)

@@ -11,7 +11,7 @@ use raysweep_transport::dots::identify::{Identified, Resonance, Transfer};
 use serde_json::json;
 
 use super::analysis::Axis;
-use super::{AXES, ResponseTask};
+use super::task::{AXES, ResponseTask};
 use crate::mirror_response::AxisResponse;
 use crate::report::{accounts, subtitle};
 

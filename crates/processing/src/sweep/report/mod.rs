@@ -12,15 +12,13 @@ use raysweep_session::report::{
 use raysweep_session::stack::{ArrayName, Stack};
 use raysweep_session::{Result, Session, durable, transport};
 
-use super::SweepTask;
+use self::products::PERCENTILE;
 use super::results::Results;
 use super::strips::Overview;
+use super::task::SweepTask;
 use crate::plane::place;
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, subtitle};
-
-/// Percentile of the pixels that maps to white in a picture.
-const PERCENTILE: f64 = 99.5;
 
 /// The same for the stack's indirect light, which is far dimmer and fills more of its images.
 const INDIRECT_PERCENTILE: f64 = 70.0;

@@ -1,0 +1,10 @@
+//! Shared by the procedures of the plane rig: points, stages, and the model that turns counts into light.
+
+pub mod manifest;
+mod processing;
+pub mod report;
+mod task;
+
+pub use self::processing::Processing;
+pub(crate) use self::task::unit_of;
+pub use self::task::{PlaneTask, place};

@@ -1,0 +1,76 @@
+//! Sweeps: computes one light transport from images at many delays and exposures.
+
+mod report;
+mod results;
+mod strips;
+mod task;
+
+use raysweep_config::plan::products_of_argument;
+use raysweep_config::{ConfigError, Places, SweepPlan};
+use raysweep_pipeline::ProductSpec;
+
+pub use self::report::write as write_report;
+pub use self::results::{Results, write_products};
+pub use self::strips::Overview;
+pub use self::task::SweepTask;
+use self::task::append_product;
+use crate::memory::{MemoryNeed, available_bytes};
+use crate::plane::{PlaneTask, manifest};
+use crate::stored::{Asked, ProcessError, Processed, Stored};
+
+/// Appends the products that a command line argument asks for: the keys of a `[[product]]`, separated by commas.
+fn append_argument(specs: &mut Vec<ProductSpec>, argument: &str, task: &PlaneTask) -> Result<(), String> {
+    let shown = |(error, text): (ConfigError, String)| error.render("--product", &text);
+    let (tables, places, text): (_, Places, _) = products_of_argument(argument).map_err(shown)?;
+    for (index, table) in tables.iter().enumerate() {
+        append_product(specs, table, index, task, &|path, message| places.error(path, message))
+            .map_err(|error| error.render("--product", &text))?;
+    }
+    Ok(())
+}
+
+/// Makes the products of a stored sweep again.
+///
+/// # Errors
+/// When a product cannot be made from it, before anything is written; when the session cannot be written.
+pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<Processed, ProcessError> {
+    let Stored { session, state, plan, .. } = stored;
+    let rig = stored.plane_rig()?;
+    let shape = state.session.shape;
+    let sweep = SweepTask::new(plan, sweep, &rig, state.session.first_row, (shape.rows, shape.columns));
+    stored.check_contents(sweep.contents())?;
+    let task = &*sweep.task;
+    let mut processing = sweep.processing().map_err(|error| stored.in_plan(&error))?;
+    if asked.only {
+        processing.products.clear();
+    }
+    for argument in &asked.products {
+        append_argument(&mut processing.products, argument, task).map_err(ProcessError::Product)?;
+    }
+    let memory = MemoryNeed::of_sweep(task, &processing.products)
+        .map_err(|error| ProcessError::Config(error.to_string()))?;
+    let available_bytes = available_bytes(asked.memory_limit_bytes);
+    if memory.bytes(available_bytes) > available_bytes {
+        return Err(ProcessError::Memory { needed_bytes: memory.bytes(available_bytes), available_bytes });
+    }
+    let in_strips = memory.in_strips(available_bytes);
+    if in_strips {
+        processing.keep_no_images();
+    }
+    processing.feed_stored(task, state, &session.stack()?, &|| true);
+    let mut results = match in_strips {
+        true => Results::in_strips(processing, session, state, task, &|| true)?,
+        false => Results::whole(processing, session, task, &|| true)?,
+    };
+    results.write_transport()?;
+    let overview = results.overview();
+    write_products(session, task, &results.products)?;
+    write_report(session, state, &sweep, &results, overview.as_ref())?;
+    manifest::write(session, state, task, &rig)?;
+    Ok(Processed {
+        report: session.report_path(),
+        stored: state.stored_points(),
+        points: shape.points(),
+        problems: results.problems,
+    })
+}
