@@ -51,9 +51,15 @@ impl Lab<'_> {
     }
 
     /// Free disk space where sessions are, or will be.
-    pub fn disk_free_bytes(&self) -> u64 {
+    fn disk_free_bytes(&self) -> u64 {
         let existing = self.data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
         durable::available_bytes(existing).unwrap_or(u64::MAX)
+    }
+
+    /// What a session and its results need, and what there is.
+    pub fn room(&self, memory_bytes: u64, disk_bytes: u64) -> Room {
+        let (memory_free_bytes, disk_free_bytes) = (self.memory_free_bytes(), self.disk_free_bytes());
+        Room { memory_bytes, memory_free_bytes, disk_bytes, disk_free_bytes }
     }
 
     /// Capabilities of the rig's camera at this frame rate.
@@ -70,10 +76,10 @@ impl Lab<'_> {
 
 /// Disk space and memory that a session and its results need, and what is available.
 pub struct Room {
-    pub memory_bytes: u64,
-    pub memory_free_bytes: u64,
-    pub disk_bytes: u64,
-    pub disk_free_bytes: u64,
+    memory_bytes: u64,
+    memory_free_bytes: u64,
+    disk_bytes: u64,
+    disk_free_bytes: u64,
 }
 
 impl Room {

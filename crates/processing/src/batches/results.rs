@@ -24,7 +24,7 @@ use crate::software::SOFTWARE;
 /// Number of images of a video in the report.
 const SHOWN: usize = 6;
 
-/// Makes the calibration, the videos, the report and the manifest; returns the problems.
+/// Makes the calibration, the videos and the report; returns the problems.
 ///
 /// # Errors
 /// When the session cannot be written.
@@ -32,7 +32,6 @@ pub fn make(
     session: &Session,
     state: &State,
     task: &DotTask,
-    rig: &DotRigFile,
     specs: &[DotSpec],
     mut problems: Vec<String>,
     go_on: &dyn Fn() -> bool,
@@ -97,7 +96,6 @@ pub fn make(
     problems.append(&mut encoder.problems);
     let page = report::make(session, state, task, calibration.as_ref(), &strips, &problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())?;
-    write_manifest(session, state, task, rig)?;
     Ok(problems)
 }
 
@@ -211,7 +209,11 @@ fn common(task: &DotTask, about: &str, channels: usize) -> Map<String, Value> {
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
-fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
+/// Writes the manifest, the last file of a session.
+///
+/// # Errors
+/// When the session cannot be written.
+pub fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
     let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
     let plan = &task.batches;
     let settings = json!({

@@ -7,7 +7,7 @@ mod sink;
 use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, Plan};
-use raysweep_processing::batches::{DotTask, keep_patterns, make};
+use raysweep_processing::batches::{DotTask, keep_patterns, make, write_manifest};
 use raysweep_proto::{ErrorCode, RpcError};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
@@ -78,7 +78,8 @@ impl Procedure for BatchesRun {
         ledger.append(&Entry::End(end.clone()))?;
         if state == EndState::Complete {
             let go_on = || orders.go_on();
-            problems = make(&session, ledger.state(), &task, &rig.file, &task.specs, problems, &go_on)?;
+            problems = make(&session, ledger.state(), &task, &task.specs, problems, &go_on)?;
+            write_manifest(&session, ledger.state(), &task, &rig.file)?;
         }
         Ok(Ended { end, warnings: problems })
     }

@@ -6,7 +6,6 @@ mod sink;
 mod worker;
 
 use std::sync::Arc;
-use std::sync::mpsc::channel;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
@@ -100,22 +99,10 @@ impl FilmRun {
         let cycles = CyclePlan::new(task, opened.camera());
         let account = Arc::new(Account::new(film.points()));
         let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
-        let (verdicts, results) = channel();
         let planned = missing.len() + film.points();
-        let points = PointSink {
-            task: task.clone(),
-            stack,
-            ledger: run.ledger,
-            processing: Processing::without_demux(self.stages.clone()),
-            verdicts: Some(verdicts),
-            orders: run.orders,
-            board: run.board.clone(),
-            progress: ProgressMeter::new(0, planned),
-            vsync: None,
-            // A film's own transports serve as its live estimate.
-            live: None,
-            write_error: None,
-        };
+        let processing = Processing::without_demux(self.stages.clone());
+        // A film's own transports serve as its live estimate.
+        let (points, results) = PointSink::new(task, run, stack, processing, ProgressMeter::new(0, planned));
         let sink = FilmSink { points, film: frames };
         let under_way = CYCLES_UNDER_WAY * cycles.shots.len();
         let taken = opened.acquire(self.stages.clone(), under_way, sink, &results, |passes| {
@@ -129,14 +116,14 @@ impl FilmRun {
         let solved = frames.finish();
         let summary = account.summary();
         points.append(&Entry::Film(summary.clone()));
-        run.board.set_film(summary);
+        points.run.board.set_film(summary);
         match solved {
             Ok(ended) => ended?,
             Err(error) => points.note_write_error(error),
         }
         Ok(Acquired {
-            session: run.session,
-            ledger: points.ledger,
+            session: points.run.session,
+            ledger: points.run.ledger,
             problems: points.processing.problems,
             vsync: points.vsync,
             exposures,

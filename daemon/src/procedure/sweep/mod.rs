@@ -4,7 +4,6 @@ mod advice;
 mod check;
 
 use std::sync::Arc;
-use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use raysweep_config::{ConfigError, Plan, SweepPlan};
@@ -130,26 +129,16 @@ fn acquire(
         processing.problems.clear();
     }
     let planned = task.schedule.points.len();
-    let (verdicts, results) = channel();
     let stages = processing.stages.clone();
-    let sink = PointSink {
-        task: task.clone(),
-        stack,
-        ledger: run.ledger,
-        processing,
-        verdicts: Some(verdicts),
-        orders: run.orders,
-        board: run.board,
-        progress: ProgressMeter::new(planned - missing.len(), planned),
-        vsync: None,
-        live: run.live.and_then(start_live),
-        write_error: None,
-    };
+    let progress = ProgressMeter::new(planned - missing.len(), planned);
+    let live = run.live.clone().and_then(start_live);
+    let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
+    sink.live = live;
     let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
     let Taken { sink, exposures, latency, fault } = taken;
     Ok(Acquired {
-        session: run.session,
-        ledger: sink.ledger,
+        session: sink.run.session,
+        ledger: sink.run.ledger,
         processing: sink.processing,
         vsync: sink.vsync,
         exposures,
