@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 use raysweep_core::{Counts, Frame, FramePool, FrameStamp, LossCause, PixelFormat};
 use raysweep_pipeline::dots::{
-    Arrival, Cut, CutSink, DarkRun, DotsFlow, DotsFlowConfig, Gathered, Scan, Sensor, column_stage,
+    Arrival, Cut, CutSink, DarkRun, DotScan, DotsFlow, DotsFlowConfig, Gathered, Sensor, column_stage,
 };
 use raysweep_pipeline::{Policy, QueueError};
 use raysweep_transport::dots::product::floodlit;
@@ -91,8 +91,8 @@ impl Memory {
         }
     }
 
-    fn scan(&self) -> Scan {
-        Scan {
+    fn scan(&self) -> DotScan {
+        DotScan {
             shape: self.shape,
             dots: DOTS,
             trailing_index: DOTS - 1,

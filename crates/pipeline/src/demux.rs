@@ -22,7 +22,7 @@ use crate::strips::{NotSolved, Strip};
 use crate::unit::Unit;
 
 /// One image of the sweep and its settings.
-struct Taken {
+struct SweepImage {
     setting: Setting,
     /// Mean counts.
     image: Array2<f32>,
@@ -35,7 +35,7 @@ pub struct DemuxFold {
     schedule: Arc<Schedule>,
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
-    taken: BTreeMap<Role, Arc<Taken>>,
+    taken: BTreeMap<Role, Arc<SweepImage>>,
     /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
     not_kept: Option<BTreeMap<Role, (u32, Setting)>>,
 }
@@ -46,7 +46,7 @@ struct Held {
     first_row: usize,
     stack: SweepStack,
     /// The regular image and its dark image, if both were taken.
-    regular: Option<(Arc<Taken>, Arc<Taken>)>,
+    regular: Option<(Arc<SweepImage>, Arc<SweepImage>)>,
 }
 
 /// A sweep that was solved in one piece.
@@ -110,14 +110,14 @@ impl DemuxFold {
     }
 
     /// The dark image for the exposure of a role's image, if it was taken.
-    fn dark_of(&self, taken: &BTreeMap<Role, Arc<Taken>>, role: Role) -> Option<Arc<Taken>> {
+    fn dark_of(&self, taken: &BTreeMap<Role, Arc<SweepImage>>, role: Role) -> Option<Arc<SweepImage>> {
         let point = self.schedule.points.iter().find(|point| point.role == role)?;
         taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
     }
 
     /// The sweep in these images, without those whose dark image is missing. Each image is dropped as soon as it is
     /// in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
-    fn stack(&self, mut taken: BTreeMap<Role, Arc<Taken>>) -> Result<SweepStack, NotSolved> {
+    fn stack(&self, mut taken: BTreeMap<Role, Arc<SweepImage>>) -> Result<SweepStack, NotSolved> {
         let darks = taken.extract_if(.., |role, _| matches!(role, Role::Dark(_))).collect();
         taken.retain(|role, _| matches!(role, Role::Sweep(_)) && self.dark_of(&darks, *role).is_some());
         if taken.is_empty() {
@@ -128,7 +128,7 @@ impl DemuxFold {
             });
         }
         let scale = (1.0 / self.geometry.white_dn) as f32;
-        let saturates = |taken: &Arc<Taken>| self.valid(taken.image.view()).iter().any(|valid| !valid);
+        let saturates = |taken: &Arc<SweepImage>| self.valid(taken.image.view()).iter().any(|valid| !valid);
         let rows = taken.values().next().map_or(0, |taken| taken.image.nrows());
         let shape = (taken.len(), rows, self.geometry.width);
         let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
@@ -160,7 +160,7 @@ impl DemuxFold {
     }
 
     /// The camera rows starting at `first_row`, to which the images belong.
-    fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<Taken>>) -> Result<Held, NotSolved> {
+    fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<SweepImage>>) -> Result<Held, NotSolved> {
         let regular = taken.get(&Role::Regular).cloned().zip(self.dark_of(&taken, Role::Regular));
         Ok(Held { first_row, stack: self.stack(taken)?, regular })
     }
@@ -210,7 +210,9 @@ impl DemuxFold {
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {
-                drop(self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() })));
+                drop(
+                    self.taken.insert(point.role, Arc::new(SweepImage { setting, image: image.to_owned() })),
+                );
             }
         }
     }

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use raysweep_transport::plane::{PlaneError, Setting};
 
 use super::tally::{SweepSummary, Tally};
-use super::{DEMUX, DemuxFold, Taken, refused};
+use super::{DEMUX, DemuxFold, SweepImage, refused};
 use crate::findings::rows_to_choose_by;
 use crate::schedule::Role;
 use crate::strips::{ImageRows, InStrips, NotSolved};
@@ -47,7 +47,7 @@ impl DemuxFold {
         not_kept: &BTreeMap<Role, (u32, Setting)>,
         images: &dyn ImageRows,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<BTreeMap<Role, Arc<Taken>>, NotSolved> {
+    ) -> Result<BTreeMap<Role, Arc<SweepImage>>, NotSolved> {
         let height = self.geometry.height;
         let rows = rows_to_choose_by(height);
         let of_rows = |(role, (point, setting)): (&Role, &(u32, Setting))| {
@@ -55,7 +55,7 @@ impl DemuxFold {
                 return Err(refused(PlaneError::Stopped));
             }
             let image = images.read(*point, 0..height).map_err(not_read)?.select(Axis(0), &rows);
-            Ok((*role, Arc::new(Taken { setting: setting.clone(), image })))
+            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image })))
         };
         not_kept.iter().map(of_rows).collect()
     }
@@ -66,12 +66,12 @@ fn read_rows(
     not_kept: &BTreeMap<Role, (u32, Setting)>,
     images: &dyn ImageRows,
     rows: &Range<usize>,
-) -> Result<BTreeMap<Role, Arc<Taken>>, NotSolved> {
+) -> Result<BTreeMap<Role, Arc<SweepImage>>, NotSolved> {
     not_kept
         .par_iter()
         .map(|(role, (point, setting))| {
             let image = images.read(*point, rows.clone()).map_err(not_read)?;
-            Ok((*role, Arc::new(Taken { setting: setting.clone(), image })))
+            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image })))
         })
         .collect()
 }

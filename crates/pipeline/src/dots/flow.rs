@@ -13,7 +13,7 @@ use raysweep_transport::dots::{
 };
 
 use super::background::Backgrounds;
-use super::gather::{CutSink, Gatherer, Looked, Loss, Scan};
+use super::gather::{CutSink, DotScan, Gatherer, Looked, Loss};
 use super::stage::{ColumnStage, ColumnWorker};
 use crate::pipeline::PipelineError;
 use crate::queue::{Input, Policy, QueueError};
@@ -30,7 +30,7 @@ pub struct Arrival {
 /// How frames are turned into batches.
 pub struct DotsFlowConfig {
     /// The scan.
-    pub scan: Scan,
+    pub scan: DotScan,
     /// Pixel format of the frames.
     pub format: PixelFormat,
     /// Counts from which a pixel is overexposed.
@@ -96,7 +96,7 @@ struct Shop {
     backgrounds: Backgrounds,
     /// Columns for reuse.
     spare: Mutex<Vec<SparseColumn>>,
-    scan: Scan,
+    scan: DotScan,
     format: PixelFormat,
     saturation_dn: u16,
     floor: NoiseFloor,
@@ -214,7 +214,7 @@ impl Shop {
             Ok(counts) => counts,
             Err(problem) => return (unseen, Err(problem)),
         };
-        let Scan { shape, trailing_region, .. } = &self.scan;
+        let DotScan { shape, trailing_region, .. } = &self.scan;
         let seen = Observation::new(frame.stamp.seq, counts, *shape, trailing_region, self.saturation_dn);
         let mut column = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
         let made =

@@ -25,7 +25,7 @@ pub struct Loss {
 
 /// The parameters of a scan.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Scan {
+pub struct DotScan {
     /// Size of the frames.
     pub shape: FrameShape,
     /// Number of frames per batch.
@@ -40,7 +40,7 @@ pub struct Scan {
     pub batches: u32,
 }
 
-impl Scan {
+impl DotScan {
     /// Whether a frame of the batch shows the scene: neither trailing dot nor beam dump.
     pub fn is_scene(&self, index: u32) -> bool {
         index != self.trailing_index && !self.background_indices.contains(&index)
@@ -120,7 +120,7 @@ enum Cutter {
 }
 
 pub(super) struct Gatherer<S> {
-    scan: Scan,
+    scan: DotScan,
     format: PixelFormat,
     pub sink: S,
     cutter: Cutter,
@@ -143,7 +143,7 @@ pub(super) struct Gatherer<S> {
 }
 
 impl<S: CutSink> Gatherer<S> {
-    pub fn new(scan: Scan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
+    pub fn new(scan: DotScan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
         let shape = scan.shape;
         let learning = LEARNT_FROM_BATCHES * scan.dots as usize + 2;
         Self {

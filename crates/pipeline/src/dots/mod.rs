@@ -14,7 +14,7 @@ mod stage;
 
 pub use dark::{DarkRun, FlatRun, Sensor};
 pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered};
-pub use gather::{Cut, CutSink, Loss, Scan};
+pub use gather::{Cut, CutSink, DotScan, Loss};
 pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, column_stage};
 
 #[cfg(test)]

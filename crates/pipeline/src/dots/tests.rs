@@ -21,8 +21,8 @@ fn shape() -> FrameShape {
     FrameShape::new(HEIGHT, WIDTH, 1).unwrap()
 }
 
-fn scan(batches: u32) -> Scan {
-    Scan {
+fn scan(batches: u32) -> DotScan {
+    DotScan {
         shape: shape(),
         dots: DOTS,
         trailing_index: TRAILING,

@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 
 use super::band::{Band, Width};
 use super::profile::{ProfileOptions, ProfileTable};
-use super::relight::Pattern;
+use super::relight::RowPattern;
 use crate::schedule::{Schedule, SweepGeometry};
 
 /// Why a product is invalid.
@@ -35,7 +35,7 @@ pub(super) enum ProductKind {
     Epipolar(Width),
     NonEpipolar(Width),
     Band(Band),
-    Relight(Pattern),
+    Relight(RowPattern),
     DelayProfile(ProfileOptions),
     Uncertainty(Band),
 }
@@ -82,7 +82,7 @@ impl ProductSpec {
                     let what = "give exactly one of rows, stripes and line".to_owned();
                     return Err(refused(Vec::new(), what));
                 }
-                let pattern: Pattern = parse(kind, options)?;
+                let pattern: RowPattern = parse(kind, options)?;
                 pattern.check(geometry).map_err(|(path, what)| refused(path, what))?;
                 ProductKind::Relight(pattern)
             }

@@ -16,7 +16,7 @@ use serde_json::{Map, Value, json};
 
 use super::calibration::{Calibration, read_batch};
 use super::product::{DotSpec, Scene, light_of, read_pattern};
-use super::report::{self, Strip};
+use super::report::{self, VideoStrip};
 use super::task::DotTask;
 use crate::mirror_response::Predistortion;
 use crate::software::SOFTWARE;
@@ -129,7 +129,7 @@ struct Video<'a> {
     spec: &'a DotSpec,
     patterns: Option<Array4<f32>>,
     writers: Vec<(String, VideoWriter)>,
-    strips: Vec<Strip>,
+    strips: Vec<VideoStrip>,
 }
 
 impl Video<'_> {
@@ -147,7 +147,7 @@ impl Video<'_> {
                 let metadata = common(task, &about, channels);
                 let writer = session.products().video(&name, count, [rows, columns, channels], &metadata)?;
                 self.writers.push((name.clone(), writer));
-                self.strips.push(Strip { name, about, images: Vec::new() });
+                self.strips.push(VideoStrip { name, about, images: Vec::new() });
             }
             let scale: ToneMap = self.writers[place].1.append(image.view())?;
             let step = count.div_ceil(SHOWN);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, DotRigFile, Places, Plan, StageTable};
 use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter};
-use raysweep_pipeline::dots::{ColumnStage, Scan, column_stage};
+use raysweep_pipeline::dots::{ColumnStage, DotScan, column_stage};
 use raysweep_session::stack::Contents;
 use raysweep_transport::dots::{Correction, FrameShape, Region, Sampling};
 use serde::Deserialize;
@@ -112,7 +112,7 @@ impl DotTask {
     }
 
     /// What the pipeline extracts from the frames of one pass of `batches` batches.
-    pub fn scan(&self, batches: u32) -> Scan {
+    pub fn scan(&self, batches: u32) -> DotScan {
         scan(&self.batches, self.shape, batches)
     }
 
@@ -160,9 +160,9 @@ impl DotTask {
 }
 
 /// What the pipeline extracts from the frames of one pass of `count` batches.
-fn scan(plan: &BatchesPlan, shape: FrameShape, count: u32) -> Scan {
+fn scan(plan: &BatchesPlan, shape: FrameShape, count: u32) -> DotScan {
     let [top, bottom, left, right] = plan.trailing_region;
-    Scan {
+    DotScan {
         shape,
         dots: plan.dots,
         trailing_index: plan.trailing_index(),

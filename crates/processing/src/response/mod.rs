@@ -14,7 +14,7 @@ use raysweep_session::ledger::State;
 use raysweep_session::{Result, Session};
 
 pub use self::analysis::ResponseError;
-use self::analysis::{Axis, analyse};
+use self::analysis::{FoundAxis, analyse};
 pub use self::dot::DotFinder;
 pub use self::record::Record;
 pub use self::task::{AXES, ResponseTask};
@@ -22,11 +22,11 @@ use crate::mirror_response::{self, KeptResponse};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
 /// Results of a session's records.
-pub struct Findings {
-    axes: [Axis; 2],
+pub struct MirrorFindings {
+    axes: [FoundAxis; 2],
 }
 
-impl Findings {
+impl MirrorFindings {
     /// Analyses the records that the ledger lists.
     ///
     /// # Errors
@@ -107,7 +107,7 @@ pub fn process(
     let task = ResponseTask::new(plan, response, &rig, rig.camera.pixel_format, size)
         .map_err(|error| ProcessError::Config(error.to_string()))?;
     stored.check_contents(task.contents())?;
-    let findings = Findings::of(session, state, &task)?;
+    let findings = MirrorFindings::of(session, state, &task)?;
     findings.keep(session, state, None)?;
     findings.write(session, state, &task, &rig)?;
     let refusal = findings.refusal().map(ToString::to_string);

@@ -14,7 +14,7 @@ use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::Ledger;
 use raysweep_transport::dots::{DotsError, FlatField};
 
-use super::sink::{BatchSink, RawSink, Stored, Writing};
+use super::sink::{BatchSink, RawSink, StoredBatches, Writing};
 use crate::devices::dots::camera::Refused;
 use crate::devices::dots::motion::Motion;
 use crate::devices::dots::play::Player;
@@ -74,7 +74,7 @@ pub fn acquire(
     camera.arm()?;
     let _ = run.board.go(RunState::Armed);
     let _ = run.board.go(RunState::Running);
-    let mut passes = Passes {
+    let mut passes = DotPasses {
         task,
         probes,
         session: &run.session,
@@ -100,12 +100,12 @@ pub fn acquire(
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
     }
-    let Stored { ledger, problems, error } = storage.finish()?;
+    let StoredBatches { ledger, problems, error } = storage.finish()?;
     let fault = error.map(RunError::from).or(passed.err());
     Ok(Acquired { session: run.session, ledger, problems, fault })
 }
 
-struct Passes<'a> {
+struct DotPasses<'a> {
     task: &'a DotTask,
     probes: &'a Probes,
     session: &'a Session,
@@ -118,7 +118,7 @@ struct Passes<'a> {
     player: Player<'a>,
 }
 
-impl Passes<'_> {
+impl DotPasses<'_> {
     /// Dark frames, flat field, planes, scene.
     fn all(&mut self) -> Result<(), RunError> {
         let plan = &self.task.batches;
