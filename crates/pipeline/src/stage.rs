@@ -22,8 +22,8 @@ pub struct StageError {
     pub what: String,
 }
 
-/// A pure computation on one unit's mean image; runs on any worker thread. Plans have [`HotPixels`]; tests add stages of
-/// their own, which fail or panic.
+/// A pure computation on one unit's mean image; runs on any worker thread. Plans have [`HotPixels`]; tests add stages
+/// of their own, which fail or panic.
 pub trait Stage: Send + Sync {
     /// Its name in plans and errors.
     fn name(&self) -> &str;

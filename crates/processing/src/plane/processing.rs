@@ -35,9 +35,9 @@ impl Processing {
         Self { stages, demux: None, products: Vec::new(), problems: Vec::new() }
     }
 
-    /// Passes stored points through the stages into the demultiplexer, while `go_on` returns true. A point whose stage fails
-    /// is left out and listed among the problems; so are points with damaged data, which are returned because they
-    /// must be acquired again.
+    /// Passes stored points through the stages into the demultiplexer, while `go_on` returns true. A point whose stage
+    /// fails is left out and listed among the problems; so are points with damaged data, which are returned because
+    /// they must be acquired again.
     pub fn feed_stored(
         &mut self,
         task: &PlaneTask,
