@@ -6,10 +6,12 @@ mod devices;
 pub mod live;
 pub mod mirror;
 mod plane;
+mod probes;
 mod procedure;
 pub mod rig;
 mod run;
 mod runner;
 pub mod server;
 
+pub use probes::Probes;
 pub use runner::Runner;

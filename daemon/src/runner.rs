@@ -8,7 +8,7 @@ use std::thread::{self, JoinHandle};
 
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{Registry, message_of};
+use raysweep_pipeline::message_of;
 use raysweep_proto::{
     CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
     Started, Status,
@@ -20,6 +20,7 @@ use tokio::sync::broadcast;
 use crate::control::Control;
 use crate::live::{LiveFile, Outlet};
 use crate::mirror;
+use crate::probes::Probes;
 use crate::procedure::lab::{Lab, LabRig};
 use crate::procedure::{Unresumable, foresee, foresee_rest};
 use crate::rig::{AnyRig, RigError};
@@ -36,10 +37,10 @@ pub struct Runner {
     /// Capabilities of the rig's camera when the daemon started.
     camera: CameraCapabilities,
     data: PathBuf,
-    registry: Arc<Registry>,
     board: Arc<StatusBoard>,
     live: Option<Arc<LiveFile>>,
     memory_limit_bytes: Option<u64>,
+    probes: Probes,
     current: Mutex<Option<Current>>,
     /// Set once, when no more runs may begin.
     closed: AtomicBool,
@@ -57,7 +58,7 @@ impl Runner {
     ///
     /// # Errors
     /// The first device that cannot be opened.
-    pub fn new(rig: impl Into<AnyRig>, data: PathBuf, registry: Registry) -> Result<Self, RigError> {
+    pub fn new(rig: impl Into<AnyRig>, data: PathBuf) -> Result<Self, RigError> {
         let (rig, camera, kind) = match rig.into() {
             AnyRig::Plane(rig) => {
                 let camera = rig.open()?.camera.capabilities().clone();
@@ -72,10 +73,10 @@ impl Runner {
             rig,
             camera,
             data,
-            registry: Arc::new(registry),
             board: Arc::new(StatusBoard::new(kind)),
             live: None,
             memory_limit_bytes: None,
+            probes: Probes::default(),
             current: Mutex::default(),
             closed: AtomicBool::new(false),
         })
@@ -97,6 +98,13 @@ impl Runner {
         self
     }
 
+    /// Inserts these into its runs, for tests.
+    #[must_use]
+    pub fn with_probes(mut self, probes: Probes) -> Self {
+        self.probes = probes;
+        self
+    }
+
     /// Capabilities of the rig's camera.
     pub fn camera(&self) -> &CameraCapabilities {
         &self.camera
@@ -107,7 +115,7 @@ impl Runner {
             rig: &self.rig,
             camera: &self.camera,
             data: &self.data,
-            registry: &self.registry,
+            probes: &self.probes,
             memory_limit_bytes: self.memory_limit_bytes,
         }
     }

@@ -6,19 +6,19 @@
 use std::fs;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::mirror::state_file;
 use raysweep::rig::AnyRig;
+use raysweep::{Probes, Runner};
 use raysweep_config::{DotRigFile, Plan, Procedure};
 use raysweep_core::{Clock, MirrorLimits};
 use raysweep_drivers::mirror::playzerx::protocol::Sample;
 use raysweep_drivers::mirror::{Parked, park};
-use raysweep_pipeline::Registry;
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
 use raysweep_proto::{Client, Event, RunParams, RunState};
 use raysweep_sim::mirror::{Held, Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
@@ -329,11 +329,10 @@ impl ColumnWorker for Panicking {
 #[test]
 fn panic_in_a_stage() {
     let lab = Lab::new();
-    let mut registry = Registry::default();
-    registry.dots.register("denoise", |_, _| Ok(Box::new(Panicking)));
+    let probes = Probes { column_stage: Some(Arc::new(|_| Arc::new(Panicking))), ..Probes::default() };
     let rig = AnyRig::load(&lab.folder.path().join("rig.toml")).unwrap();
     fs::create_dir(lab.data()).unwrap();
-    let runner = Runner::new(rig, lab.data(), registry).unwrap();
+    let runner = Runner::new(rig, lab.data()).unwrap().with_probes(probes);
     runner.run(RunParams { plan: plan(3), ..RunParams::default() }).unwrap();
     let began = Instant::now();
     while !matches!(runner.status().state, RunState::Idle | RunState::Faulted) {

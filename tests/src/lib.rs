@@ -8,10 +8,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ndarray::Array2;
-use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::rig::{DotRig, Rig};
-use raysweep_pipeline::Registry;
+use raysweep::{Probes, Runner};
 use raysweep_proto::{Event, ResumeParams, RunParams};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
@@ -92,17 +91,17 @@ impl Bench {
     /// # Panics
     /// When the rig cannot be built.
     pub fn new(rig: &str) -> Self {
-        Self::with_registry(rig, Registry::default())
+        Self::with_probes(rig, Probes::default())
     }
 
-    /// Creates a bench with this rig and these stages.
+    /// Creates a bench with this rig and these probes.
     ///
     /// # Panics
     /// When the rig cannot be built.
-    pub fn with_registry(rig: &str, registry: Registry) -> Self {
+    pub fn with_probes(rig: &str, probes: Probes) -> Self {
         let folder = TempDir::new().expect("a temporary folder");
         std::fs::write(folder.path().join("rig.toml"), rig).expect("rig.toml written");
-        let runner = Arc::new(start(folder.path(), registry));
+        let runner = Arc::new(start(folder.path(), probes));
         Self { folder, runner }
     }
 
@@ -111,37 +110,38 @@ impl Bench {
     /// # Panics
     /// When the rig cannot be built.
     pub fn dots(rig: &str) -> Self {
-        Self::dots_with_registry(rig, Registry::default())
+        Self::dots_with_probes(rig, Probes::default())
     }
 
-    /// Creates a bench with a dot rig and these stages.
+    /// Creates a bench with a dot rig and these probes.
     ///
     /// # Panics
     /// When the rig cannot be built.
-    pub fn dots_with_registry(rig: &str, registry: Registry) -> Self {
+    pub fn dots_with_probes(rig: &str, probes: Probes) -> Self {
         let folder = TempDir::new().expect("a temporary folder");
         std::fs::write(folder.path().join("rig.toml"), rig).expect("rig.toml written");
         let rig = DotRig::load(&folder.path().join("rig.toml")).unwrap_or_else(|error| panic!("{error}"));
-        let runner = Runner::new(rig, folder.path().join("sessions"), registry);
-        Self { runner: Arc::new(runner.unwrap_or_else(|error| panic!("{error}"))), folder }
+        let runner = Runner::new(rig, folder.path().join("sessions"));
+        let runner = runner.unwrap_or_else(|error| panic!("{error}")).with_probes(probes);
+        Self { runner: Arc::new(runner), folder }
     }
 
     /// Stops the daemon's core and starts another one on the same folder.
     ///
     /// # Panics
     /// When the rig cannot be built.
-    pub fn restart_with(&mut self, registry: Registry) {
+    pub fn restart_with(&mut self, probes: Probes) {
         self.runner.shut_down();
-        self.runner = Arc::new(start(self.folder.path(), registry));
+        self.runner = Arc::new(start(self.folder.path(), probes));
     }
 
     /// Like [`Self::restart_with`], with a memory limit for the results.
     ///
     /// # Panics
     /// When the rig cannot be built.
-    pub fn limit_memory(&mut self, bytes: u64, registry: Registry) {
+    pub fn limit_memory(&mut self, bytes: u64, probes: Probes) {
         self.runner.shut_down();
-        let runner = start(self.folder.path(), registry);
+        let runner = start(self.folder.path(), probes);
         self.runner = Arc::new(runner.with_memory_limit(bytes));
     }
 
@@ -168,10 +168,10 @@ impl Bench {
     }
 }
 
-fn start(folder: &Path, registry: Registry) -> Runner {
+fn start(folder: &Path, probes: Probes) -> Runner {
     let rig = Rig::load(&folder.join("rig.toml")).unwrap_or_else(|error| panic!("{error}"));
-    let runner = Runner::new(rig, folder.join("sessions"), registry);
-    runner.unwrap_or_else(|error| panic!("{error}"))
+    let runner = Runner::new(rig, folder.join("sessions"));
+    runner.unwrap_or_else(|error| panic!("{error}")).with_probes(probes)
 }
 
 /// Waits until the run ends.

@@ -11,17 +11,15 @@ use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use ndarray::{Array2, Array3, Array4, Axis, Zip, s};
-use raysweep::Runner;
 use raysweep::control::Control;
-use raysweep_pipeline::Registry;
-use raysweep_pipeline::dots::{ColumnStage, ColumnWorker, DotStages};
+use raysweep::{Probes, Runner};
+use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
 use raysweep_processing::process;
 use raysweep_proto::{RunParams, RunState};
 use raysweep_session::dots::BatchEntry;
 use raysweep_tests::dots::{plan, rig};
 use raysweep_tests::{Bench, Ended, end_of, wait_until};
 use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
-use serde_json::json;
 
 fn entries(ended: &Ended) -> Vec<BatchEntry> {
     ended.open().1.batches().cloned().collect()
@@ -240,7 +238,7 @@ fn lighting_patterns_come_from_images_and_sequences() {
 
 /// Performs an action once a given number of frames have been denoised.
 struct Trap {
-    inner: Box<dyn ColumnStage>,
+    inner: Arc<dyn ColumnStage>,
     shared: Arc<Shared>,
 }
 
@@ -273,23 +271,18 @@ impl ColumnWorker for TrapWorker {
     }
 }
 
-/// A bench whose stage `trap` denoises, and calls `spring` at the given frame of the passes with light.
+/// A bench whose stage calls `spring` before it denoises, at the given frame of the passes with light.
 fn trapped(rig: &str, frame: usize, spring: fn(&Runner)) -> Bench {
     let shared = Arc::new(Shared { frames_left: AtomicUsize::new(frame), runner: OnceLock::new(), spring });
-    let mut registry = Registry::default();
-    registry.dots.register("trap", {
+    let around = {
         let shared = shared.clone();
-        move |_, correction| {
-            let inner = DotStages::default().make("denoise", json!({}), correction)?;
-            Ok(Box::new(Trap { inner, shared: shared.clone() }))
-        }
-    });
-    let bench = Bench::dots_with_registry(rig, registry);
+        move |inner| Arc::new(Trap { inner, shared: shared.clone() }) as Arc<dyn ColumnStage>
+    };
+    let probes = Probes { column_stage: Some(Arc::new(around)), ..Probes::default() };
+    let bench = Bench::dots_with_probes(rig, probes);
     assert!(shared.runner.set(bench.runner.clone()).is_ok());
     bench
 }
-
-const TRAP: &str = "[[stage]]\nname = \"trap\"\n";
 
 #[test]
 fn a_pause_in_mid_run_holds_before_the_next_pass_and_costs_nothing() {
@@ -298,7 +291,7 @@ fn a_pause_in_mid_run_holds_before_the_next_pass_and_costs_nothing() {
     // In the second batch of the first plane.
     let bench = trapped(&rig(""), 700, |runner| runner.pause().unwrap());
     let mut events = bench.runner.events();
-    let plan = plan(FLOODLIT, 2) + TRAP;
+    let plan = plan(FLOODLIT, 2);
     bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap();
     let stored = || bench.runner.status().progress.map_or(0, |progress| progress.points_stored);
     wait_until(|| stored() == 2);
@@ -319,7 +312,7 @@ fn a_cancelled_run_makes_videos_of_the_batches_that_are_there() {
     let through = completed(&straight, &plan(FLOODLIT, 6));
     // Both planes take four batches each of 300 dots; this frame is in the fourth batch of the scene.
     let bench = trapped(&rig(""), 2 * 4 * 300 + 4 * 300 + 150, |runner| runner.cancel().unwrap());
-    let ended = bench.run(&(plan(FLOODLIT, 6) + TRAP));
+    let ended = bench.run(&plan(FLOODLIT, 6));
     assert_eq!(ended.state, "cancelled", "{:?}", ended.error);
     let stored = checksums(&ended);
     assert!((5..10).contains(&stored.len()), "{stored:?}");

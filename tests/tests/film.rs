@@ -14,7 +14,6 @@ use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile, LiveReader};
 use raysweep::rig::Rig;
 use raysweep_config::RigFile;
 use raysweep_core::{FilmSummary, LossCause, PixelFormat};
-use raysweep_pipeline::Registry;
 use raysweep_processing as process;
 use raysweep_proto::{ErrorCode, Event, ResumeParams, RunParams, RunState};
 use raysweep_session::film::{CycleEntry, TransportFilm};
@@ -293,7 +292,7 @@ fn the_views_of_a_film_are_in_the_live_file() {
     std::fs::write(folder.path().join("rig.toml"), rig(4.0, "")).unwrap();
     let loaded = Rig::load(&folder.path().join("rig.toml")).unwrap();
     let path = folder.path().join("live");
-    let runner = Runner::new(loaded, folder.path().join("sessions"), Registry::default()).unwrap();
+    let runner = Runner::new(loaded, folder.path().join("sessions")).unwrap();
     let runner = runner.with_live(LiveFile::create(&path).unwrap());
     let mut events = runner.events();
     runner.run(RunParams { plan: plan(3), ..RunParams::default() }).unwrap();

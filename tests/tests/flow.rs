@@ -6,11 +6,13 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::process::Command;
+use std::sync::Arc;
 
 use ndarray::Array2;
+use raysweep::Probes;
 use raysweep::control::Control;
 use raysweep_core::LossCause;
-use raysweep_pipeline::{Entry, HotPixels, Registry, Stage, StageError, Unit};
+use raysweep_pipeline::{Stage, StageError, Unit};
 use raysweep_processing as process;
 use raysweep_proto::{ErrorCode, Event, RunParams, RunState};
 use raysweep_session::stack::ArrayName;
@@ -78,11 +80,9 @@ impl Stage for Clumsy {
 
 #[test]
 fn a_stage_that_fails_or_panics_costs_its_unit_only() {
-    let mut registry = Registry::default();
-    registry.register("clumsy", |_, _, _| Ok(Entry::Stage(Box::new(Clumsy))));
-    let bench = Bench::with_registry(&small_rig(""), registry);
-    let plan = format!("{PLAN}[[stage]]\nname = \"clumsy\"\n[[stage]]\nname = \"demux\"\n");
-    let ended = bench.run(&plan);
+    let probes = Probes { stages: vec![Arc::new(Clumsy)], ..Probes::default() };
+    let bench = Bench::with_probes(&small_rig(""), probes);
+    let ended = bench.run(PLAN);
     assert_eq!(ended.state, "complete", "{:?}", ended.error);
     let (_, state) = ended.open();
     assert_eq!(state.stored(ArrayName::Sum).count(), 10, "the raw images are stored all the same");
@@ -118,10 +118,8 @@ impl Stage for Saboteur {
 fn a_disk_that_refuses_ends_the_run_at_once_with_its_cause_and_the_rest_can_be_resumed() {
     let mut bench = Bench::new(&small_rig(""));
     let sessions = bench.folder.path().join("sessions");
-    let mut registry = Registry::default();
-    registry.register("saboteur", move |_, _, _| Ok(Entry::Stage(Box::new(Saboteur(sessions.clone())))));
-    bench.restart_with(registry);
-    let ended = bench.run(&format!("{PLAN}[[stage]]\nname = \"saboteur\"\n[[stage]]\nname = \"demux\"\n"));
+    bench.restart_with(Probes { stages: vec![Arc::new(Saboteur(sessions))], ..Probes::default() });
+    let ended = bench.run(PLAN);
     assert_eq!(ended.state, "faulted");
     assert!(ended.error.as_ref().unwrap().contains("stack.zarr"), "{:?}", ended.error);
     let (session, state) = ended.open();
@@ -138,9 +136,7 @@ fn a_disk_that_refuses_ends_the_run_at_once_with_its_cause_and_the_rest_can_be_r
     let sum = session.stack_path().join("sum");
     std::fs::remove_file(&sum).unwrap();
     std::fs::rename(sum.with_extension("away"), &sum).unwrap();
-    let mut harmless = Registry::default();
-    harmless.register("saboteur", |_, _, _| Ok(Entry::Stage(Box::new(HotPixels::default()))));
-    bench.restart_with(harmless);
+    bench.restart_with(Probes::default());
     let resumed = bench.resume(&ended.session);
     assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
 }

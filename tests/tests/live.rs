@@ -8,16 +8,14 @@ use std::process::Command;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use ndarray::{Array2, ArrayD, ArrayView2, Ix2};
-use raysweep::Runner;
+use ndarray::{Array2, ArrayD, Ix2};
 use raysweep::control::Control;
 use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile, LiveReader, TOTAL};
 use raysweep::rig::Rig;
-use raysweep_pipeline::{Entry, Fold, FoldError, Product, Registry, Snapshot, Stage, StageError, Unit};
+use raysweep::{Probes, Runner};
+use raysweep_pipeline::{Stage, StageError, Unit};
 use raysweep_proto::Event;
-use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, data, rig_text};
-use raysweep_transport::plane::Transport;
 use serde_json::json;
 
 const PLAN: &str = "kind = \"sweep\"\nname = \"live\"\n[sweep]\naverage = 4\n\
@@ -28,12 +26,12 @@ fn rig() -> String {
 }
 
 /// A bench with live images, and the file that contains them.
-fn live_bench(registry: impl FnOnce(&Path) -> Registry) -> (Bench, PathBuf) {
+fn live_bench(probes: impl FnOnce(&Path) -> Probes) -> (Bench, PathBuf) {
     let folder = tempfile::TempDir::new().unwrap();
     std::fs::write(folder.path().join("rig.toml"), rig()).unwrap();
     let file = folder.path().join("live");
     let rig = Rig::load(&folder.path().join("rig.toml")).unwrap();
-    let runner = Runner::new(rig, folder.path().join("sessions"), registry(&file)).unwrap();
+    let runner = Runner::new(rig, folder.path().join("sessions")).unwrap().with_probes(probes(&file));
     let runner = Arc::new(runner.with_live(LiveFile::create(&file).unwrap()));
     (Bench { folder, runner }, file)
 }
@@ -100,17 +98,13 @@ fn product(session: &Path, name: &str) -> Array2<f32> {
 fn estimates_appear_while_the_sweep_goes_on_and_come_to_its_result() {
     let seen = Seen::default();
     let (bench, file) = live_bench(|file| {
-        let (file, seen) = (file.to_owned(), seen.clone());
-        let mut registry = Registry::default();
-        registry.register("patient", move |_, _, _| {
-            Ok(Entry::Stage(Box::new(Patient { file: file.clone(), seen: seen.clone() })))
-        });
-        registry
+        let patient = Patient { file: file.to_owned(), seen: seen.clone() };
+        Probes { stages: vec![Arc::new(patient)], ..Probes::default() }
     });
     assert_eq!(bench.runner.status().live.as_deref(), Some(&*file));
     assert_eq!(std::fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o640);
     let mut events = bench.runner.events();
-    let ended = bench.run(&format!("{PLAN}[[stage]]\nname = \"patient\"\n[[stage]]\nname = \"demux\"\n"));
+    let ended = bench.run(PLAN);
     assert_eq!(ended.state, "complete", "{:?}", ended.error);
 
     let result = product(&ended.session, "epipolar");
@@ -157,7 +151,7 @@ fn transport(session: &Path) -> Array2<f32> {
 
 #[test]
 fn the_results_are_the_same_bits_with_live_images_and_without() {
-    let (bench, _file) = live_bench(|_| Registry::default());
+    let (bench, _file) = live_bench(|_| Probes::default());
     let without = Bench::new(&rig());
     let (seen, unseen) = (bench.run(PLAN), without.run(PLAN));
     let mut compared = 0;
@@ -170,80 +164,6 @@ fn the_results_are_the_same_bits_with_live_images_and_without() {
         }
     }
     assert!(compared > 20, "{compared}");
-}
-
-/// Faults of a live estimate.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Trouble {
-    SnapshotPanics,
-    EstimatePanics,
-    EstimateFails,
-    EstimateHangs,
-}
-
-/// The fold `demux` with a faulty live estimate.
-struct Troubled(Box<dyn Fold>, Trouble);
-
-impl Fold for Troubled {
-    fn name(&self) -> &str {
-        self.0.name()
-    }
-
-    fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
-        self.0.push(unit, image);
-    }
-
-    fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
-        assert!(self.1 != Trouble::SnapshotPanics, "on purpose");
-        Some(Box::new(self.1))
-    }
-
-    fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError> {
-        self.0.finish(go_on)
-    }
-}
-
-impl Snapshot for Trouble {
-    fn points(&self) -> usize {
-        1
-    }
-
-    fn estimate(
-        &self,
-        _: Option<&Transport>,
-        go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Transport, FoldError> {
-        assert!(*self != Self::EstimatePanics, "on purpose");
-        while *self == Self::EstimateHangs && go_on() {
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        Err(FoldError { fold: "demux".into(), what: "on purpose".into() })
-    }
-}
-
-#[test]
-fn an_estimate_that_fails_or_hangs_costs_the_run_nothing() {
-    for trouble in
-        [Trouble::SnapshotPanics, Trouble::EstimatePanics, Trouble::EstimateFails, Trouble::EstimateHangs]
-    {
-        let (bench, file) = live_bench(|_| {
-            let mut registry = Registry::default();
-            registry.register("demux", move |options, schedule, geometry| {
-                match Registry::default().make("demux", options, schedule, geometry)? {
-                    Entry::Fold(fold) => Ok(Entry::Fold(Box::new(Troubled(fold, trouble)))),
-                    stage => Ok(stage),
-                }
-            });
-            registry
-        });
-        let ended = bench.run(PLAN);
-        assert_eq!(ended.state, "complete", "{trouble:?}: {:?}", ended.error);
-        assert_eq!(ended.open().1.stored(ArrayName::Sum).count(), 18, "{trouble:?}");
-        assert!(ended.session.join("products/transport.npy").exists(), "{trouble:?}");
-        // The final result is shown nevertheless.
-        let newest = LiveReader::open(&file).unwrap().newest(EPIPOLAR).unwrap().unwrap();
-        assert_eq!((newest.sequence, &newest.metadata["last"]), (1, &json!(true)), "{trouble:?}");
-    }
 }
 
 /// Reads with the example of `docs/reference/socket.md` during writing, and checks that each image is complete.

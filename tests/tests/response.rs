@@ -9,7 +9,6 @@ use ndarray::Array2;
 use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::rig::DotRig;
-use raysweep_pipeline::Registry;
 use raysweep_processing::process;
 use raysweep_proto::RunParams;
 use raysweep_session::manifest;
@@ -148,7 +147,7 @@ fn paths_distorted_by_what_was_identified_are_followed_closer() {
     std::fs::write(&path, text).unwrap();
     let rig = DotRig::load(&path).unwrap();
     let data = bench.folder.path().join("sessions");
-    bench.runner = Arc::new(Runner::new(rig, data, Registry::default()).unwrap());
+    bench.runner = Arc::new(Runner::new(rig, data).unwrap());
     let distorted = completed(&bench, &raster);
     let [before_px, after_px] = [&plain, &distorted].map(|ended| distance_px(&places(ended), &wanted));
     println!("dots lie {before_px:.2} px from where they should, {after_px:.2} px with the path distorted");

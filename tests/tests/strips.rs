@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, OnceLock};
 
 use ndarray::Array2;
-use raysweep::Runner;
 use raysweep::control::Control;
-use raysweep_pipeline::{Entry, Registry, Stage, StageError, Unit};
+use raysweep::{Probes, Runner};
+use raysweep_pipeline::{Stage, StageError, Unit};
 use raysweep_processing::{self as process, Asked, ProcessError};
 use raysweep_proto::{ErrorCode, RunParams};
 use raysweep_session::stack::ArrayName;
@@ -79,7 +79,7 @@ fn a_run_and_a_processing_in_strips_give_the_files_of_one_piece() {
     assert!((0..14).any(saturates), "a pixel of the sweep should saturate");
 
     let limit_bytes = whole_bytes(&bench, &plan) - 1;
-    bench.limit_memory(limit_bytes, Registry::default());
+    bench.limit_memory(limit_bytes, Probes::default());
     let foreseen = bench.runner.check(&plan).unwrap();
     assert!(foreseen.memory_bytes < limit_bytes && foreseen.memory_free_bytes == limit_bytes);
     assert!(foreseen.warnings.iter().any(|warning| warning.contains("64 camera rows at a time")));
@@ -112,15 +112,11 @@ impl Stage for Levelled {
 
 #[test]
 fn a_stage_that_must_see_the_whole_image_does() {
-    let registry = || {
-        let mut registry = Registry::default();
-        registry.register("levelled", |_, _, _| Ok(Entry::Stage(Box::new(Levelled))));
-        registry
-    };
-    let plan = plan(&["hot-pixels", "levelled", "demux"]);
-    let mut bench = Bench::with_registry(&rig(), registry());
+    let probes = Probes { stages: vec![Arc::new(Levelled)], ..Probes::default() };
+    let plan = plan(&["hot-pixels", "demux"]);
+    let mut bench = Bench::with_probes(&rig(), probes.clone());
     let whole = bench.run(&plan);
-    bench.limit_memory(whole_bytes(&bench, &plan) - 1, registry());
+    bench.limit_memory(whole_bytes(&bench, &plan) - 1, probes);
     let in_strips = bench.run(&plan);
     assert_eq!((whole.state.as_str(), in_strips.state.as_str()), ("complete", "complete"));
     assert_same(&in_strips.session, &whole.session);
@@ -154,7 +150,7 @@ fn what_does_not_fit_in_strips_either_is_refused_before_anything_is_written() {
     let refused = process::process_asked(&ended.session, &limited(1_000)).unwrap_err();
     assert!(matches!(refused, ProcessError::Memory { available_bytes: 1_000, .. }), "{refused}");
     assert!(checksums(&ended.session) == before);
-    bench.limit_memory(1_000, Registry::default());
+    bench.limit_memory(1_000, Probes::default());
     let refused = bench.runner.run(RunParams { plan, ..RunParams::default() }).unwrap_err();
     assert_eq!(refused.name(), Some(ErrorCode::Storage), "{refused}");
     assert!(refused.message.contains("--memory"), "{refused}");
@@ -182,21 +178,14 @@ impl Stage for Canceller {
 
 #[test]
 fn a_run_cancelled_between_strips_leaves_no_part_of_a_transport_and_can_be_processed() {
-    let plan = plan(&["canceller", "demux"]);
+    let plan = plan(&["demux"]);
     let mut bench = Bench::new(&rig());
     let runner = Arc::new(OnceLock::new());
-    let mut registry = Registry::default();
-    registry.register("canceller", {
-        let runner = runner.clone();
-        // 14 points of the sweep, two dark images and the regular image; processed on arrival, for choosing the
-        // solver's parameters, and for the first strip.
-        move |_, _, _| {
-            let images_left = AtomicUsize::new(3 * 17);
-            Ok(Entry::Stage(Box::new(Canceller { images_left, runner: runner.clone() })))
-        }
-    });
-    let limit_bytes = whole_bytes(&bench, &plan.replace("canceller", "hot-pixels")) - 1;
-    bench.limit_memory(limit_bytes, registry);
+    // 14 points of the sweep, two dark images and the regular image; processed on arrival, for choosing the solver's
+    // parameters, and for the first strip.
+    let canceller = Canceller { images_left: AtomicUsize::new(3 * 17), runner: runner.clone() };
+    let limit_bytes = whole_bytes(&bench, &plan) - 1;
+    bench.limit_memory(limit_bytes, Probes { stages: vec![Arc::new(canceller)], ..Probes::default() });
     assert!(runner.set(bench.runner.clone()).is_ok());
     let ended = bench.run(&plan);
     assert_eq!(ended.state, "cancelled", "{:?}", ended.error);
@@ -206,7 +195,6 @@ fn a_run_cancelled_between_strips_leaves_no_part_of_a_transport_and_can_be_proce
     };
     assert!(names(&ended.session).iter().all(|name| !name.starts_with("transport")));
     assert_eq!(names(&ended.session.join("products")), [""; 0]);
-    std::fs::write(ended.session.join("plan.toml"), plan.replace("canceller", "hot-pixels")).unwrap();
     let made = process::process_asked(&ended.session, &limited(limit_bytes)).unwrap();
     assert_eq!((made.stored, made.problems.as_slice()), (14, [].as_slice()));
     checksums(&ended.session);

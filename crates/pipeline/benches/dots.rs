@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use rayon::prelude::*;
 use raysweep_core::{Counts, Frame, FramePool, FrameStamp, LossCause, PixelFormat};
 use raysweep_pipeline::dots::{
-    Arrival, Cut, CutSink, DarkRun, DotStages, DotsFlow, DotsFlowConfig, Gathered, Scan, Sensor,
+    Arrival, Cut, CutSink, DarkRun, DotScan, DotsFlow, DotsFlowConfig, Gathered, Sensor, column_stage,
 };
 use raysweep_pipeline::{Policy, QueueError};
 use raysweep_transport::dots::product::floodlit;
@@ -91,8 +91,8 @@ impl Memory {
         }
     }
 
-    fn scan(&self) -> Scan {
-        Scan {
+    fn scan(&self) -> DotScan {
+        DotScan {
             shape: self.shape,
             dots: DOTS,
             trailing_index: DOTS - 1,
@@ -149,12 +149,12 @@ impl Ran {
 /// Sends frames for `duration`, as fast as they are accepted or at the given rate.
 fn flow(memory: &Memory, duration: Duration, rate_hz: Option<f64>) -> Result<Ran, Box<dyn Error>> {
     let Sensor { correction, background, floor } = memory.sensor()?;
-    let stage = DotStages::default().make("denoise", serde_json::json!({}), &correction)?;
+    let stage = column_stage("denoise", serde_json::json!({}), &correction)?;
     let config = DotsFlowConfig {
         scan: memory.scan(),
         format: FORMAT,
         saturation_dn: FORMAT.max_value(),
-        stage: stage.into(),
+        stage,
         correction,
         background,
         floor,
@@ -217,7 +217,7 @@ enum Copying {
 /// Runs the same kernels over the same frames without queues and batches; returns frames per second.
 fn plain(memory: &Memory, copying: Copying) -> Result<f64, Box<dyn Error>> {
     let Sensor { correction, background, floor } = memory.sensor()?;
-    let stage = DotStages::default().make("denoise", serde_json::json!({}), &correction)?;
+    let stage = column_stage("denoise", serde_json::json!({}), &correction)?;
     let background = Background::new(&correction, background.mean())?;
     let threads = std::thread::available_parallelism()?.get();
     let (source, next) = (Mutex::new(()), AtomicU64::new(0));

@@ -11,7 +11,8 @@ use raysweep_core::{
     ns_from_us, us_from_ns,
 };
 
-use crate::edges::{EdgeTracker, Found, Line, TrueEdge};
+use crate::edges::{EdgeTracker, Found, Line};
+use crate::regularity::TrueEdge;
 use crate::unit::Unit;
 
 /// One attempt at a point, with the camera's settings for it.
@@ -125,7 +126,7 @@ pub struct Assembler {
     config: AssemblerConfig,
     tracker: EdgeTracker,
     waiting: VecDeque<Waiting>,
-    attempt: Option<Attempt>,
+    attempt: Option<AttemptFrames>,
     /// Chain of the previous attempt.
     chain: Chain,
     outside: Counts,
@@ -147,7 +148,7 @@ enum Waiting {
     Flush,
 }
 
-struct Attempt {
+struct AttemptFrames {
     job: Job,
     sum: Array2<u32>,
     averaged: u32,
@@ -171,7 +172,7 @@ struct Chain {
 }
 
 /// The light of a frame, or why the frame is not used.
-enum Verdict {
+enum Judgement {
     Undecided,
     Sound {
         trigger: TrueEdge,
@@ -247,7 +248,7 @@ impl Assembler {
             }
             Waiting::Frame(frame, label @ (Label::Counted | Label::CountedUnless { .. })) => {
                 match self.judge(&frame.stamp, label, flushing) {
-                    Verdict::Undecided => return Some(Waiting::Frame(frame, label)),
+                    Judgement::Undecided => return Some(Waiting::Frame(frame, label)),
                     verdict => self.count(&frame, verdict),
                 }
             }
@@ -279,7 +280,7 @@ impl Assembler {
             Some(periods) => chain.extra_periods += i64::from(periods) - self.periods_per_frame(&job),
             None => chain = Chain::default(),
         }
-        self.attempt = Some(Attempt {
+        self.attempt = Some(AttemptFrames {
             job,
             sum: Array2::zeros((self.config.camera.height, self.config.camera.width)),
             averaged: 0,
@@ -323,9 +324,9 @@ impl Assembler {
     }
 
     /// Ties a frame to the edge that triggered it and to the edge of the light that it saw.
-    fn judge(&self, stamp: &FrameStamp, label: Label, flushing: bool) -> Verdict {
-        let Some(Attempt { job, .. }) = &self.attempt else {
-            return Verdict::Unsound { trigger: None, cause: LossCause::SettingsMismatch };
+    fn judge(&self, stamp: &FrameStamp, label: Label, flushing: bool) -> Judgement {
+        let Some(AttemptFrames { job, .. }) = &self.attempt else {
+            return Judgement::Unsound { trigger: None, cause: LossCause::SettingsMismatch };
         };
         let settings = &job.applied.actual;
         let out_of_patience = flushing || self.newest_ns > stamp.host_ns.saturating_add(EDGE_PATIENCE_NS);
@@ -334,20 +335,20 @@ impl Assembler {
         let trigger_ns = stamp.exposure_start_ns
             - ns_from_us(self.config.camera.trigger_latency_us + settings.trigger_delay_us);
         if known_ns < trigger_ns + TRIGGER_TOLERANCE_NS {
-            return Verdict::Undecided;
+            return Judgement::Undecided;
         }
         if let Label::CountedUnless { triggered_ns } = label {
             if known_ns < triggered_ns + TRIGGER_TOLERANCE_NS {
-                return Verdict::Undecided;
+                return Judgement::Undecided;
             }
             if self.tracker.near(triggered_ns, TRIGGER_TOLERANCE_NS) == Found::False {
-                return Verdict::Doubtful;
+                return Judgement::Doubtful;
             }
         }
         let trigger = match self.tracker.near(trigger_ns, TRIGGER_TOLERANCE_NS) {
             Found::True(edge) => edge,
-            Found::False => return Verdict::Unsound { trigger: None, cause: LossCause::FalseEdge },
-            Found::Nothing => return Verdict::Unsound { trigger: None, cause: LossCause::EdgeMissing },
+            Found::False => return Judgement::Unsound { trigger: None, cause: LossCause::FalseEdge },
+            Found::Nothing => return Judgement::Unsound { trigger: None, cause: LossCause::EdgeMissing },
         };
         let later = i64::from(job.light_edges_later);
         let light = if later == 0 {
@@ -356,25 +357,25 @@ impl Assembler {
             match self.tracker.by_index(trigger.index + later) {
                 Some(edge) => edge,
                 None if known_ns < self.tracker.expected_ns(trigger, later) + self.tracker.gate_ns() => {
-                    return Verdict::Undecided;
+                    return Judgement::Undecided;
                 }
-                None => return Verdict::Unsound { trigger: Some(trigger), cause: LossCause::EdgeMissing },
+                None => return Judgement::Unsound { trigger: Some(trigger), cause: LossCause::EdgeMissing },
             }
         };
         let exposure_us = stamp.exposure_us.unwrap_or(settings.exposure_us);
         if (exposure_us - settings.exposure_us).abs() > EXPOSURE_TOLERANCE_US {
-            return Verdict::Unsound { trigger: Some(trigger), cause: LossCause::SettingsMismatch };
+            return Judgement::Unsound { trigger: Some(trigger), cause: LossCause::SettingsMismatch };
         }
         let start_us = us_from_ns(stamp.exposure_start_ns - light.host_ns);
         let delay_us = self.config.raster.delay_us(self.config.first_row, start_us, exposure_us);
         if (delay_us - job.delay_us).abs() > self.config.max_jitter_us {
-            return Verdict::Unsound { trigger: Some(trigger), cause: LossCause::Jitter };
+            return Judgement::Unsound { trigger: Some(trigger), cause: LossCause::Jitter };
         }
-        Verdict::Sound { trigger, delay_us }
+        Judgement::Sound { trigger, delay_us }
     }
 
     /// Adds a sound frame to the sum, or counts the reason why it is not used.
-    fn count(&mut self, frame: &Frame, verdict: Verdict) {
+    fn count(&mut self, frame: &Frame, verdict: Judgement) {
         self.follow(frame.stamp.seq);
         let Some(periods_per_frame) =
             self.attempt.as_ref().map(|attempt| self.periods_per_frame(&attempt.job))
@@ -383,15 +384,15 @@ impl Assembler {
         };
         let Some(attempt) = &mut self.attempt else { return };
         let (trigger, sound) = match verdict {
-            Verdict::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
-            Verdict::Unsound { trigger, cause } => (trigger, Err(cause)),
-            Verdict::Doubtful => {
+            Judgement::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
+            Judgement::Unsound { trigger, cause } => (trigger, Err(cause)),
+            Judgement::Doubtful => {
                 attempt.is_doubtful = true;
                 attempt.chain.untied += 1;
                 attempt.counts.settling += 1;
                 return;
             }
-            Verdict::Undecided => return,
+            Judgement::Undecided => return,
         };
         match trigger {
             Some(edge) => {
@@ -432,7 +433,7 @@ impl Chain {
     }
 }
 
-impl Attempt {
+impl AttemptFrames {
     fn finish(mut self, failure: Failure) -> Decision {
         self.counts.averaged = u64::from(self.averaged);
         if self.averaged < self.job.frames {

@@ -1,4 +1,4 @@
-//! Fold `demux`: from the averaged images of a sweep to its light transport.
+//! `demux`: from the averaged images of a sweep to its light transport.
 
 mod options;
 mod strips;
@@ -11,23 +11,18 @@ use std::sync::Arc;
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting, Transport};
 
-pub use self::options::DemuxOptions;
+pub use self::options::{DEMUX, DemuxOptions};
 use self::tally::Tally;
+pub use self::tally::{PREDICTED_SHARE, SweepSummary};
 use crate::findings::{Choices, choose, rows_to_choose_by};
-use crate::product::Product;
-use crate::registry::RegistryError;
 use crate::schedule::{Role, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
-use crate::stage::{Fold, FoldError, Snapshot};
-use crate::strips::{InStrips, Strip};
+use crate::stage_refused::StageRefused;
+use crate::strips::{NotSolved, Strip};
 use crate::unit::Unit;
 
-/// Name of the figure that checks consistency: the light of the regular image, predicted by the model over captured
-/// by the camera.
-pub const PREDICTED_SHARE: &str = "predicted / captured regular light";
-
 /// One image of the sweep and its settings.
-struct Taken {
+struct SweepImage {
     setting: Setting,
     /// Mean counts.
     image: Array2<f32>,
@@ -40,7 +35,7 @@ pub struct DemuxFold {
     schedule: Arc<Schedule>,
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
-    taken: BTreeMap<Role, Arc<Taken>>,
+    taken: BTreeMap<Role, Arc<SweepImage>>,
     /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
     not_kept: Option<BTreeMap<Role, (u32, Setting)>>,
 }
@@ -51,7 +46,34 @@ struct Held {
     first_row: usize,
     stack: SweepStack,
     /// The regular image and its dark image, if both were taken.
-    regular: Option<(Arc<Taken>, Arc<Taken>)>,
+    regular: Option<(Arc<SweepImage>, Arc<SweepImage>)>,
+}
+
+/// A sweep that was solved in one piece.
+pub struct Solved {
+    /// The images in use.
+    pub stack: SweepStack,
+    /// The light transport `[u, t, s]`.
+    pub transport: Transport,
+    /// How it was estimated, and how far to trust it.
+    pub summary: SweepSummary,
+}
+
+/// A sweep at some time, as the live estimate takes it: a [`DemuxFold`]. The tests of that estimate script others.
+pub trait Snapshot: Send + Sync {
+    /// Number of points of the sweep that it can use for an estimate.
+    fn points(&self) -> usize;
+
+    /// The transport estimated from these points; starting from the estimate of fewer points makes it faster. Stops
+    /// early, with an error, soon after `go_on` returns false.
+    ///
+    /// # Errors
+    /// If it cannot be estimated, or `go_on` returned false.
+    fn estimate(
+        &self,
+        before: Option<&Transport>,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Result<Transport, NotSolved>;
 }
 
 /// Smallest number of points for a useful estimate.
@@ -66,9 +88,9 @@ impl DemuxFold {
         options: DemuxOptions,
         schedule: &Schedule,
         geometry: &SweepGeometry,
-    ) -> Result<Self, RegistryError> {
+    ) -> Result<Self, StageRefused> {
         let invalid =
-            |error: PlaneError| RegistryError::Invalid { name: "demux".into(), what: error.to_string() };
+            |error: PlaneError| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() };
         options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
@@ -88,25 +110,25 @@ impl DemuxFold {
     }
 
     /// The dark image for the exposure of a role's image, if it was taken.
-    fn dark_of(&self, taken: &BTreeMap<Role, Arc<Taken>>, role: Role) -> Option<Arc<Taken>> {
+    fn dark_of(&self, taken: &BTreeMap<Role, Arc<SweepImage>>, role: Role) -> Option<Arc<SweepImage>> {
         let point = self.schedule.points.iter().find(|point| point.role == role)?;
         taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
     }
 
     /// The sweep in these images, without those whose dark image is missing. Each image is dropped as soon as it is
     /// in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
-    fn stack(&self, mut taken: BTreeMap<Role, Arc<Taken>>) -> Result<SweepStack, FoldError> {
+    fn stack(&self, mut taken: BTreeMap<Role, Arc<SweepImage>>) -> Result<SweepStack, NotSolved> {
         let darks = taken.extract_if(.., |role, _| matches!(role, Role::Dark(_))).collect();
         taken.retain(|role, _| matches!(role, Role::Sweep(_)) && self.dark_of(&darks, *role).is_some());
         if taken.is_empty() {
-            return Err(FoldError {
-                fold: "demux".into(),
+            return Err(NotSolved {
+                of: DEMUX,
                 what: "no point of the sweep is there with the dark image of its exposure: resume the run"
                     .into(),
             });
         }
         let scale = (1.0 / self.geometry.white_dn) as f32;
-        let saturates = |taken: &Arc<Taken>| self.valid(taken.image.view()).iter().any(|valid| !valid);
+        let saturates = |taken: &Arc<SweepImage>| self.valid(taken.image.view()).iter().any(|valid| !valid);
         let rows = taken.values().next().map_or(0, |taken| taken.image.nrows());
         let shape = (taken.len(), rows, self.geometry.width);
         let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
@@ -138,13 +160,13 @@ impl DemuxFold {
     }
 
     /// The camera rows starting at `first_row`, to which the images belong.
-    fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<Taken>>) -> Result<Held, FoldError> {
+    fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<SweepImage>>) -> Result<Held, NotSolved> {
         let regular = taken.get(&Role::Regular).cloned().zip(self.dark_of(&taken, Role::Regular));
         Ok(Held { first_row, stack: self.stack(taken)?, regular })
     }
 
     /// Chooses how to demultiplex, from a stack that contains only the rows of [`rows_to_choose_by`].
-    fn choose(&self, stack: SweepStack) -> Result<Choices, FoldError> {
+    fn choose(&self, stack: SweepStack) -> Result<Choices, NotSolved> {
         let rows = rows_to_choose_by(self.geometry.height);
         self.demux()
             .and_then(|planned| choose(&planned, &self.options, &self.geometry, &rows, stack))
@@ -159,7 +181,7 @@ impl DemuxFold {
         held: Held,
         tally: &mut Tally,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Strip, FoldError> {
+    ) -> Result<Strip, NotSolved> {
         let Held { first_row: held_from, mut stack, regular } = held;
         let first_row = rows.start;
         let inner = rows.start - held_from..rows.end - held_from;
@@ -180,49 +202,44 @@ impl DemuxFold {
     }
 }
 
-impl Fold for DemuxFold {
-    fn name(&self) -> &str {
-        "demux"
-    }
-
-    fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
+impl DemuxFold {
+    /// Takes the next unit; a later attempt at a point replaces an earlier one.
+    pub fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
         let Some(point) = self.schedule.points.get(unit.id.point as usize) else { return };
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {
-                drop(self.taken.insert(point.role, Arc::new(Taken { setting, image: image.to_owned() })));
+                drop(
+                    self.taken.insert(point.role, Arc::new(SweepImage { setting, image: image.to_owned() })),
+                );
             }
         }
     }
 
-    fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
-        (self.points() >= MIN_LIVE_POINTS).then(|| Box::new(self.clone()) as Box<dyn Snapshot>)
+    /// The units taken so far, from which another thread can compute an estimate while more arrive; `None` if they are
+    /// too few. Cheap: images are shared, not copied.
+    pub fn snapshot(&self) -> Option<Self> {
+        (self.points() >= MIN_LIVE_POINTS).then(|| self.clone())
     }
 
-    fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError> {
+    /// Computes the transport from the units taken. Stops early, with an error, soon after `go_on` returns false.
+    ///
+    /// # Errors
+    /// If too few units were taken, or `go_on` returned false.
+    pub fn finish(mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Solved, NotSolved> {
         let taken = std::mem::take(&mut self.taken);
         let mut tally = Tally::default();
         let height = self.geometry.height;
         let held = self.hold(0, taken)?;
         let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)))?;
         let Strip { stack, transport, .. } = self.strip(&choices, 0..height, held, &mut tally, go_on)?;
-        let mut products = tally.products(choices.findings);
-        products.push(Product::Transport(Box::new(transport)));
-        products.push(Product::Stack(Box::new(stack)));
-        Ok(products)
+        Ok(Solved { stack, transport, summary: tally.summary(choices.findings) })
     }
 
-    fn keep_no_images(&mut self) {
+    /// Stops keeping images and providing snapshots: [`Self::finish_in_strips`] reads the images again.
+    pub fn keep_no_images(&mut self) {
         self.not_kept = Some(BTreeMap::new());
-    }
-
-    fn finish_in_strips(
-        &mut self,
-        strips: InStrips<'_>,
-        go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Vec<Product>, FoldError> {
-        self.solve_in_strips(strips, go_on)
     }
 }
 
@@ -238,7 +255,7 @@ impl Snapshot for DemuxFold {
         &self,
         before: Option<&Transport>,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Transport, FoldError> {
+    ) -> Result<Transport, NotSolved> {
         let SweepStack { settings, images, valid, .. } = self.stack(self.taken.clone())?;
         let valid = valid.as_ref().map(|valid| valid.view());
         self.demux()
@@ -251,6 +268,6 @@ impl Snapshot for DemuxFold {
     }
 }
 
-fn refused(error: PlaneError) -> FoldError {
-    FoldError { fold: "demux".into(), what: error.to_string() }
+fn refused(error: PlaneError) -> NotSolved {
+    NotSolved { of: DEMUX, what: error.to_string() }
 }

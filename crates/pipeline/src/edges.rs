@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use raysweep_core::{Edge, VsyncStats, us_from_ns};
 
-use crate::regularity::Regularity;
+use crate::regularity::{Regularity, TrueEdge};
 
 /// The properties of the line given by the rig file.
 #[derive(Debug, Clone, Copy)]
@@ -13,15 +13,6 @@ pub struct Line {
     pub period_ns: i64,
     /// An edge farther than this from its position expected from the last true edge is false.
     pub gate_ns: i64,
-}
-
-/// A true edge and its index in the count of periods.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TrueEdge {
-    /// Periods since the first true edge, including missed ones.
-    pub index: i64,
-    /// Time of the edge on the host's clock.
-    pub host_ns: i64,
 }
 
 /// The edge near a given time.

@@ -6,10 +6,10 @@ use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
 use raysweep_transport::plane::{Demux, Setting, Transport};
 
-use crate::demux::{DemuxFold, DemuxOptions};
-use crate::registry::RegistryError;
+use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
 use crate::schedule::{Schedule, SweepGeometry};
-use crate::stage::FoldError;
+use crate::stage_refused::StageRefused;
+use crate::strips::NotSolved;
 use crate::unit::Unit;
 
 /// The order in which a cycle takes its settings, as indices, and the VSYNC periods from each frame to the next one
@@ -127,10 +127,10 @@ impl FilmSolver {
         options: DemuxOptions,
         schedule: &Schedule,
         geometry: &SweepGeometry,
-    ) -> Result<Self, RegistryError> {
+    ) -> Result<Self, StageRefused> {
         let demux = DemuxFold::new(options, schedule, geometry)?
             .demux()
-            .map_err(|error| RegistryError::Invalid { name: "demux".into(), what: error.to_string() })?;
+            .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
         Ok(Self { demux, geometry: geometry.clone() })
     }
 
@@ -154,7 +154,7 @@ impl FilmSolver {
         frames: &[(Setting, Arc<Array2<f32>>)],
         dark: &Array2<f32>,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Transport, FoldError> {
+    ) -> Result<Transport, NotSolved> {
         let (height, width) = (self.geometry.height, self.geometry.width);
         let scale = (1.0 / self.geometry.white_dn) as f32;
         let is_valid = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
@@ -174,7 +174,7 @@ impl FilmSolver {
             .and_then(|demux| {
                 demux.solve_while(stack.view(), valid.as_ref().map(|valid| valid.view()), go_on)
             })
-            .map_err(|error| FoldError { fold: "film".into(), what: error.to_string() })
+            .map_err(|error| NotSolved { of: "film", what: error.to_string() })
     }
 }
 

@@ -1,5 +1,5 @@
 //! From frames to results: frames and VSYNC edges become averaged units, units pass through stages in parallel, and
-//! sinks and folds receive them in order.
+//! the sink and the demultiplexer receive them in order.
 //!
 //! This crate accesses no devices, files or sockets. Threads are named `std` threads, workers are rayon's.
 
@@ -13,28 +13,28 @@ mod pipeline;
 mod product;
 mod products;
 mod queue;
-mod registry;
 mod regularity;
 mod schedule;
 mod stack;
 mod stage;
+mod stage_refused;
 mod strips;
 mod unit;
 
 pub use assembler::{
     Assembler, AssemblerConfig, Decision, EXPOSURE_TOLERANCE_US, Event, Failure, Job, Label,
 };
-pub use demux::{DemuxFold, DemuxOptions, PREDICTED_SHARE};
+pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solved, SweepSummary};
 pub use edges::{EdgeTracker, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
-pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink, message_of, run_stages};
+pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};
 pub use product::{Product, Profile};
 pub use products::{Assembly, NotMade, ProductError, ProductSpec};
 pub use queue::{Input, Policy, QueueError, Receiver};
-pub use registry::{Entry, Registry, RegistryError};
 pub use schedule::{Point, Role, Scan, Schedule, Shot, Spot, SweepGeometry};
 pub use stack::SweepStack;
-pub use stage::{Fold, FoldError, HotPixels, Snapshot, Stage, StageError};
-pub use strips::{ImageRows, InStrips, Strip};
+pub use stage::{HotPixels, PlaneStage, Stage, StageError, Stages, message_of, run_stages};
+pub use stage_refused::StageRefused;
+pub use strips::{ImageRows, InStrips, NotSolved, Strip};
 pub use unit::Unit;

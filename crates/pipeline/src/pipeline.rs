@@ -1,9 +1,6 @@
 //! The threads: `assembler` turns events into units, workers run the stages, `sink` receives everything in order.
 
-use std::any::Any;
 use std::collections::BTreeMap;
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
@@ -12,7 +9,7 @@ use raysweep_core::{Counts, SettingsId, VsyncStats};
 
 use crate::assembler::{Assembler, AssemblerConfig, Decision, Event, Failure};
 use crate::queue::{Input, Policy};
-use crate::stage::{Stage, StageError};
+use crate::stage::{StageError, Stages, run_stages};
 use crate::unit::Unit;
 
 /// The size of the pipeline.
@@ -79,7 +76,7 @@ impl<S: Sink + 'static> Pipeline<S> {
     pub fn start(
         config: PipelineConfig,
         assembler: AssemblerConfig,
-        stages: Arc<[Box<dyn Stage>]>,
+        stages: Stages,
         sink: S,
     ) -> Result<(Self, Input<Event>), PipelineError> {
         let workers = rayon::ThreadPoolBuilder::new()
@@ -128,7 +125,7 @@ fn spawn<T: Send + 'static>(
 /// Hands items from the assembler to the workers and the sink.
 struct Dispatch {
     workers: rayon::ThreadPool,
-    stages: Arc<[Box<dyn Stage>]>,
+    stages: Stages,
     done: Sender<Numbered>,
     permits: Receiver<()>,
 }
@@ -163,27 +160,6 @@ impl Dispatch {
             Decision::Flushed(outside, vsync) => drop(done.send((seq, Ordered::Flushed(outside, vsync)))),
         }
     }
-}
-
-/// Passes a unit's mean image through all stages. A stage that panics loses its unit but does not end the run.
-///
-/// # Errors
-/// The error or panic message of the first stage that failed.
-pub fn run_stages(stages: &[Box<dyn Stage>], unit: &Unit) -> Result<Array2<f32>, StageError> {
-    stages.iter().try_fold(unit.mean(), |image, stage| {
-        catch_unwind(AssertUnwindSafe(|| stage.apply(unit, image))).unwrap_or_else(|panic| {
-            Err(StageError { stage: stage.name().into(), what: format!("panicked: {}", message_of(&*panic)) })
-        })
-    })
-}
-
-/// The message of a panic.
-pub fn message_of(panic: &(dyn Any + Send)) -> &str {
-    panic
-        .downcast_ref::<&str>()
-        .copied()
-        .or_else(|| panic.downcast_ref::<String>().map(String::as_str))
-        .unwrap_or("without a message")
 }
 
 /// Restores the order of assembly in the workers' results.

@@ -1,12 +1,9 @@
-//! What folds and plans make of a sweep.
+//! What plans ask for of a sweep.
 
 use ndarray::{Array2, Array3};
-use raysweep_transport::plane::{DelayProfile, Transport};
+use raysweep_transport::plane::DelayProfile;
 
-use crate::findings::Findings;
-use crate::stack::SweepStack;
-
-/// The results of a fold.
+/// A product, as it is written to disk.
 #[derive(Debug, Clone)]
 pub enum Product {
     /// An image `[t, s]` in the scene's units (1 = a white pixel).
@@ -33,22 +30,6 @@ pub enum Product {
     },
     /// Light as a function of the delay.
     Profile(Profile),
-    /// The light transport `[u, t, s]`.
-    Transport(Box<Transport>),
-    /// The images from which it was computed, needed by [`crate::ProductSpec`] to compute other products. Not written
-    /// to disk.
-    Stack(Box<SweepStack>),
-    /// How the sweep was demultiplexed.
-    Findings(Box<Findings>),
-    /// A problem that makes other products worse than they look.
-    Warning(String),
-    /// A number for the report.
-    Figure {
-        /// Name, with the unit.
-        name: &'static str,
-        /// Its value.
-        value: f64,
-    },
 }
 
 /// Light as a function of the delay at one exposure.

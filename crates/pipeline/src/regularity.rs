@@ -3,8 +3,6 @@
 
 use std::collections::VecDeque;
 
-use crate::edges::TrueEdge;
-
 /// Edges on each side of the one whose deviation is measured: a quarter of a second at 60 Hz, too short for crystal
 /// drift.
 const REACH: usize = 8;
@@ -19,6 +17,15 @@ const GATE_SIGMAS: f64 = 8.0;
 const MIN_GATE_NS: f64 = 50_000.0;
 /// Averaging time of the frequency for the Allan deviation.
 const ALLAN_NS: i64 = 1_000_000_000;
+
+/// A true edge and its index in the count of periods.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TrueEdge {
+    /// Periods since the first true edge, including missed ones.
+    pub index: i64,
+    /// Time of the edge on the host's clock.
+    pub host_ns: i64,
+}
 
 /// Statistics of a line, computed from its true edges.
 pub struct Regularity {

@@ -1,11 +1,15 @@
-//! Processing of units: stages, in parallel and each unit independently; folds, over all units in order.
+//! Stages, which process units in parallel and each unit independently.
 
-use ndarray::{Array2, ArrayView2};
-use raysweep_transport::plane::Transport;
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+
+use ndarray::Array2;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
-use crate::product::Product;
-use crate::strips::InStrips;
+use crate::demux::{DEMUX, DemuxOptions};
+use crate::stage_refused::{self, StageRefused};
 use crate::unit::Unit;
 
 /// Why a stage failed on a unit.
@@ -18,12 +22,13 @@ pub struct StageError {
     pub what: String,
 }
 
-/// A pure computation on one unit's mean image; runs on any worker thread.
+/// A pure computation on one unit's mean image; runs on any worker thread. Plans have [`HotPixels`]; tests add stages
+/// of their own, which fail or panic.
 pub trait Stage: Send + Sync {
-    /// Its name in plans.
+    /// Its name in plans and errors.
     fn name(&self) -> &str;
 
-    /// Returns the image for the next stage or the folds: counts, `[t, s]`.
+    /// Returns the image for the next stage or the demultiplexer: counts, `[t, s]`.
     ///
     /// # Errors
     /// If this unit cannot be processed; its raw image is still stored.
@@ -37,70 +42,54 @@ pub trait Stage: Send + Sync {
     }
 }
 
-/// Why a fold could not finish.
-#[derive(Debug, thiserror::Error)]
-#[error("{fold}: {what}")]
-pub struct FoldError {
-    /// The fold's name.
-    pub fold: String,
-    /// What happened and what to do.
-    pub what: String,
+/// The stages of a plan, in order.
+pub type Stages = Arc<[Arc<dyn Stage>]>;
+
+/// What a `[[stage]]` of a plan on the plane rig asks for.
+pub enum PlaneStage {
+    /// To process each image.
+    Image(Arc<dyn Stage>),
+    /// To demultiplex the images.
+    Demux(DemuxOptions),
 }
 
-/// Takes units in order and computes products from all of them.
-pub trait Fold: Send {
-    /// Its name in plans.
-    fn name(&self) -> &str;
-
-    /// Takes the next unit; a later attempt at a point replaces an earlier one.
-    fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>);
-
-    /// The units taken so far, from which another thread can compute an estimate while more arrive; `None` if the
-    /// fold has no estimates, or too few units. Cheap: images are shared, not copied.
-    fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
-        None
-    }
-
-    /// Computes the products from the units taken, which it consumes. Stops early, with an error, soon after `go_on`
-    /// returns false.
+impl PlaneStage {
+    /// The stage that a plan names, with the plan's options (a JSON object).
     ///
     /// # Errors
-    /// If too few units were taken, or `go_on` returned false.
-    fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Result<Vec<Product>, FoldError>;
-
-    /// Stops keeping images and providing snapshots: [`Self::finish_in_strips`] reads the images again. Does nothing
-    /// for a fold whose memory does not grow with the sweep.
-    fn keep_no_images(&mut self) {}
-
-    /// [`Self::finish`] after [`Self::keep_no_images`]. The transport and its stack are not among the products; they
-    /// are handed over strip by strip.
-    ///
-    /// # Errors
-    /// Those of [`Self::finish`]; if an image cannot be read again, or a strip is refused.
-    fn finish_in_strips(
-        &mut self,
-        _strips: InStrips<'_>,
-        go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Vec<Product>, FoldError> {
-        self.finish(go_on)
+    /// For unknown names, and for options that the stage rejects.
+    pub fn new(name: &str, options: Value) -> Result<Self, StageRefused> {
+        match name {
+            "hot-pixels" => {
+                let stage: HotPixels = stage_refused::options(name, options)?;
+                stage.check().map_err(|what| StageRefused::Invalid { name: name.into(), what })?;
+                Ok(Self::Image(Arc::new(stage)))
+            }
+            DEMUX => Ok(Self::Demux(stage_refused::options(name, options)?)),
+            _ => Err(StageRefused::Unknown { name: name.into(), known: format!("{DEMUX}, hot-pixels") }),
+        }
     }
 }
 
-/// The units of a fold at some time.
-pub trait Snapshot: Send + Sync {
-    /// Number of points of the sweep that it can use for an estimate.
-    fn points(&self) -> usize;
+/// Passes a unit's mean image through all stages. A stage that panics loses its unit but does not end the run.
+///
+/// # Errors
+/// The error or panic message of the first stage that failed.
+pub fn run_stages(stages: &[Arc<dyn Stage>], unit: &Unit) -> Result<Array2<f32>, StageError> {
+    stages.iter().try_fold(unit.mean(), |image, stage| {
+        catch_unwind(AssertUnwindSafe(|| stage.apply(unit, image))).unwrap_or_else(|panic| {
+            Err(StageError { stage: stage.name().into(), what: format!("panicked: {}", message_of(&*panic)) })
+        })
+    })
+}
 
-    /// The transport estimated from these points; starting from the estimate of fewer points makes it faster. Stops
-    /// early, with an error, soon after `go_on` returns false.
-    ///
-    /// # Errors
-    /// If it cannot be estimated, or `go_on` returned false.
-    fn estimate(
-        &self,
-        before: Option<&Transport>,
-        go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Transport, FoldError>;
+/// The message of a panic.
+pub fn message_of(panic: &(dyn Any + Send)) -> &str {
+    panic
+        .downcast_ref::<&str>()
+        .copied()
+        .or_else(|| panic.downcast_ref::<String>().map(String::as_str))
+        .unwrap_or("without a message")
 }
 
 /// Stage `hot-pixels`: replaces a pixel that exceeds all its neighbours by more than `threshold_dn` by their median.
@@ -165,8 +154,6 @@ impl Stage for HotPixels {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use raysweep_core::{Counts, SettingsId};
 
     use super::*;

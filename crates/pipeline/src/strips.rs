@@ -7,11 +7,20 @@ use raysweep_transport::plane::Transport;
 
 use crate::findings::Findings;
 use crate::stack::SweepStack;
-use crate::stage::FoldError;
 
-/// Reads images again that a fold was given and did not keep.
+/// Why a sweep, or a cycle of a film, has no transport.
+#[derive(Debug, thiserror::Error)]
+#[error("{of}: {what}")]
+pub struct NotSolved {
+    /// `demux` or `film`.
+    pub of: &'static str,
+    /// What happened and what to do.
+    pub what: String,
+}
+
+/// Reads images again that were not kept.
 pub trait ImageRows: Sync {
-    /// Some rows of the image of a point of the schedule, as passed to [`crate::Fold::push`]: counts, `[rows, s]`.
+    /// Some rows of the image of a point of the schedule, as passed to [`crate::DemuxFold::push`]: counts, `[rows, s]`.
     ///
     /// # Errors
     /// What cannot be read, why, and what to do.
@@ -29,12 +38,12 @@ pub struct Strip {
     pub transport: Transport,
 }
 
-/// How a fold that has kept no images finishes.
+/// How a sweep is solved whose images were not kept.
 pub struct InStrips<'a> {
     /// Source of the images.
     pub images: &'a dyn ImageRows,
     /// Number of camera rows per strip; the last strip may have fewer.
     pub strip_rows: usize,
     /// Receives each strip once, from top to bottom, and the findings common to all of them.
-    pub take: &'a mut dyn FnMut(&Findings, Strip) -> Result<(), FoldError>,
+    pub take: &'a mut dyn FnMut(&Findings, Strip) -> Result<(), NotSolved>,
 }

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use raysweep_core::{Counts, Frame, FramePool, FrameStamp, PixelFormat};
 use raysweep_pipeline::Policy;
 use raysweep_pipeline::dots::{
-    Arrival, Cut, CutSink, DarkRun, DotStages, DotsFlow, DotsFlowConfig, Scan, Sensor,
+    Arrival, Cut, CutSink, DarkRun, DotScan, DotsFlow, DotsFlowConfig, Sensor, column_stage,
 };
 use raysweep_transport::dots::{FrameShape, Region, Sampling};
 use serde_json::json;
@@ -79,9 +79,9 @@ fn allocations_a_batch(dots: u32, format: PixelFormat) -> f64 {
         assert_eq!(dark.push(&counts(number, None)).unwrap(), number < 31);
     }
     let Sensor { correction, background, floor } = dark.finish(8.0, None, Sampling::Full).unwrap();
-    let stage = DotStages::default().make("denoise", json!({ "radius_px": 5.0 }), &correction).unwrap();
+    let stage = column_stage("denoise", json!({ "radius_px": 5.0 }), &correction).unwrap();
     let trailing_region = Region { rows: 0..8, columns: 56..64 };
-    let scan = Scan {
+    let scan = DotScan {
         shape,
         dots,
         trailing_index: dots - 1,
@@ -93,7 +93,7 @@ fn allocations_a_batch(dots: u32, format: PixelFormat) -> f64 {
         scan,
         format,
         saturation_dn: 4000,
-        stage: stage.into(),
+        stage,
         correction,
         background,
         floor,

@@ -12,31 +12,21 @@ pub mod mirror_response;
 pub mod plane;
 mod report;
 pub mod response;
+mod saturation;
+mod software;
 mod stored;
 pub mod sweep;
 
 use std::path::Path;
 
 use raysweep_config::{Plan, Procedure};
-use raysweep_core::PixelFormat;
 use raysweep_session::Session;
 
 use self::stored::read;
 
 pub use export::export;
+pub use software::SOFTWARE;
 pub use stored::{Asked, ProcessError, Processed, Stored};
-
-/// Name and version that are recorded in sessions.
-pub const SOFTWARE: &str = concat!("raysweepd ", env!("CARGO_PKG_VERSION"));
-
-/// A mean counts as saturated from this share of the converter's range on: the noise of single frames must not be
-/// clipped.
-const SATURATION: f64 = 0.97;
-
-/// Counts from which on a pixel of this format is overexposed: wells may be full before the converter saturates.
-pub(crate) fn saturation_dn(format: PixelFormat) -> f64 {
-    SATURATION * f64::from(format.max_value())
-}
 
 /// Makes the products of a session again, with its own plan and rig file: bit-identical to those of the run.
 ///

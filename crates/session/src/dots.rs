@@ -157,23 +157,17 @@ impl Dots {
         zarr::create_group(&store, attributes)?;
         let put = Put { store: &store };
         let words = columns.words.len();
-        put.array(
-            "word_offsets",
-            &[dots + 1],
-            &["dot"],
-            data_type::uint64(),
-            0u64.into(),
-            &columns.word_offsets,
-        )?;
-        put.array("words", &[words], &["word"], data_type::uint32(), 0u32.into(), &columns.words)?;
-        put.array("masks", &[words], &["word"], data_type::uint32(), 0u32.into(), &columns.masks)?;
-        let pixels = columns.values.len();
-        put.array("values", &[pixels], &["pixel"], data_type::float32(), 0f32.into(), &columns.values)?;
-        let (shape, axes) = ([dots, rows, across], ["dot", "block_row", "block_column"]);
-        put.array("residual", &shape, &axes, data_type::float32(), 0f32.into(), &columns.residual)?;
-        put.array("discs", &[dots], &["dot"], data_type::uint32(), 0u32.into(), &columns.discs)?;
-        put.array("capped", &[dots], &["dot"], data_type::bool(), false.into(), &columns.capped)?;
-        put.array("seen", &[dots], &["dot"], data_type::bool(), false.into(), &columns.seen)?;
+        let offsets = [("dot", dots + 1)];
+        put.array("word_offsets", &offsets, data_type::uint64(), 0u64.into(), &columns.word_offsets)?;
+        put.array("words", &[("word", words)], data_type::uint32(), 0u32.into(), &columns.words)?;
+        put.array("masks", &[("word", words)], data_type::uint32(), 0u32.into(), &columns.masks)?;
+        let pixels = [("pixel", columns.values.len())];
+        put.array("values", &pixels, data_type::float32(), 0f32.into(), &columns.values)?;
+        let blocks = [("dot", dots), ("block_row", rows), ("block_column", across)];
+        put.array("residual", &blocks, data_type::float32(), 0f32.into(), &columns.residual)?;
+        put.array("discs", &[("dot", dots)], data_type::uint32(), 0u32.into(), &columns.discs)?;
+        put.array("capped", &[("dot", dots)], data_type::bool(), false.into(), &columns.capped)?;
+        put.array("seen", &[("dot", dots)], data_type::bool(), false.into(), &columns.seen)?;
         sync_all(draft.path())?;
         draft.commit()
     }
@@ -312,19 +306,18 @@ struct Put<'a> {
 }
 
 impl Put<'_> {
-    /// Writes an array as a single chunk.
+    /// Writes an array, given the names and lengths of its axes, as a single chunk.
     fn array<T: Element>(
         &self,
         name: &str,
-        shape: &[usize],
-        axes: &[&str],
+        axes: &[(&str, usize)],
         data_type: DataType,
         fill: FillValue,
         values: &[T],
     ) -> Result<()> {
-        let lengths = |least: usize| shape.iter().map(|&len| len.max(least) as u64).collect::<Vec<_>>();
+        let lengths = |least: usize| axes.iter().map(|&(_, len)| len.max(least) as u64).collect::<Vec<_>>();
         let mut builder = ArrayBuilder::new(lengths(0), lengths(1), data_type, fill);
-        zarr::with_codecs(&mut builder).dimension_names(Some(axes.iter().copied()));
+        zarr::with_codecs(&mut builder).dimension_names(Some(axes.iter().map(|&(axis, _)| axis)));
         let array = zarr::create_array(self.store, name, &builder)?;
         if values.is_empty() {
             return Ok(());
@@ -332,7 +325,7 @@ impl Put<'_> {
         let path = self.store.root().join(name);
         // One thread only: the next frames arrive while batches are written, and need the other threads.
         let options = zarr::codec_options().with_concurrent_target(1);
-        array.store_chunk_opt(&vec![0; shape.len()], values, &options).map_err(Error::zarr("write", &path))
+        array.store_chunk_opt(&vec![0; axes.len()], values, &options).map_err(Error::zarr("write", &path))
     }
 }
 

@@ -15,7 +15,6 @@ use raysweep::mirror;
 use raysweep::rig::AnyRig;
 use raysweep::server::{self, Access, Listening};
 use raysweep_drivers::mirror::{Parked, park};
-use raysweep_pipeline::Registry;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -81,7 +80,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
         ),
         _ => None,
     };
-    let runner = Runner::new(rig, arguments.data.clone(), Registry::default())?;
+    let runner = Runner::new(rig, arguments.data.clone())?;
     let camera = runner.camera();
     let opened = format!(
         "{} ({} x {} {:?}), rig {}",

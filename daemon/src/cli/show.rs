@@ -264,26 +264,33 @@ pub(super) fn description(description: &Description) -> String {
     lines.join("\n")
 }
 
-/// Text for the end of a run.
-pub(super) fn ending(
-    session: &Path,
-    state: &str,
-    report: Option<&Path>,
-    stored: usize,
-    missing: usize,
-    final_s: Option<f64>,
-    light_s: Option<f64>,
-) -> String {
-    let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
-    lines.push(format!("session: {}", session.display()));
-    lines
-        .extend(light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")));
-    lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
-    lines.extend(report.map(|report| format!("report: {}", report.display())));
-    if missing > 0 {
-        lines.push(format!("`raysweep resume {}` takes what is missing", name(session)));
+/// How a run ended.
+pub(super) struct Ending<'a> {
+    pub session: &'a Path,
+    pub state: &'a str,
+    pub report: Option<&'a Path>,
+    pub stored: usize,
+    pub missing: usize,
+    pub final_s: Option<f64>,
+    pub light_s: Option<f64>,
+}
+
+impl Ending<'_> {
+    /// Text for the end of a run.
+    pub(super) fn text(&self) -> String {
+        let Self { session, state, report, stored, missing, final_s, light_s } = *self;
+        let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
+        lines.push(format!("session: {}", session.display()));
+        lines.extend(
+            light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")),
+        );
+        lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
+        lines.extend(report.map(|report| format!("report: {}", report.display())));
+        if missing > 0 {
+            lines.push(format!("`raysweep resume {}` takes what is missing", name(session)));
+        }
+        lines.join("\n")
     }
-    lines.join("\n")
 }
 
 /// Text for the end of a film.
@@ -369,10 +376,27 @@ mod tests {
     #[test]
     fn an_unfinished_session_is_told_how_to_go_on() {
         let folder = Path::new("/data/20260101-000000_corner");
-        let unfinished = ending(folder, "cancelled", None, 40, 35, None, None);
+        let unfinished = Ending {
+            session: folder,
+            state: "cancelled",
+            report: None,
+            stored: 40,
+            missing: 35,
+            final_s: None,
+            light_s: None,
+        };
+        let report = folder.join("report.html");
+        let complete = Ending {
+            state: "complete",
+            report: Some(&report),
+            stored: 75,
+            missing: 0,
+            final_s: Some(0.25),
+            light_s: Some(10.5),
+            ..unfinished
+        };
+        let (unfinished, complete) = (unfinished.text(), complete.text());
         assert!(unfinished.contains("35 missing") && unfinished.contains("resume 20260101-000000_corner"));
-        let complete =
-            ending(folder, "complete", Some(&folder.join("report.html")), 75, 0, Some(0.25), Some(10.5));
         assert!(
             complete.contains("0.25 s after the last frame") && complete.contains("10.50 s from the first")
         );

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use raysweep_proto::{Event, FilmEstimate, Progress, RunState};
 
-use super::show;
+use super::show::{self, Ending};
 
 /// Interval between progress lines where no bar can be drawn.
 const PACE: Duration = Duration::from_secs(5);
@@ -81,7 +81,9 @@ impl View {
                 let summary = match film {
                     Some(film) => show::film_ending(session, state, report.as_deref(), film),
                     None => {
-                        show::ending(session, state, report.as_deref(), *stored, *missing, *final_s, *light_s)
+                        let (report, stored, missing) = (report.as_deref(), *stored, *missing);
+                        let (final_s, light_s) = (*final_s, *light_s);
+                        Ending { session, state, report, stored, missing, final_s, light_s }.text()
                     }
                 };
                 writeln!(io::stdout(), "{summary}")?;

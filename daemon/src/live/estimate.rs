@@ -189,7 +189,7 @@ mod tests {
     use std::sync::mpsc::{Receiver, Sender, channel};
 
     use ndarray::Array3;
-    use raysweep_pipeline::FoldError;
+    use raysweep_pipeline::NotSolved;
     use tokio::sync::broadcast;
 
     use super::super::LiveReader;
@@ -220,13 +220,14 @@ mod tests {
             &self,
             _: Option<&Transport>,
             go_on: &(dyn Fn() -> bool + Sync),
-        ) -> Result<Transport, FoldError> {
+        ) -> Result<Transport, NotSolved> {
             self.begun.send(self.points).unwrap();
             loop {
                 match self.points {
                     0 => panic!("on purpose"),
+                    1 => return Err(NotSolved { of: "scripted", what: "on purpose".into() }),
                     _ if !go_on() => {
-                        return Err(FoldError { fold: "scripted".into(), what: "stopped".into() });
+                        return Err(NotSolved { of: "scripted", what: "stopped".into() });
                     }
                     _ if self.may_end.lock().unwrap().recv_timeout(Duration::from_millis(1)).is_ok() => {
                         return Ok(transport(self.points as f32));
@@ -291,14 +292,16 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_ends_the_estimates_and_nothing_else() {
-        let stage = stage();
-        stage.live.offer((stage.snapshot)(0));
-        stage.begun.recv().unwrap();
-        for points in 6..60 {
-            stage.live.offer((stage.snapshot)(points));
+    fn a_panic_and_an_error_end_the_estimates_and_nothing_else() {
+        for failing in [0, 1] {
+            let stage = stage();
+            stage.live.offer((stage.snapshot)(failing));
+            stage.begun.recv().unwrap();
+            for points in 6..60 {
+                stage.live.offer((stage.snapshot)(points));
+            }
+            drop(stage.live);
+            assert!(stage.begun.try_recv().is_err());
         }
-        drop(stage.live);
-        assert!(stage.begun.try_recv().is_err());
     }
 }

@@ -163,12 +163,11 @@ impl LiveFile {
         slots.bytes.resize(METADATA_BYTES, 0);
         slots.bytes.extend(image.iter().flat_map(|pixel| pixel.to_le_bytes()));
         let (index, sequence) = (slots.next(), slots.sequence + 1);
-        let lock = slots.held[index].lock + 2;
-        let header =
-            header(name, image.shape(), lock, sequence, metadata.len(), &slots.bytes, self.offset_of(index));
+        let held = Held { lock: slots.held[index].lock + 2, sequence, name: name.into() };
+        let header = header(&held, image.shape(), metadata.len(), &slots.bytes, self.offset_of(index));
         self.write_slot(index, &header, &slots.bytes).map_err(LiveError::io("write", &self.path))?;
         slots.sequence = sequence;
-        slots.held[index] = Held { lock, sequence, name: name.into() };
+        slots.held[index] = held;
         Ok(sequence)
     }
 
@@ -234,12 +233,11 @@ fn remove_stale(path: &Path) -> Result<(), LiveError> {
     }
 }
 
-/// A slot's header; `bytes` are metadata, padding and pixels, `at` is where the slot starts.
+/// The header of a slot that holds an image of this shape; `bytes` are metadata, padding and pixels, `at` is where the
+/// slot starts.
 fn header(
-    name: &str,
+    held: &Held,
     shape: &[usize],
-    lock: u64,
-    sequence: u64,
     metadata_bytes: usize,
     bytes: &[u8],
     at: u64,
@@ -250,8 +248,8 @@ fn header(
     checksum.update(&bytes[METADATA_BYTES..]);
     let mut header = [0; SLOT_HEADER_BYTES];
     let mut put = |offset: usize, field: &[u8]| header[offset..offset + field.len()].copy_from_slice(field);
-    put(0, &lock.to_le_bytes());
-    put(8, &sequence.to_le_bytes());
+    put(0, &held.lock.to_le_bytes());
+    put(8, &held.sequence.to_le_bytes());
     put(16, &host_ns().to_le_bytes());
     put(24, &(metadata_at + METADATA_BYTES as u64).to_le_bytes());
     put(32, &metadata_at.to_le_bytes());
@@ -260,7 +258,7 @@ fn header(
     put(48, &DTYPE);
     put(52, &(shape.len() as u32).to_le_bytes());
     shape.iter().enumerate().for_each(|(axis, &len)| put(56 + 8 * axis, &(len as u64).to_le_bytes()));
-    put(88, name.as_bytes());
+    put(88, held.name.as_bytes());
     header
 }
 

@@ -12,7 +12,7 @@ use raysweep_core::{
     Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
     SettingsLatency, Shown, Vsync,
 };
-use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, Policy, Role, Sink, Stage};
+use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, Policy, Role, Sink, Stages};
 use raysweep_processing::plane::{PlaneTask, place};
 use raysweep_proto::RunState;
 use raysweep_session::ledger::State;
@@ -138,7 +138,7 @@ impl Opened {
     /// When a thread cannot be started, or the pipeline fails.
     pub fn acquire<S: Sink + 'static>(
         self,
-        stages: Arc<[Box<dyn Stage>]>,
+        stages: Stages,
         units_under_way: usize,
         sink: S,
         results: &Receiver<Verdict>,

@@ -1,18 +1,18 @@
-//! The pipeline's sink: data first, then the ledger entry, then the folds.
+//! The pipeline's sink: data first, then the ledger entry, then the demultiplexer.
 
 use std::sync::Arc;
-use std::sync::mpsc::Sender;
+use std::sync::mpsc::{Receiver, Sender, channel};
 
 use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
 use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
 use raysweep_processing::plane::{PlaneTask, Processing, place};
 use raysweep_proto::Event;
-use raysweep_session::ledger::{Entry, Ledger, PointEntry};
+use raysweep_session::ledger::{Entry, PointEntry};
 use raysweep_session::stack::Stack;
 
 use crate::live::LiveEstimate;
-use crate::run::board::StatusBoard;
-use crate::run::orders::{Order, Orders};
+use crate::run::life::Run;
+use crate::run::orders::Order;
 use crate::run::progress::ProgressMeter;
 
 /// What the run is told about its points, in order.
@@ -26,14 +26,12 @@ pub enum Verdict {
 
 /// Stores the points that the pipeline delivers.
 pub struct PointSink {
-    pub task: Arc<PlaneTask>,
-    pub stack: Stack,
-    pub ledger: Ledger,
+    task: Arc<PlaneTask>,
+    pub run: Run,
+    stack: Stack,
     pub processing: Processing,
     /// `None` once the pipeline has ended.
-    pub verdicts: Option<Sender<Verdict>>,
-    pub orders: Arc<Orders>,
-    pub board: Arc<StatusBoard>,
+    verdicts: Option<Sender<Verdict>>,
     pub progress: ProgressMeter,
     pub vsync: Option<VsyncStats>,
     /// `None` once the pipeline has ended: then the processor is needed for the results.
@@ -62,12 +60,12 @@ impl Sink for PointSink {
                         if let Some(live) = &self.live
                             && let Some(snapshot) = self.processing.snapshot()
                         {
-                            live.offer(snapshot);
+                            live.offer(Box::new(snapshot));
                         }
                     }
                     Err(error) => self.note_stage_error(&unit, &error),
                 }
-                self.board.publish(Event::Progress(self.progress.shown()));
+                self.run.board.publish(Event::Progress(self.progress.shown()));
             }
             Ordered::Failed(id, failure, counts) => self.fail(id, failure, counts),
             Ordered::Flushed(outside, vsync) => {
@@ -76,8 +74,8 @@ impl Sink for PointSink {
                     self.append(&Entry::Outside { counts: outside });
                 }
                 self.vsync = Some(vsync);
-                self.board.publish(Event::Progress(self.progress.shown()));
-                self.board.publish(Event::Vsync(vsync));
+                self.run.board.publish(Event::Progress(self.progress.shown()));
+                self.run.board.publish(Event::Vsync(vsync));
                 self.tell(Verdict::Flushed);
             }
         }
@@ -90,11 +88,34 @@ impl Sink for PointSink {
 }
 
 impl PointSink {
+    /// A sink for the points of a run, without a live estimate, and the other end of its verdicts.
+    pub fn new(
+        task: &Arc<PlaneTask>,
+        run: Run,
+        stack: Stack,
+        processing: Processing,
+        progress: ProgressMeter,
+    ) -> (Self, Receiver<Verdict>) {
+        let (verdicts, results) = channel();
+        let sink = Self {
+            task: task.clone(),
+            run,
+            stack,
+            processing,
+            verdicts: Some(verdicts),
+            progress,
+            vsync: None,
+            live: None,
+            write_error: None,
+        };
+        (sink, results)
+    }
+
     fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
         let point = self.task.schedule.points[unit.id.point as usize];
         let (array, index) = place(point.role);
         let crc32 = self.stack.write(array, index, unit.sum.view())?;
-        self.ledger.append(&Entry::Point(PointEntry {
+        self.run.ledger.append(&Entry::Point(PointEntry {
             array,
             index,
             attempt: unit.id.attempt,
@@ -111,7 +132,11 @@ impl PointSink {
         let (array, index) = place(self.task.schedule.points[id.point as usize].role);
         self.progress.counts.add(&counts);
         if counts.lost_total() > 0 {
-            self.board.publish(Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() });
+            self.run.board.publish(Event::Lost {
+                point: id.point,
+                attempt: id.attempt,
+                counts: counts.clone(),
+            });
         }
         let (attempt, of_attempt) = (id.attempt, counts.clone());
         self.append(&match failure {
@@ -128,7 +153,7 @@ impl PointSink {
     }
 
     pub fn note_write_error(&mut self, error: raysweep_session::Error) {
-        self.orders.give(Order::Fault);
+        self.run.orders.give(Order::Fault);
         self.write_error.get_or_insert(error);
     }
 
@@ -141,7 +166,7 @@ impl PointSink {
 
     /// Appends an entry that no stored data depend on: a failure ends the run, but nothing must be undone.
     pub fn append(&mut self, entry: &Entry) {
-        if let Err(error) = self.ledger.append(entry) {
+        if let Err(error) = self.run.ledger.append(entry) {
             tracing::error!(%error, "ledger not written");
             self.note_write_error(error);
         }

@@ -4,11 +4,11 @@ use std::path::Path;
 use std::sync::Arc;
 
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::Registry;
 use raysweep_processing::memory::available_bytes;
 use raysweep_proto::CheckReport;
 use raysweep_session::durable;
 
+use crate::probes::Probes;
 use crate::rig::{DotRig, Rig};
 
 /// The environment in which a plan is to be run.
@@ -19,8 +19,8 @@ pub struct Lab<'a> {
     pub camera: &'a CameraCapabilities,
     /// Folder of the sessions.
     pub data: &'a Path,
-    /// Stages by name.
-    pub registry: &'a Arc<Registry>,
+    /// What tests insert.
+    pub probes: &'a Probes,
     /// Memory limit; results that need more are made in strips of camera rows. `None`: the memory that is free.
     pub memory_limit_bytes: Option<u64>,
 }
@@ -51,9 +51,15 @@ impl Lab<'_> {
     }
 
     /// Free disk space where sessions are, or will be.
-    pub fn disk_free_bytes(&self) -> u64 {
+    fn disk_free_bytes(&self) -> u64 {
         let existing = self.data.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
         durable::available_bytes(existing).unwrap_or(u64::MAX)
+    }
+
+    /// What a session and its results need, and what there is.
+    pub fn room(&self, memory_bytes: u64, disk_bytes: u64) -> Room {
+        let (memory_free_bytes, disk_free_bytes) = (self.memory_free_bytes(), self.disk_free_bytes());
+        Room { memory_bytes, memory_free_bytes, disk_bytes, disk_free_bytes }
     }
 
     /// Capabilities of the rig's camera at this frame rate.
@@ -70,10 +76,10 @@ impl Lab<'_> {
 
 /// Disk space and memory that a session and its results need, and what is available.
 pub struct Room {
-    pub memory_bytes: u64,
-    pub memory_free_bytes: u64,
-    pub disk_bytes: u64,
-    pub disk_free_bytes: u64,
+    memory_bytes: u64,
+    memory_free_bytes: u64,
+    disk_bytes: u64,
+    disk_free_bytes: u64,
 }
 
 impl Room {

@@ -26,7 +26,7 @@ pub struct Plan {
     pub name: String,
     /// `kind`, with the table of that name.
     pub procedure: Procedure,
-    /// `[[stage]]`: stages in order, then folds; default: [`Procedure::default_stage`].
+    /// `[[stage]]`: in order; default: [`Procedure::default_stage`].
     pub stages: Vec<StageTable>,
     /// `[[product]]`: products to make from the transport; default: the procedure's own.
     pub products: Option<Vec<ProductTable>>,

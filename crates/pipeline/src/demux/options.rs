@@ -3,6 +3,9 @@
 use raysweep_transport::plane::Prior;
 use serde::Deserialize;
 
+/// The name of the stage in plans.
+pub const DEMUX: &str = "demux";
+
 /// Options of `demux` in a plan.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]

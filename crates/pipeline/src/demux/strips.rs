@@ -9,20 +9,22 @@ use ndarray::Axis;
 use rayon::prelude::*;
 use raysweep_transport::plane::{PlaneError, Setting};
 
-use super::tally::Tally;
-use super::{DemuxFold, Taken, refused};
+use super::tally::{SweepSummary, Tally};
+use super::{DEMUX, DemuxFold, SweepImage, refused};
 use crate::findings::rows_to_choose_by;
-use crate::product::Product;
 use crate::schedule::Role;
-use crate::stage::FoldError;
-use crate::strips::{ImageRows, InStrips};
+use crate::strips::{ImageRows, InStrips, NotSolved};
 
 impl DemuxFold {
-    pub(super) fn solve_in_strips(
-        &mut self,
+    /// [`Self::finish`] after [`Self::keep_no_images`]: stack and transport are handed over strip by strip.
+    ///
+    /// # Errors
+    /// Those of [`Self::finish`]; if an image cannot be read again, or a strip is refused.
+    pub fn finish_in_strips(
+        mut self,
         strips: InStrips<'_>,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<Vec<Product>, FoldError> {
+    ) -> Result<SweepSummary, NotSolved> {
         let InStrips { images, strip_rows, take } = strips;
         let not_kept = self.not_kept.take().unwrap_or_default();
         let height = self.geometry.height;
@@ -35,7 +37,7 @@ impl DemuxFold {
             let held = self.hold(around.start, read_rows(&not_kept, images, &around)?)?;
             take(&choices.findings, self.strip(&choices, rows, held, &mut tally, go_on)?)?;
         }
-        Ok(tally.products(choices.findings))
+        Ok(tally.summary(choices.findings))
     }
 
     /// The rows of [`rows_to_choose_by`] of all images. They are spread over the whole image, so each image is read
@@ -45,7 +47,7 @@ impl DemuxFold {
         not_kept: &BTreeMap<Role, (u32, Setting)>,
         images: &dyn ImageRows,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<BTreeMap<Role, Arc<Taken>>, FoldError> {
+    ) -> Result<BTreeMap<Role, Arc<SweepImage>>, NotSolved> {
         let height = self.geometry.height;
         let rows = rows_to_choose_by(height);
         let of_rows = |(role, (point, setting)): (&Role, &(u32, Setting))| {
@@ -53,7 +55,7 @@ impl DemuxFold {
                 return Err(refused(PlaneError::Stopped));
             }
             let image = images.read(*point, 0..height).map_err(not_read)?.select(Axis(0), &rows);
-            Ok((*role, Arc::new(Taken { setting: setting.clone(), image })))
+            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image })))
         };
         not_kept.iter().map(of_rows).collect()
     }
@@ -64,18 +66,18 @@ fn read_rows(
     not_kept: &BTreeMap<Role, (u32, Setting)>,
     images: &dyn ImageRows,
     rows: &Range<usize>,
-) -> Result<BTreeMap<Role, Arc<Taken>>, FoldError> {
+) -> Result<BTreeMap<Role, Arc<SweepImage>>, NotSolved> {
     not_kept
         .par_iter()
         .map(|(role, (point, setting))| {
             let image = images.read(*point, rows.clone()).map_err(not_read)?;
-            Ok((*role, Arc::new(Taken { setting: setting.clone(), image })))
+            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image })))
         })
         .collect()
 }
 
-fn not_read(what: String) -> FoldError {
-    FoldError { fold: "demux".into(), what }
+fn not_read(what: String) -> NotSolved {
+    NotSolved { of: DEMUX, what }
 }
 
 #[cfg(test)]
@@ -84,9 +86,8 @@ mod tests {
     use raysweep_core::{Counts, Raster, SettingsId};
 
     use super::*;
-    use crate::demux::DemuxOptions;
+    use crate::demux::{DemuxOptions, Solved};
     use crate::schedule::{Point, Schedule, Spot, SweepGeometry};
-    use crate::stage::Fold;
     use crate::strips::Strip;
     use crate::unit::Unit;
 
@@ -174,10 +175,8 @@ mod tests {
 
         let mut whole = fold();
         push_all(&mut whole, &images);
-        let mut said = whole.finish(&|| true).unwrap();
-        let Some(Product::Stack(stack)) = said.pop() else { panic!("no stack") };
-        let Some(Product::Transport(transport)) = said.pop() else { panic!("no transport") };
-        let Some(Product::Findings(findings)) = said.last() else { panic!("no findings") };
+        let Solved { stack, transport, summary } = whole.finish(&|| true).unwrap();
+        let findings = &summary.findings;
         assert!(findings.choice.is_some() && stack.variance_ratio.is_some(), "{findings:?}");
         assert!(rows_to_choose_by(HEIGHT).len() < HEIGHT);
 
@@ -186,13 +185,13 @@ mod tests {
         push_all(&mut in_strips, &images);
         let mut strips: Vec<Strip> = Vec::new();
         let mut take = |chosen: &crate::Findings, strip| {
-            assert_eq!(chosen, &**findings);
+            assert_eq!(chosen, findings);
             strips.push(strip);
             Ok(())
         };
         let order = InStrips { images: &images, strip_rows: STRIP_ROWS, take: &mut take };
-        let said_in_strips = in_strips.finish_in_strips(order, &|| true).unwrap();
-        assert_eq!(format!("{said_in_strips:?}"), format!("{said:?}"));
+        let summary_in_strips = in_strips.finish_in_strips(order, &|| true).unwrap();
+        assert_eq!(format!("{summary_in_strips:?}"), format!("{summary:?}"));
 
         assert_eq!(strips.iter().map(|strip| strip.first_row).collect::<Vec<_>>(), [0, 50, 100]);
         assert_eq!(

@@ -4,9 +4,21 @@ use ndarray::Array2;
 use raysweep_transport::plane::Transport;
 
 use crate::findings::Findings;
-use crate::product::Product;
 
-use super::PREDICTED_SHARE;
+/// Name of the figure that checks consistency: the light of the regular image, predicted by the model over captured
+/// by the camera.
+pub const PREDICTED_SHARE: &str = "predicted / captured regular light";
+
+/// What there is to say about a sweep's transport.
+#[derive(Debug, Clone)]
+pub struct SweepSummary {
+    /// How it was demultiplexed.
+    pub findings: Findings,
+    /// Numbers for the report: name, with the unit, and value.
+    pub figures: Vec<(&'static str, f64)>,
+    /// Problems that make the products worse than they look.
+    pub warnings: Vec<String>,
+}
 
 /// Largest relative error with which the transport should predict the regular image.
 const CLOSE_SHARE: f64 = 0.02;
@@ -53,47 +65,44 @@ impl Tally {
     }
 
     /// Figures and warnings, and the findings.
-    pub(super) fn products(self, findings: Findings) -> Vec<Product> {
-        let mut products = vec![
-            Product::Figure { name: "images demultiplexed", value: self.images as f64 },
-            Product::Figure { name: "saturated pixels", value: self.saturated as f64 },
-        ];
-        products.extend(too_many_saturated("the sweep", self.saturated, self.pixels));
+    pub(super) fn summary(self, findings: Findings) -> SweepSummary {
+        let mut figures =
+            vec![("images demultiplexed", self.images as f64), ("saturated pixels", self.saturated as f64)];
+        let mut warnings: Vec<String> =
+            too_many_saturated("the sweep", self.saturated, self.pixels).into_iter().collect();
         if let Some(regular) = self.regular {
-            products.extend(regular.products(self.pixels));
+            regular.check(self.pixels, &mut figures, &mut warnings);
         }
-        products.extend(findings.warnings.iter().cloned().map(Product::Warning));
-        products.push(Product::Findings(Box::new(findings)));
-        products
+        warnings.extend(findings.warnings.iter().cloned());
+        SweepSummary { findings, figures, warnings }
     }
 }
 
 impl Regular {
     /// How well the transport predicts the light of the regular image where the image is not saturated.
-    fn products(self, pixels: usize) -> Vec<Product> {
+    fn check(self, pixels: usize, figures: &mut Vec<(&'static str, f64)>, warnings: &mut Vec<String>) {
         let what = "the regular image (a whole VSYNC period long)";
-        let mut products: Vec<Product> =
-            too_many_saturated(what, self.saturated, pixels).into_iter().collect();
-        if products.is_empty() && self.captured > 0.0 {
+        if let Some(warning) = too_many_saturated(what, self.saturated, pixels) {
+            warnings.push(warning);
+        } else if self.captured > 0.0 {
             let share = self.predicted / self.captured;
-            products.push(Product::Figure { name: PREDICTED_SHARE, value: share });
+            figures.push((PREDICTED_SHARE, share));
             if (share - 1.0).abs() > CLOSE_SHARE {
-                products.push(Product::Warning(format!(
+                warnings.push(format!(
                     "the transport predicts {:.1} % of the light of the regular image: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
                     share * 100.0
-                )));
+                ));
             }
         }
-        products
     }
 }
 
-fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<Product> {
+fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<String> {
     let share = saturated as f64 / pixels as f64;
     (share > SATURATED_SHARE).then(|| {
-        Product::Warning(format!(
+        format!(
             "{:.1} % of the pixels of {what} are saturated: take less gain, a smaller aperture or less ambient light",
             share * 100.0
-        ))
+        )
     })
 }

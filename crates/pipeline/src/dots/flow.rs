@@ -7,25 +7,17 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use crossbeam_channel::{Receiver, Sender, bounded};
-use raysweep_core::{Frame, LossCause, PixelFormat};
+use raysweep_core::{Frame, PixelFormat};
 use raysweep_transport::dots::{
     Background, BackgroundMean, Correction, DotsError, NoiseFloor, Observation, SparseColumn,
 };
 
 use super::background::Backgrounds;
-use super::gather::{CutSink, Gatherer, Looked, Scan};
+use super::gather::{CutSink, DotScan, Gatherer, Looked, Loss};
 use super::stage::{ColumnStage, ColumnWorker};
-use crate::pipeline::{PipelineError, message_of};
+use crate::pipeline::PipelineError;
 use crate::queue::{Input, Policy, QueueError};
-
-/// Consecutive exposures without a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Loss {
-    /// Their number.
-    pub frames: u64,
-    /// The cause.
-    pub cause: LossCause,
-}
+use crate::stage::message_of;
 
 /// A frame, and the losses since the previous one.
 pub struct Arrival {
@@ -38,7 +30,7 @@ pub struct Arrival {
 /// How frames are turned into batches.
 pub struct DotsFlowConfig {
     /// The scan.
-    pub scan: Scan,
+    pub scan: DotScan,
     /// Pixel format of the frames.
     pub format: PixelFormat,
     /// Counts from which a pixel is overexposed.
@@ -104,7 +96,7 @@ struct Shop {
     backgrounds: Backgrounds,
     /// Columns for reuse.
     spare: Mutex<Vec<SparseColumn>>,
-    scan: Scan,
+    scan: DotScan,
     format: PixelFormat,
     saturation_dn: u16,
     floor: NoiseFloor,
@@ -222,7 +214,7 @@ impl Shop {
             Ok(counts) => counts,
             Err(problem) => return (unseen, Err(problem)),
         };
-        let Scan { shape, trailing_region, .. } = &self.scan;
+        let DotScan { shape, trailing_region, .. } = &self.scan;
         let seen = Observation::new(frame.stamp.seq, counts, *shape, trailing_region, self.saturation_dn);
         let mut column = self.spare.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
         let made =

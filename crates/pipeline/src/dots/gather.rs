@@ -8,17 +8,24 @@ use raysweep_transport::dots::{
     SparseColumn, SyncSettings, Synchroniser, pulse_threshold,
 };
 
-use super::flow::Loss;
-
 /// Number of batches from which the trailing dot's brightness is learnt before the first batch is cut.
 const LEARNT_FROM_BATCHES: usize = 2;
 /// Largest distance of a waiting frame from its position expected from the last trailing dot: a drift of one frame
 /// per batch, over the two batches for which it may wait.
 const DRIFT_FRAMES: u64 = 2;
 
+/// Consecutive exposures without a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Loss {
+    /// Their number.
+    pub frames: u64,
+    /// The cause.
+    pub cause: LossCause,
+}
+
 /// The parameters of a scan.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Scan {
+pub struct DotScan {
     /// Size of the frames.
     pub shape: FrameShape,
     /// Number of frames per batch.
@@ -33,7 +40,7 @@ pub struct Scan {
     pub batches: u32,
 }
 
-impl Scan {
+impl DotScan {
     /// Whether a frame of the batch shows the scene: neither trailing dot nor beam dump.
     pub fn is_scene(&self, index: u32) -> bool {
         index != self.trailing_index && !self.background_indices.contains(&index)
@@ -113,7 +120,7 @@ enum Cutter {
 }
 
 pub(super) struct Gatherer<S> {
-    scan: Scan,
+    scan: DotScan,
     format: PixelFormat,
     pub sink: S,
     cutter: Cutter,
@@ -136,7 +143,7 @@ pub(super) struct Gatherer<S> {
 }
 
 impl<S: CutSink> Gatherer<S> {
-    pub fn new(scan: Scan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
+    pub fn new(scan: DotScan, format: PixelFormat, background: BackgroundMean, sink: S) -> Self {
         let shape = scan.shape;
         let learning = LEARNT_FROM_BATCHES * scan.dots as usize + 2;
         Self {

@@ -13,9 +13,9 @@ mod gather;
 mod stage;
 
 pub use dark::{DarkRun, FlatRun, Sensor};
-pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered, Loss};
-pub use gather::{Cut, CutSink, Scan};
-pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, DotStages};
+pub use flow::{Arrival, DotsFlow, DotsFlowConfig, DotsInput, Gathered};
+pub use gather::{Cut, CutSink, DotScan, Loss};
+pub use stage::{ColumnStage, ColumnWorker, DenoiseOptions, column_stage};
 
 #[cfg(test)]
 mod tests;

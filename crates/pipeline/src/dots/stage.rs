@@ -1,6 +1,5 @@
 //! Stages that turn a frame into a column, by their names in plans.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use raysweep_transport::dots::{
@@ -10,7 +9,7 @@ use raysweep_transport::dots::{
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::registry::RegistryError;
+use crate::stage_refused::{self, StageRefused};
 
 /// Computes sparse columns from raw frames.
 pub trait ColumnStage: Send + Sync {
@@ -161,73 +160,41 @@ impl ColumnWorker for Plain {
     }
 }
 
-type Make = Box<dyn Fn(Value, &Correction) -> Result<Box<dyn ColumnStage>, RegistryError> + Send + Sync>;
-
-/// All column stages available to plans.
-pub struct DotStages {
-    makers: BTreeMap<&'static str, Make>,
-}
-
-impl Default for DotStages {
-    fn default() -> Self {
-        let mut stages = Self { makers: BTreeMap::new() };
-        stages.register("denoise", |options, correction| {
-            let options: DenoiseOptions = parse("denoise", options)?;
-            let denoiser = denoiser("denoise", &options, correction)?;
-            Ok(Box::new(Fused { denoiser: Arc::new(denoiser), residual: options.residual }))
-        });
-        stages.register("denoise-reference", |options, correction| {
-            let options: DenoiseOptions = parse("denoise-reference", options)?;
-            // The same settings are rejected.
-            denoiser("denoise-reference", &options, correction)?;
+/// The stage that a plan names, with the plan's options (a JSON object).
+///
+/// # Errors
+/// For unknown names, and for options that the stage rejects.
+pub fn column_stage(
+    name: &str,
+    options: Value,
+    correction: &Correction,
+) -> Result<Arc<dyn ColumnStage>, StageRefused> {
+    match name {
+        "denoise" => {
+            let (DenoiseOptions { residual, .. }, denoiser) = checked(name, options, correction)?;
+            Ok(Arc::new(Fused { denoiser: Arc::new(denoiser), residual }))
+        }
+        "denoise-reference" => {
+            let (options, _) = checked(name, options, correction)?;
             let settings = options.settings(correction.shape().width());
             let correction = Arc::new(correction.clone());
-            Ok(Box::new(Plain { correction, settings, residual: options.residual }))
-        });
-        stages
+            Ok(Arc::new(Plain { correction, settings, residual: options.residual }))
+        }
+        _ => Err(StageRefused::Unknown { name: name.into(), known: "denoise, denoise-reference".into() }),
     }
 }
 
-fn parse(name: &str, options: Value) -> Result<DenoiseOptions, RegistryError> {
-    serde_json::from_value(options).map_err(|source| RegistryError::Options { name: name.into(), source })
-}
-
-fn denoiser(
+/// The options, and the denoiser with them; the reference rejects the same settings.
+fn checked(
     name: &str,
-    options: &DenoiseOptions,
+    options: Value,
     correction: &Correction,
-) -> Result<Denoiser, RegistryError> {
+) -> Result<(DenoiseOptions, Denoiser), StageRefused> {
+    let options: DenoiseOptions = stage_refused::options(name, options)?;
     let settings = options.settings(correction.shape().width());
-    Denoiser::new(correction.clone(), settings)
-        .map_err(|error| RegistryError::Invalid { name: name.into(), what: error.to_string() })
-}
-
-impl DotStages {
-    /// Registers a stage; replaces an existing one of that name.
-    pub fn register(
-        &mut self,
-        name: &'static str,
-        make: impl Fn(Value, &Correction) -> Result<Box<dyn ColumnStage>, RegistryError> + Send + Sync + 'static,
-    ) {
-        self.makers.insert(name, Box::new(make));
-    }
-
-    /// Creates the stage that a plan names.
-    ///
-    /// # Errors
-    /// For unknown names, and for options that the stage rejects.
-    pub fn make(
-        &self,
-        name: &str,
-        options: Value,
-        correction: &Correction,
-    ) -> Result<Box<dyn ColumnStage>, RegistryError> {
-        let make = self.makers.get(name).ok_or_else(|| RegistryError::Unknown {
-            name: name.into(),
-            known: self.makers.keys().copied().collect::<Vec<_>>().join(", "),
-        })?;
-        make(options, correction)
-    }
+    let denoiser = Denoiser::new(correction.clone(), settings)
+        .map_err(|error| StageRefused::Invalid { name: name.into(), what: error.to_string() })?;
+    Ok((options, denoiser))
 }
 
 #[cfg(test)]
@@ -247,7 +214,7 @@ mod tests {
         (0..5).for_each(|at| frame[64 * 30 + 20 + at] = 900);
         let column = |name: &str, residual: bool| {
             let options = json!({ "radius_px": 6.0, "residual": residual });
-            let stage = DotStages::default().make(name, options, &correction).unwrap();
+            let stage = column_stage(name, options, &correction).unwrap();
             let mut column = SparseColumn::default();
             stage.worker().column(&frame, &background, floor, &mut column).unwrap();
             column
@@ -261,9 +228,8 @@ mod tests {
     #[test]
     fn what_no_stage_takes_is_refused_by_name() {
         let correction = Correction::none(FrameShape::new(64, 64, 1).unwrap());
-        let refused = |name: &str, options: Value| {
-            DotStages::default().make(name, options, &correction).err().unwrap().to_string()
-        };
+        let refused =
+            |name: &str, options: Value| column_stage(name, options, &correction).err().unwrap().to_string();
         assert!(refused("demux", json!({})).contains("known are denoise, denoise-reference"));
         assert!(refused("denoise", json!({ "radius": 3 })).contains("radius"));
         assert!(refused("denoise", json!({ "radius_px": -1.0 })).contains("radius_px"));

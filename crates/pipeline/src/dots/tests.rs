@@ -21,8 +21,8 @@ fn shape() -> FrameShape {
     FrameShape::new(HEIGHT, WIDTH, 1).unwrap()
 }
 
-fn scan(batches: u32) -> Scan {
-    Scan {
+fn scan(batches: u32) -> DotScan {
+    DotScan {
         shape: shape(),
         dots: DOTS,
         trailing_index: TRAILING,
@@ -161,7 +161,7 @@ fn cut_frames(
 
 fn denoise(format: PixelFormat) -> Arc<dyn ColumnStage> {
     let correction = sensor(format).correction;
-    DotStages::default().make("denoise", json!({ "radius_px": 5.0 }), &correction).unwrap().into()
+    column_stage("denoise", json!({ "radius_px": 5.0 }), &correction).unwrap()
 }
 
 fn whole(steps: std::ops::Range<u64>) -> impl Iterator<Item = (u64, Vec<Loss>)> {

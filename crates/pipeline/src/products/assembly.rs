@@ -4,9 +4,32 @@ use ndarray::{Array3, Axis, s};
 use raysweep_transport::plane::Transport;
 
 use super::profile::ProfileSums;
-use super::{Kind, NotMade, ProductSpec, uncertainty};
+use super::spec::{ProductKind, ProductSpec};
+use super::uncertainty;
 use crate::product::Product;
 use crate::stack::SweepStack;
+
+/// Why a product could not be computed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("product {name}: {what}")]
+pub struct NotMade {
+    /// The product's name.
+    pub name: String,
+    /// What is missing, and what to do.
+    pub what: String,
+}
+
+impl ProductSpec {
+    /// Computes the product.
+    ///
+    /// # Errors
+    /// If a required image was not taken, or saturates.
+    pub fn make(&self, stack: &SweepStack, transport: &Transport) -> Result<Product, NotMade> {
+        let mut assembly = Assembly::new(self.clone());
+        assembly.add(0, stack, transport)?;
+        assembly.finish()
+    }
+}
 
 /// A product under construction. It has the same bits for any division into strips.
 #[derive(Debug)]
@@ -42,7 +65,7 @@ impl Assembly {
         let name = self.spec.name.clone();
         let not_made = |what: String| NotMade { name: self.spec.name.clone(), what };
         let part = match &self.spec.kind {
-            Kind::Regular => match &stack.regular {
+            ProductKind::Regular => match &stack.regular {
                 Some(image) => Product::Image {
                     name,
                     about: "a captured exposure of one whole VSYNC period: every row lit once".into(),
@@ -53,16 +76,16 @@ impl Assembly {
                     return Err(not_made(what.into()));
                 }
             },
-            Kind::Epipolar(width) => width.epipolar(name, transport),
-            Kind::NonEpipolar(width) => width.non_epipolar(name, transport),
-            Kind::Band(band) => band.make(name, transport),
-            Kind::Relight(pattern) => pattern
+            ProductKind::Epipolar(width) => width.epipolar(name, transport),
+            ProductKind::NonEpipolar(width) => width.non_epipolar(name, transport),
+            ProductKind::Band(band) => band.make(name, transport),
+            ProductKind::Relight(pattern) => pattern
                 .make(name, &stack.timing, first_row, transport)
                 .map_err(|error| not_made(error.to_string()))?,
-            Kind::Uncertainty(band) => {
+            ProductKind::Uncertainty(band) => {
                 uncertainty::make(name, *band, first_row, stack, transport).map_err(not_made)?
             }
-            Kind::DelayProfile(options) => {
+            ProductKind::DelayProfile(options) => {
                 options.add(&mut self.sums, first_row, stack, transport);
                 return Ok(());
             }
@@ -77,7 +100,7 @@ impl Assembly {
     /// If a required image saturates.
     pub fn finish(self) -> Result<Product, NotMade> {
         let Self { spec: ProductSpec { name, kind }, parts, sums } = self;
-        if let Kind::DelayProfile(options) = kind {
+        if let ProductKind::DelayProfile(options) = kind {
             return options.make(name.clone(), &sums).map_err(|what| NotMade { name, what });
         }
         let mut parts = parts.into_iter();

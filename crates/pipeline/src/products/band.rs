@@ -6,8 +6,12 @@ use ndarray::Array2;
 use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 
-use super::reach_of;
 use crate::product::Product;
+
+/// The reach of a transport as text, for products that are limited by it.
+pub(super) fn reach_of(transport: &Transport) -> String {
+    format!("the sweep reaches u = {} to {}, beyond nothing is known", transport.u_min, transport.u_max())
+}
 
 /// Options of `epipolar` and `non-epipolar`: the rows that count as the pixel's own.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]

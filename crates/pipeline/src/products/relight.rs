@@ -4,20 +4,20 @@ use ndarray::{Array1, Array3, Axis};
 use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
-use super::reach_of;
+use super::band::reach_of;
 use crate::product::Product;
 use crate::schedule::SweepGeometry;
 
 /// Options of `relight`: the brightness of each projector row.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum Pattern {
+pub(super) enum RowPattern {
     /// Ranges of rows; where they overlap, their weights add up.
     Rows(Vec<Piece>),
     /// Stripes over the whole projector.
     Stripes(Stripes),
     /// A sequence of images: a line that moves from the first row seen by the camera to the last.
-    Line(Line),
+    Line(MovingLine),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -46,12 +46,12 @@ pub(super) struct Stripes {
 
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Line {
+pub(super) struct MovingLine {
     height_rows: usize,
     step_rows: usize,
 }
 
-impl Line {
+impl MovingLine {
     /// The first lit row of each image: from the projector row of the camera's first row to that of its last.
     fn first_rows(self, timing: &RowTiming) -> Vec<usize> {
         let own_row = |t: usize| timing.relative_row(0, t).unsigned_abs() as usize;
@@ -59,7 +59,7 @@ impl Line {
     }
 }
 
-impl Pattern {
+impl RowPattern {
     /// Checks the options. An error consists of the keys and indices that lead to the invalid value, and the allowed
     /// values.
     pub(super) fn check(&self, geometry: &SweepGeometry) -> Result<(), (Vec<String>, String)> {

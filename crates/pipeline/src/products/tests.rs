@@ -1,13 +1,15 @@
 use ndarray::{Axis, s};
 use raysweep_core::Raster;
 use raysweep_transport::plane::predict;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use ndarray::{Array2, Array3};
-use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting};
+use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting, Transport};
 
 use super::*;
-use crate::schedule::{Point, Role, Spot};
+use crate::product::Product;
+use crate::schedule::{Point, Role, Schedule, Spot, SweepGeometry};
+use crate::stack::SweepStack;
 
 /// A camera with 6 rows and 3 columns that sees the rows of a 10-row projector starting at row 2.
 fn geometry() -> SweepGeometry {

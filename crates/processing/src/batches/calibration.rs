@@ -11,7 +11,7 @@ use raysweep_transport::dots::product::{column_energies, coverage};
 use raysweep_transport::dots::{Batch, DotsError, FrameShape};
 use serde_json::{Map, json};
 
-use super::from_stored;
+use super::columns::from_stored;
 
 /// A pixel belongs to a dot's spot from this share of the dot's peak on.
 const FOOTPRINT_LEVEL: f64 = 0.5;

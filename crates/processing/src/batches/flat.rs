@@ -7,7 +7,7 @@ use raysweep_session::dots::FlatArrays;
 use raysweep_session::{Result, Session};
 use raysweep_transport::dots::{Correction, FlatField};
 
-use super::DotTask;
+use super::task::DotTask;
 
 /// Stores the gains that are applied to the run's columns.
 ///

@@ -32,6 +32,11 @@ enum Kind {
     Dual(DualSize),
 }
 
+/// For kinds without options.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoOptions {}
+
 /// Options of `relight`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -187,7 +192,7 @@ impl DotSpec {
         let options = Value::Object(options.clone());
         let (kind, default_name) = match kind_name.as_str() {
             "floodlit" => {
-                read::<super::NoOptions>(kind_name, options)?;
+                read::<NoOptions>(kind_name, options)?;
                 (Kind::Floodlit, "floodlit")
             }
             "relight" => (Kind::Relight(read(kind_name, options)?), "relit"),

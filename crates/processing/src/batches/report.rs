@@ -8,12 +8,12 @@ use raysweep_session::report::{
 };
 use raysweep_session::{Result, Session};
 
-use super::DotTask;
 use super::calibration::Calibration;
+use super::task::DotTask;
 use crate::report::{accounts, subtitle};
 
 /// Selected images of a video, each with its label and scale.
-pub(super) struct Strip {
+pub(super) struct VideoStrip {
     pub name: String,
     pub about: String,
     pub images: Vec<(String, Array3<f32>, ToneMap)>,
@@ -31,7 +31,7 @@ pub(super) fn make(
     state: &State,
     task: &DotTask,
     calibration: Option<&Calibration>,
-    strips: &[Strip],
+    strips: &[VideoStrip],
     problems: &[String],
 ) -> Result<Report> {
     let mut sections = Vec::new();
@@ -78,7 +78,7 @@ fn flat_field(session: &Session, task: &DotTask) -> Result<Option<(String, Strin
     Ok(Some(("flat field".into(), text)))
 }
 
-fn video(strip: &Strip) -> Section {
+fn video(strip: &VideoStrip) -> Section {
     let picture = |(label, image, scale): &(String, Array3<f32>, ToneMap)| {
         let picture = match image.len_of(Axis(2)) {
             1 => Picture::grey(image.index_axis(Axis(2), 0), *scale),

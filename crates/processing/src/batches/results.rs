@@ -14,16 +14,17 @@ use raysweep_session::report::ToneMap;
 use raysweep_session::{Result, Session, manifest, pattern};
 use serde_json::{Map, Value, json};
 
-use super::DotTask;
 use super::calibration::{Calibration, read_batch};
 use super::product::{DotSpec, Scene, light_of, read_pattern};
-use super::report::{self, Strip};
+use super::report::{self, VideoStrip};
+use super::task::DotTask;
 use crate::mirror_response::Predistortion;
+use crate::software::SOFTWARE;
 
 /// Number of images of a video in the report.
 const SHOWN: usize = 6;
 
-/// Makes the calibration, the videos, the report and the manifest; returns the problems.
+/// Makes the calibration, the videos and the report; returns the problems.
 ///
 /// # Errors
 /// When the session cannot be written.
@@ -31,7 +32,6 @@ pub fn make(
     session: &Session,
     state: &State,
     task: &DotTask,
-    rig: &DotRigFile,
     specs: &[DotSpec],
     mut problems: Vec<String>,
     go_on: &dyn Fn() -> bool,
@@ -96,7 +96,6 @@ pub fn make(
     problems.append(&mut encoder.problems);
     let page = report::make(session, state, task, calibration.as_ref(), &strips, &problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())?;
-    write_manifest(session, state, task, rig)?;
     Ok(problems)
 }
 
@@ -130,7 +129,7 @@ struct Video<'a> {
     spec: &'a DotSpec,
     patterns: Option<Array4<f32>>,
     writers: Vec<(String, VideoWriter)>,
-    strips: Vec<Strip>,
+    strips: Vec<VideoStrip>,
 }
 
 impl Video<'_> {
@@ -148,7 +147,7 @@ impl Video<'_> {
                 let metadata = common(task, &about, channels);
                 let writer = session.products().video(&name, count, [rows, columns, channels], &metadata)?;
                 self.writers.push((name.clone(), writer));
-                self.strips.push(Strip { name, about, images: Vec::new() });
+                self.strips.push(VideoStrip { name, about, images: Vec::new() });
             }
             let scale: ToneMap = self.writers[place].1.append(image.view())?;
             let step = count.div_ceil(SHOWN);
@@ -205,12 +204,16 @@ fn common(task: &DotTask, about: &str, channels: usize) -> Map<String, Value> {
         ("axes", json!(axes)),
         ("plan", json!(task.name)),
         ("images_per_s", json!(1.0 / task.batches.path.duration_s())),
-        ("software", json!(crate::SOFTWARE)),
+        ("software", json!(SOFTWARE)),
     ];
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
-fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
+/// Writes the manifest, the last file of a session.
+///
+/// # Errors
+/// When the session cannot be written.
+pub fn write_manifest(session: &Session, state: &State, task: &DotTask, rig: &DotRigFile) -> Result<()> {
     let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
     let plan = &task.batches;
     let settings = json!({

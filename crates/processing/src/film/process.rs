@@ -5,14 +5,15 @@ use std::sync::Arc;
 use ndarray::{Array2, Axis};
 use raysweep_config::FilmPlan;
 use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Registry, Stage, Unit, run_stages};
+use raysweep_pipeline::{Stages, Unit, run_stages};
 use raysweep_session::Session;
 use raysweep_session::film::{CycleEntry, crc32};
 use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::Setting;
 
-use super::{FilmTask, write_report};
+use super::report;
+use super::task::{FilmTask, create_transports};
 use crate::plane::{manifest, unit_of};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
@@ -26,13 +27,13 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let shape = state.session.shape;
     let task = FilmTask::new(plan, film, &rig, state.session.first_row, (shape.rows, shape.columns));
     stored.check_contents(task.contents())?;
-    let stages = task.stages(&Registry::default()).map_err(|error| stored.in_plan(&error))?;
+    let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {
         let message = "a film has no products to ask for: leave --product out";
         return Err(ProcessError::Product(message.into()));
     }
     let problems = make_transports(session, &task, state, &stages)?;
-    write_report(session, state, &task, &problems)?;
+    report::write(session, state, &task, &problems)?;
     manifest::write(session, state, &task.task, &rig)?;
     Ok(Processed {
         report: session.report_path(),
@@ -47,7 +48,7 @@ fn make_transports(
     session: &Session,
     task: &FilmTask,
     state: &State,
-    stages: &[Box<dyn Stage>],
+    stages: &Stages,
 ) -> raysweep_session::Result<Vec<String>> {
     let solver = match task.solver() {
         Ok(solver) => solver,
@@ -57,7 +58,7 @@ fn make_transports(
         return Ok(vec!["the dark image is missing or damaged: no transport can be made without it".into()]);
     };
     let film = session.film()?;
-    let transports = super::create_transports(session, task, solver.reach_rows())?;
+    let transports = create_transports(session, task, solver.reach_rows())?;
     let mut problems = Vec::new();
     for entry in state.cycles() {
         let frames = match film.read(entry.cycle) {
@@ -106,7 +107,7 @@ fn frame_unit(ordinal: u32, entry: &CycleEntry, delay_us: f64, sum: Array2<u32>)
 fn dark_image(
     session: &Session,
     state: &State,
-    stages: &[Box<dyn Stage>],
+    stages: &Stages,
 ) -> raysweep_session::Result<Option<Array2<f32>>> {
     let Some(entry) = state.point(ArrayName::Dark, 0) else { return Ok(None) };
     let sum = session.stack()?.read_point(ArrayName::Dark, 0)?;

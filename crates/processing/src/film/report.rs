@@ -9,7 +9,7 @@ use raysweep_session::report::{
 };
 use raysweep_session::{Result, Session};
 
-use super::FilmTask;
+use super::task::FilmTask;
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, subtitle};
 

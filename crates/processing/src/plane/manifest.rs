@@ -8,7 +8,7 @@ use raysweep_session::ledger::State;
 use raysweep_session::{Result, Session, manifest};
 use serde_json::{Map, json};
 
-use super::{PlaneTask, place};
+use super::task::{PlaneTask, place};
 
 /// Writes the manifest, the last file of a session.
 ///

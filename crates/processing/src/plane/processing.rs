@@ -1,4 +1,4 @@
-//! Runs the stages and folds of a plan, and makes products from their results.
+//! Runs the stages of a plan, demultiplexes their images, and makes products from the transport.
 
 use std::any::Any;
 use std::fmt::Display;
@@ -7,22 +7,23 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use ndarray::Array2;
 use raysweep_core::SettingsId;
 use raysweep_pipeline::{
-    Assembly, Findings, Fold, FoldError, ImageRows, InStrips, Product, ProductSpec, Snapshot, Strip, Unit,
-    message_of, run_stages,
+    Assembly, DEMUX, DemuxFold, Findings, ImageRows, InStrips, NotSolved, Product, ProductSpec, Solved,
+    Stages, Strip, SweepStack, SweepSummary, Unit, message_of, run_stages,
 };
 use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::{Stack, crc32};
+use raysweep_transport::plane::Transport;
 
-use super::{PlaneTask, Stages, place, unit_of};
+use super::task::{PlaneTask, place, unit_of};
 
-/// The stages, folds and products of a plan.
+/// The stages and products of a plan.
 pub struct Processing {
     /// Stages, which process each unit alone.
     pub stages: Stages,
-    /// Folds, which process all units in order.
-    pub folds: Vec<Box<dyn Fold>>,
-    /// Products made from the transport of the folds.
+    /// Demultiplexes all units; `None` if the plan has no `demux`, or it has panicked.
+    pub demux: Option<DemuxFold>,
+    /// Products made from the transport.
     pub products: Vec<ProductSpec>,
     /// What has failed so far, and why.
     pub problems: Vec<String>,
@@ -30,13 +31,13 @@ pub struct Processing {
 
 impl Processing {
     /// Stages alone: the units are not combined.
-    pub fn without_folds(stages: Stages) -> Self {
-        Self { stages, folds: Vec::new(), products: Vec::new(), problems: Vec::new() }
+    pub fn without_demux(stages: Stages) -> Self {
+        Self { stages, demux: None, products: Vec::new(), problems: Vec::new() }
     }
 
-    /// Passes stored points through the stages into the folds, while `go_on` returns true. A point whose stage fails
-    /// is left out and listed among the problems; so are points with damaged data, which are returned because they
-    /// must be acquired again.
+    /// Passes stored points through the stages into the demultiplexer, while `go_on` returns true. A point whose stage
+    /// fails is left out and listed among the problems; so are points with damaged data, which are returned because
+    /// they must be acquired again.
     pub fn feed_stored(
         &mut self,
         task: &PlaneTask,
@@ -71,95 +72,81 @@ impl Processing {
         damaged
     }
 
-    /// Gives the folds a unit's image. A fold that panics is dropped, with its products; the others continue.
+    /// Gives the demultiplexer a unit's image. If it panics, it is dropped, with its products.
     pub fn push(&mut self, unit: &Unit, image: &Array2<f32>) {
-        let problems = &mut self.problems;
-        self.folds.retain_mut(|fold| {
-            let pushed = catch_unwind(AssertUnwindSafe(|| fold.push(unit, image.view())));
-            pushed.map_err(|panic| problems.push(panicked(fold.name(), &*panic))).is_ok()
-        });
+        let Some(demux) = &mut self.demux else { return };
+        if let Err(panic) = catch_unwind(AssertUnwindSafe(|| demux.push(unit, image.view()))) {
+            self.problems.push(panicked(DEMUX, &*panic));
+            self.demux = None;
+        }
     }
 
-    /// Snapshot of the first fold that provides interim estimates.
-    pub fn snapshot(&self) -> Option<Box<dyn Snapshot>> {
-        // A failed snapshot must not cost the fold, let alone the run.
-        self.folds.iter().find_map(|fold| catch_unwind(AssertUnwindSafe(|| fold.snapshot())).ok().flatten())
+    /// The sweep so far, if there is enough of it for an estimate.
+    pub fn snapshot(&self) -> Option<DemuxFold> {
+        self.demux.as_ref()?.snapshot()
     }
 
-    /// Stops the folds from keeping images: [`Self::finish_in_strips`] reads them again.
+    /// Stops keeping images: [`Self::finish_in_strips`] reads them again.
     pub fn keep_no_images(&mut self) {
-        self.folds.iter_mut().for_each(|fold| fold.keep_no_images());
+        if let Some(demux) = &mut self.demux {
+            demux.keep_no_images();
+        }
     }
 
-    /// [`Self::finish`] and [`Self::make_named`] after [`Self::keep_no_images`]: the transport goes to `write`, strip
-    /// by strip, and is not among the products.
+    /// [`Self::finish`] and [`Self::make_named`] after [`Self::keep_no_images`]: stack and transport go to `write`,
+    /// strip by strip. Also returns what has failed.
     pub fn finish_in_strips(
-        mut self,
+        self,
         images: &dyn ImageRows,
         go_on: &(dyn Fn() -> bool + Sync),
         write: &mut dyn FnMut(&Findings, &Strip) -> Result<(), String>,
-    ) -> (Vec<Product>, Vec<String>) {
-        let mut products = Vec::new();
-        let mut assemblies: Vec<Assembly> = self.products.drain(..).map(Assembly::new).collect();
-        let mut strips_taken = 0;
-        for fold in &mut self.folds {
-            let name = fold.name().to_owned();
-            let problems = &mut self.problems;
-            let mut take = |findings: &Findings, strip: Strip| {
-                write(findings, &strip).map_err(|what| FoldError { fold: name.clone(), what })?;
-                assemblies.retain_mut(|assembly| {
-                    let Strip { first_row, stack, transport } = &strip;
-                    let product = assembly.name().to_owned();
-                    let added = caught(&product, || assembly.add(*first_row, stack, transport));
-                    added.map_err(|problem| problems.push(problem)).is_ok()
-                });
-                strips_taken += 1;
-                Ok(())
-            };
-            let strips = InStrips { images, strip_rows: STRIP_ROWS, take: &mut take };
-            match caught(&name, || fold.finish_in_strips(strips, go_on)) {
-                Ok(made) => products.extend(made),
-                Err(problem) => {
-                    // Drop images that lack rows.
-                    assemblies.clear();
-                    self.problems.push(problem);
-                }
+    ) -> (Option<SweepSummary>, Vec<Product>, Vec<String>) {
+        let Self { demux, products: specs, mut problems, .. } = self;
+        let Some(demux) = demux else { return (None, Vec::new(), problems) };
+        let mut assemblies: Vec<Assembly> = specs.into_iter().map(Assembly::new).collect();
+        let mut take = |findings: &Findings, strip: Strip| {
+            write(findings, &strip).map_err(|what| NotSolved { of: DEMUX, what })?;
+            assemblies.retain_mut(|assembly| {
+                let Strip { first_row, stack, transport } = &strip;
+                let product = assembly.name().to_owned();
+                let added = caught(&product, || assembly.add(*first_row, stack, transport));
+                added.map_err(|problem| problems.push(problem)).is_ok()
+            });
+            Ok(())
+        };
+        let strips = InStrips { images, strip_rows: STRIP_ROWS, take: &mut take };
+        let summary = match caught(DEMUX, || demux.finish_in_strips(strips, go_on)) {
+            Ok(summary) => summary,
+            Err(problem) => {
+                problems.push(problem);
+                return (None, Vec::new(), problems);
             }
-        }
-        for assembly in assemblies.into_iter().filter(|_| strips_taken > 0) {
+        };
+        let mut products = Vec::new();
+        for assembly in assemblies {
             let product = assembly.name().to_owned();
             match caught(&product, || assembly.finish()) {
                 Ok(product) => products.push(product),
-                Err(problem) => self.problems.push(problem),
+                Err(problem) => problems.push(problem),
             }
         }
-        (products, self.problems)
+        (Some(summary), products, problems)
     }
 
-    /// The products of all folds. Returns early, soon after `go_on` returns false.
-    pub fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
-        let mut products = Vec::new();
-        for fold in &mut self.folds {
-            let name = fold.name().to_owned();
-            match caught(&name, || fold.finish(go_on)) {
-                Ok(made) => products.extend(made),
-                Err(problem) => self.problems.push(problem),
-            }
-        }
-        products
+    /// Computes the transport. Returns early, soon after `go_on` returns false.
+    pub fn finish(&mut self, go_on: &(dyn Fn() -> bool + Sync)) -> Option<Solved> {
+        let demux = self.demux.take()?;
+        let solved = caught(DEMUX, || demux.finish(go_on));
+        solved.map_err(|problem| self.problems.push(problem)).ok()
     }
 
-    /// The products that the plan names, if the folds have made what they need.
-    pub fn make_named(&mut self, made: &[Product], go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Product> {
-        let transport = made.iter().find_map(|product| match product {
-            Product::Transport(transport) => Some(&**transport),
-            _ => None,
-        });
-        let stack = made.iter().find_map(|product| match product {
-            Product::Stack(stack) => Some(&**stack),
-            _ => None,
-        });
-        let Some((transport, stack)) = transport.zip(stack) else { return Vec::new() };
+    /// The products that the plan names.
+    pub fn make_named(
+        &mut self,
+        stack: &SweepStack,
+        transport: &Transport,
+        go_on: &(dyn Fn() -> bool + Sync),
+    ) -> Vec<Product> {
         let mut products = Vec::new();
         for spec in self.products.iter().take_while(|_| go_on()) {
             match caught(spec.name(), || spec.make(stack, transport)) {
@@ -179,6 +166,6 @@ fn caught<T, E: Display>(name: &str, make: impl FnOnce() -> Result<T, E>) -> Res
     }
 }
 
-fn panicked(fold: &str, panic: &(dyn Any + Send)) -> String {
-    format!("{fold} panicked: {}", message_of(panic))
+fn panicked(name: &str, panic: &(dyn Any + Send)) -> String {
+    format!("{name} panicked: {}", message_of(panic))
 }

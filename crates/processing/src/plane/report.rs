@@ -6,7 +6,7 @@ use raysweep_pipeline::{Spot, SweepGeometry};
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Block, Plot, Series, SeriesStyle};
 
-use super::PlaneTask;
+use super::task::PlaneTask;
 
 /// Deviations of single frames from the commanded delay: over time, and as a histogram.
 pub(crate) fn jitter(deviations_us: &[f64]) -> Vec<Plot> {

@@ -8,7 +8,9 @@ use raysweep_transport::dots::identify::{
 };
 use serde_json::{Map, Value, json};
 
-use super::{AXES, Record};
+use super::record::Record;
+use super::task::AXES;
+use crate::software::SOFTWARE;
 
 /// Share of the frames that must show the dot; the others are interpolated linearly.
 const LEAST_SHOWN: f64 = 0.9;
@@ -45,7 +47,7 @@ pub enum ResponseError {
 }
 
 /// Results of an axis.
-pub struct Axis {
+pub struct FoundAxis {
     /// Its resonance, or why it could not be identified; the gain is in pixels per degree.
     pub found: std::result::Result<Identified, ResponseError>,
     /// Measured transfer function, without a model, in pixels per degree; empty where too few frames show the dot.
@@ -55,8 +57,8 @@ pub struct Axis {
 /// Identifies an axis' resonance from its record.
 ///
 /// # Errors
-/// None at present: why an axis could not be identified is in [`Axis::found`].
-pub fn analyse(record: Record, axis: usize, state: &State, plan: &ResponsePlan) -> Result<Axis> {
+/// None at present: why an axis could not be identified is in [`FoundAxis::found`].
+pub fn analyse(record: Record, axis: usize, state: &State, plan: &ResponsePlan) -> Result<FoundAxis> {
     let name = AXES[axis];
     let lost = state.axes().find(|entry| entry.axis == axis).map_or(0, |entry| entry.lost);
     let (frames, gaps) = (record.commanded_deg.len(), record.gaps());
@@ -64,7 +66,7 @@ pub fn analyse(record: Record, axis: usize, state: &State, plan: &ResponsePlan) 
     let needed = (LEAST_SHOWN * frames as f64).ceil() as usize;
     if shown < needed {
         let found = Err(ResponseError::Unseen { axis: name, shown, frames, needed, lost });
-        return Ok(Axis { found, measured: Vec::new() });
+        return Ok(FoundAxis { found, measured: Vec::new() });
     }
     let band = plan.band_hz[0]..=plan.band_hz[1];
     let rate_hz = plan.camera_rate_hz;
@@ -82,7 +84,7 @@ pub fn analyse(record: Record, axis: usize, state: &State, plan: &ResponsePlan) 
     let found = identify(&commanded_deg, &along_px, rate_hz, &band)
         .map_err(|source| ResponseError::Refused { axis: name, rms_px, source });
     let measured = transfer(&commanded_deg, &along_px, rate_hz, &band).unwrap_or_default();
-    Ok(Axis { found, measured })
+    Ok(FoundAxis { found, measured })
 }
 
 /// Interpolates linearly over a gap; at an end of the track, repeats the nearest value.
@@ -113,7 +115,7 @@ fn level(track: &mut [f64]) {
     }
 }
 
-impl Axis {
+impl FoundAxis {
     /// The fitted model at the measured frequencies, if there is one.
     pub fn fitted(&self) -> Vec<Transfer> {
         let Ok(found) = &self.found else { return Vec::new() };
@@ -151,7 +153,7 @@ impl Axis {
             columns.push(("fitted_phase_rad", column(&fitted, |at| at.phase_rad)));
         }
         let about = "the dot's movement over the commanded tilt, in pixels per degree of the mirror; phases are those of the movement";
-        let entries = [("about", json!(about)), ("axis", json!(name)), ("software", json!(crate::SOFTWARE))];
+        let entries = [("about", json!(about)), ("axis", json!(name)), ("software", json!(SOFTWARE))];
         let metadata: Map<String, Value> =
             entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();
         session.products().table(&format!("response_{name}"), &columns, &metadata)

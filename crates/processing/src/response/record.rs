@@ -6,7 +6,8 @@ use ndarray::Array2;
 use raysweep_session::{Result, Session};
 use serde_json::{Map, Value, json};
 
-use super::{AXES, ResponseTask};
+use super::task::{AXES, ResponseTask};
+use crate::software::SOFTWARE;
 
 /// The record of one axis, indexed by frame number, so that a lost frame shifts none of the others.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,7 +66,7 @@ impl Record {
             ("axis", json!(AXES[axis])),
             ("camera_rate_hz", json!(task.response.camera_rate_hz)),
             ("exposure_us", json!(task.response.exposure_us)),
-            ("software", json!(crate::SOFTWARE)),
+            ("software", json!(SOFTWARE)),
         ];
         let metadata: Map<String, Value> =
             entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect();

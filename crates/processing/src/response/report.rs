@@ -10,13 +10,13 @@ use raysweep_session::{Result, Session, manifest};
 use raysweep_transport::dots::identify::{Identified, Resonance, Transfer};
 use serde_json::json;
 
-use super::analysis::Axis;
-use super::{AXES, ResponseTask};
+use super::analysis::FoundAxis;
+use super::task::{AXES, ResponseTask};
 use crate::mirror_response::AxisResponse;
 use crate::report::{accounts, subtitle};
 
 /// Makes the report.
-pub fn make(session: &Session, state: &State, task: &ResponseTask, axes: &[Axis; 2]) -> Report {
+pub fn make(session: &Session, state: &State, task: &ResponseTask, axes: &[FoundAxis; 2]) -> Report {
     let plan = &task.response;
     let facts = [
         ("axes stored", format!("{} of {}", state.stored_points(), AXES.len())),
@@ -42,7 +42,7 @@ pub fn make(session: &Session, state: &State, task: &ResponseTask, axes: &[Axis;
     }
 }
 
-fn section(state: &State, number: usize, (axis, name): (&Axis, &str)) -> Section {
+fn section(state: &State, number: usize, (axis, name): (&FoundAxis, &str)) -> Section {
     let mut blocks = vec![match &axis.found {
         Ok(found) => Block::Table(figures(found)),
         Err(refusal) => Block::Note(NoteLevel::Error, refusal.to_string()),
@@ -82,7 +82,7 @@ fn figures(found: &Identified) -> Table {
     }
 }
 
-fn plots(axis: &Axis) -> Vec<Plot> {
+fn plots(axis: &FoundAxis) -> Vec<Plot> {
     let fitted = axis.fitted();
     // The delay is removed: it would wrap the phase many times.
     let delay_s = axis.found.as_ref().map_or(0.0, |found| found.delay_s);
@@ -115,7 +115,7 @@ pub fn write_manifest(
     state: &State,
     task: &ResponseTask,
     rig: &DotRigFile,
-    axes: &[Axis; 2],
+    axes: &[FoundAxis; 2],
 ) -> Result<()> {
     let software = BTreeMap::from([("raysweep".to_owned(), env!("CARGO_PKG_VERSION").to_owned())]);
     let plan = &task.response;

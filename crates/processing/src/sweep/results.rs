@@ -1,6 +1,6 @@
 //! Writes the products to files.
 
-use raysweep_pipeline::{Findings, Product, Strip};
+use raysweep_pipeline::{Findings, Product, Solved, Strip, SweepSummary};
 use raysweep_session::ledger::State;
 use raysweep_session::products::VolumeWriter;
 use raysweep_session::{Result, Session, transport};
@@ -8,17 +8,21 @@ use raysweep_transport::plane::Transport;
 use serde_json::{Map, Value, json};
 
 use super::strips::{Overview, StoredImages};
-use super::{SweepTask, report};
 use crate::plane::{PlaneTask, Processing};
 
 /// The results of a sweep.
+#[derive(Default)]
 pub struct Results {
-    /// All products; the transport only if it was made in one piece.
+    /// The products that the plan names.
     pub products: Vec<Product>,
+    /// What there is to say about the transport, if it was made.
+    pub summary: Option<SweepSummary>,
     /// What could not be made, and why.
     pub problems: Vec<String>,
     /// Writer of the transport's files, which are not in place yet.
     writer: Option<TransportWriter>,
+    /// The transport, if it was made in one piece.
+    transport: Option<Transport>,
     /// Sums of a transport that was made in strips.
     overview: Option<Overview>,
 }
@@ -34,22 +38,29 @@ impl Results {
         task: &PlaneTask,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Self> {
-        let mut products = processing.finish(go_on);
+        let Some(Solved { stack, transport, summary }) = processing.finish(go_on) else {
+            return Ok(Self { problems: processing.problems, ..Self::default() });
+        };
         let write = || {
-            let Some(transport) = transport_in(&products) else { return Ok(None) };
-            let mut writer = TransportWriter::create(session, task, findings_in(&products), transport)?;
-            writer.append(transport)?;
-            Ok(Some(writer))
+            let mut writer = TransportWriter::create(session, task, &summary.findings, &transport)?;
+            writer.append(&transport)?;
+            Ok(writer)
         };
         // Write the transport while its products are made: it may be needed soon, and the disk is slower than the
         // computation.
-        let (writer, named) = rayon::join(write, || processing.make_named(&products, go_on));
-        products.extend(named);
-        products.retain(|product| !matches!(product, Product::Stack(_)));
-        Ok(Self { products, problems: processing.problems, writer: writer?, overview: None })
+        let (writer, products) = rayon::join(write, || processing.make_named(&stack, &transport, go_on));
+        Ok(Self {
+            products,
+            summary: Some(summary),
+            problems: processing.problems,
+            writer: Some(writer?),
+            transport: Some(transport),
+            overview: None,
+        })
     }
 
-    /// Makes the results strip by strip from stored images, with folds that keep none; otherwise as [`Self::whole`].
+    /// Makes the results strip by strip from stored images, if the demultiplexer keeps none; otherwise as
+    /// [`Self::whole`].
     ///
     /// # Errors
     /// When the stack cannot be opened or the transport cannot be written.
@@ -67,7 +78,7 @@ impl Results {
             let (writer, overview) = match &mut written {
                 Some(written) => written,
                 None => written.insert((
-                    TransportWriter::create(session, task, Some(findings), transport)?,
+                    TransportWriter::create(session, task, findings, transport)?,
                     Overview::empty(task.geometry.height, transport),
                 )),
             };
@@ -82,13 +93,13 @@ impl Results {
                 what
             })
         };
-        let (products, problems) = processing.finish_in_strips(&images, go_on, &mut write);
+        let (summary, products, problems) = processing.finish_in_strips(&images, go_on, &mut write);
         if let Some(error) = refused {
             return Err(error);
         }
-        // Rows are missing if the fold stopped early.
+        // Rows are missing if the demultiplexer stopped early.
         let (writer, overview) = written.filter(|(writer, _)| writer.is_whole()).unzip();
-        Ok(Self { products, problems, writer, overview })
+        Ok(Self { products, summary, problems, writer, transport: None, overview })
     }
 
     /// Moves the transport into place, as NPY and Zarr at the same time: it may be needed soon.
@@ -101,22 +112,15 @@ impl Results {
 
     /// The transport's sums, if there is one.
     pub fn overview(&mut self) -> Option<Overview> {
-        self.overview.take().or_else(|| transport_in(&self.products).map(Overview::of))
+        self.overview.take().or_else(|| self.transport.as_ref().map(Overview::of))
     }
-}
 
-fn transport_in(products: &[Product]) -> Option<&Transport> {
-    products.iter().find_map(|product| match product {
-        Product::Transport(transport) => Some(&**transport),
-        _ => None,
-    })
-}
-
-fn findings_in(products: &[Product]) -> Option<&Findings> {
-    products.iter().find_map(|product| match product {
-        Product::Findings(findings) => Some(&**findings),
-        _ => None,
-    })
+    /// What could not be made, and what makes the products worse than they look.
+    pub fn into_warnings(self) -> Vec<String> {
+        let mut warnings = self.problems;
+        warnings.extend(self.summary.into_iter().flat_map(|summary| summary.warnings));
+        warnings
+    }
 }
 
 /// Writes a transport from its first camera row to its last, as NPY and Zarr; the files become visible only at the
@@ -129,14 +133,9 @@ struct TransportWriter {
 
 impl TransportWriter {
     /// Creates a writer; `transport` is the whole transport or some rows of it.
-    fn create(
-        session: &Session,
-        task: &PlaneTask,
-        findings: Option<&Findings>,
-        found: &Transport,
-    ) -> Result<Self> {
+    fn create(session: &Session, task: &PlaneTask, findings: &Findings, found: &Transport) -> Result<Self> {
         let mut metadata = task.metadata();
-        metadata.extend(findings.map(model).unwrap_or_default());
+        metadata.extend(model(findings));
         metadata.insert("axes".into(), json!(["u", "t", "s"]));
         metadata.insert("u_min".into(), json!(found.u_min));
         metadata.insert("u_max".into(), json!(found.u_max()));
@@ -206,11 +205,6 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
                 );
                 files.table(&profile.name, &columns, &metadata)?;
             }
-            Product::Transport(_)
-            | Product::Stack(_)
-            | Product::Findings(_)
-            | Product::Figure { .. }
-            | Product::Warning(_) => {}
         }
     }
     Ok(())
@@ -231,20 +225,4 @@ fn model(found: &Findings) -> Map<String, Value> {
         ("findings", json!(remarks)),
     ];
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
-}
-
-/// Writes the report.
-///
-/// # Errors
-/// When the stack cannot be read or the report cannot be written.
-pub fn write_report(
-    session: &Session,
-    state: &State,
-    task: &SweepTask,
-    results: &Results,
-    overview: Option<&Overview>,
-) -> Result<()> {
-    let Results { products, problems, .. } = results;
-    let page = report::make(session, state, task, overview, products, problems)?.to_html()?;
-    raysweep_session::durable::write(&session.report_path(), page.as_bytes())
 }

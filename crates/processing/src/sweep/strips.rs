@@ -4,23 +4,23 @@
 use std::ops::Range;
 
 use ndarray::{Array2, s};
-use raysweep_pipeline::{ImageRows, Stage, run_stages};
+use raysweep_pipeline::{ImageRows, Stages, run_stages};
 use raysweep_session::ledger::State;
 use raysweep_session::stack::Stack;
 use raysweep_transport::plane::Transport;
 
 use crate::plane::{PlaneTask, place, unit_of};
 
-/// The images of a session, as they were given to its folds.
+/// The images of a session, as they were given to its demultiplexer.
 pub struct StoredImages<'a> {
     /// The plan on its rig.
     pub task: &'a PlaneTask,
     /// State of the session.
     pub state: &'a State,
-    /// Stored data. Each point was checked against the ledger when it was stored or fed to the folds.
+    /// Stored data. Each point was checked against the ledger when it was stored or read for a resumed run.
     pub stack: &'a Stack,
     /// Stages that process each image.
-    pub stages: &'a [Box<dyn Stage>],
+    pub stages: &'a Stages,
 }
 
 impl ImageRows for StoredImages<'_> {

@@ -31,10 +31,11 @@ impl Dots {
         let about = "gain: of counts above the background; repaired: hot or dead pixels, which have the mean of their neighbours";
         zarr::create_group(&store, into_map(json!({ "about": about })))?;
         let put = Put { store: &store };
-        let (size, gain) = (flat.gain.shape(), flat.gain.iter().copied().collect::<Vec<f32>>());
-        put.array("gain", size, &["t", "s"], data_type::float32(), 0f32.into(), &gain)?;
-        let (size, repaired) = (flat.repaired.shape(), flat.repaired.iter().copied().collect::<Vec<bool>>());
-        put.array("repaired", size, &["t", "s"], data_type::bool(), false.into(), &repaired)?;
+        let axes = |(rows, columns)| [("t", rows), ("s", columns)];
+        let gain = flat.gain.iter().copied().collect::<Vec<f32>>();
+        put.array("gain", &axes(flat.gain.dim()), data_type::float32(), 0f32.into(), &gain)?;
+        let repaired = flat.repaired.iter().copied().collect::<Vec<bool>>();
+        put.array("repaired", &axes(flat.repaired.dim()), data_type::bool(), false.into(), &repaired)?;
         sync_all(draft.path())?;
         draft.commit()
     }

@@ -1,5 +1,6 @@
 use super::*;
-use raysweep_core::LossCause;
+use crate::stack::{ArrayName, Contents, StackShape};
+use raysweep_core::{Counts, LossCause};
 use std::fs;
 
 fn session() -> SessionEntry {

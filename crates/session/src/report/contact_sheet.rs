@@ -2,7 +2,8 @@
 
 use maud::{Markup, html};
 
-use super::picture::{Picture, short};
+use super::picture::Picture;
+use super::style::short;
 use crate::Result;
 
 /// Small pictures in a grid over two settings, for example exposure (rows) over delay (columns).

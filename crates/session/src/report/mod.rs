@@ -6,6 +6,7 @@
 mod contact_sheet;
 mod picture;
 mod plot;
+mod style;
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
@@ -16,10 +17,6 @@ pub use plot::{Guide, Plot, Series, SeriesStyle};
 use crate::Result;
 
 const STYLE: &str = include_str!("style.css");
-
-/// Colours of series and of the corresponding markers: mid-tones that are visible on white and on black.
-const PALETTE: [&str; 8] =
-    ["#d9482b", "#2f7fc1", "#3c9d5d", "#a35bc4", "#c98a1b", "#20a0a0", "#d45d95", "#7d8794"];
 
 /// A page.
 #[derive(Debug, Clone, Default)]

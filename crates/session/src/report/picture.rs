@@ -5,7 +5,7 @@ use base64::engine::general_purpose::STANDARD;
 use maud::{Markup, html};
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 
-use super::PALETTE;
+use super::style::{PALETTE, short};
 use crate::{Error, Result};
 
 /// Maximum side length of a picture, so that a page stays within a few megabytes.
@@ -268,18 +268,4 @@ fn to_png<'a>(frames: impl Iterator<Item = &'a Picture>) -> Result<Vec<u8>> {
         Ok(file)
     };
     encode().map_err(|error: png::EncodingError| Error::codec("draw", failed())(error))
-}
-
-/// Formats a value with three significant digits.
-pub(super) fn short(value: impl Into<f64>) -> String {
-    let value = value.into();
-    if value == 0.0 || !value.is_finite() {
-        return value.to_string();
-    }
-    let magnitude = value.abs().log10().floor() as i32;
-    if !(-4..6).contains(&magnitude) {
-        return format!("{value:.2e}");
-    }
-    let text = format!("{value:.*}", usize::try_from(2 - magnitude).unwrap_or(0));
-    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }

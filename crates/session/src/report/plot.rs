@@ -4,8 +4,7 @@ use maud::{Markup, PreEscaped, html};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::PALETTE;
-use super::picture::short;
+use super::style::{PALETTE, short};
 use crate::{Error, Result};
 
 const SIZE_PX: (u32, u32) = (620, 310);

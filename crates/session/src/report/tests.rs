@@ -229,6 +229,6 @@ fn numbers_have_three_digits() {
         (0.000_012_3, "1.23e-5"),
         (1.5e7, "1.50e7"),
     ] {
-        assert_eq!(picture::short(value), text);
+        assert_eq!(style::short(value), text);
     }
 }

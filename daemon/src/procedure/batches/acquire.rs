@@ -5,8 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use raysweep_config::BatchesPlan;
 use raysweep_core::{Counts, FramePool, SettingsId, Subject};
+use raysweep_pipeline::Policy;
 use raysweep_pipeline::dots::{DarkRun, DotsFlow, DotsFlowConfig, FlatRun, Gathered, Loss, Sensor};
-use raysweep_pipeline::{Policy, Registry};
 use raysweep_processing::batches::{CorrectOptions, DotTask, flat};
 use raysweep_proto::RunState;
 use raysweep_session::Session;
@@ -14,11 +14,12 @@ use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::Ledger;
 use raysweep_transport::dots::{DotsError, FlatField};
 
-use super::sink::{BatchSink, RawSink, Stored, Writing};
+use super::sink::{BatchSink, RawSink, StoredBatches, Writing};
 use crate::devices::dots::camera::Refused;
 use crate::devices::dots::motion::Motion;
 use crate::devices::dots::play::Player;
 use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
+use crate::probes::Probes;
 use crate::rig::{DotDevices, DotRig, Pace};
 use crate::run::error::RunError;
 use crate::run::life::Run;
@@ -43,7 +44,7 @@ pub struct Acquired {
 pub fn acquire(
     rig: &DotRig,
     task: &Arc<DotTask>,
-    registry: &Registry,
+    probes: &Probes,
     mut run: Run,
 ) -> Result<Acquired, RunError> {
     run.note_beginning()?;
@@ -73,9 +74,9 @@ pub fn acquire(
     camera.arm()?;
     let _ = run.board.go(RunState::Armed);
     let _ = run.board.go(RunState::Running);
-    let mut passes = Passes {
+    let mut passes = DotPasses {
         task,
-        registry,
+        probes,
         session: &run.session,
         earlier,
         orders: &run.orders,
@@ -99,14 +100,14 @@ pub fn acquire(
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
     }
-    let Stored { ledger, problems, error } = storage.finish()?;
+    let StoredBatches { ledger, problems, error } = storage.finish()?;
     let fault = error.map(RunError::from).or(passed.err());
     Ok(Acquired { session: run.session, ledger, problems, fault })
 }
 
-struct Passes<'a> {
+struct DotPasses<'a> {
     task: &'a DotTask,
-    registry: &'a Registry,
+    probes: &'a Probes,
     session: &'a Session,
     /// The flat field of an earlier session, if the plan names one.
     earlier: Option<FlatField>,
@@ -117,7 +118,7 @@ struct Passes<'a> {
     player: Player<'a>,
 }
 
-impl Passes<'_> {
+impl DotPasses<'_> {
     /// Dark frames, flat field, planes, scene.
     fn all(&mut self) -> Result<(), RunError> {
         let plan = &self.task.batches;
@@ -223,12 +224,12 @@ impl Passes<'_> {
     ) -> Result<(Sensor, Option<RawSink>), RunError> {
         let (task, plan) = (self.task, &self.task.batches);
         let Sensor { correction, background, floor } = sensor;
-        let stage = task.stage(self.registry, &correction)?;
+        let stage = self.probes.around(task.stage(&correction)?);
         let config = DotsFlowConfig {
             scan: task.scan(batches),
             format: task.format,
             saturation_dn: task.saturation_dn(),
-            stage: stage.into(),
+            stage,
             correction: correction.clone(),
             background,
             floor,

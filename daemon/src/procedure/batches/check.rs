@@ -6,7 +6,7 @@ use raysweep_proto::{BatchesCheck, CheckReport};
 use raysweep_transport::dots::Correction;
 
 use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
-use crate::procedure::lab::{Lab, Room};
+use crate::procedure::lab::Lab;
 use crate::rig::Pace;
 
 /// Disk space of a dot's column in bytes, without its residual: measured on rendered scenes with dots of 32 pixels.
@@ -25,7 +25,7 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
     lab.camera_at(plan.camera_rate_hz())
         .allows(&task.camera_settings())
         .map_err(|message| task.refuse(&["batches", "exposure_us"], format!("batches.{message}")))?;
-    task.stage(lab.registry, &Correction::none(task.shape))?;
+    task.stage(&Correction::none(task.shape))?;
     task.earlier_flat_field(lab.data)
         .map_err(|error| task.refuse_stage("correct", format!("stage correct: flat_field: {error}")))?;
     let planes: Vec<u32> = plan.calibration.iter().map(|plane| plane.batches).collect();
@@ -50,12 +50,10 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
                 .into(),
         );
     }
-    let room = Room {
-        memory_bytes: frames as u64 * frame_bytes + BATCHES_IN_MEMORY * batch_bytes + 16 * image_bytes,
-        memory_free_bytes: lab.memory_free_bytes(),
-        disk_bytes: total * (batch_bytes + 4 * 8 * image_bytes) + raw_bytes + OTHER_BYTES,
-        disk_free_bytes: lab.disk_free_bytes(),
-    };
+    let room = lab.room(
+        frames as u64 * frame_bytes + BATCHES_IN_MEMORY * batch_bytes + 16 * image_bytes,
+        total * (batch_bytes + 4 * 8 * image_bytes) + raw_bytes + OTHER_BYTES,
+    );
     Ok(CheckReport {
         points: plan.total(),
         frames: u64::from(rounds) * dots,

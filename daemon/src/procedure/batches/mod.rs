@@ -7,24 +7,24 @@ mod sink;
 use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, Plan};
-use raysweep_pipeline::Registry;
-use raysweep_processing::batches::{DotTask, keep_patterns, make};
+use raysweep_processing::batches::{DotTask, keep_patterns, make, write_manifest};
 use raysweep_proto::{ErrorCode, RpcError};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
 use self::acquire::{Acquired, acquire};
+use crate::probes::Probes;
 use crate::procedure::lab::Lab;
 use crate::rig::DotRig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 
 /// A run of batches on a rig.
 struct BatchesRun {
     rig: Arc<DotRig>,
     task: Arc<DotTask>,
-    registry: Arc<Registry>,
+    probes: Probes,
 }
 
 /// Predicts a run of batches.
@@ -49,12 +49,12 @@ pub fn foresee(
         procedure: Box::new(BatchesRun {
             rig: rig.clone(),
             task: Arc::new(task),
-            registry: lab.registry.clone(),
+            probes: lab.probes.clone(),
         }),
     })
 }
 
-impl Procedure for BatchesRun {
+impl Measurement for BatchesRun {
     fn keep(&self, session: &Session) -> Result<(), RpcError> {
         keep_patterns(session, &self.task).map_err(|error| RpcError::new(ErrorCode::InvalidPlan, error))?;
         match &self.task.predistortion {
@@ -66,9 +66,9 @@ impl Procedure for BatchesRun {
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
-        let Self { rig, task, registry } = *self;
+        let Self { rig, task, probes } = *self;
         let orders = run.orders.clone();
-        let Acquired { session, mut ledger, mut problems, fault } = acquire(&rig, &task, &registry, run)?;
+        let Acquired { session, mut ledger, mut problems, fault } = acquire(&rig, &task, &probes, run)?;
         let stored = ledger.state().stored_points();
         let state = end_state(fault.as_ref(), &orders);
         let end = EndEntry {
@@ -78,7 +78,8 @@ impl Procedure for BatchesRun {
         ledger.append(&Entry::End(end.clone()))?;
         if state == EndState::Complete {
             let go_on = || orders.go_on();
-            problems = make(&session, ledger.state(), &task, &rig.file, &task.specs, problems, &go_on)?;
+            problems = make(&session, ledger.state(), &task, &task.specs, problems, &go_on)?;
+            write_manifest(&session, ledger.state(), &task, &rig.file)?;
         }
         Ok(Ended { end, warnings: problems })
     }

@@ -35,11 +35,11 @@ enum Item {
 /// Handle of the writer's thread.
 pub struct BatchSink {
     items: SyncSender<Item>,
-    thread: JoinHandle<Writer>,
+    thread: JoinHandle<BatchWriter>,
 }
 
 /// Result of the writer.
-pub struct Stored {
+pub struct StoredBatches {
     /// The ledger, still locked.
     pub ledger: Ledger,
     /// Problems with single dots.
@@ -64,7 +64,7 @@ pub struct Writing {
     pub live: Option<Outlet>,
 }
 
-struct Writer {
+struct BatchWriter {
     writing: Writing,
     progress: ProgressMeter,
     first_ns: Option<i64>,
@@ -81,7 +81,7 @@ impl BatchSink {
         let (items, inbox) = sync_channel(WAITING_BATCHES);
         let planned = writing.task.batches.total();
         let progress = ProgressMeter::new(0, planned);
-        let writer = Writer { writing, progress, first_ns: None, problems: Vec::new(), error: None };
+        let writer = BatchWriter { writing, progress, first_ns: None, problems: Vec::new(), error: None };
         let thread = thread::Builder::new()
             .name("dots-writer".into())
             .spawn(move || writer.run(&inbox))
@@ -103,11 +103,11 @@ impl BatchSink {
     ///
     /// # Errors
     /// When the writer panicked.
-    pub fn finish(self) -> Result<Stored, PipelineError> {
+    pub fn finish(self) -> Result<StoredBatches, PipelineError> {
         drop(self.items);
-        let Writer { writing, problems, error, .. } =
+        let BatchWriter { writing, problems, error, .. } =
             self.thread.join().map_err(|_panic| PipelineError::Panicked("dots-writer"))?;
-        Ok(Stored { ledger: writing.ledger, problems, error })
+        Ok(StoredBatches { ledger: writing.ledger, problems, error })
     }
 }
 
@@ -200,7 +200,7 @@ impl CutSink for PassSink {
     }
 }
 
-impl Writer {
+impl BatchWriter {
     fn run(mut self, inbox: &Receiver<Item>) -> Self {
         for item in inbox {
             match item {

@@ -5,7 +5,7 @@ use raysweep_processing::darks::DarksTask;
 use raysweep_proto::CheckReport;
 
 use crate::plane::foresight::periods;
-use crate::procedure::lab::{Lab, Room};
+use crate::procedure::lab::Lab;
 
 /// Images in memory at once, including those of an exposure and the report's, in bytes per pixel.
 const BYTES_PER_PX: u64 = 64;
@@ -30,13 +30,9 @@ pub fn check(darks: &DarksTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigErro
     }
     let pixels = (task.geometry.height * task.geometry.width) as u64;
     let images = darks.points() as u64;
-    let room = Room {
-        // The means of all exposures are written as one sequence.
-        memory_bytes: pixels * (BYTES_PER_PX + 8 * images),
-        memory_free_bytes: lab.memory_free_bytes(),
-        disk_bytes: pixels * 4 * 2 * images + OTHER_BYTES,
-        disk_free_bytes: lab.disk_free_bytes(),
-    };
+    // The means of all exposures are written as one sequence.
+    let memory_bytes = pixels * (BYTES_PER_PX + 8 * images);
+    let room = lab.room(memory_bytes, pixels * 4 * 2 * images + OTHER_BYTES);
     Ok(CheckReport {
         points: darks.points(),
         frames,

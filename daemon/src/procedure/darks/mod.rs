@@ -3,7 +3,6 @@
 mod check;
 
 use std::sync::Arc;
-use std::sync::mpsc::channel;
 
 use raysweep_config::plan::DarksPlan;
 use raysweep_config::{ConfigError, Plan};
@@ -17,7 +16,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 use crate::run::progress::ProgressMeter;
 
 /// Capacity of the queue of images between the assembler and the disk.
@@ -54,7 +53,7 @@ pub fn foresee(
     })
 }
 
-impl Procedure for DarksRun {
+impl Measurement for DarksRun {
     fn measure(self: Box<Self>, mut run: Run) -> Result<Ended, RunError> {
         run.note_beginning()?;
         let Self { rig, darks } = *self;
@@ -69,26 +68,16 @@ impl Procedure for DarksRun {
             }));
             missing.sort_by_key(|id| id.point);
         }
-        let (verdicts, results) = channel();
         let stages: Arc<[_]> = Arc::new([]);
-        let sink = PointSink {
-            task: darks.task.clone(),
-            stack,
-            ledger: run.ledger,
-            processing: Processing::without_folds(stages.clone()),
-            verdicts: Some(verdicts),
-            orders: run.orders.clone(),
-            board: run.board,
-            progress: ProgressMeter::new(darks.points() - missing.len(), darks.points()),
-            vsync: None,
-            live: None,
-            write_error: None,
-        };
+        let processing = Processing::without_demux(stages.clone());
+        let progress = ProgressMeter::new(darks.points() - missing.len(), darks.points());
+        let (sink, results) = PointSink::new(&darks.task, run, stack, processing, progress);
         let taken =
             opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
-        let Taken { sink: PointSink { mut ledger, vsync, write_error, .. }, latency, fault, .. } = taken;
+        let Taken { sink: PointSink { run, vsync, write_error, .. }, latency, fault, .. } = taken;
+        let Run { session, mut ledger, orders, .. } = run;
         let fault = write_error.map(RunError::from).or(fault);
-        let state = end_state(fault.as_ref(), &run.orders);
+        let state = end_state(fault.as_ref(), &orders);
         let stored = ledger.state().stored_points();
         let error = fault.map(|fault| fault.to_string());
         let end = EndEntry {
@@ -99,7 +88,7 @@ impl Procedure for DarksRun {
         };
         ledger.append(&Entry::End(end.clone()))?;
         let warnings = match state {
-            EndState::Complete => make(&run.session, ledger.state(), &darks, &rig.file)?,
+            EndState::Complete => make(&session, ledger.state(), &darks, &rig.file)?,
             EndState::Cancelled | EndState::Faulted => Vec::new(),
         };
         Ok(Ended { end, warnings })

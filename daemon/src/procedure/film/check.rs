@@ -9,7 +9,7 @@ use raysweep_proto::{CheckReport, FilmCheck};
 
 use super::cycle::CyclePlan;
 use crate::plane::foresight::Model;
-use crate::procedure::lab::{Lab, Room};
+use crate::procedure::lab::Lab;
 
 /// Disk space of the report and other small files, in bytes.
 const OTHER_BYTES: u64 = 10_000_000;
@@ -24,13 +24,8 @@ pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError>
     let cycles = of_cycles(film, lab.camera, model.reach());
     let memory = MemoryNeed::of_film(task).map_err(|error| task.refuse(&["film"], error.to_string()))?;
     let minutes = film.points() as f64 / cycles.transports_per_s / 60.0;
-    let memory_free_bytes = lab.memory_free_bytes();
-    let room = Room {
-        memory_bytes: memory.bytes(memory_free_bytes),
-        memory_free_bytes,
-        disk_bytes: (cycles.disk_bytes_per_minute as f64 * minutes) as u64 + OTHER_BYTES,
-        disk_free_bytes: lab.disk_free_bytes(),
-    };
+    let disk_bytes = (cycles.disk_bytes_per_minute as f64 * minutes) as u64 + OTHER_BYTES;
+    let room = lab.room(memory.bytes(lab.memory_free_bytes()), disk_bytes);
     let (mut dark_frames, mut dark_periods) = (0, 0);
     for (point, periods) in task.schedule.points.iter().zip(&model.periods) {
         if matches!(point.role, Role::Dark(_)) {

@@ -6,11 +6,10 @@ mod sink;
 mod worker;
 
 use std::sync::Arc;
-use std::sync::mpsc::channel;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
-use raysweep_pipeline::{CycleOrder, Point, Role, Stage};
+use raysweep_pipeline::{CycleOrder, Point, Role, Stages};
 use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_session::Session;
@@ -25,7 +24,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
 use crate::rig::{Pace, Rig};
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
@@ -36,7 +35,7 @@ const CYCLES_UNDER_WAY: usize = 4;
 struct FilmRun {
     rig: Arc<Rig>,
     film: FilmTask,
-    stages: Arc<[Box<dyn Stage>]>,
+    stages: Stages,
 }
 
 /// Predicts a film.
@@ -50,7 +49,7 @@ pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Res
     }
     let first_row = rig.first_row(lab.camera);
     let film = FilmTask::new(plan, own, &rig.file, first_row, lab.size());
-    let stages = film.stages(lab.registry)?;
+    let stages = lab.probes.after(&film.stages()?);
     let shape = StackShape { contents: film.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {
         report: check::check(&film, lab)?,
@@ -63,7 +62,7 @@ pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Res
     })
 }
 
-impl Procedure for FilmRun {
+impl Measurement for FilmRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let orders = run.orders.clone();
         let acquired = self.acquire(run)?;
@@ -100,22 +99,10 @@ impl FilmRun {
         let cycles = CyclePlan::new(task, opened.camera());
         let account = Arc::new(Account::new(film.points()));
         let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
-        let (verdicts, results) = channel();
         let planned = missing.len() + film.points();
-        let points = PointSink {
-            task: task.clone(),
-            stack,
-            ledger: run.ledger,
-            processing: Processing::without_folds(self.stages.clone()),
-            verdicts: Some(verdicts),
-            orders: run.orders,
-            board: run.board.clone(),
-            progress: ProgressMeter::new(0, planned),
-            vsync: None,
-            // A film's own transports serve as its live estimate.
-            live: None,
-            write_error: None,
-        };
+        let processing = Processing::without_demux(self.stages.clone());
+        // A film's own transports serve as its live estimate.
+        let (points, results) = PointSink::new(task, run, stack, processing, ProgressMeter::new(0, planned));
         let sink = FilmSink { points, film: frames };
         let under_way = CYCLES_UNDER_WAY * cycles.shots.len();
         let taken = opened.acquire(self.stages.clone(), under_way, sink, &results, |passes| {
@@ -129,14 +116,14 @@ impl FilmRun {
         let solved = frames.finish();
         let summary = account.summary();
         points.append(&Entry::Film(summary.clone()));
-        run.board.set_film(summary);
+        points.run.board.set_film(summary);
         match solved {
             Ok(ended) => ended?,
             Err(error) => points.note_write_error(error),
         }
         Ok(Acquired {
-            session: run.session,
-            ledger: points.ledger,
+            session: points.run.session,
+            ledger: points.run.ledger,
             problems: points.processing.problems,
             vsync: points.vsync,
             exposures,

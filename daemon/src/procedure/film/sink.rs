@@ -209,7 +209,7 @@ impl FilmSink {
     fn frame_lost(&mut self, id: SettingsId, counts: &Counts) {
         if counts.lost_total() > 0 {
             let lost = Event::Lost { point: id.point, attempt: id.attempt, counts: counts.clone() };
-            self.points.board.publish(lost);
+            self.points.run.board.publish(lost);
         }
         self.decided(id.attempt, |cycle| cycle.counts.add(counts));
     }
@@ -253,7 +253,7 @@ impl FilmSink {
                 self.points.append(&Entry::CycleLost { cycle: number as usize, missing, counts });
             }
         }
-        self.points.board.publish(Event::Progress(self.points.progress.shown()));
+        self.points.run.board.publish(Event::Progress(self.points.progress.shown()));
     }
 
     fn store_cycle(&mut self, cycle: &Cycle) -> raysweep_session::Result<()> {
@@ -268,7 +268,7 @@ impl FilmSink {
             place.zip_mut_with(&frame.raw, |place, &counts| *place = counts.min(u32::from(u16::MAX)) as u16);
         }
         film.film.write(cycle.number as usize, raw.view())?;
-        self.points.ledger.append(&Entry::Cycle(CycleEntry {
+        self.points.run.ledger.append(&Entry::Cycle(CycleEntry {
             cycle: cycle.number as usize,
             start_s: film.seconds_since_start(first_ns),
             exposure_us: frames[0].setting.exposure_us,

@@ -5,7 +5,7 @@ use raysweep_processing::response::{AXES, ResponseTask};
 use raysweep_proto::{CheckReport, ResponseCheck};
 
 use crate::devices::dots::FRAMES_AT_WORK;
-use crate::procedure::lab::{Lab, Room};
+use crate::procedure::lab::Lab;
 
 /// Disk space of a frame's line in the records: three numbers, as text and as floats.
 const LINE_BYTES: u64 = 96;
@@ -25,12 +25,8 @@ pub fn check(task: &ResponseTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigEr
         .map_err(|message| task.refuse(&["response", "exposure_us"], format!("response.{message}")))?;
     let (frames, axes) = (task.frames() as u64, AXES.len());
     let frame_bytes = task.format.frame_bytes(task.shape.pixels()) as u64;
-    let room = Room {
-        memory_bytes: FRAMES_AT_WORK as u64 * frame_bytes + DARK_BYTES * task.shape.pixels() as u64,
-        memory_free_bytes: lab.memory_free_bytes(),
-        disk_bytes: frames * axes as u64 * LINE_BYTES + OTHER_BYTES,
-        disk_free_bytes: lab.disk_free_bytes(),
-    };
+    let memory_bytes = FRAMES_AT_WORK as u64 * frame_bytes + DARK_BYTES * task.shape.pixels() as u64;
+    let room = lab.room(memory_bytes, frames * axes as u64 * LINE_BYTES + OTHER_BYTES);
     Ok(CheckReport {
         points: axes,
         frames: frames * axes as u64 + u64::from(plan.dark_frames),

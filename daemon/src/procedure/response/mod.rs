@@ -6,7 +6,7 @@ mod check;
 use std::sync::Arc;
 
 use raysweep_config::{ConfigError, Plan, ResponsePlan};
-use raysweep_processing::response::{AXES, Findings, ResponseTask};
+use raysweep_processing::response::{AXES, MirrorFindings, ResponseTask};
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
@@ -14,7 +14,7 @@ use self::acquire::{Recorded, acquire};
 use crate::procedure::lab::Lab;
 use crate::rig::DotRig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry};
 
 /// A mirror's chirps on a rig.
 struct ResponseRun {
@@ -45,14 +45,14 @@ pub fn foresee(
     })
 }
 
-impl Procedure for ResponseRun {
+impl Measurement for ResponseRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let Self { rig, task } = *self;
         let data = run.data.clone();
         let Recorded { session, mut ledger, mut fault } = acquire(&rig, &task, run)?;
         let stored = ledger.state().stored_points();
         let is_whole = fault.is_none() && stored == AXES.len();
-        let findings = is_whole.then(|| Findings::of(&session, ledger.state(), &task)).transpose()?;
+        let findings = is_whole.then(|| MirrorFindings::of(&session, ledger.state(), &task)).transpose()?;
         if let Some(findings) = &findings {
             fault = findings.refusal().cloned().map(RunError::from);
             // Must come before the ledger records the run as complete.

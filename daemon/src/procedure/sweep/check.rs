@@ -8,7 +8,7 @@ use raysweep_proto::CheckReport;
 use raysweep_session::STRIP_ROWS;
 
 use crate::plane::foresight::Model;
-use crate::procedure::lab::{Lab, Room};
+use crate::procedure::lab::Lab;
 
 /// Disk space of the report and other small files, in bytes.
 const OTHER_BYTES: u64 = 10_000_000;
@@ -27,12 +27,7 @@ pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Resu
     let pixels = (geometry.height * geometry.width) as u64;
     let files = 2 * products.iter().map(|product| product.images(geometry) as u64).sum::<u64>();
     let images = task.schedule.points.len() as u64 + 2 * model.reach() + files;
-    let room = Room {
-        memory_bytes: memory.bytes(memory_free_bytes),
-        memory_free_bytes,
-        disk_bytes: pixels * 4 * images + OTHER_BYTES,
-        disk_free_bytes: lab.disk_free_bytes(),
-    };
+    let room = lab.room(memory.bytes(memory_free_bytes), pixels * 4 * images + OTHER_BYTES);
 
     let (points, frames) =
         (sweep.points(), || task.schedule.points.iter().map(|point| u64::from(point.frames)));

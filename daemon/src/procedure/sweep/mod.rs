@@ -4,14 +4,13 @@ mod advice;
 mod check;
 
 use std::sync::Arc;
-use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
 use raysweep_config::{ConfigError, Plan, SweepPlan};
 use raysweep_core::{CameraCapabilities, SettingsLatency, VsyncStats};
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
 use raysweep_processing::plane::{Processing, manifest};
-use raysweep_processing::sweep::{Overview, Results, SweepTask, warnings, write_products, write_report};
+use raysweep_processing::sweep::{Overview, Results, SweepTask, write_products, write_report};
 use raysweep_proto::CheckReport;
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
@@ -23,7 +22,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
@@ -53,7 +52,8 @@ pub fn foresee(
     size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
     let sweep = SweepTask::new(plan, own, &rig.file, first_row, size);
-    let mut processing = sweep.processing(lab.registry)?;
+    let mut processing = sweep.processing()?;
+    processing.stages = lab.probes.after(&processing.stages);
     let report = check::check(&sweep, &processing.products, lab)?;
     let memory = MemoryNeed::of_sweep(&sweep.task, &processing.products)
         .map_err(|error| sweep.task.refuse(&["sweep"], error.to_string()))?;
@@ -79,7 +79,7 @@ pub fn foresee(
     })
 }
 
-impl Procedure for SweepRun {
+impl Measurement for SweepRun {
     fn advise(&self, report: &mut CheckReport) {
         match advice::advise(&self.sweep, &self.rig.file, &self.camera) {
             Ok(advice) => report.advice = Some(advice),
@@ -100,7 +100,7 @@ struct Acquired {
     session: Session,
     /// Still locked.
     ledger: Ledger,
-    /// Its folds have received every stored point.
+    /// Its demultiplexer has received every stored point.
     processing: Processing,
     vsync: Option<VsyncStats>,
     exposures: Exposures,
@@ -129,26 +129,16 @@ fn acquire(
         processing.problems.clear();
     }
     let planned = task.schedule.points.len();
-    let (verdicts, results) = channel();
     let stages = processing.stages.clone();
-    let sink = PointSink {
-        task: task.clone(),
-        stack,
-        ledger: run.ledger,
-        processing,
-        verdicts: Some(verdicts),
-        orders: run.orders,
-        board: run.board,
-        progress: ProgressMeter::new(planned - missing.len(), planned),
-        vsync: None,
-        live: run.live.and_then(start_live),
-        write_error: None,
-    };
+    let progress = ProgressMeter::new(planned - missing.len(), planned);
+    let live = run.live.clone().and_then(start_live);
+    let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
+    sink.live = live;
     let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
     let Taken { sink, exposures, latency, fault } = taken;
     Ok(Acquired {
-        session: run.session,
-        ledger: sink.ledger,
+        session: sink.run.session,
+        ledger: sink.run.ledger,
         processing: sink.processing,
         vsync: sink.vsync,
         exposures,
@@ -210,11 +200,7 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    let warnings = results.map_or_else(Vec::new, |Results { products, mut problems, .. }| {
-        problems.extend(warnings(&products));
-        problems
-    });
-    Ok(Ended { end, warnings })
+    Ok(Ended { end, warnings: results.map_or_else(Vec::new, Results::into_warnings) })
 }
 
 /// Publishes the result where the earlier estimates were published.

@@ -1,15 +1,11 @@
 //! How the transport was estimated: properties of rig and scene found in the stack, and the held-out error of the
 //! priors.
 
-use raysweep_pipeline::{Findings, Product, prior_name};
+use raysweep_pipeline::{Findings, prior_name};
 use raysweep_session::report::{Block, NoteLevel, Section, Table};
 
-/// The section, unless nothing was demultiplexed.
-pub(super) fn section(products: &[Product]) -> Option<Section> {
-    let findings = products.iter().find_map(|product| match product {
-        Product::Findings(findings) => Some(&**findings),
-        _ => None,
-    })?;
+/// The section about these findings.
+pub(super) fn section(findings: &Findings) -> Section {
     let note = |(what, said): &(&str, String)| Block::Note(NoteLevel::Info, format!("{what}: {said}"));
     let mut blocks: Vec<Block> = findings.remarks.iter().map(note).collect();
     blocks.extend(curve(findings));
@@ -22,11 +18,11 @@ pub(super) fn section(products: &[Product]) -> Option<Section> {
             rows: findings.left_out_us.iter().map(row).collect(),
         }));
     }
-    Some(Section {
+    Section {
         title: "How it was demultiplexed".into(),
         intro: "Some images are held out and predicted from the others; the model that predicts them best is taken, the default in doubt.".into(),
         blocks,
-    })
+    }
 }
 
 /// Held-out error of the priors.

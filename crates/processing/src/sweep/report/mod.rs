@@ -4,44 +4,55 @@ mod findings;
 mod products;
 
 use ndarray::{Array1, Array2};
-use raysweep_pipeline::{PREDICTED_SHARE, Product, Role};
+use raysweep_pipeline::{PREDICTED_SHARE, Role, SweepSummary};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
     Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, ToneSamples,
 };
 use raysweep_session::stack::{ArrayName, Stack};
-use raysweep_session::{Result, Session, transport};
+use raysweep_session::{Result, Session, durable, transport};
 
-use super::SweepTask;
+use self::products::PERCENTILE;
+use super::results::Results;
 use super::strips::Overview;
+use super::task::SweepTask;
 use crate::plane::place;
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, subtitle};
 
-/// Percentile of the pixels that maps to white in a picture.
-const PERCENTILE: f64 = 99.5;
-
 /// The same for the stack's indirect light, which is far dimmer and fills more of its images.
 const INDIRECT_PERCENTILE: f64 = 70.0;
 
-/// Makes the report of a session.
+/// Writes the report.
 ///
 /// # Errors
-/// When the stack cannot be read.
-pub fn make(
+/// When the stack cannot be read or the report cannot be written.
+pub fn write(
     session: &Session,
     state: &State,
     task: &SweepTask,
+    results: &Results,
     overview: Option<&Overview>,
-    products: &[Product],
-    problems: &[String],
+) -> Result<()> {
+    let page = make(session, state, task, results, overview)?.to_html()?;
+    durable::write(&session.report_path(), page.as_bytes())
+}
+
+fn make(
+    session: &Session,
+    state: &State,
+    task: &SweepTask,
+    results: &Results,
+    overview: Option<&Overview>,
 ) -> Result<Report> {
+    let Results { products, summary, problems, .. } = results;
     let stack = session.stack()?;
     let markers = overview.map(mark).unwrap_or_default();
     let sweep = SweepImages { task, state, stack: &stack };
     let mut sections = Vec::new();
     let errors = problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone()));
-    let warnings = warnings(products).into_iter().map(|text| Block::Note(NoteLevel::Warning, text));
+    let warnings = summary.iter().flat_map(|summary| &summary.warnings);
+    let warnings = warnings.map(|text| Block::Note(NoteLevel::Warning, text.clone()));
     let blocks: Vec<Block> = errors.chain(warnings).collect();
     if !blocks.is_empty() {
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
@@ -55,23 +66,14 @@ pub fn make(
         sections.extend(products::profiles(products));
     }
     sections.push(sweep.contact_sheet()?);
-    sections.extend(findings::section(products));
-    sections.push(trust(state, task, products));
+    sections.extend(summary.iter().map(|summary| findings::section(&summary.findings)));
+    sections.push(trust(state, task, summary.as_ref()));
     Ok(Report {
         title: state.session.name.clone(),
         subtitle: subtitle(state, session),
         facts: facts(state, task),
         sections,
     })
-}
-
-/// Warnings about the products.
-pub fn warnings(products: &[Product]) -> Vec<String> {
-    let warning = |product: &Product| match product {
-        Product::Warning(text) => Some(text.clone()),
-        _ => None,
-    };
-    products.iter().filter_map(warning).collect()
 }
 
 fn facts(state: &State, task: &SweepTask) -> Vec<(String, String)> {
@@ -246,17 +248,11 @@ impl SweepImages<'_> {
     }
 }
 
-fn trust(state: &State, task: &SweepTask, products: &[Product]) -> Section {
+fn trust(state: &State, task: &SweepTask, summary: Option<&SweepSummary>) -> Section {
     let mut blocks = vec![settings(state, &task.task)];
-    let figures: Vec<(String, String)> = products
-        .iter()
-        .filter_map(|product| match product {
-            Product::Figure { name, value } => Some(((*name).to_owned(), short(*value))),
-            _ => None,
-        })
-        .collect();
-    if !figures.is_empty() {
-        blocks.push(Block::Facts(figures));
+    if let Some(summary) = summary {
+        let figures = summary.figures.iter().map(|&(name, value)| (name.to_owned(), short(value)));
+        blocks.push(Block::Facts(figures.collect()));
     }
     blocks.extend(accounts(state));
     let deviation = |point: &PointEntry| {
@@ -264,9 +260,7 @@ fn trust(state: &State, task: &SweepTask, products: &[Product]) -> Section {
         point.delays_us.iter().map(move |true_us| true_us - delay_us).collect::<Vec<_>>()
     };
     blocks.push(Block::Plots(jitter(&state.stored(ArrayName::Sum).flat_map(deviation).collect::<Vec<_>>())));
-    if let Some(note) = regular_note(products) {
-        blocks.push(note);
-    }
+    blocks.extend(summary.and_then(regular_note));
     let sweep = &task.sweep;
     Section {
         title: "How far to trust it".into(),
@@ -283,11 +277,8 @@ fn short(value: f64) -> String {
     format!("{value:.4}").trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
-fn regular_note(products: &[Product]) -> Option<Block> {
-    let share = products.iter().find_map(|product| match product {
-        Product::Figure { name, value } if *name == PREDICTED_SHARE => Some(*value),
-        _ => None,
-    })?;
+fn regular_note(summary: &SweepSummary) -> Option<Block> {
+    let (_, share) = summary.figures.iter().find(|(name, _)| *name == PREDICTED_SHARE)?;
     Some(Block::Note(
         NoteLevel::Info,
         format!(

@@ -4,8 +4,8 @@ use ndarray::{Array2, Array3, ArrayView2};
 use raysweep_pipeline::{Product, Profile};
 use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Section, Series, ToneMap};
 
-use super::PERCENTILE;
-
+/// Percentile of the pixels that maps to white in a picture.
+pub(super) const PERCENTILE: f64 = 99.5;
 /// Number of pictures of a sequence on a contact sheet.
 const SHEET_PICTURES: usize = 12;
 /// Number of pictures in the animation of a sequence; more would make the page too large.

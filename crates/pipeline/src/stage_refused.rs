@@ -1,8 +1,11 @@
 //! Why a plan's stage cannot be created.
 
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
 /// Why a plan's stage cannot be created.
 #[derive(Debug, thiserror::Error)]
-pub enum RegistryError {
+pub enum StageRefused {
     /// The name does not exist.
     #[error("stage name = {name:?}: known are {known}")]
     Unknown {
@@ -27,4 +30,12 @@ pub enum RegistryError {
         /// Field, value, and the allowed values.
         what: String,
     },
+}
+
+/// The options of the stage `name`.
+///
+/// # Errors
+/// For options that it does not have, and values of the wrong type.
+pub fn options<T: DeserializeOwned>(name: &str, options: Value) -> Result<T, StageRefused> {
+    serde_json::from_value(options).map_err(|source| StageRefused::Options { name: name.into(), source })
 }

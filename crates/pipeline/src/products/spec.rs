@@ -1,0 +1,179 @@
+//! Products by their names in plans: a `[[product]]` table is validated before anything moves.
+
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
+
+use super::band::{Band, Width};
+use super::profile::{ProfileOptions, ProfileTable};
+use super::relight::RowPattern;
+use crate::schedule::{Schedule, SweepGeometry};
+
+/// Why a product is invalid.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("product {kind}: {what}")]
+pub struct ProductError {
+    /// The kind that the plan names.
+    pub kind: String,
+    /// Keys and indices that lead to the option within the product's table.
+    pub path: Vec<String>,
+    /// Field, value, and the allowed values.
+    pub what: String,
+}
+
+/// A valid product, which can be computed from every sweep of its plan.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ProductSpec {
+    pub(super) name: String,
+    pub(super) kind: ProductKind,
+}
+
+/// A kind of product, with its options.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum ProductKind {
+    Regular,
+    Epipolar(Width),
+    NonEpipolar(Width),
+    Band(Band),
+    Relight(RowPattern),
+    DelayProfile(ProfileOptions),
+    Uncertainty(Band),
+}
+
+/// The kinds by their names in plans.
+const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile, uncertainty";
+
+/// The file name of the transport itself, which products must not use.
+const TAKEN_NAME: &str = "transport";
+
+/// Longest name; with its extension it is a valid file name on every file system.
+const MAX_NAME: usize = 64;
+
+/// `kind = "regular"` has no options.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct NoOptions {}
+
+impl ProductSpec {
+    /// The product described by a plan's table: its kind, its name if it has one, and all other keys.
+    ///
+    /// # Errors
+    /// The option that is invalid for this plan on this rig.
+    pub fn new(
+        kind: &str,
+        name: Option<&str>,
+        options: &Map<String, Value>,
+        schedule: &Schedule,
+        geometry: &SweepGeometry,
+    ) -> Result<Self, ProductError> {
+        let refused = |path: Vec<String>, what: String| ProductError { kind: kind.into(), path, what };
+        let one = |(field, what): (&str, String)| refused(vec![field.into()], what);
+        let made = match kind {
+            "regular" => {
+                let NoOptions {} = parse(kind, options)?;
+                ProductKind::Regular
+            }
+            "epipolar" => ProductKind::Epipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
+            "non-epipolar" => ProductKind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
+            "band" => ProductKind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "uncertainty" => ProductKind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "relight" => {
+                if options.len() != 1 {
+                    let what = "give exactly one of rows, stripes and line".to_owned();
+                    return Err(refused(Vec::new(), what));
+                }
+                let pattern: RowPattern = parse(kind, options)?;
+                pattern.check(geometry).map_err(|(path, what)| refused(path, what))?;
+                ProductKind::Relight(pattern)
+            }
+            "delay-profile" => {
+                let table: ProfileTable = parse(kind, options)?;
+                ProductKind::DelayProfile(table.check(schedule, geometry).map_err(one)?)
+            }
+            _ => {
+                return Err(refused(vec!["kind".into()], format!("kind = {kind:?}: known are {KINDS}")));
+            }
+        };
+        let name = match name {
+            Some(name) => checked_name(name).map_err(|what| refused(vec!["name".into()], what))?,
+            None => made.default_name(),
+        };
+        Ok(Self { name, kind: made })
+    }
+
+    /// The products that are made if a plan names none.
+    pub fn defaults() -> Vec<Self> {
+        let spec = |name: &str, kind| Self { name: name.into(), kind };
+        vec![
+            spec("regular", ProductKind::Regular),
+            spec("epipolar", ProductKind::Epipolar(Width::default())),
+            spec("non_epipolar", ProductKind::NonEpipolar(Width::default())),
+            spec("short_range", ProductKind::Band(Band::new(1, Some(10)))),
+            spec("long_range", ProductKind::Band(Band::new(11, None))),
+            spec("uncertainty", ProductKind::Uncertainty(Band::new(0, Some(0)))),
+        ]
+    }
+
+    /// The name of its files, without extension.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The number of its images on this rig.
+    pub fn images(&self, geometry: &SweepGeometry) -> usize {
+        match &self.kind {
+            ProductKind::Relight(pattern) => pattern.images(geometry),
+            ProductKind::DelayProfile(_) => 0,
+            ProductKind::Regular
+            | ProductKind::Epipolar(_)
+            | ProductKind::NonEpipolar(_)
+            | ProductKind::Band(_)
+            | ProductKind::Uncertainty(_) => 1,
+        }
+    }
+}
+
+impl ProductKind {
+    fn default_name(&self) -> String {
+        match self {
+            Self::Regular => "regular".into(),
+            Self::Epipolar(width) => width.named("epipolar"),
+            Self::NonEpipolar(width) => width.named("non_epipolar"),
+            Self::Band(band) => band.default_name(),
+            Self::Relight(_) => "relight".into(),
+            Self::DelayProfile(options) => options.default_name(),
+            Self::Uncertainty(band) => format!("uncertainty_{}", band.default_name()),
+        }
+    }
+}
+
+fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Result<T, ProductError> {
+    serde_path_to_error::deserialize(Value::Object(options.clone())).map_err(|error| {
+        use serde_path_to_error::Segment;
+        let key = |segment: &Segment| match segment {
+            Segment::Seq { index } => Some(index.to_string()),
+            Segment::Map { key } => Some(key.clone()),
+            Segment::Enum { .. } | Segment::Unknown => None,
+        };
+        let path: Vec<String> = error.path().iter().filter_map(key).collect();
+        let what = match path.is_empty() {
+            true => error.inner().to_string(),
+            false => format!("{}: {}", path.join("."), error.inner()),
+        };
+        ProductError { kind: kind.into(), path, what }
+    })
+}
+
+/// A name becomes a file name and must not contain a path.
+fn checked_name(name: &str) -> Result<String, String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+    if name.is_empty() || name.len() > MAX_NAME || !name.chars().all(plain) {
+        return Err(format!(
+            "name = {name:?}: it becomes a file's, so give 1 to {MAX_NAME} letters, digits, `-` and `_`"
+        ));
+    }
+    if name == TAKEN_NAME {
+        return Err(format!("name = {name:?}: that is the light transport itself; give another"));
+    }
+    Ok(name.into())
+}

@@ -1,0 +1,17 @@
+//! Batches between the session and the products.
+
+use raysweep_session::dots::BatchColumns;
+use raysweep_transport::dots::{Batch, BatchArrays, DotsError, FrameShape};
+
+/// Converts a stored batch for the products; also returns which of its dots show the scene.
+pub fn from_stored(shape: FrameShape, columns: BatchColumns) -> Result<(Batch, Vec<bool>), DotsError> {
+    let BatchColumns { word_offsets, words, masks, values, residual, discs, capped, seen } = columns;
+    let arrays = BatchArrays { word_offsets, words, masks, values, residual, discs, capped };
+    Ok((Batch::new(shape, arrays)?, seen))
+}
+
+/// The inverse of [`from_stored`].
+pub fn to_stored(arrays: BatchArrays, seen: Vec<bool>) -> BatchColumns {
+    let BatchArrays { word_offsets, words, masks, values, residual, discs, capped } = arrays;
+    BatchColumns { word_offsets, words, masks, values, residual, discs, capped, seen }
+}

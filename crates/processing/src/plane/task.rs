@@ -1,0 +1,166 @@
+//! The points of a plan on the plane rig, and the model that turns counts into light.
+
+use std::sync::Arc;
+
+use ndarray::Array2;
+use raysweep_config::rig::plane::{ScanKind, SpotKind};
+use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
+use raysweep_core::SettingsId;
+use raysweep_pipeline::{
+    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, Role, Scan, Schedule, Spot, Stages, SweepGeometry,
+    Unit,
+};
+use raysweep_session::ledger::PointEntry;
+use raysweep_session::stack::ArrayName;
+use serde_json::{Map, Value, json};
+
+use crate::saturation::saturation_dn;
+use crate::software::SOFTWARE;
+
+/// The points of a plan on a plane rig: everything that acquisition and processing share.
+#[derive(Clone)]
+pub struct PlaneTask {
+    /// The plan's name.
+    pub name: String,
+    /// Stages that process each image.
+    pub stages: Vec<StageTable>,
+    /// Frames whose measured delay deviates by more than this are dropped.
+    pub max_jitter_us: f64,
+    /// The points to acquire.
+    pub schedule: Schedule,
+    /// The model that turns counts into light transport.
+    pub geometry: SweepGeometry,
+    places: Places,
+}
+
+impl PlaneTask {
+    /// The points of `plan` on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
+    /// `first_row`.
+    pub fn new(
+        plan: &Plan,
+        schedule: Schedule,
+        max_jitter_us: f64,
+        rig: &RigFile,
+        first_row: usize,
+        size: (usize, usize),
+    ) -> Self {
+        let geometry = SweepGeometry {
+            raster: rig.raster(),
+            row_table_us: rig.projector.row_table.as_deref().map(Into::into),
+            beam_sigma_rows: rig.projector.beam_sigma_rows,
+            spot: spot(rig.projector.spot, rig.projector.scan),
+            projector_columns: rig.camera.projector_columns,
+            first_row,
+            row_pitch: rig.camera.row_pitch,
+            camera_row_time_us: rig.camera_row_time_us(),
+            height: size.0,
+            width: size.1,
+            white_dn: rig.camera.white_dn(),
+            saturation_dn: saturation_dn(rig.camera.pixel_format),
+        };
+        let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
+        Self { name, stages, max_jitter_us, schedule, geometry, places }
+    }
+
+    /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
+    pub fn settings(&self) -> impl Iterator<Item = (u32, &Point)> {
+        (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, Role::Sweep(_)))
+    }
+
+    /// An error about a value of the plan.
+    pub fn refuse(&self, path: &[&str], message: impl Into<String>) -> ConfigError {
+        self.places.error(path, message)
+    }
+
+    /// The plan's stage `demux`.
+    pub(crate) fn demux_table(&self) -> Option<&StageTable> {
+        self.stages.iter().find(|stage| stage.name == DEMUX)
+    }
+
+    /// The options of `demux` in the plan.
+    ///
+    /// # Errors
+    /// When the plan has options that `demux` does not know.
+    pub fn demux_options(&self) -> Result<DemuxOptions, ConfigError> {
+        let Some(stage) = self.demux_table() else { return Ok(DemuxOptions::default()) };
+        serde_json::from_value(Value::Object(stage.options.clone()))
+            .map_err(|error| self.refuse(&["stage"], format!("stage demux: {error}")))
+    }
+
+    /// The stages that the plan names, and what demultiplexes their images.
+    ///
+    /// # Errors
+    /// With the position in the plan of a stage that cannot be made, or of a second `demux`.
+    pub(crate) fn made_stages(&self) -> Result<(Stages, Option<DemuxFold>), ConfigError> {
+        let (mut stages, mut demux) = (Vec::new(), None);
+        for (index, table) in self.stages.iter().enumerate() {
+            let place = index.to_string();
+            let refuse = |message: String| self.refuse(&["stage", &place, "name"], message);
+            let made = PlaneStage::new(&table.name, Value::Object(table.options.clone()));
+            match made.map_err(|error| refuse(error.to_string()))? {
+                PlaneStage::Image(stage) => stages.push(stage),
+                PlaneStage::Demux(options) => {
+                    let fold = DemuxFold::new(options, &self.schedule, &self.geometry)
+                        .map_err(|error| refuse(error.to_string()))?;
+                    if demux.replace(fold).is_some() {
+                        return Err(refuse(format!(
+                            "{DEMUX} stands twice: its products would overwrite each other; keep one"
+                        )));
+                    }
+                }
+            }
+        }
+        Ok((stages.into(), demux))
+    }
+
+    /// Metadata that all products share.
+    pub(crate) fn metadata(&self) -> Map<String, Value> {
+        let geometry = &self.geometry;
+        let entries = [
+            ("units", json!("1 = a white pixel lit by its own projector row")),
+            ("plan", json!(self.name)),
+            (DEMUX, json!(self.demux_table().map(|stage| &stage.options))),
+            ("row_time_us", json!(geometry.raster.row_time_us)),
+            ("row_table", json!(geometry.row_table_us.is_some())),
+            ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
+            ("first_row", json!(geometry.first_row)),
+            ("row_pitch", json!(geometry.row_pitch)),
+            ("camera_row_time_us", json!(geometry.camera_row_time_us)),
+            ("white_dn", json!(geometry.white_dn)),
+            ("software", json!(SOFTWARE)),
+        ];
+        entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+    }
+}
+
+/// Distribution over time of a pixel's direct light within its row.
+fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
+    match (kind, scan) {
+        (SpotKind::Uniform, _) => Spot::Uniform,
+        (SpotKind::Flying, None | Some(ScanKind::Unknown)) => Spot::Flying(Scan::Unknown),
+        (SpotKind::Flying, Some(ScanKind::OneWay)) => Spot::Flying(Scan::OneWay),
+        (SpotKind::Flying, Some(ScanKind::Bidirectional)) => Spot::Flying(Scan::Bidirectional),
+    }
+}
+
+/// Position of a point in the stack.
+pub fn place(role: Role) -> (ArrayName, usize) {
+    match role {
+        Role::Sweep(index) => (ArrayName::Sum, index as usize),
+        Role::Dark(index) => (ArrayName::Dark, index as usize),
+        Role::Regular => (ArrayName::Regular, 0),
+    }
+}
+
+/// A stored point, in the form in which the pipeline delivered it.
+pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
+    Unit {
+        id: SettingsId { point: ordinal, attempt: entry.attempt },
+        frames: entry.frames,
+        exposure_us: entry.exposure_us,
+        delays_us: entry.delays_us.clone(),
+        last_exposure_ns: None,
+        sum: Arc::new(sum),
+        counts: entry.counts.clone(),
+    }
+}

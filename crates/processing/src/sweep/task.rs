@@ -1,0 +1,136 @@
+//! A sweep on a plane rig: its points and products.
+
+use std::sync::Arc;
+
+use raysweep_config::{ConfigError, Plan, ProductTable, RigFile, SweepPlan};
+use raysweep_pipeline::{Point, ProductSpec, Role, Schedule};
+use raysweep_session::stack::Contents;
+
+use crate::plane::{PlaneTask, Processing};
+
+/// Minimum number of frames of a dark image: its noise enters all images of its exposure, so it must be small.
+const MIN_DARK_AVERAGE: u32 = 8;
+
+/// A sweep on a plane rig.
+#[derive(Clone)]
+pub struct SweepTask {
+    /// The plan's own table.
+    pub sweep: SweepPlan,
+    /// Its points and model.
+    pub task: Arc<PlaneTask>,
+    products: Option<Vec<ProductTable>>,
+}
+
+impl SweepTask {
+    /// A sweep on a rig; see [`PlaneTask::new`].
+    pub fn new(plan: &Plan, sweep: SweepPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
+        let schedule = schedule(&sweep, rig.vsync.period_us);
+        let task = PlaneTask::new(plan, schedule, sweep.max_jitter_us, rig, first_row, size);
+        Self { sweep, task: Arc::new(task), products: plan.products.clone() }
+    }
+
+    /// The same task with another sweep, if the plan allows it and the products can be made from it.
+    pub fn with_sweep(&self, sweep: SweepPlan) -> Option<Self> {
+        let is_possible = sweep.is_possible();
+        let mut task = (*self.task).clone();
+        task.schedule = schedule(&sweep, task.geometry.raster.period_us);
+        let other = Self { sweep, task: Arc::new(task), products: self.products.clone() };
+        (is_possible && other.products().is_ok()).then_some(other)
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        Contents::Sweep { points: self.points(), exposures: self.task.schedule.dark_len() }
+    }
+
+    /// Number of images to store, without dark and regular ones.
+    pub fn points(&self) -> usize {
+        self.task.schedule.sweep_len()
+    }
+
+    /// The stages and products that the plan names.
+    ///
+    /// # Errors
+    /// With the position in the plan's text of the stage or product that cannot be made.
+    pub fn processing(&self) -> Result<Processing, ConfigError> {
+        let (stages, demux) = self.task.made_stages()?;
+        // After `demux`, which refuses a rig on which no product could be made.
+        let products = self.products()?;
+        Ok(Processing { stages, demux, products, problems: Vec::new() })
+    }
+
+    /// The products that the plan names, made from the transport.
+    fn products(&self) -> Result<Vec<ProductSpec>, ConfigError> {
+        let Some(tables) = &self.products else { return Ok(ProductSpec::defaults()) };
+        if !tables.is_empty() && self.task.demux_table().is_none() {
+            let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";
+            return Err(self.task.refuse(&["product"], what));
+        }
+        let mut specs = Vec::new();
+        for (index, table) in tables.iter().enumerate() {
+            append_product(&mut specs, table, index, &self.task, &|path, message| {
+                self.task.refuse(path, message)
+            })?;
+        }
+        Ok(specs)
+    }
+}
+
+/// The points of a sweep: dark images of each exposure, the regular image, then the grid with the exposure in the outer
+/// loop, because some cameras take long to change it.
+fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
+    let frames = sweep.average;
+    let point = |role, delay_us, exposure_us| {
+        let frames = if matches!(role, Role::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+        Point { role, delay_us, exposure_us, frames }
+    };
+    let exposures = sweep.exposure_us.values();
+    let delays = sweep.delay_us.values();
+
+    let mut dark_exposures: Vec<f64> = Vec::new();
+    for &exposure_us in exposures.iter().chain([&period_us]) {
+        if !dark_exposures.contains(&exposure_us) {
+            dark_exposures.push(exposure_us);
+        }
+    }
+    let mut points: Vec<Point> =
+        (0..).zip(&dark_exposures).map(|(index, &us)| point(Role::Dark(index), 0.0, us)).collect();
+    points.push(point(Role::Regular, 0.0, period_us));
+    let grid =
+        exposures.iter().flat_map(|&exposure_us| delays.iter().map(move |&delay_us| (delay_us, exposure_us)));
+    points.extend(
+        (0..)
+            .zip(grid)
+            .map(|(index, (delay_us, exposure_us))| point(Role::Sweep(index), delay_us, exposure_us)),
+    );
+    Schedule { points }
+}
+
+/// Appends the product that a table asks for to the others. `refuse` makes an error about a value of the document in
+/// which the product has the number `index`.
+pub(super) fn append_product(
+    specs: &mut Vec<ProductSpec>,
+    table: &ProductTable,
+    index: usize,
+    task: &PlaneTask,
+    refuse: &dyn Fn(&[&str], String) -> ConfigError,
+) -> Result<(), ConfigError> {
+    let index = index.to_string();
+    let refused = |path: &[String], message: String| {
+        let path: Vec<&str> =
+            ["product", &index].into_iter().chain(path.iter().map(String::as_str)).collect();
+        refuse(&path, message)
+    };
+    let ProductTable { kind, name, options } = table;
+    let spec = ProductSpec::new(kind, name.as_deref(), options, &task.schedule, &task.geometry)
+        .map_err(|error| refused(&error.path, error.to_string()))?;
+    if specs.iter().any(|other| other.name() == spec.name()) {
+        let message = format!(
+            "product {kind}: two products are named {:?} and would overwrite each other: give one another name",
+            spec.name()
+        );
+        return Err(refused(&["name".into()], message));
+    }
+    specs.push(spec);
+    Ok(())
+}

@@ -1,0 +1,33 @@
+//! What tests insert into runs, to watch them or to make them fail. The daemon inserts nothing.
+
+use std::sync::Arc;
+
+use raysweep_pipeline::dots::ColumnStage;
+use raysweep_pipeline::{Stage, Stages};
+
+/// Replaces the stage of a dot rig's plan.
+type Around = Arc<dyn Fn(Arc<dyn ColumnStage>) -> Arc<dyn ColumnStage> + Send + Sync>;
+
+/// What is inserted into runs.
+#[derive(Clone, Default)]
+pub struct Probes {
+    /// On the plane rig: stages after those of the plan.
+    pub stages: Vec<Arc<dyn Stage>>,
+    /// On the dot rig: what takes the place of the plan's stage, given that one.
+    pub column_stage: Option<Around>,
+}
+
+impl Probes {
+    /// The stages of a plan on the plane rig, and those inserted.
+    pub(crate) fn after(&self, stages: &Stages) -> Stages {
+        stages.iter().chain(&self.stages).cloned().collect()
+    }
+
+    /// The stage of a dot rig's plan, or the one in its place.
+    pub(crate) fn around(&self, stage: Arc<dyn ColumnStage>) -> Arc<dyn ColumnStage> {
+        match &self.column_stage {
+            Some(around) => around(stage),
+            None => stage,
+        }
+    }
+}
