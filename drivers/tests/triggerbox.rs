@@ -70,6 +70,8 @@ fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
     let mut pty = plug(WireFaults::default());
     let mut vsync = TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
     edges(&mut vsync, 10);
+    let error = TriggerBox::open(config(pty.path()), PERIOD_US).err().unwrap();
+    assert_eq!(error.kind, DeviceErrorKind::Busy, "{error}");
     pty.unplug();
     let error = loop {
         if let Err(error) = vsync.next_edge(Duration::from_millis(100)) {

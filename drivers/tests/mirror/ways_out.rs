@@ -116,6 +116,8 @@ fn unplug_and_plug_in_again() {
     drop(mirror);
     // Its state still says that it was left away from rest, so nobody assumes that it is parked.
     assert!(matches!(park(&rig.state()), Err(ParkError::Device(_))));
+    let error = PlayzerX::open(rig.config()).err().unwrap();
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
 }
 
 #[test]

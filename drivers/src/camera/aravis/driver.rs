@@ -87,7 +87,11 @@ fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
 }
 
 fn lost() -> DeviceError {
-    error(DeviceErrorKind::NotReady, "stopped answering and is being opened again")
+    error(DeviceErrorKind::Disconnected, "stopped answering and is being opened again")
+}
+
+fn thread_ended() -> DeviceError {
+    error(DeviceErrorKind::Disconnected, "its thread has ended; the log has its message")
 }
 
 impl AravisCamera {
@@ -127,7 +131,7 @@ impl AravisCamera {
         let opened = match replies.recv() {
             Ok(Reply::Opened(opened)) => opened?,
             Ok(Reply::Done(..)) | Err(_) => {
-                return Err(error(DeviceErrorKind::NotReady, "its thread ended; the log has its message"));
+                return Err(thread_ended());
             }
         };
         let Opened { frames, chunks, capabilities, tells_time, .. } = opened;
@@ -171,10 +175,7 @@ impl AravisCamera {
         let order = Order { ticket: self.ticket, command };
         let asked_ns = self.shared.clock.now_ns();
         if self.orders.as_ref().is_none_or(|orders| orders.try_send(order).is_err()) {
-            return Err(error(
-                DeviceErrorKind::Disconnected,
-                "its thread has ended; the log has its message",
-            ));
+            return Err(thread_ended());
         }
         loop {
             match self.replies.recv_timeout(LOOK) {
@@ -192,12 +193,7 @@ impl AravisCamera {
                     return Err(lost());
                 }
                 Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => {
-                    return Err(error(
-                        DeviceErrorKind::Disconnected,
-                        "its thread has ended; the log has its message",
-                    ));
-                }
+                Err(RecvTimeoutError::Disconnected) => return Err(thread_ended()),
             }
         }
     }
@@ -250,12 +246,7 @@ impl AravisCamera {
                     return Err(error(DeviceErrorKind::Disconnected, what));
                 }
                 Err(RecvTimeoutError::Timeout) => return Ok(()),
-                Err(RecvTimeoutError::Disconnected) => {
-                    return Err(error(
-                        DeviceErrorKind::Disconnected,
-                        "its thread has ended; the log has its message",
-                    ));
-                }
+                Err(RecvTimeoutError::Disconnected) => return Err(thread_ended()),
             }
         }
     }

@@ -171,7 +171,7 @@ impl Owner {
                     return true;
                 }
                 Ok(Order { ticket, .. }) => {
-                    let error = DeviceError::new("camera", DeviceErrorKind::NotReady, "is not open");
+                    let error = DeviceError::new("camera", DeviceErrorKind::Disconnected, "is not open");
                     let _ = self.replies.send(Reply::Done(ticket, Err(error)));
                 }
                 Err(RecvTimeoutError::Timeout) => return false,
