@@ -4,5 +4,6 @@
 pub mod camera;
 pub mod mirror;
 pub mod projector;
+mod reopen;
 pub mod serial;
 pub mod vsync;

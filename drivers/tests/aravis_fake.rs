@@ -220,7 +220,7 @@ fn a_camera_that_died_is_noticed_and_goes_on_when_it_is_back() {
     });
     eprintln!("noticed after {:?}", died.elapsed());
     let error = camera.configure(ID, &SETTINGS).unwrap_err();
-    assert_eq!(error.kind, DeviceErrorKind::NotReady, "{error}");
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
 
     let _device = FakeCamera::start(&[]);
     let back = Instant::now();

@@ -2,13 +2,13 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
-use rand_xoshiro::Xoshiro256PlusPlus;
-use rand_xoshiro::rand_core::{Rng, SeedableRng};
+#[path = "suite/noise.rs"]
+mod noise;
+
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
-use raysweep_drivers::serial::wire::{LONGEST_REPLY, Receiver};
 use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
 use raysweep_drivers::vsync::triggerbox::{TriggerBox, TriggerBoxConfig, TriggerBoxLink};
 use raysweep_sim::mirror::{Link as Wire, WireFaults};
@@ -70,6 +70,8 @@ fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
     let mut pty = plug(WireFaults::default());
     let mut vsync = TriggerBox::open(config(pty.path()), PERIOD_US).unwrap();
     edges(&mut vsync, 10);
+    let error = TriggerBox::open(config(pty.path()), PERIOD_US).err().unwrap();
+    assert_eq!(error.kind, DeviceErrorKind::Busy, "{error}");
     pty.unplug();
     let error = loop {
         if let Err(error) = vsync.next_edge(Duration::from_millis(100)) {
@@ -83,29 +85,10 @@ fn an_unplugged_box_is_gone_and_what_is_no_box_is_told() {
     assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
 }
 
-/// Uniform bytes and bytes that occur in replies, in pieces; every byte is part of a reply, garbage, or waits for
-/// more.
 #[test]
 fn ten_million_bytes_of_noise_are_accounted_for() {
-    let mut random = Xoshiro256PlusPlus::seed_from_u64(5);
-    let mut next = || random.next_u64();
     let alphabet = b"PV\x07\x00\x01\x0e\x10";
-    let mut receiver = Receiver::default();
-    let (mut pushed, mut replies) = (0, 0);
-    while pushed < 10_000_000 {
-        let mut byte = || match next() {
-            random if random % 4 == 0 => (random >> 8) as u8,
-            random => alphabet[(random >> 8) as usize % alphabet.len()],
-        };
-        let length = 1 + usize::from(byte()) % 40;
-        let piece: Vec<u8> = (0..length).map(|_| byte()).collect();
-        receiver.push(&piece);
-        pushed += piece.len();
-        while receiver.next(parse_reply).is_some() {
-            replies += 1;
-        }
-        assert!(receiver.waiting_bytes() < LONGEST_REPLY);
-        assert_eq!(replies * 10 + receiver.garbage_bytes() as usize + receiver.waiting_bytes(), pushed);
-    }
-    assert!(replies > 0 && receiver.garbage_bytes() > 5_000_000, "{replies}");
+    let (pushed, in_replies, receiver) = noise::survives(parse_reply, alphabet, |_| 10);
+    assert!(in_replies > 0);
+    assert_eq!(in_replies + receiver.garbage_bytes() as usize + receiver.waiting_bytes(), pushed);
 }

@@ -195,8 +195,8 @@ pub trait Camera: Send {
     /// Writes settings. Works while armed too, so that a sweep need not stop the stream.
     ///
     /// # Errors
-    /// `OutOfRange` if the camera cannot accept a value; the old settings then stay. Any kind while it is
-    /// [`DeviceState::Lost`]: write the settings again when it is back.
+    /// `OutOfRange` if the camera cannot accept a value; the old settings then stay. `Disconnected` while it is
+    /// [`DeviceState::Lost`], or the failure with which it was lost: write the settings again when it is back.
     fn configure(&mut self, id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError>;
 
     /// Has the camera's own sequencer step through these settings, which all have the same exposure and shutter: one
@@ -228,7 +228,7 @@ pub trait Camera: Send {
     /// none arrives within `timeout`, also while the camera is [`DeviceState::Lost`].
     ///
     /// # Errors
-    /// `NotReady` before [`Camera::arm`], `Disconnected` when the device is gone for good.
+    /// `NotReady` before [`Camera::arm`], `Disconnected` when a lost camera is given up.
     fn next_frame(
         &mut self,
         buf: &mut FrameBuf,
@@ -249,10 +249,11 @@ pub trait Camera: Send {
 
 /// A device that watches the projector's VSYNC line.
 pub trait Vsync: Send {
-    /// Waits for the next edge. Returns `None` if none comes within `timeout`.
+    /// Waits for the next edge. Returns `None` if none comes within `timeout`, also while the device is
+    /// [`DeviceState::Lost`].
     ///
     /// # Errors
-    /// `Disconnected` when the device is gone.
+    /// `Disconnected` when the device is gone, or given up by a driver that reopens it.
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError>;
 
     /// The state of its connection: [`DeviceState::Lost`] while its driver tries to reopen it.

@@ -8,11 +8,13 @@ use std::error::Error;
 pub enum DeviceErrorKind {
     /// The device is in use by somebody else.
     Busy,
-    /// The device is gone: unplugged, powered off, or its process died.
+    /// The device cannot be reached now, whatever the cause: it is missing, unplugged or switched off, is being opened
+    /// again after it was lost, or the thread or process that serves it has ended.
     Disconnected,
     /// The device is present but did not answer in time.
     Timeout,
-    /// The call needs the device armed or open, but it was not.
+    /// The device can be reached, but something must be done first, which the message names: arm it, load a path,
+    /// permit light, grant access to it.
     NotReady,
     /// The device cannot do what was asked, with any value.
     Unsupported,

@@ -137,7 +137,7 @@ impl VsyncThread {
         thread.join().unwrap_or_else(|_panic| {
             Err(DeviceError::new(
                 "vsync",
-                DeviceErrorKind::NotReady,
+                DeviceErrorKind::Disconnected,
                 "the watcher's thread panicked; the log has its message",
             ))
         })

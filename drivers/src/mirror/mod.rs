@@ -7,6 +7,7 @@
 mod error;
 mod guardian;
 mod light;
+mod lines;
 mod mti;
 mod open;
 mod optotune;

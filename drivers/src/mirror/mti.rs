@@ -1,18 +1,19 @@
 //! Mirrorcle's MTI controllers in their ASCII mode: one line per command, answered by `MTI-OK` or `MTI-ERR ...`.
 
+use std::fmt;
 use std::ops::RangeInclusive;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 pub use raysweep_config::rig::dots::MtiDrive;
 use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorLimits, MirrorPoint, Tilt};
 
-use super::error::{DEVICE, fault};
+use super::error::fault;
 use super::light::LightGuard;
+use super::lines::LinePort;
 use super::points::{self, PointController, PointMirror};
 use super::state::{MirrorState, Reach, Sent, StateFile};
-use crate::serial::port::Port;
-use crate::serial::wire::{Parsed, line};
+use crate::serial::wire::{Parsed, parse_line};
 
 const BAUD: u32 = 115_200;
 const REPLY_WAIT: Duration = Duration::from_millis(300);
@@ -85,22 +86,20 @@ pub enum MtiCommand {
     Exit,
 }
 
-impl MtiCommand {
-    /// Appends the bytes of the command.
-    pub fn to_bytes(self, out: &mut Vec<u8>) {
-        let text = match self {
-            Self::Enter => "$MTI$".into(),
-            Self::Bias(volts) => format!("MTI+VB {volts}"),
-            Self::Difference(volts) => format!("MTI+VD {volts}"),
-            Self::Bandwidth(hz) => format!("MTI+BW {hz}"),
-            Self::Enable => "MTI+EN".into(),
-            Self::Disable => "MTI+DI".into(),
-            Self::GoTo { x, y, light } => format!("MTI+GT {x:.5} {y:.5} {light}"),
-            Self::Echo => "MTI+EC".into(),
-            Self::Exit => "MTI+EX".into(),
-        };
-        out.extend_from_slice(text.as_bytes());
-        out.push(b'\n');
+/// The line of the command, without its end.
+impl fmt::Display for MtiCommand {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Enter => write!(f, "$MTI$"),
+            Self::Bias(volts) => write!(f, "MTI+VB {volts}"),
+            Self::Difference(volts) => write!(f, "MTI+VD {volts}"),
+            Self::Bandwidth(hz) => write!(f, "MTI+BW {hz}"),
+            Self::Enable => write!(f, "MTI+EN"),
+            Self::Disable => write!(f, "MTI+DI"),
+            Self::GoTo { x, y, light } => write!(f, "MTI+GT {x:.5} {y:.5} {light}"),
+            Self::Echo => write!(f, "MTI+EC"),
+            Self::Exit => write!(f, "MTI+EX"),
+        }
     }
 }
 
@@ -117,43 +116,23 @@ pub enum MtiReply {
 
 /// Parses the reply at the start of `bytes`.
 pub fn parse_mti(bytes: &[u8]) -> Parsed<MtiReply> {
-    let (text, used) = match line(bytes) {
-        Ok(Some(line)) => line,
-        Ok(None) => return Parsed::Incomplete,
-        Err(used) => return Parsed::Garbage { used },
-    };
-    let reply = match text.split_at_checked(4) {
-        Some(("MTI-", "OK")) => MtiReply::Done,
-        Some(("MTI-", said)) if said.starts_with("ERR") => MtiReply::Refused(said[3..].trim().to_owned()),
-        Some(("MTI-", said)) if said.starts_with("Device ") => MtiReply::Device(said[7..].to_owned()),
-        // A reply may follow garbage on the same line.
-        _ => {
-            let next = text.get(1..).and_then(|rest| rest.find("MTI-")).map(|at| at + 1);
-            return Parsed::Garbage { used: next.unwrap_or(used) };
-        }
-    };
-    Parsed::Reply { reply, used }
+    parse_line(bytes, |text| match text.split_at_checked(4) {
+        Some(("MTI-", "OK")) => Ok(MtiReply::Done),
+        Some(("MTI-", said)) if said.starts_with("ERR") => Ok(MtiReply::Refused(said[3..].trim().to_owned())),
+        Some(("MTI-", said)) if said.starts_with("Device ") => Ok(MtiReply::Device(said[7..].to_owned())),
+        _ => Err(text.get(1..).and_then(|rest| rest.find("MTI-")).map(|at| at + 1)),
+    })
 }
 
 /// An MTI controller in its command mode.
 pub struct MtiLine {
-    port: Port,
+    port: LinePort<MtiReply>,
     full_scale: MechanicalDeg,
 }
 
 impl MtiLine {
-    fn ask(&mut self, command: MtiCommand, wait: Duration) -> Result<MtiReply, DeviceError> {
-        let mut bytes = Vec::new();
-        command.to_bytes(&mut bytes);
-        self.port.send(&bytes)?;
-        self.port.await_reply(wait, parse_mti, Some)?.ok_or_else(|| {
-            let what = format!("no answer to {command:?}: check the controller's power and cable");
-            fault(DeviceErrorKind::Timeout, what)
-        })
-    }
-
     fn tell(&mut self, command: MtiCommand, wait: Duration) -> Result<(), DeviceError> {
-        match self.ask(command, wait)? {
+        match self.port.ask(command, wait)? {
             MtiReply::Refused(why) => {
                 Err(fault(DeviceErrorKind::Protocol, format!("the controller refuses {command:?}: {why}")))
             }
@@ -161,12 +140,10 @@ impl MtiLine {
         }
     }
 
-    /// Completes any partial line and enters the command mode, or detects that the controller is already in it.
-    fn enter(port: &std::path::Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
-        let mut line = Self { port: Port::open(DEVICE, port, BAUD)?, full_scale };
-        line.port.send(b"\n")?;
-        line.port.await_silence(parse_mti)?;
-        let model = match line.ask(MtiCommand::Enter, REPLY_WAIT)? {
+    /// Enters the command mode, or detects that the controller is already in it.
+    fn enter(port: &Path, full_scale: MechanicalDeg) -> Result<(Self, String), DeviceError> {
+        let mut line = Self { port: LinePort::open(port, BAUD, "\n", parse_mti)?, full_scale };
+        let model = match line.port.ask(MtiCommand::Enter, REPLY_WAIT)? {
             MtiReply::Device(model) => model,
             MtiReply::Done | MtiReply::Refused(_) => "MTI controller".into(),
         };
@@ -225,14 +202,10 @@ mod tests {
 
     #[test]
     fn commands_are_the_documented_lines() {
-        let text = |command: MtiCommand| {
-            let mut out = Vec::new();
-            command.to_bytes(&mut out);
-            String::from_utf8(out).unwrap()
-        };
-        assert_eq!(text(MtiCommand::Enter), "$MTI$\n");
-        assert_eq!(text(MtiCommand::Bias(80)), "MTI+VB 80\n");
-        assert_eq!(text(MtiCommand::GoTo { x: -0.5, y: 1.0, light: 7 }), "MTI+GT -0.50000 1.00000 7\n");
+        assert_eq!(MtiCommand::Enter.to_string(), "$MTI$");
+        assert_eq!(MtiCommand::Bias(80).to_string(), "MTI+VB 80");
+        let point = MtiCommand::GoTo { x: -0.5, y: 1.0, light: 7 };
+        assert_eq!(point.to_string(), "MTI+GT -0.50000 1.00000 7");
     }
 
     #[test]

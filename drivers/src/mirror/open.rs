@@ -8,7 +8,7 @@ use raysweep_core::{DeviceError, DeviceErrorKind};
 use super::error::fault;
 use super::mti::{self, Mti, MtiConfig};
 use super::optotune::{Laser, Optotune, OptotuneConfig};
-use super::park::park_left;
+use super::park::{ParkError, park_left};
 use super::playzerx::{PlayzerX, PlayzerXConfig};
 use super::state::{StateFile, of_state};
 
@@ -18,7 +18,10 @@ const LOCK_WAIT: Duration = Duration::from_secs(1);
 /// Takes the lock, and parks a mirror that was left behind.
 fn parked(state: &Path) -> Result<StateFile, DeviceError> {
     let state = StateFile::open(state, LOCK_WAIT).map_err(of_state)?;
-    park_left(&state).map_err(|error| fault(DeviceErrorKind::NotReady, error.to_string()))?;
+    park_left(&state).map_err(|error| match &error {
+        ParkError::Device(cause) => fault(cause.kind, error.to_string()),
+        ParkError::State(_) => fault(DeviceErrorKind::NotReady, error.to_string()),
+    })?;
     Ok(state)
 }
 

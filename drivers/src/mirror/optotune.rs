@@ -1,6 +1,7 @@
 //! Optotune's MR-E-2 in its simple mode: one line per command, answered by `OK`, `NO`, `OL` or `OU`. It has no output
 //! for a light, so the light is controlled by a separate [`Laser`].
 
+use std::fmt;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -9,10 +10,11 @@ use raysweep_core::{DeviceError, DeviceErrorKind, MirrorLimits, MirrorPoint, Til
 
 use super::error::{DEVICE, fault};
 use super::light::LightGuard;
+use super::lines::LinePort;
 use super::points::{self, PointController, PointMirror};
 use super::state::{MirrorState, Reach, Sent, StateFile, node_of};
 use crate::serial::port::Port;
-use crate::serial::wire::{Parsed, line};
+use crate::serial::wire::{Parsed, parse_line};
 
 const BAUD: u32 = 256_000;
 const REPLY_WAIT: Duration = Duration::from_millis(300);
@@ -81,15 +83,13 @@ pub enum OptotuneCommand {
     },
 }
 
-impl OptotuneCommand {
-    /// Appends the bytes of the command.
-    pub fn to_bytes(self, out: &mut Vec<u8>) {
-        let text = match self {
-            Self::Start => "START".into(),
-            Self::GoTo { x, y } => format!("XY={x:.5};{y:.5}"),
-        };
-        out.extend_from_slice(text.as_bytes());
-        out.extend_from_slice(b"\r\n");
+/// The line of the command, without its end.
+impl fmt::Display for OptotuneCommand {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Start => write!(f, "START"),
+            Self::GoTo { x, y } => write!(f, "XY={x:.5};{y:.5}"),
+        }
     }
 }
 
@@ -108,39 +108,29 @@ pub enum OptotuneReply {
 
 /// Parses the reply at the start of `bytes`.
 pub fn parse_optotune(bytes: &[u8]) -> Parsed<OptotuneReply> {
-    let (text, used) = match line(bytes) {
-        Ok(Some(line)) => line,
-        Ok(None) => return Parsed::Incomplete,
-        Err(used) => return Parsed::Garbage { used },
-    };
-    let reply = match text {
-        "OK" => OptotuneReply::Ok,
-        "NO" => OptotuneReply::No,
-        "OL" => OptotuneReply::TooLow,
-        "OU" => OptotuneReply::TooHigh,
-        // A reply may follow garbage on the same line.
-        _ if ["OK", "NO", "OL", "OU"].iter().any(|reply| text.ends_with(reply)) => {
-            return Parsed::Garbage { used: text.len() - 2 };
-        }
-        _ => return Parsed::Garbage { used },
-    };
-    Parsed::Reply { reply, used }
+    parse_line(bytes, |text| match text {
+        "OK" => Ok(OptotuneReply::Ok),
+        "NO" => Ok(OptotuneReply::No),
+        "OL" => Ok(OptotuneReply::TooLow),
+        "OU" => Ok(OptotuneReply::TooHigh),
+        _ if ["OK", "NO", "OL", "OU"].iter().any(|reply| text.ends_with(reply)) => Err(Some(text.len() - 2)),
+        _ => Err(None),
+    })
 }
 
 /// The controller and its separate laser.
 pub struct OptotuneLine {
-    port: Port,
+    port: LinePort<OptotuneReply>,
     laser: Box<dyn Laser>,
     lit: bool,
 }
 
 impl OptotuneLine {
-    fn open(port: &Path, laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
-        let mut line = Self { port: Port::open(DEVICE, port, BAUD)?, laser, lit: true };
-        line.light(false)?;
-        // Completes any partial line; the reply to that is discarded.
-        line.port.send(b"\r\n")?;
-        line.port.await_silence(parse_optotune)?;
+    fn open(port: &Path, mut laser: Box<dyn Laser>) -> Result<Self, DeviceError> {
+        // Also if the mirror cannot be reached.
+        laser.switch(false)?;
+        let port = LinePort::open(port, BAUD, "\r\n", parse_optotune)?;
+        let mut line = Self { port, laser, lit: false };
         line.tell(OptotuneCommand::Start)?;
         Ok(line)
     }
@@ -154,18 +144,11 @@ impl OptotuneLine {
     }
 
     fn tell(&mut self, command: OptotuneCommand) -> Result<(), DeviceError> {
-        let mut bytes = Vec::new();
-        command.to_bytes(&mut bytes);
-        self.port.send(&bytes)?;
-        match self.port.await_reply(REPLY_WAIT, parse_optotune, Some)? {
-            Some(OptotuneReply::Ok) => Ok(()),
-            Some(refused) => {
+        match self.port.ask(command, REPLY_WAIT)? {
+            OptotuneReply::Ok => Ok(()),
+            refused => {
                 let what = format!("the controller answers {refused:?} to {command:?}");
                 Err(fault(DeviceErrorKind::Protocol, what))
-            }
-            None => {
-                let what = format!("no answer to {command:?}: check the controller's power and cable");
-                Err(fault(DeviceErrorKind::Timeout, what))
             }
         }
     }
@@ -241,13 +224,8 @@ mod tests {
 
     #[test]
     fn commands_and_replies_are_the_documented_lines() {
-        let text = |command: OptotuneCommand| {
-            let mut out = Vec::new();
-            command.to_bytes(&mut out);
-            String::from_utf8(out).unwrap()
-        };
-        assert_eq!(text(OptotuneCommand::Start), "START\r\n");
-        assert_eq!(text(OptotuneCommand::GoTo { x: 0.25, y: -1.0 }), "XY=0.25000;-1.00000\r\n");
+        assert_eq!(OptotuneCommand::Start.to_string(), "START");
+        assert_eq!(OptotuneCommand::GoTo { x: 0.25, y: -1.0 }.to_string(), "XY=0.25000;-1.00000");
         assert_eq!(parse_optotune(b"OK\r\nNO"), Parsed::Reply { reply: OptotuneReply::Ok, used: 4 });
         assert_eq!(parse_optotune(b"OL\r\n"), Parsed::Reply { reply: OptotuneReply::TooLow, used: 4 });
         assert_eq!(parse_optotune(b"xOU\r\n"), Parsed::Garbage { used: 1 });

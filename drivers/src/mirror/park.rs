@@ -1,9 +1,9 @@
 //! Parking a mirror that a process left moving or away from the origin.
 
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use raysweep_core::{DeviceError, Tilt};
+use raysweep_core::{DeviceError, DeviceErrorKind, Tilt};
 
 use super::state::{MirrorState, Reach, StateError, StateFile};
 use super::{mti, optotune, playzerx};
@@ -53,10 +53,20 @@ pub(super) fn park_left(file: &StateFile) -> Result<Parked, ParkError> {
     if state.playing.is_none() {
         return Ok(Parked::Already);
     }
-    let found = match &state.reach {
-        Reach::PlayzerX { .. } => playzerx::recover(file, &state, sent)?,
-        Reach::Mti { .. } => mti::recover(&state, sent)?,
-        Reach::Optotune { .. } => optotune::recover(&state, sent)?,
+    let deadline = Instant::now() + LOCK_WAIT;
+    let found = loop {
+        let recovered = match &state.reach {
+            Reach::PlayzerX { .. } => playzerx::recover(file, &state, sent),
+            Reach::Mti { .. } => mti::recover(&state, sent),
+            Reach::Optotune { .. } => optotune::recover(&state, sent),
+        };
+        match recovered {
+            // A dying process closes its files one after the other: it may release the port after the lock.
+            Err(error) if error.kind == DeviceErrorKind::Busy && Instant::now() < deadline => {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            recovered => break recovered?,
+        }
     };
     file.write(&MirrorState { playing: None, ..state })?;
     Ok(found.map_or(Parked::ByReset, Parked::From))

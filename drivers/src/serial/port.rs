@@ -41,10 +41,11 @@ impl Port {
             .open_native()
             .map_err(|error| {
                 let kind = match error.kind() {
-                    serialport::ErrorKind::NoDevice => DeviceErrorKind::Disconnected,
-                    serialport::ErrorKind::Io(io::ErrorKind::NotFound) => DeviceErrorKind::Disconnected,
-                    serialport::ErrorKind::Io(io::ErrorKind::ResourceBusy) => DeviceErrorKind::Busy,
-                    _ => DeviceErrorKind::NotReady,
+                    // What the crate says of a port that another program has opened.
+                    serialport::ErrorKind::NoDevice => DeviceErrorKind::Busy,
+                    serialport::ErrorKind::Io(io::ErrorKind::PermissionDenied) => DeviceErrorKind::NotReady,
+                    // Missing, or a node whose device was pulled out (ENXIO, ENODEV, EIO).
+                    _ => DeviceErrorKind::Disconnected,
                 };
                 let what = format!("cannot open {name}: {error}: check the cable, the rig file's port, and who else has it open");
                 DeviceError::new(device, kind, what)

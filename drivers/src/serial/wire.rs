@@ -66,19 +66,25 @@ impl Receiver {
     }
 }
 
-/// The line at the start of `bytes` without its CR LF or LF, and its length in bytes including that. `Err` is the
-/// number of bytes that cannot begin a line; `Ok(None)` means that more bytes are needed.
-pub(crate) fn line(bytes: &[u8]) -> Result<Option<(&str, usize)>, usize> {
+/// Parses a reply that is a line, at the start of `bytes`. `reply_of` gets the line without its CR LF or LF; for a line
+/// that is no reply, it returns where in it a reply may begin, if anywhere after garbage.
+pub(crate) fn parse_line<R>(
+    bytes: &[u8],
+    reply_of: impl FnOnce(&str) -> Result<R, Option<usize>>,
+) -> Parsed<R> {
     let end = bytes.iter().take(LONGEST_REPLY).position(|byte| *byte == b'\n');
     let shown = &bytes[..end.unwrap_or(bytes.len().min(LONGEST_REPLY))];
     let text = shown.strip_suffix(b"\r").unwrap_or(shown);
     // A byte that cannot occur in a line invalidates everything before it.
     if let Some(bad) = text.iter().rposition(|byte| !(b' '..=b'~').contains(byte)) {
-        return Err(bad + 1);
+        return Parsed::Garbage { used: bad + 1 };
     }
     match (end, std::str::from_utf8(text)) {
-        (Some(end), Ok(text)) => Ok(Some((text, end + 1))),
-        (None, _) if bytes.len() >= LONGEST_REPLY => Err(LONGEST_REPLY),
-        _ => Ok(None),
+        (Some(end), Ok(text)) => match reply_of(text) {
+            Ok(reply) => Parsed::Reply { reply, used: end + 1 },
+            Err(start) => Parsed::Garbage { used: start.unwrap_or(end + 1) },
+        },
+        (None, _) if bytes.len() >= LONGEST_REPLY => Parsed::Garbage { used: LONGEST_REPLY },
+        _ => Parsed::Incomplete,
     }
 }

@@ -1,11 +1,11 @@
 //! A watcher whose device may be unplugged and plugged in again during use.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use raysweep_core::{ClockQuality, DeviceError, DeviceErrorKind, DeviceState, Edge, Vsync};
+use raysweep_core::{Clock, ClockQuality, DeviceError, DeviceErrorKind, DeviceState, Edge, Vsync};
 
-/// Interval of checking whether the device is back.
-const LOOK: Duration = Duration::from_millis(250);
+use super::DEVICE;
+use crate::reopen::Reopening;
 
 /// Opens a device again.
 pub type Opener<V> = Box<dyn FnMut() -> Result<V, DeviceError> + Send>;
@@ -14,85 +14,68 @@ pub type Opener<V> = Box<dyn FnMut() -> Result<V, DeviceError> + Send>;
 /// number if edges may have been lost.
 pub struct Reopened<V> {
     open: Opener<V>,
-    patience: Duration,
+    reopening: Reopening,
     device: Option<V>,
-    /// Set when the device was lost, until it reports an edge again.
-    lost: Option<Lost>,
     /// Added to the device's own edge numbers.
     base: u64,
     last_seq: u64,
 }
 
-#[derive(Clone, Copy)]
-struct Lost {
-    since: Instant,
-    looked: Instant,
-}
-
 impl<V: Vsync> Reopened<V> {
     /// Watches with `device`. If it is lost, `open` opens it again, for up to `patience`.
     pub fn new(device: V, open: Opener<V>, patience: Duration) -> Self {
-        Self { open, patience, device: Some(device), lost: None, base: 0, last_seq: 0 }
+        let reopening = Reopening::new(DEVICE, patience, Clock::real());
+        Self { open, reopening, device: Some(device), base: 0, last_seq: 0 }
     }
 
-    /// Checks whether the device is back.
-    fn look(&mut self, timeout: Duration) -> Result<(), DeviceError> {
-        let Some(lost) = &mut self.lost else { return Ok(()) };
-        std::thread::sleep(timeout.min(LOOK.saturating_sub(lost.looked.elapsed())));
-        if lost.looked.elapsed() < LOOK {
+    /// Tries to open the lost device, if an attempt is due within `timeout`.
+    fn reopen(&mut self, timeout: Duration) -> Result<(), DeviceError> {
+        self.reopening.sleep(timeout);
+        if !self.reopening.is_due() {
             return Ok(());
         }
-        lost.looked = Instant::now();
         match (self.open)() {
             Ok(device) => {
-                tracing::info!("the VSYNC line's watcher is back");
                 self.device = Some(device);
                 self.base = self.last_seq + 1;
                 Ok(())
             }
-            Err(_) if lost.since.elapsed() < self.patience => Ok(()),
-            Err(error) => Err(error),
+            Err(error) => self.reopening.failed(&error.source),
         }
     }
+}
 
-    /// Closes the device after an error that reopening may fix; returns the error when `patience` is exhausted.
-    fn lose(&mut self, error: DeviceError) -> Result<(), DeviceError> {
-        let now = Instant::now();
-        // A device that can be opened but reports no edge is still lost.
-        let since = self.lost.map_or(now, |lost| lost.since);
-        let passing = matches!(
-            error.kind,
-            DeviceErrorKind::Disconnected | DeviceErrorKind::Timeout | DeviceErrorKind::Protocol
-        );
-        if !passing || now - since > self.patience {
-            return Err(error);
-        }
-        tracing::warn!(%error, "the VSYNC line's watcher is lost");
-        self.device = None;
-        self.lost = Some(Lost { since, looked: now });
-        Ok(())
-    }
+/// Whether opening the device again may help.
+fn is_loss(error: &DeviceError) -> bool {
+    matches!(
+        error.kind,
+        DeviceErrorKind::Disconnected | DeviceErrorKind::Timeout | DeviceErrorKind::Protocol
+    )
 }
 
 impl<V: Vsync> Vsync for Reopened<V> {
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
         let Some(device) = &mut self.device else {
-            self.look(timeout)?;
-            return Ok(None);
+            return self.reopen(timeout).map(|()| None);
         };
         match device.next_edge(timeout) {
             Ok(Some(edge)) => {
-                self.lost = None;
+                self.reopening.delivered();
                 self.last_seq = self.base + edge.seq;
                 Ok(Some(Edge { seq: self.last_seq, ..edge }))
             }
-            Ok(None) => Ok(None),
-            Err(error) => self.lose(error).map(|()| None),
+            // A device that can be opened but reports no edge is still lost.
+            Ok(None) => self.reopening.check().map(|()| None),
+            Err(error) if is_loss(&error) => {
+                self.device = None;
+                self.reopening.failed(&error.source).map(|()| None)
+            }
+            Err(error) => Err(error),
         }
     }
 
     fn state(&self) -> DeviceState {
-        if self.lost.is_some() { DeviceState::Lost } else { DeviceState::Streaming }
+        if self.reopening.is_lost() { DeviceState::Lost } else { DeviceState::Streaming }
     }
 
     fn clock(&self) -> Option<ClockQuality> {
@@ -104,6 +87,7 @@ impl<V: Vsync> Vsync for Reopened<V> {
 mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU32, Ordering};
+    use std::time::Instant;
 
     use super::*;
 
@@ -150,24 +134,35 @@ mod tests {
     fn a_device_that_stays_away_is_given_up() {
         let mut vsync = Reopened::new(Brief(9), Box::new(|| Err(gone())), Duration::ZERO);
         assert_eq!(vsync.next_edge(Duration::ZERO).unwrap(), None);
-        let error = loop {
-            if let Err(error) = vsync.next_edge(Duration::from_millis(1)) {
-                break error;
-            }
-        };
+        let error = vsync.next_edge(Duration::ZERO).unwrap_err();
         assert_eq!(error.kind, DeviceErrorKind::Disconnected);
+        assert!(error.to_string().contains("vsync.reopen_s = 0 s: not there"), "{error}");
     }
 
     #[test]
-    fn a_device_that_opens_and_fails_before_its_first_edge_is_given_up() {
-        let mut vsync = Reopened::new(Brief(9), Box::new(|| Ok(Brief(9))), 2 * LOOK);
-        let began = Instant::now();
-        let error = loop {
-            if let Err(error) = vsync.next_edge(LOOK) {
-                break error;
+    fn a_device_that_opens_and_then_fails_or_is_silent_is_given_up() {
+        type Answer = fn() -> Result<Option<Edge>, DeviceError>;
+
+        struct Always(Answer);
+
+        impl Vsync for Always {
+            fn next_edge(&mut self, _: Duration) -> Result<Option<Edge>, DeviceError> {
+                (self.0)()
             }
-        };
-        assert_eq!(error.kind, DeviceErrorKind::Disconnected);
-        assert!(began.elapsed() > 2 * LOOK, "it was opened again meanwhile");
+        }
+
+        const PATIENCE: Duration = Duration::from_millis(200);
+        for again in [(|| Err(gone())) as Answer, || Ok(None)] {
+            let opener = Box::new(move || Ok(Always(again)));
+            let mut vsync = Reopened::new(Always(|| Err(gone())), opener, PATIENCE);
+            let began = Instant::now();
+            let error = loop {
+                if let Err(error) = vsync.next_edge(Duration::from_millis(1)) {
+                    break error;
+                }
+            };
+            assert_eq!(error.kind, DeviceErrorKind::Disconnected);
+            assert!(began.elapsed() >= PATIENCE);
+        }
     }
 }

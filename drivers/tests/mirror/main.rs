@@ -3,6 +3,8 @@
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 mod conformance;
+#[path = "../suite/noise.rs"]
+mod noise;
 mod parsers;
 mod playzerx_script;
 mod points;

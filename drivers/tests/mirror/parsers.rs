@@ -4,39 +4,9 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use raysweep_drivers::mirror::playzerx::protocol::{Reply, parse_response};
 use raysweep_drivers::mirror::{MtiReply, OptotuneReply, parse_mti, parse_optotune};
-use raysweep_drivers::serial::wire::{LONGEST_REPLY, Parsed, Receiver};
+use raysweep_drivers::serial::wire::{Parsed, Receiver};
 
-const BYTES: usize = 10_000_000;
-
-struct Noise(Xoshiro256PlusPlus);
-
-impl Noise {
-    /// Uniform bytes, or bytes that occur in replies: these get further into a parser.
-    fn byte(&mut self, alphabet: &[u8]) -> u8 {
-        let random = self.0.next_u64();
-        if random & 0x300 == 0 { random as u8 } else { alphabet[(random >> 16) as usize % alphabet.len()] }
-    }
-}
-
-/// Feeds noise in pieces of every size; every byte must be accounted for, and no bytes may accumulate.
-fn survives<R>(parse: impl Fn(&[u8]) -> Parsed<R> + Copy, alphabet: &[u8], length: impl Fn(&R) -> usize) {
-    let mut noise = Noise(Xoshiro256PlusPlus::seed_from_u64(alphabet.len() as u64));
-    let mut receiver = Receiver::default();
-    let (mut pushed, mut in_replies) = (0_usize, 0_usize);
-    while pushed < BYTES {
-        let piece: Vec<u8> =
-            (0..1 + noise.0.next_u64() as usize % 40).map(|_| noise.byte(alphabet)).collect();
-        receiver.push(&piece);
-        pushed += piece.len();
-        while let Some(reply) = receiver.next(parse) {
-            in_replies += length(&reply);
-        }
-        assert!(receiver.waiting_bytes() < LONGEST_REPLY, "{} bytes wait", receiver.waiting_bytes());
-        let accounted = in_replies + receiver.garbage_bytes() as usize + receiver.waiting_bytes();
-        assert!(accounted <= pushed);
-    }
-    assert!(receiver.garbage_bytes() > 0);
-}
+use crate::noise::survives;
 
 /// Replies with garbage in between: all replies are found, all garbage is counted.
 fn finds<R: PartialEq + std::fmt::Debug>(
@@ -44,13 +14,13 @@ fn finds<R: PartialEq + std::fmt::Debug>(
     replies: &[(&[u8], R)],
     garbage: &[u8],
 ) {
-    let mut noise = Noise(Xoshiro256PlusPlus::seed_from_u64(99));
+    let mut noise = Xoshiro256PlusPlus::seed_from_u64(99);
     let mut receiver = Receiver::default();
     let mut garbage_bytes = 0;
     for round in 0..20_000 {
-        let count = noise.0.next_u64() as usize % 8;
+        let count = noise.next_u64() as usize % 8;
         let mut bytes: Vec<u8> =
-            (0..count).map(|_| garbage[noise.0.next_u64() as usize % garbage.len()]).collect();
+            (0..count).map(|_| garbage[noise.next_u64() as usize % garbage.len()]).collect();
         garbage_bytes += bytes.len() as u64;
         let (reply_bytes, reply) = &replies[round % replies.len()];
         bytes.extend_from_slice(reply_bytes);

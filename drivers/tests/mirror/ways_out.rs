@@ -116,6 +116,8 @@ fn unplug_and_plug_in_again() {
     drop(mirror);
     // Its state still says that it was left away from rest, so nobody assumes that it is parked.
     assert!(matches!(park(&rig.state()), Err(ParkError::Device(_))));
+    let error = PlayzerX::open(rig.config()).err().unwrap();
+    assert_eq!(error.kind, DeviceErrorKind::Disconnected, "{error}");
 }
 
 #[test]
@@ -143,9 +145,10 @@ fn a_controller_that_was_plugged_in_again_is_not_taken_for_the_one_that_was_left
     assert_eq!(held.largest_step, 0.0);
 }
 
-/// The process that the tests below end: plays until it is told to stop.
+/// Not a test but the process that the tests below end: plays until it is killed. It is listed as ignored because
+/// only a test of this program can be started by name (`start_child`).
 #[test]
-#[ignore = "run by the other tests, as a process of its own"]
+#[ignore = "not a test: a process that other tests start and kill"]
 fn child() {
     let Ok(port) = std::env::var("MIRROR_PORT") else { return };
     let state = std::path::PathBuf::from(std::env::var("MIRROR_STATE").unwrap());
@@ -179,9 +182,9 @@ fn child() {
     }
 }
 
-/// The guardian's process.
+/// Not a test but the guardian's process, which `child` starts.
 #[test]
-#[ignore = "run by the other tests, as a process of its own"]
+#[ignore = "not a test: a process that other tests start"]
 fn guardian() {
     let Ok(state) = std::env::var("MIRROR_STATE") else { return };
     park_when_closed(std::io::stdin(), Path::new(&state)).unwrap();
@@ -283,6 +286,22 @@ fn the_next_driver_parks_what_the_last_one_left() {
     let mirror = rig.open();
     rig.assert_parked().print("SIGKILL, next driver", since_ns);
     drop(mirror);
+}
+
+#[test]
+fn a_port_that_a_dying_process_releases_after_the_lock_is_waited_for() {
+    let rig = Rig::good();
+    let mut child = start_child(&rig, "playzerx", false);
+    rig.await_light(20_000);
+    end(&mut child, Signal::SIGKILL);
+    let held = serialport::new(rig.pty.path().display().to_string(), 921_600).open_native().unwrap();
+    let release = std::thread::spawn(move || {
+        std::thread::sleep(Duration::from_millis(200));
+        drop(held);
+    });
+    assert!(matches!(park(&rig.state()).unwrap(), Parked::From(_)));
+    release.join().unwrap();
+    rig.assert_parked();
 }
 
 #[test]

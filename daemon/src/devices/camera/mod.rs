@@ -192,7 +192,7 @@ impl CameraThread {
         drop(self.work);
         self.thread.join().map_err(|panic| {
             let what = format!("its thread panicked: {}; resume the session", message_of(&*panic));
-            DeviceError::new("camera", DeviceErrorKind::NotReady, what)
+            DeviceError::new("camera", DeviceErrorKind::Disconnected, what)
         })
     }
 }

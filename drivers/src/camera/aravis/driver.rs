@@ -1,5 +1,6 @@
 //! The camera behind the traits of `raysweep-core`: the side that takes frames.
 
+use std::fmt::Display;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
@@ -20,6 +21,7 @@ use super::losses::Losses;
 use super::owner::{Command, Done, Opened, Order, Owner, Reply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
 use super::sequencer::Sequence;
+use crate::reopen::Reopening;
 use raysweep_config::rig::aravis::{AravisConfig, TimestampAt};
 
 /// Properties of the rig that the camera driver needs.
@@ -43,6 +45,10 @@ const SILENCE_NS: i64 = 900_000_000;
 const ROUND_TRIPS: usize = 100;
 /// Maximum wait on a channel or a stream before the camera's health is checked.
 const LOOK: Duration = Duration::from_millis(50);
+/// A killed program keeps the camera until its heartbeat is missed, after 3 s.
+const BUSY_PATIENCE: Duration = Duration::from_secs(5);
+/// Pause between attempts to open a camera that another program holds.
+const BUSY_PAUSE: Duration = Duration::from_millis(250);
 /// Maximum wait for the owner thread on closing. With a dead camera it may be blocked for longer; it then ends by
 /// itself.
 const FAREWELL: Duration = Duration::from_secs(3);
@@ -58,6 +64,7 @@ pub struct AravisCamera {
     owner: Option<JoinHandle<()>>,
     ticket: u64,
     link: Link,
+    reopening: Reopening,
     armed_ns: Option<i64>,
     ids: FrameIds,
     losses: Losses,
@@ -68,8 +75,14 @@ pub struct AravisCamera {
 }
 
 enum Link {
-    Up { frames: Frames, chunks: Option<Chunks>, tells_time: bool },
-    Lost { since: Instant },
+    Up {
+        frames: Frames,
+        chunks: Option<Chunks>,
+        tells_time: bool,
+    },
+    Lost,
+    /// The owner thread is opening the lost camera.
+    Opening,
 }
 
 /// The newest complete frame.
@@ -86,8 +99,15 @@ fn error(kind: DeviceErrorKind, what: impl Into<String>) -> DeviceError {
     DeviceError::new("camera", kind, what.into())
 }
 
+/// Why a camera is lost that neither answers nor delivers frames.
+const SILENT: &str = "it has stopped answering";
+
 fn lost() -> DeviceError {
-    error(DeviceErrorKind::NotReady, "stopped answering and is being opened again")
+    error(DeviceErrorKind::Disconnected, "stopped answering and is being opened again")
+}
+
+fn thread_ended() -> DeviceError {
+    error(DeviceErrorKind::Disconnected, "its thread has ended; the log has its message")
 }
 
 impl AravisCamera {
@@ -107,7 +127,7 @@ impl AravisCamera {
             model: Arc::new(Mutex::new(ClockModel::new(ROUND_TRIPS))),
             clock,
         };
-        // At most one order is pending, in addition to the last two when a camera is given up.
+        // At most one order is pending, in addition to those that release a lost camera and open it again.
         let (orders, todo) = sync_channel(4);
         let (answers, replies) = sync_channel(4);
         let owner = Owner {
@@ -124,10 +144,18 @@ impl AravisCamera {
             .name("camera-owner".into())
             .spawn(move || owner.run())
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
-        let opened = match replies.recv() {
-            Ok(Reply::Opened(opened)) => opened?,
-            Ok(Reply::Done(..)) | Err(_) => {
-                return Err(error(DeviceErrorKind::NotReady, "its thread ended; the log has its message"));
+        let begun = Instant::now();
+        let opened = loop {
+            let open = Order { ticket: 0, command: Command::Open };
+            orders.send(open).map_err(|_closed| thread_ended())?;
+            match replies.recv() {
+                Ok(Reply::Opened(Err(error)))
+                    if error.kind == DeviceErrorKind::Busy && begun.elapsed() < BUSY_PATIENCE =>
+                {
+                    thread::sleep(BUSY_PAUSE);
+                }
+                Ok(Reply::Opened(opened)) => break opened?,
+                Ok(Reply::Done(..)) | Err(_) => return Err(thread_ended()),
             }
         };
         let Opened { frames, chunks, capabilities, tells_time, .. } = opened;
@@ -137,6 +165,7 @@ impl AravisCamera {
             capabilities,
             config: config.clone(),
             facts,
+            reopening: Reopening::new("camera", facts.reopen, shared.clock.clone()),
             shared,
             orders: Some(orders),
             replies,
@@ -162,25 +191,26 @@ impl AravisCamera {
         self.shared.with_model(|model| model.residual_ns())
     }
 
-    /// Lets the owner thread execute a command; gives up if the camera is silent.
-    fn ask(&mut self, command: Command) -> Result<Done, DeviceError> {
-        if matches!(self.link, Link::Lost { .. }) {
-            return Err(lost());
-        }
+    /// Sends a command to the owner thread; the channel has room for it.
+    fn order(&mut self, command: Command) -> Result<(), DeviceError> {
         self.ticket += 1;
         let order = Order { ticket: self.ticket, command };
-        let asked_ns = self.shared.clock.now_ns();
-        if self.orders.as_ref().is_none_or(|orders| orders.try_send(order).is_err()) {
-            return Err(error(
-                DeviceErrorKind::Disconnected,
-                "its thread has ended; the log has its message",
-            ));
+        let sent = self.orders.as_ref().is_some_and(|orders| orders.try_send(order).is_ok());
+        sent.then_some(()).ok_or_else(thread_ended)
+    }
+
+    /// Lets the owner thread execute a command; gives up if the camera is silent.
+    fn ask(&mut self, command: Command) -> Result<Done, DeviceError> {
+        if !matches!(self.link, Link::Up { .. }) {
+            return Err(lost());
         }
+        let asked_ns = self.shared.clock.now_ns();
+        self.order(command)?;
         loop {
             match self.replies.recv_timeout(LOOK) {
                 Ok(Reply::Done(ticket, Err(error))) if ticket == self.ticket => {
                     if matches!(error.kind, DeviceErrorKind::Timeout | DeviceErrorKind::Disconnected) {
-                        self.lose();
+                        self.lose(&error.source)?;
                     }
                     return Err(error);
                 }
@@ -188,16 +218,11 @@ impl AravisCamera {
                 // Reply to an order that was given up.
                 Ok(Reply::Done(..) | Reply::Opened(_)) => {}
                 Err(RecvTimeoutError::Timeout) if self.silent_since(asked_ns) => {
-                    self.lose();
+                    self.lose(&SILENT)?;
                     return Err(lost());
                 }
                 Err(RecvTimeoutError::Timeout) => {}
-                Err(RecvTimeoutError::Disconnected) => {
-                    return Err(error(
-                        DeviceErrorKind::Disconnected,
-                        "its thread has ended; the log has its message",
-                    ));
-                }
+                Err(RecvTimeoutError::Disconnected) => return Err(thread_ended()),
             }
         }
     }
@@ -209,55 +234,55 @@ impl AravisCamera {
             || self.shared.clock.now_ns().saturating_sub(answered_ns.max(since_ns)) > SILENCE_NS
     }
 
-    /// Gives up the camera and has it opened again.
-    fn lose(&mut self) {
-        let link = std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() });
-        if let (Link::Up { frames, .. }, Some(orders)) = (link, &self.orders) {
-            tracing::warn!(camera = self.capabilities.model, "camera lost; opening it again");
-            self.ticket += 1;
-            // The channel has room for this and for the orders before it.
-            let _ = orders.try_send(Order { ticket: self.ticket, command: Command::Reopen(frames) });
+    /// Closes the failed camera, to be opened again, unless it is given up.
+    fn lose(&mut self, cause: &dyn Display) -> Result<(), DeviceError> {
+        if let Link::Up { frames, .. } = std::mem::replace(&mut self.link, Link::Lost) {
+            self.order(Command::Release(frames))?;
         }
+        self.reopening.failed(cause)
     }
 
     /// Waits up to `timeout` for a lost camera to come back; returns `Ok` also if it is still away.
-    fn wait_for_return(&mut self, since: Instant, timeout: Duration) -> Result<(), DeviceError> {
+    fn wait_for_return(&mut self, timeout: Duration) -> Result<(), DeviceError> {
         let until = Instant::now() + timeout;
         loop {
-            match self.replies.recv_timeout(until.saturating_duration_since(Instant::now())) {
-                Ok(Reply::Opened(opened)) => {
-                    let opened = opened?;
-                    if opened.capabilities != self.capabilities {
-                        let what = format!(
-                            "came back as another: {} of {} x {}; end the run and look at it",
-                            opened.capabilities.model, opened.capabilities.height, opened.capabilities.width
-                        );
-                        return Err(error(DeviceErrorKind::Protocol, what));
-                    }
-                    let Opened { frames, chunks, tells_time, armed_ns, .. } = opened;
-                    tracing::warn!(camera = self.capabilities.model, away = ?since.elapsed(), "camera back");
-                    self.link = Link::Up { frames, chunks, tells_time };
-                    self.armed_ns = self.armed_ns.and(armed_ns);
-                    self.resume_ids();
+            let left = until.saturating_duration_since(Instant::now());
+            if let Link::Lost = self.link {
+                self.reopening.sleep(left);
+                if !self.reopening.is_due() {
                     return Ok(());
                 }
+                self.order(Command::Open)?;
+                self.link = Link::Opening;
+                continue;
+            }
+            match self.replies.recv_timeout(left) {
+                Ok(Reply::Opened(Ok(opened))) => return self.resume(opened),
+                Ok(Reply::Opened(Err(error))) => {
+                    self.link = Link::Lost;
+                    self.reopening.failed(&error.source)?;
+                }
                 Ok(Reply::Done(..)) => {}
-                Err(RecvTimeoutError::Timeout) if since.elapsed() > self.facts.reopen => {
-                    let what = format!(
-                        "stopped answering and did not come back within camera.reopen_s = {} s",
-                        self.facts.reopen.as_secs_f64()
-                    );
-                    return Err(error(DeviceErrorKind::Disconnected, what));
-                }
-                Err(RecvTimeoutError::Timeout) => return Ok(()),
-                Err(RecvTimeoutError::Disconnected) => {
-                    return Err(error(
-                        DeviceErrorKind::Disconnected,
-                        "its thread has ended; the log has its message",
-                    ));
-                }
+                // The library may block the owner for longer than the camera may stay away.
+                Err(RecvTimeoutError::Timeout) => return self.reopening.check(),
+                Err(RecvTimeoutError::Disconnected) => return Err(thread_ended()),
             }
         }
+    }
+
+    /// Goes on with a camera that was opened again, if it is the same as before.
+    fn resume(&mut self, opened: Opened) -> Result<(), DeviceError> {
+        let Opened { frames, chunks, capabilities: found, tells_time, armed_ns } = opened;
+        self.link = Link::Up { frames, chunks, tells_time };
+        if found != self.capabilities {
+            return self.lose(&format!(
+                "there is now {} of {} x {} pixels, with other abilities than {}: connect the camera again that the run began with",
+                found.model, found.width, found.height, self.capabilities.model
+            ));
+        }
+        self.armed_ns = self.armed_ns.and(armed_ns);
+        self.resume_ids();
+        Ok(())
     }
 
     /// Evaluates a received frame, of which `bytes` are used; `None` if it is incomplete.
@@ -300,6 +325,7 @@ impl AravisCamera {
         });
         let Some(seq) = self.ids.extend(from.frame_id()) else { return Ok(None) };
         self.losses.whole(seq);
+        self.reopening.delivered();
         self.shared.health.gave_frame(host_ns);
         self.newest = Some(Newest { seq, exposure_start_ns, host_ns, set });
         Ok(Some(FrameStamp { seq, device_ns, exposure_start_ns, host_ns, exposure_us }))
@@ -370,7 +396,7 @@ impl Camera for AravisCamera {
 
     fn state(&self) -> DeviceState {
         match (&self.link, self.armed_ns) {
-            (Link::Lost { .. }, _) => DeviceState::Lost,
+            (Link::Lost | Link::Opening, _) => DeviceState::Lost,
             (Link::Up { .. }, Some(_)) => DeviceState::Streaming,
             (Link::Up { .. }, None) => DeviceState::Ready,
         }
@@ -440,20 +466,16 @@ impl Camera for AravisCamera {
         let until = Instant::now() + timeout;
         loop {
             let left = until.saturating_duration_since(Instant::now());
-            let frames = match &self.link {
-                Link::Lost { since } => {
-                    let since = *since;
-                    self.wait_for_return(since, left)?;
-                    return Ok(None);
-                }
-                Link::Up { frames, .. } => frames,
+            let Link::Up { frames, .. } = &self.link else {
+                self.wait_for_return(left)?;
+                return Ok(None);
             };
             let wait_us = left.min(LOOK).as_micros().try_into().unwrap_or(u64::MAX);
             let popped = frames.pop(wait_us);
             let Some(buffer) = popped else {
                 let alive_ns = self.newest.map_or(armed_ns, |newest| newest.host_ns.max(armed_ns));
                 if self.silent_since(alive_ns) {
-                    self.lose();
+                    self.lose(&SILENT)?;
                 } else if left.is_zero() {
                     return Ok(None);
                 }
@@ -494,9 +516,7 @@ impl Camera for AravisCamera {
 impl Drop for AravisCamera {
     fn drop(&mut self) {
         let Some(orders) = self.orders.take() else { return };
-        if let Link::Up { frames, .. } =
-            std::mem::replace(&mut self.link, Link::Lost { since: Instant::now() })
-        {
+        if let Link::Up { frames, .. } = std::mem::replace(&mut self.link, Link::Lost) {
             let _ = orders.try_send(Order { ticket: 0, command: Command::Close(frames) });
         }
         drop(orders);

@@ -1,8 +1,9 @@
 //! GenICam cameras, GigE Vision and USB3 Vision, through libaravis.
 //!
-//! Two threads share a camera. The *owner*, a thread of the driver's, holds the control channel: it opens the camera, sets it, asks
-//! it for its time, and opens it again when it has stopped answering. Whoever calls [`AravisCamera`] holds the stream of
-//! frames. So a call that a dead camera blocks for seconds, as libaravis' calls do, costs nobody but the owner its time.
+//! Two threads share a camera. The *owner*, a thread of the driver's, holds the control channel: it opens the camera,
+//! sets it and asks it for its time. Whoever calls [`AravisCamera`] holds the stream of frames and decides when a lost
+//! camera is opened again. So a call that a dead camera blocks for seconds, as libaravis' calls do, costs nobody but
+//! the owner its time.
 
 mod chunks;
 mod driver;

@@ -29,14 +29,11 @@ const LONGEST_ASK_PERIOD: Duration = Duration::from_secs(1);
 const FORETOLD: u32 = 8;
 /// Clock readings at first, so that the first frame has a time.
 const FIRST_ASKS: usize = 8;
-/// A killed program keeps the camera until its heartbeat is missed, after 3 s.
-const BUSY_PATIENCE: Duration = Duration::from_secs(5);
-/// Maximum pause between two attempts to open a camera again.
-const LONGEST_PAUSE: Duration = Duration::from_secs(1);
-const SHORTEST_PAUSE: Duration = Duration::from_millis(100);
 
 /// A command to the owner.
 pub enum Command {
+    /// Open the camera, with the settings written last, and start answering triggers if it did before.
+    Open,
     /// Start answering triggers.
     Arm,
     /// Stop answering triggers.
@@ -45,8 +42,8 @@ pub enum Command {
     Configure(CameraSettings),
     /// Let the camera's sequencer step through these settings.
     Sequence(Vec<CameraSettings>),
-    /// The camera is given up: drop its stream and open it again.
-    Reopen(Frames),
+    /// The camera is lost: drop its stream and close it, perhaps to open it again.
+    Release(Frames),
     /// Drop the stream and close the camera for good, as also when the channel closes.
     Close(Frames),
 }
@@ -90,7 +87,7 @@ pub struct Opened {
 
 /// Why serving a camera ended.
 enum Ended {
-    Lost,
+    Released,
     Closed,
 }
 
@@ -128,53 +125,27 @@ struct Connection {
 }
 
 impl Owner {
-    /// Opens the camera, serves it, and opens it again when it was lost, until the driver closes it.
+    /// Opens the camera when asked to and serves it until it is released, until the driver closes it.
     pub fn run(mut self) {
-        let begun = Instant::now();
-        let mut was_open = false;
-        let mut pause = SHORTEST_PAUSE;
-        loop {
-            match self.connect() {
-                Ok((connection, opened)) => {
-                    was_open = true;
-                    pause = SHORTEST_PAUSE;
-                    if self.replies.send(Reply::Opened(Ok(opened))).is_err() {
-                        return;
-                    }
-                    if matches!(self.serve(connection), Ended::Closed) {
-                        return;
-                    }
+        while let Ok(Order { ticket, command }) = self.orders.recv() {
+            let (connection, reply) = match command {
+                Command::Open => match self.connect() {
+                    Ok((connection, opened)) => (Some(connection), Reply::Opened(Ok(opened))),
+                    Err(error) => (None, Reply::Opened(Err(error))),
+                },
+                Command::Close(_) => return,
+                _ => {
+                    let error = DeviceError::new("camera", DeviceErrorKind::Disconnected, "is not open");
+                    (None, Reply::Done(ticket, Err(error)))
                 }
-                Err(error) => {
-                    let is_held = error.kind == DeviceErrorKind::Busy && begun.elapsed() < BUSY_PATIENCE;
-                    if !was_open && !is_held {
-                        // If the receiver is gone, nobody needs the error.
-                        let _ = self.replies.send(Reply::Opened(Err(error)));
-                        return;
-                    }
-                    tracing::debug!(%error, "camera not open yet");
-                    if self.rest(pause) {
-                        return;
-                    }
-                    pause = (2 * pause).min(LONGEST_PAUSE);
-                }
+            };
+            if self.replies.send(reply).is_err() {
+                return;
             }
-        }
-    }
-
-    /// Pauses; returns whether the camera was closed meanwhile.
-    fn rest(&self, pause: Duration) -> bool {
-        let until = Instant::now() + pause;
-        loop {
-            match self.orders.recv_timeout(until.saturating_duration_since(Instant::now())) {
-                Ok(Order { command: Command::Close(_), .. }) | Err(RecvTimeoutError::Disconnected) => {
-                    return true;
-                }
-                Ok(Order { ticket, .. }) => {
-                    let error = DeviceError::new("camera", DeviceErrorKind::NotReady, "is not open");
-                    let _ = self.replies.send(Reply::Done(ticket, Err(error)));
-                }
-                Err(RecvTimeoutError::Timeout) => return false,
+            if let Some(connection) = connection
+                && matches!(self.serve(connection), Ended::Closed)
+            {
+                return;
             }
         }
     }
@@ -258,9 +229,9 @@ impl Owner {
         let (mut asked, mut next_look) = (opened, opened + ASK_PERIOD);
         loop {
             match self.orders.recv_timeout(next_look.saturating_duration_since(Instant::now())) {
-                Ok(Order { command: Command::Reopen(frames), .. }) => {
+                Ok(Order { command: Command::Release(frames), .. }) => {
                     drop(frames);
-                    return Ended::Lost;
+                    return Ended::Released;
                 }
                 Ok(Order { command: Command::Close(frames), .. }) => {
                     let _ = connection.device.execute("AcquisitionStop");
@@ -372,7 +343,7 @@ impl Owner {
                     }
                 }
             }
-            Command::Sequence(_) | Command::Reopen(_) | Command::Close(_) => {}
+            Command::Sequence(_) | Command::Open | Command::Release(_) | Command::Close(_) => {}
         }
         done.written_ns = self.shared.clock.now_ns();
         Ok(done)

@@ -62,6 +62,7 @@ fn refused(path: &Path, what: impl std::fmt::Display) -> DeviceError {
 fn unreadable(path: &Path, error: &io::Error) -> DeviceError {
     let kind = match error.kind() {
         io::ErrorKind::InvalidData | io::ErrorKind::UnexpectedEof => DeviceErrorKind::OutOfRange,
+        io::ErrorKind::PermissionDenied => DeviceErrorKind::NotReady,
         _ => DeviceErrorKind::Disconnected,
     };
     let what =

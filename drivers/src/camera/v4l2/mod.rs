@@ -29,13 +29,8 @@ pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, Opene
 use self::session::{Layout, Session};
 pub use self::setup::V4l2Setup;
 use self::timing::{Exposures, Ids, exposure_start_ns, is_monotonic};
+use crate::reopen::Reopening;
 pub use raysweep_config::rig::v4l2::{TimeControl, V4l2Config};
-
-/// Pause before the second attempt to open a lost camera again; the first is made at once. The pause doubles from
-/// attempt to attempt.
-const FIRST_PAUSE_NS: i64 = 100_000_000;
-/// Maximum pause between attempts.
-const LONGEST_PAUSE_NS: i64 = 2_000_000_000;
 
 /// Opens a camera of this machine's kernel.
 ///
@@ -65,9 +60,9 @@ pub struct V4l2Camera {
     capabilities: CameraCapabilities,
     layout: Layout,
     armed: bool,
-    link: Link,
-    /// Pause before the next attempt if the device is lost; 0 as long as frames arrive.
-    pause_ns: i64,
+    /// The connection to the device; `None` while it is lost.
+    session: Option<Box<Session>>,
+    reopening: Reopening,
     /// The settings written last: requested and applied.
     settings: (CameraSettings, CameraSettings),
     /// The first frame that is certain to have them.
@@ -81,12 +76,6 @@ pub struct V4l2Camera {
     /// Frames that were already complete when settings were written, oldest first.
     waiting: VecDeque<(u64, Filled, i64)>,
     warned_of_clock: bool,
-}
-
-/// The connection to the device.
-enum Link {
-    Open(Box<Session>),
-    Lost { since_ns: i64, next_attempt_ns: i64 },
 }
 
 impl V4l2Camera {
@@ -105,12 +94,12 @@ impl V4l2Camera {
             layout: session.layout(),
             exposures: Exposures::new(settings.exposure_us),
             waiting: VecDeque::with_capacity(setup.config.buffers as usize),
+            reopening: Reopening::new("camera", setup.reopen, clock.clone()),
             opener,
             clock,
             capabilities,
             armed: false,
-            link: Link::Open(session),
-            pause_ns: 0,
+            session: Some(session),
             settings: (settings, settings),
             certain: 0,
             ids: Ids::default(),
@@ -121,16 +110,11 @@ impl V4l2Camera {
         })
     }
 
-    /// Closes the failed device, to be opened again.
-    fn lose(&mut self, cause: &io::Error) {
-        tracing::warn!(%cause, device = %self.setup.config.device.display(), "camera lost; opening it again");
+    /// Closes the failed device, to be opened again, unless it is given up.
+    fn lose(&mut self, cause: &io::Error) -> Result<(), DeviceError> {
         self.waiting.clear();
-        self.schedule_attempt(self.clock.now_ns());
-    }
-
-    fn schedule_attempt(&mut self, since_ns: i64) {
-        self.link = Link::Lost { since_ns, next_attempt_ns: self.clock.now_ns() + self.pause_ns };
-        self.pause_ns = (2 * self.pause_ns).clamp(FIRST_PAUSE_NS, LONGEST_PAUSE_NS);
+        self.session = None;
+        self.reopening.failed(&format!("{}: {cause}", self.setup.config.device.display()))
     }
 
     /// Opens the device in its earlier state: same formats, same settings, and streaming if it was.
@@ -153,22 +137,18 @@ impl V4l2Camera {
         Ok(session)
     }
 
-    /// Tries to open a lost device, at most once, and not before the next attempt is due.
-    fn reopen(&mut self, now_ns: i64) {
-        let Link::Lost { since_ns, next_attempt_ns } = self.link else { return };
-        if now_ns < next_attempt_ns {
-            return;
+    /// Tries to open a lost device if an attempt is due.
+    fn reopen(&mut self) -> Result<(), DeviceError> {
+        if self.session.is_some() || !self.reopening.is_due() {
+            return Ok(());
         }
         match self.reopened() {
             Ok(session) => {
-                tracing::info!(device = %self.setup.config.device.display(), "camera is back");
                 self.resume_ids();
-                self.link = Link::Open(session);
+                self.session = Some(session);
+                Ok(())
             }
-            Err(cause) => {
-                tracing::debug!(%cause, "camera still lost");
-                self.schedule_attempt(since_ns);
-            }
+            Err(error) => self.reopening.failed(&error.source),
         }
     }
 
@@ -187,7 +167,7 @@ impl V4l2Camera {
 
     /// Takes a filled buffer from the kernel, with its id and the time of taking it.
     fn dequeue(&mut self) -> io::Result<Option<(u64, Filled, i64)>> {
-        let Link::Open(session) = &mut self.link else { return Ok(None) };
+        let Some(session) = &mut self.session else { return Ok(None) };
         let Some(filled) = session.node.dequeue()? else { return Ok(None) };
         Ok(Some((self.ids.take(filled.sequence), filled, self.clock.now_ns())))
     }
@@ -209,7 +189,7 @@ impl V4l2Camera {
             Some(frame) => Some(frame),
             None => self.dequeue()?,
         };
-        let (Some((id, filled, dequeued_ns)), Link::Open(session)) = (frame, &mut self.link) else {
+        let (Some((id, filled, dequeued_ns)), Some(session)) = (frame, &mut self.session) else {
             return Ok(None);
         };
         let sound = session.copy(&filled, into)?;
@@ -219,7 +199,7 @@ impl V4l2Camera {
             tracing::debug!(id, flags = filled.flags, bytes = filled.bytes_used, "damaged frame");
             return Ok(None);
         }
-        self.pause_ns = 0;
+        self.reopening.delivered();
         if !is_monotonic(&filled) && !self.warned_of_clock {
             tracing::warn!(
                 flags = filled.flags,
@@ -242,12 +222,11 @@ impl V4l2Camera {
 
     /// Waits for a buffer or the deadline; if the device is lost, for the next attempt to open it.
     fn wait(&mut self, now_ns: i64, deadline_ns: i64) -> io::Result<()> {
-        match &mut self.link {
-            Link::Open(session) => {
-                session.node.wait(Duration::from_nanos((deadline_ns - now_ns).unsigned_abs()))
-            }
-            Link::Lost { next_attempt_ns, .. } => {
-                self.clock.register().sleep_until(deadline_ns.min(*next_attempt_ns));
+        let left = Duration::from_nanos((deadline_ns - now_ns).unsigned_abs());
+        match &mut self.session {
+            Some(session) => session.node.wait(left),
+            None => {
+                self.reopening.sleep(left);
                 Ok(())
             }
         }
@@ -255,13 +234,13 @@ impl V4l2Camera {
 
     /// Writes settings; if the camera refuses them, the old ones are kept.
     fn write(&mut self, wanted: &CameraSettings) -> Result<CameraSettings, DeviceError> {
-        let Link::Open(session) = &mut self.link else { return Err(lost()) };
+        let Some(session) = &mut self.session else { return Err(lost()) };
         let cause = match session.write(wanted) {
             Ok(actual) => return Ok(actual),
             Err(cause) => cause,
         };
         if !matches!(cause.raw_os_error(), Some(EACCES | EBUSY | EINVAL | ERANGE)) {
-            self.lose(&cause);
+            self.lose(&cause)?;
             return Err(kernel_error(cause));
         }
         // The exposure may have been written before the delay was refused. If this fails too, the first error is more
@@ -283,10 +262,7 @@ impl V4l2Camera {
             return Err(error(DeviceErrorKind::Unsupported, what));
         }
         self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
-        match &self.link {
-            Link::Open(session) => Ok(session.nearest(settings)),
-            Link::Lost { .. } => Err(lost()),
-        }
+        self.session.as_ref().map(|session| session.nearest(settings)).ok_or_else(lost)
     }
 }
 
@@ -296,17 +272,17 @@ impl Camera for V4l2Camera {
     }
 
     fn state(&self) -> DeviceState {
-        match (&self.link, self.armed) {
-            (Link::Lost { .. }, _) => DeviceState::Lost,
-            (Link::Open(_), true) => DeviceState::Streaming,
-            (Link::Open(_), false) => DeviceState::Ready,
+        match (&self.session, self.armed) {
+            (None, _) => DeviceState::Lost,
+            (Some(_), true) => DeviceState::Streaming,
+            (Some(_), false) => DeviceState::Ready,
         }
     }
 
     fn configure(&mut self, _id: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
         let wanted = self.nearest(settings)?;
         if let Err(cause) = self.drain() {
-            self.lose(&cause);
+            self.lose(&cause)?;
             return Err(kernel_error(cause));
         }
         if wanted != self.settings.0 {
@@ -326,15 +302,13 @@ impl Camera for V4l2Camera {
         if self.armed {
             return Ok(());
         }
-        let started = match &mut self.link {
-            Link::Open(session) => session.start().map_err(kernel_error),
-            Link::Lost { .. } => self.reopened().and_then(|mut session| {
-                session.start().map_err(kernel_error)?;
-                self.link = Link::Open(session);
-                Ok(())
-            }),
-        };
-        started?;
+        if let Some(session) = &mut self.session {
+            session.start().map_err(kernel_error)?;
+        } else {
+            let mut session = self.reopened()?;
+            session.start().map_err(kernel_error)?;
+            self.session = Some(session);
+        }
         self.ids.stream_begins(self.ids.next());
         self.newest_ns = None;
         self.armed = true;
@@ -360,26 +334,17 @@ impl Camera for V4l2Camera {
         let timeout_ns = i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX);
         let deadline_ns = self.clock.now_ns().saturating_add(timeout_ns);
         loop {
-            self.reopen(self.clock.now_ns());
+            self.reopen()?;
             let now_ns = self.clock.now_ns();
-            if let Link::Lost { since_ns, .. } = self.link
-                && now_ns - since_ns > i64::try_from(self.setup.reopen.as_nanos()).unwrap_or(i64::MAX)
-            {
-                let what = format!(
-                    "was lost and did not come back within camera.reopen_s = {} s",
-                    self.setup.reopen.as_secs_f64()
-                );
-                return Err(error(DeviceErrorKind::Disconnected, what));
-            }
             match self.take(buf) {
                 Ok(Some(stamp)) => return Ok(Some(stamp)),
                 Ok(None) if now_ns >= deadline_ns => return Ok(None),
                 Ok(None) => {
                     if let Err(cause) = self.wait(now_ns, deadline_ns) {
-                        self.lose(&cause);
+                        self.lose(&cause)?;
                     }
                 }
-                Err(cause) => self.lose(&cause),
+                Err(cause) => self.lose(&cause)?,
             }
         }
     }
@@ -393,11 +358,12 @@ impl Camera for V4l2Camera {
         if !std::mem::replace(&mut self.armed, false) {
             return Ok(());
         }
-        let Link::Open(session) = &mut self.link else { return Ok(()) };
-        session.node.stop().map_err(|cause| {
-            self.lose(&cause);
-            kernel_error(cause)
-        })
+        let Some(session) = &mut self.session else { return Ok(()) };
+        if let Err(cause) = session.node.stop() {
+            self.lose(&cause)?;
+            return Err(kernel_error(cause));
+        }
+        Ok(())
     }
 }
 
