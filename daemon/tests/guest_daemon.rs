@@ -7,14 +7,16 @@
 
 #[path = "../../drivers/tests/guest/mod.rs"]
 mod guest;
+mod process;
 
 use std::fs::File;
 use std::path::PathBuf;
-use std::process::{Child, Command};
+use std::process::Command;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use guest::wait_for;
+use process::Process;
 use raysweep_core::{Edge, LossCause, Vsync};
 use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig};
 use raysweep_proto::{Client, Event, RunParams};
@@ -94,15 +96,9 @@ fn lateness_us() -> f64 {
 
 /// A daemon with its analyser, in a temporary folder.
 struct Lab {
+    // Dropped before the folder.
+    _daemon: Process,
     folder: TempDir,
-    daemon: Child,
-}
-
-impl Drop for Lab {
-    fn drop(&mut self) {
-        let _ = self.daemon.kill();
-        let _ = self.daemon.wait();
-    }
 }
 
 impl Lab {
@@ -118,17 +114,16 @@ impl Lab {
         std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
         let program = std::env::current_exe().unwrap().with_file_name("raysweepd");
         let path = |name: &str| folder.path().join(name);
-        let daemon = Command::new(program)
+        let mut command = Command::new(program);
+        command
             .arg("--rig")
             .arg(path("rig.toml"))
             .arg("--socket")
             .arg(path("socket"))
             .arg("--data")
             .arg(path("sessions"))
-            .stderr(File::create(path("log")).unwrap())
-            .spawn()
-            .unwrap();
-        Self { folder, daemon }
+            .stderr(File::create(path("log")).unwrap());
+        Self { _daemon: Process::start(&mut command), folder }
     }
 
     fn path(&self, name: &str) -> PathBuf {

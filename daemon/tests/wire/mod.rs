@@ -4,13 +4,17 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on may panic")]
 
+#[path = "../process/mod.rs"]
+mod process;
+
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use ndarray::Axis;
 use nix::sched::{CloneFlags, unshare};
+use process::Process;
 use raysweep::rig::Rig;
 use raysweep_config::{FilmPlan, Plan, Procedure};
 use raysweep_core::{CameraSettings, Counts, FramePool, Pattern, SettingsId, Shutter, ns_from_us};
@@ -74,7 +78,7 @@ impl Sweep<'_> {
         std::fs::write(&rig, self.rig()).unwrap();
         let mut arguments = vec!["--rig", rig.to_str().unwrap()];
         arguments.extend(self.faults.iter().flat_map(|fault| ["--fault", fault]));
-        let _camera = Process::start(env!("CARGO_BIN_EXE_raysweep-sim-camera"), &arguments);
+        let _camera = start(env!("CARGO_BIN_EXE_raysweep-sim-camera"), &arguments);
         let bench = folder.path().join("bench.sock");
         let mut probe = wait_for("the camera does not start", || BenchProbe::open(&bench).ok());
         let session = self.run_daemon(folder.path(), &mut probe);
@@ -129,7 +133,7 @@ impl Sweep<'_> {
         let (rig, socket, data) = (folder.join("rig.toml"), folder.join("socket"), folder.join("sessions"));
         let arguments = [("--rig", &rig), ("--socket", &socket), ("--data", &data)];
         let arguments = arguments.iter().flat_map(|(flag, path)| [*flag, path.to_str().unwrap()]);
-        let _daemon = Process::start(env!("CARGO_BIN_EXE_raysweepd"), &arguments.collect::<Vec<_>>());
+        let _daemon = start(env!("CARGO_BIN_EXE_raysweepd"), &arguments.collect::<Vec<_>>());
         let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
         let events = Client::connect(&socket).unwrap().subscribe().unwrap();
         client.run(&RunParams { plan: self.plan(), ..RunParams::default() }).unwrap();
@@ -225,22 +229,8 @@ fn assert_camera_is_left_as_set(rig: &Rig, plan: &FilmPlan) {
     assert!(lines.iter().all(|line| found.contains(line)), "{lines:?}: {found}");
 }
 
-/// A process that is killed at the end of the test.
-struct Process(Child);
-
-impl Process {
-    fn start(program: &str, arguments: &[&str]) -> Self {
-        let mut command = Command::new(program);
-        command.args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
-        Self(command.spawn().unwrap())
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
+fn start(program: &str, arguments: &[&str]) -> Process {
+    Process::start(Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()))
 }
 
 /// Waits until `look` returns a value.
