@@ -10,11 +10,12 @@ use ndarray::{Array2, Array3};
 use rayon::prelude::*;
 
 use super::dipole::{Dipole, WAX, fresnel_transmittance};
+use super::object::{Direct, Object};
 use super::projector::{PROJECTOR_TAN, ProjectorFrame, ROW_PITCH_MM, projector_cos};
 use super::quadrature::{cell_rule, offset_rule};
+use super::size::SceneSize;
 use super::texture::{Dice, noise, printed_page};
 use super::translucent::Strip;
-use super::{Direct, Object, SceneSize};
 
 /// Albedo of the matte reflection at the wax surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.04;

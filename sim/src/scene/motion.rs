@@ -2,10 +2,10 @@
 
 use raysweep_core::ns_from_us;
 
-use super::{MAX_ENTRIES, MONO, Scene, SceneError, SceneSize};
-
-/// Names of the built-in scenes that move.
-pub const MOVING_NAMES: [&str; 2] = ["pendulum", "moving-candle"];
+use super::error::SceneError;
+use super::names::MOVING_NAMES;
+use super::size::{MAX_ENTRIES, SceneSize};
+use super::{MONO, Scene};
 
 /// Number of key positions, from one end of the swing to the other, in which a moving scene is computed.
 const KEYS: usize = 16;
@@ -34,7 +34,7 @@ impl Motion {
 
 impl Scene {
     /// Computes a built-in scene in mono at each of its key positions, from one end of its swing to the other: one for
-    /// [`super::BUILTIN_NAMES`], several for [`MOVING_NAMES`].
+    /// [`BUILTIN_NAMES`](super::BUILTIN_NAMES), several for [`MOVING_NAMES`].
     ///
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`], [`SceneError::MovingSize`].

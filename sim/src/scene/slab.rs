@@ -9,11 +9,12 @@ use ndarray::{Array2, Array3, s};
 use rayon::prelude::*;
 
 use super::dipole::{Dipole, MEASURED, Material, fresnel_transmittance};
+use super::object::{Direct, Object};
 use super::projector::{ProjectorFrame, ROW_PITCH_MM, projector_cos};
 use super::quadrature::offset_rule;
+use super::size::SceneSize;
 use super::texture::noise;
 use super::translucent::Strip;
-use super::{Direct, Object, SceneSize};
 
 /// Albedo of the matte reflection at the surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.03;

@@ -3,7 +3,7 @@
 use ndarray::{Array2, Array3, ArrayViewMut2, ArrayViewMut3, ArrayViewMut4, Axis, Zip, s};
 use rayon::prelude::*;
 
-use super::Indirect;
+use super::object::Indirect;
 use super::projector::PatternPart;
 
 /// Projector rows per work item; fixed, so that the sums do not depend on the number of threads.

@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use super::GuestTest;
 use super::kernel::Kernel;
+use super::table::GuestTest;
 use crate::run::Done;
 
 /// HPET clock source: on a busy host the kernel misjudges the TSC's rate, and the guest's time then runs several times
