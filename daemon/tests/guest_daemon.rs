@@ -23,7 +23,7 @@ use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
-use raysweep_sim::usb::{Fx2Faults, Fx2Lafw as Analyser, Plugged, Signal};
+use raysweep_sim::usb::{Fx2Analyser, Fx2Faults, Plugged, Signal};
 use tempfile::TempDir;
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
@@ -61,7 +61,7 @@ fn signal(missing: f64, false_edges: f64) -> Signal {
 
 /// Plugs in an analyser whose thread, since it represents a device, has priority over the guest's computations.
 fn plug(signal: Signal) -> (Plugged, Fx2Faults) {
-    let (analyser, faults) = Analyser::new(signal, 20.0);
+    let (analyser, faults) = Fx2Analyser::new(signal, 20.0);
     let plugged = std::thread::spawn(|| {
         let priority = ThreadPriorityValue::try_from(80).map(ThreadPriority::Crossplatform).unwrap();
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);

@@ -23,7 +23,9 @@ use raysweep_drivers::mirror::{Parked, park};
 use raysweep_pipeline::Registry;
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
 use raysweep_proto::{Client, Event, RunParams, RunState};
-use raysweep_sim::mirror::{Held, Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
+use raysweep_sim::mirror::{
+    Held, MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults,
+};
 use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
 use tempfile::TempDir;
 
@@ -43,8 +45,8 @@ struct Lab {
 
 impl Lab {
     fn new() -> Self {
-        let controller = PlayzerXController::new(PlayzerXConfig::default());
-        let pty = MirrorPty::plug(controller, Link::VirtualCom, WireFaults::default()).unwrap();
+        let controller = PlayzerXController::new(PlayzerXControllerConfig::default());
+        let pty = MirrorPty::plug(controller, SerialLink::VirtualCom, WireFaults::default()).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let rig = format!(
             "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"playzerx\"\nport = \"{}\"\n\

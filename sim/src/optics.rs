@@ -10,10 +10,10 @@ use raysweep_core::{Mosaic, Raster};
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::scene::Scene;
-use raysweep_config::sim::{Beam, RowTable, SimProjector, Spot};
+use raysweep_config::sim::{RowTable, SimBeam, SimProjector, SimSpot};
 
 /// A scene under a raster projector, prepared so that an exposure takes two look-ups per camera row.
-pub struct Optics {
+pub struct RasterOptics {
     /// Start of each drawn row's light after the VSYNC edge, and the last row's end. Drawn rows are the scene's rows
     /// and those next to them whose beam reaches it.
     row_starts_us: Vec<f64>,
@@ -40,7 +40,7 @@ struct Flashes {
     pattern: Vec<f32>,
 }
 
-impl Optics {
+impl RasterOptics {
     /// Prepares `scene` under `pattern`, which has one weight per projector row.
     ///
     /// # Errors
@@ -66,10 +66,12 @@ impl Optics {
         let pattern = pattern[first_drawn..end_drawn].to_vec();
 
         let direct = match projector.spot {
-            Spot::Uniform => None,
-            Spot::OneWay | Spot::Bidirectional => Some(Array2::from_shape_fn((height, width), |(t, s)| {
-                if t < rows { transport[[t, t, s]] } else { 0.0 }
-            })),
+            SimSpot::Uniform => None,
+            SimSpot::OneWay | SimSpot::Bidirectional => {
+                Some(Array2::from_shape_fn((height, width), |(t, s)| {
+                    if t < rows { transport[[t, t, s]] } else { 0.0 }
+                }))
+            }
         };
         let mut cumulative = Array3::<f32>::zeros((height, pattern.len() + 1, width));
         cumulative.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
@@ -96,7 +98,7 @@ impl Optics {
                 Array2::from_shape_fn((height, width), |(_, s)| (s as f32 + 0.5) / width as f32)
             }),
             beam,
-            bidirectional: projector.spot == Spot::Bidirectional,
+            bidirectional: projector.spot == SimSpot::Bidirectional,
             first_drawn,
             scene_offset,
             pattern,
@@ -251,14 +253,14 @@ pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64
 }
 
 /// Row offsets that a row's beam reaches and the fraction of light at each; the fractions sum to 1.
-fn beam_weights(beam: &Beam) -> Result<Vec<(isize, f32)>, SimError> {
+fn beam_weights(beam: &SimBeam) -> Result<Vec<(isize, f32)>, SimError> {
     let weights: Vec<(isize, f64)> = match *beam {
-        Beam::Ideal => vec![(0, 1.0)],
-        Beam::Gaussian { sigma_rows } if sigma_rows > 0.0 && sigma_rows <= 100.0 => {
+        SimBeam::Ideal => vec![(0, 1.0)],
+        SimBeam::Gaussian { sigma_rows } if sigma_rows > 0.0 && sigma_rows <= 100.0 => {
             let reach = (5.0 * sigma_rows).ceil() as isize;
             (-reach..=reach).map(|d| (d, (-(d as f64 / sigma_rows).powi(2) / 2.0).exp())).collect()
         }
-        Beam::FlatTop { up_rows, down_rows }
+        SimBeam::FlatTop { up_rows, down_rows }
             if up_rows >= 0.0
                 && down_rows >= 0.0
                 && up_rows + down_rows > 0.0

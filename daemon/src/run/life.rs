@@ -30,11 +30,11 @@ pub struct Foreseen {
     /// Advice for the user if memory is insufficient.
     pub instead: &'static str,
     /// The procedure that carries it out.
-    pub procedure: Box<dyn Procedure>,
+    pub procedure: Box<dyn Measurement>,
 }
 
 /// The part of a run that differs between procedures.
-pub trait Procedure: Send {
+pub trait Measurement: Send {
     /// Adds what is computed only on request: a run must not wait for it.
     fn advise(&self, _report: &mut CheckReport) {}
 
@@ -93,7 +93,7 @@ pub struct Ended {
 
 /// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon
 /// stuck.
-pub fn conduct(procedure: Box<dyn Procedure>, run: Run, points: usize) {
+pub fn conduct(procedure: Box<dyn Measurement>, run: Run, points: usize) {
     let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
     tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
     let ended = catch_unwind(AssertUnwindSafe(|| procedure.measure(run)))

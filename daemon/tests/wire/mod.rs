@@ -24,7 +24,7 @@ use raysweep_session::ledger::EndEntry;
 use raysweep_session::stack::ArrayName;
 use raysweep_sim::bench::BenchProbe;
 use raysweep_sim::gige::{Faults, WireTruth};
-use raysweep_sim::{Devices, PlaneRig};
+use raysweep_sim::{PlaneDevices, PlaneRig};
 
 /// Time from the simulated camera's trigger to its exposure at zero delay.
 const LATENCY_US: f64 = 8.0;
@@ -282,7 +282,7 @@ fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &FilmPlan) {
 /// Counts of one frame of the simulated camera, without network and daemon.
 fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -> Vec<u32> {
     let scene: &PlaneRig = rig.simulated().unwrap();
-    let Devices { mut camera, mut projector, vsync, .. } = scene.open();
+    let PlaneDevices { mut camera, mut projector, vsync, .. } = scene.open();
     // Virtual time waits for every device.
     drop(vsync);
     let (raster, format) = (rig.file.raster(), camera.capabilities().format);

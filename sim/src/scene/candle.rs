@@ -15,7 +15,7 @@ use super::projector::{PROJECTOR_TAN, ProjectorFrame, ROW_PITCH_MM, projector_co
 use super::quadrature::{cell_rule, offset_rule};
 use super::size::SceneSize;
 use super::texture::{Dice, noise, printed_page};
-use super::translucent::Strip;
+use super::translucent::TranslucentStrip;
 
 /// Albedo of the matte reflection at the wax surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.04;
@@ -127,7 +127,7 @@ fn cos_to_projector(angle: f64) -> f64 {
     (angle - PROJECTOR_TAN.atan()).cos()
 }
 
-fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usize]) -> Strip {
+fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usize]) -> TranslucentStrip {
     let first = (candle.axis_x - candle.radius).floor().max(0.0) as usize;
     let end = ((candle.axis_x + candle.radius).ceil() as usize).min(size.columns);
     let cells = ((PI * candle.radius).round() as usize).max(8);
@@ -154,7 +154,7 @@ fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usiz
         frame.column(x, z)
     };
     let centres: Vec<f64> = (0..cells).map(cell_centre).collect();
-    Strip {
+    TranslucentStrip {
         column: first,
         kernel: bands
             .iter()

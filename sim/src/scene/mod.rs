@@ -32,10 +32,10 @@ use std::path::Path;
 use ndarray::{Array2, Array3, Array4, ArrayView2, Axis, s};
 
 pub use error::SceneError;
-pub use motion::Motion;
+pub use motion::SceneMotion;
 pub use names::{BUILTIN_NAMES, MOVING_NAMES};
 use object::Panel;
-use projector::Pattern;
+use projector::ColumnPattern;
 pub use size::{MAX_ENTRIES, MIN_SIDE, SceneSize, Window};
 pub use slab::slab_materials;
 
@@ -218,7 +218,7 @@ impl Scene {
             return Err(SceneError::RowsOnly { columns: pattern.ncols() });
         }
         let (height, width) = self.size();
-        let pattern = Pattern::new(pattern);
+        let pattern = ColumnPattern::new(pattern);
         let mut image = Array3::zeros((height, width, self.channels()));
         for panel in &self.panels {
             let part = pattern.part(panel.rows(), panel.projector_columns.clone());

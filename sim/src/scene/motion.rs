@@ -12,13 +12,13 @@ const KEYS: usize = 16;
 
 /// Maps time to the key positions of a scene. A scene at rest has one.
 #[derive(Debug, Clone, Copy)]
-pub struct Motion {
+pub struct SceneMotion {
     keys: usize,
     /// Full period, there and back.
     period_ns: i64,
 }
 
-impl Motion {
+impl SceneMotion {
     /// A motion over `keys` positions with a full period of `period_s`.
     pub fn new(keys: usize, period_s: f64) -> Self {
         Self { keys, period_ns: ns_from_us(period_s * 1e6).max(1) }
@@ -58,12 +58,12 @@ mod tests {
 
     #[test]
     fn a_motion_goes_there_and_back_through_every_key() {
-        let motion = Motion::new(4, 8.0);
+        let motion = SceneMotion::new(4, 8.0);
         let keys: Vec<usize> =
             (0..16).map(|second| motion.key(second * 1_000_000_000 + 500_000_000)).collect();
         assert_eq!(keys, [0, 1, 2, 3, 3, 2, 1, 0, 0, 1, 2, 3, 3, 2, 1, 0]);
         assert_eq!(motion.key(-500_000_000), 0, "clocks may read anything");
-        assert_eq!(Motion::new(1, 4.0).key(1_234_567), 0);
+        assert_eq!(SceneMotion::new(1, 4.0).key(1_234_567), 0);
     }
 
     #[test]

@@ -61,7 +61,10 @@ impl Graph {
                 let name: PathBuf = child.iter().collect();
                 let files = [name.with_extension("rs"), name.join("mod.rs")];
                 let file = files.into_iter().find(|file| text(file).is_some());
-                open.push((child, file.unwrap_or_else(|| panic!("no file has the module {}", name.display()))));
+                open.push((
+                    child,
+                    file.unwrap_or_else(|| panic!("no file has the module {}", name.display())),
+                ));
             }
         }
         Self { modules }
@@ -80,9 +83,9 @@ impl Graph {
 
     /// Names of structs, enums, traits and unions that are visible beyond their file, with the file.
     pub fn visible_types(&self) -> impl Iterator<Item = (&str, &Path)> {
-        self.modules.values().flat_map(|module| {
-            module.visible_types.iter().map(|name| (name.as_str(), module.file.as_path()))
-        })
+        self.modules
+            .values()
+            .flat_map(|module| module.visible_types.iter().map(|name| (name.as_str(), module.file.as_path())))
     }
 
     /// The module that defines the item that a path names in this module. `None` if the path names a module, something

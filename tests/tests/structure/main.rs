@@ -166,6 +166,29 @@ fn files_import_each_other_in_no_large_circle_and_in_none_between_folders() {
     assert!(files > 200, "only {files} files were read");
 }
 
+/// Names that several types may share, and why.
+const SHARED_NAMES: [(&str, &str); 1] =
+    [("Error", "what can go wrong in a module; its users write `module::Error`")];
+
+/// Types of the same name that are visible beyond their files, each with those files.
+fn doubles(graphs: &BTreeMap<String, Graph>) -> Vec<String> {
+    let mut files: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    for (crate_name, graph) in graphs {
+        for (name, file) in graph.visible_types() {
+            files.entry(name).or_default().push(format!("{crate_name}/src/{}", file.display()));
+        }
+    }
+    files.retain(|name, files| files.len() > 1 && SHARED_NAMES.iter().all(|(shared, _)| shared != name));
+    files.into_iter().map(|(name, files)| format!("{name}: {}", files.join(", "))).collect()
+}
+
+#[test]
+fn no_two_types_that_others_see_have_the_same_name() {
+    let graph = |(name, folder): (String, PathBuf)| (name, Graph::read(&folder.join("src")));
+    let doubles = doubles(&crates().into_iter().map(graph).collect());
+    assert!(doubles.is_empty(), "rename all but one of each:\n{}", doubles.join("\n"));
+}
+
 /// The imports between the daemon's folders that are not allowed.
 fn forbidden_imports(graph: &Graph) -> Vec<String> {
     let procedure = |file: &Path| {
@@ -229,6 +252,21 @@ fn broken_rules_are_found() {
         imports,
         ["procedure/film/mod.rs imports procedure/sweep/mod.rs", "run/mod.rs imports procedure/sweep/mod.rs"]
     );
+}
+
+#[test]
+fn doubles_are_found() {
+    let one = Graph::of(&[
+        ("lib.rs", "pub mod a; mod b; pub struct Error;"),
+        ("a.rs", "pub struct Line; struct Own; pub enum Kind { Line } mod c { pub trait Deep {} }"),
+        (
+            "b.rs",
+            "pub(super) union Line { x: u8 } struct Own; #[cfg(test)] pub struct Kind; pub type Deep = u8;",
+        ),
+    ]);
+    let two = Graph::of(&[("lib.rs", "pub(crate) trait Deep {} pub struct Error; pub fn Line() {}")]);
+    let doubles = doubles(&[("one".to_owned(), one), ("two".to_owned(), two)].into());
+    assert_eq!(doubles, ["Deep: one/src/a.rs, two/src/lib.rs", "Line: one/src/a.rs, one/src/b.rs"]);
 }
 
 /// What `x/mod.rs` names, if this is its text beside two children, a module `other` and the crate's root.

@@ -19,7 +19,7 @@ use std::time::Instant;
 
 use crate::packages;
 use crate::run::{Done, cargo, target};
-use kernel::Kernel;
+use kernel::GuestKernel;
 use table::{GuestTest, TESTS};
 
 /// Runs the given tests, or all.
@@ -27,7 +27,7 @@ pub fn guest(names: &[&str]) -> Done {
     let tests = chosen(names)?;
     packages::install()?;
     let folder = target().join("guest");
-    let kernel = Kernel::fetch(&folder)?;
+    let kernel = GuestKernel::fetch(&folder)?;
     let executables = build(&tests)?;
     let began = Instant::now();
     let run = folder.join("run");

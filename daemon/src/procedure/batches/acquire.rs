@@ -14,7 +14,7 @@ use raysweep_session::dots::RawFrames;
 use raysweep_session::ledger::Ledger;
 use raysweep_transport::dots::{DotsError, FlatField};
 
-use super::sink::{BatchSink, RawSink, Stored, Writing};
+use super::sink::{BatchSink, RawSink, StoredBatches, Writing};
 use crate::devices::dots::camera::Refused;
 use crate::devices::dots::motion::Motion;
 use crate::devices::dots::play::Player;
@@ -99,7 +99,7 @@ pub fn acquire(
     if let Err(error) = camera.disarm() {
         tracing::warn!(%error, "camera not disarmed");
     }
-    let Stored { ledger, problems, error } = storage.finish()?;
+    let StoredBatches { ledger, problems, error } = storage.finish()?;
     let fault = error.map(RunError::from).or(passed.err());
     Ok(Acquired { session: run.session, ledger, problems, fault })
 }

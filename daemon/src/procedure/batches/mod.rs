@@ -18,7 +18,7 @@ use self::acquire::{Acquired, acquire};
 use crate::procedure::lab::Lab;
 use crate::rig::DotRig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 
 /// A run of batches on a rig.
 struct BatchesRun {
@@ -54,7 +54,7 @@ pub fn foresee(
     })
 }
 
-impl Procedure for BatchesRun {
+impl Measurement for BatchesRun {
     fn keep(&self, session: &Session) -> Result<(), RpcError> {
         keep_patterns(session, &self.task).map_err(|error| RpcError::new(ErrorCode::InvalidPlan, error))?;
         match &self.task.predistortion {

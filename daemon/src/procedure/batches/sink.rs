@@ -39,7 +39,7 @@ pub struct BatchSink {
 }
 
 /// Result of the writer.
-pub struct Stored {
+pub struct StoredBatches {
     /// The ledger, still locked.
     pub ledger: Ledger,
     /// Problems with single dots.
@@ -103,11 +103,11 @@ impl BatchSink {
     ///
     /// # Errors
     /// When the writer panicked.
-    pub fn finish(self) -> Result<Stored, PipelineError> {
+    pub fn finish(self) -> Result<StoredBatches, PipelineError> {
         drop(self.items);
         let Writer { writing, problems, error, .. } =
             self.thread.join().map_err(|_panic| PipelineError::Panicked("dots-writer"))?;
-        Ok(Stored { ledger: writing.ledger, problems, error })
+        Ok(StoredBatches { ledger: writing.ledger, problems, error })
     }
 }
 

@@ -17,7 +17,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 use crate::run::progress::ProgressMeter;
 
 /// Capacity of the queue of images between the assembler and the disk.
@@ -54,7 +54,7 @@ pub fn foresee(
     })
 }
 
-impl Procedure for DarksRun {
+impl Measurement for DarksRun {
     fn measure(self: Box<Self>, mut run: Run) -> Result<Ended, RunError> {
         run.note_beginning()?;
         let Self { rig, darks } = *self;

@@ -25,7 +25,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
 use crate::rig::{Pace, Rig};
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
@@ -63,7 +63,7 @@ pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Res
     })
 }
 
-impl Procedure for FilmRun {
+impl Measurement for FilmRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let orders = run.orders.clone();
         let acquired = self.acquire(run)?;

@@ -14,7 +14,7 @@ use self::acquire::{Recorded, acquire};
 use crate::procedure::lab::Lab;
 use crate::rig::DotRig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry};
 
 /// A mirror's chirps on a rig.
 struct ResponseRun {
@@ -45,7 +45,7 @@ pub fn foresee(
     })
 }
 
-impl Procedure for ResponseRun {
+impl Measurement for ResponseRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let Self { rig, task } = *self;
         let data = run.data.clone();

@@ -23,7 +23,7 @@ use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::Lab;
 use crate::rig::Rig;
 use crate::run::error::RunError;
-use crate::run::life::{Ended, Foreseen, Procedure, Run, end_entry, end_state};
+use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
 use crate::run::orders::Orders;
 use crate::run::progress::ProgressMeter;
 
@@ -79,7 +79,7 @@ pub fn foresee(
     })
 }
 
-impl Procedure for SweepRun {
+impl Measurement for SweepRun {
     fn advise(&self, report: &mut CheckReport) {
         match advice::advise(&self.sweep, &self.rig.file, &self.camera) {
             Ok(advice) => report.advice = Some(advice),
