@@ -41,28 +41,26 @@ struct Flashes {
 }
 
 impl RasterOptics {
-    /// Prepares `scene` under `pattern`, which has one weight per projector row.
+    /// Prepares `scene` under `pattern`, which has one weight per projector row, drawn at the times of the row table.
     ///
     /// # Errors
-    /// When the scene does not fit the projector or the row table is not increasing.
+    /// When the beam's profile is out of range.
     pub fn new(
         scene: &Scene,
-        raster: &Raster,
+        mosaic: Mosaic,
         first_row: usize,
         projector: &SimProjector,
+        row_table: &[f64],
         pattern: &[f32],
-        seed: u64,
-        mosaic: Mosaic,
     ) -> Result<Self, SimError> {
         let transport = filtered(scene, mosaic);
         let (rows, height, width) = transport.dim();
-        let table = row_table(raster, &projector.row_table, seed)?;
         let beam = beam_weights(&projector.beam)?;
         let beam_rows = beam.iter().map(|(offset, _)| offset.unsigned_abs()).max().unwrap_or(0);
         let first_drawn = first_row.saturating_sub(beam_rows);
-        let end_drawn = (first_row + rows + beam_rows).min(raster.rows);
+        let end_drawn = (first_row + rows + beam_rows).min(pattern.len());
         let scene_offset = first_row - first_drawn;
-        let row_starts_us = table[first_drawn..=end_drawn].to_vec();
+        let row_starts_us = row_table[first_drawn..=end_drawn].to_vec();
         let pattern = pattern[first_drawn..end_drawn].to_vec();
 
         let direct = match projector.spot {

@@ -8,7 +8,7 @@ use raysweep_core::{CameraCapabilities, Pattern, PixelFormat, Raster, Shutter, n
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::line::{Exposure, LineConfig, Shown};
-use crate::optics::RasterOptics;
+use crate::optics::{RasterOptics, row_table};
 use crate::scene::{Scene, SceneMotion};
 use crate::sensor::ImageSensor;
 
@@ -49,11 +49,10 @@ impl PlaneWorld {
     pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
         let rows = self.setup.raster.rows;
         let build = |weights: &[f32]| {
-            let mosaic = self.format.mosaic;
-            let (raster, projector) = (&self.setup.raster, &self.config.projector);
+            let (mosaic, projector) = (self.format.mosaic, &self.config.projector);
+            let table = row_table(&self.setup.raster, &projector.row_table, self.config.seed)?;
             let optics = |scene| {
-                RasterOptics::new(scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)
-                    .map(Arc::new)
+                RasterOptics::new(scene, mosaic, self.first_row, projector, &table, weights).map(Arc::new)
             };
             self.scenes.iter().map(optics).collect::<Result<Shown, SimError>>()
         };

@@ -164,8 +164,9 @@ impl LiveFile {
         slots.bytes.extend(image.iter().flat_map(|pixel| pixel.to_le_bytes()));
         let (index, sequence) = (slots.next(), slots.sequence + 1);
         let lock = slots.held[index].lock + 2;
-        let header =
-            header(name, image.shape(), lock, sequence, metadata.len(), &slots.bytes, self.offset_of(index));
+        let contents =
+            Contents { name, shape: image.shape(), metadata_bytes: metadata.len(), bytes: &slots.bytes };
+        let header = contents.header(lock, sequence, self.offset_of(index));
         self.write_slot(index, &header, &slots.bytes).map_err(LiveError::io("write", &self.path))?;
         slots.sequence = sequence;
         slots.held[index] = Held { lock, sequence, name: name.into() };
@@ -234,34 +235,41 @@ fn remove_stale(path: &Path) -> Result<(), LiveError> {
     }
 }
 
-/// A slot's header; `bytes` are metadata, padding and pixels, `at` is where the slot starts.
-fn header(
-    name: &str,
-    shape: &[usize],
-    lock: u64,
-    sequence: u64,
+/// What a slot holds behind its header.
+struct Contents<'a> {
+    name: &'a str,
+    shape: &'a [usize],
     metadata_bytes: usize,
-    bytes: &[u8],
-    at: u64,
-) -> [u8; SLOT_HEADER_BYTES] {
-    let metadata_at = at + SLOT_HEADER_BYTES as u64;
-    let mut checksum = Hasher::new();
-    checksum.update(&bytes[..metadata_bytes]);
-    checksum.update(&bytes[METADATA_BYTES..]);
-    let mut header = [0; SLOT_HEADER_BYTES];
-    let mut put = |offset: usize, field: &[u8]| header[offset..offset + field.len()].copy_from_slice(field);
-    put(0, &lock.to_le_bytes());
-    put(8, &sequence.to_le_bytes());
-    put(16, &host_ns().to_le_bytes());
-    put(24, &(metadata_at + METADATA_BYTES as u64).to_le_bytes());
-    put(32, &metadata_at.to_le_bytes());
-    put(40, &(metadata_bytes as u32).to_le_bytes());
-    put(44, &checksum.finalize().to_le_bytes());
-    put(48, &DTYPE);
-    put(52, &(shape.len() as u32).to_le_bytes());
-    shape.iter().enumerate().for_each(|(axis, &len)| put(56 + 8 * axis, &(len as u64).to_le_bytes()));
-    put(88, name.as_bytes());
-    header
+    /// Metadata, padding and pixels.
+    bytes: &'a [u8],
+}
+
+impl Contents<'_> {
+    /// The header of a slot that starts at `at`.
+    fn header(&self, lock: u64, sequence: u64, at: u64) -> [u8; SLOT_HEADER_BYTES] {
+        let metadata_at = at + SLOT_HEADER_BYTES as u64;
+        let mut checksum = Hasher::new();
+        checksum.update(&self.bytes[..self.metadata_bytes]);
+        checksum.update(&self.bytes[METADATA_BYTES..]);
+        let mut header = [0; SLOT_HEADER_BYTES];
+        let mut put =
+            |offset: usize, field: &[u8]| header[offset..offset + field.len()].copy_from_slice(field);
+        put(0, &lock.to_le_bytes());
+        put(8, &sequence.to_le_bytes());
+        put(16, &host_ns().to_le_bytes());
+        put(24, &(metadata_at + METADATA_BYTES as u64).to_le_bytes());
+        put(32, &metadata_at.to_le_bytes());
+        put(40, &(self.metadata_bytes as u32).to_le_bytes());
+        put(44, &checksum.finalize().to_le_bytes());
+        put(48, &DTYPE);
+        put(52, &(self.shape.len() as u32).to_le_bytes());
+        self.shape
+            .iter()
+            .enumerate()
+            .for_each(|(axis, &len)| put(56 + 8 * axis, &(len as u64).to_le_bytes()));
+        put(88, self.name.as_bytes());
+        header
+    }
 }
 
 /// The side of the blocks that an image must be averaged over to have at most `pixels` pixels.

@@ -187,163 +187,177 @@ pub const CHUNKS: [&str; 4] = ["ExposureTime", "Timestamp", "FrameID", "Sequence
 
 /// Returns the feature table of a camera with these capabilities.
 pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
-    use RegisterAccess::{Command, ReadOnly, ReadWrite, ReadWriteIdle};
-    let (width, height) = (camera.width as u32, camera.height as u32);
-    let whole = |min, max, step, max_in| Kind::Integer { min, max, step, max_in };
-    let one_of = |entries: &[&str]| {
-        Kind::Enumeration(entries.iter().map(|entry| (*entry).to_owned()).zip(0..).collect())
-    };
-    let exposure =
-        Kind::Float { min: *camera.exposure_us.start(), max: *camera.exposure_us.end(), unit: "us" };
-    let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
-    let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
-    let mosaic = camera.format.mosaic;
-    // A region that starts in the middle of a 2 x 2 cell would change the mosaic.
-    let offset_step = if mosaic == Mosaic::Mono { 1 } else { 2 };
-    let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
-    let formats = formats.filter_map(|format| Some((format.to_string(), format.pfnc()?)));
-    let formats = Kind::Enumeration(formats.collect());
+    [bootstrap(), image(camera), acquisition(camera), chunks_and_user_sets(), sequencer()].concat()
+}
 
-    let device = Some("DeviceControl");
-    let transport = Some("TransportLayerControl");
-    let image = Some("ImageFormatControl");
-    let acquisition = Some("AcquisitionControl");
-    let chunks = Some("ChunkDataControl");
-    let user_sets = Some("UserSetControl");
-    let sequencer = Some("SequencerControl");
-    let set = whole(0, SEQUENCER_SETS as u32 - 1, 1, None);
-    let standard =
-        |id, address, category, access, kind| Feature { id, category, address, access, kind, initial: 0 };
-    let maker = |id, category, access, kind, initial| {
-        let address = MAKERS_REGISTERS + MAKERS_STRIDE * id as u32;
-        Feature { id, category, address, access, kind, initial }
-    };
+// Categories of the SFNC.
+const DEVICE: Option<&str> = Some("DeviceControl");
+const TRANSPORT: Option<&str> = Some("TransportLayerControl");
+const IMAGE: Option<&str> = Some("ImageFormatControl");
+const ACQUISITION: Option<&str> = Some("AcquisitionControl");
+const CHUNK_DATA: Option<&str> = Some("ChunkDataControl");
+const USER_SETS: Option<&str> = Some("UserSetControl");
+const SEQUENCER: Option<&str> = Some("SequencerControl");
+
+/// A register at an address given by GigE Vision.
+fn standard(
+    id: FeatureId,
+    address: u32,
+    category: Option<&'static str>,
+    access: RegisterAccess,
+    kind: Kind,
+) -> Feature {
+    Feature { id, category, address, access, kind, initial: 0 }
+}
+
+/// A register at an address of the manufacturer's choice.
+fn maker(
+    id: FeatureId,
+    category: Option<&'static str>,
+    access: RegisterAccess,
+    kind: Kind,
+    initial: u64,
+) -> Feature {
+    let address = MAKERS_REGISTERS + MAKERS_STRIDE * id as u32;
+    Feature { id, category, address, access, kind, initial }
+}
+
+fn whole(min: u32, max: u32, step: u32, max_in: Option<FeatureId>) -> Kind {
+    Kind::Integer { min, max, step, max_in }
+}
+
+fn one_of(entries: &[&str]) -> Kind {
+    Kind::Enumeration(entries.iter().map(|entry| (*entry).to_owned()).zip(0..).collect())
+}
+
+fn formats(mosaic: Mosaic) -> Kind {
+    let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
+    Kind::Enumeration(formats.filter_map(|format| Some((format.to_string(), format.pfnc()?))).collect())
+}
+
+fn bootstrap() -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadOnly, ReadWrite};
     vec![
-        standard(FeatureId::DeviceVendorName, 0x48, device, ReadOnly, Kind::Text(32)),
-        standard(FeatureId::DeviceModelName, 0x68, device, ReadOnly, Kind::Text(32)),
-        standard(FeatureId::DeviceVersion, 0x88, device, ReadOnly, Kind::Text(32)),
-        standard(FeatureId::DeviceManufacturerInfo, 0xA8, device, ReadOnly, Kind::Text(48)),
-        standard(FeatureId::DeviceSerialNumber, 0xD8, device, ReadOnly, Kind::Text(16)),
-        standard(FeatureId::DeviceUserID, 0xE8, device, ReadWrite, Kind::Text(16)),
+        standard(DeviceVendorName, 0x48, DEVICE, ReadOnly, Kind::Text(32)),
+        standard(DeviceModelName, 0x68, DEVICE, ReadOnly, Kind::Text(32)),
+        standard(DeviceVersion, 0x88, DEVICE, ReadOnly, Kind::Text(32)),
+        standard(DeviceManufacturerInfo, 0xA8, DEVICE, ReadOnly, Kind::Text(48)),
+        standard(DeviceSerialNumber, 0xD8, DEVICE, ReadOnly, Kind::Text(16)),
+        standard(DeviceUserID, 0xE8, DEVICE, ReadWrite, Kind::Text(16)),
         Feature {
             initial: 3000,
-            ..standard(
-                FeatureId::GevHeartbeatTimeout,
-                0x938,
-                transport,
-                ReadWrite,
-                whole(500, 60_000, 1, None),
-            )
+            ..standard(GevHeartbeatTimeout, 0x938, TRANSPORT, ReadWrite, whole(500, 60_000, 1, None))
         },
-        standard(FeatureId::GevTimestampTickFrequency, 0x93C, transport, ReadOnly, Kind::Long),
-        standard(FeatureId::GevTimestampControl, 0x944, None, Command, Kind::any()),
-        standard(FeatureId::GevTimestampValue, 0x948, transport, ReadOnly, Kind::Long),
-        standard(FeatureId::GevCCP, 0xA00, None, ReadWrite, Kind::any()),
-        standard(FeatureId::GevSCPHostPort, 0xD00, transport, ReadWrite, whole(0, 0xFFFF, 1, None)),
-        Feature { initial: 1500, ..standard(FeatureId::GevSCPS, 0xD04, None, ReadWrite, Kind::any()) },
-        standard(FeatureId::GevSCPD, 0xD08, transport, ReadWrite, whole(0, MAX_PACKET_GAP_TICKS, 1, None)),
-        standard(FeatureId::GevSCDA, 0xD18, transport, ReadWrite, Kind::any()),
-        maker(FeatureId::SensorWidth, image, ReadOnly, Kind::any(), width.into()),
-        maker(FeatureId::SensorHeight, image, ReadOnly, Kind::any(), height.into()),
-        maker(FeatureId::SensorShutterMode, image, ReadWrite, one_of(&["Rolling", "Global"]), 0),
+        standard(GevTimestampTickFrequency, 0x93C, TRANSPORT, ReadOnly, Kind::Long),
+        standard(GevTimestampControl, 0x944, None, Command, Kind::any()),
+        standard(GevTimestampValue, 0x948, TRANSPORT, ReadOnly, Kind::Long),
+        standard(GevCCP, 0xA00, None, ReadWrite, Kind::any()),
+        standard(GevSCPHostPort, 0xD00, TRANSPORT, ReadWrite, whole(0, 0xFFFF, 1, None)),
+        Feature { initial: 1500, ..standard(GevSCPS, 0xD04, None, ReadWrite, Kind::any()) },
+        standard(GevSCPD, 0xD08, TRANSPORT, ReadWrite, whole(0, MAX_PACKET_GAP_TICKS, 1, None)),
+        standard(GevSCDA, 0xD18, TRANSPORT, ReadWrite, Kind::any()),
+    ]
+}
+
+fn image(camera: &CameraCapabilities) -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{ReadOnly, ReadWrite, ReadWriteIdle};
+    let (width, height) = (camera.width as u32, camera.height as u32);
+    // A region that starts in the middle of a 2 x 2 cell would change the mosaic.
+    let offset_step = if camera.format.mosaic == Mosaic::Mono { 1 } else { 2 };
+    vec![
+        maker(SensorWidth, IMAGE, ReadOnly, Kind::any(), width.into()),
+        maker(SensorHeight, IMAGE, ReadOnly, Kind::any(), height.into()),
+        maker(SensorShutterMode, IMAGE, ReadWrite, one_of(&["Rolling", "Global"]), 0),
         maker(
-            FeatureId::SensorReadoutTime,
-            image,
+            SensorReadoutTime,
+            IMAGE,
             ReadOnly,
             Kind::Float { min: 0.0, max: 1e9, unit: "us" },
             camera.readout_us.to_bits(),
         ),
-        maker(FeatureId::WidthMax, image, ReadOnly, Kind::any(), width.into()),
-        maker(FeatureId::HeightMax, image, ReadOnly, Kind::any(), height.into()),
-        maker(FeatureId::OffsetXMax, None, ReadOnly, Kind::any(), 0),
-        maker(FeatureId::OffsetYMax, None, ReadOnly, Kind::any(), 0),
+        maker(WidthMax, IMAGE, ReadOnly, Kind::any(), width.into()),
+        maker(HeightMax, IMAGE, ReadOnly, Kind::any(), height.into()),
+        maker(OffsetXMax, None, ReadOnly, Kind::any(), 0),
+        maker(OffsetYMax, None, ReadOnly, Kind::any(), 0),
+        maker(Width, IMAGE, ReadWriteIdle, whole(1, width, 1, Some(WidthMax)), width.into()),
+        maker(Height, IMAGE, ReadWriteIdle, whole(1, height, 1, Some(HeightMax)), height.into()),
+        maker(OffsetX, IMAGE, ReadWriteIdle, whole(0, width, offset_step, Some(OffsetXMax)), 0),
+        maker(OffsetY, IMAGE, ReadWriteIdle, whole(0, height, offset_step, Some(OffsetYMax)), 0),
         maker(
-            FeatureId::Width,
-            image,
+            PixelFormat,
+            IMAGE,
             ReadWriteIdle,
-            whole(1, width, 1, Some(FeatureId::WidthMax)),
-            width.into(),
-        ),
-        maker(
-            FeatureId::Height,
-            image,
-            ReadWriteIdle,
-            whole(1, height, 1, Some(FeatureId::HeightMax)),
-            height.into(),
-        ),
-        maker(
-            FeatureId::OffsetX,
-            image,
-            ReadWriteIdle,
-            whole(0, width, offset_step, Some(FeatureId::OffsetXMax)),
-            0,
-        ),
-        maker(
-            FeatureId::OffsetY,
-            image,
-            ReadWriteIdle,
-            whole(0, height, offset_step, Some(FeatureId::OffsetYMax)),
-            0,
-        ),
-        maker(
-            FeatureId::PixelFormat,
-            image,
-            ReadWriteIdle,
-            formats,
+            formats(camera.format.mosaic),
             camera.format.pfnc().unwrap_or_default().into(),
         ),
+    ]
+}
+
+fn acquisition(camera: &CameraCapabilities) -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadWrite, ReadWriteIdle};
+    let exposure =
+        Kind::Float { min: *camera.exposure_us.start(), max: *camera.exposure_us.end(), unit: "us" };
+    let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
+    let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
+    vec![
+        maker(AcquisitionMode, ACQUISITION, ReadWriteIdle, one_of(&["Continuous", "SingleFrame"]), 0),
+        maker(AcquisitionStart, ACQUISITION, Command, Kind::any(), 0),
+        maker(AcquisitionStop, ACQUISITION, Command, Kind::any(), 0),
+        maker(AcquisitionFrameRateEnable, ACQUISITION, ReadWrite, Kind::Boolean, 1),
         maker(
-            FeatureId::AcquisitionMode,
-            acquisition,
-            ReadWriteIdle,
-            one_of(&["Continuous", "SingleFrame"]),
-            0,
-        ),
-        maker(FeatureId::AcquisitionStart, acquisition, Command, Kind::any(), 0),
-        maker(FeatureId::AcquisitionStop, acquisition, Command, Kind::any(), 0),
-        maker(FeatureId::AcquisitionFrameRateEnable, acquisition, ReadWrite, Kind::Boolean, 1),
-        maker(
-            FeatureId::AcquisitionFrameRate,
-            acquisition,
+            AcquisitionFrameRate,
+            ACQUISITION,
             ReadWrite,
             Kind::Float { min: 0.1, max: 10_000.0, unit: "Hz" },
             30_f64.to_bits(),
         ),
-        maker(FeatureId::TriggerSelector, acquisition, ReadWrite, one_of(&["FrameStart"]), 0),
-        maker(FeatureId::TriggerMode, acquisition, ReadWrite, one_of(&["Off", "On"]), 0),
-        maker(FeatureId::TriggerSoftware, acquisition, Command, Kind::any(), 0),
-        maker(FeatureId::TriggerSource, acquisition, ReadWrite, one_of(&["Line0", "Software"]), 0),
-        maker(FeatureId::TriggerActivation, acquisition, ReadWrite, one_of(&["RisingEdge"]), 0),
-        maker(FeatureId::TriggerDelay, acquisition, ReadWrite, delay, delay_min.to_bits()),
-        maker(FeatureId::ExposureMode, acquisition, ReadWrite, one_of(&["Timed"]), 0),
-        maker(FeatureId::ExposureTime, acquisition, ReadWrite, exposure, 1000_f64.to_bits()),
-        maker(FeatureId::ChunkModeActive, chunks, ReadWriteIdle, Kind::Boolean, 0),
-        maker(FeatureId::ChunkSelector, chunks, ReadWrite, one_of(&CHUNKS), 0),
-        maker(FeatureId::ChunkEnable, chunks, ReadWriteIdle, Kind::BooleanFor(FeatureId::ChunkSelector), 0),
-        maker(FeatureId::TimestampLatch, device, Command, Kind::any(), 0),
-        maker(FeatureId::PayloadSize, transport, ReadOnly, Kind::any(), 0),
-        maker(FeatureId::TLParamsLocked, transport, ReadWrite, whole(0, 1, 1, None), 0),
-        maker(FeatureId::UserSetSelector, user_sets, ReadWrite, one_of(&["Default", "UserSet1"]), 0),
-        maker(FeatureId::UserSetLoad, user_sets, Command, Kind::any(), 0),
-        maker(FeatureId::UserSetSave, user_sets, Command, Kind::any(), 0),
-        maker(FeatureId::SequencerMode, sequencer, ReadWrite, one_of(&["Off", "On"]), 0),
-        maker(FeatureId::SequencerConfigurationMode, sequencer, ReadWrite, one_of(&["Off", "On"]), 0),
-        maker(FeatureId::SequencerFeatureSelector, sequencer, ReadWrite, one_of(&SEQUENCED), 0),
-        maker(
-            FeatureId::SequencerFeatureEnable,
-            sequencer,
-            ReadWrite,
-            Kind::BooleanFor(FeatureId::SequencerFeatureSelector),
-            0,
-        ),
-        maker(FeatureId::SequencerSetSelector, sequencer, ReadWrite, set.clone(), 0),
-        maker(FeatureId::SequencerSetSave, sequencer, Command, Kind::any(), 0),
-        maker(FeatureId::SequencerSetLoad, sequencer, Command, Kind::any(), 0),
-        maker(FeatureId::SequencerSetStart, sequencer, ReadWrite, set.clone(), 0),
-        maker(FeatureId::SequencerPathSelector, sequencer, ReadWrite, whole(0, 0, 1, None), 0),
-        maker(FeatureId::SequencerSetNext, sequencer, ReadWrite, set, 0),
-        maker(FeatureId::SequencerTriggerSource, sequencer, ReadWrite, one_of(&["Off", "FrameStart"]), 0),
-        maker(FeatureId::SequencerSetActive, sequencer, ReadOnly, Kind::any(), 0),
+        maker(TriggerSelector, ACQUISITION, ReadWrite, one_of(&["FrameStart"]), 0),
+        maker(TriggerMode, ACQUISITION, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(TriggerSoftware, ACQUISITION, Command, Kind::any(), 0),
+        maker(TriggerSource, ACQUISITION, ReadWrite, one_of(&["Line0", "Software"]), 0),
+        maker(TriggerActivation, ACQUISITION, ReadWrite, one_of(&["RisingEdge"]), 0),
+        maker(TriggerDelay, ACQUISITION, ReadWrite, delay, delay_min.to_bits()),
+        maker(ExposureMode, ACQUISITION, ReadWrite, one_of(&["Timed"]), 0),
+        maker(ExposureTime, ACQUISITION, ReadWrite, exposure, 1000_f64.to_bits()),
+    ]
+}
+
+fn chunks_and_user_sets() -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadOnly, ReadWrite, ReadWriteIdle};
+    vec![
+        maker(ChunkModeActive, CHUNK_DATA, ReadWriteIdle, Kind::Boolean, 0),
+        maker(ChunkSelector, CHUNK_DATA, ReadWrite, one_of(&CHUNKS), 0),
+        maker(ChunkEnable, CHUNK_DATA, ReadWriteIdle, Kind::BooleanFor(ChunkSelector), 0),
+        maker(TimestampLatch, DEVICE, Command, Kind::any(), 0),
+        maker(PayloadSize, TRANSPORT, ReadOnly, Kind::any(), 0),
+        maker(TLParamsLocked, TRANSPORT, ReadWrite, whole(0, 1, 1, None), 0),
+        maker(UserSetSelector, USER_SETS, ReadWrite, one_of(&["Default", "UserSet1"]), 0),
+        maker(UserSetLoad, USER_SETS, Command, Kind::any(), 0),
+        maker(UserSetSave, USER_SETS, Command, Kind::any(), 0),
+    ]
+}
+
+fn sequencer() -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadOnly, ReadWrite};
+    let set = whole(0, SEQUENCER_SETS as u32 - 1, 1, None);
+    vec![
+        maker(SequencerMode, SEQUENCER, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(SequencerConfigurationMode, SEQUENCER, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(SequencerFeatureSelector, SEQUENCER, ReadWrite, one_of(&SEQUENCED), 0),
+        maker(SequencerFeatureEnable, SEQUENCER, ReadWrite, Kind::BooleanFor(SequencerFeatureSelector), 0),
+        maker(SequencerSetSelector, SEQUENCER, ReadWrite, set.clone(), 0),
+        maker(SequencerSetSave, SEQUENCER, Command, Kind::any(), 0),
+        maker(SequencerSetLoad, SEQUENCER, Command, Kind::any(), 0),
+        maker(SequencerSetStart, SEQUENCER, ReadWrite, set.clone(), 0),
+        maker(SequencerPathSelector, SEQUENCER, ReadWrite, whole(0, 0, 1, None), 0),
+        maker(SequencerSetNext, SEQUENCER, ReadWrite, set, 0),
+        maker(SequencerTriggerSource, SEQUENCER, ReadWrite, one_of(&["Off", "FrameStart"]), 0),
+        maker(SequencerSetActive, SEQUENCER, ReadOnly, Kind::any(), 0),
     ]
 }
 

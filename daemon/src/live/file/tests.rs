@@ -146,7 +146,8 @@ fn readers_that_race_the_writer_see_whole_images_only() {
     // All into the same slot, so that readers are often overtaken.
     let write = |sequence: u64| {
         let bytes = &images[sequence as usize % images.len()];
-        let header = header("image", &SHAPE, 2 * sequence, sequence, 2, bytes, live.offset_of(0));
+        let contents = Contents { name: "image", shape: &SHAPE, metadata_bytes: 2, bytes };
+        let header = contents.header(2 * sequence, sequence, live.offset_of(0));
         live.write_slot(0, &header, bytes).unwrap();
     };
     write(1);
