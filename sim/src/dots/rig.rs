@@ -20,7 +20,7 @@ use raysweep_config::sim::{DotsConfig, SimDotSensor, SimSensor};
 pub enum DotsRigError {
     /// The scene cannot be read or computed.
     #[error("sim.dots.scene: {0}")]
-    DotScene(#[from] DotSceneError),
+    Scene(#[from] DotSceneError),
     /// A key of `[sim.dots]` outside its range.
     #[error("sim.dots.{key} = {value}: allowed is {allowed}")]
     Range {
