@@ -364,8 +364,9 @@ impl Control for Runner {
 fn invalid_plan(error: &ConfigError) -> RpcError {
     let mut rpc = RpcError::new(ErrorCode::InvalidPlan, error.to_string());
     if let Some(data) = &mut rpc.data {
-        let span =
-            |mistake: &raysweep_config::Mistake| mistake.span.clone().map(|span| (span.start, span.end));
+        let span = |mistake: &raysweep_config::ConfigMistake| {
+            mistake.span.clone().map(|span| (span.start, span.end))
+        };
         data.field.clone_from(&error.first().field);
         data.span = span(error.first());
         data.mistakes = error

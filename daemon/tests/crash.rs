@@ -2,12 +2,16 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
-use rand_xoshiro::Xoshiro256PlusPlus;
-use rand_xoshiro::rand_core::{Rng, SeedableRng};
+mod process;
+
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
+use process::Process;
+use rand_xoshiro::Xoshiro256PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use raysweep_core::Counts;
 use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
@@ -28,7 +32,7 @@ const PLAN: &str = "kind = \"sweep\"\nname = \"crash\"\n[sweep]\naverage = 2\n\
                     delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
 
 struct Daemon {
-    process: Child,
+    process: Process,
     socket: PathBuf,
 }
 
@@ -40,7 +44,8 @@ impl Daemon {
     /// Simulator, stages and solver all take their number of threads from rayon's environment variable.
     fn start_with_threads(folder: &Path, threads: u32) -> Self {
         let socket = folder.join("socket");
-        let process = Command::new(env!("CARGO_BIN_EXE_raysweepd"))
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
+        command
             .arg("--rig")
             .arg(folder.join("rig.toml"))
             .arg("--socket")
@@ -48,9 +53,8 @@ impl Daemon {
             .arg("--data")
             .arg(folder.join("sessions"))
             .env("RAYON_NUM_THREADS", threads.to_string())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
+            .stderr(Stdio::null());
+        let process = Process::start(&mut command);
         Self { process, socket }
     }
 
@@ -60,7 +64,7 @@ impl Daemon {
             if let Ok(client) = Client::connect(&self.socket) {
                 return client;
             }
-            assert!(self.process.try_wait().unwrap().is_none(), "the daemon has ended");
+            assert!(!self.process.has_ended(), "the daemon has ended");
             assert!(began.elapsed() < Duration::from_secs(60), "the daemon does not listen");
             std::thread::sleep(Duration::from_millis(2));
         }
@@ -71,16 +75,7 @@ impl Daemon {
     }
 
     fn terminate(&self) {
-        let status = Command::new("kill").args(["-TERM", &self.process.id().to_string()]).status().unwrap();
-        assert!(status.success());
-    }
-}
-
-impl Drop for Daemon {
-    /// SIGKILL, also when a test fails: a remaining daemon would hold the test's output open.
-    fn drop(&mut self) {
-        let _ = self.process.kill();
-        let _ = self.process.wait();
+        self.process.signal(Signal::SIGTERM);
     }
 }
 
@@ -134,10 +129,14 @@ fn outcome(session: &Path) -> Outcome {
     Outcome { points, files }
 }
 
-/// Waits until the ledger has a given number of lines, or 5 s, in case the run has ended with fewer.
+/// Waits until the ledger has a given number of lines.
 fn wait_for_line(session: &Path, line: usize) {
     let began = Instant::now();
-    while ledger_lines(session) < line && began.elapsed() < Duration::from_secs(5) {}
+    while ledger_lines(session) < line {
+        let lines = ledger_lines(session);
+        assert!(began.elapsed() < Duration::from_secs(60), "{lines} lines, not {line}, after a minute");
+        std::thread::sleep(Duration::from_micros(200));
+    }
 }
 
 fn ledger_lines(session: &Path) -> usize {
@@ -397,7 +396,7 @@ fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
     }
     let (session, state) = finished.expect("subscribers learn how the run ended");
     assert_eq!(state, "cancelled");
-    assert!(daemon.process.wait().unwrap().success());
+    assert!(daemon.process.wait().success());
     let state = stored(&session).unwrap();
     assert!(state.stored(ArrayName::Dark).count() + state.stored(ArrayName::Sum).count() >= 5);
     assert!(state.counts.balanced(), "{:?}", state.counts);
@@ -415,7 +414,8 @@ fn a_socket_passed_by_the_service_manager_is_served() {
     let folder = folder(RIG);
     let path = folder.path().join("activated");
     // The service manager's own helper passes the socket and LISTEN_FDS, and starts the daemon on the first connection.
-    let process = Command::new("systemd-socket-activate")
+    let mut command = Command::new("systemd-socket-activate");
+    command
         .arg("--listen")
         .arg(&path)
         .arg(env!("CARGO_BIN_EXE_raysweepd"))
@@ -423,13 +423,11 @@ fn a_socket_passed_by_the_service_manager_is_served() {
         .arg(folder.path().join("rig.toml"))
         .arg("--data")
         .arg(folder.path().join("sessions"))
-        .stderr(Stdio::null())
-        .spawn()
-        .expect("systemd-socket-activate: `cargo xtask test` installs it");
-    let mut daemon = Daemon { process, socket: path };
+        .stderr(Stdio::null());
+    let mut daemon = Daemon { process: Process::start(&mut command), socket: path };
     assert_eq!(daemon.client().status().unwrap().rig, "plane");
     daemon.terminate();
-    assert!(daemon.process.wait().unwrap().success());
+    assert!(daemon.process.wait().success());
 }
 
 #[test]
@@ -437,10 +435,7 @@ fn a_film_that_is_killed_keeps_its_cycles_and_is_processed_not_resumed() {
     let folder = folder(RIG);
     let mut daemon = Daemon::start(folder.path());
     let started = daemon.client().run(&plan("kind = \"film\"\n[film]\ncycles = 80000\n")).unwrap();
-    let began = Instant::now();
-    while ledger_lines(&started.session) < 30 {
-        assert!(began.elapsed() < Duration::from_secs(60), "the film does not go on");
-    }
+    wait_for_line(&started.session, 30);
     daemon.kill();
 
     let session = Session::open(&started.session).unwrap();

@@ -7,21 +7,23 @@
 
 #[path = "../../drivers/tests/guest/mod.rs"]
 mod guest;
+mod process;
 
 use std::fs::File;
 use std::path::PathBuf;
-use std::process::{Child, Command};
+use std::process::Command;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
 use guest::wait_for;
+use process::Process;
 use raysweep_core::{Edge, LossCause, Vsync};
 use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig};
 use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
-use raysweep_sim::usb::{Fx2Faults, Fx2Lafw as Analyser, Plugged, Signal};
+use raysweep_sim::usb::{Fx2Analyser, Fx2Faults, Plugged, Signal};
 use tempfile::TempDir;
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
@@ -59,7 +61,7 @@ fn signal(missing: f64, false_edges: f64) -> Signal {
 
 /// Plugs in an analyser whose thread, since it represents a device, has priority over the guest's computations.
 fn plug(signal: Signal) -> (Plugged, Fx2Faults) {
-    let (analyser, faults) = Analyser::new(signal, 20.0);
+    let (analyser, faults) = Fx2Analyser::new(signal, 20.0);
     let plugged = std::thread::spawn(|| {
         let priority = ThreadPriorityValue::try_from(80).map(ThreadPriority::Crossplatform).unwrap();
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
@@ -94,15 +96,9 @@ fn lateness_us() -> f64 {
 
 /// A daemon with its analyser, in a temporary folder.
 struct Lab {
+    // Dropped before the folder.
+    _daemon: Process,
     folder: TempDir,
-    daemon: Child,
-}
-
-impl Drop for Lab {
-    fn drop(&mut self) {
-        let _ = self.daemon.kill();
-        let _ = self.daemon.wait();
-    }
 }
 
 impl Lab {
@@ -118,17 +114,16 @@ impl Lab {
         std::fs::write(folder.path().join("rig.toml"), rig).unwrap();
         let program = std::env::current_exe().unwrap().with_file_name("raysweepd");
         let path = |name: &str| folder.path().join(name);
-        let daemon = Command::new(program)
+        let mut command = Command::new(program);
+        command
             .arg("--rig")
             .arg(path("rig.toml"))
             .arg("--socket")
             .arg(path("socket"))
             .arg("--data")
             .arg(path("sessions"))
-            .stderr(File::create(path("log")).unwrap())
-            .spawn()
-            .unwrap();
-        Self { folder, daemon }
+            .stderr(File::create(path("log")).unwrap());
+        Self { _daemon: Process::start(&mut command), folder }
     }
 
     fn path(&self, name: &str) -> PathBuf {

@@ -3,14 +3,16 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod process;
+
 use std::fs;
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use nix::sys::signal::{Signal, kill};
-use nix::unistd::Pid;
+use nix::sys::signal::Signal;
+use process::Process;
 use raysweep::control::Control;
 use raysweep::mirror::state_file;
 use raysweep::rig::AnyRig;
@@ -21,7 +23,9 @@ use raysweep_drivers::mirror::playzerx::protocol::Sample;
 use raysweep_drivers::mirror::{Parked, park};
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
 use raysweep_proto::{Client, Event, RunParams, RunState};
-use raysweep_sim::mirror::{Held, Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
+use raysweep_sim::mirror::{
+    Held, MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults,
+};
 use raysweep_transport::dots::{Background, DotsError, NoiseFloor, SparseColumn};
 use tempfile::TempDir;
 
@@ -39,26 +43,10 @@ struct Lab {
     folder: TempDir,
 }
 
-struct Daemon(Child);
-
-impl Drop for Daemon {
-    /// SIGKILL, also when a test fails: a remaining daemon would hold the test's output open.
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-impl Daemon {
-    fn signal(&self, signal: Signal) {
-        kill(Pid::from_raw(self.0.id().try_into().unwrap()), signal).unwrap();
-    }
-}
-
 impl Lab {
     fn new() -> Self {
-        let controller = PlayzerXController::new(PlayzerXConfig::default());
-        let pty = MirrorPty::plug(controller, Link::VirtualCom, WireFaults::default()).unwrap();
+        let controller = PlayzerXController::new(PlayzerXControllerConfig::default());
+        let pty = MirrorPty::plug(controller, SerialLink::VirtualCom, WireFaults::default()).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let rig = format!(
             "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"playzerx\"\nport = \"{}\"\n\
@@ -79,18 +67,17 @@ impl Lab {
         self.folder.path().join("socket")
     }
 
-    fn daemon(&self) -> Daemon {
-        let daemon = Command::new(env!("CARGO_BIN_EXE_raysweepd"))
+    fn daemon(&self) -> Process {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_raysweepd"));
+        command
             .arg("--rig")
             .arg(self.folder.path().join("rig.toml"))
             .arg("--socket")
             .arg(self.socket())
             .arg("--data")
             .arg(self.data())
-            .stderr(fs::File::create(self.folder.path().join("log")).map_or(Stdio::null(), Stdio::from))
-            .spawn()
-            .unwrap();
-        Daemon(daemon)
+            .stderr(fs::File::create(self.folder.path().join("log")).map_or(Stdio::null(), Stdio::from));
+        Process::start(&mut command)
     }
 
     fn log(&self) -> String {
@@ -109,7 +96,7 @@ impl Lab {
     }
 
     /// Starts a run and waits until the mirror has played a number of samples with light.
-    fn play(&self, count: u32, samples: usize) -> Daemon {
+    fn play(&self, count: u32, samples: usize) -> Process {
         let daemon = self.daemon();
         let params = RunParams { plan: plan(count), ..RunParams::default() };
         self.client().run(&params).unwrap();
@@ -288,7 +275,7 @@ fn sigterm() {
     let since_ns = now_ns();
     daemon.signal(Signal::SIGTERM);
     lab.assert_parked("SIGTERM", since_ns);
-    assert!(daemon.0.wait().unwrap().success(), "{}", lab.log());
+    assert!(daemon.wait().success(), "{}", lab.log());
     println!("SIGTERM: the daemon had ended after {:.1} ms", (now_ns() - since_ns) as f64 / 1e6);
     lab.assert_noted();
 }
@@ -299,7 +286,7 @@ fn sigkill() {
     let mut daemon = lab.play(1000, 20_000);
     let since_ns = now_ns();
     daemon.signal(Signal::SIGKILL);
-    daemon.0.wait().unwrap();
+    daemon.wait();
     lab.assert_parked("SIGKILL, by the guardian", since_ns);
     lab.assert_noted();
 }

@@ -15,7 +15,7 @@ use nix::time::{ClockId, clock_getcpuclockid};
 use nix::unistd::Pid;
 use raysweep_core::{Camera, CameraSettings, Clock, FramePool, PixelFormat, SettingsId, Shutter};
 use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, RigFacts};
-use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look};
+use raysweep_sim::gige::{CameraClock, Faults, GigeCamera, GigeSetup, Look};
 
 use support::{ADDRESS, own_network};
 
@@ -220,7 +220,7 @@ impl Case {
         let setup = GigeSetup {
             address: ADDRESS.parse()?,
             serial: "1".into(),
-            clock: DeviceClock::default(),
+            clock: CameraClock::default(),
             faults: Faults::default(),
             zipped: false,
         };

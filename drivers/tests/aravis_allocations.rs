@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use raysweep_core::{Camera, CameraSettings, FramePool, PixelFormat, SettingsId, Shutter};
-use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, Region, RigFacts};
+use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, RigFacts, SensorRegion};
 
 use support::{ADDRESS, FakeCamera, own_network};
 
@@ -105,7 +105,7 @@ fn stream() {
     let config = AravisConfig {
         address: Some(ADDRESS.into()),
         features: vec!["R[0x138]=2000".into()],
-        region: Some(Region { x: 0, y: 0, width: 128, height: 128 }),
+        region: Some(SensorRegion { x: 0, y: 0, width: 128, height: 128 }),
         trigger_source: "off".into(),
         ..AravisConfig::default()
     };

@@ -14,7 +14,7 @@ use raysweep_core::{
     PixelFormat, SettingsId, Shutter,
 };
 use raysweep_drivers::camera::aravis::{
-    AravisCamera, AravisConfig, Region, RigFacts, discover, load_features, save_features,
+    AravisCamera, AravisConfig, RigFacts, SensorRegion, discover, load_features, save_features,
 };
 
 use support::{ADDRESS, FakeCamera, own_network};
@@ -32,7 +32,7 @@ fn config(period_us: u32, size: u32) -> AravisConfig {
     AravisConfig {
         address: Some(ADDRESS.into()),
         features: vec![format!("R[0x138]={period_us}")],
-        region: Some(Region { x: 0, y: 0, width: size, height: size }),
+        region: Some(SensorRegion { x: 0, y: 0, width: size, height: size }),
         trigger_source: "off".into(),
         packet_size: Some(9000),
         ..AravisConfig::default()

@@ -9,7 +9,7 @@ mod support;
 use std::time::Duration;
 
 use raysweep_core::{Camera, CameraSettings, DeviceErrorKind, FramePool, PixelFormat, SettingsId, Shutter};
-use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, Region, RigFacts, discover};
+use raysweep_drivers::camera::aravis::{AravisCamera, AravisConfig, RigFacts, SensorRegion, discover};
 
 use support::own_network;
 
@@ -31,7 +31,7 @@ fn a_camera_that_is_not_on_the_network_is_found_opened_by_name_and_streams() {
     assert_eq!(camera.protocol, "Fake");
     let config = AravisConfig {
         name: Some(camera.name.clone()),
-        region: Some(Region { x: 0, y: 0, width: 64, height: 32 }),
+        region: Some(SensorRegion { x: 0, y: 0, width: 64, height: 32 }),
         trigger_source: "off".into(),
         // Applies only to cameras on the network.
         packet_size: Some(9000),

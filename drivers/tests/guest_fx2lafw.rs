@@ -11,7 +11,7 @@ use guest::{PATIENCE, wait_for};
 use raysweep_core::{DeviceErrorKind, Edge, Vsync};
 use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig, Slope, Usb};
 use raysweep_drivers::vsync::reopen::Reopened;
-use raysweep_sim::usb::{Fx2Blank, Fx2Faults, Fx2Lafw as Analyser, Plugged, Signal};
+use raysweep_sim::usb::{Fx2Analyser, Fx2Blank, Fx2Faults, Plugged, Signal};
 
 const PERIOD_NS: i64 = 16_666_667;
 
@@ -26,7 +26,7 @@ fn plug() -> (Plugged, Fx2Faults) {
         exposure_after_ns: 3_000_000,
         exposure_ns: 1_000_000,
     };
-    let (analyser, faults) = Analyser::new(signal, 20.0);
+    let (analyser, faults) = Fx2Analyser::new(signal, 20.0);
     (Plugged::new(analyser).unwrap(), faults)
 }
 

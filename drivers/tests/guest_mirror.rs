@@ -18,9 +18,7 @@ use nix::fcntl::OFlag;
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorLimits, MirrorPath, Tilt};
 use raysweep_drivers::mirror::playzerx::protocol::Sample;
 use raysweep_drivers::mirror::{LightGuard, MirrorReport, PlayzerX, PlayzerXConfig, PlayzerXLink, arm_light};
-use raysweep_sim::mirror::{
-    Held, MechanicsConfig, MirrorPty, PlayzerXConfig as SimConfig, PlayzerXController,
-};
+use raysweep_sim::mirror::{Held, MechanicsConfig, MirrorPty, PlayzerXController, PlayzerXControllerConfig};
 use suite::{BATCHES, mirror_conforms};
 use tempfile::TempDir;
 
@@ -44,7 +42,7 @@ impl Lab {
         let mut options = File::options();
         options.read(true).write(true).custom_flags(OFlag::O_NONBLOCK.bits());
         let end = options.open(format!("/dev/virtio-ports/{PIPE}")).unwrap();
-        let controller = PlayzerXController::new(SimConfig::default());
+        let controller = PlayzerXController::new(PlayzerXControllerConfig::default());
         let mut lab = Self {
             monitor: Monitor::open(),
             controller: MirrorPty::attach(end, PORT.into(), controller).unwrap(),

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use raysweep_core::{Clock, DeviceErrorKind, Edge, Vsync};
 use raysweep_drivers::vsync::triggerbox::protocol::parse_reply;
 use raysweep_drivers::vsync::triggerbox::{TriggerBox, TriggerBoxConfig, TriggerBoxLink};
-use raysweep_sim::mirror::{Link as Wire, WireFaults};
+use raysweep_sim::mirror::{SerialLink as Wire, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 
 const PERIOD_NS: i64 = 16_666_667;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use raysweep_config::sim::SimConfig;
 use raysweep_core::{FramePool, Pattern, PixelFormat, Raster};
-use raysweep_sim::{Devices, PlaneRig, PlaneSetup};
+use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup};
 
 const FRAMES: u32 = 1000;
 
@@ -24,7 +24,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             format: PixelFormat::Mono12,
             first_row: None,
         };
-        let Devices { mut camera, vsync, mut projector, .. } =
+        let PlaneDevices { mut camera, vsync, mut projector, .. } =
             PlaneRig::new(config, setup, Path::new(""))?.open();
         drop(vsync);
         camera.arm()?;

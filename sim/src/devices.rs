@@ -1,4 +1,4 @@
-//! Simulated devices: the traits of `raysweep-core` over one [`Line`] and one clock.
+//! Simulated devices: the traits of `raysweep-core` over one [`VsyncLine`] and one clock.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -10,12 +10,12 @@ use raysweep_core::{
 };
 
 use crate::error::SimError;
-use crate::line::{Exposure, Light, Line, LineTruth};
-use crate::sensor::Exposed;
+use crate::line::{Exposure, Light, LineTruth, VsyncLine};
+use crate::sensor::SensorExposure;
 use crate::world::PlaneWorld;
 
 /// The devices of one rig, sharing one clock.
-pub struct Devices {
+pub struct PlaneDevices {
     /// The camera.
     pub camera: Box<dyn Camera>,
     /// The VSYNC monitor.
@@ -40,10 +40,10 @@ impl TruthProbe {
 }
 
 #[derive(Clone)]
-struct SharedLine(Arc<Mutex<Line>>);
+struct SharedLine(Arc<Mutex<VsyncLine>>);
 
 impl SharedLine {
-    fn lock(&self) -> MutexGuard<'_, Line> {
+    fn lock(&self) -> MutexGuard<'_, VsyncLine> {
         // A panic in a device ends only that device's thread; the line is never left half changed.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -53,7 +53,7 @@ impl SharedLine {
         &self,
         clock: &ClockHandle,
         timeout: Duration,
-        mut ready: impl FnMut(&mut Line, i64) -> Option<T>,
+        mut ready: impl FnMut(&mut VsyncLine, i64) -> Option<T>,
     ) -> Option<T> {
         let deadline_ns =
             clock.now_ns().saturating_add(i64::try_from(timeout.as_nanos()).unwrap_or(i64::MAX));
@@ -77,10 +77,10 @@ impl SharedLine {
     }
 }
 
-pub fn open(world: &Arc<PlaneWorld>, line: Line, clock: Clock) -> Devices {
+pub fn open(world: &Arc<PlaneWorld>, line: VsyncLine, clock: Clock) -> PlaneDevices {
     let line = SharedLine(Arc::new(Mutex::new(line)));
-    Devices {
-        camera: Box::new(SimCamera::new(world.clone(), line.clone(), clock.register())),
+    PlaneDevices {
+        camera: Box::new(PlaneCamera::new(world.clone(), line.clone(), clock.register())),
         vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
         projector: Box::new(SimProjector { world: world.clone(), line: line.clone(), clock: clock.clone() }),
         truth: TruthProbe(line),
@@ -90,19 +90,19 @@ pub fn open(world: &Arc<PlaneWorld>, line: Line, clock: Clock) -> Devices {
 
 /// VSYNC monitor and projector on the host's clock, with two handles to the camera: one writes settings while the other
 /// waits for frames.
-pub type Shared = ([SimCamera; 2], Box<dyn Vsync>, Box<dyn Projector>, TruthProbe);
+pub type Shared = ([PlaneCamera; 2], Box<dyn Vsync>, Box<dyn Projector>, TruthProbe);
 
 /// The devices of [`open`] on the host's clock.
-pub fn open_shared(world: &Arc<PlaneWorld>, line: Line) -> Shared {
+pub fn open_shared(world: &Arc<PlaneWorld>, line: VsyncLine) -> Shared {
     let (line, clock) = (SharedLine(Arc::new(Mutex::new(line))), Clock::real());
-    let camera = || SimCamera::new(world.clone(), line.clone(), clock.register());
+    let camera = || PlaneCamera::new(world.clone(), line.clone(), clock.register());
     let cameras = [camera(), camera()];
     let vsync = Box::new(SimVsync { line: line.clone(), clock: clock.register() });
     let projector = Box::new(SimProjector { world: world.clone(), line: line.clone(), clock });
     (cameras, vsync, projector, TruthProbe(line))
 }
 
-pub struct SimCamera {
+pub struct PlaneCamera {
     world: Arc<PlaneWorld>,
     line: SharedLine,
     clock: ClockHandle,
@@ -111,7 +111,7 @@ pub struct SimCamera {
     counts: Vec<u16>,
 }
 
-impl SimCamera {
+impl PlaneCamera {
     fn new(world: Arc<PlaneWorld>, line: SharedLine, clock: ClockHandle) -> Self {
         let (height, width) = world.size;
         let capabilities = world.capabilities();
@@ -135,7 +135,7 @@ impl SimCamera {
     }
 
     /// Calls `work` with the line that triggers the camera, and the current time.
-    pub fn with_line<T>(&self, work: impl FnOnce(&mut Line, i64) -> T) -> T {
+    pub fn with_line<T>(&self, work: impl FnOnce(&mut VsyncLine, i64) -> T) -> T {
         let now_ns = self.clock.now_ns();
         work(&mut self.line.lock(), now_ns)
     }
@@ -164,12 +164,12 @@ impl SimCamera {
                 }
             }
         }
-        let exposed = Exposed { light: &mut self.light, exposure_us, key: exposure.key };
+        let exposed = SensorExposure { light: &mut self.light, exposure_us, key: exposure.key };
         self.world.sensor.read(exposed, &mut self.counts);
     }
 }
 
-impl Camera for SimCamera {
+impl Camera for PlaneCamera {
     fn capabilities(&self) -> &CameraCapabilities {
         &self.capabilities
     }

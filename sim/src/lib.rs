@@ -21,7 +21,7 @@ pub mod usb;
 mod wire;
 mod world;
 
-pub use devices::{Devices, TruthProbe};
+pub use devices::{PlaneDevices, TruthProbe};
 pub use error::SimError;
 pub use line::LineTruth;
 pub use rig::PlaneRig;

@@ -9,15 +9,15 @@ use std::sync::Arc;
 use rand_distr::{Distribution, StandardNormal};
 use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, ns_from_us};
 
-use self::camera::{CameraLine, Sequence, Written};
+use self::camera::{CameraLine, RunningSequence, WrittenSettings};
 pub use self::camera::{Exposure, Sets, TriggeredBy};
 use crate::keyed::{Purpose, keyed, uniform};
-use crate::optics::Optics;
-use crate::scene::Motion;
+use crate::optics::RasterOptics;
+use crate::scene::SceneMotion;
 use raysweep_config::sim::{SimCamera, SimProjector, SimVsync};
 
 /// What the projector shows: the scene under its pattern, for each key position of the scene's motion.
-pub type Shown = Arc<[Arc<Optics>]>;
+pub type Shown = Arc<[Arc<RasterOptics>]>;
 
 /// One projector frame: the time of its edge and what it shows (`None`: dark).
 #[derive(Clone)]
@@ -27,7 +27,7 @@ pub struct Light {
     /// Start of the light: the edge plus a phase error that no device measures.
     pub start_ns: i64,
     /// The scene under the pattern shown.
-    pub optics: Option<Arc<Optics>>,
+    pub optics: Option<Arc<RasterOptics>>,
 }
 
 /// Parameters of the line.
@@ -37,7 +37,7 @@ pub struct LineConfig {
     pub vsync: SimVsync,
     pub projector: SimProjector,
     pub camera: SimCamera,
-    pub motion: Motion,
+    pub motion: SceneMotion,
     /// Time from the end of row 0's exposure until the last row is read.
     pub readout_ns: i64,
     /// Time from the end of row 0's exposure to the end of the last row's.
@@ -45,7 +45,7 @@ pub struct LineConfig {
 }
 
 /// State of the line.
-pub struct Line {
+pub struct VsyncLine {
     config: LineConfig,
     /// Number of the next period to draw.
     next_period: i64,
@@ -109,7 +109,7 @@ const FREE_RETRY_NS: i64 = 50_000;
 /// Time before its nominal edge at which a period is drawn; larger than any jitter.
 const GUARD_NS: i64 = 400_000;
 
-impl Line {
+impl VsyncLine {
     /// An idle line at `now_ns`.
     pub fn new(config: LineConfig, now_ns: i64) -> Self {
         Self {
@@ -300,7 +300,7 @@ impl Line {
         let first_seq = self.camera.seq + u64::from(self.late_frames.unwrap_or(late));
         // Registers are read in the order in which they were written: the latest value counts.
         self.camera.written.retain(|earlier| earlier.first_seq < first_seq);
-        self.camera.written.push_back(Written { first_seq, id, settings });
+        self.camera.written.push_back(WrittenSettings { first_seq, id, settings });
         self.redraw(now_ns);
         self.camera.seq
     }
@@ -310,7 +310,7 @@ impl Line {
     pub fn set_sequence(&mut self, now_ns: i64, sets: Sets, first: usize) {
         self.advance(now_ns);
         self.camera.written.clear();
-        self.camera.sequence = Some(Sequence { sets, next: first, frames: 0 });
+        self.camera.sequence = Some(RunningSequence { sets, next: first, frames: 0 });
         self.camera.take_next_set();
         self.redraw(now_ns);
     }

@@ -10,10 +10,10 @@ use raysweep_core::{Mosaic, Raster};
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::scene::Scene;
-use raysweep_config::sim::{Beam, RowTable, SimProjector, Spot};
+use raysweep_config::sim::{RowTable, SimBeam, SimProjector, SimSpot};
 
 /// A scene under a raster projector, prepared so that an exposure takes two look-ups per camera row.
-pub struct Optics {
+pub struct RasterOptics {
     /// Start of each drawn row's light after the VSYNC edge, and the last row's end. Drawn rows are the scene's rows
     /// and those next to them whose beam reaches it.
     row_starts_us: Vec<f64>,
@@ -40,36 +40,36 @@ struct Flashes {
     pattern: Vec<f32>,
 }
 
-impl Optics {
-    /// Prepares `scene` under `pattern`, which has one weight per projector row.
+impl RasterOptics {
+    /// Prepares `scene` under `pattern`, which has one weight per projector row, drawn at the times of the row table.
     ///
     /// # Errors
-    /// When the scene does not fit the projector or the row table is not increasing.
+    /// When the beam's profile is out of range.
     pub fn new(
         scene: &Scene,
-        raster: &Raster,
+        mosaic: Mosaic,
         first_row: usize,
         projector: &SimProjector,
+        row_table: &[f64],
         pattern: &[f32],
-        seed: u64,
-        mosaic: Mosaic,
     ) -> Result<Self, SimError> {
         let transport = filtered(scene, mosaic);
         let (rows, height, width) = transport.dim();
-        let table = row_table(raster, &projector.row_table, seed)?;
         let beam = beam_weights(&projector.beam)?;
         let beam_rows = beam.iter().map(|(offset, _)| offset.unsigned_abs()).max().unwrap_or(0);
         let first_drawn = first_row.saturating_sub(beam_rows);
-        let end_drawn = (first_row + rows + beam_rows).min(raster.rows);
+        let end_drawn = (first_row + rows + beam_rows).min(pattern.len());
         let scene_offset = first_row - first_drawn;
-        let row_starts_us = table[first_drawn..=end_drawn].to_vec();
+        let row_starts_us = row_table[first_drawn..=end_drawn].to_vec();
         let pattern = pattern[first_drawn..end_drawn].to_vec();
 
         let direct = match projector.spot {
-            Spot::Uniform => None,
-            Spot::OneWay | Spot::Bidirectional => Some(Array2::from_shape_fn((height, width), |(t, s)| {
-                if t < rows { transport[[t, t, s]] } else { 0.0 }
-            })),
+            SimSpot::Uniform => None,
+            SimSpot::OneWay | SimSpot::Bidirectional => {
+                Some(Array2::from_shape_fn((height, width), |(t, s)| {
+                    if t < rows { transport[[t, t, s]] } else { 0.0 }
+                }))
+            }
         };
         let mut cumulative = Array3::<f32>::zeros((height, pattern.len() + 1, width));
         cumulative.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
@@ -96,7 +96,7 @@ impl Optics {
                 Array2::from_shape_fn((height, width), |(_, s)| (s as f32 + 0.5) / width as f32)
             }),
             beam,
-            bidirectional: projector.spot == Spot::Bidirectional,
+            bidirectional: projector.spot == SimSpot::Bidirectional,
             first_drawn,
             scene_offset,
             pattern,
@@ -251,14 +251,14 @@ pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64
 }
 
 /// Row offsets that a row's beam reaches and the fraction of light at each; the fractions sum to 1.
-fn beam_weights(beam: &Beam) -> Result<Vec<(isize, f32)>, SimError> {
+fn beam_weights(beam: &SimBeam) -> Result<Vec<(isize, f32)>, SimError> {
     let weights: Vec<(isize, f64)> = match *beam {
-        Beam::Ideal => vec![(0, 1.0)],
-        Beam::Gaussian { sigma_rows } if sigma_rows > 0.0 && sigma_rows <= 100.0 => {
+        SimBeam::Ideal => vec![(0, 1.0)],
+        SimBeam::Gaussian { sigma_rows } if sigma_rows > 0.0 && sigma_rows <= 100.0 => {
             let reach = (5.0 * sigma_rows).ceil() as isize;
             (-reach..=reach).map(|d| (d, (-(d as f64 / sigma_rows).powi(2) / 2.0).exp())).collect()
         }
-        Beam::FlatTop { up_rows, down_rows }
+        SimBeam::FlatTop { up_rows, down_rows }
             if up_rows >= 0.0
                 && down_rows >= 0.0
                 && up_rows + down_rows > 0.0

@@ -6,12 +6,12 @@ use std::sync::{Arc, OnceLock};
 use ndarray::Array2;
 use raysweep_core::{Clock, Pattern, Shutter};
 
-use crate::devices::{self, Devices};
+use crate::devices::{self, PlaneDevices};
 use crate::error::SimError;
-use crate::line::Line;
+use crate::line::VsyncLine;
 use crate::optics;
-use crate::scene::{Motion, Scene, SceneSize};
-use crate::sensor::{Scale, Sensor};
+use crate::scene::{Scene, SceneMotion, SceneSize};
+use crate::sensor::{ImageSensor, Scale};
 use crate::wire::{self, WireDevices};
 use crate::world::{PlaneSetup, PlaneWorld};
 use raysweep_config::sim::SimConfig;
@@ -34,11 +34,11 @@ impl PlaneRig {
             let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
             Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?
         };
-        let motion = Motion::new(scenes.len(), config.motion_period_s);
+        let motion = SceneMotion::new(scenes.len(), config.motion_period_s);
         let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
         let size = scenes[0].size();
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
-        let sensor = Sensor::new(&config.sensor, size, scale, config.seed);
+        let sensor = ImageSensor::new(&config.sensor, size, scale, config.seed);
         let world = PlaneWorld {
             config,
             setup,
@@ -80,14 +80,14 @@ impl PlaneRig {
     }
 
     /// Opens the devices, starting at time zero of their own clock.
-    pub fn open(&self) -> Devices {
+    pub fn open(&self) -> PlaneDevices {
         let clock = if self.world.config.realtime { Clock::real() } else { Clock::simulated() };
-        devices::open(&self.world, Line::new(self.world.line_config(), clock.now_ns()), clock)
+        devices::open(&self.world, VsyncLine::new(self.world.line_config(), clock.now_ns()), clock)
     }
 
     /// Opens the devices on the host's clock, with the camera as the picture source of a network camera.
     pub fn open_for_wire(&self) -> WireDevices {
-        wire::open(&self.world, Line::new(self.world.line_config(), Clock::real().now_ns()))
+        wire::open(&self.world, VsyncLine::new(self.world.line_config(), Clock::real().now_ns()))
     }
 
     /// Light of an image without noise or jitter, in the scene's units, `[t, s]`: one white frame, each camera row

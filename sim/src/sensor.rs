@@ -8,7 +8,7 @@ use crate::keyed::{Purpose, keyed, uniform};
 use raysweep_config::sim::SimSensor;
 
 /// One frame's exposure: its light, its duration and its noise key.
-pub struct Exposed<'a> {
+pub struct SensorExposure<'a> {
     /// Light of each pixel in the scene's units (1 = a white pixel's row), `[t, s]`, row-major.
     pub light: &'a mut [f32],
     /// Time for which each row collected dark current.
@@ -29,7 +29,7 @@ pub struct Scale {
 }
 
 /// Fixed properties of each pixel, drawn once.
-pub struct Sensor {
+pub struct ImageSensor {
     config: SimSensor,
     seed: u64,
     width: usize,
@@ -46,7 +46,7 @@ pub struct Sensor {
     max_dn: f32,
 }
 
-impl Sensor {
+impl ImageSensor {
     /// A sensor of `size` (rows, columns).
     pub fn new(config: &SimSensor, size: (usize, usize), scale: Scale, seed: u64) -> Self {
         let (height, width) = size;
@@ -94,8 +94,8 @@ impl Sensor {
     }
 
     /// Converts light to counts, `[t, s]` row-major.
-    pub fn read(&self, exposed: Exposed<'_>, counts: &mut [u16]) {
-        let Exposed { light, exposure_us, key } = exposed;
+    pub fn read(&self, exposed: SensorExposure<'_>, counts: &mut [u16]) {
+        let SensorExposure { light, exposure_us, key } = exposed;
         let width = self.width;
         light.par_chunks_mut(width).zip(counts.par_chunks_mut(width)).enumerate().for_each(
             |(t, (light, counts))| {
@@ -130,12 +130,15 @@ mod tests {
     /// Mean and variance over pixels and frames under a uniform `light`.
     fn field(config: &SimSensor, light: f32, frames: u64) -> (f64, f64) {
         let scale = Scale { white_dn: 2500.0, black_dn: 64.0, bits: 12 };
-        let sensor = Sensor::new(config, (64, 64), scale, 3);
+        let sensor = ImageSensor::new(config, (64, 64), scale, 3);
         let mut all = Vec::new();
         for frame in 0..frames {
             let mut counts = vec![0; 64 * 64];
             let mut field = vec![light; 64 * 64];
-            sensor.read(Exposed { light: &mut field, exposure_us: 1000.0, key: [1, 0, frame] }, &mut counts);
+            sensor.read(
+                SensorExposure { light: &mut field, exposure_us: 1000.0, key: [1, 0, frame] },
+                &mut counts,
+            );
             all.extend(counts.into_iter().map(f64::from));
         }
         let mean = all.iter().sum::<f64>() / all.len() as f64;
@@ -171,9 +174,10 @@ mod tests {
         for (bits, black_dn, saturated) in [(8, 4.0, 255), (10, 16.0, 1023), (16, 1024.0, 65_520)] {
             let white_dn = 2500.0 * 2_f64.powi(bits - 12);
             let scale = Scale { white_dn, black_dn, bits: bits as u32 };
-            let sensor = Sensor::new(&config, (1, 2), scale, 1);
+            let sensor = ImageSensor::new(&config, (1, 2), scale, 1);
             let mut counts = [0; 2];
-            sensor.read(Exposed { light: &mut [0.5, 9.0], exposure_us: 1.0, key: [0; 3] }, &mut counts);
+            sensor
+                .read(SensorExposure { light: &mut [0.5, 9.0], exposure_us: 1.0, key: [0; 3] }, &mut counts);
             assert!(
                 (f64::from(counts[0]) - black_dn - white_dn / 2.0).abs() <= 8.0,
                 "{bits} bits: {counts:?}"

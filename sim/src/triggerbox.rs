@@ -4,7 +4,7 @@
 use std::io;
 use std::path::Path;
 
-use crate::mirror::{Link, Pty, WireFaults};
+use crate::mirror::{Pty, SerialLink, WireFaults};
 
 /// Pulse length in ticks; a pulse is counted at its end.
 const PULSE_TICKS: i64 = 1000;
@@ -19,7 +19,7 @@ impl TriggerBoxPty {
     ///
     /// # Errors
     /// When a pseudo-terminal or a thread cannot be created.
-    pub fn plug(period_ns: i64, link: Link, faults: WireFaults) -> io::Result<Self> {
+    pub fn plug(period_ns: i64, link: SerialLink, faults: WireFaults) -> io::Result<Self> {
         let mut timer = Timer { period_ns, top: 0x2710, started: Some(0), buffer: Vec::new() };
         let run = move |bytes: &[u8], now_ns, replies: &mut Vec<u8>| timer.run(bytes, now_ns, replies);
         Pty::plug(Box::new(run), link, faults).map(Self)

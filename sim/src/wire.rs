@@ -6,7 +6,7 @@ use raysweep_core::{Projector, Vsync};
 
 use crate::devices::{TruthProbe, open_shared};
 use crate::gige::Look;
-use crate::line::Line;
+use crate::line::VsyncLine;
 use crate::world::PlaneWorld;
 
 /// The devices of one rig on the host's clock, with the camera behind a network connection.
@@ -22,7 +22,7 @@ pub struct WireDevices {
 }
 
 /// Opens the devices of a rig.
-pub(crate) fn open(world: &Arc<PlaneWorld>, line: Line) -> WireDevices {
+pub(crate) fn open(world: &Arc<PlaneWorld>, line: VsyncLine) -> WireDevices {
     let ([written, read], vsync, projector, truth) = open_shared(world, line);
     WireDevices { camera: Look::at_scene(written, read), vsync, projector, truth }
 }

@@ -8,9 +8,9 @@ use raysweep_core::{CameraCapabilities, Pattern, PixelFormat, Raster, Shutter, n
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::line::{Exposure, LineConfig, Shown};
-use crate::optics::Optics;
-use crate::scene::{Motion, Scene};
-use crate::sensor::Sensor;
+use crate::optics::{RasterOptics, row_table};
+use crate::scene::{Scene, SceneMotion};
+use crate::sensor::ImageSensor;
 
 /// Parameters from the rest of the rig file that the simulation needs.
 #[derive(Debug, Clone, Copy)]
@@ -37,11 +37,11 @@ pub(crate) struct PlaneWorld {
     pub setup: PlaneSetup,
     /// The scene in each key position of its motion; all have the same size.
     pub scenes: Vec<Scene>,
-    pub motion: Motion,
+    pub motion: SceneMotion,
     pub first_row: usize,
     pub size: (usize, usize),
     pub format: PixelFormat,
-    pub sensor: Sensor,
+    pub sensor: ImageSensor,
     pub white: OnceLock<Shown>,
 }
 
@@ -49,11 +49,10 @@ impl PlaneWorld {
     pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
         let rows = self.setup.raster.rows;
         let build = |weights: &[f32]| {
-            let mosaic = self.format.mosaic;
-            let (raster, projector) = (&self.setup.raster, &self.config.projector);
+            let (mosaic, projector) = (self.format.mosaic, &self.config.projector);
+            let table = row_table(&self.setup.raster, &projector.row_table, self.config.seed)?;
             let optics = |scene| {
-                Optics::new(scene, raster, self.first_row, projector, weights, self.config.seed, mosaic)
-                    .map(Arc::new)
+                RasterOptics::new(scene, mosaic, self.first_row, projector, &table, weights).map(Arc::new)
             };
             self.scenes.iter().map(optics).collect::<Result<Shown, SimError>>()
         };

@@ -14,7 +14,7 @@ use raysweep_core::{
     CameraSettings, FramePool, FrameStamp, MechanicalDeg, MirrorLimits, MirrorPath, MirrorPoint, PixelFormat,
     RasterScan, SettingsId, Shutter, Subject, Tilt,
 };
-use raysweep_sim::dots::{DotsDevices, DotsError, DotsRig, DotsSetup, FrameFate};
+use raysweep_sim::dots::{DotsDevices, DotsRig, DotsRigError, DotsSetup, FrameFate};
 use raysweep_sim::mirror::{Mechanics, MechanicsConfig};
 
 const EXPOSURE_US: f64 = 70.0;
@@ -429,7 +429,7 @@ fn what_cannot_be_is_refused_by_its_key() {
     let error = refused(DotsConfig { plane_depths: vec![9.0], ..exact() });
     assert_eq!((error.key(), error.to_string().contains("0.5 to 2")), ("plane_depths", true));
     let error = refused(DotsConfig { scene: "teapot".into(), ..exact() });
-    assert!(matches!(error, DotsError::Scene(_)) && error.to_string().contains("v-groove"), "{error}");
+    assert!(matches!(error, DotsRigError::Scene(_)) && error.to_string().contains("v-groove"), "{error}");
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.npy");
     write_npy(&path, &Array3::<f32>::zeros((5, 8, 8))).unwrap();

@@ -8,12 +8,12 @@ use std::time::Duration;
 
 use ndarray::Array3;
 use raysweep_config::sim::SimConfig;
-use raysweep_config::sim::{Beam, RowTable, SimProjector, SimSensor, SimVsync, Spot};
+use raysweep_config::sim::{RowTable, SimBeam, SimProjector, SimSensor, SimSpot, SimVsync};
 use raysweep_core::{
     Camera, CameraSettings, DeviceErrorKind, Edge, FirstFrame, FramePool, FrameStamp, Pattern, PixelFormat,
     Raster, SettingsId, Shutter,
 };
-use raysweep_sim::{Devices, PlaneRig, PlaneSetup};
+use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup};
 
 const ROWS: usize = 8;
 const COLUMNS: usize = 4;
@@ -67,7 +67,7 @@ struct Bench {
 impl Bench {
     /// Shows a pattern (`None`: dark) and waits until the light shows it.
     fn lit(rig: &PlaneRig, pattern: Option<&Pattern>) -> Self {
-        let Devices { mut camera, mut vsync, mut projector, .. } = rig.open();
+        let PlaneDevices { mut camera, mut vsync, mut projector, .. } = rig.open();
         let (seen, edges) = channel();
         std::thread::spawn(move || {
             while let Ok(edge) = vsync.next_edge(Duration::from_secs(1)) {
@@ -172,8 +172,8 @@ fn a_single_row_lights_what_the_scene_says_and_a_dark_projector_nothing() {
 #[test]
 fn a_beam_spreads_a_row_and_keeps_its_light() {
     for (beam, expected) in [
-        (Beam::FlatTop { up_rows: 0.5, down_rows: 1.5 }, [0.0, 0.0, 0.5, 0.5, 0.0]),
-        (Beam::Gaussian { sigma_rows: 0.5 }, [0.0002, 0.1065, 0.7866, 0.1065, 0.0002]),
+        (SimBeam::FlatTop { up_rows: 0.5, down_rows: 1.5 }, [0.0, 0.0, 0.5, 0.5, 0.0]),
+        (SimBeam::Gaussian { sigma_rows: 0.5 }, [0.0002, 0.1065, 0.7866, 0.1065, 0.0002]),
     ] {
         let rig = rig(|config| config.projector.beam = beam);
         let mut bench = Bench::lit(&rig, Some(&only(3)));
@@ -197,14 +197,14 @@ fn a_flying_spot_lights_each_column_at_its_own_moment() {
         let mut bench = Bench::lit(&rig, Some(&Pattern::White));
         bench.expose(rolling(500.0, TAU_US / 2.0))
     };
-    let one_way = halves(Spot::OneWay);
+    let one_way = halves(SimSpot::OneWay);
     assert!(one_way.iter().all(|row| row[..] == [1.0, 1.0, 0.0, 0.0]), "{one_way:?}");
-    let both_ways = halves(Spot::Bidirectional);
+    let both_ways = halves(SimSpot::Bidirectional);
     assert_eq!(
         (&both_ways[2][..], &both_ways[3][..]),
         (&[1.0, 1.0, 0.0, 0.0][..], &[0.0, 0.0, 1.0, 1.0][..])
     );
-    let uniform = halves(Spot::Uniform);
+    let uniform = halves(SimSpot::Uniform);
     assert!(uniform.iter().flatten().all(|&light| light == 0.5), "{uniform:?}");
 }
 
@@ -297,7 +297,10 @@ fn rows_beside_the_scenes_window_shine_into_it() {
         let folder = tempfile::tempdir().unwrap();
         let config = SimConfig {
             scene: scene(folder.path()),
-            projector: SimProjector { beam: Beam::Gaussian { sigma_rows: 0.5 }, ..SimProjector::default() },
+            projector: SimProjector {
+                beam: SimBeam::Gaussian { sigma_rows: 0.5 },
+                ..SimProjector::default()
+            },
             ..SimConfig::default()
         };
         let setup = PlaneSetup {

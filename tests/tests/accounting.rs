@@ -10,7 +10,7 @@ use std::time::Duration;
 use raysweep_config::RigFile;
 use raysweep_core::{CameraSettings, Counts, Frame, FramePool, LossCause, SettingsId, Shutter};
 use raysweep_pipeline::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
-use raysweep_sim::{Devices, PlaneRig, PlaneSetup};
+use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup};
 use raysweep_tests::rig_text;
 
 const FRAMES: u32 = 400;
@@ -29,7 +29,7 @@ fn observe(faults: &str) -> (Counts, Truth) {
         first_row: None,
     };
     let bench = PlaneRig::new(rig.sim.clone(), setup, Path::new("")).unwrap();
-    let Devices { mut camera, mut vsync, truth, .. } = bench.open();
+    let PlaneDevices { mut camera, mut vsync, truth, .. } = bench.open();
     let (seen, edges) = channel();
     let watcher = std::thread::spawn(move || {
         while let Ok(edge) = vsync.next_edge(Duration::from_secs(1)) {

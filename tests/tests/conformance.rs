@@ -22,7 +22,7 @@ use raysweep_core::{
     Shutter, Vsync,
 };
 use raysweep_drivers::projector::external::Request;
-use raysweep_sim::mirror::{Link, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults};
+use raysweep_sim::mirror::{MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use raysweep_tests::rig_text;
 
@@ -203,7 +203,7 @@ fn a_projector_that_an_operator_works() {
 
 #[test]
 fn a_triggerbox_on_its_wire() {
-    let pty = TriggerBoxPty::plug(16_666_667, Link::VirtualCom, WireFaults::default()).unwrap();
+    let pty = TriggerBoxPty::plug(16_666_667, SerialLink::VirtualCom, WireFaults::default()).unwrap();
     let vsync =
         format!("driver = \"triggerbox\"\ntriggerbox = {{ port = {:?}, link = \"usb\" }}", pty.path());
     let (_folder, path) = rig_file(&vsync, "realtime = true");
@@ -212,8 +212,8 @@ fn a_triggerbox_on_its_wire() {
 
 #[test]
 fn a_mirror_by_its_rig_file() {
-    let controller = PlayzerXController::new(PlayzerXConfig::default());
-    let pty = MirrorPty::plug(controller, Link::VirtualCom, WireFaults::default()).unwrap();
+    let controller = PlayzerXController::new(PlayzerXControllerConfig::default());
+    let pty = MirrorPty::plug(controller, SerialLink::VirtualCom, WireFaults::default()).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("rig.toml");
     let mirror = format!("[mirror]\ndriver = \"playzerx\"\nport = {:?}\n", pty.path());

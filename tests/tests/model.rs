@@ -10,7 +10,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::SeedableRng;
 use raysweep_config::sim::SimConfig;
-use raysweep_config::sim::{Beam as SimBeam, RowTable, SimProjector};
+use raysweep_config::sim::{RowTable, SimBeam, SimProjector};
 use raysweep_core::{PixelFormat, Raster};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 use raysweep_tests::{Bench, corner_rig, data};

@@ -9,12 +9,12 @@ use std::time::Duration;
 use raysweep::control::Control;
 use raysweep_core::{Counts, LossCause};
 use raysweep_proto::{Event, RunParams};
-use raysweep_sim::mirror::{Link, WireFaults};
+use raysweep_sim::mirror::{SerialLink, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use raysweep_tests::{Bench, Ended, end_of, rig_text};
 
 fn plug(faults: WireFaults) -> TriggerBoxPty {
-    TriggerBoxPty::plug(16_666_667, Link::VirtualCom, faults).unwrap()
+    TriggerBoxPty::plug(16_666_667, SerialLink::VirtualCom, faults).unwrap()
 }
 
 fn bench(port: &Path, reopen_s: f64) -> Bench {

@@ -8,7 +8,7 @@ use serde::Deserialize;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use crate::{ConfigError, Mistake};
+use crate::{ConfigError, ConfigMistake};
 
 /// A value of a device's table that no device can be opened with: its key, and a message that follows the key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -33,7 +33,7 @@ pub(crate) fn out_of_range<const N: usize>(
 pub(crate) struct Document<'a> {
     tables: DeTable<'a>,
     places: Places,
-    mistakes: Vec<Mistake>,
+    mistakes: Vec<ConfigMistake>,
 }
 
 impl<'a> Document<'a> {
@@ -43,7 +43,11 @@ impl<'a> Document<'a> {
     /// A syntax error, in which case nothing else is checked.
     pub fn parse(text: &'a str) -> Result<Self, ConfigError> {
         let table = DeTable::parse(text).map_err(|error| {
-            ConfigError::from(Mistake { message: error.message().into(), field: None, span: error.span() })
+            ConfigError::from(ConfigMistake {
+                message: error.message().into(),
+                field: None,
+                span: error.span(),
+            })
         })?;
         let places = Places::of(&table);
         Ok(Self { tables: table.into_inner(), places, mistakes: Vec::new() })
@@ -63,7 +67,7 @@ impl<'a> Document<'a> {
                 let field = error.span().and_then(|span| self.places.path_at(&span));
                 let field = field.unwrap_or_else(|| key.to_owned());
                 let message = format!("{field}: {}", error.message());
-                self.mistakes.push(Mistake { message, field: Some(field), span: error.span() });
+                self.mistakes.push(ConfigMistake { message, field: Some(field), span: error.span() });
                 None
             }
         }
@@ -185,7 +189,7 @@ impl Places {
 
     /// A mistake about the value at a path of keys (for arrays, indices). If the text has no such value, the mistake
     /// points to the deepest table on the way to it.
-    pub fn mistake(&self, path: &[&str], message: impl Into<String>) -> Mistake {
+    pub fn mistake(&self, path: &[&str], message: impl Into<String>) -> ConfigMistake {
         let mut place = &self.root;
         for key in path {
             match place.inside.get(*key) {
@@ -193,7 +197,11 @@ impl Places {
                 None => break,
             }
         }
-        Mistake { message: message.into(), field: Some(path.join(".")), span: Some(place.value.clone()) }
+        ConfigMistake {
+            message: message.into(),
+            field: Some(path.join(".")),
+            span: Some(place.value.clone()),
+        }
     }
 
     /// An error with this [`Self::mistake`] only.

@@ -10,7 +10,7 @@ pub mod rig;
 pub mod sim;
 
 pub use document::{Fault, Places};
-pub use error::{ConfigError, Mistake};
+pub use error::{ConfigError, ConfigMistake};
 pub use plan::{
     Axis, BatchesPlan, FilmPlan, PathPlan, Plan, PlanePlan, Procedure, ProductTable, ResponsePlan, Shape,
     StageTable, SweepPlan,

@@ -44,7 +44,7 @@ pub struct ClockModel {
 }
 
 /// How accurately a device's clock is known.
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 pub struct ClockQuality {
     /// Weighted root mean square distance of the round trips' middles from the line.
     pub residual_us: f64,

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Why a frame that a point needed was not used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LossCause {
     /// The camera exposed a frame (its id says so) that never reached the host.
@@ -70,7 +71,7 @@ impl fmt::Display for LossCause {
 ///
 /// Invariant ([`Counts::balanced`]): `expected = averaged + settling + cancelled + sum(lost)`. `expected` grows with
 /// the camera's frame ids and with unanswered edges. The other columns grow where the fate of a frame is decided.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Counts {
     /// Triggers that the camera should have answered.
     pub expected: u64,
@@ -133,7 +134,7 @@ impl Counts {
 }
 
 /// Statistics of the edges on a run's VSYNC line.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct VsyncStats {
     /// Genuine edges seen.
     pub edges: u64,

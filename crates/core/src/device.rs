@@ -76,7 +76,7 @@ impl FirstFrame {
 }
 
 /// How many frames after the next one to be triggered settings take effect, as measured by a run's probe.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 pub struct SettingsLatency {
     /// The minimum over all changes.
     pub min_frames: u32,

@@ -1,9 +1,10 @@
 //! The outcome of a film, as given in its end record, its report and the daemon's status.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The result of a film. Planned cycles = stored + incomplete + not taken.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FilmSummary {
     /// Cycles that the plan asks for.
     pub cycles_planned: usize,
@@ -25,7 +26,7 @@ pub struct FilmSummary {
 }
 
 /// Percentiles of repeated measurements.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Percentiles {
     /// Median.
     pub p50: f64,

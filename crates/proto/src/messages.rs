@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use raysweep_core::{ClockQuality, Counts, FilmSummary, SettingsLatency, VsyncStats};
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::SweepAdvice;
@@ -53,7 +53,6 @@ pub struct Progress {
     /// Points that the run needs: those of the sweep, its dark images and the regular image.
     pub points_planned: usize,
     /// What became of this run's triggers so far.
-    #[schemars(schema_with = "counts_schema")]
     pub counts: Counts,
     /// Seconds since the run began.
     pub elapsed_s: f64,
@@ -61,88 +60,6 @@ pub struct Progress {
     pub left_s: Option<f64>,
     /// Frames averaged per second.
     pub frames_per_s: f64,
-}
-
-/// `core` has no schemas, so those of its counts and statistics are written out here.
-fn counts_schema(_: &mut SchemaGenerator) -> Schema {
-    let frames = json_schema!({ "type": "integer", "minimum": 0 });
-    json_schema!({
-        "type": "object",
-        "description": "Frames: expected = averaged + settling + cancelled + sum of lost.",
-        "properties": {
-            "expected": frames,
-            "averaged": frames,
-            "settling": frames,
-            "cancelled": frames,
-            "lost": { "type": "object", "description": "Frames by cause.", "additionalProperties": frames },
-        },
-        "required": ["expected", "averaged", "settling", "cancelled", "lost"],
-    })
-}
-
-fn vsync_schema(_: &mut SchemaGenerator) -> Schema {
-    let edges = json_schema!({ "type": "integer", "minimum": 0 });
-    json_schema!({
-        "type": ["object", "null"],
-        "properties": {
-            "edges": edges,
-            "missed": edges,
-            "false_edges": edges,
-            "period_us": { "type": "number" },
-            "jitter_us": { "type": "number", "description": "Standard deviation of edges from the line through their neighbours." },
-            "jitter_p99_us": { "type": "number" },
-            "allan_1s": { "type": ["number", "null"], "description": "Allan deviation over one second." },
-        },
-        "required": ["edges", "missed", "false_edges", "period_us", "jitter_us"],
-    })
-}
-
-fn clock_schema(_: &mut SchemaGenerator) -> Schema {
-    json_schema!({
-        "type": ["object", "null"],
-        "description": "The fit of a device's clock to the host's, null where the host stamps.",
-        "properties": {
-            "residual_us": { "type": "number" },
-            "rate_ppm": { "type": "number" },
-            "round_trips": { "type": "integer", "minimum": 0 },
-        },
-        "required": ["residual_us", "rate_ppm", "round_trips"],
-    })
-}
-
-fn latency_schema(_: &mut SchemaGenerator) -> Schema {
-    let frames = json_schema!({ "type": "integer", "minimum": 0 });
-    json_schema!({
-        "type": ["object", "null"],
-        "properties": { "min_frames": frames, "max_frames": frames },
-        "required": ["min_frames", "max_frames"],
-    })
-}
-
-fn film_schema(_: &mut SchemaGenerator) -> Schema {
-    let cycles = json_schema!({ "type": "integer", "minimum": 0 });
-    json_schema!({
-        "type": ["object", "null"],
-        "description": "A film's account: cycles planned = stored + incomplete + those not taken.",
-        "properties": {
-            "cycles_planned": cycles,
-            "cycles_stored": cycles,
-            "cycles_incomplete": cycles,
-            "transports": cycles,
-            "transports_missing": cycles,
-            "sliding_estimates": cycles,
-            "cycles_per_s": { "type": ["number", "null"] },
-            "latency_ms": {
-                "type": ["object", "null"],
-                "description": "Percentiles p50, p95, p99 and max: from the end of a cycle's last exposure to its transport.",
-                "additionalProperties": { "type": "number" },
-            },
-        },
-        "required": [
-            "cycles_planned", "cycles_stored", "cycles_incomplete", "transports", "transports_missing",
-            "sliding_estimates", "cycles_per_s", "latency_ms",
-        ],
-    })
 }
 
 /// A light transport estimated during a film; the images themselves are not included.
@@ -164,7 +81,6 @@ pub struct FilmEstimate {
     /// The same for the light from all other rows.
     pub non_epipolar: f64,
     /// Summary of the film so far.
-    #[schemars(schema_with = "film_schema")]
     pub film: FilmSummary,
 }
 
@@ -273,20 +189,16 @@ pub struct Status {
     /// Progress of that run.
     pub progress: Option<Progress>,
     /// Statistics of its VSYNC line, updated once per second.
-    #[schemars(schema_with = "vsync_schema")]
     pub vsync: Option<VsyncStats>,
     /// Quality of the clock fit of the device that watches the VSYNC line.
     #[serde(default)]
-    #[schemars(schema_with = "clock_schema")]
     pub vsync_clock: Option<ClockQuality>,
     /// Summary of the film, if the run is a film.
     #[serde(default)]
-    #[schemars(schema_with = "film_schema")]
     pub film: Option<FilmSummary>,
     /// How many frames after a change the camera's settings take effect (0: the next frame), as measured by
     /// the run's probe.
     #[serde(default)]
-    #[schemars(schema_with = "latency_schema")]
     pub settings_latency: Option<SettingsLatency>,
     /// Why the last run faulted.
     pub error: Option<String>,
@@ -431,11 +343,10 @@ pub enum Event {
         /// Counted from 0; in a film, the cycle.
         attempt: u32,
         /// What became of its triggers.
-        #[schemars(schema_with = "counts_schema")]
         counts: Counts,
     },
     /// Statistics of the VSYNC line so far: once per second and at the end of a pass.
-    Vsync(#[schemars(schema_with = "vsync_schema")] VsyncStats),
+    Vsync(VsyncStats),
     /// The light transport was estimated during a film.
     Film(FilmEstimate),
     /// A batch of a flying dot was stored.
@@ -470,7 +381,6 @@ pub enum Event {
         missing: usize,
         /// Summary of the film, if the run was a film.
         #[serde(default)]
-        #[schemars(schema_with = "film_schema")]
         film: Option<FilmSummary>,
         /// Reasons why the results may be worse than they look.
         #[serde(default)]

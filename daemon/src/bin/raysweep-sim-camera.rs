@@ -9,7 +9,7 @@ use clap::Parser;
 use raysweep::rig::Rig;
 use raysweep_sim::WireDevices;
 use raysweep_sim::bench::BenchServer;
-use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look};
+use raysweep_sim::gige::{CameraClock, Faults, GigeCamera, GigeSetup, Look};
 use serde::de::DeserializeOwned;
 
 /// A simulated GigE Vision camera: any GenICam client finds it, sets it and receives its pictures.
@@ -53,7 +53,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let setup = GigeSetup {
         address: arguments.address,
         serial: arguments.serial.clone(),
-        clock: table::<DeviceClock>("clock", &arguments.clock)?,
+        clock: table::<CameraClock>("clock", &arguments.clock)?,
         faults: table::<Faults>("fault", &arguments.faults)?,
         zipped: arguments.zipped,
     };

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Subcommand;
 
 use super::exit::Exit;
-use super::failure::Failure;
+use super::failure::CommandFailure;
 use super::printer::Printer;
 
 #[derive(Debug, Subcommand)]
@@ -29,13 +29,13 @@ pub(super) enum CameraCommand {
 }
 
 #[cfg(not(feature = "aravis"))]
-pub(super) fn devices(_: Printer) -> Result<Exit, Failure> {
-    Err(Failure::WithoutAravis)
+pub(super) fn devices(_: Printer) -> Result<Exit, CommandFailure> {
+    Err(CommandFailure::WithoutAravis)
 }
 
 #[cfg(not(feature = "aravis"))]
-pub(super) fn camera(_: CameraCommand, _: Printer) -> Result<Exit, Failure> {
-    Err(Failure::WithoutAravis)
+pub(super) fn camera(_: CameraCommand, _: Printer) -> Result<Exit, CommandFailure> {
+    Err(CommandFailure::WithoutAravis)
 }
 
 #[cfg(feature = "aravis")]
@@ -48,20 +48,21 @@ mod with_aravis {
     use raysweep_drivers::camera::aravis::{Found, Refused, discover, load_features, save_features};
     use serde_json::json;
 
-    use super::{CameraCommand, Exit, Failure, Printer};
+    use super::{CameraCommand, CommandFailure, Exit, Printer};
 
     /// Lists the cameras that respond.
-    pub fn devices(printer: Printer) -> Result<Exit, Failure> {
+    pub fn devices(printer: Printer) -> Result<Exit, CommandFailure> {
         printer.print(&discover(), |found| table(found))?;
         Ok(Exit::Done)
     }
 
-    pub fn camera(command: CameraCommand, printer: Printer) -> Result<Exit, Failure> {
+    pub fn camera(command: CameraCommand, printer: Printer) -> Result<Exit, CommandFailure> {
         match command {
             CameraCommand::Save { file, camera } => {
                 let camera = the_camera(camera)?;
                 let text = save_features(&camera)?;
-                fs::write(&file, &text).map_err(|source| Failure::Write { path: file.clone(), source })?;
+                fs::write(&file, &text)
+                    .map_err(|source| CommandFailure::Write { path: file.clone(), source })?;
                 let lines = text.lines().filter(|line| !line.starts_with('#')).count();
                 let value = json!({ "camera": camera, "file": file, "lines": lines });
                 printer
@@ -70,7 +71,7 @@ mod with_aravis {
             }
             CameraCommand::Load { file, camera } => {
                 let text = fs::read_to_string(&file)
-                    .map_err(|source| Failure::File { path: file.clone(), source })?;
+                    .map_err(|source| CommandFailure::File { path: file.clone(), source })?;
                 let camera = the_camera(camera)?;
                 let (taken, refused) = load_features(&camera, &text)?;
                 let value = json!({ "camera": camera, "taken": taken, "refused": refused });
@@ -80,14 +81,14 @@ mod with_aravis {
         }
     }
 
-    fn the_camera(named: Option<String>) -> Result<String, Failure> {
+    fn the_camera(named: Option<String>) -> Result<String, CommandFailure> {
         if let Some(named) = named {
             return Ok(named);
         }
         let found = discover();
         match found.as_slice() {
             [only] => Ok(only.name.clone()),
-            _ => Err(Failure::WhichCamera(table(&found))),
+            _ => Err(CommandFailure::WhichCamera(table(&found))),
         }
     }
 

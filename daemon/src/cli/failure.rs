@@ -16,7 +16,7 @@ use raysweep_processing::ProcessError;
 
 /// Why the command failed.
 #[derive(Debug, thiserror::Error)]
-pub(super) enum Failure {
+pub(super) enum CommandFailure {
     #[error(transparent)]
     Client(#[from] ClientError),
     #[error("{0}")]
@@ -65,7 +65,7 @@ pub(super) struct PlanProblem {
     help: Option<String>,
 }
 
-impl Failure {
+impl CommandFailure {
     /// The failure of a call that sent a plan's text.
     pub fn of_plan(error: ClientError, path: &Path, text: &str) -> Self {
         match error {
@@ -159,9 +159,9 @@ mod tests {
     fn a_plans_error_shows_its_file_its_line_and_its_field() {
         let text = "kind = \"sweep\"\n[sweep]\ncount = 0\n";
         let start = text.find('0').unwrap();
-        let failure = Failure::of_plan(invalid((start, start + 1)), Path::new("night.toml"), text);
+        let failure = CommandFailure::of_plan(invalid((start, start + 1)), Path::new("night.toml"), text);
         assert_eq!(failure.exit(), Exit::Refused);
-        let Failure::Plan(problem) = failure else { panic!("{failure}") };
+        let CommandFailure::Plan(problem) = failure else { panic!("{failure}") };
         let shown = format!("{:?}", miette::Report::new(*problem));
         for part in ["count is 0", "night.toml:3:9", "count = 0", "sweep.count"] {
             assert!(shown.contains(part), "{part} in {shown}");
@@ -171,19 +171,19 @@ mod tests {
     #[test]
     fn a_span_beyond_the_text_does_no_harm() {
         for span in [(0, 99), (99, 100), (5, 2)] {
-            let failure = Failure::of_plan(invalid(span), Path::new("p"), "é = 1");
-            let Failure::Plan(problem) = failure else { panic!("{failure}") };
+            let failure = CommandFailure::of_plan(invalid(span), Path::new("p"), "é = 1");
+            let CommandFailure::Plan(problem) = failure else { panic!("{failure}") };
             assert!(format!("{:?}", miette::Report::new(*problem)).contains("count is 0"));
         }
     }
 
     #[test]
     fn refusals_failures_and_silence_end_differently() {
-        let rpc = |code| Failure::from(ClientError::from(RpcError::new(code, "")));
+        let rpc = |code| CommandFailure::from(ClientError::from(RpcError::new(code, "")));
         assert_eq!(rpc(ErrorCode::Forbidden).exit(), Exit::Refused);
         assert_eq!(rpc(ErrorCode::Busy).exit(), Exit::Refused);
         assert_eq!(rpc(ErrorCode::Device).exit(), Exit::Failed);
         let lost = ClientError::Lost { path: "s".into(), source: io::ErrorKind::UnexpectedEof.into() };
-        assert_eq!(Failure::from(lost).exit(), Exit::Unreachable);
+        assert_eq!(CommandFailure::from(lost).exit(), Exit::Unreachable);
     }
 }

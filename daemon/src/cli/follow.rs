@@ -9,8 +9,8 @@ use tokio::runtime::Runtime;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::exit::Exit;
-use super::failure::Failure;
-use super::view::View;
+use super::failure::CommandFailure;
+use super::view::EventView;
 
 /// How long handling of an interrupt may be delayed while no event arrives.
 const PATIENCE: Duration = Duration::from_millis(100);
@@ -60,9 +60,9 @@ pub(super) fn follow(
     mut events: Subscription,
     session: &Path,
     mut interrupts: Interrupts,
-    mut view: View,
+    mut view: EventView,
     mut on_interrupt: OnInterrupt,
-) -> Result<Exit, Failure> {
+) -> Result<Exit, CommandFailure> {
     let mut cancelled = false;
     loop {
         if interrupts.pending() {
@@ -84,7 +84,7 @@ pub(super) fn follow(
             }
         }
         let Some(event) = events.next_within(PATIENCE)? else { continue };
-        view.show(&event).map_err(Failure::Output)?;
+        view.show(&event).map_err(CommandFailure::Output)?;
         if let Event::Finished { session: ended, state, missing, .. } = &event
             && ended == session
         {

@@ -23,10 +23,10 @@ use serde_json::json;
 
 use self::devices::CameraCommand;
 use self::exit::Exit;
-use self::failure::Failure;
+use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::printer::Printer;
-use self::view::View;
+use self::view::EventView;
 use raysweep_processing::{Asked, export, process_asked};
 
 /// Where the packaged daemon listens.
@@ -167,7 +167,7 @@ pub fn main() -> ExitCode {
     }
 }
 
-fn execute(arguments: Arguments) -> Result<Exit, Failure> {
+fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
     let Arguments { socket, json, command } = arguments;
     let socket = socket_path(socket, std::env::var_os("RAYSWEEP_SOCKET"));
     let connect = || Client::connect(&socket);
@@ -179,14 +179,15 @@ fn execute(arguments: Arguments) -> Result<Exit, Failure> {
         Command::Camera(command) => return devices::camera(command, printer),
         Command::Check { plan } => {
             let text = read_plan(&plan)?;
-            let report = connect()?.check(&text).map_err(|error| Failure::of_plan(error, &plan, &text))?;
+            let report =
+                connect()?.check(&text).map_err(|error| CommandFailure::of_plan(error, &plan, &text))?;
             printer.print(&report, show::check)?;
         }
         Command::Run(RunArguments { plan, detach, operator, sample, note, tags }) => {
             let text = read_plan(&plan)?;
             let params = RunParams { plan: text.clone(), operator, sample, note, tags };
             let begin = |client: &mut Client| {
-                client.run(&params).map_err(|error| Failure::of_plan(error, &plan, &text))
+                client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &text))
             };
             return begin_run(&socket, printer, detach, begin);
         }
@@ -249,8 +250,8 @@ fn begin_run(
     socket: &Path,
     printer: Printer,
     detach: bool,
-    begin: impl FnOnce(&mut Client) -> Result<Started, Failure>,
-) -> Result<Exit, Failure> {
+    begin: impl FnOnce(&mut Client) -> Result<Started, CommandFailure>,
+) -> Result<Exit, CommandFailure> {
     let mut client = Client::connect(socket)?;
     if detach {
         let started = begin(&mut client)?;
@@ -259,24 +260,24 @@ fn begin_run(
     }
     // Before the run begins, so that none of its events is missed, and no Ctrl-C ends us with the run unattended.
     let events = Client::connect(socket)?.subscribe()?;
-    let interrupts = Interrupts::new().map_err(Failure::Signals)?;
+    let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
     let Started { session } = begin(&mut client)?;
-    follow(events, &session, interrupts, View::new(printer.json), OnInterrupt::Cancel(client))
+    follow(events, &session, interrupts, EventView::new(printer.json), OnInterrupt::Cancel(client))
 }
 
-fn watch(socket: &Path, printer: Printer) -> Result<Exit, Failure> {
+fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
     let events = Client::connect(socket)?.subscribe()?;
-    let interrupts = Interrupts::new().map_err(Failure::Signals)?;
+    let interrupts = Interrupts::new().map_err(CommandFailure::Signals)?;
     let status = Client::connect(socket)?.status()?;
     let under_way = !matches!(status.state, RunState::Idle | RunState::Faulted);
     let Some(session) = status.session.filter(|_| under_way) else {
         let message = "no run is under way; `raysweep sessions` lists those that were";
         return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
     };
-    let mut view = View::new(printer.json);
+    let mut view = EventView::new(printer.json);
     if let Some(text) = status.question {
         // Asked before anybody watched.
-        view.show(&Event::Ask { text }).map_err(Failure::Output)?;
+        view.show(&Event::Ask { text }).map_err(CommandFailure::Output)?;
     }
     follow(events, &session, interrupts, view, OnInterrupt::Leave)
 }
@@ -286,8 +287,8 @@ fn socket_path(argument: Option<PathBuf>, variable: Option<OsString>) -> PathBuf
     argument.or(variable).unwrap_or_else(|| DEFAULT_SOCKET.into())
 }
 
-fn read_plan(path: &Path) -> Result<String, Failure> {
-    fs::read_to_string(path).map_err(|source| Failure::File { path: path.to_owned(), source })
+fn read_plan(path: &Path) -> Result<String, CommandFailure> {
+    fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })
 }
 
 fn export_folder(session: &Path) -> PathBuf {

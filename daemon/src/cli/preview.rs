@@ -12,7 +12,7 @@ use raysweep_session::report::{Picture, ToneMap};
 use serde_json::{Value, json};
 
 use super::exit::Exit;
-use super::failure::Failure;
+use super::failure::CommandFailure;
 use super::printer::Printer;
 use crate::live::{EPIPOLAR, INDIRECT, LiveError, LiveImage, LiveReader};
 
@@ -25,9 +25,14 @@ const PERCENTILE: f64 = 99.5;
 
 /// Writes epipolar and indirect light, side by side and each on its own scale, as a PNG file; with `follow`, repeats
 /// this for every newer estimate until the daemon or the run ends.
-pub(super) fn preview(socket: &Path, output: &Path, follow: bool, printer: Printer) -> Result<Exit, Failure> {
+pub(super) fn preview(
+    socket: &Path,
+    output: &Path,
+    follow: bool,
+    printer: Printer,
+) -> Result<Exit, CommandFailure> {
     let mut client = Client::connect(socket)?;
-    let file = client.status()?.live.ok_or(Failure::NoLiveImage)?;
+    let file = client.status()?.live.ok_or(CommandFailure::NoLiveImage)?;
     let reader = LiveReader::open(&file)?;
     let mut drawn = None;
     loop {
@@ -42,7 +47,7 @@ pub(super) fn preview(socket: &Path, output: &Path, follow: bool, printer: Print
                     return Ok(Exit::Done);
                 }
             }
-            None if !follow => return Err(Failure::NoLiveImage),
+            None if !follow => return Err(CommandFailure::NoLiveImage),
             _ => {}
         }
         if !follow {
@@ -66,33 +71,35 @@ fn pair(reader: &LiveReader) -> Result<Option<(LiveImage, LiveImage)>, LiveError
     Ok(epipolar.zip(indirect).filter(of_one))
 }
 
-fn side_by_side(epipolar: LiveImage, indirect: &LiveImage) -> Result<Vec<u8>, Failure> {
+fn side_by_side(epipolar: LiveImage, indirect: &LiveImage) -> Result<Vec<u8>, CommandFailure> {
     let scaled = |image: &LiveImage| {
         let image = image.image.view().into_dimensionality::<Ix2>().map_err(io::Error::other)?;
         Ok::<_, io::Error>(image.mapv(|light| light / ToneMap::percentile(&[image], PERCENTILE).white))
     };
-    let (left, right) =
-        (scaled(&epipolar).map_err(Failure::Output)?, scaled(indirect).map_err(Failure::Output)?);
+    let (left, right) = (
+        scaled(&epipolar).map_err(CommandFailure::Output)?,
+        scaled(indirect).map_err(CommandFailure::Output)?,
+    );
     let gap = Array2::zeros((left.nrows(), GAP_PX));
     let both = concatenate(Axis(1), &[left.view(), gap.view(), right.view()])
-        .map_err(|error| Failure::Output(io::Error::other(error)))?;
+        .map_err(|error| CommandFailure::Output(io::Error::other(error)))?;
     Ok(Picture::grey(both.view(), ToneMap { white: 1.0 })
         .to_png()
         .map_err(raysweep_processing::ProcessError::from)?)
 }
 
 /// Replaces the file atomically, so that a viewer never sees half an image.
-fn replace(output: &Path, png: &[u8]) -> Result<(), Failure> {
-    let failed = |source| Failure::Write { path: output.to_owned(), source };
+fn replace(output: &Path, png: &[u8]) -> Result<(), CommandFailure> {
+    let failed = |source| CommandFailure::Write { path: output.to_owned(), source };
     let mut name = output.as_os_str().to_owned();
     name.push(".part");
     let part = PathBuf::from(name);
     fs::write(&part, png).and_then(|()| fs::rename(&part, output)).map_err(failed)
 }
 
-fn tell(image: &LiveImage, output: &Path, printer: Printer) -> Result<(), Failure> {
+fn tell(image: &LiveImage, output: &Path, printer: Printer) -> Result<(), CommandFailure> {
     let points = image.metadata.get("points").and_then(Value::as_u64).unwrap_or_default();
     let value = json!({ "output": output, "sequence": image.sequence, "points": points });
     printer.print(&value, |_| format!("{}: estimated from {points} points", output.display()))?;
-    io::stdout().flush().map_err(Failure::Output)
+    io::stdout().flush().map_err(CommandFailure::Output)
 }

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::failure::Failure;
+use super::failure::CommandFailure;
 
 /// Prints results for people or for programs.
 #[derive(Debug, Clone, Copy)]
@@ -13,11 +13,15 @@ pub(super) struct Printer {
 }
 
 impl Printer {
-    pub fn print<T: Serialize>(self, result: &T, text: impl FnOnce(&T) -> String) -> Result<(), Failure> {
+    pub fn print<T: Serialize>(
+        self,
+        result: &T,
+        text: impl FnOnce(&T) -> String,
+    ) -> Result<(), CommandFailure> {
         let line = match self.json {
-            true => serde_json::to_string(result).map_err(io::Error::from).map_err(Failure::Output)?,
+            true => serde_json::to_string(result).map_err(io::Error::from).map_err(CommandFailure::Output)?,
             false => text(result),
         };
-        writeln!(io::stdout(), "{line}").map_err(Failure::Output)
+        writeln!(io::stdout(), "{line}").map_err(CommandFailure::Output)
     }
 }

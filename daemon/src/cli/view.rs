@@ -14,7 +14,7 @@ const PACE: Duration = Duration::from_secs(5);
 const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} points  {msg}";
 
 /// Displays a run's events.
-pub(super) struct View {
+pub(super) struct EventView {
     place: Place,
     /// Points in the newest live estimate.
     live: Option<usize>,
@@ -33,7 +33,7 @@ enum Place {
     Json,
 }
 
-impl View {
+impl EventView {
     /// The view that suits our output.
     pub fn new(json: bool) -> Self {
         Self { place: Place::new(json), live: None }

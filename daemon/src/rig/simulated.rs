@@ -7,7 +7,7 @@ use raysweep_config::RigFile;
 use raysweep_config::rig::plane::CameraDriver;
 use raysweep_core::{Camera, Clock, Projector, Vsync};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
-use raysweep_sim::{Devices, PlaneRig, PlaneSetup, SimError};
+use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError};
 
 use super::{Rig, RigError};
 
@@ -45,7 +45,7 @@ impl Simulated {
             }
             (Some(bench), _) => Ok(Self { bench: Some(bench.clone()), ..Self::default() }),
             (None, Some(sim)) => {
-                let Devices { camera, vsync, projector, clock, .. } = sim.open();
+                let PlaneDevices { camera, vsync, projector, clock, .. } = sim.open();
                 let camera = Some((camera, clock));
                 Ok(Self { camera, vsync: Some(vsync), projector: Some(projector), bench: None })
             }

@@ -10,7 +10,7 @@ use tokio::sync::broadcast;
 use crate::control::Control;
 
 /// Result of a call.
-pub(super) struct Reply {
+pub(super) struct CallResult {
     /// The method's result.
     pub result: Value,
     /// For `subscribe`: the events to send from now on.
@@ -22,7 +22,7 @@ pub(super) fn carry_out(
     control: &dyn Control,
     method: Method,
     given: Map<String, Value>,
-) -> Result<Reply, RpcError> {
+) -> Result<CallResult, RpcError> {
     let result = match method {
         Method::Check => control.check(&params::<CheckParams>(given)?.plan).and_then(value),
         Method::Run => control.run(params::<RunParams>(given)?).and_then(value),
@@ -36,10 +36,10 @@ pub(super) fn carry_out(
         Method::ArmLight => none(given).and_then(|()| control.arm_light()).and_then(done),
         Method::Subscribe => {
             none(given)?;
-            return Ok(Reply { result: done(())?, events: Some(control.events()) });
+            return Ok(CallResult { result: done(())?, events: Some(control.events()) });
         }
     };
-    Ok(Reply { result: result?, events: None })
+    Ok(CallResult { result: result?, events: None })
 }
 
 /// Reads the parameters of a method that has none.

@@ -4,13 +4,17 @@
 
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a test that cannot go on may panic")]
 
+#[path = "../process/mod.rs"]
+mod process;
+
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use ndarray::Axis;
 use nix::sched::{CloneFlags, unshare};
+use process::Process;
 use raysweep::rig::Rig;
 use raysweep_config::{FilmPlan, Plan, Procedure};
 use raysweep_core::{CameraSettings, Counts, FramePool, Pattern, SettingsId, Shutter, ns_from_us};
@@ -20,7 +24,7 @@ use raysweep_session::ledger::EndEntry;
 use raysweep_session::stack::ArrayName;
 use raysweep_sim::bench::BenchProbe;
 use raysweep_sim::gige::{Faults, WireTruth};
-use raysweep_sim::{Devices, PlaneRig};
+use raysweep_sim::{PlaneDevices, PlaneRig};
 
 /// Time from the simulated camera's trigger to its exposure at zero delay.
 const LATENCY_US: f64 = 8.0;
@@ -74,7 +78,7 @@ impl Sweep<'_> {
         std::fs::write(&rig, self.rig()).unwrap();
         let mut arguments = vec!["--rig", rig.to_str().unwrap()];
         arguments.extend(self.faults.iter().flat_map(|fault| ["--fault", fault]));
-        let _camera = Process::start(env!("CARGO_BIN_EXE_raysweep-sim-camera"), &arguments);
+        let _camera = start(env!("CARGO_BIN_EXE_raysweep-sim-camera"), &arguments);
         let bench = folder.path().join("bench.sock");
         let mut probe = wait_for("the camera does not start", || BenchProbe::open(&bench).ok());
         let session = self.run_daemon(folder.path(), &mut probe);
@@ -129,7 +133,7 @@ impl Sweep<'_> {
         let (rig, socket, data) = (folder.join("rig.toml"), folder.join("socket"), folder.join("sessions"));
         let arguments = [("--rig", &rig), ("--socket", &socket), ("--data", &data)];
         let arguments = arguments.iter().flat_map(|(flag, path)| [*flag, path.to_str().unwrap()]);
-        let _daemon = Process::start(env!("CARGO_BIN_EXE_raysweepd"), &arguments.collect::<Vec<_>>());
+        let _daemon = start(env!("CARGO_BIN_EXE_raysweepd"), &arguments.collect::<Vec<_>>());
         let mut client = wait_for("the daemon does not listen", || Client::connect(&socket).ok());
         let events = Client::connect(&socket).unwrap().subscribe().unwrap();
         client.run(&RunParams { plan: self.plan(), ..RunParams::default() }).unwrap();
@@ -225,22 +229,8 @@ fn assert_camera_is_left_as_set(rig: &Rig, plan: &FilmPlan) {
     assert!(lines.iter().all(|line| found.contains(line)), "{lines:?}: {found}");
 }
 
-/// A process that is killed at the end of the test.
-struct Process(Child);
-
-impl Process {
-    fn start(program: &str, arguments: &[&str]) -> Self {
-        let mut command = Command::new(program);
-        command.args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
-        Self(command.spawn().unwrap())
-    }
-}
-
-impl Drop for Process {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
+fn start(program: &str, arguments: &[&str]) -> Process {
+    Process::start(Command::new(program).args(arguments).stdout(Stdio::null()).stderr(Stdio::null()))
 }
 
 /// Waits until `look` returns a value.
@@ -292,7 +282,7 @@ fn assert_frames_of_the_scene(session: &Session, rig: &Rig, plan: &FilmPlan) {
 /// Counts of one frame of the simulated camera, without network and daemon.
 fn scene_counts(rig: &Rig, pattern: &Pattern, delay_us: f64, exposure_us: f64) -> Vec<u32> {
     let scene: &PlaneRig = rig.simulated().unwrap();
-    let Devices { mut camera, mut projector, vsync, .. } = scene.open();
+    let PlaneDevices { mut camera, mut projector, vsync, .. } = scene.open();
     // Virtual time waits for every device.
     drop(vsync);
     let (raster, format) = (rig.file.raster(), camera.capabilities().format);

@@ -3,7 +3,7 @@
 use raysweep_core::{Mirror, MirrorPath};
 use raysweep_drivers::mirror::{Mti, Optotune, OptotuneConfig};
 use raysweep_sim::mirror::{
-    Held, Link, MechanicsConfig, MirrorPty, OptotuneController, PlayzerXConfig, WireFaults,
+    Held, MechanicsConfig, MirrorPty, OptotuneController, PlayzerXControllerConfig, SerialLink, WireFaults,
 };
 
 use crate::points::{Lamp, assert_points, mti_config, mti_rig, rig};
@@ -26,7 +26,7 @@ fn conforms(rig: &Rig, mut mirror: impl Mirror) -> (MirrorPath, Vec<Held>) {
 #[test]
 fn playzerx() {
     for faults in [WireFaults::default(), FAULTS] {
-        let rig = Rig::playzerx(PlayzerXConfig::default(), faults);
+        let rig = Rig::playzerx(PlayzerXControllerConfig::default(), faults);
         let (path, held) = conforms(&rig, rig.open());
         let codes = codes(&path).repeat(BATCHES as usize);
         assert!(held.windows(codes.len()).any(|window| window == codes), "the path is not what was played");
@@ -48,7 +48,7 @@ fn optotune() {
     for faults in [WireFaults::default(), FAULTS] {
         let mechanics =
             MechanicsConfig { max_tilt: raysweep_core::MechanicalDeg(25.0), ..Default::default() };
-        let link = Link::Uart { baud: 256_000 };
+        let link = SerialLink::Uart { baud: 256_000 };
         let rig = rig(MirrorPty::plug(OptotuneController::new(mechanics), link, faults).unwrap());
         let port = rig.pty.path().to_owned();
         let (state, light) = (rig.state(), rig.armed());

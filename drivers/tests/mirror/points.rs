@@ -10,7 +10,7 @@ use raysweep_drivers::mirror::{
     Laser, LightGuard, Mti, MtiConfig, MtiDrive, Optotune, OptotuneConfig, Parked, park,
 };
 use raysweep_sim::mirror::{
-    Held, Link, MechanicsConfig, MirrorPty, MtiController, OptotuneController, WireFaults,
+    Held, MechanicsConfig, MirrorPty, MtiController, OptotuneController, SerialLink, WireFaults,
 };
 
 use crate::rig::{LIMITS, Rig, play};
@@ -20,7 +20,7 @@ pub fn rig(pty: MirrorPty) -> Rig {
 }
 
 pub fn mti_rig(faults: WireFaults) -> Rig {
-    let link = Link::Uart { baud: 115_200 };
+    let link = SerialLink::Uart { baud: 115_200 };
     rig(MirrorPty::plug(MtiController::new(MechanicsConfig::default()), link, faults).unwrap())
 }
 
@@ -108,7 +108,7 @@ impl Laser for Lamp {
 
 fn optotune_rig(faults: WireFaults) -> Rig {
     let mechanics = MechanicsConfig { max_tilt: raysweep_core::MechanicalDeg(25.0), ..Default::default() };
-    let link = Link::Uart { baud: 256_000 };
+    let link = SerialLink::Uart { baud: 256_000 };
     rig(MirrorPty::plug(OptotuneController::new(mechanics), link, faults).unwrap())
 }
 

@@ -7,7 +7,7 @@ use raysweep_core::{Mirror, MirrorLimits, MirrorPath, MirrorProgress, Tilt};
 use raysweep_drivers::mirror::playzerx::protocol::Sample;
 use raysweep_drivers::mirror::{self, LightGuard, PlayzerX, arm_light};
 use raysweep_sim::mirror::{
-    Held, Link, MechanicsConfig, MirrorPty, PlayzerXConfig, PlayzerXController, WireFaults,
+    Held, MechanicsConfig, MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults,
 };
 use tempfile::TempDir;
 
@@ -26,13 +26,13 @@ pub struct Rig {
 }
 
 impl Rig {
-    pub fn playzerx(config: PlayzerXConfig, faults: WireFaults) -> Self {
-        let pty = MirrorPty::plug(PlayzerXController::new(config), Link::VirtualCom, faults).unwrap();
+    pub fn playzerx(config: PlayzerXControllerConfig, faults: WireFaults) -> Self {
+        let pty = MirrorPty::plug(PlayzerXController::new(config), SerialLink::VirtualCom, faults).unwrap();
         Self { pty, folder: tempfile::tempdir().unwrap() }
     }
 
     pub fn good() -> Self {
-        Self::playzerx(PlayzerXConfig::default(), WireFaults::default())
+        Self::playzerx(PlayzerXControllerConfig::default(), WireFaults::default())
     }
 
     pub fn state(&self) -> PathBuf {

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorPath, Tilt};
 use raysweep_drivers::mirror::{self, LightGuard, Mti, Optotune, OptotuneConfig, PlayzerX};
-use raysweep_sim::mirror::{Link, Pty, WireFaults};
+use raysweep_sim::mirror::{Pty, SerialLink, WireFaults};
 use tempfile::TempDir;
 
 use crate::points::{Lamp, mti_config};
@@ -46,7 +46,7 @@ impl Script {
                 replies.extend(answer(&message, now_ns));
             }
         };
-        let pty = Pty::plug(Box::new(run), Link::VirtualCom, WireFaults::default()).unwrap();
+        let pty = Pty::plug(Box::new(run), SerialLink::VirtualCom, WireFaults::default()).unwrap();
         Self { pty, heard, folder: tempfile::tempdir().unwrap() }
     }
 

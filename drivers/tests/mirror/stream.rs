@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorLimits, MirrorPath, Tilt};
 use raysweep_drivers::mirror::{self, LightGuard, LightState, MirrorReport, PlayzerX};
-use raysweep_sim::mirror::{Held, PlayzerXConfig, WireFaults};
+use raysweep_sim::mirror::{Held, PlayzerXControllerConfig, WireFaults};
 
 use crate::rig::{LIMITS, RATE_HZ, Rig, batch, codes, play};
 
@@ -39,7 +39,7 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
 
 #[test]
 fn garbage_stalls_and_a_wrong_clock_change_no_sample() {
-    let config = PlayzerXConfig { clock_error: 0.01, ..PlayzerXConfig::default() };
+    let config = PlayzerXControllerConfig { clock_error: 0.01, ..PlayzerXControllerConfig::default() };
     let faults = WireFaults { seed: 7, garbage: 0.1, stalls: 0.005, stall_ms: 30 };
     let rig = Rig::playzerx(config, faults);
     let path = batch();
@@ -78,8 +78,10 @@ fn a_full_fifo_is_not_overfilled_when_the_mirror_is_stopped_and_started_again() 
 
 #[test]
 fn a_rate_that_the_controller_does_not_keep_is_found_out() {
-    let rig =
-        Rig::playzerx(PlayzerXConfig { max_rate_hz: 30_000.0, ..Default::default() }, WireFaults::default());
+    let rig = Rig::playzerx(
+        PlayzerXControllerConfig { max_rate_hz: 30_000.0, ..Default::default() },
+        WireFaults::default(),
+    );
     let mut mirror = rig.open();
     let error = mirror.load(&batch()).unwrap_err();
     assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
@@ -158,7 +160,7 @@ fn an_interlock_that_opens_switches_the_light_off_and_parks() {
 #[test]
 fn a_mirror_that_confirms_no_motion_is_not_lit() {
     // About 18,000 samples are played before the light: the approach and the rest before the path.
-    let config = PlayzerXConfig { freezes_after: Some(40_000), ..Default::default() };
+    let config = PlayzerXControllerConfig { freezes_after: Some(40_000), ..Default::default() };
     let rig = Rig::playzerx(config, WireFaults::default());
     let mut mirror = rig.open();
     mirror.load(&batch()).unwrap();

@@ -14,7 +14,7 @@ use raysweep_drivers::mirror::{
     self, Guardian, LightGuard, Mti, ParkError, Parked, PlayzerX, StateError, arm_light, park,
     park_when_closed,
 };
-use raysweep_sim::mirror::{Held, PlayzerXConfig, WireFaults};
+use raysweep_sim::mirror::{Held, PlayzerXControllerConfig, WireFaults};
 
 use crate::points::{circle, mti_config, mti_rig};
 use crate::rig::{LIMITS, Rig, batch, codes, largest_step};
@@ -66,7 +66,7 @@ fn panic() {
 fn stop_with_garbage_on_the_wire() {
     for seed in 0..6 {
         let faults = WireFaults { seed, garbage: 0.5, stalls: 0.0, stall_ms: 0 };
-        let rig = Rig::playzerx(PlayzerXConfig::default(), faults);
+        let rig = Rig::playzerx(PlayzerXControllerConfig::default(), faults);
         let mut mirror = playing(&rig);
         let since_ns = now_ns();
         mirror.park().unwrap();
@@ -79,7 +79,7 @@ fn stop_with_garbage_on_the_wire() {
 fn stop_of_a_controller_that_stalls() {
     for seed in 0..6 {
         let faults = WireFaults { seed, garbage: 0.1, stalls: 0.005, stall_ms: 50 };
-        let rig = Rig::playzerx(PlayzerXConfig::default(), faults);
+        let rig = Rig::playzerx(PlayzerXControllerConfig::default(), faults);
         let mut mirror = playing(&rig);
         let since_ns = now_ns();
         mirror.park().unwrap();
@@ -134,7 +134,8 @@ fn a_controller_that_was_plugged_in_again_is_not_taken_for_the_one_that_was_left
         std::thread::sleep(Duration::from_millis(2));
     }
     // When the power is back, it is at rest. Commanded to its last position, it would jump.
-    let again = Rig::playzerx(PlayzerXConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
+    let again =
+        Rig::playzerx(PlayzerXControllerConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
     rig.pty.unplug();
     while mirror.feed().is_ok() {}
     drop(mirror);
@@ -306,7 +307,8 @@ fn a_port_that_a_dying_process_releases_after_the_lock_is_waited_for() {
 
 #[test]
 fn a_state_of_another_boot_is_not_trusted() {
-    let rig = Rig::playzerx(PlayzerXConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
+    let rig =
+        Rig::playzerx(PlayzerXControllerConfig { reset_s: 0.1, ..Default::default() }, WireFaults::default());
     let mut child = start_child(&rig, "playzerx", false);
     rig.await_light(20_000);
     end(&mut child, Signal::SIGKILL);

@@ -9,7 +9,7 @@ const REACH_SIGMAS: f64 = 4.5;
 
 /// The beam over the whole field of view. Directions are tangents of the beam's angles, x and y.
 #[derive(Debug, Clone)]
-pub struct Beam {
+pub struct DotBeam {
     sigma: f64,
     uneven: f64,
     half: [f64; 2],
@@ -17,7 +17,7 @@ pub struct Beam {
 
 /// The spot of the beam in one direction.
 #[derive(Debug, Clone, Copy)]
-pub struct Spot {
+pub struct BeamSpot {
     /// Direction of its centre.
     pub centre: [f64; 2],
     /// Irradiance at its centre; 1 is the full beam.
@@ -28,7 +28,7 @@ pub struct Spot {
     long: [f64; 2],
 }
 
-impl Beam {
+impl DotBeam {
     /// The beam over a field of view of `2 half`, as tangents.
     pub fn new(dot: &SimDot, half: [f64; 2]) -> Self {
         let sigma = SIGMA_OVER_FWHM * dot.fwhm_deg.to_radians().tan();
@@ -36,18 +36,18 @@ impl Beam {
     }
 
     /// The spot around `centre`: round in the middle of the field, elongated radially towards the corners.
-    pub fn spot(&self, centre: [f64; 2], light: f64) -> Spot {
+    pub fn spot(&self, centre: [f64; 2], light: f64) -> BeamSpot {
         let [x, y] = [centre[0] / self.half[0], centre[1] / self.half[1]];
         let square = x * x + y * y;
         let stretch = self.uneven * (square / 2.0).min(1.0);
         let sigmas = [self.sigma * (1.0 + stretch), self.sigma / (1.0 + stretch)];
         let radius = square.sqrt();
         let long = if radius > 0.0 { [x / radius, y / radius] } else { [1.0, 0.0] };
-        Spot { centre, light, sigmas, long }
+        BeamSpot { centre, light, sigmas, long }
     }
 }
 
-impl Spot {
+impl BeamSpot {
     /// Irradiance in a direction.
     pub fn at(&self, direction: [f64; 2]) -> f64 {
         let [x, y] = [direction[0] - self.centre[0], direction[1] - self.centre[1]];
@@ -85,7 +85,7 @@ mod tests {
     fn the_spot_is_as_wide_as_stated_and_uneven_towards_the_corners() {
         let dot = SimDot::default();
         let half = [0.081, 0.046];
-        let beam = Beam::new(&dot, half);
+        let beam = DotBeam::new(&dot, half);
         let middle = beam.spot([0.0, 0.0], 1.0);
         let half_width = (dot.fwhm_deg / 2.0).to_radians().tan();
         for direction in [[half_width, 0.0], [0.0, -half_width]] {

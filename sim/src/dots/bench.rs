@@ -3,9 +3,9 @@
 use raysweep_config::sim::DotsConfig;
 use raysweep_core::{MechanicalDeg, MirrorLimits, PixelFormat, ns_from_us};
 
-use super::beam::Beam;
-use super::scene::Scene;
-use crate::sensor::Sensor;
+use super::beam::DotBeam;
+use super::scene::DotScene;
+use crate::sensor::ImageSensor;
 
 /// Parameters from the rest of the rig file that the simulation needs.
 #[derive(Debug, Clone)]
@@ -28,9 +28,9 @@ pub struct DotsSetup {
 pub(super) struct Bench {
     pub config: DotsConfig,
     pub setup: DotsSetup,
-    pub scene: Scene,
-    pub beam: Beam,
-    pub sensor: Sensor,
+    pub scene: DotScene,
+    pub beam: DotBeam,
+    pub sensor: ImageSensor,
     /// Camera rows and columns, including the margin.
     pub size: (usize, usize),
 }

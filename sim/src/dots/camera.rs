@@ -8,9 +8,9 @@ use raysweep_core::{
     DeviceState, FirstFrame, FrameBuf, FrameStamp, Readout, SettingsId, Shutter, Subject,
 };
 
-use super::scene::{Light, Still};
+use super::scene::{SpotImages, Still};
 use super::world::{Due, FrameFate, Next, World, even_light};
-use crate::sensor::Exposed;
+use crate::sensor::SensorExposure;
 
 /// Standard deviation of the trailing dot, as a fraction of the margin's rows.
 const TRAILING_SIGMA: f64 = 0.15;
@@ -23,7 +23,7 @@ pub struct DotCamera {
     capabilities: CameraCapabilities,
     exposure_us: f64,
     before: Option<Before>,
-    light: Light,
+    light: SpotImages,
     /// Light of the whole sensor, `[row, column]` row-major; `counts` has the same layout.
     sensor_light: Vec<f32>,
     counts: Vec<u16>,
@@ -96,7 +96,7 @@ impl DotCamera {
         if let Some(Before { still, .. }) = &self.before {
             trailing = self.world.render(&due.lit, self.exposure_us, &**still, &mut self.light);
         }
-        let Light { direct, global } = &self.light;
+        let SpotImages { direct, global } = &self.light;
         let (scene, margin) = self.sensor_light.split_at_mut(direct.len());
         scene
             .iter_mut()
@@ -110,7 +110,7 @@ impl DotCamera {
             self.sensor_light.fill(FLASH);
         }
         let light = &mut self.sensor_light;
-        let exposed = Exposed { light, exposure_us: self.exposure_us, key: [scan, frame, 0] };
+        let exposed = SensorExposure { light, exposure_us: self.exposure_us, key: [scan, frame, 0] };
         self.world.bench.sensor.read(exposed, &mut self.counts);
     }
 

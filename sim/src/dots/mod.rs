@@ -16,6 +16,6 @@ mod view;
 mod world;
 
 pub use bench::DotsSetup;
-pub use rig::{DotsDevices, DotsError, DotsRig};
+pub use rig::{DotsDevices, DotsRig, DotsRigError};
 pub use scene::{BUILTIN_NAMES, DotSceneError};
 pub use world::{DotsTruth, FrameFate, FrameTruth, SubjectSwitch};

@@ -6,18 +6,18 @@ use std::sync::Arc;
 
 use raysweep_core::{Camera, Clock, Mirror};
 
-use super::beam::Beam;
+use super::beam::DotBeam;
 use super::bench::{Bench, DotsSetup};
 use super::camera::DotCamera;
 use super::mirror::{DotMirror, WatchedMirror};
-use super::scene::{DotSceneError, Scene};
+use super::scene::{DotScene, DotSceneError};
 use super::world::{DotsTruth, SubjectSwitch, World};
-use crate::sensor::{Scale, Sensor};
+use crate::sensor::{ImageSensor, Scale};
 use raysweep_config::sim::{DotsConfig, SimDotSensor, SimSensor};
 
 /// Why a simulated dot rig cannot be built.
 #[derive(Debug, thiserror::Error)]
-pub enum DotsError {
+pub enum DotsRigError {
     /// The scene cannot be read or computed.
     #[error("sim.dots.scene: {0}")]
     Scene(#[from] DotSceneError),
@@ -33,7 +33,7 @@ pub enum DotsError {
     },
 }
 
-impl DotsError {
+impl DotsRigError {
     /// The key below `[sim.dots]` that causes the error.
     pub fn key(&self) -> &'static str {
         match self {
@@ -67,15 +67,15 @@ impl DotsRig {
     ///
     /// # Errors
     /// When the scene cannot be read or a key is out of range; the message names the key.
-    pub fn new(config: DotsConfig, setup: DotsSetup, folder: &Path) -> Result<Self, DotsError> {
+    pub fn new(config: DotsConfig, setup: DotsSetup, folder: &Path) -> Result<Self, DotsRigError> {
         check_ranges(&config)?;
         let half = config.fov_deg.map(|fov| (fov / 2.0).to_radians().tan());
-        let scene = Scene::new(&config, half, setup.format.mosaic, folder)?;
+        let scene = DotScene::new(&config, half, setup.format.mosaic, folder)?;
         let (rows, columns) = scene.view().size;
         let size = (rows + config.margin_rows, columns);
         let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
-        let sensor = Sensor::new(&emva(&config.sensor), size, scale, config.seed);
-        let beam = Beam::new(&config.dot, half);
+        let sensor = ImageSensor::new(&emva(&config.sensor), size, scale, config.seed);
+        let beam = DotBeam::new(&config.dot, half);
         Ok(Self { bench: Arc::new(Bench { config, setup, scene, beam, sensor, size }) })
     }
 
@@ -116,7 +116,7 @@ impl DotsRig {
     }
 }
 
-fn check_ranges(config: &DotsConfig) -> Result<(), DotsError> {
+fn check_ranges(config: &DotsConfig) -> Result<(), DotsRigError> {
     let share = (0.0..=1.0, "0 to 1");
     let not_negative = (0.0..=f64::MAX, "0 or more");
     let positive = (f64::MIN_POSITIVE..=f64::MAX, "more than 0");
@@ -157,7 +157,7 @@ fn check_ranges(config: &DotsConfig) -> Result<(), DotsError> {
     );
     for (key, value, (range, allowed)) in rules {
         if !range.contains(&value) {
-            return Err(DotsError::Range { key, value, allowed });
+            return Err(DotsRigError::Range { key, value, allowed });
         }
     }
     Ok(())

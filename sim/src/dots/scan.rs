@@ -27,7 +27,7 @@ pub enum Lit {
 
 /// A path, how often it is played, and how it is divided into frames.
 #[derive(Clone)]
-pub struct Scan {
+pub struct MirrorScan {
     path: MirrorPath,
     incidence: MechanicalDeg,
     samples: u64,
@@ -49,7 +49,7 @@ struct Motion {
     next: u64,
 }
 
-impl Scan {
+impl MirrorScan {
     /// Plays a path `batches` times, with frames at `frame_rate_hz`.
     pub fn new(
         path: MirrorPath,

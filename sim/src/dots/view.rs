@@ -5,14 +5,14 @@ const BASELINE: [f64; 3] = [0.12, 0.03, -0.05];
 
 /// A camera with square pixels that sees the beam's field of view at the scene's distance.
 #[derive(Debug, Clone, Copy)]
-pub struct View {
+pub struct CameraView {
     /// Scene rows and columns.
     pub size: (usize, usize),
     /// Half the beam's field of view, as tangents x and y.
     pub half: [f64; 2],
 }
 
-impl View {
+impl CameraView {
     fn tangent_per_px(&self) -> f64 {
         2.0 * self.half[0] / self.size.1 as f64
     }
@@ -51,7 +51,7 @@ mod tests {
 
     #[test]
     fn pixels_and_directions_are_inverse_and_agree_at_the_scenes_distance() {
-        let view = View { size: (240, 256), half: [0.081, 0.0459] };
+        let view = CameraView { size: (240, 256), half: [0.081, 0.0459] };
         for depth in [0.8, 1.0, 1.3] {
             let [row, column] = view.pixel(view.direction(30, 200, depth), depth);
             assert!((row - 30.5).abs() < 1e-9 && (column - 200.5).abs() < 1e-9, "{row} {column}");

@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind, MirrorPath, Subject, ns_from_us};
 
 use super::bench::Bench;
-use super::scan::{Lit, Scan};
-use super::scene::{Light, Still};
+use super::scan::{Lit, MirrorScan};
+use super::scene::{SpotImages, Still};
 use crate::keyed::{Purpose, keyed, uniform};
 
 /// Frames that a camera in real time buffers for a slow host.
@@ -100,7 +100,7 @@ impl DotsTruth {
             let state = self.0.lock();
             let (record, frame) = state.record_of(seq)?;
             if let Some(even) = even_light(record.subject) {
-                let Light { direct, mut global } = self.0.dark();
+                let SpotImages { direct, mut global } = self.0.dark();
                 global.fill(even);
                 return Some((direct, global));
             }
@@ -145,7 +145,7 @@ struct State {
 /// A path that was started.
 struct Record {
     number: u64,
-    scan: Scan,
+    scan: MirrorScan,
     subject: Subject,
     /// Time of its first sample; `None` until the mirror's driver knows it.
     start_ns: Option<i64>,
@@ -210,8 +210,13 @@ impl World {
 
     /// Starts a path whose first sample is played at `start_ns`, if already known.
     pub fn start(&self, path: MirrorPath, batches: u32, start_ns: Option<i64>) {
-        let scan =
-            Scan::new(path, batches, self.frame_rate_hz, self.bench.setup.incidence, &self.bench.config);
+        let scan = MirrorScan::new(
+            path,
+            batches,
+            self.frame_rate_hz,
+            self.bench.setup.incidence,
+            &self.bench.config,
+        );
         let mut state = self.lock();
         let (number, subject) = (state.records.len() as u64, state.subject);
         let end = scan.samples() as f64;
@@ -346,7 +351,7 @@ impl World {
         Some(self.still(subject, record.scan.rate_hz(), &record.scan, batch))
     }
 
-    fn still(&self, subject: Subject, rate_hz: f64, scan: &Scan, batch: u64) -> Arc<dyn Still> {
+    fn still(&self, subject: Subject, rate_hz: f64, scan: &MirrorScan, batch: u64) -> Arc<dyn Still> {
         let plane = match subject {
             Subject::Plane(number) => self.bench.scene.plane(number),
             Subject::Scene | Subject::Diffuser => None,
@@ -359,14 +364,14 @@ impl World {
     }
 
     /// Dark images of the scene's size.
-    pub fn dark(&self) -> Light {
+    pub fn dark(&self) -> SpotImages {
         let (rows, columns) = self.bench.scene.view().size;
-        Light { direct: vec![0.0; rows * columns], global: vec![0.0; rows * columns] }
+        SpotImages { direct: vec![0.0; rows * columns], global: vec![0.0; rows * columns] }
     }
 
     /// Adds the light of an exposure to `light`; returns how much fell on the trailing dot's plane. Light
     /// without fine detail is computed once, for the exposure's mean position.
-    pub fn render(&self, lit: &[Lit], exposure_us: f64, still: &dyn Still, light: &mut Light) -> f64 {
+    pub fn render(&self, lit: &[Lit], exposure_us: f64, still: &dyn Still, light: &mut SpotImages) -> f64 {
         let dot = &self.bench.config.dot;
         let share = self.bench.exposed(exposure_us) / lit.len() as f64;
         let (mut trailing, mut on_scene, mut middle) = (0.0, 0.0, [0.0; 2]);

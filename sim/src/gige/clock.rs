@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 /// A clock with an offset and a drift relative to the host's clock.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct DeviceClock {
+pub struct CameraClock {
     /// Ticks per second, 1..=10^10.
     pub tick_frequency_hz: u64,
     /// Reading at zero of the host's clock, in ns.
@@ -14,14 +14,14 @@ pub struct DeviceClock {
     pub drift_ppm: f64,
 }
 
-impl Default for DeviceClock {
+impl Default for CameraClock {
     fn default() -> Self {
         // [A] Offset and drift are large enough to expose a host that confuses the two clocks.
         Self { tick_frequency_hz: 1_000_000_000, offset_ns: 3_600_000_000_000, drift_ppm: 12.5 }
     }
 }
 
-impl DeviceClock {
+impl CameraClock {
     /// Converts a time of the host's clock to ticks.
     pub fn ticks(&self, host_ns: i64) -> u64 {
         let ns = i128::from(host_ns)

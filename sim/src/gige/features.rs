@@ -7,7 +7,7 @@ use raysweep_core::{CameraCapabilities, Mosaic, PixelFormat};
 /// Identifies a register by the name of its feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 #[allow(missing_docs, reason = "the names are defined by the SFNC and by GigE Vision")]
-pub enum Id {
+pub enum FeatureId {
     DeviceVendorName,
     DeviceModelName,
     DeviceVersion,
@@ -74,7 +74,7 @@ pub enum Id {
 
 /// Access mode of a register.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Access {
+pub enum RegisterAccess {
     /// Read-only for clients.
     ReadOnly,
     /// Writable by the client in control.
@@ -97,7 +97,7 @@ pub enum Kind {
         /// Step between allowed values.
         step: u32,
         /// Register that holds the current maximum, if it varies.
-        max_in: Option<Id>,
+        max_in: Option<FeatureId>,
     },
     /// Unsigned, eight bytes.
     Long,
@@ -115,7 +115,7 @@ pub enum Kind {
     /// Four bytes: 0 or 1.
     Boolean,
     /// Four bytes, 0 or 1, for each entry of this enumeration.
-    BooleanFor(Id),
+    BooleanFor(FeatureId),
     /// Zero-terminated text in a register of this many bytes.
     Text(u32),
 }
@@ -131,13 +131,13 @@ impl Kind {
 #[derive(Debug, Clone)]
 pub struct Feature {
     /// Register and feature name.
-    pub id: Id,
+    pub id: FeatureId,
     /// Category in the description; `None`: an auxiliary register that is not shown.
     pub category: Option<&'static str>,
     /// Address of the register.
     pub address: u32,
     /// Access mode.
-    pub access: Access,
+    pub access: RegisterAccess,
     /// Type.
     pub kind: Kind,
     /// Initial value as the bits of a `u64`: an integer, or a double's bits.
@@ -187,141 +187,191 @@ pub const CHUNKS: [&str; 4] = ["ExposureTime", "Timestamp", "FrameID", "Sequence
 
 /// Returns the feature table of a camera with these capabilities.
 pub fn features(camera: &CameraCapabilities) -> Vec<Feature> {
-    use Access::{Command, ReadOnly, ReadWrite, ReadWriteIdle};
-    let (width, height) = (camera.width as u32, camera.height as u32);
-    let whole = |min, max, step, max_in| Kind::Integer { min, max, step, max_in };
-    let one_of = |entries: &[&str]| {
-        Kind::Enumeration(entries.iter().map(|entry| (*entry).to_owned()).zip(0..).collect())
-    };
-    let exposure =
-        Kind::Float { min: *camera.exposure_us.start(), max: *camera.exposure_us.end(), unit: "us" };
-    let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
-    let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
-    let mosaic = camera.format.mosaic;
-    // A region that starts in the middle of a 2 x 2 cell would change the mosaic.
-    let offset_step = if mosaic == Mosaic::Mono { 1 } else { 2 };
-    let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
-    let formats = formats.filter_map(|format| Some((format.to_string(), format.pfnc()?)));
-    let formats = Kind::Enumeration(formats.collect());
+    [bootstrap(), image(camera), acquisition(camera), chunks_and_user_sets(), sequencer()].concat()
+}
 
-    let device = Some("DeviceControl");
-    let transport = Some("TransportLayerControl");
-    let image = Some("ImageFormatControl");
-    let acquisition = Some("AcquisitionControl");
-    let chunks = Some("ChunkDataControl");
-    let user_sets = Some("UserSetControl");
-    let sequencer = Some("SequencerControl");
-    let set = whole(0, SEQUENCER_SETS as u32 - 1, 1, None);
-    let standard =
-        |id, address, category, access, kind| Feature { id, category, address, access, kind, initial: 0 };
-    let maker = |id, category, access, kind, initial| {
-        let address = MAKERS_REGISTERS + MAKERS_STRIDE * id as u32;
-        Feature { id, category, address, access, kind, initial }
-    };
+// Categories of the SFNC.
+const DEVICE: Option<&str> = Some("DeviceControl");
+const TRANSPORT: Option<&str> = Some("TransportLayerControl");
+const IMAGE: Option<&str> = Some("ImageFormatControl");
+const ACQUISITION: Option<&str> = Some("AcquisitionControl");
+const CHUNK_DATA: Option<&str> = Some("ChunkDataControl");
+const USER_SETS: Option<&str> = Some("UserSetControl");
+const SEQUENCER: Option<&str> = Some("SequencerControl");
+
+/// A register at an address given by GigE Vision.
+fn standard(
+    id: FeatureId,
+    address: u32,
+    category: Option<&'static str>,
+    access: RegisterAccess,
+    kind: Kind,
+) -> Feature {
+    Feature { id, category, address, access, kind, initial: 0 }
+}
+
+/// A register at an address of the manufacturer's choice.
+fn maker(
+    id: FeatureId,
+    category: Option<&'static str>,
+    access: RegisterAccess,
+    kind: Kind,
+    initial: u64,
+) -> Feature {
+    let address = MAKERS_REGISTERS + MAKERS_STRIDE * id as u32;
+    Feature { id, category, address, access, kind, initial }
+}
+
+fn whole(min: u32, max: u32, step: u32, max_in: Option<FeatureId>) -> Kind {
+    Kind::Integer { min, max, step, max_in }
+}
+
+fn one_of(entries: &[&str]) -> Kind {
+    Kind::Enumeration(entries.iter().map(|entry| (*entry).to_owned()).zip(0..).collect())
+}
+
+fn formats(mosaic: Mosaic) -> Kind {
+    let formats = PixelFormat::all().filter(|format| format.mosaic == mosaic);
+    Kind::Enumeration(formats.filter_map(|format| Some((format.to_string(), format.pfnc()?))).collect())
+}
+
+fn bootstrap() -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadOnly, ReadWrite};
     vec![
-        standard(Id::DeviceVendorName, 0x48, device, ReadOnly, Kind::Text(32)),
-        standard(Id::DeviceModelName, 0x68, device, ReadOnly, Kind::Text(32)),
-        standard(Id::DeviceVersion, 0x88, device, ReadOnly, Kind::Text(32)),
-        standard(Id::DeviceManufacturerInfo, 0xA8, device, ReadOnly, Kind::Text(48)),
-        standard(Id::DeviceSerialNumber, 0xD8, device, ReadOnly, Kind::Text(16)),
-        standard(Id::DeviceUserID, 0xE8, device, ReadWrite, Kind::Text(16)),
+        standard(DeviceVendorName, 0x48, DEVICE, ReadOnly, Kind::Text(32)),
+        standard(DeviceModelName, 0x68, DEVICE, ReadOnly, Kind::Text(32)),
+        standard(DeviceVersion, 0x88, DEVICE, ReadOnly, Kind::Text(32)),
+        standard(DeviceManufacturerInfo, 0xA8, DEVICE, ReadOnly, Kind::Text(48)),
+        standard(DeviceSerialNumber, 0xD8, DEVICE, ReadOnly, Kind::Text(16)),
+        standard(DeviceUserID, 0xE8, DEVICE, ReadWrite, Kind::Text(16)),
         Feature {
             initial: 3000,
-            ..standard(Id::GevHeartbeatTimeout, 0x938, transport, ReadWrite, whole(500, 60_000, 1, None))
+            ..standard(GevHeartbeatTimeout, 0x938, TRANSPORT, ReadWrite, whole(500, 60_000, 1, None))
         },
-        standard(Id::GevTimestampTickFrequency, 0x93C, transport, ReadOnly, Kind::Long),
-        standard(Id::GevTimestampControl, 0x944, None, Command, Kind::any()),
-        standard(Id::GevTimestampValue, 0x948, transport, ReadOnly, Kind::Long),
-        standard(Id::GevCCP, 0xA00, None, ReadWrite, Kind::any()),
-        standard(Id::GevSCPHostPort, 0xD00, transport, ReadWrite, whole(0, 0xFFFF, 1, None)),
-        Feature { initial: 1500, ..standard(Id::GevSCPS, 0xD04, None, ReadWrite, Kind::any()) },
-        standard(Id::GevSCPD, 0xD08, transport, ReadWrite, whole(0, MAX_PACKET_GAP_TICKS, 1, None)),
-        standard(Id::GevSCDA, 0xD18, transport, ReadWrite, Kind::any()),
-        maker(Id::SensorWidth, image, ReadOnly, Kind::any(), width.into()),
-        maker(Id::SensorHeight, image, ReadOnly, Kind::any(), height.into()),
-        maker(Id::SensorShutterMode, image, ReadWrite, one_of(&["Rolling", "Global"]), 0),
+        standard(GevTimestampTickFrequency, 0x93C, TRANSPORT, ReadOnly, Kind::Long),
+        standard(GevTimestampControl, 0x944, None, Command, Kind::any()),
+        standard(GevTimestampValue, 0x948, TRANSPORT, ReadOnly, Kind::Long),
+        standard(GevCCP, 0xA00, None, ReadWrite, Kind::any()),
+        standard(GevSCPHostPort, 0xD00, TRANSPORT, ReadWrite, whole(0, 0xFFFF, 1, None)),
+        Feature { initial: 1500, ..standard(GevSCPS, 0xD04, None, ReadWrite, Kind::any()) },
+        standard(GevSCPD, 0xD08, TRANSPORT, ReadWrite, whole(0, MAX_PACKET_GAP_TICKS, 1, None)),
+        standard(GevSCDA, 0xD18, TRANSPORT, ReadWrite, Kind::any()),
+    ]
+}
+
+fn image(camera: &CameraCapabilities) -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{ReadOnly, ReadWrite, ReadWriteIdle};
+    let (width, height) = (camera.width as u32, camera.height as u32);
+    // A region that starts in the middle of a 2 x 2 cell would change the mosaic.
+    let offset_step = if camera.format.mosaic == Mosaic::Mono { 1 } else { 2 };
+    vec![
+        maker(SensorWidth, IMAGE, ReadOnly, Kind::any(), width.into()),
+        maker(SensorHeight, IMAGE, ReadOnly, Kind::any(), height.into()),
+        maker(SensorShutterMode, IMAGE, ReadWrite, one_of(&["Rolling", "Global"]), 0),
         maker(
-            Id::SensorReadoutTime,
-            image,
+            SensorReadoutTime,
+            IMAGE,
             ReadOnly,
             Kind::Float { min: 0.0, max: 1e9, unit: "us" },
             camera.readout_us.to_bits(),
         ),
-        maker(Id::WidthMax, image, ReadOnly, Kind::any(), width.into()),
-        maker(Id::HeightMax, image, ReadOnly, Kind::any(), height.into()),
-        maker(Id::OffsetXMax, None, ReadOnly, Kind::any(), 0),
-        maker(Id::OffsetYMax, None, ReadOnly, Kind::any(), 0),
-        maker(Id::Width, image, ReadWriteIdle, whole(1, width, 1, Some(Id::WidthMax)), width.into()),
-        maker(Id::Height, image, ReadWriteIdle, whole(1, height, 1, Some(Id::HeightMax)), height.into()),
-        maker(Id::OffsetX, image, ReadWriteIdle, whole(0, width, offset_step, Some(Id::OffsetXMax)), 0),
-        maker(Id::OffsetY, image, ReadWriteIdle, whole(0, height, offset_step, Some(Id::OffsetYMax)), 0),
+        maker(WidthMax, IMAGE, ReadOnly, Kind::any(), width.into()),
+        maker(HeightMax, IMAGE, ReadOnly, Kind::any(), height.into()),
+        maker(OffsetXMax, None, ReadOnly, Kind::any(), 0),
+        maker(OffsetYMax, None, ReadOnly, Kind::any(), 0),
+        maker(Width, IMAGE, ReadWriteIdle, whole(1, width, 1, Some(WidthMax)), width.into()),
+        maker(Height, IMAGE, ReadWriteIdle, whole(1, height, 1, Some(HeightMax)), height.into()),
+        maker(OffsetX, IMAGE, ReadWriteIdle, whole(0, width, offset_step, Some(OffsetXMax)), 0),
+        maker(OffsetY, IMAGE, ReadWriteIdle, whole(0, height, offset_step, Some(OffsetYMax)), 0),
         maker(
-            Id::PixelFormat,
-            image,
+            PixelFormat,
+            IMAGE,
             ReadWriteIdle,
-            formats,
+            formats(camera.format.mosaic),
             camera.format.pfnc().unwrap_or_default().into(),
         ),
-        maker(Id::AcquisitionMode, acquisition, ReadWriteIdle, one_of(&["Continuous", "SingleFrame"]), 0),
-        maker(Id::AcquisitionStart, acquisition, Command, Kind::any(), 0),
-        maker(Id::AcquisitionStop, acquisition, Command, Kind::any(), 0),
-        maker(Id::AcquisitionFrameRateEnable, acquisition, ReadWrite, Kind::Boolean, 1),
+    ]
+}
+
+fn acquisition(camera: &CameraCapabilities) -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadWrite, ReadWriteIdle};
+    let exposure =
+        Kind::Float { min: *camera.exposure_us.start(), max: *camera.exposure_us.end(), unit: "us" };
+    let (delay_min, delay_max) = (*camera.trigger_delay_us.start(), *camera.trigger_delay_us.end());
+    let delay = Kind::Float { min: delay_min, max: delay_max, unit: "us" };
+    vec![
+        maker(AcquisitionMode, ACQUISITION, ReadWriteIdle, one_of(&["Continuous", "SingleFrame"]), 0),
+        maker(AcquisitionStart, ACQUISITION, Command, Kind::any(), 0),
+        maker(AcquisitionStop, ACQUISITION, Command, Kind::any(), 0),
+        maker(AcquisitionFrameRateEnable, ACQUISITION, ReadWrite, Kind::Boolean, 1),
         maker(
-            Id::AcquisitionFrameRate,
-            acquisition,
+            AcquisitionFrameRate,
+            ACQUISITION,
             ReadWrite,
             Kind::Float { min: 0.1, max: 10_000.0, unit: "Hz" },
             30_f64.to_bits(),
         ),
-        maker(Id::TriggerSelector, acquisition, ReadWrite, one_of(&["FrameStart"]), 0),
-        maker(Id::TriggerMode, acquisition, ReadWrite, one_of(&["Off", "On"]), 0),
-        maker(Id::TriggerSoftware, acquisition, Command, Kind::any(), 0),
-        maker(Id::TriggerSource, acquisition, ReadWrite, one_of(&["Line0", "Software"]), 0),
-        maker(Id::TriggerActivation, acquisition, ReadWrite, one_of(&["RisingEdge"]), 0),
-        maker(Id::TriggerDelay, acquisition, ReadWrite, delay, delay_min.to_bits()),
-        maker(Id::ExposureMode, acquisition, ReadWrite, one_of(&["Timed"]), 0),
-        maker(Id::ExposureTime, acquisition, ReadWrite, exposure, 1000_f64.to_bits()),
-        maker(Id::ChunkModeActive, chunks, ReadWriteIdle, Kind::Boolean, 0),
-        maker(Id::ChunkSelector, chunks, ReadWrite, one_of(&CHUNKS), 0),
-        maker(Id::ChunkEnable, chunks, ReadWriteIdle, Kind::BooleanFor(Id::ChunkSelector), 0),
-        maker(Id::TimestampLatch, device, Command, Kind::any(), 0),
-        maker(Id::PayloadSize, transport, ReadOnly, Kind::any(), 0),
-        maker(Id::TLParamsLocked, transport, ReadWrite, whole(0, 1, 1, None), 0),
-        maker(Id::UserSetSelector, user_sets, ReadWrite, one_of(&["Default", "UserSet1"]), 0),
-        maker(Id::UserSetLoad, user_sets, Command, Kind::any(), 0),
-        maker(Id::UserSetSave, user_sets, Command, Kind::any(), 0),
-        maker(Id::SequencerMode, sequencer, ReadWrite, one_of(&["Off", "On"]), 0),
-        maker(Id::SequencerConfigurationMode, sequencer, ReadWrite, one_of(&["Off", "On"]), 0),
-        maker(Id::SequencerFeatureSelector, sequencer, ReadWrite, one_of(&SEQUENCED), 0),
-        maker(
-            Id::SequencerFeatureEnable,
-            sequencer,
-            ReadWrite,
-            Kind::BooleanFor(Id::SequencerFeatureSelector),
-            0,
-        ),
-        maker(Id::SequencerSetSelector, sequencer, ReadWrite, set.clone(), 0),
-        maker(Id::SequencerSetSave, sequencer, Command, Kind::any(), 0),
-        maker(Id::SequencerSetLoad, sequencer, Command, Kind::any(), 0),
-        maker(Id::SequencerSetStart, sequencer, ReadWrite, set.clone(), 0),
-        maker(Id::SequencerPathSelector, sequencer, ReadWrite, whole(0, 0, 1, None), 0),
-        maker(Id::SequencerSetNext, sequencer, ReadWrite, set, 0),
-        maker(Id::SequencerTriggerSource, sequencer, ReadWrite, one_of(&["Off", "FrameStart"]), 0),
-        maker(Id::SequencerSetActive, sequencer, ReadOnly, Kind::any(), 0),
+        maker(TriggerSelector, ACQUISITION, ReadWrite, one_of(&["FrameStart"]), 0),
+        maker(TriggerMode, ACQUISITION, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(TriggerSoftware, ACQUISITION, Command, Kind::any(), 0),
+        maker(TriggerSource, ACQUISITION, ReadWrite, one_of(&["Line0", "Software"]), 0),
+        maker(TriggerActivation, ACQUISITION, ReadWrite, one_of(&["RisingEdge"]), 0),
+        maker(TriggerDelay, ACQUISITION, ReadWrite, delay, delay_min.to_bits()),
+        maker(ExposureMode, ACQUISITION, ReadWrite, one_of(&["Timed"]), 0),
+        maker(ExposureTime, ACQUISITION, ReadWrite, exposure, 1000_f64.to_bits()),
+    ]
+}
+
+fn chunks_and_user_sets() -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadOnly, ReadWrite, ReadWriteIdle};
+    vec![
+        maker(ChunkModeActive, CHUNK_DATA, ReadWriteIdle, Kind::Boolean, 0),
+        maker(ChunkSelector, CHUNK_DATA, ReadWrite, one_of(&CHUNKS), 0),
+        maker(ChunkEnable, CHUNK_DATA, ReadWriteIdle, Kind::BooleanFor(ChunkSelector), 0),
+        maker(TimestampLatch, DEVICE, Command, Kind::any(), 0),
+        maker(PayloadSize, TRANSPORT, ReadOnly, Kind::any(), 0),
+        maker(TLParamsLocked, TRANSPORT, ReadWrite, whole(0, 1, 1, None), 0),
+        maker(UserSetSelector, USER_SETS, ReadWrite, one_of(&["Default", "UserSet1"]), 0),
+        maker(UserSetLoad, USER_SETS, Command, Kind::any(), 0),
+        maker(UserSetSave, USER_SETS, Command, Kind::any(), 0),
+    ]
+}
+
+fn sequencer() -> Vec<Feature> {
+    use FeatureId::*;
+    use RegisterAccess::{Command, ReadOnly, ReadWrite};
+    let set = whole(0, SEQUENCER_SETS as u32 - 1, 1, None);
+    vec![
+        maker(SequencerMode, SEQUENCER, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(SequencerConfigurationMode, SEQUENCER, ReadWrite, one_of(&["Off", "On"]), 0),
+        maker(SequencerFeatureSelector, SEQUENCER, ReadWrite, one_of(&SEQUENCED), 0),
+        maker(SequencerFeatureEnable, SEQUENCER, ReadWrite, Kind::BooleanFor(SequencerFeatureSelector), 0),
+        maker(SequencerSetSelector, SEQUENCER, ReadWrite, set.clone(), 0),
+        maker(SequencerSetSave, SEQUENCER, Command, Kind::any(), 0),
+        maker(SequencerSetLoad, SEQUENCER, Command, Kind::any(), 0),
+        maker(SequencerSetStart, SEQUENCER, ReadWrite, set.clone(), 0),
+        maker(SequencerPathSelector, SEQUENCER, ReadWrite, whole(0, 0, 1, None), 0),
+        maker(SequencerSetNext, SEQUENCER, ReadWrite, set, 0),
+        maker(SequencerTriggerSource, SEQUENCER, ReadWrite, one_of(&["Off", "FrameStart"]), 0),
+        maker(SequencerSetActive, SEQUENCER, ReadOnly, Kind::any(), 0),
     ]
 }
 
 /// A feature that is part of a register, or an alias of one.
-pub struct View {
+pub struct FeatureView {
     /// Its SFNC name.
     pub name: &'static str,
     /// The register.
-    pub of: Id,
+    pub of: FeatureId,
     /// The part of the register that it represents.
     pub shows: Shows,
 }
 
-/// What a [`View`] represents.
+/// What a [`FeatureView`] represents.
 pub enum Shows {
     /// The bits from the first to the second, counted from the least significant, as an integer.
     Bits(u32, u32),
@@ -334,12 +384,20 @@ pub enum Shows {
 }
 
 /// Views in the description only; accesses are checked at the register.
-pub const VIEWS: [View; 7] = [
-    View { name: "GevSCPSPacketSize", of: Id::GevSCPS, shows: Shows::Bits(0, 15) },
-    View { name: "GevSCPSDoNotFragment", of: Id::GevSCPS, shows: Shows::Flag(30) },
-    View { name: "GevSCPSFireTestPacket", of: Id::GevSCPS, shows: Shows::Flag(31) },
-    View { name: "GevTimestampControlLatch", of: Id::GevTimestampControl, shows: Shows::Command(2) },
-    View { name: "GevTimestampControlReset", of: Id::GevTimestampControl, shows: Shows::Command(1) },
-    View { name: "TimestampLatchValue", of: Id::GevTimestampValue, shows: Shows::All },
-    View { name: "DeviceID", of: Id::DeviceSerialNumber, shows: Shows::All },
+pub const VIEWS: [FeatureView; 7] = [
+    FeatureView { name: "GevSCPSPacketSize", of: FeatureId::GevSCPS, shows: Shows::Bits(0, 15) },
+    FeatureView { name: "GevSCPSDoNotFragment", of: FeatureId::GevSCPS, shows: Shows::Flag(30) },
+    FeatureView { name: "GevSCPSFireTestPacket", of: FeatureId::GevSCPS, shows: Shows::Flag(31) },
+    FeatureView {
+        name: "GevTimestampControlLatch",
+        of: FeatureId::GevTimestampControl,
+        shows: Shows::Command(2),
+    },
+    FeatureView {
+        name: "GevTimestampControlReset",
+        of: FeatureId::GevTimestampControl,
+        shows: Shows::Command(1),
+    },
+    FeatureView { name: "TimestampLatchValue", of: FeatureId::GevTimestampValue, shows: Shows::All },
+    FeatureView { name: "DeviceID", of: FeatureId::DeviceSerialNumber, shows: Shows::All },
 ];

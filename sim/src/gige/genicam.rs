@@ -6,7 +6,7 @@ use std::io::{self, Cursor, Write as _};
 use zip::ZipWriter;
 use zip::write::SimpleFileOptions;
 
-use super::features::{Access, Feature, Id, Kind, Shows, VIEWS};
+use super::features::{Feature, FeatureId, Kind, RegisterAccess, Shows, VIEWS};
 use super::gvsp::Chunk;
 
 /// Generates the description that clients download.
@@ -78,7 +78,7 @@ fn element(xml: &mut String, tag: &str, text: &str) {
 fn node(xml: &mut String, feature: &Feature) {
     let Feature { id, access, kind, .. } = feature;
     let tag = match (access, kind) {
-        (Access::Command, _) => "Command",
+        (RegisterAccess::Command, _) => "Command",
         (_, Kind::Integer { .. } | Kind::Long) => "Integer",
         (_, Kind::Float { .. }) => "Float",
         (_, Kind::Enumeration(_)) => "Enumeration",
@@ -87,7 +87,7 @@ fn node(xml: &mut String, feature: &Feature) {
         (_, Kind::Text(_)) => return,
     };
     let _ = write!(xml, "<{tag} Name=\"{id:?}\">");
-    if *access == Access::ReadWriteIdle {
+    if *access == RegisterAccess::ReadWriteIdle {
         element(xml, "pIsLocked", "TLParamsLocked");
     }
     if let Kind::Enumeration(entries) = kind {
@@ -97,8 +97,8 @@ fn node(xml: &mut String, feature: &Feature) {
     }
     let _ = write!(xml, "<pValue>{id:?}Register</pValue>");
     match kind {
-        _ if *access == Access::Command => element(xml, "CommandValue", "1"),
-        Kind::Integer { min, max, step, max_in } if *access != Access::ReadOnly => {
+        _ if *access == RegisterAccess::Command => element(xml, "CommandValue", "1"),
+        Kind::Integer { min, max, step, max_in } if *access != RegisterAccess::ReadOnly => {
             let _ = write!(xml, "<Min>{min}</Min>");
             match max_in {
                 Some(register) => {
@@ -117,9 +117,9 @@ fn node(xml: &mut String, feature: &Feature) {
         _ => {}
     }
     let selected: &[&str] = match id {
-        Id::ChunkSelector => &["ChunkEnable"],
-        Id::SequencerFeatureSelector => &["SequencerFeatureEnable"],
-        Id::SequencerSetSelector | Id::SequencerPathSelector => {
+        FeatureId::ChunkSelector => &["ChunkEnable"],
+        FeatureId::SequencerFeatureSelector => &["SequencerFeatureEnable"],
+        FeatureId::SequencerSetSelector | FeatureId::SequencerPathSelector => {
             &["SequencerSetNext", "SequencerTriggerSource"]
         }
         _ => &[],
@@ -142,12 +142,12 @@ fn register(xml: &mut String, feature: &Feature, features: &[Feature]) {
         let _ = write!(xml, "<pIndex Offset=\"4\">{selector:?}</pIndex>");
     }
     let mode = match access {
-        Access::ReadOnly => "RO",
-        Access::ReadWrite | Access::ReadWriteIdle => "RW",
-        Access::Command => "WO",
+        RegisterAccess::ReadOnly => "RO",
+        RegisterAccess::ReadWrite | RegisterAccess::ReadWriteIdle => "RW",
+        RegisterAccess::Command => "WO",
     };
     let _ = write!(xml, "<Length>{bytes}</Length><AccessMode>{mode}</AccessMode><pPort>Device</pPort>");
-    if let Access::ReadOnly = access {
+    if let RegisterAccess::ReadOnly = access {
         // Values that the camera changes by itself must not be cached.
         element(xml, "Cachable", "NoCache");
     }

@@ -14,7 +14,7 @@ const EXTENDED_IDS: u8 = 0x10;
 /// Status of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the names are defined by GigE Vision")]
-pub enum Status {
+pub enum GvcpStatus {
     Success = 0x0000,
     NotImplemented = 0x8001,
     InvalidParameter = 0x8002,
@@ -39,7 +39,7 @@ pub struct Resend {
 
 /// A client's command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Command<'a> {
+pub enum GvcpCommand<'a> {
     /// Device discovery.
     Discovery,
     /// Register addresses, four bytes each.
@@ -56,7 +56,7 @@ pub enum Command<'a> {
 
 /// A request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Request<'a> {
+pub struct GvcpRequest<'a> {
     /// Request id, repeated in the answer.
     pub id: u16,
     /// Command code.
@@ -64,10 +64,10 @@ pub struct Request<'a> {
     /// Whether an answer is requested.
     pub acknowledge: bool,
     /// The command, or the error status if it is invalid.
-    pub command: Result<Command<'a>, Status>,
+    pub command: Result<GvcpCommand<'a>, GvcpStatus>,
 }
 
-impl<'a> Request<'a> {
+impl<'a> GvcpRequest<'a> {
     /// Parses a datagram; `None` if it is incomplete or not a request, and must not be answered.
     pub fn parse(datagram: &'a [u8]) -> Option<Self> {
         let (header, data) = datagram.split_first_chunk::<HEADER>()?;
@@ -85,36 +85,36 @@ impl<'a> Request<'a> {
         })
     }
 
-    fn command(code: u16, flags: u8, data: &'a [u8]) -> Result<Command<'a>, Status> {
-        let word = |at: usize| u32_at(data, at).ok_or(Status::InvalidHeader);
+    fn command(code: u16, flags: u8, data: &'a [u8]) -> Result<GvcpCommand<'a>, GvcpStatus> {
+        let word = |at: usize| u32_at(data, at).ok_or(GvcpStatus::InvalidHeader);
         let whole = |bytes: usize| {
             let fits = !data.is_empty() && data.len().is_multiple_of(bytes) && data.len() <= MAX_DATA;
-            if fits { Ok(data) } else { Err(Status::InvalidHeader) }
+            if fits { Ok(data) } else { Err(GvcpStatus::InvalidHeader) }
         };
         match code {
-            0x0002 => Ok(Command::Discovery),
-            0x0040 if flags & EXTENDED_IDS == 0 => Ok(Command::Resend(Resend {
+            0x0002 => Ok(GvcpCommand::Discovery),
+            0x0040 if flags & EXTENDED_IDS == 0 => Ok(GvcpCommand::Resend(Resend {
                 block: u64::from(word(0)? & 0xFFFF),
                 first: word(4)? & 0xFF_FFFF,
                 last: word(8)? & 0xFF_FFFF,
             })),
-            0x0080 => Ok(Command::ReadRegisters(whole(4)?)),
-            0x0082 => Ok(Command::WriteRegisters(whole(8)?)),
+            0x0080 => Ok(GvcpCommand::ReadRegisters(whole(4)?)),
+            0x0082 => Ok(GvcpCommand::WriteRegisters(whole(8)?)),
             0x0084 => {
                 let bytes = (word(4)? & 0xFFFF) as usize;
                 if bytes > MAX_DATA {
-                    Err(Status::InvalidParameter)
+                    Err(GvcpStatus::InvalidParameter)
                 } else {
-                    Ok(Command::ReadMemory(word(0)?, bytes))
+                    Ok(GvcpCommand::ReadMemory(word(0)?, bytes))
                 }
             }
-            0x0086 => Ok(Command::WriteMemory(word(0)?, &whole(4)?[4..])),
-            _ => Err(Status::NotImplemented),
+            0x0086 => Ok(GvcpCommand::WriteMemory(word(0)?, &whole(4)?[4..])),
+            _ => Err(GvcpStatus::NotImplemented),
         }
     }
 
     /// Starts an answer, to which the caller appends data; [`seal`] completes it.
-    pub fn answer(&self, status: Status, reply: &mut Vec<u8>) {
+    pub fn answer(&self, status: GvcpStatus, reply: &mut Vec<u8>) {
         reply.clear();
         reply.extend_from_slice(&(status as u16).to_be_bytes());
         reply.extend_from_slice(&(self.code + 1).to_be_bytes());

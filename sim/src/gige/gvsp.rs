@@ -3,7 +3,7 @@
 
 use raysweep_core::PixelFormat;
 
-use super::gvcp::Status;
+use super::gvcp::GvcpStatus;
 
 /// Bytes of IP, UDP and GVSP headers, which are included in a packet's size.
 const HEADERS: usize = 20 + 8 + GVSP_HEADER;
@@ -62,7 +62,7 @@ impl Chunk {
 
 /// Region, packing and chunks of the transmitted frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct View {
+pub struct FrameLayout {
     /// Pixel packing.
     pub format: PixelFormat,
     /// First column.
@@ -77,7 +77,7 @@ pub struct View {
     pub chunks: Option<[bool; Chunk::ALL.len()]>,
 }
 
-impl View {
+impl FrameLayout {
     /// Size of the pixels in bytes.
     pub fn image_bytes(&self) -> usize {
         self.format.frame_bytes(self.width * self.height)
@@ -114,22 +114,22 @@ pub struct Stamp {
 }
 
 /// A frame as sent, kept for resend requests.
-pub struct Block {
+pub struct SentBlock {
     /// Block id carried by its packets; 0 if empty.
     pub id: u16,
     /// Region and packing.
-    pub view: View,
+    pub view: FrameLayout,
     /// Metadata.
     pub stamp: Stamp,
     /// Packet size in bytes, headers included.
     pub packet_bytes: usize,
-    /// Buffer for pixels and chunks; the first [`View::payload_bytes`] bytes are used.
+    /// Buffer for pixels and chunks; the first [`FrameLayout::payload_bytes`] bytes are used.
     pub payload: Vec<u8>,
 }
 
-impl Block {
+impl SentBlock {
     /// An empty block with capacity for any view of `pixels` pixels.
-    pub fn with_room(view: View, pixels: usize) -> Self {
+    pub fn with_room(view: FrameLayout, pixels: usize) -> Self {
         let bytes =
             PixelFormat::Mono16.frame_bytes(pixels) + (CHUNK_DATA + CHUNK_TRAILER) * (Chunk::ALL.len() + 1);
         Self { id: 0, view, stamp: Stamp::default(), packet_bytes: MIN_PACKET_BYTES, payload: vec![0; bytes] }
@@ -176,7 +176,7 @@ impl Block {
             number if number == last => TRAILER,
             _ => PAYLOAD,
         };
-        word(&(Status::Success as u16).to_be_bytes());
+        word(&(GvcpStatus::Success as u16).to_be_bytes());
         word(&self.id.to_be_bytes());
         word(&(u32::from(kind) << 24 | number).to_be_bytes());
         match kind {
@@ -212,7 +212,7 @@ impl Block {
 /// Writes the answer to a request for packets that are no longer stored; returns its length.
 pub fn unavailable(block: u16, number: u32, datagram: &mut [u8]) -> usize {
     let mut at = 0;
-    put(datagram, &mut at, &(Status::PacketUnavailable as u16).to_be_bytes());
+    put(datagram, &mut at, &(GvcpStatus::PacketUnavailable as u16).to_be_bytes());
     put(datagram, &mut at, &block.to_be_bytes());
     put(datagram, &mut at, &(u32::from(PAYLOAD) << 24 | number).to_be_bytes());
     at

@@ -25,16 +25,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-pub use clock::DeviceClock;
+pub use clock::CameraClock;
 pub use faults::{Faults, TriggerOrder, WireTruth};
 pub use source::test_pixel;
 
-use self::control::Control;
+use self::control::ControlChannel;
 use self::locks::lock;
-use self::registers::{Identity, Registers};
-use self::source::{Controls, Pictures};
-use self::stream::Stream;
-use crate::devices::SimCamera;
+use self::registers::{CameraIdentity, Registers};
+use self::source::{Pictures, SourceControls};
+use self::stream::StreamChannel;
+use crate::devices::PlaneCamera;
 
 /// Longest wait for a datagram, and so the longest delay in detecting a lost client or a stop.
 const PATIENCE: Duration = Duration::from_millis(20);
@@ -67,7 +67,7 @@ pub struct GigeSetup {
     /// Serial number, at most 15 characters.
     pub serial: String,
     /// Its clock.
-    pub clock: DeviceClock,
+    pub clock: CameraClock,
     /// Initial faults.
     pub faults: Faults,
     /// Whether the description is served as a zip file.
@@ -75,11 +75,11 @@ pub struct GigeSetup {
 }
 
 /// The camera's picture source.
-pub struct Look(Arc<dyn Controls>, Box<dyn Pictures>);
+pub struct Look(Arc<dyn SourceControls>, Box<dyn Pictures>);
 
 impl Look {
     /// The simulated scene.
-    pub(crate) fn at_scene(written: SimCamera, read: SimCamera) -> Self {
+    pub(crate) fn at_scene(written: PlaneCamera, read: PlaneCamera) -> Self {
         let (controls, pictures) = source::scene(written, read);
         Self(controls, pictures)
     }
@@ -93,7 +93,7 @@ impl Look {
 
 /// A running camera, which stops when dropped.
 pub struct GigeCamera {
-    stream: Arc<Stream>,
+    stream: Arc<StreamChannel>,
     stop: Arc<AtomicBool>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -112,7 +112,7 @@ impl GigeCamera {
         let capabilities = controls.capabilities();
         let out = UdpSocket::bind(SocketAddrV4::new(setup.address, 0))?;
         let pixels = capabilities.width * capabilities.height;
-        let stream = Arc::new(Stream::new(out, pixels, setup.clock, setup.faults));
+        let stream = Arc::new(StreamChannel::new(out, pixels, setup.clock, setup.faults));
         let features = features::features(&capabilities);
         let description = genicam::describe(&features, &capabilities.model);
         let description = if setup.zipped {
@@ -120,7 +120,7 @@ impl GigeCamera {
         } else {
             (description.into_bytes(), "raysweep.xml")
         };
-        let identity = Identity {
+        let identity = CameraIdentity {
             address: setup.address,
             model: &capabilities.model,
             serial: &setup.serial,
@@ -128,7 +128,7 @@ impl GigeCamera {
             description,
         };
         let registers = Registers::new(features, identity);
-        let control = Control::new(registers, controls.clone(), stream.clone(), stream.wire()?);
+        let control = ControlChannel::new(registers, controls.clone(), stream.clone(), stream.wire()?);
 
         let mut camera = Self { stream: stream.clone(), stop: Arc::default(), threads: Vec::new() };
         let wire = stream.wire()?;
@@ -186,7 +186,7 @@ fn listen(address: SocketAddrV4) -> io::Result<UdpSocket> {
 }
 
 /// Answers datagrams on both `sockets` until `stop`; answers are sent from the first.
-fn serve(mut control: Control, stream: &Stream, sockets: &[UdpSocket; 2], stop: &AtomicBool) {
+fn serve(mut control: ControlChannel, stream: &StreamChannel, sockets: &[UdpSocket; 2], stop: &AtomicBool) {
     use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
     use std::os::fd::AsFd;
     let mut datagram = [0; MAX_DATAGRAM];

@@ -2,8 +2,8 @@
 
 use std::net::Ipv4Addr;
 
-use super::features::{Access, Feature, Id, Kind, MAKERS_REGISTERS, MAKERS_STRIDE};
-use super::gvcp::Status;
+use super::features::{Feature, FeatureId, Kind, MAKERS_REGISTERS, MAKERS_STRIDE, RegisterAccess};
+use super::gvcp::GvcpStatus;
 
 /// Length of a discovery answer: the beginning of the memory.
 pub const DISCOVERY_BYTES: usize = 0xF8;
@@ -22,7 +22,7 @@ const CAPABILITIES: u32 = 1 | 1 << 1 | 1 << 30 | 1 << 31;
 const RESENDS: u32 = 1 << 2;
 
 /// Properties that are fixed when the camera is created.
-pub struct Identity<'a> {
+pub struct CameraIdentity<'a> {
     /// Address on which it listens.
     pub address: Ipv4Addr,
     /// Model name.
@@ -47,9 +47,9 @@ pub struct Registers {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Write<'a> {
     /// The register.
-    pub id: Id,
+    pub id: FeatureId,
     /// Access mode of the register.
-    pub access: Access,
+    pub access: RegisterAccess,
     address: u32,
     data: &'a [u8],
 }
@@ -63,7 +63,7 @@ impl Write<'_> {
 
 impl Registers {
     /// The memory after power-on.
-    pub fn new(features: Vec<Feature>, identity: Identity<'_>) -> Self {
+    pub fn new(features: Vec<Feature>, identity: CameraIdentity<'_>) -> Self {
         let (description, file) = identity.description;
         let bytes = description.len();
         let mut registers = Self {
@@ -92,17 +92,17 @@ impl Registers {
         put(0x600, &1_u32.to_be_bytes());
         put(0x904, &1_u32.to_be_bytes());
         put(0x934, &CAPABILITIES.to_be_bytes());
-        registers.set_text(Id::DeviceVendorName, "raysweep");
-        registers.set_text(Id::DeviceModelName, identity.model);
-        registers.set_text(Id::DeviceVersion, env!("CARGO_PKG_VERSION"));
-        registers.set_text(Id::DeviceManufacturerInfo, "simulated camera");
-        registers.set_text(Id::DeviceSerialNumber, identity.serial);
+        registers.set_text(FeatureId::DeviceVendorName, "raysweep");
+        registers.set_text(FeatureId::DeviceModelName, identity.model);
+        registers.set_text(FeatureId::DeviceVersion, env!("CARGO_PKG_VERSION"));
+        registers.set_text(FeatureId::DeviceManufacturerInfo, "simulated camera");
+        registers.set_text(FeatureId::DeviceSerialNumber, identity.serial);
         for feature in registers.features.clone() {
             if feature.initial != 0 {
                 registers.set_bits(feature.id, feature.initial);
             }
         }
-        registers.set_long(Id::GevTimestampTickFrequency, identity.tick_frequency_hz);
+        registers.set_long(FeatureId::GevTimestampTickFrequency, identity.tick_frequency_hz);
         registers
     }
 
@@ -121,9 +121,9 @@ impl Registers {
     ///
     /// # Errors
     /// `BadAlignment` unless address and length are multiples of four, `InvalidAddress` outside the memory.
-    pub fn read(&self, address: u32, bytes: usize) -> Result<&[u8], Status> {
+    pub fn read(&self, address: u32, bytes: usize) -> Result<&[u8], GvcpStatus> {
         if !address.is_multiple_of(4) || !bytes.is_multiple_of(4) {
-            return Err(Status::BadAlignment);
+            return Err(GvcpStatus::BadAlignment);
         }
         let (base, memory) = match address {
             DESCRIPTION.. => (DESCRIPTION, &self.description),
@@ -131,7 +131,7 @@ impl Registers {
             _ => (0, &self.standard),
         };
         let from = (address - base) as usize;
-        memory.get(from..from + bytes).ok_or(Status::InvalidAddress)
+        memory.get(from..from + bytes).ok_or(GvcpStatus::InvalidAddress)
     }
 
     /// Validates a write without carrying it out.
@@ -139,19 +139,21 @@ impl Registers {
     /// # Errors
     /// `InvalidAddress` unless it covers exactly one register, `WriteProtect` for a read-only register,
     /// `InvalidParameter` for a value that the feature does not accept.
-    pub fn check<'a>(&self, address: u32, data: &'a [u8]) -> Result<Write<'a>, Status> {
+    pub fn check<'a>(&self, address: u32, data: &'a [u8]) -> Result<Write<'a>, GvcpStatus> {
         if !address.is_multiple_of(4) {
-            return Err(Status::BadAlignment);
+            return Err(GvcpStatus::BadAlignment);
         }
         let feature = self.features.iter().find(|feature| {
             let end = feature.address + feature.bytes(&self.features);
             (feature.address..end).contains(&address)
         });
         let Some(feature) = feature else {
-            return Err(self.read(address, 4).map_or(Status::InvalidAddress, |_| Status::WriteProtect));
+            return Err(self
+                .read(address, 4)
+                .map_or(GvcpStatus::InvalidAddress, |_| GvcpStatus::WriteProtect));
         };
-        if feature.access == Access::ReadOnly {
-            return Err(Status::WriteProtect);
+        if feature.access == RegisterAccess::ReadOnly {
+            return Err(GvcpStatus::WriteProtect);
         }
         let offset = address - feature.address;
         let whole = match feature.kind {
@@ -160,11 +162,11 @@ impl Registers {
             _ => offset == 0 && data.len() == feature.bytes(&self.features) as usize,
         };
         if !whole {
-            return Err(Status::InvalidAddress);
+            return Err(GvcpStatus::InvalidAddress);
         }
         let number = || super::gvcp::u32_at(data, 0).unwrap_or(0);
         let allowed = match &feature.kind {
-            _ if feature.access == Access::Command => true,
+            _ if feature.access == RegisterAccess::Command => true,
             Kind::Integer { min, max, step, max_in } => {
                 let max = max_in.map_or(*max, |id| self.number(id).min(*max));
                 (*min..=max).contains(&number()) && (number() - min).is_multiple_of(*step)
@@ -178,14 +180,14 @@ impl Registers {
             Kind::Long | Kind::Text(_) => true,
         };
         if !allowed {
-            return Err(Status::InvalidParameter);
+            return Err(GvcpStatus::InvalidParameter);
         }
         Ok(Write { id: feature.id, access: feature.access, address, data })
     }
 
     /// Carries out a validated write; a command stores nothing.
     pub fn commit(&mut self, write: Write<'_>) {
-        if write.access != Access::Command
+        if write.access != RegisterAccess::Command
             && let Some(memory) = self.memory(write.address, write.data.len())
         {
             memory.copy_from_slice(write.data);
@@ -202,55 +204,55 @@ impl Registers {
         memory.get_mut(from..from + bytes)
     }
 
-    fn address(&self, id: Id) -> u32 {
+    fn address(&self, id: FeatureId) -> u32 {
         self.features.iter().find(|feature| feature.id == id).map_or(0, |feature| feature.address)
     }
 
     /// Sets the bits of a register of four or eight bytes.
-    fn set_bits(&mut self, id: Id, bits: u64) {
+    fn set_bits(&mut self, id: FeatureId, bits: u64) {
         let wide = self.features.iter().any(|feature| feature.id == id && feature.bytes(&self.features) == 8);
         if wide { self.set_long(id, bits) } else { self.set_number(id, bits as u32) }
     }
 
     /// Reads a four-byte register.
-    pub fn number(&self, id: Id) -> u32 {
+    pub fn number(&self, id: FeatureId) -> u32 {
         self.number_for(id, 0)
     }
 
     /// Reads entry `index` of a register that has one entry per enumeration value.
-    pub fn number_for(&self, id: Id, index: u32) -> u32 {
+    pub fn number_for(&self, id: FeatureId, index: u32) -> u32 {
         let word = self.read(self.address(id) + 4 * index, 4);
         word.ok().and_then(|bytes| super::gvcp::u32_at(bytes, 0)).unwrap_or(0)
     }
 
     /// Reads a register that holds a double.
-    pub fn float(&self, id: Id) -> f64 {
+    pub fn float(&self, id: FeatureId) -> f64 {
         let bytes = self.read(self.address(id), 8).ok().and_then(|bytes| bytes.first_chunk());
         bytes.map_or(0.0, |bytes| f64::from_be_bytes(*bytes))
     }
 
     /// Sets a four-byte register.
-    pub fn set_number(&mut self, id: Id, value: u32) {
+    pub fn set_number(&mut self, id: FeatureId, value: u32) {
         self.set(id, &value.to_be_bytes());
     }
 
     /// Sets an eight-byte register.
-    pub fn set_long(&mut self, id: Id, value: u64) {
+    pub fn set_long(&mut self, id: FeatureId, value: u64) {
         self.set(id, &value.to_be_bytes());
     }
 
     /// Sets a register that holds a double.
-    pub fn set_float(&mut self, id: Id, value: f64) {
+    pub fn set_float(&mut self, id: FeatureId, value: f64) {
         self.set(id, &value.to_be_bytes());
     }
 
-    fn set_text(&mut self, id: Id, text: &str) {
+    fn set_text(&mut self, id: FeatureId, text: &str) {
         let room = self.features.iter().find(|feature| feature.id == id);
         let room = room.map_or(0, |feature| feature.bytes(&self.features) as usize - 1);
         self.set(id, &text.as_bytes()[..text.len().min(room)]);
     }
 
-    fn set(&mut self, id: Id, bytes: &[u8]) {
+    fn set(&mut self, id: FeatureId, bytes: &[u8]) {
         if let Some(memory) = self.memory(self.address(id), bytes.len()) {
             memory.copy_from_slice(bytes);
         }

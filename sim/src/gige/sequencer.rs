@@ -3,8 +3,8 @@
 
 use raysweep_core::CameraSettings;
 
-use super::features::{FRAME_START, Id, SEQUENCER_SETS};
-use super::gvcp::Status;
+use super::features::{FRAME_START, FeatureId, SEQUENCER_SETS};
+use super::gvcp::GvcpStatus;
 use super::registers::Registers;
 use super::source::Sets;
 
@@ -40,38 +40,38 @@ impl Sequencer {
     ///
     /// # Errors
     /// `AccessDenied`.
-    pub fn check(registers: &Registers, id: Id) -> Result<(), Status> {
-        let runs = registers.number(Id::SequencerMode) == ON;
-        let configures = registers.number(Id::SequencerConfigurationMode) == ON;
+    pub fn check(registers: &Registers, id: FeatureId) -> Result<(), GvcpStatus> {
+        let runs = registers.number(FeatureId::SequencerMode) == ON;
+        let configures = registers.number(FeatureId::SequencerConfigurationMode) == ON;
         let allowed = match id {
-            Id::SequencerMode => !configures,
-            Id::SequencerConfigurationMode
-            | Id::ExposureTime
-            | Id::TriggerDelay
-            | Id::SensorShutterMode
-            | Id::UserSetLoad
-            | Id::UserSetSave => !runs,
-            Id::SequencerFeatureSelector
-            | Id::SequencerFeatureEnable
-            | Id::SequencerSetSelector
-            | Id::SequencerSetSave
-            | Id::SequencerSetLoad
-            | Id::SequencerSetStart
-            | Id::SequencerPathSelector
-            | Id::SequencerSetNext
-            | Id::SequencerTriggerSource => configures,
+            FeatureId::SequencerMode => !configures,
+            FeatureId::SequencerConfigurationMode
+            | FeatureId::ExposureTime
+            | FeatureId::TriggerDelay
+            | FeatureId::SensorShutterMode
+            | FeatureId::UserSetLoad
+            | FeatureId::UserSetSave => !runs,
+            FeatureId::SequencerFeatureSelector
+            | FeatureId::SequencerFeatureEnable
+            | FeatureId::SequencerSetSelector
+            | FeatureId::SequencerSetSave
+            | FeatureId::SequencerSetLoad
+            | FeatureId::SequencerSetStart
+            | FeatureId::SequencerPathSelector
+            | FeatureId::SequencerSetNext
+            | FeatureId::SequencerTriggerSource => configures,
             _ => true,
         };
-        if allowed { Ok(()) } else { Err(Status::AccessDenied) }
+        if allowed { Ok(()) } else { Err(GvcpStatus::AccessDenied) }
     }
 
     /// Whether the sequencer is switched on.
     pub fn runs(registers: &Registers) -> bool {
-        registers.number(Id::SequencerMode) == ON
+        registers.number(FeatureId::SequencerMode) == ON
     }
 
     fn selected(registers: &Registers) -> usize {
-        registers.number(Id::SequencerSetSelector) as usize
+        registers.number(FeatureId::SequencerSetSelector) as usize
     }
 
     /// Saves the current settings to the selected set.
@@ -80,8 +80,8 @@ impl Sequencer {
             let number = |id| registers.number(id);
             *set = Set {
                 settings,
-                next: number(Id::SequencerSetNext),
-                source: number(Id::SequencerTriggerSource),
+                next: number(FeatureId::SequencerSetNext),
+                source: number(FeatureId::SequencerTriggerSource),
             };
         }
     }
@@ -89,8 +89,8 @@ impl Sequencer {
     /// Writes the selected set's successor and trigger source to the registers.
     pub fn show(&self, registers: &mut Registers) {
         if let Some(set) = self.sets.get(Self::selected(registers)) {
-            registers.set_number(Id::SequencerSetNext, set.next);
-            registers.set_number(Id::SequencerTriggerSource, set.source);
+            registers.set_number(FeatureId::SequencerSetNext, set.next);
+            registers.set_number(FeatureId::SequencerTriggerSource, set.source);
         }
     }
 
@@ -98,14 +98,14 @@ impl Sequencer {
     pub fn load(&self, registers: &mut Registers) {
         self.show(registers);
         if let Some(Set { settings, .. }) = self.sets.get(Self::selected(registers)) {
-            registers.set_float(Id::ExposureTime, settings.exposure_us);
-            registers.set_float(Id::TriggerDelay, settings.trigger_delay_us);
+            registers.set_float(FeatureId::ExposureTime, settings.exposure_us);
+            registers.set_float(FeatureId::TriggerDelay, settings.trigger_delay_us);
         }
     }
 
     /// The sets for the frames; features that are not enabled keep their values in `settings`.
     pub fn sequence(&self, registers: &Registers, settings: CameraSettings) -> Sets {
-        let enabled = |feature| registers.number_for(Id::SequencerFeatureEnable, feature) == ON;
+        let enabled = |feature| registers.number_for(FeatureId::SequencerFeatureEnable, feature) == ON;
         let (exposure, delay) = (enabled(EXPOSURE_TIME), enabled(TRIGGER_DELAY));
         let sets = self.sets.iter().enumerate().map(|(place, set)| {
             let of_set = CameraSettings {

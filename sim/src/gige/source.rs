@@ -9,17 +9,17 @@ use raysweep_core::{
     SettingsId,
 };
 
-use super::gvsp::{Block, View};
+use super::gvsp::{FrameLayout, SentBlock};
 use super::locks::lock;
-use crate::devices::SimCamera;
-use crate::line::Line;
+use crate::devices::PlaneCamera;
+use crate::line::VsyncLine;
 pub use crate::line::{Sets, TriggeredBy};
 
 /// Number of pictures kept for resend requests; test pictures repeat with this period.
 pub const BLOCKS: usize = 16;
 
 /// The control side of a source, used by the thread of the control protocol.
-pub trait Controls: Send + Sync {
+pub trait SourceControls: Send + Sync {
     /// Capabilities of the camera.
     fn capabilities(&self) -> CameraCapabilities;
     /// Applies settings; returns the actual values.
@@ -27,7 +27,7 @@ pub trait Controls: Send + Sync {
     /// # Errors
     /// `OutOfRange`; the old settings then remain.
     fn configure(&self, settings: &CameraSettings) -> Result<CameraSettings, DeviceError>;
-    /// Steps through sets from `first` on, one per frame, until [`Controls::configure`].
+    /// Steps through sets from `first` on, one per frame, until [`SourceControls::configure`].
     fn set_sequence(&self, sets: Sets, first: usize);
     /// The set of the newest frame, while a sequence is running.
     fn active_set(&self) -> Option<usize>;
@@ -45,7 +45,7 @@ pub trait Controls: Send + Sync {
 
 /// One exposure.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Exposed {
+pub struct ExposedPicture {
     /// Its number; all exposures are counted.
     pub seq: u64,
     /// Start of row 0's exposure on the host's clock.
@@ -59,25 +59,25 @@ pub struct Exposed {
 /// The picture side of a source, used by the sending thread.
 pub trait Pictures: Send {
     /// Waits for the next exposure; exposure starts with the first row of the region.
-    fn wait(&mut self, view: &View, timeout: Duration) -> Option<Exposed>;
+    fn wait(&mut self, view: &FrameLayout, timeout: Duration) -> Option<ExposedPicture>;
     /// Writes the pixels of the last exposure; `block` is the one at `seq` modulo [`BLOCKS`].
-    fn write(&mut self, exposed: &Exposed, block: &mut Block);
+    fn write(&mut self, exposed: &ExposedPicture, block: &mut SentBlock);
 }
 
 /// Control side of the simulated scene.
 struct SceneControls {
-    camera: Mutex<SimCamera>,
+    camera: Mutex<PlaneCamera>,
     /// Number of settings written so far, which keys noise in place of a sweep's points.
     written: AtomicU32,
 }
 
 struct ScenePictures {
-    camera: SimCamera,
+    camera: PlaneCamera,
     region: Vec<u16>,
 }
 
 /// Control and picture side of the simulated scene, from two handles to its camera.
-pub fn scene(written: SimCamera, read: SimCamera) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
+pub fn scene(written: PlaneCamera, read: PlaneCamera) -> (Arc<dyn SourceControls>, Box<dyn Pictures>) {
     let region = Vec::with_capacity(read.counts().len());
     (
         Arc::new(SceneControls { camera: Mutex::new(written), written: AtomicU32::new(0) }),
@@ -86,12 +86,12 @@ pub fn scene(written: SimCamera, read: SimCamera) -> (Arc<dyn Controls>, Box<dyn
 }
 
 impl SceneControls {
-    fn with_line<T>(&self, work: impl FnOnce(&mut Line, i64) -> T) -> T {
+    fn with_line<T>(&self, work: impl FnOnce(&mut VsyncLine, i64) -> T) -> T {
         lock(&self.camera).with_line(work)
     }
 }
 
-impl Controls for SceneControls {
+impl SourceControls for SceneControls {
     fn capabilities(&self) -> CameraCapabilities {
         lock(&self.camera).capabilities().clone()
     }
@@ -135,15 +135,15 @@ impl Controls for SceneControls {
 }
 
 impl Pictures for ScenePictures {
-    fn wait(&mut self, view: &View, timeout: Duration) -> Option<Exposed> {
+    fn wait(&mut self, view: &FrameLayout, timeout: Duration) -> Option<ExposedPicture> {
         let exposure = self.camera.next_exposure(view.y, timeout)?;
         let (seq, start_ns) = (exposure.seq, exposure.start_ns);
         // Sequencer sets are keyed by their index; other settings have point 0.
         let [set, ..] = exposure.key;
-        Some(Exposed { seq, start_ns, exposure_us: exposure.settings.exposure_us, set })
+        Some(ExposedPicture { seq, start_ns, exposure_us: exposure.settings.exposure_us, set })
     }
 
-    fn write(&mut self, _: &Exposed, block: &mut Block) {
+    fn write(&mut self, _: &ExposedPicture, block: &mut SentBlock) {
         let view = block.view;
         // The converter has the bits of the rig's format; other formats keep the upper bits or set the lower ones to 0.
         let (from, to) = (self.camera.capabilities().format.bits(), view.format.bits());
@@ -160,7 +160,7 @@ impl Pictures for ScenePictures {
     }
 }
 
-fn pack(format: PixelFormat, pixels: &[u16], block: &mut Block) {
+fn pack(format: PixelFormat, pixels: &[u16], block: &mut SentBlock) {
     // The block has room for exactly its own view.
     let packed = format.pack_into(pixels, block.image_mut());
     debug_assert!(packed.is_ok(), "{packed:?}");
@@ -187,7 +187,7 @@ struct PatternPictures {
     pattern: Arc<Pattern>,
     clock: ClockHandle,
     /// View of the picture that each block already contains.
-    made: [Option<View>; BLOCKS],
+    made: [Option<FrameLayout>; BLOCKS],
     pixels: Vec<u16>,
 }
 
@@ -197,7 +197,7 @@ pub fn test_pixel(x: usize, y: usize, picture: usize, format: PixelFormat) -> u1
 }
 
 /// Control and picture side of a camera of `size` (rows, columns) that sends test pictures.
-pub fn pattern(size: (usize, usize)) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
+pub fn pattern(size: (usize, usize)) -> (Arc<dyn SourceControls>, Box<dyn Pictures>) {
     let clock = Clock::real();
     let idle = CameraSettings {
         shutter: raysweep_core::Shutter::Rolling,
@@ -223,7 +223,7 @@ pub fn pattern(size: (usize, usize)) -> (Arc<dyn Controls>, Box<dyn Pictures>) {
     (pattern, Box::new(pictures))
 }
 
-impl Controls for Pattern {
+impl SourceControls for Pattern {
     fn capabilities(&self) -> CameraCapabilities {
         let (height, width) = self.size;
         CameraCapabilities {
@@ -295,7 +295,7 @@ impl PatternState {
 }
 
 impl Pictures for PatternPictures {
-    fn wait(&mut self, _: &View, timeout: Duration) -> Option<Exposed> {
+    fn wait(&mut self, _: &FrameLayout, timeout: Duration) -> Option<ExposedPicture> {
         let mut state = lock(&self.pattern.state);
         let now_ns = self.clock.now_ns();
         let Some(due_ns) = state.due_ns(now_ns) else {
@@ -319,12 +319,12 @@ impl Pictures for PatternPictures {
         state.fired = state.fired.saturating_sub(1);
         let seq = state.next_seq;
         state.next_seq += 1;
-        Some(Exposed { seq, start_ns: due_ns, exposure_us: state.settings.exposure_us, set: 0 })
+        Some(ExposedPicture { seq, start_ns: due_ns, exposure_us: state.settings.exposure_us, set: 0 })
     }
 
-    fn write(&mut self, exposed: &Exposed, block: &mut Block) {
+    fn write(&mut self, exposed: &ExposedPicture, block: &mut SentBlock) {
         let slot = (exposed.seq % BLOCKS as u64) as usize;
-        let view = View { chunks: None, ..block.view };
+        let view = FrameLayout { chunks: None, ..block.view };
         if self.made[slot] == Some(view) {
             return;
         }

@@ -7,12 +7,12 @@ use std::time::Duration;
 
 use raysweep_core::PixelFormat;
 
-use super::clock::DeviceClock;
+use super::clock::CameraClock;
 use super::faults::{Faults, WireTruth};
 use super::gvcp::Resend;
-use super::gvsp::{Block, MIN_PACKET_BYTES, Stamp, View, block_id};
+use super::gvsp::{FrameLayout, MIN_PACKET_BYTES, SentBlock, Stamp, block_id};
 use super::locks::{lock, read, write};
-use super::source::{BLOCKS, Controls, Pictures};
+use super::source::{BLOCKS, Pictures, SourceControls};
 use super::wire::{Route, Wire};
 use crate::keyed::{Purpose, keyed, uniform};
 
@@ -21,11 +21,11 @@ const PATIENCE: Duration = Duration::from_millis(2);
 
 /// What the client has requested.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Order {
+pub struct StreamOrder {
     /// Number of the acquisition: frames exposed for an earlier one are not sent.
     pub acquisition: u64,
     /// Region and packing.
-    pub view: View,
+    pub view: FrameLayout,
     /// Packet size in bytes, including IP and UDP headers.
     pub packet_bytes: usize,
     /// Destination and packet gap.
@@ -37,25 +37,26 @@ pub struct Order {
 }
 
 /// State shared by the control and stream threads.
-pub struct Stream {
-    order: Mutex<Option<Order>>,
-    blocks: Vec<RwLock<Block>>,
+pub struct StreamChannel {
+    order: Mutex<Option<StreamOrder>>,
+    blocks: Vec<RwLock<SentBlock>>,
     /// Current faults.
     pub faults: Mutex<Faults>,
     /// Ground truth of what was sent.
     pub truth: Arc<Mutex<WireTruth>>,
     /// The camera's clock.
-    pub clock: Mutex<DeviceClock>,
+    pub clock: Mutex<CameraClock>,
     socket: UdpSocket,
 }
 
-impl Stream {
+impl StreamChannel {
     /// An idle stream that sends from `socket`; pictures have at most `pixels` pixels.
-    pub fn new(socket: UdpSocket, pixels: usize, clock: DeviceClock, faults: Faults) -> Self {
-        let nothing = View { format: PixelFormat::Mono8, x: 0, y: 0, width: 0, height: 0, chunks: None };
+    pub fn new(socket: UdpSocket, pixels: usize, clock: CameraClock, faults: Faults) -> Self {
+        let nothing =
+            FrameLayout { format: PixelFormat::Mono8, x: 0, y: 0, width: 0, height: 0, chunks: None };
         Self {
             order: Mutex::new(None),
-            blocks: (0..BLOCKS).map(|_| RwLock::new(Block::with_room(nothing, pixels))).collect(),
+            blocks: (0..BLOCKS).map(|_| RwLock::new(SentBlock::with_room(nothing, pixels))).collect(),
             faults: Mutex::new(faults),
             truth: Arc::default(),
             clock: Mutex::new(clock),
@@ -72,7 +73,7 @@ impl Stream {
     }
 
     /// Starts or ends an acquisition.
-    pub fn set_order(&self, order: Option<Order>) {
+    pub fn set_order(&self, order: Option<StreamOrder>) {
         if order.is_some() {
             // Block ids restart, and stored frames of the previous acquisition would match them.
             self.blocks.iter().for_each(|block| write(block).id = 0);
@@ -81,7 +82,7 @@ impl Stream {
     }
 
     /// The current order, if any.
-    pub fn order(&self) -> Option<Order> {
+    pub fn order(&self) -> Option<StreamOrder> {
         *lock(&self.order)
     }
 
@@ -102,7 +103,7 @@ impl Stream {
     /// Sends frames until `stop`.
     pub fn run(
         &self,
-        controls: &dyn Controls,
+        controls: &dyn SourceControls,
         mut pictures: Box<dyn Pictures>,
         mut wire: Wire,
         stop: &AtomicBool,

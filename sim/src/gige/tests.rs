@@ -6,16 +6,16 @@ use std::time::{Duration, Instant};
 use proptest::prelude::*;
 use raysweep_core::PixelFormat;
 
-use super::clock::DeviceClock;
-use super::control::Control;
+use super::clock::CameraClock;
+use super::control::ControlChannel;
 use super::faults::{Faults, TriggerOrder};
-use super::features::{Access, Feature, Id, Kind, features};
+use super::features::{Feature, FeatureId, Kind, RegisterAccess, features};
 use super::gvcp::u32_at;
-use super::gvsp::{Block, View, block_id};
+use super::gvsp::{FrameLayout, SentBlock, block_id};
 use super::locks::lock;
-use super::registers::{Identity, Registers};
+use super::registers::{CameraIdentity, Registers};
 use super::source;
-use super::stream::Stream;
+use super::stream::StreamChannel;
 
 const READ_REGISTER: u16 = 0x0080;
 const WRITE_REGISTER: u16 = 0x0082;
@@ -26,8 +26,8 @@ const CCP: u32 = 0xA00;
 
 /// A camera with test pictures of 48 x 64 pixels, and the datagrams sent to it.
 struct Bench {
-    control: Control,
-    stream: std::sync::Arc<Stream>,
+    control: ControlChannel,
+    stream: std::sync::Arc<StreamChannel>,
     features: Vec<Feature>,
     now: Instant,
     reply: Vec<u8>,
@@ -42,10 +42,14 @@ impl Bench {
         let (controls, _) = source::pattern((48, 64));
         let capabilities = controls.capabilities();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-        let stream =
-            std::sync::Arc::new(Stream::new(socket, 48 * 64, DeviceClock::default(), Faults::default()));
+        let stream = std::sync::Arc::new(StreamChannel::new(
+            socket,
+            48 * 64,
+            CameraClock::default(),
+            Faults::default(),
+        ));
         let features = features(&capabilities);
-        let identity = Identity {
+        let identity = CameraIdentity {
             address: [127, 0, 0, 1].into(),
             model: "model",
             serial: "a serial number that is far too long",
@@ -53,7 +57,7 @@ impl Bench {
             description: (b"<xml/>".to_vec(), "raysweep.xml"),
         };
         let registers = Registers::new(features.clone(), identity);
-        let control = Control::new(registers, controls, stream.clone(), stream.wire().unwrap());
+        let control = ControlChannel::new(registers, controls, stream.clone(), stream.wire().unwrap());
         Self { control, stream, features, now: Instant::now(), reply: Vec::new() }
     }
 
@@ -82,26 +86,26 @@ impl Bench {
         if status == SUCCESS { Ok(u32_at(&data, 0).unwrap()) } else { Err(status) }
     }
 
-    fn address(&self, id: Id) -> u32 {
+    fn address(&self, id: FeatureId) -> u32 {
         self.features.iter().find(|feature| feature.id == id).unwrap().address
     }
 
-    fn set(&mut self, id: Id, value: u32) -> u16 {
+    fn set(&mut self, id: FeatureId, value: u32) -> u16 {
         let address = self.address(id);
         self.write(0, address, value)
     }
 
-    fn get(&mut self, id: Id) -> u32 {
+    fn get(&mut self, id: FeatureId) -> u32 {
         let address = self.address(id);
         self.read(0, address).unwrap()
     }
 
-    fn set_float(&mut self, id: Id, value: f64) -> u16 {
+    fn set_float(&mut self, id: FeatureId, value: f64) -> u16 {
         let data = [&self.address(id).to_be_bytes()[..], &value.to_be_bytes()].concat();
         self.ask(0, WRITE_MEMORY, &data).0
     }
 
-    fn get_float(&mut self, id: Id) -> f64 {
+    fn get_float(&mut self, id: FeatureId) -> f64 {
         let data = [self.address(id).to_be_bytes(), 8_u32.to_be_bytes()].concat();
         let (status, data) = self.ask(0, READ_MEMORY, &data);
         assert_eq!(status, SUCCESS);
@@ -110,9 +114,9 @@ impl Bench {
 
     fn started(mut self) -> Self {
         assert_eq!(self.write(0, CCP, 2), SUCCESS);
-        assert_eq!(self.set(Id::GevSCDA, 0x7F00_0001), SUCCESS);
-        assert_eq!(self.set(Id::GevSCPHostPort, 50_999), SUCCESS);
-        assert_eq!(self.set(Id::AcquisitionStart, 1), SUCCESS);
+        assert_eq!(self.set(FeatureId::GevSCDA, 0x7F00_0001), SUCCESS);
+        assert_eq!(self.set(FeatureId::GevSCPHostPort, 50_999), SUCCESS);
+        assert_eq!(self.set(FeatureId::AcquisitionStart, 1), SUCCESS);
         self
     }
 }
@@ -120,7 +124,7 @@ impl Bench {
 #[test]
 fn one_client_controls_and_the_others_may_look() {
     let mut bench = Bench::new();
-    let width = bench.address(Id::Width);
+    let width = bench.address(FeatureId::Width);
     assert_eq!(bench.write(0, width, 32), 0x8006, "nobody writes without control");
     assert_eq!(bench.write(0, CCP, 2), SUCCESS);
     assert_eq!(bench.read(1, CCP), Ok(2), "others see that it is taken");
@@ -140,7 +144,7 @@ fn one_client_controls_and_the_others_may_look() {
 #[test]
 fn a_silent_client_loses_the_camera_and_its_stream() {
     let mut bench = Bench::new().started();
-    let timeout = Duration::from_millis(bench.get(Id::GevHeartbeatTimeout).into());
+    let timeout = Duration::from_millis(bench.get(FeatureId::GevHeartbeatTimeout).into());
     bench.now += timeout;
     bench.control.check_heartbeat(bench.now);
     assert_eq!(bench.read(0, CCP), Ok(2), "not silent for longer than the time-out, and now heard again");
@@ -164,8 +168,8 @@ fn values_that_a_feature_does_not_take_change_nothing() {
         let before =
             bench.ask(0, READ_MEMORY, &[feature.address.to_be_bytes(), 4_u32.to_be_bytes()].concat());
         let (refused, status) = match (&feature.kind, feature.access) {
-            (_, Access::ReadOnly) => (bench.set(feature.id, 1), 0x8004),
-            (_, Access::Command) => continue,
+            (_, RegisterAccess::ReadOnly) => (bench.set(feature.id, 1), 0x8004),
+            (_, RegisterAccess::Command) => continue,
             (Kind::Integer { max: u32::MAX, .. } | Kind::Text(_) | Kind::Long, _) => continue,
             (Kind::Float { max, .. }, _) => {
                 assert_eq!(bench.set_float(feature.id, f64::NAN), 0x8002, "{:?}", feature.id);
@@ -202,50 +206,52 @@ fn registers_lie_apart() {
 fn a_region_is_bounded_by_the_sensor_and_sets_the_payload() {
     let mut bench = Bench::new();
     bench.write(0, CCP, 2);
-    assert_eq!(bench.set(Id::OffsetX, 1), 0x8002, "the full width leaves no room");
-    assert_eq!(bench.set(Id::Width, 31), SUCCESS);
-    assert_eq!(bench.set(Id::OffsetX, 33), SUCCESS);
-    assert_eq!(bench.set(Id::OffsetX, 34), 0x8002);
-    assert_eq!(bench.set(Id::Width, 32), 0x8002);
-    assert_eq!(bench.set(Id::Height, 3), SUCCESS);
-    assert_eq!(bench.set(Id::PixelFormat, PixelFormat::Mono12p.pfnc().unwrap()), SUCCESS);
-    assert_eq!(bench.get(Id::PayloadSize), (31 * 3 * 12_u32).div_ceil(8));
-    assert_eq!(bench.set(Id::ChunkModeActive, 1), SUCCESS);
-    let enable = bench.address(Id::ChunkEnable);
+    assert_eq!(bench.set(FeatureId::OffsetX, 1), 0x8002, "the full width leaves no room");
+    assert_eq!(bench.set(FeatureId::Width, 31), SUCCESS);
+    assert_eq!(bench.set(FeatureId::OffsetX, 33), SUCCESS);
+    assert_eq!(bench.set(FeatureId::OffsetX, 34), 0x8002);
+    assert_eq!(bench.set(FeatureId::Width, 32), 0x8002);
+    assert_eq!(bench.set(FeatureId::Height, 3), SUCCESS);
+    assert_eq!(bench.set(FeatureId::PixelFormat, PixelFormat::Mono12p.pfnc().unwrap()), SUCCESS);
+    assert_eq!(bench.get(FeatureId::PayloadSize), (31 * 3 * 12_u32).div_ceil(8));
+    assert_eq!(bench.set(FeatureId::ChunkModeActive, 1), SUCCESS);
+    let enable = bench.address(FeatureId::ChunkEnable);
     assert_eq!(bench.write(0, enable + 8, 1), SUCCESS);
     // 140 bytes of pixels and an 8-byte trailer; 8 bytes of a chunk and an 8-byte trailer.
-    assert_eq!(bench.get(Id::PayloadSize), 140 + 8 + 16);
+    assert_eq!(bench.get(FeatureId::PayloadSize), 140 + 8 + 16);
 }
 
 #[test]
 fn what_frames_look_like_is_locked_while_they_are_acquired() {
     let mut bench = Bench::new().started();
-    for (id, value) in
-        [(Id::Width, 8), (Id::PixelFormat, PixelFormat::Mono16.pfnc().unwrap()), (Id::ChunkModeActive, 1)]
-    {
+    for (id, value) in [
+        (FeatureId::Width, 8),
+        (FeatureId::PixelFormat, PixelFormat::Mono16.pfnc().unwrap()),
+        (FeatureId::ChunkModeActive, 1),
+    ] {
         assert_eq!(bench.set(id, value), 0x8006, "{id:?}");
     }
-    assert_eq!(bench.set_float(Id::ExposureTime, 1234.5), SUCCESS, "settings of a sweep are not");
-    assert_eq!(bench.get_float(Id::ExposureTime), 1234.5);
-    assert_eq!(bench.set(Id::AcquisitionStop, 1), SUCCESS);
-    assert_eq!(bench.set(Id::Width, 8), SUCCESS);
+    assert_eq!(bench.set_float(FeatureId::ExposureTime, 1234.5), SUCCESS, "settings of a sweep are not");
+    assert_eq!(bench.get_float(FeatureId::ExposureTime), 1234.5);
+    assert_eq!(bench.set(FeatureId::AcquisitionStop, 1), SUCCESS);
+    assert_eq!(bench.set(FeatureId::Width, 8), SUCCESS);
 }
 
 #[test]
 fn user_sets_bring_settings_back() {
     let mut bench = Bench::new();
     bench.write(0, CCP, 2);
-    let factory = bench.get_float(Id::ExposureTime);
-    bench.set_float(Id::ExposureTime, 777.0);
-    assert_eq!(bench.set(Id::UserSetSave, 1), 0x8004, "the factory's set stays");
-    bench.set(Id::UserSetSelector, 1);
-    assert_eq!(bench.set(Id::UserSetSave, 1), SUCCESS);
-    bench.set_float(Id::ExposureTime, 5.0);
-    bench.set(Id::UserSetLoad, 1);
-    assert_eq!(bench.get_float(Id::ExposureTime), 777.0);
-    bench.set(Id::UserSetSelector, 0);
-    bench.set(Id::UserSetLoad, 1);
-    assert_eq!(bench.get_float(Id::ExposureTime), factory);
+    let factory = bench.get_float(FeatureId::ExposureTime);
+    bench.set_float(FeatureId::ExposureTime, 777.0);
+    assert_eq!(bench.set(FeatureId::UserSetSave, 1), 0x8004, "the factory's set stays");
+    bench.set(FeatureId::UserSetSelector, 1);
+    assert_eq!(bench.set(FeatureId::UserSetSave, 1), SUCCESS);
+    bench.set_float(FeatureId::ExposureTime, 5.0);
+    bench.set(FeatureId::UserSetLoad, 1);
+    assert_eq!(bench.get_float(FeatureId::ExposureTime), 777.0);
+    bench.set(FeatureId::UserSetSelector, 0);
+    bench.set(FeatureId::UserSetLoad, 1);
+    assert_eq!(bench.get_float(FeatureId::ExposureTime), factory);
 }
 
 #[test]
@@ -253,33 +259,38 @@ fn sets_of_the_sequencer_are_made_in_configuration_mode_and_kept_while_it_runs()
     const DENIED: u16 = 0x8006;
     let mut bench = Bench::new();
     bench.write(0, CCP, 2);
-    assert_eq!(bench.set(Id::SequencerSetSelector, 1), DENIED, "not yet configured");
-    assert_eq!(bench.set(Id::SequencerConfigurationMode, 1), SUCCESS);
+    assert_eq!(bench.set(FeatureId::SequencerSetSelector, 1), DENIED, "not yet configured");
+    assert_eq!(bench.set(FeatureId::SequencerConfigurationMode, 1), SUCCESS);
     for (set, exposure_us, next) in [(0, 300.0, 1), (1, 400.0, 0)] {
-        assert_eq!(bench.set(Id::SequencerSetSelector, set), SUCCESS);
-        assert_eq!(bench.set_float(Id::ExposureTime, exposure_us), SUCCESS);
-        assert_eq!(bench.set(Id::SequencerSetNext, next), SUCCESS);
-        assert_eq!(bench.set(Id::SequencerTriggerSource, 1), SUCCESS);
-        assert_eq!(bench.set(Id::SequencerSetSave, 1), SUCCESS);
+        assert_eq!(bench.set(FeatureId::SequencerSetSelector, set), SUCCESS);
+        assert_eq!(bench.set_float(FeatureId::ExposureTime, exposure_us), SUCCESS);
+        assert_eq!(bench.set(FeatureId::SequencerSetNext, next), SUCCESS);
+        assert_eq!(bench.set(FeatureId::SequencerTriggerSource, 1), SUCCESS);
+        assert_eq!(bench.set(FeatureId::SequencerSetSave, 1), SUCCESS);
     }
-    assert_eq!(bench.set(Id::SequencerSetSelector, 0), SUCCESS);
-    assert_eq!(bench.get(Id::SequencerSetNext), 1);
-    assert_eq!(bench.get_float(Id::ExposureTime), 400.0, "not before it is loaded");
-    assert_eq!(bench.set(Id::SequencerSetLoad, 1), SUCCESS);
-    assert_eq!(bench.get_float(Id::ExposureTime), 300.0);
-    assert_eq!(bench.set(Id::SequencerMode, 1), DENIED, "still configured");
-    assert_eq!(bench.set(Id::SequencerConfigurationMode, 0), SUCCESS);
-    assert_eq!(bench.set(Id::SequencerMode, 1), SUCCESS);
+    assert_eq!(bench.set(FeatureId::SequencerSetSelector, 0), SUCCESS);
+    assert_eq!(bench.get(FeatureId::SequencerSetNext), 1);
+    assert_eq!(bench.get_float(FeatureId::ExposureTime), 400.0, "not before it is loaded");
+    assert_eq!(bench.set(FeatureId::SequencerSetLoad, 1), SUCCESS);
+    assert_eq!(bench.get_float(FeatureId::ExposureTime), 300.0);
+    assert_eq!(bench.set(FeatureId::SequencerMode, 1), DENIED, "still configured");
+    assert_eq!(bench.set(FeatureId::SequencerConfigurationMode, 0), SUCCESS);
+    assert_eq!(bench.set(FeatureId::SequencerMode, 1), SUCCESS);
     let written = lock(&bench.stream.truth).settings_written;
     assert_eq!(written, 2);
-    for id in [Id::SequencerConfigurationMode, Id::SequencerSetSave, Id::UserSetLoad, Id::SequencerSetStart] {
+    for id in [
+        FeatureId::SequencerConfigurationMode,
+        FeatureId::SequencerSetSave,
+        FeatureId::UserSetLoad,
+        FeatureId::SequencerSetStart,
+    ] {
         assert_eq!(bench.set(id, 1), DENIED, "{id:?}");
     }
-    assert_eq!(bench.set_float(Id::ExposureTime, 500.0), DENIED);
-    assert_eq!(bench.set_float(Id::TriggerDelay, 500.0), DENIED);
+    assert_eq!(bench.set_float(FeatureId::ExposureTime, 500.0), DENIED);
+    assert_eq!(bench.set_float(FeatureId::TriggerDelay, 500.0), DENIED);
     assert_eq!(lock(&bench.stream.truth).settings_written, written);
-    assert_eq!(bench.set(Id::SequencerMode, 0), SUCCESS);
-    assert_eq!(bench.set_float(Id::ExposureTime, 500.0), SUCCESS);
+    assert_eq!(bench.set(FeatureId::SequencerMode, 0), SUCCESS);
+    assert_eq!(bench.set_float(FeatureId::ExposureTime, 500.0), SUCCESS);
 }
 
 #[test]
@@ -287,34 +298,34 @@ fn some_cameras_want_their_trigger_set_in_one_order() {
     let mut bench = Bench::new();
     bench.write(0, CCP, 2);
     lock(&bench.stream.faults).trigger_order = TriggerOrder::SelectorFirst;
-    assert_eq!(bench.set(Id::TriggerSource, 1), 0x8006);
-    assert_eq!(bench.set(Id::TriggerSelector, 0), SUCCESS);
-    assert_eq!(bench.set(Id::TriggerSource, 1), SUCCESS);
+    assert_eq!(bench.set(FeatureId::TriggerSource, 1), 0x8006);
+    assert_eq!(bench.set(FeatureId::TriggerSelector, 0), SUCCESS);
+    assert_eq!(bench.set(FeatureId::TriggerSource, 1), SUCCESS);
     lock(&bench.stream.faults).trigger_order = TriggerOrder::ModeLast;
-    assert_eq!(bench.set(Id::TriggerMode, 1), SUCCESS);
-    assert_eq!(bench.set(Id::TriggerSource, 0), 0x8006);
-    assert_eq!(bench.set_float(Id::TriggerDelay, 10.0), 0x8006);
-    assert_eq!(bench.set(Id::TriggerMode, 0), SUCCESS);
-    assert_eq!(bench.set(Id::TriggerSource, 0), SUCCESS);
+    assert_eq!(bench.set(FeatureId::TriggerMode, 1), SUCCESS);
+    assert_eq!(bench.set(FeatureId::TriggerSource, 0), 0x8006);
+    assert_eq!(bench.set_float(FeatureId::TriggerDelay, 10.0), 0x8006);
+    assert_eq!(bench.set(FeatureId::TriggerMode, 0), SUCCESS);
+    assert_eq!(bench.set(FeatureId::TriggerSource, 0), SUCCESS);
 }
 
 #[test]
 fn writes_of_several_registers_stop_at_the_first_that_is_refused() {
     let mut bench = Bench::new();
     bench.write(0, CCP, 2);
-    let pairs = [(Id::Width, 20), (Id::Height, 1000), (Id::OffsetX, 1)];
+    let pairs = [(FeatureId::Width, 20), (FeatureId::Height, 1000), (FeatureId::OffsetX, 1)];
     let data: Vec<u8> = pairs
         .iter()
         .flat_map(|(id, value)| [bench.address(*id).to_be_bytes(), u32::to_be_bytes(*value)].concat())
         .collect();
     let (status, data) = bench.ask(0, WRITE_REGISTER, &data);
     assert_eq!((status, data), (0x8002, vec![0, 0, 0, 1]));
-    assert_eq!((bench.get(Id::Width), bench.get(Id::OffsetX)), (20, 0));
+    assert_eq!((bench.get(FeatureId::Width), bench.get(FeatureId::OffsetX)), (20, 0));
 }
 
 #[test]
 fn the_clock_keeps_its_offset_and_drift() {
-    let clock = DeviceClock { tick_frequency_hz: 125_000_000, offset_ns: 1_000, drift_ppm: 100.0 };
+    let clock = CameraClock { tick_frequency_hz: 125_000_000, offset_ns: 1_000, drift_ppm: 100.0 };
     assert_eq!(clock.ticks(0), 125);
     // One second of the host's clock is 1.0001 s of the camera's.
     assert_eq!(clock.ticks(1_000_000_000), 125_012_500 + 125);
@@ -379,8 +390,8 @@ proptest! {
         packet_bytes in 576_usize..4000,
         chunks in prop::option::of(any::<[bool; 4]>()),
     ) {
-        let view = View { format: PixelFormat::Mono12p, x: 3, y: 4, width, height, chunks };
-        let mut block = Block::with_room(view, 80 * 60);
+        let view = FrameLayout { format: PixelFormat::Mono12p, x: 3, y: 4, width, height, chunks };
+        let mut block = SentBlock::with_room(view, 80 * 60);
         block.id = 9;
         block.packet_bytes = packet_bytes;
         block.payload.iter_mut().enumerate().for_each(|(index, byte)| *byte = (index * 7) as u8);

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use raysweep_core::Clock;
 
 use super::faults::{Faults, WireTruth};
-use super::gvsp::{self, Block, MAX_PACKET_BYTES};
+use super::gvsp::{self, MAX_PACKET_BYTES, SentBlock};
 use super::locks::lock;
 use crate::keyed::{Purpose, keyed, uniform};
 
@@ -46,7 +46,7 @@ impl Wire {
     }
 
     /// Sends a frame.
-    pub fn send(&mut self, block: &Block, route: Route, faults: &Faults) {
+    pub fn send(&mut self, block: &SentBlock, route: Route, faults: &Faults) {
         let mut truth = WireTruth { frames: 1, ..WireTruth::default() };
         let mut due_ns = self.clock.now_ns();
         for number in 0..block.packets() {
@@ -69,7 +69,7 @@ impl Wire {
     }
 
     /// Resends packets of a frame.
-    pub fn resend(&mut self, block: &Block, numbers: RangeInclusive<u32>, route: Route, faults: &Faults) {
+    pub fn resend(&mut self, block: &SentBlock, numbers: RangeInclusive<u32>, route: Route, faults: &Faults) {
         let mut truth = WireTruth::default();
         let last = block.packets() - 1;
         for number in *numbers.start()..=last.min(*numbers.end()) {

@@ -25,7 +25,7 @@ pub struct Exposure {
 pub enum TriggeredBy {
     /// The edges of the VSYNC line.
     Edges,
-    /// Calls of [`super::Line::fire`] only.
+    /// Calls of [`super::VsyncLine::fire`] only.
     Software,
     /// The camera's own clock, whenever it is ready but no faster than `period_ns`.
     FreeRun {
@@ -44,12 +44,12 @@ pub(super) struct CameraLine {
     pub(super) deaf_until_ns: i64,
     /// Exposures cannot start before this time.
     pub(super) occupied_until_ns: i64,
-    pub(super) in_force: Written,
+    pub(super) in_force: WrittenSettings,
     /// Number of frames triggered under the current settings.
     pub(super) frames: u64,
     /// Settings that have not taken effect yet, in the order of their first frames.
-    pub(super) written: VecDeque<Written>,
-    pub(super) sequence: Option<Sequence>,
+    pub(super) written: VecDeque<WrittenSettings>,
+    pub(super) sequence: Option<RunningSequence>,
     pub(super) seq: u64,
     pub(super) exposures: VecDeque<Exposure>,
 }
@@ -58,7 +58,7 @@ pub(super) struct CameraLine {
 pub type Sets = Vec<(CameraSettings, usize)>;
 
 /// The camera's running sequencer.
-pub(super) struct Sequence {
+pub(super) struct RunningSequence {
     pub(super) sets: Sets,
     /// Index of the next frame's set.
     pub(super) next: usize,
@@ -67,7 +67,7 @@ pub(super) struct Sequence {
 
 /// Settings, and the first frame that uses them.
 #[derive(Clone, Copy)]
-pub(super) struct Written {
+pub(super) struct WrittenSettings {
     pub(super) first_seq: u64,
     pub(super) id: SettingsId,
     pub(super) settings: CameraSettings,
@@ -75,7 +75,7 @@ pub(super) struct Written {
 
 impl CameraLine {
     pub(super) fn at_rest() -> Self {
-        let idle = Written {
+        let idle = WrittenSettings {
             first_seq: 0,
             id: SettingsId { point: u32::MAX, attempt: u32::MAX },
             settings: CameraSettings { shutter: Shutter::Rolling, exposure_us: 100.0, trigger_delay_us: 0.0 },
@@ -96,29 +96,29 @@ impl CameraLine {
     }
 
     /// Settings of the next frame to be triggered, and the number of frames that have used them.
-    pub(super) fn due(&self) -> (Written, u64) {
+    pub(super) fn due(&self) -> (WrittenSettings, u64) {
         let due = self.written.iter().rev().find(|written| written.first_seq <= self.seq);
         due.map_or((self.in_force, self.frames), |written| (*written, 0))
     }
 
     /// Key for noise and faults of the next frame.
     pub(super) fn key(&self) -> [u64; 3] {
-        let (Written { id, .. }, frames) = self.due();
+        let (WrittenSettings { id, .. }, frames) = self.due();
         [u64::from(id.point), u64::from(id.attempt), frames]
     }
 
     /// Key of the newest frame.
     pub(super) fn newest_key(&self) -> [u64; 3] {
-        let Written { id, .. } = self.in_force;
+        let WrittenSettings { id, .. } = self.in_force;
         [u64::from(id.point), u64::from(id.attempt), self.frames.saturating_sub(1)]
     }
 
     /// If a sequence is running, moves on to the next frame's set.
     pub(super) fn take_next_set(&mut self) {
-        let Some(Sequence { sets, next, frames }) = &mut self.sequence else { return };
+        let Some(RunningSequence { sets, next, frames }) = &mut self.sequence else { return };
         let Some(&(settings, after)) = sets.get(*next) else { return };
         let id = SettingsId { point: *next as u32, attempt: *frames };
-        self.written.push_back(Written { first_seq: self.seq, id, settings });
+        self.written.push_back(WrittenSettings { first_seq: self.seq, id, settings });
         (*next, *frames) = (after, *frames + 1);
     }
 
@@ -130,7 +130,7 @@ impl CameraLine {
 
     /// Whether the camera would respond to an edge at `edge_ns`.
     pub(super) fn is_ready(&self, edge_ns: i64, latency_us: f64) -> bool {
-        let (Written { settings, .. }, _) = self.due();
+        let (WrittenSettings { settings, .. }, _) = self.due();
         let start_ns = edge_ns + ns_from_us(latency_us + settings.trigger_delay_us);
         edge_ns >= self.deaf_until_ns && start_ns >= self.occupied_until_ns
     }

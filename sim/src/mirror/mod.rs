@@ -12,5 +12,5 @@ pub use mechanics::{Mechanics, MechanicsConfig};
 pub use mti::MtiController;
 pub use optotune::OptotuneController;
 pub use plant::{Held, MirrorTruth, Plant};
-pub use playzerx::{PlayzerXConfig, PlayzerXController};
-pub use pty::{Controller, Link, MirrorPty, Pty, Run, WireFaults};
+pub use playzerx::{PlayzerXController, PlayzerXControllerConfig};
+pub use pty::{Controller, MirrorPty, Pty, Run, SerialLink, WireFaults};

@@ -10,7 +10,7 @@ use super::pty::Controller;
 
 /// Parameters of a simulated PlayzerX.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlayzerXConfig {
+pub struct PlayzerXControllerConfig {
     /// The mirror.
     pub mechanics: MechanicsConfig,
     /// Capacity of its FIFO in samples: 125,000, or 83,333 with RGB.
@@ -25,7 +25,7 @@ pub struct PlayzerXConfig {
     pub reset_s: f64,
 }
 
-impl Default for PlayzerXConfig {
+impl Default for PlayzerXControllerConfig {
     fn default() -> Self {
         Self {
             mechanics: MechanicsConfig::default(),
@@ -44,7 +44,7 @@ const LONGEST_FRAME: usize = 11;
 
 /// A monochrome PlayzerX.
 pub struct PlayzerXController {
-    config: PlayzerXConfig,
+    config: PlayzerXControllerConfig,
     plant: Plant,
     input: Vec<u8>,
     fifo: VecDeque<Held>,
@@ -60,7 +60,7 @@ pub struct PlayzerXController {
 
 impl PlayzerXController {
     /// Power-on state: at the origin, dark, 10,000 samples per second.
-    pub fn new(config: PlayzerXConfig) -> Self {
+    pub fn new(config: PlayzerXControllerConfig) -> Self {
         let rate_hz = 10_000.0;
         let full_scale_deg = config.mechanics.max_tilt.0;
         let plant = Plant::new(config.mechanics, rate_hz, ORIGIN, full_scale_deg, |held| {
@@ -235,7 +235,7 @@ mod tests {
 
     #[test]
     fn the_fifo_drains_by_the_clock_and_runs_dry_once() {
-        let mut controller = PlayzerXController::new(PlayzerXConfig::default());
+        let mut controller = PlayzerXController::new(PlayzerXControllerConfig::default());
         let truth = controller.truth();
         let mut replies = Vec::new();
         let samples: Vec<u8> = (0..100).flat_map(|n| frame(2048 + n, 2048 - n, 9)).collect();
@@ -254,7 +254,7 @@ mod tests {
     #[test]
     fn a_torn_frame_padded_with_zeros_moves_nothing() {
         for torn in 1..9 {
-            let mut controller = PlayzerXController::new(PlayzerXConfig::default());
+            let mut controller = PlayzerXController::new(PlayzerXControllerConfig::default());
             let truth = controller.truth();
             let mut bytes = frame(100, 100, 255)[..torn].to_vec();
             bytes.extend([0; LONGEST_FRAME]);
@@ -267,8 +267,10 @@ mod tests {
 
     #[test]
     fn a_full_fifo_takes_no_more_and_says_so() {
-        let mut controller =
-            PlayzerXController::new(PlayzerXConfig { fifo_samples: 10, ..PlayzerXConfig::default() });
+        let mut controller = PlayzerXController::new(PlayzerXControllerConfig {
+            fifo_samples: 10,
+            ..PlayzerXControllerConfig::default()
+        });
         let truth = controller.truth();
         let samples: Vec<u8> = (0..15).flat_map(|_| frame(2048, 2048, 0)).collect();
         controller.run(&samples, 1_000_000, &mut Vec::new());

@@ -33,7 +33,7 @@ pub trait Controller: Send + 'static {
 
 /// Speed of the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Link {
+pub enum SerialLink {
     /// A virtual serial port over USB: the baud rate has no effect.
     VirtualCom,
     /// A UART with ten bits per byte.
@@ -77,7 +77,7 @@ impl Pty {
     ///
     /// # Errors
     /// When a pseudo-terminal or a thread cannot be created.
-    pub fn plug(run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
+    pub fn plug(run: Run, link: SerialLink, faults: WireFaults) -> io::Result<Self> {
         // Close-on-exec: a process started by a test must not keep an unplugged controller's port alive. The other end
         // is left to the driver, which can open and close it like a real port.
         let master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_NONBLOCK | OFlag::O_CLOEXEC)?;
@@ -91,7 +91,13 @@ impl Pty {
     ///
     /// # Errors
     /// When a thread cannot be created.
-    pub fn attach(end: File, path: PathBuf, run: Run, link: Link, faults: WireFaults) -> io::Result<Self> {
+    pub fn attach(
+        end: File,
+        path: PathBuf,
+        run: Run,
+        link: SerialLink,
+        faults: WireFaults,
+    ) -> io::Result<Self> {
         // No real-time priority: in a guest with one emulated processor it would starve the driver.
         Self::start(end, path, run, link, faults, || ())
     }
@@ -100,7 +106,7 @@ impl Pty {
         end: File,
         path: PathBuf,
         run: Run,
-        link: Link,
+        link: SerialLink,
         faults: WireFaults,
         begin: fn(),
     ) -> io::Result<Self> {
@@ -154,7 +160,7 @@ impl MirrorPty {
     ///
     /// # Errors
     /// When a pseudo-terminal or a thread cannot be created.
-    pub fn plug(controller: impl Controller, link: Link, faults: WireFaults) -> io::Result<Self> {
+    pub fn plug(controller: impl Controller, link: SerialLink, faults: WireFaults) -> io::Result<Self> {
         let truth = controller.truth();
         Ok(Self { pty: Pty::plug(run_of(controller), link, faults)?, truth })
     }
@@ -166,7 +172,7 @@ impl MirrorPty {
     pub fn attach(end: File, path: PathBuf, controller: impl Controller) -> io::Result<Self> {
         let truth = controller.truth();
         let faults = WireFaults::default();
-        Ok(Self { pty: Pty::attach(end, path, run_of(controller), Link::VirtualCom, faults)?, truth })
+        Ok(Self { pty: Pty::attach(end, path, run_of(controller), SerialLink::VirtualCom, faults)?, truth })
     }
 
     /// The port for the driver to open.
@@ -204,7 +210,7 @@ fn run_as_soon_as_awake() {
 struct Wire {
     end: File,
     device: Run,
-    link: Link,
+    link: SerialLink,
     faults: WireFaults,
     unplugged: Arc<AtomicBool>,
     clock: Clock,
@@ -229,8 +235,8 @@ impl Wire {
             let stalled = now_ns < stalled_until_ns;
             let room = match self.link {
                 _ if stalled => 0,
-                Link::VirtualCom => buffer.len(),
-                Link::Uart { baud } => {
+                SerialLink::VirtualCom => buffer.len(),
+                SerialLink::Uart { baud } => {
                     // An idle line accumulates no credit.
                     let carried = (now_ns - start_ns) as u64 / 1000 * u64::from(baud) / 10_000_000;
                     taken = taken.max(carried.saturating_sub(64));
@@ -256,7 +262,7 @@ impl Wire {
         let mut fds = [PollFd::new(self.end.as_fd(), PollFlags::POLLIN)];
         let ready = poll(&mut fds, PollTimeout::from(1_u8)).unwrap_or(0);
         let closed = fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP));
-        if closed || (ready > 0 && self.link != Link::VirtualCom) {
+        if closed || (ready > 0 && self.link != SerialLink::VirtualCom) {
             std::thread::sleep(Duration::from_millis(1));
         }
     }

@@ -10,10 +10,11 @@ use std::f64::consts::PI;
 use ndarray::{Array3, ArrayViewMut3, ArrayViewMut4};
 use rayon::prelude::*;
 
+use super::object::{Direct, Indirect, Object};
 use super::projector::{PatternPart, ProjectorFrame, projector_cos, to_projector};
+use super::size::SceneSize;
 use super::texture::{Dice, printed_page};
 use super::vector::{Vector, dot, minus, plus, reflect};
-use super::{Direct, Indirect, Object, SceneSize};
 
 const TO_CAMERA: Vector = [0.0, 0.0, 1.0];
 /// Reflectance of a facet \[A\].

@@ -10,11 +10,12 @@ use ndarray::{Array2, Array3};
 use rayon::prelude::*;
 
 use super::dipole::{Dipole, WAX, fresnel_transmittance};
+use super::object::{Direct, Object};
 use super::projector::{PROJECTOR_TAN, ProjectorFrame, ROW_PITCH_MM, projector_cos};
 use super::quadrature::{cell_rule, offset_rule};
+use super::size::SceneSize;
 use super::texture::{Dice, noise, printed_page};
-use super::translucent::Strip;
-use super::{Direct, Object, SceneSize};
+use super::translucent::TranslucentStrip;
 
 /// Albedo of the matte reflection at the wax surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.04;
@@ -126,7 +127,7 @@ fn cos_to_projector(angle: f64) -> f64 {
     (angle - PROJECTOR_TAN.atan()).cos()
 }
 
-fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usize]) -> Strip {
+fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usize]) -> TranslucentStrip {
     let first = (candle.axis_x - candle.radius).floor().max(0.0) as usize;
     let end = ((candle.axis_x + candle.radius).ceil() as usize).min(size.columns);
     let cells = ((PI * candle.radius).round() as usize).max(8);
@@ -153,7 +154,7 @@ fn strip(candle: &Candle, frame: &ProjectorFrame, size: SceneSize, bands: &[usiz
         frame.column(x, z)
     };
     let centres: Vec<f64> = (0..cells).map(cell_centre).collect();
-    Strip {
+    TranslucentStrip {
         column: first,
         kernel: bands
             .iter()

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use ndarray_npy::{ReadNpzError, WriteNpzError};
 
-use super::{BUILTIN_NAMES, MAX_ENTRIES, MIN_SIDE, MOVING_NAMES, Window};
+use super::names::{BUILTIN_NAMES, MOVING_NAMES};
+use super::size::{MAX_ENTRIES, MIN_SIDE, Window};
 
 /// Why a scene cannot be loaded, computed, saved or rendered.
 #[derive(Debug, thiserror::Error)]

@@ -14,9 +14,10 @@ use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayViewMut1, ArrayViewMut3, 
 use rayon::prelude::*;
 
 use super::form_factor::exchange;
+use super::object::{Direct, Indirect, Object};
 use super::projector::{PatternPart, ProjectorFrame};
+use super::size::SceneSize;
 use super::texture::{Dice, printed_page};
-use super::{Direct, Indirect, Object, SceneSize};
 
 /// Maximum number of patches along the edge.
 const PATCH_COLUMNS: usize = 32;

@@ -2,7 +2,9 @@
 //!
 //! The quarters do not illuminate each other, and each uses half of the projector's columns.
 
-use super::{Object, Panel, SceneSize, ball, candle, groove, slab};
+use super::object::{Object, Panel};
+use super::size::SceneSize;
+use super::{ball, candle, groove, slab};
 
 type Build = fn(SceneSize, &[usize], u64) -> Object;
 

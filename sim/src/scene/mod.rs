@@ -16,55 +16,32 @@ mod form_factor;
 mod groove;
 mod mix;
 mod motion;
+mod names;
 mod npz;
+mod object;
 mod projector;
 mod quadrature;
+mod size;
 mod slab;
 pub(crate) mod texture;
 mod translucent;
 mod vector;
 
-use std::fmt;
-use std::ops::Range;
 use std::path::Path;
 
-use ndarray::{Array2, Array3, Array4, ArrayView2, ArrayViewMut3, ArrayViewMut4, Axis, s};
+use ndarray::{Array2, Array3, Array4, ArrayView2, Axis, s};
 
 pub use error::SceneError;
-pub use motion::{MOVING_NAMES, Motion};
-use projector::{Pattern, PatternPart};
+pub use motion::SceneMotion;
+pub use names::{BUILTIN_NAMES, MOVING_NAMES};
+use object::Panel;
+use projector::ColumnPattern;
+pub use size::{MAX_ENTRIES, MIN_SIDE, SceneSize, Window};
 pub use slab::slab_materials;
-
-/// Names accepted by [`Scene::builtin`].
-pub const BUILTIN_NAMES: [&str; 5] = ["v-groove", "mirror-ball", "slab", "candle", "mix"];
-
-/// Minimum number of rows and columns of a built-in scene.
-pub const MIN_SIDE: usize = 8;
-
-/// Maximum number of entries of a built-in scene's transport: 2 GiB of float32; 720 x 720 x 720 fits in mono.
-pub const MAX_ENTRIES: usize = 1 << 29;
 
 /// RGB bands of mono and colour scenes; mono uses the green coefficients of every medium and print.
 const MONO: &[usize] = &[1];
 const RGB: &[usize] = &[0, 1, 2];
-
-/// Camera rows (equal to projector rows) and camera columns of a built-in scene.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct SceneSize {
-    /// Camera rows, equal to projector rows.
-    pub rows: usize,
-    /// Camera columns.
-    pub columns: usize,
-}
-
-/// A rectangle of camera pixels.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Window {
-    /// Camera rows.
-    pub rows: Range<usize>,
-    /// Camera columns.
-    pub columns: Range<usize>,
-}
 
 /// Light transport of a scene under a rectified projector-camera pair; see the [module](self).
 #[derive(Debug)]
@@ -241,7 +218,7 @@ impl Scene {
             return Err(SceneError::RowsOnly { columns: pattern.ncols() });
         }
         let (height, width) = self.size();
-        let pattern = Pattern::new(pattern);
+        let pattern = ColumnPattern::new(pattern);
         let mut image = Array3::zeros((height, width, self.channels()));
         for panel in &self.panels {
             let part = pattern.part(panel.rows(), panel.projector_columns.clone());
@@ -249,99 +226,6 @@ impl Scene {
         }
         Ok(image)
     }
-}
-
-/// One object of a built-in scene and its position in the image.
-#[derive(Debug)]
-struct Panel {
-    /// Camera (and projector) row and camera column of the upper left corner.
-    row: usize,
-    column: usize,
-    /// Range of projector columns that lights the object.
-    projector_columns: Range<f64>,
-    object: Object,
-}
-
-impl Panel {
-    fn whole(object: Object) -> Self {
-        Self { row: 0, column: 0, projector_columns: 0.0..1.0, object }
-    }
-
-    fn rows(&self) -> Range<usize> {
-        self.row..self.row + self.object.direct.value.len_of(Axis(0))
-    }
-
-    fn columns(&self) -> Range<usize> {
-        self.column..self.column + self.object.direct.value.len_of(Axis(1))
-    }
-
-    fn add_transport(&self, mut transport: ArrayViewMut4<f32>) {
-        for (row, direct) in self.object.direct.value.outer_iter().enumerate() {
-            let mut own_row = transport.slice_mut(s![row, row, .., ..]);
-            own_row += &direct;
-        }
-        self.object.indirect.add_transport(transport);
-    }
-
-    fn add_image(&self, pattern: &PatternPart, mut image: ArrayViewMut3<f32>) {
-        let direct = &self.object.direct;
-        for ((row, column, channel), value) in direct.value.indexed_iter() {
-            image[[row, column, channel]] += value * pattern.mean(row, direct.columns(row, column));
-        }
-        self.object.indirect.add_image(pattern, image);
-    }
-
-    /// Projector column at each pixel's centre, relative to the whole projector.
-    fn middle_columns(&self) -> Array2<f32> {
-        let (rows, columns, _) = self.object.direct.value.dim();
-        let Range { start, end } = self.projector_columns;
-        Array2::from_shape_fn((rows, columns), |(row, column)| {
-            let (from, to) = self.object.direct.columns(row, column);
-            (start + (end - start) * 0.5 * f64::from(from + to)) as f32
-        })
-    }
-}
-
-/// Direct and indirect light of an object of a built-in scene.
-#[derive(Debug)]
-struct Object {
-    direct: Direct,
-    indirect: Box<dyn Indirect>,
-}
-
-/// Direct light from the projector: row t lights what camera row t sees.
-#[derive(Debug, Clone)]
-struct Direct {
-    /// Value under white light, `[row, column, channel]`.
-    value: Array3<f32>,
-    /// `[row, column, 2]`: projector columns 0..1 at the pixel's left and right border.
-    columns: Array3<f32>,
-}
-
-impl Direct {
-    /// All dark; `column_at(row, x)` is the projector column that lights the point seen at x.
-    fn new(size: SceneSize, channels: usize, column_at: impl Fn(usize, f64) -> f32) -> Self {
-        Self {
-            value: Array3::zeros((size.rows, size.columns, channels)),
-            columns: Array3::from_shape_fn((size.rows, size.columns, 2), |(row, column, border)| {
-                column_at(row, (column + border) as f64)
-            }),
-        }
-    }
-
-    fn columns(&self, row: usize, column: usize) -> (f32, f32) {
-        (self.columns[[row, column, 0]], self.columns[[row, column, 1]])
-    }
-}
-
-/// Light that reaches the camera on any other path. Both methods describe the same light: the transport of a row
-/// equals the image under that row alone.
-trait Indirect: fmt::Debug + Send + Sync {
-    /// Adds the image under each row to `transport` `[V, H, W, C]`.
-    fn add_transport(&self, transport: ArrayViewMut4<f32>);
-
-    /// Adds the image under a pattern to `image` `[H, W, C]`.
-    fn add_image(&self, pattern: &PatternPart, image: ArrayViewMut3<f32>);
 }
 
 #[cfg(test)]

@@ -2,23 +2,23 @@
 
 use raysweep_core::ns_from_us;
 
-use super::{MAX_ENTRIES, MONO, Scene, SceneError, SceneSize};
-
-/// Names of the built-in scenes that move.
-pub const MOVING_NAMES: [&str; 2] = ["pendulum", "moving-candle"];
+use super::error::SceneError;
+use super::names::MOVING_NAMES;
+use super::size::{MAX_ENTRIES, SceneSize};
+use super::{MONO, Scene};
 
 /// Number of key positions, from one end of the swing to the other, in which a moving scene is computed.
 const KEYS: usize = 16;
 
 /// Maps time to the key positions of a scene. A scene at rest has one.
 #[derive(Debug, Clone, Copy)]
-pub struct Motion {
+pub struct SceneMotion {
     keys: usize,
     /// Full period, there and back.
     period_ns: i64,
 }
 
-impl Motion {
+impl SceneMotion {
     /// A motion over `keys` positions with a full period of `period_s`.
     pub fn new(keys: usize, period_s: f64) -> Self {
         Self { keys, period_ns: ns_from_us(period_s * 1e6).max(1) }
@@ -34,7 +34,7 @@ impl Motion {
 
 impl Scene {
     /// Computes a built-in scene in mono at each of its key positions, from one end of its swing to the other: one for
-    /// [`super::BUILTIN_NAMES`], several for [`MOVING_NAMES`].
+    /// [`BUILTIN_NAMES`](super::BUILTIN_NAMES), several for [`MOVING_NAMES`].
     ///
     /// # Errors
     /// [`SceneError::UnknownName`], [`SceneError::Size`], [`SceneError::MovingSize`].
@@ -58,12 +58,12 @@ mod tests {
 
     #[test]
     fn a_motion_goes_there_and_back_through_every_key() {
-        let motion = Motion::new(4, 8.0);
+        let motion = SceneMotion::new(4, 8.0);
         let keys: Vec<usize> =
             (0..16).map(|second| motion.key(second * 1_000_000_000 + 500_000_000)).collect();
         assert_eq!(keys, [0, 1, 2, 3, 3, 2, 1, 0, 0, 1, 2, 3, 3, 2, 1, 0]);
         assert_eq!(motion.key(-500_000_000), 0, "clocks may read anything");
-        assert_eq!(Motion::new(1, 4.0).key(1_234_567), 0);
+        assert_eq!(SceneMotion::new(1, 4.0).key(1_234_567), 0);
     }
 
     #[test]

@@ -10,7 +10,8 @@ use std::path::Path;
 use ndarray::{Array2, Array3, ArrayD, Axis, Ix2, Ix4, IxDyn, OwnedRepr};
 use ndarray_npy::{NpzReader, NpzWriter, ReadNpyError, ReadNpzError, WriteNpzError};
 
-use super::{Scene, SceneError};
+use super::Scene;
+use super::error::SceneError;
 
 const TRANSPORT: &str = "T";
 const PROJECTOR_UV: &str = "proj_uv";

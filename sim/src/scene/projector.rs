@@ -50,12 +50,12 @@ impl ProjectorFrame {
 
 /// A projected pattern, prepared for averages over sections of a row.
 #[derive(Debug)]
-pub(super) struct Pattern {
+pub(super) struct ColumnPattern {
     /// `[row, column + 1]`: running sum along each row.
     cumulative: Array2<f64>,
 }
 
-impl Pattern {
+impl ColumnPattern {
     pub(super) fn new(pattern: ArrayView2<f32>) -> Self {
         let (rows, columns) = pattern.dim();
         let mut cumulative = Array2::zeros((rows, columns + 1));
@@ -71,7 +71,7 @@ impl Pattern {
     }
 }
 
-/// A rectangle of a [`Pattern`] whose columns run from 0 to 1.
+/// A rectangle of a [`ColumnPattern`] whose columns run from 0 to 1.
 #[derive(Debug)]
 pub(super) struct PatternPart<'a> {
     cumulative: ArrayView2<'a, f64>,
@@ -106,7 +106,7 @@ mod tests {
 
     #[test]
     fn mean_weighs_partial_columns() {
-        let pattern = Pattern::new(array![[1.0, 0.0, 3.0, 5.0]].view());
+        let pattern = ColumnPattern::new(array![[1.0, 0.0, 3.0, 5.0]].view());
         let part = pattern.part(0..1, 0.0..1.0);
         // Columns 0.5..2.5 contain half of 1, all of 0 and half of 3.
         assert!((part.mean(0, (0.125, 0.625)) - 1.0).abs() < 1e-6);

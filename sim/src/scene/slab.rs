@@ -9,11 +9,12 @@ use ndarray::{Array2, Array3, s};
 use rayon::prelude::*;
 
 use super::dipole::{Dipole, MEASURED, Material, fresnel_transmittance};
+use super::object::{Direct, Object};
 use super::projector::{ProjectorFrame, ROW_PITCH_MM, projector_cos};
 use super::quadrature::offset_rule;
+use super::size::SceneSize;
 use super::texture::noise;
-use super::translucent::Strip;
-use super::{Direct, Object, SceneSize};
+use super::translucent::TranslucentStrip;
 
 /// Albedo of the matte reflection at the surface \[A\].
 const SURFACE_ALBEDO: f32 = 0.03;
@@ -45,7 +46,7 @@ pub(super) fn build(size: SceneSize, bands: &[usize], seed: u64) -> Object {
             direct.value.slice_mut(s![.., columns.clone(), ..]).fill(SURFACE_ALBEDO);
             let grain = grain(rows, columns.len(), seed.wrapping_add(k as u64));
             let transmitted = |cos| fresnel_transmittance(cos, material.refraction) as f32;
-            Strip {
+            TranslucentStrip {
                 column: columns.start,
                 kernel: bands
                     .iter()

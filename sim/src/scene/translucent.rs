@@ -3,7 +3,7 @@
 use ndarray::{Array2, Array3, ArrayViewMut2, ArrayViewMut3, ArrayViewMut4, Axis, Zip, s};
 use rayon::prelude::*;
 
-use super::Indirect;
+use super::object::Indirect;
 use super::projector::PatternPart;
 
 /// Projector rows per work item; fixed, so that the sums do not depend on the number of threads.
@@ -14,7 +14,7 @@ const BLOCK_LAGS: usize = 32;
 /// A body with the same cross-section at each of its rows (a slab's stripe, a vertical cylinder), so that diffusion
 /// depends only on the lag between rows.
 #[derive(Debug)]
-pub(super) struct Strip {
+pub(super) struct TranslucentStrip {
     /// First camera column of the body.
     pub(super) column: usize,
     /// Per channel `[lag, camera column, cell]`: exitance of a pixel, lag rows away from a cell's row, per irradiance
@@ -28,7 +28,7 @@ pub(super) struct Strip {
     pub(super) exit: Array2<f32>,
 }
 
-impl Strip {
+impl TranslucentStrip {
     fn add_transport(&self, channel: usize, mut transport: ArrayViewMut3<f32>) {
         let rows = self.entry.nrows();
         let kernel = &self.kernel[channel];
@@ -85,7 +85,7 @@ impl Strip {
     }
 }
 
-impl Indirect for Vec<Strip> {
+impl Indirect for Vec<TranslucentStrip> {
     fn add_transport(&self, mut transport: ArrayViewMut4<f32>) {
         for strip in self {
             let columns = strip.column..strip.column + strip.exit.ncols();

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use super::{Identity, Request, Speed, Stall, UsbDevice};
+use super::{Speed, Stall, UsbDevice, UsbIdentity, UsbRequest};
 
 const LATENCY: Duration = Duration::from_millis(16);
 /// Modem status: a reserved bit that is always set, and DCD.
@@ -21,7 +21,7 @@ const GET_LATENCY_TIMER: u8 = 10;
 
 /// The converter.
 pub struct Ftdi {
-    identity: Identity,
+    identity: UsbIdentity,
     period: Duration,
     pulse: Duration,
     began: Instant,
@@ -58,7 +58,7 @@ impl FtdiLine {
 impl Ftdi {
     /// A converter whose DCD, once started, is asserted for `pulse` in each `period`.
     pub fn new(period: Duration, pulse: Duration) -> (Self, FtdiLine) {
-        let identity = Identity {
+        let identity = UsbIdentity {
             speed: Speed::Full,
             vendor: 0x0403,
             product: 0x6001,
@@ -81,11 +81,11 @@ impl Ftdi {
 }
 
 impl UsbDevice for Ftdi {
-    fn identity(&self) -> &Identity {
+    fn identity(&self) -> &UsbIdentity {
         &self.identity
     }
 
-    fn control(&mut self, request: &Request, _: &[u8]) -> Result<Vec<u8>, Stall> {
+    fn control(&mut self, request: &UsbRequest, _: &[u8]) -> Result<Vec<u8>, Stall> {
         match request.request {
             GET_MODEM_STATUS => {
                 Ok(vec![MODEM_IDLE | if self.is_asserted() { MODEM_DCD } else { 0 }, LINE_IDLE])

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use rand_distr::{Distribution, StandardNormal};
 use raysweep_core::Clock;
 
-use super::{Identity, Request, Speed, Stall, UsbDevice};
+use super::{Speed, Stall, UsbDevice, UsbIdentity, UsbRequest};
 use crate::keyed::{Purpose, keyed, uniform};
 
 /// Signals on the analyser's inputs, timed by the host's clock: a VSYNC on input 0, whose edges lie on multiples of its
@@ -65,8 +65,8 @@ impl Signal {
 }
 
 /// The analyser.
-pub struct Fx2Lafw {
-    identity: Identity,
+pub struct Fx2Analyser {
+    identity: UsbIdentity,
     signal: Signal,
     clock: Clock,
     /// How slow its clock is, in parts per million.
@@ -106,10 +106,10 @@ impl Fx2Faults {
     }
 }
 
-impl Fx2Lafw {
+impl Fx2Analyser {
     /// An analyser of a signal.
     pub fn new(signal: Signal, rate_ppm: f64) -> (Self, Fx2Faults) {
-        let identity = Identity {
+        let identity = UsbIdentity {
             speed: Speed::High,
             vendor: 0x1D50,
             product: 0x608C,
@@ -123,12 +123,12 @@ impl Fx2Lafw {
     }
 }
 
-impl UsbDevice for Fx2Lafw {
-    fn identity(&self) -> &Identity {
+impl UsbDevice for Fx2Analyser {
+    fn identity(&self) -> &UsbIdentity {
         &self.identity
     }
 
-    fn control(&mut self, request: &Request, data: &[u8]) -> Result<Vec<u8>, Stall> {
+    fn control(&mut self, request: &UsbRequest, data: &[u8]) -> Result<Vec<u8>, Stall> {
         match (request.is_in(), request.request, data) {
             (true, 0xB0, _) => Ok(vec![1, 4]),
             (false, 0xB1, &[flags, high, low]) => {
@@ -171,9 +171,9 @@ impl UsbDevice for Fx2Lafw {
 }
 
 /// The chip's boot loader: it accepts a firmware and leaves the bus when started; the test then plugs in an
-/// [`Fx2Lafw`].
+/// [`Fx2Analyser`].
 pub struct Fx2Blank {
-    identity: Identity,
+    identity: UsbIdentity,
     memory: Fx2Memory,
 }
 
@@ -200,7 +200,7 @@ impl Fx2Memory {
 impl Fx2Blank {
     /// A clone of the analyser as sold, without firmware.
     pub fn new() -> (Self, Fx2Memory) {
-        let identity = Identity {
+        let identity = UsbIdentity {
             speed: Speed::High,
             vendor: 0x0925,
             product: 0x3881,
@@ -214,11 +214,11 @@ impl Fx2Blank {
 }
 
 impl UsbDevice for Fx2Blank {
-    fn identity(&self) -> &Identity {
+    fn identity(&self) -> &UsbIdentity {
         &self.identity
     }
 
-    fn control(&mut self, request: &Request, data: &[u8]) -> Result<Vec<u8>, Stall> {
+    fn control(&mut self, request: &UsbRequest, data: &[u8]) -> Result<Vec<u8>, Stall> {
         const CPUCS: u16 = 0xE600;
         match (request.request, request.value, data) {
             (0xA0, CPUCS, &[reset]) => self.memory.started.store(reset == 0, Ordering::Relaxed),

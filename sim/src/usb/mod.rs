@@ -7,7 +7,7 @@ mod responder;
 mod vhci;
 
 pub use ftdi::{Ftdi, FtdiLine};
-pub use fx2lafw::{Fx2Blank, Fx2Faults, Fx2Lafw, Fx2Memory, Signal};
+pub use fx2lafw::{Fx2Analyser, Fx2Blank, Fx2Faults, Fx2Memory, Signal};
 pub use responder::respond;
 pub use vhci::Plugged;
 
@@ -17,7 +17,7 @@ pub struct Stall;
 
 /// A request on endpoint 0 (USB 2.0, section 9.3).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Request {
+pub struct UsbRequest {
     /// Direction, kind and recipient (`bmRequestType`).
     pub kind: u8,
     /// `bRequest`.
@@ -30,7 +30,7 @@ pub struct Request {
     pub length: u16,
 }
 
-impl Request {
+impl UsbRequest {
     /// Whether the device returns data.
     pub fn is_in(&self) -> bool {
         self.kind & 0x80 != 0
@@ -40,13 +40,13 @@ impl Request {
 /// A device with one vendor-specific interface of bulk endpoints. The responder answers standard requests.
 pub trait UsbDevice: Send {
     /// The device's descriptors; constant while it is plugged in.
-    fn identity(&self) -> &Identity;
+    fn identity(&self) -> &UsbIdentity;
 
     /// Handles a vendor or class request, with the data of an outgoing one; returns the data of an incoming one.
     ///
     /// # Errors
     /// When the device does not know the request.
-    fn control(&mut self, request: &Request, data: &[u8]) -> Result<Vec<u8>, Stall>;
+    fn control(&mut self, request: &UsbRequest, data: &[u8]) -> Result<Vec<u8>, Stall>;
 
     /// Returns at most `room` bytes for the host from an endpoint, `None` if there are none. Polled every millisecond.
     ///
@@ -75,7 +75,7 @@ pub enum Speed {
 
 /// Contents of the descriptors.
 #[derive(Debug, Clone)]
-pub struct Identity {
+pub struct UsbIdentity {
     /// Full or high speed.
     pub speed: Speed,
     /// `idVendor`.
@@ -90,7 +90,7 @@ pub struct Identity {
     pub endpoints: Vec<u8>,
 }
 
-impl Identity {
+impl UsbIdentity {
     /// Returns a descriptor by its type and index (USB 2.0, section 9.6).
     fn descriptor(&self, kind: u8, index: u8) -> Result<Vec<u8>, Stall> {
         match kind {

@@ -11,7 +11,7 @@ use std::os::unix::net::UnixStream;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, poll};
 
-use super::{Request, Stall, UsbDevice};
+use super::{Stall, UsbDevice, UsbRequest};
 
 const SUBMIT: u32 = 1;
 const UNLINK: u32 = 2;
@@ -59,7 +59,7 @@ struct Message {
     endpoint: u8,
     /// Submit: number of bytes to transfer. Unlink: number of the transfer to cancel.
     argument: u32,
-    setup: Request,
+    setup: UsbRequest,
     data: Vec<u8>,
 }
 
@@ -89,8 +89,13 @@ impl Message {
         } else if command != UNLINK {
             return strange(format!("USB/IP: unknown command {command}"));
         }
-        let setup =
-            Request { kind: head[40], request: head[41], value: half(42), index: half(44), length: half(46) };
+        let setup = UsbRequest {
+            kind: head[40],
+            request: head[41],
+            value: half(42),
+            index: half(44),
+            length: half(46),
+        };
         Ok(Some(Self { command, seqnum: word(4), is_in, endpoint: head[19], argument, setup, data }))
     }
 }
@@ -144,7 +149,7 @@ fn serve(device: &mut dyn UsbDevice, parked: &mut VecDeque<Parked>, host: &mut U
 }
 
 /// Answers standard requests, which are the same for all devices; passes all others to the device.
-fn control(device: &mut dyn UsbDevice, setup: &Request, data: &[u8]) -> Result<Vec<u8>, Stall> {
+fn control(device: &mut dyn UsbDevice, setup: &UsbRequest, data: &[u8]) -> Result<Vec<u8>, Stall> {
     let [index, kind] = setup.value.to_le_bytes();
     match (setup.kind, setup.request) {
         (0x80, 6) => device.identity().descriptor(kind, index),
@@ -198,21 +203,21 @@ fn send(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::usb::{Identity, Speed};
+    use crate::usb::{Speed, UsbIdentity};
     use std::time::Duration;
 
     /// Returns on 0x81 what was sent to 0x02; stalls on 0x03.
     struct Echo {
-        identity: Identity,
+        identity: UsbIdentity,
         bytes: Vec<u8>,
     }
 
     impl UsbDevice for Echo {
-        fn identity(&self) -> &Identity {
+        fn identity(&self) -> &UsbIdentity {
             &self.identity
         }
 
-        fn control(&mut self, request: &Request, _: &[u8]) -> Result<Vec<u8>, Stall> {
+        fn control(&mut self, request: &UsbRequest, _: &[u8]) -> Result<Vec<u8>, Stall> {
             if request.request == 0xB0 { Ok(vec![1, 4, 9]) } else { Err(Stall) }
         }
 
@@ -251,7 +256,7 @@ mod tests {
     fn transfers_are_answered_once_in_order_and_can_be_cancelled() {
         let (mut host, end) = UnixStream::pair().unwrap();
         host.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
-        let identity = Identity {
+        let identity = UsbIdentity {
             speed: Speed::High,
             vendor: 0x1d50,
             product: 0x608c,

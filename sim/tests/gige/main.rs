@@ -16,7 +16,7 @@ use raysweep_core::{
     CameraSettings, Clock, FramePool, Pattern, PixelFormat, Projector, Raster, SettingsId, Shutter, Vsync,
 };
 use raysweep_sim::bench::{BenchProbe, BenchServer, RemoteProjector, RemoteVsync};
-use raysweep_sim::gige::{DeviceClock, Faults, GigeCamera, GigeSetup, Look, test_pixel};
+use raysweep_sim::gige::{CameraClock, Faults, GigeCamera, GigeSetup, Look, test_pixel};
 use raysweep_sim::{PlaneRig, PlaneSetup, WireDevices};
 
 use self::client::Client;
@@ -36,7 +36,7 @@ fn setup(test: u8, faults: Faults) -> GigeSetup {
     GigeSetup {
         address: address(test),
         serial: format!("T{test}"),
-        clock: DeviceClock::default(),
+        clock: CameraClock::default(),
         faults,
         zipped: false,
     }
@@ -172,7 +172,7 @@ fn stamps_tell_the_start_of_the_exposure_on_the_cameras_own_clock() {
     while let Some(edge) = vsync.next_edge(Duration::ZERO).unwrap() {
         edges.push(edge);
     }
-    let clock = DeviceClock::default();
+    let clock = CameraClock::default();
     for frame in frames {
         let starts = edges.iter().map(|edge| clock.ticks(edge.host_ns + (LATENCY_US * 1e3) as i64 + 321_000));
         let nearest = starts.map(|start| start.abs_diff(frame.ticks)).min();
@@ -338,7 +338,7 @@ fn vsync_and_projector_reach_another_process() {
     client.set_float("TriggerDelay", 300.0);
     client.set("AcquisitionStart", 1);
     let mut brightest_after = |shown: raysweep_core::Shown| {
-        let clock = DeviceClock::default();
+        let clock = CameraClock::default();
         loop {
             let frame = client.frame().unwrap();
             if frame.ticks >= clock.ticks(shown.not_before_ns) {

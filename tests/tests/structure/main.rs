@@ -140,20 +140,53 @@ fn forbidden_cycles(graph: &Graph) -> Vec<String> {
     graph.cycles().into_iter().filter(is_forbidden).map(|cycle| format!("{cycle:?}")).collect()
 }
 
-#[test]
-fn files_import_each_other_in_no_large_circle_and_in_none_between_folders() {
+/// The folders of all crates, by the folder's name.
+fn crates() -> BTreeMap<String, PathBuf> {
     let project = project();
     let crates = std::fs::read_dir(project.join("crates")).unwrap().map(|entry| entry.unwrap().path());
     let others = ["daemon", "drivers", "sim"].map(|name| project.join(name));
+    let name = |folder: &PathBuf| folder.file_name().unwrap().to_str().unwrap().to_owned();
+    crates.chain(others).map(|folder| (name(&folder), folder)).collect()
+}
+
+/// Crates whose circles are not refused yet.
+const NOT_CHECKED: [&str; 3] = ["pipeline", "processing", "session"];
+
+#[test]
+fn files_import_each_other_in_no_large_circle_and_in_none_between_folders() {
     let (mut files, mut forbidden) = (0, Vec::new());
-    for folder in crates.chain(others) {
+    for (name, folder) in crates() {
         let graph = Graph::read(&folder.join("src"));
         files += graph.edges().len();
-        let cycles = forbidden_cycles(&graph).into_iter();
-        forbidden.extend(cycles.map(|cycle| format!("{}: {cycle}", folder.display())));
+        if !NOT_CHECKED.contains(&name.as_str()) {
+            forbidden.extend(forbidden_cycles(&graph).into_iter().map(|cycle| format!("{name}: {cycle}")));
+        }
     }
     assert!(forbidden.is_empty(), "{}", forbidden.join("\n"));
     assert!(files > 200, "only {files} files were read");
+}
+
+/// Names that several types may share, and why.
+const SHARED_NAMES: [(&str, &str); 1] =
+    [("Error", "what can go wrong in a module; its users write `module::Error`")];
+
+/// Types of the same name that are visible beyond their files, each with those files.
+fn doubles(graphs: &BTreeMap<String, Graph>) -> Vec<String> {
+    let mut files: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    for (crate_name, graph) in graphs {
+        for (name, file) in graph.visible_types() {
+            files.entry(name).or_default().push(format!("{crate_name}/src/{}", file.display()));
+        }
+    }
+    files.retain(|name, files| files.len() > 1 && SHARED_NAMES.iter().all(|(shared, _)| shared != name));
+    files.into_iter().map(|(name, files)| format!("{name}: {}", files.join(", "))).collect()
+}
+
+#[test]
+fn no_two_types_that_others_see_have_the_same_name() {
+    let graph = |(name, folder): (String, PathBuf)| (name, Graph::read(&folder.join("src")));
+    let doubles = doubles(&crates().into_iter().map(graph).collect());
+    assert!(doubles.is_empty(), "rename all but one of each:\n{}", doubles.join("\n"));
 }
 
 /// The imports between the daemon's folders that are not allowed.
@@ -186,11 +219,8 @@ fn procedures_know_nothing_of_each_other_and_nothing_below_knows_a_procedure() {
 
 #[test]
 fn broken_rules_are_found() {
-    let graph = |sources: &[(&'static str, &'static str)]| {
-        Graph::of(sources.iter().map(|(name, text)| (Path::new(*name), *text)))
-    };
     // A circle between folders, one of its edges through a re-export.
-    let cycles = forbidden_cycles(&graph(&[
+    let cycles = forbidden_cycles(&Graph::of(&[
         ("lib.rs", "mod a; mod b; pub use b::c::Deep;"),
         ("a.rs", "use crate::Deep;"),
         ("b/mod.rs", "pub mod c;"),
@@ -198,29 +228,107 @@ fn broken_rules_are_found() {
     ]));
     assert_eq!(cycles, ["{\"a.rs\", \"b/c.rs\"}"]);
     // Four files of one folder; a test does not count.
-    let ring = |last: &'static str| {
-        forbidden_cycles(&graph(&[
+    let ring = |last: &str| {
+        let cycles = forbidden_cycles(&Graph::of(&[
             ("lib.rs", "mod a; mod b; mod c; mod d;"),
-            ("a.rs", "use crate::b::B;"),
-            ("b.rs", "use super::c::C;"),
-            ("c.rs", "use crate::{d::D};"),
-            ("d.rs", last),
-        ]))
+            ("a.rs", "use crate::b::B; pub struct A;"),
+            ("b.rs", "use super::c::C; pub struct B;"),
+            ("c.rs", "use crate::{d::D}; pub struct C;"),
+            ("d.rs", &format!("pub struct D; {last}")),
+        ]));
+        cycles.len()
     };
-    assert_eq!(ring("use crate::a::A;").len(), 1);
-    assert_eq!(ring("#[cfg(test)] mod tests { use crate::a::A; }").len(), 0);
-    let imports = forbidden_imports(&graph(&[
+    assert_eq!(ring("use crate::a::A;"), 1);
+    assert_eq!(ring("#[cfg(test)] mod tests { use crate::a::A; }"), 0);
+    let imports = forbidden_imports(&Graph::of(&[
         ("lib.rs", "mod procedure; mod run;"),
-        ("procedure/mod.rs", "mod film; mod sweep; use self::sweep::f;"),
-        ("procedure/lab.rs", ""),
+        ("procedure/mod.rs", "mod film; mod lab; mod sweep; use self::sweep::f;"),
+        ("procedure/lab.rs", "pub struct Lab;"),
         ("procedure/film/mod.rs", "use crate::procedure::sweep::f; use crate::procedure::lab::Lab;"),
-        ("procedure/sweep/mod.rs", "use crate::run::Run;"),
-        ("run/mod.rs", "use crate::procedure::sweep::f;"),
+        ("procedure/sweep/mod.rs", "use crate::run::Run; pub fn f() {}"),
+        ("run/mod.rs", "use crate::procedure::sweep::f; pub struct Run;"),
     ]));
     assert_eq!(
         imports,
         ["procedure/film/mod.rs imports procedure/sweep/mod.rs", "run/mod.rs imports procedure/sweep/mod.rs"]
     );
+}
+
+#[test]
+fn doubles_are_found() {
+    let one = Graph::of(&[
+        ("lib.rs", "pub mod a; mod b; pub struct Error;"),
+        ("a.rs", "pub struct Line; struct Own; pub enum Kind { Line } mod c { pub trait Deep {} }"),
+        (
+            "b.rs",
+            "pub(super) union Line { x: u8 } struct Own; #[cfg(test)] pub struct Kind; pub type Deep = u8;",
+        ),
+    ]);
+    let two = Graph::of(&[("lib.rs", "pub(crate) trait Deep {} pub struct Error; pub fn Line() {}")]);
+    let doubles = doubles(&[("one".to_owned(), one), ("two".to_owned(), two)].into());
+    assert_eq!(doubles, ["Deep: one/src/a.rs, two/src/lib.rs", "Line: one/src/a.rs, one/src/b.rs"]);
+}
+
+/// What `x/mod.rs` names, if this is its text beside two children, a module `other` and the crate's root.
+fn named_by(text: &str) -> Vec<String> {
+    let graph = Graph::of(&[
+        ("lib.rs", "mod other; mod x; pub fn root() {}"),
+        ("other.rs", "pub struct Other; pub fn call() {}"),
+        ("x/mod.rs", text),
+        ("x/a.rs", "pub struct A; pub enum E { V } pub trait T {} pub fn f() {}"),
+        ("x/b.rs", "pub use super::a::A as Again; pub struct B;"),
+    ]);
+    graph.edges()[Path::new("x/mod.rs")].iter().map(|file| file.display().to_string()).collect()
+}
+
+#[test]
+fn every_way_to_name_an_item_is_an_edge_to_the_file_that_defines_it() {
+    let named_by = |text: &str| named_by(&format!("mod a; mod b; {text}"));
+    for text in [
+        "use a::A;",
+        "use self::a::{A, E};",
+        "use crate::x::a::f as g;",
+        "fn g() -> a::A { a::A }",
+        "struct S { field: Vec<a::A> }",
+        "impl a::T for u8 {}",
+        "fn g() { self::a::f() }",
+        "fn g() { super::x::a::f() }",
+        "fn g(e: &a::E) -> bool { matches!(e, a::E::V) }",
+        "fn g() { println!(\"{}\", [a::f()].len()) }",
+        "macro_rules! g { () => { $crate::x::a::f() } }",
+        "#[wrapped(by = a::f)] struct S;",
+        "mod inner { use super::a::A; }",
+        "use self::inner::A as I; mod inner { pub use super::a::A; }",
+        // Through imports of modules and of everything, and through re-exports.
+        "use crate::x; fn g() { x::a::f() }",
+        "use a as c; fn g() { c::f() }",
+        "use a::*; fn g() { f() }",
+        "use b::Again;",
+        "fn g() -> b::Again { loop {} }",
+        "pub use a::f; fn g() { f() }",
+        "pub(crate) use b::Again; struct S(Again);",
+    ] {
+        assert_eq!(named_by(text), ["x/a.rs"], "{text}");
+    }
+    assert_eq!(named_by("use crate::root;"), ["lib.rs"]);
+    assert_eq!(named_by("use crate::other::{self, Other};"), ["other.rs"]);
+    assert_eq!(named_by("use super::other; fn g() { other::call(); b::B; }"), ["other.rs", "x/b.rs"]);
+    // What a macro may have defined.
+    assert_eq!(named_by("use a::unknown;"), ["x/a.rs"]);
+    for text in [
+        "",
+        "pub use a::A;",
+        "pub(crate) use a::{E, f};",
+        "pub use a::*;",
+        "use crate::other;",
+        "fn g(a: u8) -> u8 { a }",
+        "use a_crate::a::A; fn g() { ::a::f() }",
+        "#[cfg(test)] use a::A;",
+        "#[cfg(test)] fn g() { a::f() }",
+        "struct S; impl S { #[cfg(test)] fn g() { a::f() } }",
+    ] {
+        assert_eq!(named_by(text), [""; 0], "{text}");
+    }
 }
 
 #[test]

@@ -16,7 +16,7 @@ pub struct AravisConfig {
     /// Features to set first, in this order, each as `Name=Value`.
     pub features: Vec<String>,
     /// Pixels to read out; default: all.
-    pub region: Option<Region>,
+    pub region: Option<SensorRegion>,
     /// Sensor columns and rows that form a pixel.
     pub binning: [u32; 2],
     /// Offset of the analogue-digital converter, in the camera's units; default: unchanged.
@@ -47,7 +47,7 @@ pub struct AravisConfig {
 /// A part of the sensor, in binned pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Region {
+pub struct SensorRegion {
     /// First column.
     #[serde(default)]
     pub x: u32,

@@ -157,7 +157,7 @@ pub struct MirrorSection {
 )]
 pub enum ResponseKey {
     /// The response that a run of kind `response` has identified.
-    Found(Identified),
+    Found(IdentifiedWord),
     /// Responses stated here, for x and y.
     Stated([SecondOrder; 2]),
 }
@@ -165,7 +165,7 @@ pub enum ResponseKey {
 /// Accepts only the word `identified`.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Identified {
+pub enum IdentifiedWord {
     /// Use the response that was identified.
     Identified,
 }

@@ -12,7 +12,7 @@ use super::{
     RigKind, default_black_dn, default_pixel_format, default_reopen_s, default_white_dn, full_scale_dn,
 };
 use crate::document::Document;
-use crate::sim::{SimConfig, Spot as SimSpot};
+use crate::sim::{SimConfig, SimSpot};
 use crate::{ConfigError, Places};
 
 /// A plane rig.
@@ -123,7 +123,7 @@ impl CameraSection {
 
 /// Origin of a camera's noise figures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum NoiseSource {
+pub enum NoiseOrigin {
     /// Stated in the rig file.
     Stated,
     /// Taken from the simulator.
@@ -140,7 +140,7 @@ pub struct CameraNoise {
     /// Electrons of noise in a dark sample.
     pub read_noise_e: f64,
     /// Origin of the figures.
-    pub source: NoiseSource,
+    pub source: NoiseOrigin,
 }
 
 /// Electrons at full scale of a typical camera [A].
@@ -299,7 +299,7 @@ impl RigFile {
             CameraNoise {
                 electrons_per_dn: TYPICAL_FULL_SCALE_E / full_scale_dn(camera.pixel_format),
                 read_noise_e: TYPICAL_READ_NOISE_E,
-                source: NoiseSource::Assumed,
+                source: NoiseOrigin::Assumed,
             }
         } else if sensor.noise {
             // The simulator defines its electrons per count on a 12-bit scale.
@@ -307,14 +307,14 @@ impl RigFile {
             CameraNoise {
                 electrons_per_dn,
                 read_noise_e: sensor.read_noise_e,
-                source: NoiseSource::Simulated,
+                source: NoiseOrigin::Simulated,
             }
         } else {
-            CameraNoise { electrons_per_dn: f64::INFINITY, read_noise_e: 0.0, source: NoiseSource::Simulated }
+            CameraNoise { electrons_per_dn: f64::INFINITY, read_noise_e: 0.0, source: NoiseOrigin::Simulated }
         };
         match (camera.electrons_per_dn, camera.read_noise_e) {
             (Some(electrons_per_dn), Some(read_noise_e)) => {
-                CameraNoise { electrons_per_dn, read_noise_e, source: NoiseSource::Stated }
+                CameraNoise { electrons_per_dn, read_noise_e, source: NoiseOrigin::Stated }
             }
             (electrons_per_dn, read_noise_e) => CameraNoise {
                 electrons_per_dn: electrons_per_dn.unwrap_or(unstated.electrons_per_dn),
@@ -480,11 +480,11 @@ mod tests {
         };
         let is =
             |electrons_per_dn, read_noise_e, source| CameraNoise { electrons_per_dn, read_noise_e, source };
-        assert_eq!(noise("", "read_noise_e = 7"), is(1.66, 7.0, NoiseSource::Simulated));
-        assert_eq!(noise("pixel_format = \"Mono10\"", ""), is(6.64, 9.0, NoiseSource::Simulated));
-        assert_eq!(noise("read_noise_e = 3", ""), is(1.66, 3.0, NoiseSource::Simulated));
-        assert_eq!(noise("", "noise = false"), is(f64::INFINITY, 0.0, NoiseSource::Simulated));
-        assert_eq!(noise("electrons_per_dn = 2\nread_noise_e = 3", ""), is(2.0, 3.0, NoiseSource::Stated));
+        assert_eq!(noise("", "read_noise_e = 7"), is(1.66, 7.0, NoiseOrigin::Simulated));
+        assert_eq!(noise("pixel_format = \"Mono10\"", ""), is(6.64, 9.0, NoiseOrigin::Simulated));
+        assert_eq!(noise("read_noise_e = 3", ""), is(1.66, 3.0, NoiseOrigin::Simulated));
+        assert_eq!(noise("", "noise = false"), is(f64::INFINITY, 0.0, NoiseOrigin::Simulated));
+        assert_eq!(noise("electrons_per_dn = 2\nread_noise_e = 3", ""), is(2.0, 3.0, NoiseOrigin::Stated));
     }
 
     #[test]

@@ -5,5 +5,5 @@ mod plane;
 
 pub use self::dots::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
 pub use self::plane::{
-    Beam, RowTable, SimAmbient, SimCamera, SimConfig, SimProjector, SimSensor, SimVsync, Spot,
+    RowTable, SimAmbient, SimBeam, SimCamera, SimConfig, SimProjector, SimSensor, SimSpot, SimVsync,
 };

@@ -63,9 +63,9 @@ pub struct SimProjector {
     /// Time at which each row is lit.
     pub row_table: RowTable,
     /// How a row's light spreads over its neighbours.
-    pub beam: Beam,
+    pub beam: SimBeam,
     /// Whether the spot's movement along the row affects the timing of direct light.
-    pub spot: Spot,
+    pub spot: SimSpot,
     /// Timing error of the light relative to the VSYNC edge: uniform, plus or minus this. No device measures it.
     pub phase_jitter_us: f64,
     /// Number of VSYNC edges between setting a new picture and its light.
@@ -76,8 +76,8 @@ impl Default for SimProjector {
     fn default() -> Self {
         Self {
             row_table: RowTable::Linear,
-            beam: Beam::Ideal,
-            spot: Spot::Uniform,
+            beam: SimBeam::Ideal,
+            spot: SimSpot::Uniform,
             phase_jitter_us: 0.0,
             video_latency_frames: 1, // [A]
         }
@@ -107,7 +107,7 @@ pub enum RowTable {
 /// The beam's profile over rows; its weights sum to 1.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum Beam {
+pub enum SimBeam {
     /// All light falls in the row itself.
     Ideal,
     /// A Gaussian, sampled at the rows' centres.
@@ -127,7 +127,7 @@ pub enum Beam {
 /// Time within its row at which a pixel's direct light arrives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Spot {
+pub enum SimSpot {
     /// Spread evenly over the row's dwell.
     Uniform,
     /// When the spot passes the pixel's projector column, left to right.

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::kernel::Kernel;
+use super::kernel::GuestKernel;
 use crate::run::{Done, program};
 
 /// Modules needed before the host's folders are mounted.
@@ -38,7 +38,7 @@ poweroff -f
 ";
 
 /// Writes the initramfs: an uncompressed cpio archive in `newc` format.
-pub fn write(path: &Path, kernel: &Kernel) -> Done {
+pub fn write(path: &Path, kernel: &GuestKernel) -> Done {
     let busybox = program("busybox").ok_or("no busybox on the path: install busybox-static")?;
     let mut archive = Archive::default();
     for folder in ["bin", "lib"] {

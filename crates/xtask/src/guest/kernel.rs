@@ -31,7 +31,7 @@ const MODULE_FOLDERS: [&str; 15] = [
 ];
 
 /// An unpacked kernel.
-pub struct Kernel {
+pub struct GuestKernel {
     /// ELF image, which QEMU boots faster than a compressed one, or else the image from the package.
     pub image: PathBuf,
     /// Folder mounted by the guest as `/lib/modules`; it contains one folder, named after the output of `uname -r`.
@@ -39,7 +39,7 @@ pub struct Kernel {
     release: String,
 }
 
-impl Kernel {
+impl GuestKernel {
     /// Returns the kernel in `folder`; downloads and unpacks it if necessary.
     pub fn fetch(folder: &Path) -> Done<Self> {
         let kept = folder.join("kernel");
@@ -57,7 +57,7 @@ impl Kernel {
         Ok(Self { image: kept.join("vmlinux"), modules, release })
     }
 
-    /// Name of the release, which is the folder below [`Kernel::modules`].
+    /// Name of the release, which is the folder below [`GuestKernel::modules`].
     pub fn release(&self) -> &str {
         &self.release
     }

@@ -11,6 +11,7 @@ mod kernel;
 mod qemu;
 mod report;
 mod script;
+mod table;
 
 use std::path::PathBuf;
 use std::process::Stdio;
@@ -18,90 +19,15 @@ use std::time::Instant;
 
 use crate::packages;
 use crate::run::{Done, cargo, target};
-use kernel::Kernel;
-
-/// An integration test and its requirements on the guest.
-pub struct GuestTest {
-    /// File name in the crate's `tests` folder, without `.rs`.
-    name: &'static str,
-    /// Programs of that crate that the test starts; they are placed next to it.
-    programs: &'static [&'static str],
-    /// Kernel modules with their parameters, loaded just before the test.
-    modules: &'static [&'static str],
-    /// QEMU devices present from the start; tests plug in others through QMP.
-    devices: &'static [&'static str],
-    /// QEMU character devices whose other end the test opens as `/dev/virtio-ports/NAME`.
-    pipes: &'static [&'static str],
-    /// Environment variables that tell the test its devices.
-    environment: &'static [(&'static str, &'static str)],
-}
-
-/// To add a test, add its line here, and its modules' folder in `kernel.rs` if that is new.
-const TESTS: &[GuestTest] = &[
-    GuestTest {
-        name: "guest_daemon",
-        programs: &["raysweepd"],
-        modules: &["vhci-hcd"],
-        devices: &[],
-        pipes: &[],
-        environment: &[],
-    },
-    GuestTest {
-        name: "guest_drm",
-        programs: &[],
-        modules: &["virtio-gpu"],
-        devices: &["virtio-gpu-pci"],
-        pipes: &[],
-        environment: &[("RAYSWEEP_DRM_CARD", "/dev/dri/card0")],
-    },
-    GuestTest {
-        name: "guest_fx2lafw",
-        programs: &[],
-        modules: &["vhci-hcd"],
-        devices: &[],
-        pipes: &[],
-        environment: &[],
-    },
-    GuestTest {
-        name: "guest_mirror",
-        programs: &[],
-        modules: &["xhci_pci", "ftdi_sio"],
-        devices: &[],
-        pipes: &["serial"],
-        environment: &[],
-    },
-    GuestTest {
-        name: "guest_modemline",
-        programs: &[],
-        modules: &["vhci-hcd", "ftdi_sio", "pps-ldisc"],
-        devices: &[],
-        pipes: &[],
-        environment: &[],
-    },
-    GuestTest {
-        name: "guest_serial",
-        programs: &[],
-        modules: &["xhci_pci", "ftdi_sio"],
-        devices: &[],
-        pipes: &["serial"],
-        environment: &[],
-    },
-    GuestTest {
-        name: "v4l2_vivid",
-        programs: &[],
-        modules: &["vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=3"],
-        devices: &[],
-        pipes: &[],
-        environment: &[("RAYSWEEP_V4L2_DEVICE", "/dev/video0")],
-    },
-];
+use kernel::GuestKernel;
+use table::{GuestTest, TESTS};
 
 /// Runs the given tests, or all.
 pub fn guest(names: &[&str]) -> Done {
     let tests = chosen(names)?;
     packages::install()?;
     let folder = target().join("guest");
-    let kernel = Kernel::fetch(&folder)?;
+    let kernel = GuestKernel::fetch(&folder)?;
     let executables = build(&tests)?;
     let began = Instant::now();
     let run = folder.join("run");

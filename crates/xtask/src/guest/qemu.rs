@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
-use super::GuestTest;
-use super::kernel::Kernel;
+use super::kernel::GuestKernel;
+use super::table::GuestTest;
 use crate::run::Done;
 
 /// HPET clock source: on a busy host the kernel misjudges the TSC's rate, and the guest's time then runs several times
@@ -17,7 +17,7 @@ pub struct Machine(Child);
 
 impl Machine {
     /// Boots the guest. It powers off once it has run the tests.
-    pub fn start(kernel: &Kernel, run: &Path, tests: &[&GuestTest]) -> Done<Self> {
+    pub fn start(kernel: &GuestKernel, run: &Path, tests: &[&GuestTest]) -> Done<Self> {
         let log = run.join("qemu.log");
         let log = std::fs::File::create(&log).map_err(|error| format!("{}: {error}", log.display()))?;
         let mut qemu = Command::new("qemu-system-x86_64");

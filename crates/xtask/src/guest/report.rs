@@ -3,9 +3,9 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use super::GuestTest;
 use super::qemu::Machine;
 use super::script::TEST_LIMIT_S;
+use super::table::GuestTest;
 use crate::run::Done;
 
 /// Added to the guest's own time limit so that the guest's limit applies first: covers booting (5 s) and loading

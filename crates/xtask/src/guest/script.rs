@@ -1,6 +1,6 @@
 //! The script that the guest runs once the host's folders are mounted.
 
-use super::GuestTest;
+use super::table::GuestTest;
 
 /// Time limit for a test; a test that takes longer counts as hung.
 pub const TEST_LIMIT_S: u32 = 120;

@@ -8,7 +8,7 @@ pub const PATH: &str = "tests/packages.txt";
 
 /// One line of the list.
 #[derive(Debug, PartialEq)]
-pub struct Entry {
+pub struct PackageEntry {
     /// The package's name in each Debian release, in the order in which they are tried.
     pub names: Vec<String>,
     /// Probes that must all succeed if the package is present.
@@ -17,7 +17,7 @@ pub struct Entry {
     pub why: String,
 }
 
-impl Entry {
+impl PackageEntry {
     /// Fails, and tells why, if a probe fails.
     pub fn check(&self) -> Done {
         let failed: Vec<_> = self.probes.iter().filter_map(|probe| probe.check().err()).collect();
@@ -26,14 +26,14 @@ impl Entry {
 }
 
 /// Reads the project's list.
-pub fn entries() -> Done<Vec<Entry>> {
+pub fn entries() -> Done<Vec<PackageEntry>> {
     let path = root().join(PATH);
     let bytes = std::fs::read(&path).map_err(|error| format!("{}: {error}", path.display()))?;
     parse(&bytes)
 }
 
-fn parse(bytes: &[u8]) -> Done<Vec<Entry>> {
-    let mut entries: Vec<Entry> = Vec::new();
+fn parse(bytes: &[u8]) -> Done<Vec<PackageEntry>> {
+    let mut entries: Vec<PackageEntry> = Vec::new();
     for (index, line) in bytes.split(|&byte| byte == b'\n').enumerate() {
         let failed = |error: String| format!("{PATH}, line {}: {error}", index + 1);
         let line = std::str::from_utf8(line).map_err(|error| failed(format!("not UTF-8: {error}")))?.trim();
@@ -52,7 +52,7 @@ fn parse(bytes: &[u8]) -> Done<Vec<Entry>> {
     Ok(entries)
 }
 
-fn entry(line: &str) -> Done<Entry> {
+fn entry(line: &str) -> Done<PackageEntry> {
     if line.starts_with('\u{feff}') {
         return Err("begins with a byte order mark: save the file as UTF-8 without one".to_owned());
     }
@@ -69,7 +69,7 @@ fn entry(line: &str) -> Done<Entry> {
     }
     let probes = probes.split(',').map(Probe::parse).collect::<Done<_>>();
     let probes = probes.map_err(|error| format!("what shows that it is there: {error}"))?;
-    Ok(Entry { names, probes, why: why.to_owned() })
+    Ok(PackageEntry { names, probes, why: why.to_owned() })
 }
 
 /// Names are given to apt, which would take others for options.

@@ -8,7 +8,7 @@ mod probe;
 
 use crate::rootfs::is_root;
 use crate::run::{Done, say};
-use list::{Entry, PATH};
+use list::{PATH, PackageEntry};
 
 /// Advice for systems other than those of the list.
 const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On another system, install by its own means what serves the same\n\
@@ -16,7 +16,7 @@ const ELSEWHERE: &str = "tests/packages.txt is made for Debian 12 and 13. On ano
 
 /// An entry that is not there.
 struct Missing {
-    entry: Entry,
+    entry: PackageEntry,
     /// What was looked for, and why it is not found.
     reason: String,
 }
@@ -26,9 +26,9 @@ pub fn print() -> Done {
     let entries = list::entries()?;
     let all = entries.len();
     let known = apt::candidates(entries.iter().flat_map(|entry| &entry.names));
-    let name = |entry: &Entry| first_of(entry, &known).cloned().unwrap_or(entry.names.join("|"));
+    let name = |entry: &PackageEntry| first_of(entry, &known).cloned().unwrap_or(entry.names.join("|"));
     let width = entries.iter().map(|entry| name(entry).len()).max().unwrap_or(0);
-    let line = |state, entry: &Entry| format!("{state}  {:width$}  {}", name(entry), entry.why);
+    let line = |state, entry: &PackageEntry| format!("{state}  {:width$}  {}", name(entry), entry.why);
     let (present, missing) = sorted(entries);
     for entry in &present {
         say(&line("present", entry))?;
@@ -63,7 +63,7 @@ pub fn install() -> Done {
 }
 
 /// The entries that are there and those that are not.
-fn sorted(entries: impl IntoIterator<Item = Entry>) -> (Vec<Entry>, Vec<Missing>) {
+fn sorted(entries: impl IntoIterator<Item = PackageEntry>) -> (Vec<PackageEntry>, Vec<Missing>) {
     let (mut present, mut missing) = (Vec::new(), Vec::new());
     for entry in entries {
         match entry.check() {
@@ -79,7 +79,7 @@ fn candidates(missing: &[Missing]) -> Vec<String> {
 }
 
 /// The first name of an entry that apt knows.
-fn first_of<'a>(entry: &'a Entry, known: &[String]) -> Option<&'a String> {
+fn first_of<'a>(entry: &'a PackageEntry, known: &[String]) -> Option<&'a String> {
     entry.names.iter().find(|name| known.contains(name))
 }
 
@@ -143,7 +143,7 @@ mod tests {
     use super::*;
 
     fn missing(names: &[&str], why: &str) -> Missing {
-        let entry = Entry { names: strings(names), probes: Vec::new(), why: why.to_owned() };
+        let entry = PackageEntry { names: strings(names), probes: Vec::new(), why: why.to_owned() };
         Missing { entry, reason: "no program".to_owned() }
     }
 

@@ -12,7 +12,7 @@ use raysweep_session::film::{CycleEntry, Film, crc32};
 use raysweep_session::ledger::Entry;
 use raysweep_transport::plane::Setting;
 
-use super::worker::{Account, Exposed, Worker};
+use super::worker::{Account, CycleFrames, Worker};
 use crate::plane::PointSink;
 use crate::rig::Pace;
 
@@ -106,9 +106,9 @@ impl Cycles {
         cycle: u32,
         frames: Vec<(Setting, Arc<Array2<f32>>)>,
         starts_ns: (i64, i64),
-    ) -> Option<Exposed> {
+    ) -> Option<CycleFrames> {
         let (oldest_ns, newest_ns) = starts_ns;
-        Some(Exposed {
+        Some(CycleFrames {
             cycle,
             frames,
             dark: self.dark.clone()?,

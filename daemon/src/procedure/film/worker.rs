@@ -23,7 +23,7 @@ use crate::run::orders::{Order, Orders};
 const WAITING_CYCLES: usize = 4;
 
 /// One frame of each setting, from which a transport is computed.
-pub struct Exposed {
+pub struct CycleFrames {
     /// The cycle of the newest frame.
     pub cycle: u32,
     /// The frames in the settings' order, after all stages.
@@ -79,9 +79,9 @@ impl Account {
 /// Work that waits for the solver.
 #[derive(Default)]
 struct Waiting {
-    cycles: VecDeque<Exposed>,
+    cycles: VecDeque<CycleFrames>,
     /// The newest frames, and when the cycle in progress will be complete.
-    sliding: Option<(Exposed, Instant)>,
+    sliding: Option<(CycleFrames, Instant)>,
     closed: bool,
 }
 
@@ -103,7 +103,7 @@ impl Inbox {
 
     /// The next job, and whether it is a sliding one. A sliding job starts only if it should end, after `solve_time`,
     /// before the next cycle arrives; otherwise the solver aborts it in favour of the cycle.
-    fn next(&self, solve_time: Duration) -> Option<(Exposed, bool)> {
+    fn next(&self, solve_time: Duration) -> Option<(CycleFrames, bool)> {
         let mut waiting = self.lock();
         loop {
             if let Some(cycle) = waiting.cycles.pop_front() {
@@ -174,7 +174,7 @@ impl Worker {
     }
 
     /// Hands over a complete cycle. In real time, a cycle that finds the queue full gets no transport for now.
-    pub fn cycle(&self, exposed: Exposed) {
+    pub fn cycle(&self, exposed: CycleFrames) {
         let mut waiting = self.inbox.lock();
         while waiting.cycles.len() >= WAITING_CYCLES && self.is_alive() {
             if self.pace == Pace::Devices {
@@ -189,7 +189,7 @@ impl Worker {
 
     /// Offers the newest frames, to be solved if there is time before `cycle_end`, when the cycle in progress is
     /// complete.
-    pub fn sliding(&self, exposed: Exposed, cycle_end: Instant) {
+    pub fn sliding(&self, exposed: CycleFrames, cycle_end: Instant) {
         self.inbox.lock().sliding = Some((exposed, cycle_end));
         self.inbox.changed.notify_all();
     }
@@ -232,7 +232,7 @@ impl Solving {
         let mut solve_time = Duration::ZERO;
         while let Some((exposed, is_sliding)) = inbox.next(solve_time) {
             let began = Instant::now();
-            let Exposed { cycle, frames, dark, .. } = &exposed;
+            let CycleFrames { cycle, frames, dark, .. } = &exposed;
             let go_on = || !is_sliding || !inbox.has_cycle();
             let solved = workers.install(|| self.solver.solve(frames, dark, &go_on));
             if is_sliding && solved.is_err() && !go_on() {
@@ -259,7 +259,7 @@ impl Solving {
         Ok(())
     }
 
-    fn publish(&self, exposed: &Exposed, is_sliding: bool, transport: &Transport, solve_time: Duration) {
+    fn publish(&self, exposed: &CycleFrames, is_sliding: bool, transport: &Transport, solve_time: Duration) {
         let views = [(EPIPOLAR, transport.epipolar(1)), (INDIRECT, transport.non_epipolar(1))];
         if let Some(Outlet { file, session, .. }) = &self.live {
             let entries = [
@@ -306,8 +306,8 @@ impl Solving {
 mod tests {
     use super::*;
 
-    fn exposed(cycle: u32) -> Exposed {
-        Exposed { cycle, frames: Vec::new(), dark: Arc::default(), start_s: 0.0, end_ns: 0 }
+    fn exposed(cycle: u32) -> CycleFrames {
+        CycleFrames { cycle, frames: Vec::new(), dark: Arc::default(), start_s: 0.0, end_ns: 0 }
     }
 
     fn slide(inbox: &Inbox, cycle: u32, left: Duration) {

@@ -1,6 +1,6 @@
 //! Predicts the errors of a sweep on this rig, and searches for a better sweep of the same length.
 
-use raysweep_config::rig::plane::NoiseSource as KnownFrom;
+use raysweep_config::rig::plane::NoiseOrigin;
 use raysweep_config::{Axis, RigFile, SweepPlan};
 use raysweep_core::CameraCapabilities;
 use raysweep_pipeline::{DemuxFold, Point, Role, Spot, prior_name};
@@ -96,9 +96,9 @@ pub fn advise(
             dark: read,
             shot: gain.sqrt(),
             source: match known.source {
-                KnownFrom::Stated => NoiseSource::Stated,
-                KnownFrom::Simulated => NoiseSource::Simulated,
-                KnownFrom::Assumed => NoiseSource::Assumed,
+                NoiseOrigin::Stated => NoiseSource::Stated,
+                NoiseOrigin::Simulated => NoiseSource::Simulated,
+                NoiseOrigin::Assumed => NoiseSource::Assumed,
             },
         },
         prior: prior_name(prior),

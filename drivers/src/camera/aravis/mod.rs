@@ -23,4 +23,4 @@ mod setup;
 pub use driver::{AravisCamera, RigFacts};
 pub use file::{Refused, load_features, save_features};
 pub use library::{Found, discover};
-pub use raysweep_config::rig::aravis::{AravisConfig, Region, TimestampAt};
+pub use raysweep_config::rig::aravis::{AravisConfig, SensorRegion, TimestampAt};

@@ -6,7 +6,7 @@ use raysweep_core::{DeviceErrorKind, PixelFormat};
 use super::features::{FeatureError, Features, Result, first_present, put_boolean, put_integer, put_text};
 use super::sequencer;
 use super::settings::Names;
-use raysweep_config::rig::aravis::{AravisConfig, Region};
+use raysweep_config::rig::aravis::{AravisConfig, SensorRegion};
 
 /// Result of setting up a camera.
 #[derive(Debug, PartialEq)]
@@ -135,7 +135,7 @@ fn set_region(
             lacks.push(format!("{name}: its region starts in the corner"));
         }
     }
-    let full = Region { x: 0, y: 0, width: 0, height: 0 };
+    let full = SensorRegion { x: 0, y: 0, width: 0, height: 0 };
     let region = config.region.unwrap_or(full);
     for (name, pixels) in [("Width", region.width), ("Height", region.height)] {
         let pixels = if pixels == 0 { *features.integer_range(name)?.end() } else { i64::from(pixels) };
@@ -244,7 +244,7 @@ mod tests {
         AravisConfig {
             name: Some("camera".into()),
             features: vec!["LineSelector=Line0".into(), "LineMode=Input".into()],
-            region: Some(Region { x: 16, y: 32, width: 640, height: 480 }),
+            region: Some(SensorRegion { x: 16, y: 32, width: 640, height: 480 }),
             black_level: Some(16.0),
             ..AravisConfig::default()
         }
@@ -342,7 +342,7 @@ mod tests {
         assert!(message.contains("PixelFormat") && message.contains("Mono8, Mono12p"), "{message}");
         let line2 = AravisConfig { trigger_source: "Line2".into(), ..config.clone() };
         assert!(refused(sfnc(), &line2, PixelFormat::Mono8).contains("Software, Line0, Line1"));
-        let wide = Region { x: 0, y: 0, width: 1601, height: 8 };
+        let wide = SensorRegion { x: 0, y: 0, width: 1601, height: 8 };
         let message = refused(sfnc(), &AravisConfig { region: Some(wide), ..config }, PixelFormat::Mono8);
         assert!(message.contains("Width: 1601 was asked for; allowed is 8 to 1600"), "{message}");
     }

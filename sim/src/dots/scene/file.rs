@@ -14,8 +14,8 @@ use raysweep_core::Mosaic;
 
 use super::error::DotSceneError;
 use super::still::{Still, seen};
-use crate::dots::beam::Spot;
-use crate::dots::view::View;
+use crate::dots::beam::BeamSpot;
+use crate::dots::view::CameraView;
 
 /// Number of surrounding dots that are interpolated if the dots do not form a grid.
 const NEIGHBOURS: usize = 4;
@@ -27,7 +27,7 @@ pub struct FileScene {
     uv: Vec<[f64; 2]>,
     /// Columns and rows of the dots' grid in row order, if they form one.
     grid: Option<[usize; 2]>,
-    view: View,
+    view: CameraView,
 }
 
 impl FileScene {
@@ -117,7 +117,7 @@ impl FileScene {
             }
         });
         let grid = grid_of(&uv);
-        Ok(Self { images, uv, grid, view: View { size: (rows, columns), half } })
+        Ok(Self { images, uv, grid, view: CameraView { size: (rows, columns), half } })
     }
 
     /// Rows and columns of the images.
@@ -169,7 +169,7 @@ impl FileScene {
 }
 
 impl Still for FileScene {
-    fn add_direct(&self, spot: &Spot, image: &mut [f32]) {
+    fn add_direct(&self, spot: &BeamSpot, image: &mut [f32]) {
         for (dot, weight) in self.neighbours(self.view.uv(spot.centre)) {
             let weight = (weight * spot.light) as f32;
             if weight > 0.0 {
@@ -178,7 +178,7 @@ impl Still for FileScene {
         }
     }
 
-    fn add_global(&self, _: &Spot, _: &mut [f32]) {}
+    fn add_global(&self, _: &BeamSpot, _: &mut [f32]) {}
 }
 
 /// Columns and rows of the dots' grid in row order, if they form one.

@@ -3,9 +3,9 @@
 
 use std::f64::consts::PI;
 
-use super::model::{Coarse, Model, Place};
-use crate::dots::beam::Spot;
-use crate::dots::view::View;
+use super::model::{Coarse, Place, SceneModel};
+use crate::dots::beam::BeamSpot;
+use crate::dots::view::CameraView;
 
 /// Global light transport of a scene.
 pub enum Glow {
@@ -40,7 +40,13 @@ impl Glow {
     }
 
     /// Light without fine detail at the coarse pixels; `None` if there is none.
-    pub fn coarse(&self, spot: &Spot, model: &Model, view: &View, coarse: &Coarse) -> Option<Vec<f32>> {
+    pub fn coarse(
+        &self,
+        spot: &BeamSpot,
+        model: &SceneModel,
+        view: &CameraView,
+        coarse: &Coarse,
+    ) -> Option<Vec<f32>> {
         let light: LightAt = match self {
             Self::None | Self::Caustic { .. } => return None,
             Self::Bounce => {
@@ -95,7 +101,7 @@ fn exchange(from: &Place, to: &Place, blur: f64) -> f64 {
 }
 
 /// Light that entered the wax under a spot and leaves it at `m`.
-fn wandered(spot: &Spot, m: [f64; 2], height: f64) -> f64 {
+fn wandered(spot: &BeamSpot, m: [f64; 2], height: f64) -> f64 {
     let square = (m[0] - spot.centre[0]).powi(2) + (m[1] - spot.centre[1]).powi(2);
     let gaussians = WAX.iter().map(|(width, share)| {
         let variance = (width * height).powi(2) + spot.sigma().powi(2);
@@ -106,7 +112,7 @@ fn wandered(spot: &Spot, m: [f64; 2], height: f64) -> f64 {
 
 /// The refracted spot behind a glass ball for a spot on the ball. Spots from near the rim and from closer to the centre
 /// overlap, so that light concentrates in a ring.
-pub fn caustic(centre: [f64; 2], radius: f64, spot: &Spot) -> Option<Spot> {
+pub fn caustic(centre: [f64; 2], radius: f64, spot: &BeamSpot) -> Option<BeamSpot> {
     let from_centre = [0, 1].map(|axis| (spot.centre[axis] - centre[axis]) / radius);
     let rho = from_centre[0].hypot(from_centre[1]);
     if rho >= 1.0 {

@@ -13,16 +13,16 @@ use raysweep_core::Mosaic;
 
 pub use self::error::DotSceneError;
 use self::file::FileScene;
-use self::model::{Model, Surface};
-pub use self::still::{BUILTIN_NAMES, Light, Still};
-use super::view::View;
+use self::model::{SceneModel, Surface};
+pub use self::still::{BUILTIN_NAMES, SpotImages, Still};
+use super::view::CameraView;
 use raysweep_config::sim::DotsConfig;
 
 /// A scene that may move, and the planes that can replace it.
-pub struct Scene {
+pub struct DotScene {
     kind: Kind,
     planes: Vec<Arc<dyn Still>>,
-    view: View,
+    view: CameraView,
     mosaic: Mosaic,
     seed: u64,
 }
@@ -32,7 +32,7 @@ enum Kind {
     Builtin(&'static str),
 }
 
-impl Scene {
+impl DotScene {
     /// Loads or computes a scene; file paths are relative to `folder`.
     ///
     /// # Errors
@@ -56,17 +56,17 @@ impl Scene {
             })?;
             (Kind::Builtin(name), (config.rows, config.columns))
         };
-        let view = View { size, half };
+        let view = CameraView { size, half };
         let planes = config
             .plane_depths
             .iter()
-            .map(|&depth| Arc::new(Surface::trace(Model::plane(depth), view, mosaic)) as Arc<dyn Still>)
+            .map(|&depth| Arc::new(Surface::trace(SceneModel::plane(depth), view, mosaic)) as Arc<dyn Still>)
             .collect();
         Ok(Self { kind, planes, view, mosaic, seed: config.seed })
     }
 
     /// The camera's view of the scene.
-    pub fn view(&self) -> View {
+    pub fn view(&self) -> CameraView {
         self.view
     }
 
@@ -85,7 +85,7 @@ impl Scene {
         match &self.kind {
             Kind::File(still) => still.clone(),
             Kind::Builtin(name) => {
-                let model = Model::builtin(name, self.view.half, swing, self.seed);
+                let model = SceneModel::builtin(name, self.view.half, swing, self.seed);
                 Arc::new(Surface::trace(model, self.view, self.mosaic))
             }
         }

@@ -5,8 +5,8 @@ use raysweep_core::Mosaic;
 
 use super::glow::{self, Glow};
 use super::still::{Still, seen};
-use crate::dots::beam::Spot;
-use crate::dots::view::View;
+use crate::dots::beam::BeamSpot;
+use crate::dots::view::CameraView;
 use crate::scene::texture::{noise, printed_page};
 
 /// Iterations for finding the point that a pixel sees; each reduces the error by a factor of at least five.
@@ -23,13 +23,13 @@ pub type Depth = Box<dyn Fn([f64; 2]) -> f64 + Send + Sync>;
 pub type Albedo = Box<dyn Fn([f64; 2]) -> [f32; 3] + Send + Sync>;
 
 /// A surface and its light transport, independent of the camera.
-pub struct Model {
+pub struct SceneModel {
     depth: Depth,
     albedo: Albedo,
     glow: Glow,
 }
 
-impl Model {
+impl SceneModel {
     /// A white Lambertian plane.
     pub fn plane(depth: f64) -> Self {
         Self { depth: Box::new(move |_| depth), albedo: Box::new(|_| [1.0; 3]), glow: Glow::None }
@@ -121,8 +121,8 @@ pub struct Place {
 
 /// A surface as seen by the camera.
 pub struct Surface {
-    model: Model,
-    view: View,
+    model: SceneModel,
+    view: CameraView,
     /// Direction from the projector to the point that each pixel sees.
     directions: Vec<[f64; 2]>,
     /// Albedo of each pixel, as seen through its colour filter.
@@ -142,7 +142,7 @@ pub struct Coarse {
 impl Coarse {
     const STEP: usize = 4;
 
-    fn new(model: &Model, view: View) -> Self {
+    fn new(model: &SceneModel, view: CameraView) -> Self {
         let (rows, columns) = view.size;
         let [rows, columns] = [rows, columns].map(|length| length.div_ceil(Self::STEP) + 1);
         let seen = (0..rows * columns).into_par_iter().map(|node| {
@@ -168,9 +168,9 @@ impl Coarse {
     }
 }
 
-impl Model {
+impl SceneModel {
     /// Direction from the projector to the point that a pixel sees.
-    fn seen(&self, view: View, row: usize, column: usize) -> [f64; 2] {
+    fn seen(&self, view: CameraView, row: usize, column: usize) -> [f64; 2] {
         let mut depth = 1.0;
         for _ in 0..TRACE_STEPS {
             depth = (self.depth)(view.direction(row, column, depth));
@@ -205,7 +205,7 @@ impl Model {
 
 impl Surface {
     /// Computes what each pixel sees.
-    pub fn trace(model: Model, view: View, mosaic: Mosaic) -> Self {
+    pub fn trace(model: SceneModel, view: CameraView, mosaic: Mosaic) -> Self {
         let (rows, columns) = view.size;
         let pixels: Vec<([f64; 2], f32, f32)> = (0..rows * columns)
             .into_par_iter()
@@ -232,7 +232,7 @@ impl Surface {
 }
 
 impl Still for Surface {
-    fn add_direct(&self, spot: &Spot, image: &mut [f32]) {
+    fn add_direct(&self, spot: &BeamSpot, image: &mut [f32]) {
         let columns = self.view.size.1;
         image.par_chunks_mut(columns).enumerate().for_each(|(row, image)| {
             let first = row * columns;
@@ -243,7 +243,7 @@ impl Still for Surface {
         });
     }
 
-    fn add_global(&self, spot: &Spot, image: &mut [f32]) {
+    fn add_global(&self, spot: &BeamSpot, image: &mut [f32]) {
         if let Glow::Caustic { centre, radius } = self.model.glow {
             glow::caustic(centre, radius, spot).iter().for_each(|spot| self.add_direct(spot, image));
             return;

@@ -2,14 +2,14 @@
 
 use raysweep_core::Mosaic;
 
-use crate::dots::beam::Spot;
+use crate::dots::beam::BeamSpot;
 
 /// Names of the built-in scenes.
 pub const BUILTIN_NAMES: [&str; 4] = ["v-groove", "glass", "candle", "fog"];
 
 /// Images under one spot, `[row, column]` row-major, relative to a white plane under the full beam.
 #[derive(Debug, Clone)]
-pub struct Light {
+pub struct SpotImages {
     /// Direct light from the mirror; for a scene from a file, all light.
     pub direct: Vec<f32>,
     /// All other light.
@@ -19,10 +19,10 @@ pub struct Light {
 /// A scene at rest.
 pub trait Still: Send + Sync {
     /// Adds the direct light of a spot; for a scene from a file, all light.
-    fn add_direct(&self, spot: &Spot, image: &mut [f32]);
+    fn add_direct(&self, spot: &BeamSpot, image: &mut [f32]);
 
     /// Adds all other light of a spot.
-    fn add_global(&self, spot: &Spot, image: &mut [f32]);
+    fn add_global(&self, spot: &BeamSpot, image: &mut [f32]);
 }
 
 /// A colour as seen by a pixel of a mosaic; on a monochrome sensor, the mean.
