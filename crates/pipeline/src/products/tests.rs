@@ -1,7 +1,7 @@
 use ndarray::{Axis, s};
 use raysweep_core::Raster;
 use raysweep_transport::plane::predict;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 
 use ndarray::{Array2, Array3};
 use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting, Transport};

@@ -66,7 +66,7 @@ impl PixelResponse {
             Err(PlaneError::OutOfRange { field, value: f64::from(value), allowed })
         };
         // Beyond this, rows could not be counted in f32.
-        if let Some(&place) = places.iter().find(|place| !(place.abs() < 1e5)) {
+        if let Some(&place) = places.iter().find(|place| !(-1e5..1e5).contains(*place)) {
             return refused(
                 "place",
                 place,
@@ -74,7 +74,7 @@ impl PixelResponse {
             );
         }
         let sums = shares.sum_axis(ndarray::Axis(0));
-        if let Some(&sum) = sums.iter().find(|sum| !((*sum - 1.0).abs() < 0.02)) {
+        if let Some(&sum) = sums.iter().find(|sum| !(0.98..1.02).contains(*sum)) {
             return refused(
                 "response",
                 sum,
