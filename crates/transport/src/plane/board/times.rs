@@ -1,1 +1,0 @@
-//! When each projector row is lit, from images of the white board.

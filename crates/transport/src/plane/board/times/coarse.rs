@@ -1,0 +1,238 @@
+use nalgebra::{Matrix4, Vector4};
+
+use super::columns::Columns;
+use super::error::TimesError;
+use super::settings::{BoardFrame, Nominal, Shutter};
+
+/// The sweep as global frames see it, to within 10 us: a cubic through the borders between dark and light.
+///
+/// Its times are those of exposures with a global shutter, which differ from those of rolling exposures by a constant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Coarse {
+    nominal: Nominal,
+    /// Middle and half width of the rows that the borders cover.
+    middle_row: f64,
+    half_rows: f64,
+    /// Lateness against the nominal time as a polynomial over -1..1.
+    late_us: Vector4<f64>,
+    error_us: f64,
+}
+
+/// Smallest number of borders.
+const MIN_BORDERS: usize = 12;
+/// Rows at the ends of the raster in which borders are not used.
+const END_ROWS: f64 = 12.0;
+/// Errors beyond this count less.
+const BORDER_SCATTER_US: f64 = 10.0;
+/// How much the coefficients may differ from a nominal sweep, which keeps a fit to few rows from oscillating.
+const PRIOR_US: [f64; 4] = [1e4, 1e4, 500.0, 200.0];
+/// Error of a measured sweep, and how far the shutter modes may be apart.
+const MEASURED_ERROR_US: f64 = 20.0;
+
+impl Coarse {
+    /// A sweep of which only the nominal numbers are known.
+    pub fn nominal(nominal: &Nominal) -> Self {
+        Self {
+            nominal: *nominal,
+            middle_row: 0.0,
+            half_rows: 1.0,
+            late_us: Vector4::zeros(),
+            error_us: nominal.error_us(),
+        }
+    }
+
+    /// The sweep from the global frames among `frames`.
+    ///
+    /// # Errors
+    /// Those of [`Nominal::check`]; [`TimesError::TooFewBorders`].
+    pub fn from_borders(
+        columns: &Columns,
+        frames: &[BoardFrame],
+        nominal: &Nominal,
+    ) -> Result<Self, TimesError> {
+        nominal.check()?;
+        let global = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Global);
+        let points: Vec<(f64, f64)> =
+            global().flat_map(|frame| borders(columns, frame, nominal)).collect();
+        let seen = columns.seen_rows();
+        let first = points.iter().map(|point| point.0).fold(f64::MAX, f64::min);
+        let last = points.iter().map(|point| point.0).fold(f64::MIN, f64::max);
+        let covered = (last - first).max(0.0) / seen.len() as f64;
+        if points.len() < MIN_BORDERS || covered < 0.5 {
+            return Err(TimesError::TooFewBorders {
+                borders: points.len(),
+                needed: MIN_BORDERS,
+                frames: global().count(),
+                covered_percent: covered * 100.0,
+            });
+        }
+        let (middle_row, half_rows) = ((first + last) / 2.0, (last - first) / 2.0);
+        let mut coarse =
+            Self { middle_row, half_rows, error_us: MEASURED_ERROR_US, ..Self::nominal(nominal) };
+        // Some rounds of reweighting are enough for a few outliers.
+        for _ in 0..20 {
+            let mut normal = Matrix4::from_diagonal(&Vector4::from(PRIOR_US).map(|sd| sd.powi(-2)));
+            let mut right = Vector4::zeros();
+            for &(row, time_us) in &points {
+                let powers = coarse.powers(row);
+                let late_us = time_us - nominal.start_us(row);
+                let error_us = late_us - coarse.late_us.dot(&powers);
+                let weight = 1.0 / (BORDER_SCATTER_US * error_us.abs().max(BORDER_SCATTER_US));
+                normal += powers * powers.transpose() * weight;
+                right += powers * late_us * weight;
+            }
+            let solution = normal.cholesky().ok_or(TimesError::Undetermined)?.solve(&right);
+            coarse.late_us = solution;
+        }
+        Ok(coarse)
+    }
+
+    /// When a row, or a fraction of it, begins to be lit, as counted by frames with a global shutter.
+    pub fn time_us(&self, row: f64) -> f64 {
+        // Beyond the borders, the sweep continues with its outermost slope.
+        let inside = row.clamp(self.middle_row - self.half_rows, self.middle_row + self.half_rows);
+        let x = (inside - self.middle_row) / self.half_rows;
+        let slope = Vector4::new(0.0, 1.0, 2.0 * x, 3.0 * x * x).dot(&self.late_us) / self.half_rows;
+        self.nominal.start_us(row) + self.late_us.dot(&self.powers(inside)) + slope * (row - inside)
+    }
+
+    /// How far a row's light may be from [`Self::time_us`] of a rolling frame.
+    pub(super) fn error_us(&self) -> f64 {
+        self.error_us
+    }
+
+    fn powers(&self, row: f64) -> Vector4<f64> {
+        let x = (row - self.middle_row) / self.half_rows;
+        Vector4::new(1.0, x, x * x, x * x * x)
+    }
+}
+
+/// Places of the opening and closing border of a global frame, with their times. A place is that of drawing: half a
+/// row below the centre of the response that is half lit.
+fn borders(columns: &Columns, frame: &BoardFrame, nominal: &Nominal) -> Vec<(f64, f64)> {
+    let opening_us = frame.setting.delay_us;
+    let edges = [(true, opening_us), (false, opening_us + frame.setting.exposure_us)];
+    let border = |(opening, time_us): (bool, f64)| {
+        let mut rows: Vec<f64> =
+            (0..columns.groups()).filter_map(|group| crossing(columns, frame, group, opening)).collect();
+        // A border of the light runs through the whole image.
+        if rows.len() * 2 < columns.groups() {
+            return None;
+        }
+        let row = median(&mut rows) + 0.5;
+        let inside = row >= END_ROWS && row <= nominal.projector_rows as f64 - END_ROWS;
+        // The border may belong to the light of another period.
+        let periods = ((time_us - nominal.start_us(row)) / nominal.period_us).round();
+        inside.then_some((row, time_us - periods * nominal.period_us))
+    };
+    edges.into_iter().filter_map(border).collect()
+}
+
+/// The place at which a group's light, smoothed over three rows, crosses one half upwards (`opening`) or downwards, if
+/// there is exactly one.
+fn crossing(columns: &Columns, frame: &BoardFrame, group: usize, opening: bool) -> Option<f64> {
+    let lit: Vec<usize> =
+        (0..columns.rows()).filter(|&row| columns.cell(row, group).pixels > 0).collect();
+    let smooth = |rows: &[usize]| {
+        let sum: f64 = rows.iter().map(|&row| f64::from(frame.light[[row, group]])).sum();
+        (columns.cell(rows[1], group).place, sum / 3.0 - 0.5)
+    };
+    let mut found = None;
+    for rows in lit.windows(4) {
+        let ((place, above), (next_place, below)) = (smooth(&rows[..3]), smooth(&rows[1..]));
+        let crosses = if opening { above < 0.0 && below >= 0.0 } else { above >= 0.0 && below < 0.0 };
+        if crosses {
+            if found.is_some() {
+                return None;
+            }
+            found = Some(place + (next_place - place) * above / (above - below));
+        }
+    }
+    found
+}
+
+/// When the light of each camera row arrives, from short rolling exposures.
+#[derive(Debug)]
+pub(super) struct Arrivals {
+    /// Exposure of the frames.
+    pub exposure_us: f64,
+    /// What exposures have more than their nominal length.
+    pub exposure_offset_us: f64,
+    /// Centre of each camera row's light, counted from the trigger edge plus the row's own start; `None` if the row is
+    /// unlit, or its arrival is not covered.
+    pub times_us: Vec<Option<f64>>,
+}
+
+const MIN_DELAYS: usize = 4;
+/// Light at the first or the last delay that tells that an arrival is cut.
+const CUT_LIGHT: f64 = 0.1;
+
+/// When the light of each camera row arrives: the centroid of its light over the delays of the shortest rolling
+/// exposure.
+pub(super) fn arrivals(columns: &Columns, frames: &[BoardFrame]) -> Result<Arrivals, TimesError> {
+    let rolling = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Rolling);
+    let exposure_us = rolling().map(|frame| frame.setting.exposure_us).fold(f64::MAX, f64::min);
+    let mut short: Vec<&BoardFrame> =
+        rolling().filter(|frame| frame.setting.exposure_us == exposure_us).collect();
+    short.sort_by(|a, b| a.setting.delay_us.total_cmp(&b.setting.delay_us));
+    let delays: Vec<&[&BoardFrame]> =
+        short.chunk_by(|a, b| b.setting.delay_us - a.setting.delay_us < 0.01).collect();
+    if delays.len() < MIN_DELAYS {
+        return Err(TimesError::TooFewDelays { delays: delays.len(), needed: MIN_DELAYS });
+    }
+    let delay_us = |index: usize| delays[index][0].setting.delay_us;
+    let last = delays.len() - 1;
+    // Rule of trapezoids.
+    let step_us = |index: usize| (delay_us((index + 1).min(last)) - delay_us(index.saturating_sub(1))) / 2.0;
+    let (mut early, mut late, mut seen) = (0, 0, 0);
+    let mut excess_us = Vec::new();
+    let mut times_us = Vec::new();
+    for row in 0..columns.rows() {
+        if columns.row_place(row).is_none() {
+            times_us.push(None);
+            continue;
+        }
+        let light: Vec<f64> = delays
+            .iter()
+            .map(|frames| {
+                let sum: f64 = frames.iter().map(|frame| columns.row_mean(&frame.light, row)).sum();
+                sum / frames.len() as f64
+            })
+            .collect();
+        let (cut_early, cut_late) = (light[0] > CUT_LIGHT, light[last] > CUT_LIGHT);
+        let moments = light.iter().enumerate().map(|(index, light)| {
+            let weight = light * step_us(index);
+            (weight, weight * (delay_us(index) + exposure_us / 2.0))
+        });
+        let (sum, moment) = moments.fold((0.0, 0.0), |sums, terms| (sums.0 + terms.0, sums.1 + terms.1));
+        let whole = !cut_early && !cut_late && sum > exposure_us / 2.0;
+        (seen, early, late) = (seen + 1, early + usize::from(cut_early), late + usize::from(cut_late));
+        times_us.push(whole.then(|| {
+            excess_us.push(sum - exposure_us);
+            moment / sum
+        }));
+    }
+    if excess_us.len() * 2 < seen {
+        return Err(TimesError::ArrivalsCut {
+            exposure_us,
+            from_us: delay_us(0),
+            to_us: delay_us(last),
+            rows: excess_us.len(),
+            seen,
+            early,
+            late,
+        });
+    }
+    let exposure_offset_us = median(&mut excess_us);
+    times_us.iter_mut().flatten().for_each(|time_us| *time_us += exposure_offset_us / 2.0);
+    Ok(Arrivals { exposure_us, exposure_offset_us, times_us })
+}
+
+/// The middle value; 0 without values.
+pub(super) fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    match values.len() {
+        0 => 0.0,
+        count => (values[(count - 1) / 2] + values[count / 2]) / 2.0,
+    }
+}

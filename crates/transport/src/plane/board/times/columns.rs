@@ -1,0 +1,194 @@
+use std::ops::Range;
+
+use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
+
+use super::super::super::PlaneError;
+use super::super::super::error::check_shape;
+
+/// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
+/// only in the fraction of a row at which their pixels lie.
+const GROUPS: usize = 12;
+/// Number of drawn rows in a pixel's response.
+const RESPONSE_ROWS: usize = 16;
+/// The response's first row, relative to the row nearest to the pixel's place.
+const FIRST_RESPONSE_ROW: i64 = -7;
+
+/// What each camera row sees of each drawn row, averaged over groups of neighbouring columns.
+///
+/// The light of a mean of pixels is the mean of their responses times the light that each row has sent. So averaging
+/// adds no error, and a fit takes as long for an image of 1280 columns as for one of 12.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Columns {
+    lit: Array2<bool>,
+    /// Image columns of each group.
+    groups: Vec<Range<usize>>,
+    /// `[row * groups + group]`.
+    cells: Vec<Cell>,
+    /// Cumulative responses, `[row * groups + group, rows]`.
+    cumulative: Array2<f64>,
+}
+
+/// The lit pixels of one camera row in one group of columns.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Cell {
+    /// Number of lit pixels; cells without any are never compared.
+    pub pixels: usize,
+    /// Mean place of the pixels in projector rows.
+    pub place: f64,
+    /// The first drawn row of the response.
+    first_row: i64,
+    /// Number of drawn rows in the response.
+    rows: usize,
+}
+
+impl Columns {
+    /// From each pixel's `place` in projector rows, NaN where it is unlit, and its `response` `[16, rows, columns]`:
+    /// the share of its light that drawn row `round(place) + d` sends, for `d` from -7 to 8.
+    ///
+    /// # Errors
+    /// [`PlaneError::Shape`] if the arrays do not fit together; [`PlaneError::OutOfRange`] for a response of a lit
+    /// pixel whose sum is not 1 to within 1 %, or for an image without lit pixels.
+    pub fn new(place: ArrayView2<f32>, response: ArrayView3<f32>) -> Result<Self, PlaneError> {
+        let (rows, columns) = place.dim();
+        check_shape("response", "[d, row, column]", response.shape(), &[RESPONSE_ROWS, rows, columns])?;
+        let lit = place.mapv(f32::is_finite);
+        if !lit.iter().any(|&lit| lit) {
+            return Err(PlaneError::OutOfRange {
+                field: "place",
+                value: f64::NAN,
+                allowed: "a projector row in at least one pixel: fill the view with the board",
+            });
+        }
+        let count = GROUPS.min(columns);
+        let groups: Vec<_> =
+            (0..count).map(|group| group * columns / count..(group + 1) * columns / count).collect();
+        let mut cells = Vec::with_capacity(rows * count);
+        let mut responses: Vec<Vec<f64>> = Vec::with_capacity(rows * count);
+        for row in 0..rows {
+            for group in &groups {
+                let pixels: Vec<usize> = group.clone().filter(|&column| lit[[row, column]]).collect();
+                let own_row = |column: usize| place[[row, column]].round() as i64;
+                let first = pixels.iter().map(|&column| own_row(column)).min().unwrap_or(0);
+                let last = pixels.iter().map(|&column| own_row(column)).max().unwrap_or(0);
+                let mut sum = vec![0.0; (last - first) as usize + RESPONSE_ROWS];
+                for &column in &pixels {
+                    let shift = (own_row(column) - first) as usize;
+                    let shares = pixel_response(response.slice(s![.., row, column]))?;
+                    sum[shift..].iter_mut().zip(shares).for_each(|(sum, share)| *sum += share);
+                }
+                let places = pixels.iter().map(|&column| f64::from(place[[row, column]]));
+                cells.push(Cell {
+                    pixels: pixels.len(),
+                    place: places.sum::<f64>() / pixels.len() as f64,
+                    first_row: first + FIRST_RESPONSE_ROW,
+                    rows: sum.len(),
+                });
+                responses.push(sum.iter().map(|sum| sum / pixels.len().max(1) as f64).collect());
+            }
+        }
+        let longest = responses.iter().map(Vec::len).max().unwrap_or(0);
+        let mut cumulative = Array2::zeros((cells.len(), longest + 1));
+        for (mut cumulative, response) in cumulative.outer_iter_mut().zip(&responses) {
+            for index in 0..longest {
+                cumulative[index + 1] = cumulative[index] + response.get(index).unwrap_or(&0.0);
+            }
+        }
+        Ok(Self { lit, groups, cells, cumulative })
+    }
+
+    /// The mean of an image over the lit pixels of each group, `[rows, groups]`; 0 where a group has none.
+    ///
+    /// # Errors
+    /// [`PlaneError::Shape`] if the image does not have the shape of the places; [`PlaneError::OutOfRange`] for a
+    /// lit pixel without a value.
+    pub fn average(&self, image: ArrayView2<f32>) -> Result<Array2<f32>, PlaneError> {
+        let (rows, columns) = self.lit.dim();
+        check_shape("image", "[row, column]", image.shape(), &[rows, columns])?;
+        let mut means = Array2::zeros((rows, self.groups.len()));
+        for ((row, group), mean) in means.indexed_iter_mut() {
+            let pixels = self.groups[group].clone().filter(|&column| self.lit[[row, column]]);
+            let sum: f64 = pixels.map(|column| f64::from(image[[row, column]])).sum();
+            if !sum.is_finite() {
+                return Err(PlaneError::OutOfRange {
+                    field: "light of a lit pixel",
+                    value: sum,
+                    allowed: "finite: give pixels without a value no place either",
+                });
+            }
+            *mean = (sum / self.cell(row, group).pixels.max(1) as f64) as f32;
+        }
+        Ok(means)
+    }
+
+    /// Number of camera rows.
+    pub fn rows(&self) -> usize {
+        self.lit.nrows()
+    }
+
+    /// Number of groups of columns, at most 12.
+    pub fn groups(&self) -> usize {
+        self.groups.len()
+    }
+
+    /// The projector rows nearest to the places of the image.
+    pub fn seen_rows(&self) -> Range<usize> {
+        let places = || self.cells.iter().filter(|cell| cell.pixels > 0).map(|cell| cell.place);
+        let (first, last) = (places().fold(f64::MAX, f64::min), places().fold(0.0, f64::max));
+        first.round().max(0.0) as usize..last.round() as usize + 1
+    }
+
+    pub(super) fn cell(&self, row: usize, group: usize) -> &Cell {
+        &self.cells[row * self.groups.len() + group]
+    }
+
+    /// Mean place of a camera row's lit pixels, if it has any.
+    pub(super) fn row_place(&self, row: usize) -> Option<f64> {
+        let cells = || (0..self.groups()).map(|group| self.cell(row, group)).filter(|cell| cell.pixels > 0);
+        let pixels: usize = cells().map(|cell| cell.pixels).sum();
+        let sum: f64 = cells().map(|cell| cell.place * cell.pixels as f64).sum();
+        (pixels > 0).then(|| sum / pixels as f64)
+    }
+
+    /// Mean of an averaged image over a camera row's lit pixels.
+    pub(super) fn row_mean(&self, light: &Array2<f32>, row: usize) -> f64 {
+        let (sum, pixels) = (0..self.groups()).fold((0.0, 0), |(sum, pixels), group| {
+            let cell = self.cell(row, group);
+            (sum + f64::from(light[[row, group]]) * cell.pixels as f64, pixels + cell.pixels)
+        });
+        sum / pixels as f64
+    }
+
+    /// The share of a cell's light that has been sent when `drawn` rows (with a fraction) have been drawn, and the
+    /// share that the row being drawn sends in all.
+    #[inline]
+    pub(super) fn light_before(&self, row: usize, group: usize, drawn: f64) -> (f64, f64) {
+        let index = row * self.groups.len() + group;
+        let cell = &self.cells[index];
+        let cumulative = self.cumulative.row(index);
+        let from_first = drawn - cell.first_row as f64;
+        if from_first <= 0.0 {
+            return (0.0, 0.0);
+        }
+        let whole = from_first as usize;
+        if whole >= cell.rows {
+            return (cumulative[cell.rows], 0.0);
+        }
+        let share = cumulative[whole + 1] - cumulative[whole];
+        (cumulative[whole] + (from_first - whole as f64) * share, share)
+    }
+}
+
+/// The response of one pixel, checked.
+fn pixel_response(response: ArrayView1<f32>) -> Result<[f64; RESPONSE_ROWS], PlaneError> {
+    let mut shares = [0.0; RESPONSE_ROWS];
+    shares.iter_mut().zip(response).for_each(|(share, &given)| *share = f64::from(given));
+    let sum: f64 = shares.iter().sum();
+    match (sum - 1.0).abs() < 0.01 {
+        true => Ok(shares),
+        false => Err(PlaneError::OutOfRange {
+            field: "sum of a lit pixel's response",
+            value: sum,
+            allowed: "1: divide each response by its sum, and mark pixels without one as unlit",
+        }),
+    }
+}

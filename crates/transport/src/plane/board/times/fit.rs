@@ -1,0 +1,719 @@
+use nalgebra::{DMatrix, DVector};
+
+use super::super::super::NoiseModel;
+use super::super::super::error::check_shape;
+use super::coarse::{Arrivals, Coarse, arrivals, median};
+use super::columns::Columns;
+use super::error::TimesError;
+use super::model::{Clocks, Comparison, Edge, Sums, Sweep};
+use super::result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
+use super::settings::{BoardFrame, Nominal, Shutter};
+use super::table::Table;
+
+/// What each frame's light may be late, before it is measured.
+const JITTER_PRIOR_US: f64 = 8.0;
+/// How far coefficients may be from their start, which only matters where no light is seen.
+const COEFFICIENT_PRIOR_US: f64 = 30.0;
+/// Weight of the squares of third differences of coefficients, per square microsecond.
+const SMOOTHNESS: f64 = 0.003;
+/// Largest step of a coefficient or of a frame's jitter.
+const STEP_US: f64 = 8.0;
+/// Steps below this end the fit.
+const CONVERGED_US: f64 = 0.02;
+const MAX_STEPS: usize = 20;
+/// First range of the search for a frame's jitter, the one used if the best value lies at its end, and its step.
+const SCAN_US: [f64; 2] = [40.0, 160.0];
+const SCAN_STEP_US: f64 = 4.0;
+/// Only every fourth camera row is compared in the search.
+const SCAN_ROWS: usize = 4;
+/// Frames whose jitter is farther from the median, in robust standard deviations, are dropped.
+const OUTLIER_SDS: f64 = 4.5;
+/// Frames whose chi^2 per sample exceeds both this value and this multiple of the median are dropped.
+const MISFIT: f64 = 9.0;
+/// A frame whose edges tell its jitter less well than this has none on the light.
+const NO_EDGE_SD_US: f64 = 2.0;
+/// Smallest jitter; smaller ones cannot be told from the noise.
+const LEAST_JITTER_US: f64 = 0.05;
+/// Limits of what is accepted.
+const MAX_CHI2_PER_SAMPLE: f64 = 3.0;
+const MAX_EXPOSURE_DIFFERENCE_US: f64 = 0.3;
+/// A difference of exposures is refused if it exceeds the limit by this many standard deviations.
+const DIFFERENCE_SDS: f64 = 3.0;
+/// What single exposures may differ from the others, while it is fixed and while it is fitted.
+const FIXED_US: f64 = 1e-4;
+const FREE_US: f64 = 20.0;
+/// Variance that a mode of the table may leave unexplained.
+const MODES_REST: f64 = 0.01;
+/// How much more a sweep may bend beyond the rows seen: the time by which it is early in its middle, as a share of it.
+const BEND: f64 = 0.02;
+
+impl RowTimes {
+    /// Fits the times of rows to single frames of the board. `noise` is that of a single pixel, in shares of white.
+    ///
+    /// # Errors
+    /// Any [`TimesError`] other than [`TimesError::Narrow`].
+    pub fn fit(
+        columns: &Columns,
+        frames: &[BoardFrame],
+        nominal: &Nominal,
+        noise: NoiseModel,
+    ) -> Result<Self, TimesError> {
+        noise.check()?;
+        let expected = [columns.rows(), columns.groups()];
+        for frame in frames {
+            check_shape("light of a frame", "[row, group]", frame.light.shape(), &expected)?;
+        }
+        let coarse = Coarse::from_borders(columns, frames, nominal)?;
+        let arrivals = arrivals(columns, frames)?;
+        let mut fit = Fit::start(columns, frames, nominal, noise, &coarse, &arrivals)?;
+        fit.scan_jitters();
+        fit.steps(3, false)?;
+        fit.scan_jitters();
+        fit.steps(MAX_STEPS, false)?;
+        fit.drop_outliers();
+        fit.steps(MAX_STEPS, false)?;
+        let jitter_us = fit.check_jitter()?;
+        let residuals = fit.check_residuals()?;
+        fit.check_order()?;
+        // From now on, samples and jitters weigh as much as they have turned out to scatter.
+        fit.jitter_prior_us = jitter_us.value.max(LEAST_JITTER_US);
+        fit.variance_scale = fit.chi2_per_sample();
+        fit.steps(MAX_STEPS, false)?;
+        fit.check_exposures()?;
+        fit.result(jitter_us, residuals)
+    }
+}
+
+/// A joint fit of the table, the clocks and the jitter of each frame, by Gauss-Newton steps.
+///
+/// Unknowns are the table's coefficients, then the camera's row time, the offset of the global mode, what exposures
+/// have more than nominal, and what each exposure other than the shortest rolling one has more than that.
+struct Fit<'a> {
+    columns: &'a Columns,
+    frames: &'a [BoardFrame],
+    nominal: &'a Nominal,
+    noise: NoiseModel,
+    table: Table,
+    /// Different exposures; the first is that of the arrivals.
+    exposures_us: Vec<f64>,
+    start: Vec<f64>,
+    unknowns: Vec<f64>,
+    late_us: Vec<f64>,
+    /// Inverse variance of each frame's jitter from its own light.
+    jitter_weight: Vec<f64>,
+    dropped: Vec<Option<Dropped>>,
+    jitter_prior_us: f64,
+    variance_scale: f64,
+}
+
+/// Normal equations without the jitters of frames, and what is needed to find those afterwards.
+struct Normal {
+    matrix: DMatrix<f64>,
+    right: DVector<f64>,
+    frames: Vec<FrameNormal>,
+}
+
+/// One frame's part of the normal equations.
+struct FrameNormal {
+    frame: usize,
+    mixed: DVector<f64>,
+    weight: f64,
+    right: f64,
+}
+
+impl<'a> Fit<'a> {
+    fn start(
+        columns: &'a Columns,
+        frames: &'a [BoardFrame],
+        nominal: &'a Nominal,
+        noise: NoiseModel,
+        coarse: &Coarse,
+        arrivals: &Arrivals,
+    ) -> Result<Self, TimesError> {
+        // Places of drawing and arrivals, by camera row.
+        let points: Vec<(f64, f64, f64)> = (0..columns.rows())
+            .filter_map(|row| Some((row as f64, columns.row_place(row)? + 0.5, arrivals.times_us[row]?)))
+            .collect();
+        // Sweep minus arrival = rows * camera row time - offset of the modes.
+        let lines: Vec<(f64, f64)> =
+            points.iter().map(|&(row, place, time_us)| (row, coarse.time_us(place) - time_us)).collect();
+        let (camera_row_us, at_row_0_us) = line(&lines);
+        let clocks =
+            [camera_row_us, -at_row_0_us, arrivals.exposure_offset_us];
+        let table = Table::new(nominal.projector_rows, &columns.seen_rows());
+        // The table through the arrivals; where there are none, through the sweep seen by global frames.
+        let count = table.coefficients;
+        let mut matrix = DMatrix::zeros(count, count);
+        let mut right = DVector::zeros(count);
+        let mut add = |row: f64, time_us: f64, weight: f64| {
+            let weights = DVector::from_vec(table.weights_at(row));
+            matrix.ger(weight, &weights, &weights, 1.0);
+            right.axpy(weight * time_us, &weights, 1.0);
+        };
+        points.iter().for_each(|&(row, place, time_us)| add(place, time_us + row * camera_row_us, 1.0));
+        for row in columns.seen_rows() {
+            add(row as f64, coarse.time_us(row as f64) + clocks[1], 1e-3);
+        }
+        add_third_differences(&mut matrix, &mut right, None, SMOOTHNESS);
+        let coefficients = matrix.cholesky().ok_or(TimesError::Undetermined)?.solve(&right);
+        let mut exposures_us = vec![arrivals.exposure_us];
+        for frame in frames {
+            if !exposures_us.contains(&frame.setting.exposure_us) {
+                exposures_us.push(frame.setting.exposure_us);
+            }
+        }
+        let mut unknowns: Vec<f64> = coefficients.iter().copied().chain(clocks).collect();
+        unknowns.resize(count + 2 + exposures_us.len(), 0.0);
+        Ok(Self {
+            columns,
+            frames,
+            nominal,
+            noise,
+            table,
+            exposures_us,
+            start: coefficients.as_slice().to_vec(),
+            unknowns,
+            late_us: vec![0.0; frames.len()],
+            jitter_weight: vec![0.0; frames.len()],
+            dropped: vec![None; frames.len()],
+            jitter_prior_us: JITTER_PRIOR_US,
+            variance_scale: 1.0,
+        })
+    }
+
+    fn coefficients(&self) -> &[f64] {
+        &self.unknowns[..self.table.coefficients]
+    }
+
+    fn sweep(&self) -> Sweep {
+        Sweep::new(self.table.starts_us(self.coefficients()), self.nominal.period_us)
+    }
+
+    fn comparison<'b>(&'b self, sweep: &'b Sweep) -> Comparison<'b> {
+        let clocks = &self.unknowns[self.table.coefficients..];
+        let clocks = Clocks {
+            camera_row_us: clocks[0],
+            mode_offset_us: clocks[1],
+            exposure_offset_us: clocks[2],
+        };
+        let (columns, noise, variance_scale) = (self.columns, self.noise, self.variance_scale);
+        Comparison { columns, sweep, clocks, noise, variance_scale }
+    }
+
+    /// The unknown that says what a frame's exposure has more than that of the arrivals, unless it is the same.
+    fn own_exposure(&self, frame: usize) -> Option<usize> {
+        let exposure_us = self.frames[frame].setting.exposure_us;
+        let index = self.exposures_us.iter().position(|&other_us| other_us == exposure_us);
+        index.filter(|&index| index > 0).map(|index| self.table.coefficients + 2 + index)
+    }
+
+    fn longer_us(&self, frame: usize) -> f64 {
+        self.own_exposure(frame).map_or(0.0, |unknown| self.unknowns[unknown])
+    }
+
+    fn used(&self) -> impl Iterator<Item = usize> {
+        (0..self.frames.len()).filter(|&frame| self.dropped[frame].is_none())
+    }
+
+    /// Finds the jitter of each frame alone: the best of equally spaced values, then a few steps.
+    fn scan_jitters(&mut self) {
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let late_us: Vec<(usize, f64)> =
+            self.used().map(|frame| (frame, self.scan_jitter(&comparison, frame))).collect();
+        late_us.into_iter().for_each(|(frame, late_us)| self.late_us[frame] = late_us);
+    }
+
+    fn scan_jitter(&self, comparison: &Comparison, frame: usize) -> f64 {
+        let longer_us = self.longer_us(frame);
+        let prior = self.jitter_prior_us.powi(-2);
+        let objective = |late_us: f64| {
+            let mut chi2 = late_us * late_us * prior;
+            comparison.visit(&self.frames[frame], (late_us, longer_us), (SCAN_ROWS, true), |_, _, _, sums| {
+                chi2 += sums.chi2;
+            });
+            chi2
+        };
+        let mut best_us = 0.0;
+        for range_us in SCAN_US {
+            let steps = (range_us / SCAN_STEP_US) as i32;
+            let values = (-steps..=steps).map(|step| f64::from(step) * SCAN_STEP_US);
+            let best = values
+                .map(|late_us| (late_us, objective(late_us)))
+                .fold((0.0, f64::MAX), |best, value| if value.1 < best.1 { value } else { best });
+            best_us = best.0;
+            if best_us.abs() < range_us - SCAN_STEP_US / 2.0 {
+                break;
+            }
+        }
+        for _ in 0..4 {
+            let (mut weight, mut right) = (prior, -best_us * prior);
+            comparison.visit(&self.frames[frame], (best_us, longer_us), (1, false), |_, _, _, sums| {
+                weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
+                right += sums.opening_residual - sums.closing_residual;
+            });
+            best_us += (right / weight).clamp(-STEP_US, STEP_US);
+        }
+        best_us
+    }
+
+    /// The normal equations at the present values. `free` frees the differences between exposures.
+    fn normal(&self, free: bool) -> Normal {
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let count = self.unknowns.len();
+        let coefficients = self.table.coefficients;
+        let mut matrix = DMatrix::zeros(count, count);
+        let mut right = DVector::zeros(count);
+        let mut frames = Vec::new();
+        let (mut opening_edge, mut closing_edge) = (Sparse::default(), Sparse::default());
+        for frame in self.used() {
+            let prior = self.jitter_prior_us.powi(-2);
+            let mut own = FrameNormal {
+                frame,
+                mixed: DVector::zeros(count),
+                weight: prior,
+                right: -self.late_us[frame] * prior,
+            };
+            let shutter = self.frames[frame].setting.shutter;
+            let own_exposure = self.own_exposure(frame);
+            let late = (self.late_us[frame], self.longer_us(frame));
+            comparison.visit(&self.frames[frame], late, (1, false), |row, opening, closing, sums| {
+                opening_edge.clear();
+                closing_edge.clear();
+                for (edge, place) in [(&mut opening_edge, opening), (&mut closing_edge, closing)] {
+                    edge.add_table(&self.table, place);
+                    match shutter {
+                        Shutter::Rolling => edge.push(coefficients, row as f64),
+                        Shutter::Global => edge.push(coefficients + 1, 1.0),
+                    }
+                }
+                closing_edge.push(coefficients + 2, 1.0);
+                if let Some(unknown) = own_exposure {
+                    closing_edge.push(unknown, 1.0);
+                }
+                own.add(&opening_edge, &closing_edge, sums, &mut matrix, &mut right);
+            });
+            matrix.ger(-own.weight.recip(), &own.mixed, &own.mixed, 1.0);
+            right.axpy(-own.right / own.weight, &own.mixed, 1.0);
+            frames.push(own);
+        }
+        for index in 0..coefficients {
+            let weight = COEFFICIENT_PRIOR_US.powi(-2);
+            matrix[(index, index)] += weight;
+            right[index] += weight * (self.start[index] - self.unknowns[index]);
+        }
+        add_third_differences(&mut matrix, &mut right, Some(self.coefficients()), SMOOTHNESS);
+        let weight = if free { FREE_US } else { FIXED_US }.powi(-2);
+        for index in coefficients + 3..count {
+            matrix[(index, index)] += weight;
+            right[index] -= weight * self.unknowns[index];
+        }
+        Normal { matrix, right, frames }
+    }
+
+    /// Joint steps until they are small, at most `limit`.
+    fn steps(&mut self, limit: usize, free: bool) -> Result<(), TimesError> {
+        for _ in 0..limit {
+            let Normal { matrix, right, frames } = self.normal(free);
+            let mut step = matrix.cholesky().ok_or(TimesError::Undetermined)?.solve(&right);
+            step.rows_mut(0, self.table.coefficients).apply(|step| *step = step.clamp(-STEP_US, STEP_US));
+            if step.iter().any(|step| !step.is_finite()) {
+                return Err(TimesError::Undetermined);
+            }
+            self.unknowns.iter_mut().zip(&step).for_each(|(unknown, step)| *unknown += step);
+            for FrameNormal { frame, mixed, weight, right } in &frames {
+                let late_us = (right - mixed.dot(&step)) / weight;
+                self.late_us[*frame] += late_us.clamp(-STEP_US, STEP_US);
+                self.jitter_weight[*frame] = weight - self.jitter_prior_us.powi(-2);
+            }
+            if step.rows(0, self.table.coefficients).amax() < CONVERGED_US {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// chi^2 and number of samples of a frame.
+    fn misfit(&self, comparison: &Comparison, frame: usize) -> (f64, f64) {
+        let (mut chi2, mut samples) = (0.0, 0.0);
+        let late = (self.late_us[frame], self.longer_us(frame));
+        comparison.visit(&self.frames[frame], late, (1, false), |_, _, _, sums| {
+            chi2 += sums.chi2;
+            samples += sums.samples;
+        });
+        (chi2, samples)
+    }
+
+    /// The frames of a shutter mode that are used, with their jitters.
+    fn jitters_of(&self, shutter: Shutter) -> Vec<(usize, f64)> {
+        self.used()
+            .filter(|&frame| self.frames[frame].setting.shutter == shutter)
+            .map(|frame| (frame, self.late_us[frame]))
+            .collect()
+    }
+
+    fn drop_outliers(&mut self) {
+        for frame in self.used().collect::<Vec<_>>() {
+            if self.jitter_weight[frame] < NO_EDGE_SD_US.powi(-2) {
+                self.dropped[frame] = Some(Dropped::NoEdge);
+            }
+        }
+        for shutter in [Shutter::Global, Shutter::Rolling] {
+            let jitters = self.jitters_of(shutter);
+            let middle_us = median(&mut jitters.iter().map(|jitter| jitter.1).collect::<Vec<_>>());
+            let mut away_us: Vec<f64> = jitters.iter().map(|jitter| (jitter.1 - middle_us).abs()).collect();
+            let sd_us = (1.4826 * median(&mut away_us)).max(0.5);
+            for (frame, late_us) in jitters {
+                if (late_us - middle_us).abs() > OUTLIER_SDS * sd_us {
+                    self.dropped[frame] = Some(Dropped::Late { late_us: late_us - middle_us });
+                }
+            }
+        }
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let misfits: Vec<(usize, f64)> = self
+            .used()
+            .map(|frame| {
+                let (chi2, samples) = self.misfit(&comparison, frame);
+                (frame, chi2 / samples.max(1.0))
+            })
+            .collect();
+        let usual = median(&mut misfits.iter().map(|misfit| misfit.1).collect::<Vec<_>>());
+        for (frame, chi2_per_sample) in misfits {
+            if chi2_per_sample > MISFIT * usual.max(1.0) {
+                self.dropped[frame] = Some(Dropped::Misfit { chi2_per_sample });
+            }
+        }
+    }
+
+    /// Standard deviation of the frames' jitters about the mean of their shutter mode.
+    fn check_jitter(&self) -> Result<Measured, TimesError> {
+        let (mut squares, mut count) = (0.0, 0.0);
+        for shutter in [Shutter::Global, Shutter::Rolling] {
+            let jitters = self.jitters_of(shutter);
+            let mean_us = jitters.iter().map(|jitter| jitter.1).sum::<f64>() / jitters.len() as f64;
+            squares += jitters.iter().map(|jitter| (jitter.1 - mean_us).powi(2)).sum::<f64>();
+            count += jitters.len() as f64 - 1.0;
+        }
+        if count < 1.0 {
+            return Err(TimesError::Undetermined);
+        }
+        let jitter_us = (squares / count).sqrt();
+        let limit_us = self.nominal.row_time_us / 2.0 + 20.0;
+        if jitter_us > limit_us {
+            return Err(TimesError::Jitter { jitter_us, limit_us });
+        }
+        Ok(Measured { value: jitter_us, sd: jitter_us / (2.0 * count).sqrt() })
+    }
+
+    fn check_residuals(&self) -> Result<Vec<Residual>, TimesError> {
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let mut residuals: Vec<Residual> = Vec::new();
+        for frame in self.used() {
+            let setting = self.frames[frame].setting;
+            let (chi2, samples) = self.misfit(&comparison, frame);
+            let same = |residual: &&mut Residual| {
+                residual.shutter == setting.shutter && residual.exposure_us == setting.exposure_us
+            };
+            match residuals.iter_mut().find(same) {
+                Some(residual) => {
+                    residual.frames += 1;
+                    residual.samples += samples as usize;
+                    residual.chi2_per_sample += chi2;
+                }
+                None => residuals.push(Residual {
+                    shutter: setting.shutter,
+                    exposure_us: setting.exposure_us,
+                    frames: 1,
+                    samples: samples as usize,
+                    chi2_per_sample: chi2,
+                }),
+            }
+        }
+        for residual in &mut residuals {
+            residual.chi2_per_sample /= residual.samples.max(1) as f64;
+        }
+        let worst = residuals.iter().max_by(|a, b| a.chi2_per_sample.total_cmp(&b.chi2_per_sample));
+        match worst {
+            Some(worst) if worst.chi2_per_sample > MAX_CHI2_PER_SAMPLE => Err(TimesError::Misfit {
+                chi2_per_sample: worst.chi2_per_sample,
+                limit: MAX_CHI2_PER_SAMPLE,
+                exposure_us: worst.exposure_us,
+            }),
+            _ => Ok(residuals),
+        }
+    }
+
+    fn chi2_per_sample(&self) -> f64 {
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let (chi2, samples) = self
+            .used()
+            .map(|frame| self.misfit(&comparison, frame))
+            .fold((0.0, 0.0), |sums, (chi2, samples)| (sums.0 + chi2, sums.1 + samples));
+        chi2 / f64::max(samples, 1.0)
+    }
+
+    fn check_order(&self) -> Result<(), TimesError> {
+        let starts_us = self.table.starts_us(self.coefficients());
+        let back = |row: &usize| starts_us[row + 1] <= starts_us[*row];
+        match self.columns.seen_rows().find(back) {
+            Some(row) => Err(TimesError::FoldsBack { row, back_us: starts_us[row] - starts_us[row + 1] }),
+            None => Ok(()),
+        }
+    }
+
+    /// Fits the length of each exposure, and refuses those that are longer than others by more than they should.
+    fn check_exposures(&self) -> Result<(), TimesError> {
+        let Normal { matrix, right, .. } = self.normal(true);
+        let cholesky = matrix.cholesky().ok_or(TimesError::Undetermined)?;
+        let (differences_us, covariance) = (cholesky.solve(&right), cholesky.inverse());
+        for (index, &exposure_us) in self.exposures_us.iter().enumerate().skip(1) {
+            let unknown = self.table.coefficients + 2 + index;
+            let difference_us = differences_us[unknown] + self.unknowns[unknown];
+            let sd_us = covariance[(unknown, unknown)].sqrt();
+            if difference_us.abs() > MAX_EXPOSURE_DIFFERENCE_US + DIFFERENCE_SDS * sd_us {
+                return Err(TimesError::Granular {
+                    exposure_us,
+                    reference_us: self.exposures_us[0],
+                    difference_us,
+                    sd_us,
+                    limit_us: MAX_EXPOSURE_DIFFERENCE_US,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    fn result(&self, jitter_us: Measured, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
+        let Normal { matrix, .. } = self.normal(false);
+        let covariance = matrix.cholesky().ok_or(TimesError::Undetermined)?.inverse();
+        let coefficients = self.table.coefficients;
+        let seen_rows = self.columns.seen_rows();
+        let unknown = |index: usize| {
+            let mut weights = DVector::zeros(self.unknowns.len());
+            weights[index] = 1.0;
+            weights
+        };
+        let start_of = |row: f64| {
+            let mut weights = DVector::zeros(self.unknowns.len());
+            weights.rows_mut(0, coefficients).copy_from_slice(&self.table.weights_at(row));
+            weights
+        };
+        let (first, end) = (seen_rows.start as f64, seen_rows.end as f64);
+        let row_time = (start_of(end) - start_of(first)) / (end - first);
+        let (camera_row, mode, exposure) =
+            (unknown(coefficients), unknown(coefficients + 1), unknown(coefficients + 2));
+        let lit: Vec<usize> =
+            (0..self.columns.rows()).filter(|&row| self.columns.row_place(row).is_some()).collect();
+        let middle = lit[lit.len() / 2];
+        let place = self.columns.row_place(middle).unwrap_or(first);
+        let latency = start_of(place + 0.5) - &camera_row * middle as f64;
+        let values = DVector::from_column_slice(&self.unknowns);
+        let measured = |weights: &DVector<f64>| Measured {
+            value: weights.dot(&values),
+            sd: weights.dot(&(&covariance * weights)).sqrt(),
+        };
+        let quantities = [&latency, &exposure, &camera_row, &row_time];
+        let products = quantities.map(|a| quantities.map(|b| a.dot(&(&covariance * b))));
+        let (row_starts_modes, row_starts_sd_us) = self.modes(&covariance)?;
+        let late_us = |shutter| {
+            let jitters = self.jitters_of(shutter);
+            jitters.iter().map(|jitter| jitter.1).sum::<f64>() / jitters.len() as f64
+        };
+        let means_us = (late_us(Shutter::Global), late_us(Shutter::Rolling));
+        let jitter = |frame: usize| {
+            let mean_us = match self.frames[frame].setting.shutter {
+                Shutter::Global => means_us.0,
+                Shutter::Rolling => means_us.1,
+            };
+            self.dropped[frame].is_none().then(|| FrameJitter {
+                late_us: self.late_us[frame] - mean_us,
+                sd_us: self.jitter_weight[frame].sqrt().recip(),
+            })
+        };
+        Ok(RowTimes {
+            row_starts_us: self.table.starts_us(self.coefficients()),
+            row_starts_sd_us,
+            row_starts_modes,
+            row_time_us: measured(&row_time),
+            camera_row_time_us: measured(&camera_row),
+            exposure_offset_us: measured(&exposure),
+            mode_offset_us: measured(&mode),
+            latency_sd_us: measured(&latency).sd,
+            covariance: products,
+            jitter_us,
+            jitters: (0..self.frames.len()).map(jitter).collect(),
+            useful_frames: self.jitters_of(Shutter::Rolling).len(),
+            residuals,
+            dropped: self
+                .dropped
+                .iter()
+                .enumerate()
+                .filter_map(|(frame, dropped)| Some((frame, (*dropped)?)))
+                .collect(),
+            seen_rows,
+        })
+    }
+
+    /// Modes of the covariance of the row starts, `[mode, row]`, and the standard deviations of the row starts.
+    fn modes(&self, covariance: &DMatrix<f64>) -> Result<(ndarray::Array2<f64>, Vec<f64>), TimesError> {
+        let rows = self.nominal.projector_rows + 1;
+        let count = self.table.coefficients;
+        let root = covariance.view((0, 0), (count, count)).clone_owned();
+        let root = root.cholesky().ok_or(TimesError::Undetermined)?.l();
+        let mut factor = DMatrix::zeros(rows, count);
+        for row in 0..rows {
+            let (first, weights) = self.table.weights(row);
+            for (index, weight) in weights.iter().enumerate() {
+                for column in 0..=first + index {
+                    factor[(row, column)] += weight * root[(first + index, column)];
+                }
+            }
+        }
+        // The covariance is factor * factor'. What its mean and its slope over the rows seen explain, is split off.
+        let seen = self.columns.seen_rows();
+        let length = seen.len() as f64 + 1.0;
+        let offset = DVector::from_fn(rows, |row, _| f64::from(row >= seen.start && row <= seen.end));
+        let middle = (seen.start + seen.end) as f64 / 2.0;
+        let slope = DVector::from_fn(rows, |row, _| offset[row] * (row as f64 - middle) / length);
+        let mut modes: Vec<DVector<f64>> = Vec::new();
+        let whole = factor.clone();
+        for direction in [offset, slope] {
+            let along = factor.tr_mul(&direction);
+            let along = &along / along.norm().max(f64::MIN_POSITIVE);
+            let mode = &factor * &along;
+            factor.ger(-1.0, &mode, &along, 1.0);
+            modes.push(mode);
+        }
+        // Beyond the rows seen, the sweep may bend: early by a share of the sweep in its middle is this curvature.
+        let curvature_us = 8.0 * BEND * self.nominal.row_time_us / self.nominal.projector_rows as f64;
+        let bend = |away: usize| curvature_us * (away as f64).powi(2) / 2.0;
+        modes.push(DVector::from_fn(rows, |row, _| bend(seen.start.saturating_sub(row))));
+        modes.push(DVector::from_fn(rows, |row, _| bend(row.saturating_sub(seen.end))));
+        let variance = |row: usize| {
+            whole.row(row).norm_squared() + modes[2][row].powi(2) + modes[3][row].powi(2)
+        };
+        let sd_us = (0..rows).map(|row| variance(row).sqrt()).collect();
+        // Beyond the rows seen, the largest modes would be those of the extrapolation, which the bend covers.
+        let inside = factor.rows(seen.start, seen.len() + 1).clone_owned();
+        let eigen = inside.tr_mul(&inside).symmetric_eigen();
+        let mut order: Vec<usize> = (0..count).collect();
+        order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+        let mut rest: f64 = eigen.eigenvalues.iter().sum();
+        let enough = MODES_REST * whole.rows(seen.start, seen.len() + 1).norm_squared();
+        for index in order {
+            if rest <= enough {
+                break;
+            }
+            rest -= eigen.eigenvalues[index];
+            modes.push(&factor * eigen.eigenvectors.column(index));
+        }
+        let modes = ndarray::Array2::from_shape_fn((modes.len(), rows), |(mode, row)| modes[mode][row]);
+        Ok((modes, sd_us))
+    }
+}
+
+impl FrameNormal {
+    /// Adds the samples of one camera row. The light is `closing` minus `opening`, and late light is an early edge.
+    fn add(
+        &mut self,
+        opening: &Sparse,
+        closing: &Sparse,
+        sums: &Sums,
+        matrix: &mut DMatrix<f64>,
+        right: &mut DVector<f64>,
+    ) {
+        for &(a, x) in opening.entries() {
+            opening.entries().iter().for_each(|&(b, y)| matrix[(b, a)] += sums.opening_square * x * y);
+            for &(b, y) in closing.entries() {
+                matrix[(b, a)] -= sums.mixed * x * y;
+                matrix[(a, b)] -= sums.mixed * x * y;
+            }
+            right[a] -= sums.opening_residual * x;
+            self.mixed[a] -= (sums.opening_square - sums.mixed) * x;
+        }
+        for &(a, x) in closing.entries() {
+            closing.entries().iter().for_each(|&(b, y)| matrix[(b, a)] += sums.closing_square * x * y);
+            right[a] += sums.closing_residual * x;
+            self.mixed[a] -= (sums.closing_square - sums.mixed) * x;
+        }
+        self.weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
+        self.right += sums.opening_residual - sums.closing_residual;
+    }
+}
+
+/// Derivative of an edge's time, relative to the light, to the unknowns.
+#[derive(Default)]
+struct Sparse {
+    entries: [(usize, f64); 12],
+    count: usize,
+}
+
+impl Sparse {
+    fn clear(&mut self) {
+        self.count = 0;
+    }
+
+    fn push(&mut self, unknown: usize, value: f64) {
+        self.entries[self.count] = (unknown, value);
+        self.count += 1;
+    }
+
+    fn entries(&self) -> &[(usize, f64)] {
+        &self.entries[..self.count]
+    }
+
+    /// The light is late by the table at the place that is being drawn at the edge, not at the pixel's place.
+    fn add_table(&mut self, table: &Table, edge: &Edge) {
+        for (row, share) in [(edge.row, 1.0 - edge.fraction), (edge.row + 1, edge.fraction)] {
+            let (first, weights) = table.weights(row);
+            weights.iter().enumerate().for_each(|(index, weight)| self.push(first + index, -share * weight));
+        }
+    }
+}
+
+/// Slope, and value at 0, of a line through points; robust against outliers.
+fn line(points: &[(f64, f64)]) -> (f64, f64) {
+    let mut fitted = (0.0, 0.0);
+    let mut scatter = f64::MAX;
+    for _ in 0..10 {
+        let mut sums = [0.0; 5];
+        for &(x, y) in points {
+            let away = (y - fitted.0 * x - fitted.1).abs();
+            let weight = if away > 3.0 * scatter { 0.0 } else { 1.0 };
+            let terms = [weight, weight * x, weight * y, weight * x * x, weight * x * y];
+            sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+        }
+        let [n, x, y, xx, xy] = sums;
+        let slope = (n * xy - x * y) / (n * xx - x * x);
+        fitted = (slope, (y - slope * x) / n);
+        let mut away: Vec<f64> = points.iter().map(|&(x, y)| (y - fitted.0 * x - fitted.1).abs()).collect();
+        scatter = 1.4826 * median(&mut away) + 1e-9;
+    }
+    fitted
+}
+
+/// Adds the squares of third differences of the coefficients, which begin at `values`, to normal equations.
+fn add_third_differences(
+    matrix: &mut DMatrix<f64>,
+    right: &mut DVector<f64>,
+    values: Option<&[f64]>,
+    weight: f64,
+) {
+    const DIFFERENCE: [f64; 4] = [-1.0, 3.0, -3.0, 1.0];
+    let count = values.map_or(matrix.nrows(), <[f64]>::len);
+    for first in 0..count - 3 {
+        let value: f64 = values.map_or(0.0, |values| {
+            DIFFERENCE.iter().zip(&values[first..]).map(|(difference, value)| difference * value).sum()
+        });
+        for (a, x) in DIFFERENCE.iter().enumerate() {
+            for (b, y) in DIFFERENCE.iter().enumerate() {
+                matrix[(first + a, first + b)] += weight * x * y;
+            }
+            right[first + a] -= weight * x * value;
+        }
+    }
+}

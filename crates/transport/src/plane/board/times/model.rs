@@ -1,0 +1,156 @@
+use super::super::super::NoiseModel;
+use super::columns::Columns;
+use super::settings::{BoardFrame, Shutter};
+
+/// Variance of a share of light that the model does not explain: brightness of single rows, errors of responses.
+const MODEL_VARIANCE: f64 = 0.006 * 0.006;
+/// Residuals beyond this many standard deviations count less.
+const ROBUST_SDS: f64 = 4.0;
+/// Shortest dwell of a row in a table that folds back while it is being fitted, as a share of the mean.
+const LEAST_DWELL: f64 = 0.02;
+
+/// Times that all frames share, besides the table.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Clocks {
+    pub camera_row_us: f64,
+    pub mode_offset_us: f64,
+    pub exposure_offset_us: f64,
+}
+
+/// A table of row starts, repeated every period, in which edges are looked up.
+pub(super) struct Sweep {
+    starts_us: Vec<f64>,
+    period_us: f64,
+}
+
+/// Where the drawing stands at an edge of an exposure.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Edge {
+    /// The row being drawn, and the fraction of it that has been drawn.
+    pub row: usize,
+    pub fraction: f64,
+    /// Rows drawn per microsecond; 0 while nothing is drawn.
+    rows_per_us: f64,
+    /// Whole periods drawn before.
+    periods: f64,
+}
+
+/// Sums over the samples of a camera row in one frame, for the normal equations. Derivatives are those to the times of
+/// the opening edge (which takes light away) and the closing edge.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Sums {
+    pub chi2: f64,
+    pub samples: f64,
+    pub opening_square: f64,
+    pub mixed: f64,
+    pub closing_square: f64,
+    pub opening_residual: f64,
+    pub closing_residual: f64,
+}
+
+impl Sweep {
+    pub fn new(mut starts_us: Vec<f64>, period_us: f64) -> Self {
+        let rows = starts_us.len() - 1;
+        let least_us = LEAST_DWELL * (starts_us[rows] - starts_us[0]).max(0.0) / rows as f64 + 1e-9;
+        for row in 0..rows {
+            starts_us[row + 1] = starts_us[row + 1].max(starts_us[row] + least_us);
+        }
+        Self { starts_us, period_us }
+    }
+
+    /// The edge at a time. `near` is a row at which to begin the search.
+    fn edge(&self, time_us: f64, near: usize) -> Edge {
+        let rows = self.starts_us.len() - 1;
+        let periods = ((time_us - self.starts_us[0]) / self.period_us).floor();
+        let time_us = time_us - periods * self.period_us;
+        if time_us >= self.starts_us[rows] {
+            return Edge { row: rows - 1, fraction: 1.0, rows_per_us: 0.0, periods };
+        }
+        let mut row = near.min(rows - 1);
+        while self.starts_us[row] > time_us {
+            row -= 1;
+        }
+        while self.starts_us[row + 1] <= time_us {
+            row += 1;
+        }
+        let rows_per_us = (self.starts_us[row + 1] - self.starts_us[row]).recip();
+        Edge { row, fraction: (time_us - self.starts_us[row]) * rows_per_us, rows_per_us, periods }
+    }
+}
+
+/// Compares frames with the light that a sweep sends.
+pub(super) struct Comparison<'a> {
+    pub columns: &'a Columns,
+    pub sweep: &'a Sweep,
+    pub clocks: Clocks,
+    pub noise: NoiseModel,
+    /// Factor on the variances of samples.
+    pub variance_scale: f64,
+}
+
+impl Comparison<'_> {
+    /// Visits every `step`th camera row of a frame whose light is late by `late_us` and whose exposure is `longer_us`
+    /// longer than that of other frames. Only samples that an edge meets count, or all of them with `everywhere`.
+    pub fn visit(
+        &self,
+        frame: &BoardFrame,
+        (late_us, longer_us): (f64, f64),
+        (step, everywhere): (usize, bool),
+        mut visitor: impl FnMut(usize, &Edge, &Edge, &Sums),
+    ) {
+        let setting = frame.setting;
+        let exposure_us = setting.exposure_us + self.clocks.exposure_offset_us + longer_us;
+        let (mut opening, mut closing) = (self.sweep.edge(-late_us, 0), self.sweep.edge(-late_us, 0));
+        for row in (0..self.columns.rows()).step_by(step) {
+            let starts_us = match setting.shutter {
+                Shutter::Global => self.clocks.mode_offset_us,
+                Shutter::Rolling => row as f64 * self.clocks.camera_row_us,
+            };
+            let from_us = setting.delay_us + starts_us - late_us;
+            opening = self.sweep.edge(from_us, opening.row);
+            closing = self.sweep.edge(from_us + exposure_us, closing.row);
+            let sums = self.compare(frame, row, &opening, &closing, everywhere);
+            if sums.samples > 0.0 {
+                visitor(row, &opening, &closing, &sums);
+            }
+        }
+    }
+
+    fn compare(
+        &self,
+        frame: &BoardFrame,
+        row: usize,
+        opening: &Edge,
+        closing: &Edge,
+        everywhere: bool,
+    ) -> Sums {
+        let mut sums = Sums::default();
+        let (opening_row, closing_row) =
+            (opening.row as f64 + opening.fraction, closing.row as f64 + closing.fraction);
+        for group in 0..self.columns.groups() {
+            let pixels = self.columns.cell(row, group).pixels;
+            if pixels == 0 {
+                continue;
+            }
+            let (before, opening_share) = self.columns.light_before(row, group, opening_row);
+            let (until, closing_share) = self.columns.light_before(row, group, closing_row);
+            let (a, b) = (opening_share * opening.rows_per_us, closing_share * closing.rows_per_us);
+            if !everywhere && a == 0.0 && b == 0.0 {
+                continue;
+            }
+            let light = until - before + closing.periods - opening.periods;
+            let residual = f64::from(frame.light[[row, group]]) - light;
+            let variance = (self.noise.variance(light, pixels) + MODEL_VARIANCE) * self.variance_scale;
+            let chi2 = residual * residual / variance;
+            let weight = (ROBUST_SDS / chi2.sqrt().max(ROBUST_SDS)) / variance;
+            sums.chi2 += chi2;
+            sums.samples += 1.0;
+            sums.opening_square += weight * a * a;
+            sums.mixed += weight * a * b;
+            sums.closing_square += weight * b * b;
+            sums.opening_residual += weight * a * residual;
+            sums.closing_residual += weight * b * residual;
+        }
+        sums
+    }
+}

@@ -1,0 +1,102 @@
+use std::ops::Range;
+
+/// Rows from one knot to the next.
+const KNOT_ROWS: usize = 8;
+/// Rows beyond those seen that the spline covers, because their light reaches them.
+const BORDER_ROWS: usize = 4;
+
+/// The table of row starts as a cubic B-spline over the rows seen, continued with its outermost slopes.
+#[derive(Debug, Clone)]
+pub(super) struct Table {
+    /// Number of coefficients.
+    pub coefficients: usize,
+    /// For each row start, the first of four coefficients and their weights.
+    weights: Vec<(usize, [f64; 4])>,
+}
+
+impl Table {
+    pub fn new(projector_rows: usize, seen_rows: &Range<usize>) -> Self {
+        let first = seen_rows.start.saturating_sub(BORDER_ROWS);
+        let end = (seen_rows.end + BORDER_ROWS).min(projector_rows);
+        let intervals = (end - first).div_ceil(KNOT_ROWS);
+        let weights = (0..=projector_rows).map(|row| {
+            let inside = row.clamp(first, end);
+            let interval = ((inside - first) / KNOT_ROWS).min(intervals - 1);
+            let x = (inside - first) as f64 / KNOT_ROWS as f64 - interval as f64;
+            let rest = (row as f64 - inside as f64) / KNOT_ROWS as f64;
+            let (value, slope) = (basis(x), basis_slope(x));
+            (interval, std::array::from_fn(|index| value[index] + rest * slope[index]))
+        });
+        Self { coefficients: intervals + 3, weights: weights.collect() }
+    }
+
+    /// The first of the four coefficients on which a row's start depends, and their weights.
+    #[inline]
+    pub fn weights(&self, row: usize) -> (usize, &[f64; 4]) {
+        let (first, weights) = &self.weights[row];
+        (*first, weights)
+    }
+
+    /// Start of each row, and end of the last.
+    pub fn starts_us(&self, coefficients: &[f64]) -> Vec<f64> {
+        let start = |(first, weights): &(usize, [f64; 4])| {
+            weights.iter().zip(&coefficients[*first..]).map(|(weight, value)| weight * value).sum()
+        };
+        self.weights.iter().map(start).collect()
+    }
+
+    /// Weights of all coefficients in the start of a row, or of a fraction of it.
+    pub fn weights_at(&self, row: f64) -> Vec<f64> {
+        let whole = (row.max(0.0) as usize).min(self.weights.len() - 2);
+        let fraction = row - whole as f64;
+        let mut sum = vec![0.0; self.coefficients];
+        for (row, share) in [(whole, 1.0 - fraction), (whole + 1, fraction)] {
+            let (first, weights) = self.weights(row);
+            sum[first..].iter_mut().zip(weights).for_each(|(sum, weight)| *sum += share * weight);
+        }
+        sum
+    }
+}
+
+/// Values of the four cubic B-splines that overlap an interval, at `x` in 0..=1.
+fn basis(x: f64) -> [f64; 4] {
+    let y = 1.0 - x;
+    [
+        y * y * y / 6.0,
+        (3.0 * x * x * x - 6.0 * x * x + 4.0) / 6.0,
+        (3.0 * y * y * y - 6.0 * y * y + 4.0) / 6.0,
+        x * x * x / 6.0,
+    ]
+}
+
+/// Derivatives of [`basis`].
+fn basis_slope(x: f64) -> [f64; 4] {
+    let y = 1.0 - x;
+    [-y * y / 2.0, (3.0 * x * x - 4.0 * x) / 2.0, (4.0 * y - 3.0 * y * y) / 2.0, x * x / 2.0]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_straight_table_stays_straight_beyond_the_rows_seen() {
+        let table = Table::new(720, &(296..424));
+        // Coefficient k belongs to row 292 + 8 (k - 1).
+        let coefficients: Vec<f64> =
+            (0..table.coefficients).map(|k| 22.22 * (292.0 + 8.0 * (k as f64 - 1.0))).collect();
+        for (row, start_us) in table.starts_us(&coefficients).iter().enumerate() {
+            assert!((start_us - 22.22 * row as f64).abs() < 1e-9, "row {row}: {start_us}");
+        }
+    }
+
+    #[test]
+    fn slopes_are_derivatives() {
+        for x in [0.1, 0.5, 0.93] {
+            let (above, below, slope) = (basis(x + 1e-6), basis(x - 1e-6), basis_slope(x));
+            for index in 0..4 {
+                assert!(((above[index] - below[index]) / 2e-6 - slope[index]).abs() < 1e-8, "{x} {index}");
+            }
+        }
+    }
+}
