@@ -1,1 +1,0 @@
-//! Properties of each pixel from images of the board.

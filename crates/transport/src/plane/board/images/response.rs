@@ -1,0 +1,451 @@
+use std::fmt;
+use std::ops::RangeInclusive;
+
+use ndarray::{Array2, Array3, ArrayView1, Axis};
+use rayon::prelude::*;
+
+use super::place::{PHASES, Phases, Places};
+use super::{Estimate, ImagesError, WhiteMap, check_frames, check_shape, median};
+
+/// The drawn rows of a response, relative to the row nearest to the pixel's place.
+pub const RESPONSE_ROWS: RangeInclusive<i32> = -7..=8;
+
+/// A pixel's own row is at this index of its response.
+const OWN: i32 = -*RESPONSE_ROWS.start();
+/// Counts are averaged over this many camera rows above and below.
+const REACH_ROWS: usize = 10;
+/// Counts are averaged over at most this many columns to the left and right.
+const REACH_COLUMNS: usize = 4;
+/// Pixels are averaged whose places differ by whole rows to within this.
+const MOST_SHIFT_ROWS: f32 = 0.05;
+/// The sum of the pictures may differ from white by this share.
+const MOST_SUM_ERROR: f64 = 0.02;
+/// Share of the pixels that may see two separate peaks.
+const MOST_TWO_PEAKS: f64 = 0.05;
+/// A second peak has this share of the first, and light between them falls to `VALLEY` of the second.
+const SECOND_PEAK: f32 = 0.2;
+const VALLEY: f32 = 0.7;
+/// Rows within which light of a row is near.
+const NEAR_ROWS: i32 = 6;
+/// Share of a row's light that may lie beyond [`NEAR_ROWS`].
+const MOST_FAR_LIGHT: f64 = 0.01;
+
+/// How each pixel responds to the projector's rows: the share of its direct light that each drawn row sends.
+///
+/// The response's centroid is the pixel's place: a shift of one against the other cannot be seen. At the border of the
+/// projector's picture, rows that do not exist have no share, and the place is that of the complete response.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Responses {
+    /// Place in projector rows, `[t, s]`; NaN where unlit.
+    pub place: Array2<f32>,
+    /// Its standard deviation, `[t, s]`.
+    pub place_sd: Array2<f32>,
+    /// Share of row `round(place) + d` for each `d` of [`RESPONSE_ROWS`], `[16, t, s]`. Sums to 1; NaN where unlit.
+    pub response: Array3<f32>,
+    /// Its standard deviation, `[16, t, s]`.
+    pub response_sd: Array3<f32>,
+    /// What the images say about projector and board.
+    pub checks: ResponseChecks,
+}
+
+/// Figures that show whether the projector draws its picture row by row, and the board is sharp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ResponseChecks {
+    /// Median of the sum of the 16 pictures over white: 1.
+    pub sum_of_phases: f64,
+    /// Share of the pixels that see two separate peaks: 0.
+    pub two_peaks: f64,
+    /// Median share of a row's light beyond 6 rows: 0.
+    pub far_light: f64,
+    /// Root mean square difference of single pixels' places from the smooth map.
+    pub place_rms_rows: f64,
+}
+
+impl ResponseChecks {
+    /// Refuses a projector or a board that is of no use for calibration.
+    ///
+    /// # Errors
+    /// [`ImagesError::SumOfPhases`] beyond 2 %, [`ImagesError::TwoPeaks`] above 5 % of the pixels,
+    /// [`ImagesError::FarLight`] above 1 %.
+    pub fn check(&self) -> Result<(), ImagesError> {
+        // A NaN, for want of lit pixels, is refused too.
+        let within = (self.sum_of_phases - 1.0).abs() <= MOST_SUM_ERROR;
+        if !within {
+            let (sum, limit) = (self.sum_of_phases, MOST_SUM_ERROR);
+            return Err(ImagesError::SumOfPhases { pictures: PHASES, sum, limit });
+        }
+        if self.two_peaks > MOST_TWO_PEAKS {
+            return Err(ImagesError::TwoPeaks { share: self.two_peaks, limit: MOST_TWO_PEAKS });
+        }
+        if self.far_light > MOST_FAR_LIGHT {
+            return Err(ImagesError::FarLight { share: self.far_light, limit: MOST_FAR_LIGHT });
+        }
+        Ok(())
+    }
+}
+
+impl Responses {
+    /// Averages the counts of each row over pixels with the same fraction of a row, within 10 camera rows and 4
+    /// columns, and divides by their sum. Standard deviations are those of the scatter between the camera rows, so
+    /// that they contain the unevenness of the projector's rows as well as noise.
+    ///
+    /// # Errors
+    /// [`ImagesError::Shape`], [`ImagesError::TooFew`] if no pixel has neighbours to average with. The checks are
+    /// separate: see [`ResponseChecks::check`].
+    pub fn new(
+        phases: &Phases,
+        white: &WhiteMap,
+        places: &Places,
+        projector_rows: usize,
+    ) -> Result<Self, ImagesError> {
+        let shape = places.place.dim();
+        let (rows, columns) = shape;
+        check_frames(phases.frames, 1)?;
+        check_shape("phases", "[pictures, t, s]", phases.images.shape(), &[PHASES, rows, columns])?;
+        check_shape("white_dn", "[t, s]", white.white_dn.shape(), &[rows, columns])?;
+        let window = Window { light: by_pixel(phases), place: &places.place, projector_rows };
+        let mut place = Array2::from_elem(shape, f32::NAN);
+        let mut place_sd = place.clone();
+        let mut response = Array3::from_elem((PHASES, rows, columns), f32::NAN);
+        let mut response_sd = response.clone();
+        place
+            .axis_iter_mut(Axis(0))
+            .into_par_iter()
+            .zip(place_sd.axis_iter_mut(Axis(0)))
+            .zip(response.axis_iter_mut(Axis(1)).into_par_iter().zip(response_sd.axis_iter_mut(Axis(1))))
+            .enumerate()
+            .for_each(|(t, ((mut place, mut place_sd), (mut response, mut response_sd)))| {
+                for s in 0..columns {
+                    if let Some(pixel) = window.pixel(t, s) {
+                        place[s] = pixel.place;
+                        place_sd[s] = pixel.place_sd;
+                        response.column_mut(s).assign(&ArrayView1::from(&pixel.response));
+                        response_sd.column_mut(s).assign(&ArrayView1::from(&pixel.response_sd));
+                    }
+                }
+            });
+        if place.iter().all(|place| place.is_nan()) {
+            let what = "lit pixels with lit neighbours";
+            let cure = "fill the view with the board";
+            return Err(ImagesError::TooFew { what, given: 0, needed: 1, cure });
+        }
+        let checks = ResponseChecks {
+            sum_of_phases: sum_of_phases(&window, white),
+            place_rms_rows: places.rms,
+            ..checks(&response)
+        };
+        Ok(Self { place, place_sd, response, response_sd, checks })
+    }
+
+    /// Second central moment of a pixel's response, in rows^2; NaN where unlit.
+    fn second_moment(&self, t: usize, s: usize) -> f64 {
+        let [mut first, mut second] = [0.0; 2];
+        for (&share, d) in self.response.slice(ndarray::s![.., t, s]).iter().zip(RESPONSE_ROWS) {
+            first += f64::from(share) * f64::from(d);
+            second += f64::from(share) * f64::from(d).powi(2);
+        }
+        second - first * first
+    }
+}
+
+/// The pictures with the light of one pixel together, `[t, s, 16]`.
+fn by_pixel(phases: &Phases) -> Array3<f32> {
+    let (_, rows, columns) = phases.images.dim();
+    let mut light = Array3::zeros((rows, columns, PHASES));
+    light.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
+        for (phase, image) in phases.images.axis_iter(Axis(0)).enumerate() {
+            light.column_mut(phase).assign(&image.index_axis(Axis(0), t));
+        }
+    });
+    light
+}
+
+/// What a pixel's response is averaged from.
+struct Window<'a> {
+    /// `[t, s, 16]`.
+    light: Array3<f32>,
+    place: &'a Array2<f32>,
+    projector_rows: usize,
+}
+
+struct Pixel {
+    place: f32,
+    place_sd: f32,
+    response: [f32; PHASES],
+    response_sd: [f32; PHASES],
+}
+
+/// Counts of one camera row's pixels, by relative row.
+#[derive(Clone, Copy)]
+struct RowSum {
+    counts: [f32; PHASES],
+    pixels: f32,
+    /// Projector row that corresponds to the pixel's own.
+    own_row: i32,
+}
+
+impl Window<'_> {
+    fn pixel(&self, t: usize, s: usize) -> Option<Pixel> {
+        let place = self.place[[t, s]];
+        if place.is_nan() {
+            return None;
+        }
+        let own_row = place.round() as i32;
+        let mut sums = [RowSum { counts: [0.0; PHASES], pixels: 0.0, own_row }; 2 * REACH_ROWS + 1];
+        let mut used = 0;
+        for row in t.saturating_sub(REACH_ROWS)..(t + REACH_ROWS + 1).min(self.place.nrows()) {
+            if let Some(sum) = self.row(row, s, place) {
+                sums[used] = sum;
+                used += 1;
+            }
+        }
+        // A single camera row has no scatter to judge by.
+        (used > 1).then(|| self.average(&sums[..used], own_row)).flatten()
+    }
+
+    /// The pixels of a camera row whose places differ from `place` by a whole number of rows.
+    fn row(&self, t: usize, s: usize, place: f32) -> Option<RowSum> {
+        let columns = s.saturating_sub(REACH_COLUMNS)..(s + REACH_COLUMNS + 1).min(self.place.ncols());
+        let mut by_phase = [0.0; PHASES];
+        let (mut pixels, mut steps) = (0, 0.0);
+        let places = self.place.row(t);
+        for column in columns {
+            let difference = places[column] - place;
+            let whole = difference.round();
+            // NaN, which stands for an unlit pixel, fails.
+            let same = (difference - whole).abs() <= MOST_SHIFT_ROWS && (pixels == 0 || whole == steps);
+            if same {
+                steps = whole;
+                pixels += 1;
+                let light = self.light.slice(ndarray::s![t, column, ..]);
+                let light = light.to_slice()?.first_chunk::<PHASES>()?;
+                for (sum, light) in by_phase.iter_mut().zip(light) {
+                    *sum += light;
+                }
+            }
+        }
+        let own_row = place.round() as i32 + steps as i32;
+        let counts = std::array::from_fn(|index| by_phase[phase(own_row + index as i32 - OWN)]);
+        (pixels > 0).then_some(RowSum { counts, pixels: pixels as f32, own_row })
+    }
+
+    fn exists(&self, row: i32) -> bool {
+        (0..self.projector_rows as i32).contains(&row)
+    }
+
+    fn average(&self, sums: &[RowSum], own_row: i32) -> Option<Pixel> {
+        // At the border of the picture, a relative row is averaged over those pixels only for which it is drawn.
+        let drawn = |sum: &RowSum, index: usize| self.exists(sum.own_row + index as i32 - OWN);
+        let (mut counts, mut pixels) = ([0.0; PHASES], [0.0; PHASES]);
+        for sum in sums {
+            for index in (0..PHASES).filter(|&index| drawn(sum, index)) {
+                counts[index] += sum.counts[index];
+                pixels[index] += sum.pixels;
+            }
+        }
+        let mean: [f32; PHASES] =
+            std::array::from_fn(
+                |index| if pixels[index] > 0.0 { counts[index] / pixels[index] } else { 0.0 },
+            );
+        let total: f32 = mean.iter().sum();
+        if total.is_nan() || total <= 0.0 {
+            return None;
+        }
+        let share = mean.map(|mean| mean / total);
+        let centroid: f32 = share.iter().zip(RESPONSE_ROWS).map(|(share, d)| share * d as f32).sum();
+        // What each camera row contributes to the deviation of each share, and of the centroid.
+        let (mut squares, mut centroid_squares) = ([0.0; PHASES], 0.0);
+        for sum in sums {
+            let mut deviation = [0.0; PHASES];
+            for index in (0..PHASES).filter(|&index| drawn(sum, index)) {
+                deviation[index] = (sum.counts[index] - mean[index] * sum.pixels) / (pixels[index] * total);
+            }
+            let common: f32 = deviation.iter().sum();
+            let mut moment = 0.0;
+            for (index, d) in RESPONSE_ROWS.enumerate() {
+                squares[index] += (deviation[index] - share[index] * common).powi(2);
+                moment += deviation[index] * (d as f32 - centroid);
+            }
+            centroid_squares += moment * moment;
+        }
+        let degrees = (sums.len() - 1) as f32;
+        // Few rows underestimate the scatter half of the time: the factor makes 68 % of the errors smaller (Student).
+        let factor = ((degrees + 1.0) / degrees).sqrt() * (1.0 + 0.55 / degrees);
+        let place = own_row as f32 + centroid;
+        // The response refers to the row nearest to the new place.
+        let moved = place.round() as i32 - own_row;
+        let turned = |values: &[f32; PHASES]| -> [f32; PHASES] {
+            std::array::from_fn(|index| values[phase(index as i32 + moved)])
+        };
+        let mut response = turned(&share);
+        for (share, d) in response.iter_mut().zip(RESPONSE_ROWS) {
+            if !self.exists(own_row + moved + d) {
+                *share = 0.0;
+            }
+        }
+        let kept: f32 = response.iter().sum();
+        Some(Pixel {
+            place,
+            place_sd: factor * centroid_squares.sqrt(),
+            response: response.map(|share| share / kept),
+            response_sd: turned(&squares).map(|square| factor * square.sqrt() / kept),
+        })
+    }
+}
+
+/// The picture in which a row is lit.
+fn phase(row: i32) -> usize {
+    row.rem_euclid(PHASES as i32) as usize
+}
+
+fn sum_of_phases(window: &Window, white: &WhiteMap) -> f64 {
+    let pixels = white.white_dn.indexed_iter().filter(|(at, _)| !window.place[*at].is_nan());
+    let ratios = pixels.map(|((t, s), &white)| {
+        let sum: f32 = window.light.slice(ndarray::s![t, s, ..]).iter().sum();
+        f64::from(sum / white)
+    });
+    let mut ratios: Vec<f64> = ratios.filter(|ratio| ratio.is_finite()).collect();
+    median(&mut ratios).unwrap_or(f64::NAN)
+}
+
+/// Shares of pixels with two peaks, and of far light.
+fn checks(response: &Array3<f32>) -> ResponseChecks {
+    let mut far = Vec::new();
+    let mut two_peaks = 0;
+    for shares in response.lanes(Axis(0)) {
+        if shares[0].is_nan() {
+            continue;
+        }
+        let beyond = shares.iter().zip(RESPONSE_ROWS).filter(|(_, d)| d.abs() > NEAR_ROWS);
+        far.push(beyond.map(|(&share, _)| f64::from(share)).sum());
+        two_peaks += usize::from(has_two_peaks(shares));
+    }
+    let two_peaks = two_peaks as f64 / far.len().max(1) as f64;
+    let far_light = median(&mut far).unwrap_or(f64::NAN);
+    ResponseChecks { sum_of_phases: f64::NAN, two_peaks, far_light, place_rms_rows: f64::NAN }
+}
+
+/// Whether there is a second maximum with less light between it and the first.
+fn has_two_peaks(shares: ArrayView1<f32>) -> bool {
+    let Some(first) = (0..PHASES).max_by(|&a, &b| shares[a].total_cmp(&shares[b])) else { return false };
+    rises_again(shares, first, first + 1..PHASES) || rises_again(shares, first, (0..first).rev())
+}
+
+/// Whether light rises again from a valley on the way from the brightest row outwards.
+fn rises_again(shares: ArrayView1<f32>, first: usize, mut outwards: impl Iterator<Item = usize>) -> bool {
+    let mut lowest = shares[first];
+    outwards.any(|index| {
+        lowest = lowest.min(shares[index]);
+        shares[index] > SECOND_PEAK * shares[first] && lowest < VALLEY * shares[index]
+    })
+}
+
+/// Which of two boards has the narrower responses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Narrower {
+    /// The first.
+    First,
+    /// The second.
+    Second,
+    /// They do not differ: the first is as good.
+    Neither,
+}
+
+/// Widths of the responses of two boards, as second central moments in rows^2.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Comparison {
+    /// The board whose responses are to be taken.
+    pub narrower: Narrower,
+    /// Mean second moment of each board.
+    pub second_moments: [f64; 2],
+    /// The second board's moment minus the first's.
+    pub difference: Estimate,
+}
+
+impl fmt::Display for Comparison {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let [first, second] = self.second_moments;
+        let Estimate { value, sd } = self.difference;
+        let (wider, taken) = match self.narrower {
+            Narrower::First => ("the second board", "the responses of the first are taken"),
+            Narrower::Second => ("the first board", "the responses of the second are taken"),
+            Narrower::Neither => {
+                return write!(
+                    f,
+                    "both boards respond alike (second moments {first:.3} and {second:.3} rows^2): the responses of \
+                     the first are taken"
+                );
+            }
+        };
+        write!(
+            f,
+            "{wider} scatters light over {:.2} rows more than the other (second moments {first:.3} and {second:.3} \
+             rows^2, difference {value:.3} with standard deviation {sd:.3}): {taken}",
+            value.abs().sqrt()
+        )
+    }
+}
+
+/// Groups of pixels by the fraction of their place: the moment of a sharp-edged beam depends on it.
+const FRACTIONS: usize = 16;
+/// Number of pixels that share their light through averaging.
+const AVERAGED: f64 = ((2 * REACH_ROWS + 1) * (2 * REACH_COLUMNS + 1)) as f64;
+/// A difference counts from this many standard deviations, and from this share of the moment.
+const DIFFERENCE_SIGMAS: f64 = 3.0;
+const DIFFERENCE_SHARE: f64 = 0.02;
+
+/// Compares the responses of two boards of different material.
+///
+/// A board that scatters light inside widens the responses, which cannot be told from the beam's width with one board.
+/// The narrower responses are closer to the beam's. Pixels are compared at the same fraction of a row.
+///
+/// # Errors
+/// [`ImagesError::TooFew`] if the boards have no fraction in common.
+pub fn compare_responses(first: &Responses, second: &Responses) -> Result<Comparison, ImagesError> {
+    let [of_first, of_second] = [first, second].map(moments_by_fraction);
+    let (mut sums, mut variance, mut groups) = ([0.0; 2], 0.0, 0);
+    for (a, b) in of_first.iter().zip(&of_second) {
+        if let (Some(a), Some(b)) = (a, b) {
+            sums[0] += a.value;
+            sums[1] += b.value;
+            variance += a.sd.powi(2) + b.sd.powi(2);
+            groups += 1;
+        }
+    }
+    if groups == 0 {
+        let cure = "move the second board by a few per cent of its distance";
+        let what = "fractions of a row that both boards have in common";
+        return Err(ImagesError::TooFew { what, given: 0, needed: 1, cure });
+    }
+    let n = f64::from(groups);
+    let second_moments = sums.map(|sum| sum / n);
+    let difference = Estimate { value: second_moments[1] - second_moments[0], sd: variance.sqrt() / n };
+    let least =
+        (DIFFERENCE_SIGMAS * difference.sd).max(DIFFERENCE_SHARE * second_moments[0].max(second_moments[1]));
+    let narrower = match difference.value {
+        value if value > least => Narrower::First,
+        value if value < -least => Narrower::Second,
+        _ => Narrower::Neither,
+    };
+    Ok(Comparison { narrower, second_moments, difference })
+}
+
+/// Mean second moment of the pixels of each fraction of a row, if there are enough of them.
+fn moments_by_fraction(responses: &Responses) -> Vec<Option<Estimate>> {
+    let mut groups = vec![Vec::new(); FRACTIONS];
+    for ((t, s), &place) in responses.place.indexed_iter() {
+        if !place.is_nan() {
+            let group = (place.rem_euclid(1.0) * FRACTIONS as f32) as usize;
+            groups[group.min(FRACTIONS - 1)].push(responses.second_moment(t, s));
+        }
+    }
+    let estimate = |moments: Vec<f64>| {
+        let n = moments.len() as f64;
+        (n >= AVERAGED).then(|| {
+            let value = moments.iter().sum::<f64>() / n;
+            let scatter = moments.iter().map(|moment| (moment - value).powi(2)).sum::<f64>() / n;
+            Estimate { value, sd: (scatter * AVERAGED / n).sqrt() }
+        })
+    };
+    groups.into_iter().map(estimate).collect()
+}
