@@ -5,5 +5,6 @@ mod plane;
 
 pub use self::dots::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
 pub use self::plane::{
-    Beam, RowTable, SimAmbient, SimCamera, SimConfig, SimProjector, SimSensor, SimVsync, Spot,
+    Beam, FlickerPhase, RowTable, SimAmbient, SimBoard, SimCamera, SimConfig, SimProjector, SimSensor,
+    SimTruth, SimVsync, Spot,
 };
