@@ -49,7 +49,7 @@ pub enum SimError {
     Pattern(#[from] PatternError),
     /// The beam's kernel has no light, or no order.
     #[error(
-        "sim.projector.beam: give a kernel rising rows within -500..=500, and for each a weight from 0 to 1e6, in weights and, if given, in to; not all weights may be 0"
+        "sim.projector.beam: a kernel needs rising rows within -500..=500, and for each row a weight from 0 to 1e6, not all of them 0; the same holds for to"
     )]
     Kernel,
     /// Rows end after the period.
