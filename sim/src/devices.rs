@@ -5,13 +5,14 @@ use std::time::Duration;
 
 use raysweep_core::{
     Applied, Camera, CameraCapabilities, CameraSettings, Clock, ClockHandle, DeviceError, DeviceErrorKind,
-    DeviceState, Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Vsync,
-    us_from_ns,
+    DeviceState, Edge, FirstFrame, FrameBuf, FrameStamp, Pattern, Projector, SettingsId, Shown, Subject,
+    Vsync, us_from_ns,
 };
 
 use crate::error::SimError;
 use crate::line::{Exposure, Light, LineTruth, VsyncLine};
 use crate::sensor::SensorExposure;
+use crate::subject::{SubjectSwitch, not_there};
 use crate::world::PlaneWorld;
 
 /// The devices of one rig, sharing one clock.
@@ -22,6 +23,8 @@ pub struct PlaneDevices {
     pub vsync: Box<dyn Vsync>,
     /// The projector, initially dark.
     pub projector: Box<dyn Projector>,
+    /// Changes what stands before the camera, initially the scene.
+    pub subject: SubjectSwitch,
     /// The devices' clock.
     pub clock: Clock,
     /// Ground truth of the line, for tests only; real rigs have none.
@@ -83,9 +86,34 @@ pub fn open(world: &Arc<PlaneWorld>, line: VsyncLine, clock: Clock) -> PlaneDevi
         camera: Box::new(PlaneCamera::new(world.clone(), line.clone(), clock.register())),
         vsync: Box::new(SimVsync { line: line.clone(), clock: clock.register() }),
         projector: Box::new(SimProjector { world: world.clone(), line: line.clone(), clock: clock.clone() }),
+        subject: subject_switch(world.clone(), line.clone(), clock.clone()),
         truth: TruthProbe(line),
         clock,
     }
+}
+
+/// Scene, board and cap before the camera.
+fn subject_switch(world: Arc<PlaneWorld>, line: SharedLine, clock: Clock) -> SubjectSwitch {
+    SubjectSwitch::new(move |subject| {
+        if matches!(subject, Subject::Plane(_) | Subject::Diffuser) {
+            return Err(not_there(format!("{subject:?}: a plane rig has the scene, a board and a cap")));
+        }
+        let shown = line.lock().all_shown();
+        for shown in shown {
+            world.prepare(&shown, subject).map_err(refusal)?;
+        }
+        line.lock().place(clock.now_ns(), subject);
+        Ok(())
+    })
+}
+
+/// The error of a pattern that cannot be simulated.
+fn refusal(error: SimError) -> DeviceError {
+    let kind = match error {
+        SimError::AlongRows | SimError::Picture => DeviceErrorKind::Unsupported,
+        _ => DeviceErrorKind::OutOfRange,
+    };
+    DeviceError::new("projector", kind, error)
 }
 
 /// VSYNC monitor and projector on the host's clock, with two handles to the camera: one writes settings while the other
@@ -153,12 +181,14 @@ impl PlaneCamera {
     fn render(&mut self, exposure: &Exposure, lights: &[Light], first_row: usize) {
         let (_, width) = self.world.size;
         let exposure_us = exposure.settings.exposure_us;
-        let ambient = self.world.ambient(exposure);
+        let subject = exposure.subject;
         for (t, row) in self.light.chunks_mut(width).enumerate().skip(first_row) {
-            row.fill(ambient);
             let row_start_us = self.world.row_start_us(exposure.settings.shutter, t - first_row);
+            let is_capped = subject == Subject::Cap;
+            row.fill(if is_capped { 0.0 } else { self.world.ambient(exposure, row_start_us) });
             for light in lights {
-                if let Some(optics) = &light.optics {
+                if let Some(optics) = light.shown.as_ref().and_then(|shown| shown.optics(subject, light.key))
+                {
                     let from_us = us_from_ns(exposure.start_ns - light.start_ns) + row_start_us;
                     optics.expose_row(t, from_us, from_us + exposure_us, row);
                 }
@@ -221,8 +251,8 @@ impl Camera for PlaneCamera {
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::Protocol, error))?;
         Ok(Some(FrameStamp {
             seq: exposure.seq,
-            device_ns: exposure.start_ns,
-            exposure_start_ns: exposure.start_ns,
+            device_ns: exposure.stamped_ns,
+            exposure_start_ns: exposure.stamped_ns,
             host_ns: exposure.done_ns,
             exposure_us: self.world.config.camera.chunk_exposure.then_some(exposure.settings.exposure_us),
         }))
@@ -253,12 +283,9 @@ struct SimProjector {
 
 impl Projector for SimProjector {
     fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
-        let optics = self.world.optics_of(pattern).map_err(|error| {
-            let along_rows = matches!(error, SimError::AlongRows);
-            let kind = if along_rows { DeviceErrorKind::Unsupported } else { DeviceErrorKind::OutOfRange };
-            DeviceError::new("projector", kind, error)
-        })?;
-        Ok(Shown { not_before_ns: self.line.lock().show(self.clock.now_ns(), Some(optics)) })
+        let subject = self.line.lock().subject();
+        let shown = self.world.show(pattern, subject).map_err(refusal)?;
+        Ok(Shown { not_before_ns: self.line.lock().show(self.clock.now_ns(), Some(shown)) })
     }
 
     fn blank(&mut self) -> Result<Shown, DeviceError> {

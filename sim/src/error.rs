@@ -47,11 +47,45 @@ pub enum SimError {
     /// The pattern does not fit the projector.
     #[error(transparent)]
     Pattern(#[from] PatternError),
-    /// The pattern varies along rows, which the scenes' row transport cannot represent.
+    /// The beam's kernel has no light, or no order.
     #[error(
-        "the simulated projector shows white, black, a line and row weights: a pattern that changes along rows needs a real one"
+        "sim.projector.beam: a kernel needs rising rows within -500..=500, and for each row a weight from 0 to 1e6, not all of them 0; the same holds for to"
+    )]
+    Kernel,
+    /// Rows end after the period.
+    #[error(
+        "sim.{key}: the last row would end {end_us:.1} us after the edge, and vsync.period_us = {period_us}: a frame's rows must be drawn before the next edge; lower truth.row_time_us or truth.first_row_us"
+    )]
+    TruthPeriod {
+        /// Key below `[sim]`.
+        key: &'static str,
+        /// End of the last row after the edge.
+        end_us: f64,
+        /// VSYNC period.
+        period_us: f64,
+    },
+    /// Pixels look beyond the projector.
+    #[error(
+        "sim.{key}: the scene would lie from projector row {from_row:.2} to {to_row:.2} of 0 to {projector_rows}: move it less, take a smaller scene or raise projector.rows"
+    )]
+    TruthRows {
+        /// Key below `[sim]`.
+        key: &'static str,
+        /// Where the scene begins.
+        from_row: f64,
+        /// Where it ends.
+        to_row: f64,
+        /// Projector rows.
+        projector_rows: usize,
+    },
+    /// The pattern varies along rows, which the scene's row transport cannot represent.
+    #[error(
+        "a scene is simulated under patterns that are the same along rows, and a built-in one under columns too: for other patterns put the board before the camera"
     )]
     AlongRows,
+    /// A picture from a file.
+    #[error("the simulated projector shows no pictures from files: take another pattern")]
+    Picture,
     /// A key of `[sim]` outside its range.
     #[error("sim.{key} = {value}: allowed is {allowed}")]
     Range {
@@ -72,10 +106,11 @@ impl SimError {
             | Self::SceneRows { .. }
             | Self::CameraRows { .. }
             | Self::Pattern(_)
-            | Self::AlongRows => "scene",
+            | Self::AlongRows
+            | Self::Picture => "scene",
             Self::RowTable => "projector.row_table",
-            Self::Beam => "projector.beam",
-            Self::Range { key, .. } => key,
+            Self::Beam | Self::Kernel => "projector.beam",
+            Self::TruthPeriod { key, .. } | Self::TruthRows { key, .. } | Self::Range { key, .. } => key,
         }
     }
 }

@@ -7,17 +7,14 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use rand_distr::{Distribution, StandardNormal};
-use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, ns_from_us};
+use raysweep_core::{CameraSettings, Edge, Readout, SettingsId, Subject, ns_from_us};
 
 use self::camera::{CameraLine, RunningSequence, WrittenSettings};
 pub use self::camera::{Exposure, Sets, TriggeredBy};
 use crate::keyed::{Purpose, keyed, uniform};
-use crate::optics::RasterOptics;
 use crate::scene::SceneMotion;
+use crate::shown::Shown;
 use raysweep_config::sim::{SimCamera, SimProjector, SimVsync};
-
-/// What the projector shows: the scene under its pattern, for each key position of the scene's motion.
-pub type Shown = Arc<[Arc<RasterOptics>]>;
 
 /// One projector frame: the time of its edge and what it shows (`None`: dark).
 #[derive(Clone)]
@@ -26,8 +23,10 @@ pub struct Light {
     pub edge_ns: i64,
     /// Start of the light: the edge plus a phase error that no device measures.
     pub start_ns: i64,
-    /// The scene under the pattern shown.
-    pub optics: Option<Arc<RasterOptics>>,
+    /// What is shown.
+    pub shown: Option<Arc<Shown>>,
+    /// Key position of the scene's motion.
+    pub key: usize,
 }
 
 /// Parameters of the line.
@@ -37,6 +36,8 @@ pub struct LineConfig {
     pub vsync: SimVsync,
     pub projector: SimProjector,
     pub camera: SimCamera,
+    /// True time from the edge to the start of row 0's exposure, at a trigger delay of zero.
+    pub trigger_latency_us: f64,
     pub motion: SceneMotion,
     /// Time from the end of row 0's exposure until the last row is read.
     pub readout_ns: i64,
@@ -58,9 +59,11 @@ pub struct VsyncLine {
     pending: VecDeque<PendingEdge>,
     /// Light of the most recent periods and the next one.
     lights: VecDeque<Light>,
-    shown: Option<Shown>,
+    shown: Option<Arc<Shown>>,
     /// The next pattern, and the period from which the projector shows it.
-    next_shown: Option<(i64, Option<Shown>)>,
+    next_shown: Option<(i64, Option<Arc<Shown>>)>,
+    /// What stands before the camera.
+    subject: Subject,
     seen: VecDeque<Edge>,
     edges: u64,
     camera: CameraLine,
@@ -122,6 +125,7 @@ impl VsyncLine {
             lights: VecDeque::new(),
             shown: None,
             next_shown: None,
+            subject: Subject::Scene,
             seen: VecDeque::new(),
             edges: 0,
             camera: CameraLine::at_rest(),
@@ -172,7 +176,7 @@ impl VsyncLine {
     fn draw_period(&mut self) {
         let nominal_ns = self.nominal_ns(self.next_period);
         let asked_ns = nominal_ns.max(self.configured_ns);
-        let ready = self.camera.is_ready(asked_ns, self.config.camera.trigger_latency_us);
+        let ready = self.camera.is_ready(asked_ns, self.config.trigger_latency_us);
         let drawn_for = (if ready { self.camera.key() } else { self.camera.newest_key() }, ready);
         if drawn_for != self.drawn_for {
             (self.drawn_for, self.draws) = (drawn_for, 0);
@@ -194,8 +198,8 @@ impl VsyncLine {
         if let Some((_, shown)) = self.next_shown.take_if(|(from, _)| *from <= self.next_period) {
             self.shown = shown;
         }
-        let optics = self.shown.as_ref().map(|keys| keys[self.config.motion.key(nominal_ns)].clone());
-        self.lights.push_back(Light { edge_ns, start_ns: edge_ns + phase_ns, optics });
+        let (shown, key) = (self.shown.clone(), self.config.motion.key(nominal_ns));
+        self.lights.push_back(Light { edge_ns, start_ns: edge_ns + phase_ns, shown, key });
         let kind = match (missing, unseen) {
             (true, _) => EdgeKind::Missing,
             (false, true) => EdgeKind::Unseen,
@@ -256,7 +260,7 @@ impl VsyncLine {
     fn trigger(&mut self, edge_ns: i64) -> bool {
         let config = &self.config;
         let camera = &mut self.camera;
-        if !camera.armed || !camera.is_ready(edge_ns, config.camera.trigger_latency_us) {
+        if !camera.armed || !camera.is_ready(edge_ns, config.trigger_latency_us) {
             return false;
         }
         let key = camera.key();
@@ -264,7 +268,9 @@ impl VsyncLine {
         let seq = camera.seq;
         camera.written.retain(|written| written.first_seq > seq);
         let settings = camera.in_force.settings;
-        let start_ns = edge_ns + ns_from_us(config.camera.trigger_latency_us + settings.trigger_delay_us);
+        let after = |latency_us: f64| edge_ns + ns_from_us(latency_us + settings.trigger_delay_us);
+        let (start_ns, stamped_ns) =
+            (after(config.trigger_latency_us), after(config.camera.trigger_latency_us));
         let exposure_ns = ns_from_us(settings.exposure_us);
         let delivered = uniform(&mut keyed(config.seed, Purpose::Drop, &key)) >= config.camera.dropped;
         (camera.deaf_until_ns, camera.occupied_until_ns) = match config.camera.readout {
@@ -275,7 +281,16 @@ impl VsyncLine {
         if camera.exposures.len() == CAMERA_BUFFERS {
             camera.exposures.pop_front();
         }
-        camera.exposures.push_back(Exposure { seq: camera.seq, key, settings, start_ns, done_ns, delivered });
+        camera.exposures.push_back(Exposure {
+            seq: camera.seq,
+            key,
+            settings,
+            subject: self.subject,
+            start_ns,
+            stamped_ns,
+            done_ns,
+            delivered,
+        });
         camera.seq += 1;
         camera.frames += 1;
         camera.take_next_set();
@@ -395,10 +410,28 @@ impl VsyncLine {
     }
 
     /// Changes what is shown (`None`: dark); returns the time from which the light shows it.
-    pub fn show(&mut self, now_ns: i64, shown: Option<Shown>) -> i64 {
+    pub fn show(&mut self, now_ns: i64, shown: Option<Arc<Shown>>) -> i64 {
         self.advance(now_ns);
         let from_period = self.next_period + i64::from(self.config.projector.video_latency_frames);
         self.next_shown = Some((from_period, shown));
         self.nominal_ns(from_period)
+    }
+
+    /// What stands before the camera.
+    pub fn subject(&self) -> Subject {
+        self.subject
+    }
+
+    /// Places a subject before the camera, for exposures that are triggered from now on.
+    pub fn place(&mut self, now_ns: i64, subject: Subject) {
+        self.advance(now_ns);
+        self.subject = subject;
+    }
+
+    /// All that is shown to exposures that are triggered from now on.
+    pub fn all_shown(&self) -> Vec<Arc<Shown>> {
+        let lit = self.lights.iter().filter_map(|light| light.shown.as_ref());
+        let next = self.next_shown.iter().filter_map(|(_, shown)| shown.as_ref());
+        lit.chain(&self.shown).chain(next).cloned().collect()
     }
 }

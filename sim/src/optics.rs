@@ -3,122 +3,195 @@
 //! Light is integrated in time, row by row as the projector draws, continuously within a row (finer than any time
 //! grid). This code shares nothing with demultiplexing or its matrix, so that it can serve as an independent check.
 
-use ndarray::{Array2, Array3, Axis, s};
+use ndarray::{Array2, Array3, Array4, ArrayView4, Axis, s};
 use rayon::prelude::*;
-use raysweep_core::{Mosaic, Raster};
+use raysweep_config::sim::{RowTable, SimBeam, SimBoard, SimProjector, SimSpot};
+use raysweep_core::{Mosaic, Pattern, Raster};
 
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
-use crate::scene::Scene;
-use raysweep_config::sim::{RowTable, SimBeam, SimProjector, SimSpot};
+use crate::scene::{Scene, SceneError};
+use crate::truth::PlaneTruth;
 
-/// A scene under a raster projector, prepared so that an exposure takes two look-ups per camera row.
+/// Columns of the projector's picture.
+const PROJECTOR_COLUMNS: usize = 1280;
+
+/// What all subjects of a rig have in common: how the projector draws, and what the camera sees of it.
+pub struct View<'a> {
+    /// Timing, and where pixels look.
+    pub truth: &'a PlaneTruth,
+    /// SimBeam, spot and row table.
+    pub projector: &'a SimProjector,
+    /// Seed of the row table.
+    pub seed: u64,
+    /// Colours of the camera's pixels.
+    pub mosaic: Mosaic,
+}
+
+/// A subject under a raster projector, prepared so that an exposure takes two look-ups per camera row.
 pub struct RasterOptics {
-    /// Start of each drawn row's light after the VSYNC edge, and the last row's end. Drawn rows are the scene's rows
-    /// and those next to them whose beam reaches it.
+    /// Start of each drawn row's light after the VSYNC edge, and the last row's end. Drawn rows of a scene are its
+    /// rows and those next to them whose beam reaches it; those of a board are all.
     row_starts_us: Vec<f64>,
-    /// Summed light of the drawn rows before `v`, `[t, v, s]`, with one more v than drawn rows.
-    cumulative: Array3<f32>,
-    /// Direct light that arrives at one instant within its row, if the moving spot is simulated.
+    /// Light that arrives evenly over its row.
+    steady: Option<Steady>,
+    /// Light that arrives at one instant within its row, if the moving spot is simulated.
     flashes: Option<Flashes>,
 }
 
-/// Direct light of a moving spot.
+/// Light that arrives evenly over its row.
+struct Steady {
+    /// First drawn row of each camera row's window.
+    first: Vec<usize>,
+    /// Summed light of the window's rows before its `v`-th, `[t, v, s]`, with one more v than rows.
+    cumulative: Array3<f32>,
+}
+
+/// Light of a moving spot.
 struct Flashes {
-    /// Direct light of each pixel, `[t, s]`.
-    direct: Array2<f32>,
+    /// Start of each projector row's light after the VSYNC edge, and the last row's end.
+    row_starts_us: Vec<f64>,
+    own: OwnLight,
     /// Projector column 0..1 that each pixel sees, `[t, s]`.
     column: Array2<f32>,
-    /// Offset in rows from the pixel's own row, and the fraction of the beam that arrives from there.
-    beam: Vec<(isize, f32)>,
     bidirectional: bool,
-    /// Projector row of the first drawn row.
-    first_drawn: usize,
-    /// Drawn row that corresponds to scene row 0.
-    scene_offset: usize,
-    /// Weight of each drawn row in the pattern.
-    pattern: Vec<f32>,
+}
+
+/// Light that reaches pixels from the places at which they look, by the projector row that sends it.
+struct OwnLight {
+    /// First projector row of each camera row's window.
+    first: Vec<usize>,
+    /// `[t, row of the window, s]`.
+    light: Array3<f32>,
 }
 
 impl RasterOptics {
-    /// Prepares `scene` under `pattern`, which has one weight per projector row, drawn at the times of the row table.
+    /// Prepares `scene` under `pattern`.
     ///
     /// # Errors
-    /// When the beam's profile is out of range.
-    pub fn new(
-        scene: &Scene,
-        mosaic: Mosaic,
-        first_row: usize,
-        projector: &SimProjector,
-        row_table: &[f64],
-        pattern: &[f32],
-    ) -> Result<Self, SimError> {
-        let transport = filtered(scene, mosaic);
-        let (rows, height, width) = transport.dim();
-        let beam = beam_weights(&projector.beam)?;
-        let beam_rows = beam.iter().map(|(offset, _)| offset.unsigned_abs()).max().unwrap_or(0);
-        let first_drawn = first_row.saturating_sub(beam_rows);
-        let end_drawn = (first_row + rows + beam_rows).min(pattern.len());
-        let scene_offset = first_row - first_drawn;
-        let row_starts_us = row_table[first_drawn..=end_drawn].to_vec();
-        let pattern = pattern[first_drawn..end_drawn].to_vec();
-
-        let direct = match projector.spot {
-            SimSpot::Uniform => None,
-            SimSpot::OneWay | SimSpot::Bidirectional => {
-                Some(Array2::from_shape_fn((height, width), |(t, s)| {
-                    if t < rows { transport[[t, t, s]] } else { 0.0 }
-                }))
+    /// When the pattern does not fit the projector or the scene, or when rows would be drawn in a different order.
+    pub fn of_scene(scene: &Scene, view: &View<'_>, pattern: &Pattern) -> Result<Self, SimError> {
+        let &View { truth, projector, seed, mosaic } = view;
+        let raster = &truth.raster;
+        let (mut transport, pattern) = match pattern.row_weights(raster.rows)? {
+            Some(weights) => (filtered(scene.transport.view(), mosaic), weights),
+            None => {
+                let columns = pattern.column_weights(PROJECTOR_COLUMNS)?.ok_or(SimError::AlongRows)?;
+                (filtered(under_columns(scene, &columns)?.view(), mosaic), vec![1.0; raster.rows])
             }
         };
-        let mut cumulative = Array3::<f32>::zeros((height, pattern.len() + 1, width));
+        let (rows, height, width) = transport.dim();
+        let table = row_table(raster, &projector.row_table, seed)?;
+        let kernel = Kernel::new(&projector.beam, raster.rows)?;
+
+        let flashes = match projector.spot {
+            SimSpot::Uniform => None,
+            SimSpot::OneWay | SimSpot::Bidirectional => {
+                let mut direct = Array2::zeros((height, width));
+                for t in 0..height.min(rows) {
+                    direct.row_mut(t).assign(&transport.slice(s![t, t, ..]));
+                    // Direct light of a moving spot is not spread over the row's dwell.
+                    transport.slice_mut(s![t, t, ..]).fill(0.0);
+                }
+                let unspread = &[(0, 1.0)];
+                let own = OwnLight::new(view, &kernel, unspread, |t, s| direct[[t, s]], |v, _| pattern[v]);
+                let column = scene.projector_column.clone().unwrap_or_else(|| {
+                    Array2::from_shape_fn((height, width), |(_, s)| (s as f32 + 0.5) / width as f32)
+                });
+                Some(Flashes::new(own, column, &table, projector.spot))
+            }
+        };
+
+        let (transport, rows_up) = shifted(transport, truth);
+        let rows = transport.len_of(Axis(0));
+        let first_row = truth.first_row.saturating_add_signed(-rows_up);
+        let beam_rows = kernel.reach_rows();
+        let first_drawn = first_row.saturating_sub(beam_rows);
+        let end_drawn = (first_row + rows + beam_rows).min(raster.rows);
+        let scene_offset = first_row - first_drawn;
+        let mut cumulative = Array3::<f32>::zeros((height, end_drawn - first_drawn + 1, width));
         cumulative.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
             let mut sum = vec![0.0_f64; width];
-            for (v, &shown) in pattern.iter().enumerate() {
-                for &(offset, share) in &beam {
+            for (v, row) in (first_drawn..end_drawn).enumerate() {
+                for (offset, share) in kernel.of_row(row) {
                     let lit = v.checked_add_signed(offset).and_then(|lit| lit.checked_sub(scene_offset));
                     let Some(lit) = lit.filter(|&lit| lit < rows) else { continue };
-                    let weight = f64::from(share * shown);
+                    let weight = f64::from(share * pattern[row]);
                     for (s, sum) in sum.iter_mut().enumerate() {
-                        // Direct light of a moving spot is not spread over the row's dwell.
-                        if direct.is_none() || lit != t {
-                            *sum += weight * f64::from(transport[[lit, t, s]]);
-                        }
+                        *sum += weight * f64::from(transport[[lit, t, s]]);
                     }
                 }
                 light.row_mut(v + 1).iter_mut().zip(&sum).for_each(|(light, &sum)| *light = sum as f32);
             }
         });
+        Ok(Self {
+            row_starts_us: table[first_drawn..=end_drawn].to_vec(),
+            steady: Some(Steady { first: vec![0; height], cumulative }),
+            flashes,
+        })
+    }
 
-        let flashes = direct.map(|direct| Flashes {
-            direct,
-            column: scene.projector_column.clone().unwrap_or_else(|| {
-                Array2::from_shape_fn((height, width), |(_, s)| (s as f32 + 0.5) / width as f32)
-            }),
-            beam,
-            bidirectional: projector.spot == SimSpot::Bidirectional,
-            first_drawn,
-            scene_offset,
-            pattern,
-        });
-        Ok(Self { row_starts_us, cumulative, flashes })
+    /// Prepares the board under `pattern`.
+    ///
+    /// # Errors
+    /// When the pattern does not fit the projector, or when rows would be drawn in a different order.
+    pub fn of_board(board: &SimBoard, view: &View<'_>, pattern: &Pattern) -> Result<Self, SimError> {
+        let &View { truth, projector, seed, .. } = view;
+        let (raster, (_, width)) = (&truth.raster, truth.size());
+        let table = row_table(raster, &projector.row_table, seed)?;
+        let kernel = Kernel::new(&projector.beam, raster.rows)?;
+        let [left, right] = board.projector_columns;
+        let column = |x: f64| left + (right - left) * x / width as f64;
+        let seen: Array2<f32> = match pattern.row_weights(raster.rows)? {
+            Some(weights) => Array2::from_shape_fn((raster.rows, width), |(v, _)| weights[v]),
+            None => {
+                let size = (PROJECTOR_COLUMNS, raster.rows);
+                let weights = pattern.pixel_weights(size)?.ok_or(SimError::Picture)?;
+                Array2::from_shape_fn((raster.rows, width), |(v, s)| {
+                    let row = &weights[v * PROJECTOR_COLUMNS..][..PROJECTOR_COLUMNS];
+                    mean_over(row, column(s as f64), column(s as f64 + 1.0))
+                })
+            }
+        };
+        let own = OwnLight::new(view, &kernel, &spread_inside(board), |_, _| 1.0, |v, s| seen[[v, s]]);
+        if projector.spot != SimSpot::Uniform {
+            let column = Array2::from_shape_fn(truth.size(), |(_, s)| column(s as f64 + 0.5) as f32);
+            let flashes = Some(Flashes::new(own, column, &table, projector.spot));
+            return Ok(Self { row_starts_us: table, steady: None, flashes });
+        }
+        let (height, window, width) = own.light.dim();
+        let mut cumulative = Array3::<f32>::zeros((height, window + 1, width));
+        for v in 0..window {
+            let sum = &cumulative.slice(s![.., v, ..]) + &own.light.slice(s![.., v, ..]);
+            cumulative.slice_mut(s![.., v + 1, ..]).assign(&sum);
+        }
+        Ok(Self {
+            row_starts_us: table,
+            steady: Some(Steady { first: own.first, cumulative }),
+            flashes: None,
+        })
     }
 
     /// Adds to `light` what camera row `t` receives from one projector frame between `from_us` and `to_us` after that
     /// frame's edge.
     pub fn expose_row(&self, t: usize, from_us: f64, to_us: f64, light: &mut [f32]) {
         let (from, to) = (self.rows_drawn(from_us), self.rows_drawn(to_us));
-        if to > from {
-            let rows = self.cumulative.index_axis(Axis(0), t);
-            let (a, b) = (Between::at(from, rows.nrows()), Between::at(to, rows.nrows()));
-            let at = |edge: &Between, s: usize| {
-                let (above, below) = (rows[[edge.row, s]], rows[[edge.row + 1, s]]);
-                above + edge.share * (below - above)
-            };
-            light.iter_mut().enumerate().for_each(|(s, light)| *light += at(&b, s) - at(&a, s));
+        if let Some(Steady { first, cumulative }) = &self.steady {
+            let rows = cumulative.index_axis(Axis(0), t);
+            let most = (rows.nrows() - 1) as f64;
+            let within = |drawn: f64| (drawn - first[t] as f64).clamp(0.0, most);
+            let (from, to) = (within(from), within(to));
+            if to > from {
+                let (a, b) = (Between::at(from, rows.nrows()), Between::at(to, rows.nrows()));
+                let at = |edge: &Between, s: usize| {
+                    let (above, below) = (rows[[edge.row, s]], rows[[edge.row + 1, s]]);
+                    above + edge.share * (below - above)
+                };
+                light.iter_mut().enumerate().for_each(|(s, light)| *light += at(&b, s) - at(&a, s));
+            }
         }
         if let Some(flashes) = &self.flashes {
-            flashes.expose_row(&self.row_starts_us, t, from_us, to_us, light);
+            flashes.expose_row(t, from_us, to_us, light);
         }
     }
 
@@ -151,31 +224,187 @@ impl Between {
 }
 
 impl Flashes {
-    fn expose_row(&self, row_starts_us: &[f64], t: usize, from_us: f64, to_us: f64, light: &mut [f32]) {
-        for &(offset, share) in &self.beam {
-            let drawn = (t + self.scene_offset).checked_add_signed(-offset);
-            let Some(v) = drawn.filter(|&v| v + 1 < row_starts_us.len()) else { continue };
-            let (start_us, dwell_us) = (row_starts_us[v], row_starts_us[v + 1] - row_starts_us[v]);
-            if start_us + dwell_us <= from_us || start_us >= to_us {
+    fn new(own: OwnLight, column: Array2<f32>, row_starts_us: &[f64], spot: SimSpot) -> Self {
+        let bidirectional = spot == SimSpot::Bidirectional;
+        Self { row_starts_us: row_starts_us.to_vec(), own, column, bidirectional }
+    }
+
+    fn expose_row(&self, t: usize, from_us: f64, to_us: f64, light: &mut [f32]) {
+        let sent = self.own.light.index_axis(Axis(0), t);
+        for (v, sent) in sent.outer_iter().enumerate().rev() {
+            let row = self.own.first[t] + v;
+            let (start_us, end_us) = (self.row_starts_us[row], self.row_starts_us[row + 1]);
+            if end_us <= from_us || start_us >= to_us {
                 continue;
             }
-            let backwards = self.bidirectional && (self.first_drawn + v) % 2 == 1;
-            let weight = share * self.pattern[v];
+            let backwards = self.bidirectional && row % 2 == 1;
             for (s, light) in light.iter_mut().enumerate() {
                 let column = f64::from(self.column[[t, s]]);
-                let moment_us = start_us + dwell_us * if backwards { 1.0 - column } else { column };
+                let moment_us =
+                    start_us + (end_us - start_us) * if backwards { 1.0 - column } else { column };
                 if (from_us..to_us).contains(&moment_us) {
-                    *light += weight * self.direct[[t, s]];
+                    *light += sent[s];
                 }
             }
         }
     }
 }
 
+impl OwnLight {
+    /// Light of pixels that send on `albedo` (t, s) of the light at their places, under weights of (projector row, s).
+    /// A pixel sees one row's height about its place, and `inside` the subject light spreads over rows.
+    fn new(
+        view: &View<'_>,
+        kernel: &Kernel,
+        inside: &[(isize, f32)],
+        albedo: impl Fn(usize, usize) -> f32 + Sync,
+        weight: impl Fn(usize, usize) -> f32 + Sync,
+    ) -> Self {
+        let &View { truth, .. } = view;
+        let (rows, (height, width)) = (truth.raster.rows, truth.size());
+        let reach = kernel.reach_rows() + inside.iter().map(|(d, _)| d.unsigned_abs()).max().unwrap_or(0);
+        // Places change linearly along a camera row.
+        let places = |t| (truth.place(t, 0), truth.place(t, width - 1));
+        let span = |t| {
+            let (left, right) = places(t);
+            (left.min(right).floor(), left.max(right).floor() + 1.0)
+        };
+        let spans = (0..height).map(|t| span(t).1 - span(t).0);
+        let window = (spans.fold(0.0, f64::max) as usize + 1 + 2 * reach).min(rows);
+        let first_of = |t: usize| ((span(t).0 - reach as f64).max(0.0) as usize).min(rows - window);
+        let mut light = Array3::zeros((height, window, width));
+        light.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut light)| {
+            for s in 0..width {
+                let seen = Seen::new(truth.place(t, s), inside);
+                for v in 0..window {
+                    let row = first_of(t) + v;
+                    let mut sum = 0.0;
+                    for (offset, share) in kernel.of_row(row) {
+                        sum += share * seen.share(row as isize + offset) * weight(row, s) * albedo(t, s);
+                    }
+                    light[[v, s]] = sum;
+                }
+            }
+        });
+        Self { first: (0..height).map(first_of).collect(), light }
+    }
+}
+
+/// The shares of lit rows in the light of a pixel.
+struct Seen {
+    first: isize,
+    shares: Vec<f32>,
+}
+
+impl Seen {
+    /// A pixel that sees one row's height about `place`, of a subject inside which light spreads over rows.
+    fn new(place: f64, inside: &[(isize, f32)]) -> Self {
+        let (above, below) = split(place);
+        let own = place.floor() as isize;
+        let first = own + inside.iter().map(|&(d, _)| d).min().unwrap_or(0);
+        let last = own + 1 + inside.iter().map(|&(d, _)| d).max().unwrap_or(0);
+        let mut shares = vec![0.0; (last - first + 1) as usize];
+        for &(d, share) in inside {
+            let at = (own + d - first) as usize;
+            shares[at] += above * share;
+            shares[at + 1] += below * share;
+        }
+        Self { first, shares }
+    }
+
+    fn share(&self, row: isize) -> f32 {
+        usize::try_from(row - self.first).ok().and_then(|at| self.shares.get(at)).copied().unwrap_or(0.0)
+    }
+}
+
+/// The shares of the rows above and below a place, of a pixel that sees one row's height.
+fn split(place: f64) -> (f32, f32) {
+    let below = (place - place.floor()) as f32;
+    (1.0 - below, below)
+}
+
+/// The transport of pixels that look further down than in the scene, and the number of rows that it begins above the
+/// scene's first.
+fn shifted(transport: Array3<f32>, truth: &PlaneTruth) -> (Array3<f32>, isize) {
+    let (rows, height, width) = transport.dim();
+    let corners = [(0, 0), (0, width - 1), (height - 1, 0), (height - 1, width - 1)];
+    let shifts = corners.map(|(t, s)| truth.shift_rows(t, s));
+    let up = -shifts.iter().fold(0.0, |a: f64, &b| a.min(b.floor())) as isize;
+    let down = shifts.iter().fold(0.0, |a: f64, &b| a.max(b.ceil())) as isize;
+    if (up, down) == (0, 0) {
+        return (transport, 0);
+    }
+    let mut seen = Array3::zeros((rows + (up + down) as usize, height, width));
+    seen.axis_iter_mut(Axis(1)).into_par_iter().enumerate().for_each(|(t, mut seen)| {
+        for s in 0..width {
+            let shift = truth.shift_rows(t, s);
+            let ((above, below), first) = (split(shift), (shift.floor() as isize + up) as usize);
+            for v in 0..rows {
+                let light = transport[[v, t, s]];
+                seen[[first + v, s]] += above * light;
+                if below > 0.0 {
+                    seen[[first + v + 1, s]] += below * light;
+                }
+            }
+        }
+    });
+    (seen, up)
+}
+
+/// The images `[V, H, W, C]` of a scene under each row alone, lit with the weights of its columns.
+fn under_columns(scene: &Scene, columns: &[f32]) -> Result<Array4<f32>, SimError> {
+    let mut images = Array4::zeros(scene.transport.dim());
+    images
+        .axis_iter_mut(Axis(0))
+        .into_par_iter()
+        .enumerate()
+        .try_for_each(|(v, mut image)| {
+            let mut lit = Array2::zeros((scene.rows(), columns.len()));
+            lit.row_mut(v).iter_mut().zip(columns).for_each(|(lit, &weight)| *lit = weight);
+            image.assign(&scene.render(lit.view(), &scene.full_window())?);
+            Ok::<(), SceneError>(())
+        })
+        .map_err(|error| match error {
+            SceneError::RowsOnly { .. } => SimError::AlongRows,
+            other => other.into(),
+        })?;
+    Ok(images)
+}
+
+/// Mean of a row's weights between two of its columns, 0..1 over its width.
+fn mean_over(row: &[f32], from: f64, to: f64) -> f32 {
+    let place = |column: f64| (column * row.len() as f64).clamp(0.0, row.len() as f64);
+    let (from, to) = (place(from.min(to)), place(from.max(to)));
+    let cells = from as usize..(to.ceil() as usize).min(row.len());
+    let overlap = |cell: usize| (to.min(cell as f64 + 1.0) - from.max(cell as f64)).max(0.0);
+    let sum: f64 = cells.map(|cell| overlap(cell) * f64::from(row[cell])).sum();
+    if to > from { (sum / (to - from)) as f32 } else { row[(from as usize).min(row.len() - 1)] }
+}
+
+/// Row offsets over which light spreads inside the board, and the shares; they sum to 1. The spread is exponential to
+/// both sides.
+fn spread_inside(board: &SimBoard) -> Vec<(isize, f32)> {
+    let &SimBoard { scatter_rows, scatter_share, .. } = board;
+    if scatter_rows == 0.0 || scatter_share == 0.0 {
+        return vec![(0, 1.0)];
+    }
+    // Shares q^|d| have the variance 2 q / (1 - q)^2.
+    let variance = scatter_rows.powi(2);
+    let q = (variance + 1.0 - (2.0 * variance + 1.0).sqrt()) / variance;
+    let reach = (1e-6_f64.ln() / q.ln()).ceil() as isize;
+    let scattered = |d: isize| q.powi(d.unsigned_abs() as i32);
+    let total: f64 = (-reach..=reach).map(scattered).sum();
+    (-reach..=reach)
+        .map(|d| {
+            let stays = if d == 0 { 1.0 - scatter_share } else { 0.0 };
+            (d, (stays + scatter_share * scattered(d) / total) as f32)
+        })
+        .collect()
+}
+
 /// The transport as seen by the sensor's pixels, `[V, H, W]`: through a Bayer mosaic or, on a monochrome sensor, the
 /// mean of the colours.
-fn filtered(scene: &Scene, mosaic: Mosaic) -> Array3<f32> {
-    let transport = &scene.transport;
+fn filtered(transport: ArrayView4<'_, f32>, mosaic: Mosaic) -> Array3<f32> {
     let channels = transport.dim().3;
     if channels == 1 {
         return transport.index_axis(Axis(3), 0).to_owned();
@@ -250,29 +479,73 @@ pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64
     if starts.is_sorted_by(|a, b| a < b) { Ok(starts) } else { Err(SimError::RowTable) }
 }
 
-/// Row offsets that a row's beam reaches and the fraction of light at each; the fractions sum to 1.
-fn beam_weights(beam: &SimBeam) -> Result<Vec<(isize, f32)>, SimError> {
-    let weights: Vec<(isize, f64)> = match *beam {
-        SimBeam::Ideal => vec![(0, 1.0)],
-        SimBeam::Gaussian { sigma_rows } if sigma_rows > 0.0 && sigma_rows <= 100.0 => {
-            let reach = (5.0 * sigma_rows).ceil() as isize;
-            (-reach..=reach).map(|d| (d, (-(d as f64 / sigma_rows).powi(2) / 2.0).exp())).collect()
-        }
-        SimBeam::FlatTop { up_rows, down_rows }
-            if up_rows >= 0.0
-                && down_rows >= 0.0
-                && up_rows + down_rows > 0.0
-                && up_rows + down_rows <= 500.0 =>
-        {
-            let overlap =
-                |d: isize| ((d as f64 + 0.5).min(down_rows) - (d as f64 - 0.5).max(-up_rows)).max(0.0);
-            (-(up_rows.ceil() as isize) - 1..=down_rows.ceil() as isize + 1)
-                .map(|d| (d, overlap(d)))
-                .filter(|&(_, share)| share > 0.0)
-                .collect()
-        }
-        _ => return Err(SimError::Beam),
-    };
-    let total: f64 = weights.iter().map(|(_, share)| share).sum();
-    Ok(weights.into_iter().map(|(d, share)| (d, (share / total) as f32)).collect())
+/// How the light of each row spreads over its neighbours.
+struct Kernel {
+    offsets: Vec<isize>,
+    /// Share of each offset in the light of the first row and of the last; each sums to 1.
+    ends: [Vec<f32>; 2],
+    rows: usize,
+}
+
+impl Kernel {
+    fn new(beam: &SimBeam, rows: usize) -> Result<Self, SimError> {
+        let even = |weights: Vec<(isize, f64)>| {
+            let (offsets, weights): (Vec<_>, Vec<_>) = weights.into_iter().unzip();
+            (offsets, weights.clone(), weights)
+        };
+        let (offsets, top, bottom) = match beam {
+            SimBeam::Ideal => even(vec![(0, 1.0)]),
+            &SimBeam::Gaussian { sigma_rows } if sigma_rows > 0.0 && sigma_rows <= 100.0 => {
+                let reach = (5.0 * sigma_rows).ceil() as isize;
+                even((-reach..=reach).map(|d| (d, (-(d as f64 / sigma_rows).powi(2) / 2.0).exp())).collect())
+            }
+            &SimBeam::FlatTop { up_rows, down_rows }
+                if up_rows >= 0.0
+                    && down_rows >= 0.0
+                    && up_rows + down_rows > 0.0
+                    && up_rows + down_rows <= 500.0 =>
+            {
+                let overlap =
+                    |d: isize| ((d as f64 + 0.5).min(down_rows) - (d as f64 - 0.5).max(-up_rows)).max(0.0);
+                even(
+                    (-(up_rows.ceil() as isize) - 1..=down_rows.ceil() as isize + 1)
+                        .map(|d| (d, overlap(d)))
+                        .filter(|&(_, share)| share > 0.0)
+                        .collect(),
+                )
+            }
+            SimBeam::Kernel { rows, weights, to } => {
+                let to = to.as_ref().unwrap_or(weights);
+                let is_sound = |weights: &Vec<f64>| {
+                    weights.len() == rows.len()
+                        && weights.iter().all(|weight| (0.0..=1e6).contains(weight))
+                        && weights.iter().sum::<f64>() > 0.0
+                };
+                let are_rows = rows.is_sorted_by(|a, b| a < b) && rows.iter().all(|d| d.abs() <= 500);
+                if !(are_rows && is_sound(weights) && is_sound(to)) {
+                    return Err(SimError::Kernel);
+                }
+                (rows.iter().map(|&d| d as isize).collect(), weights.clone(), to.clone())
+            }
+            _ => return Err(SimError::Beam),
+        };
+        let shares = |weights: Vec<f64>| {
+            let total: f64 = weights.iter().sum();
+            weights.into_iter().map(|share| (share / total) as f32).collect()
+        };
+        Ok(Self { offsets, ends: [shares(top), shares(bottom)], rows })
+    }
+
+    /// The most rows over which a row's light spreads to either side.
+    fn reach_rows(&self) -> usize {
+        self.offsets.iter().map(|offset| offset.unsigned_abs()).max().unwrap_or(0)
+    }
+
+    /// Row offsets that the beam of a row reaches and the fraction of light at each; the fractions sum to 1.
+    fn of_row(&self, row: usize) -> impl Iterator<Item = (isize, f32)> {
+        let down = row as f32 / (self.rows.saturating_sub(1)).max(1) as f32;
+        let shares =
+            self.ends[0].iter().zip(&self.ends[1]).map(move |(top, bottom)| top + down * (bottom - top));
+        self.offsets.iter().copied().zip(shares)
+    }
 }

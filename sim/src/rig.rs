@@ -1,10 +1,10 @@
 //! The simulated plane rig: a scene, a projector and a camera.
 
 use std::path::Path;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
 use ndarray::Array2;
-use raysweep_core::{Clock, Pattern, Shutter};
+use raysweep_core::{Clock, Pattern, Shutter, Subject};
 
 use crate::devices::{self, PlaneDevices};
 use crate::error::SimError;
@@ -12,6 +12,8 @@ use crate::line::VsyncLine;
 use crate::optics;
 use crate::scene::{Scene, SceneMotion, SceneSize};
 use crate::sensor::{ImageSensor, Scale};
+use crate::shown::Shown;
+use crate::truth::{PlaneTruth, Stated};
 use crate::wire::{self, WireDevices};
 use crate::world::{PlaneSetup, PlaneWorld};
 use raysweep_config::sim::SimConfig;
@@ -37,7 +39,16 @@ impl PlaneRig {
         let motion = SceneMotion::new(scenes.len(), config.motion_period_s);
         let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
         let size = scenes[0].size();
-        let scale = Scale { white_dn: setup.white_dn, black_dn: setup.black_dn, bits: setup.format.bits() };
+        let stated = Stated {
+            raster: setup.raster,
+            camera_row_time_us: setup.camera_row_time_us,
+            row_pitch: setup.row_pitch,
+            first_row,
+            white_dn: setup.white_dn,
+            black_dn: setup.black_dn,
+        };
+        let truth = PlaneTruth::new(&config, stated, size, scenes[0].rows())?;
+        let scale = Scale { white_dn: truth.white_dn, black_dn: truth.black_dn, bits: setup.format.bits() };
         let sensor = ImageSensor::new(&config.sensor, size, scale, config.seed);
         let world = PlaneWorld {
             config,
@@ -45,12 +56,13 @@ impl PlaneRig {
             scenes,
             motion,
             first_row,
+            truth,
             size,
             format: setup.format,
             sensor,
-            white: OnceLock::new(),
+            white: Arc::new(Shown::new(Pattern::White)),
         };
-        world.optics_of(&Pattern::White)?;
+        world.prepare(&world.white, Subject::Scene)?;
         Ok(Self { world: Arc::new(world) })
     }
 
@@ -64,7 +76,12 @@ impl PlaneRig {
         &self.world.scenes[self.world.motion.key(time_ns)]
     }
 
-    /// Projector row seen by camera row 0.
+    /// What is true of the rig, for tests only.
+    pub fn truth(&self) -> &PlaneTruth {
+        &self.world.truth
+    }
+
+    /// Projector row seen by camera row 0, as far as the rig file knows.
     pub fn first_row(&self) -> usize {
         self.world.first_row
     }
@@ -75,8 +92,8 @@ impl PlaneRig {
     /// # Errors
     /// None for a rig that was built successfully; returned so that no caller has to rely on that.
     pub fn row_starts_us(&self) -> Result<Vec<f64>, SimError> {
-        let PlaneWorld { config, setup, .. } = &*self.world;
-        optics::row_table(&setup.raster, &config.projector.row_table, config.seed)
+        let PlaneWorld { config, truth, .. } = &*self.world;
+        optics::row_table(&truth.raster, &config.projector.row_table, config.seed)
     }
 
     /// Opens the devices, starting at time zero of their own clock.
@@ -109,10 +126,11 @@ impl PlaneRig {
         delay_us: f64,
         exposure_us: f64,
     ) -> Result<Array2<f32>, SimError> {
-        let shown = self.world.optics_of(&Pattern::White)?;
-        let optics = &shown[self.world.motion.key(time_ns)];
-        let start_us = self.world.setup.raster.row_centre_us(self.first_row()) + delay_us - exposure_us / 2.0;
-        let mut image = Array2::zeros(self.world.size);
+        let PlaneWorld { truth, white, motion, size, .. } = &*self.world;
+        let start_us = truth.raster.row_centre_us(truth.first_row) + delay_us - exposure_us / 2.0;
+        let mut image = Array2::zeros(*size);
+        self.world.prepare(white, Subject::Scene)?;
+        let Some(optics) = white.optics(Subject::Scene, motion.key(time_ns)) else { return Ok(image) };
         for (t, mut row) in image.rows_mut().into_iter().enumerate() {
             let mut light = vec![0.0; row.len()];
             let from_us = start_us + self.world.row_start_us(Shutter::Rolling, t);
@@ -124,6 +142,7 @@ impl PlaneRig {
 }
 
 fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
+    let truth = &config.truth;
     let share = "0 to 1";
     let not_negative = "0 or more";
     let rules = [
@@ -151,6 +170,20 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
         ("ambient.level", config.ambient.level, not_negative),
         ("motion_period_s", config.motion_period_s, "0.1 to 1e6"),
         ("ambient.flicker_hz", config.ambient.flicker_hz, "more than 0"),
+        ("board.scatter_rows", config.board.scatter_rows, "0 to 100"),
+        ("board.scatter_share", config.board.scatter_share, share),
+        ("board.projector_columns", config.board.projector_columns[0], share),
+        ("board.projector_columns", config.board.projector_columns[1], share),
+        ("truth.first_row_us", truth.first_row_us.unwrap_or(0.0), not_negative),
+        ("truth.row_time_us", truth.row_time_us.unwrap_or(1.0), "0.1 to 10000"),
+        ("truth.row_pitch", truth.row_pitch.unwrap_or(1.0), "0.01 to 100"),
+        ("truth.trigger_latency_us", truth.trigger_latency_us.unwrap_or(0.0), not_negative),
+        ("truth.camera_row_time_us", truth.camera_row_time_us.unwrap_or(1.0), "0.1 to 10000"),
+        ("truth.white_dn", truth.white_dn.unwrap_or(1.0), "more than 0"),
+        ("truth.black_dn", truth.black_dn.unwrap_or(0.0), not_negative),
+        ("truth.row_offset_rows", truth.row_offset_rows, "-8192 to 8192"),
+        ("truth.rotation_deg", truth.rotation_deg, "-45 to 45"),
+        ("truth.magnification", truth.magnification, "0.01 to 100"),
     ];
     for (key, value, allowed) in rules {
         let range = match allowed {
@@ -159,6 +192,10 @@ fn check_ranges(config: &SimConfig) -> Result<(), SimError> {
             "0 to 100" => 0.0..=100.0,
             "1 to 12" => 1.0..=12.0,
             "0.1 to 1e6" => 0.1..=1e6,
+            "0.1 to 10000" => 0.1..=10_000.0,
+            "0.01 to 100" => 0.01..=100.0,
+            "-8192 to 8192" => -8192.0..=8192.0,
+            "-45 to 45" => -45.0..=45.0,
             "more than 0" => f64::MIN_POSITIVE..=f64::MAX,
             _ => 0.0..=f64::MAX,
         };

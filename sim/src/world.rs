@@ -1,16 +1,18 @@
 //! What a simulated plane rig consists of, and what its devices see of it.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 
-use raysweep_config::sim::SimConfig;
-use raysweep_core::{CameraCapabilities, Pattern, PixelFormat, Raster, Shutter, ns_from_us};
+use raysweep_config::sim::{FlickerPhase, SimConfig};
+use raysweep_core::{CameraCapabilities, Pattern, PixelFormat, Raster, Shutter, Subject, ns_from_us};
 
 use crate::error::SimError;
 use crate::keyed::{Purpose, keyed, uniform};
-use crate::line::{Exposure, LineConfig, Shown};
-use crate::optics::{RasterOptics, row_table};
+use crate::line::{Exposure, LineConfig};
+use crate::optics::{RasterOptics, View};
 use crate::scene::{Scene, SceneMotion};
 use crate::sensor::ImageSensor;
+use crate::shown::Shown;
+use crate::truth::PlaneTruth;
 
 /// Parameters from the rest of the rig file that the simulation needs.
 #[derive(Debug, Clone, Copy)]
@@ -38,57 +40,78 @@ pub(crate) struct PlaneWorld {
     /// The scene in each key position of its motion; all have the same size.
     pub scenes: Vec<Scene>,
     pub motion: SceneMotion,
+    /// Projector row seen by camera row 0, as far as the rig file knows.
     pub first_row: usize,
+    pub truth: PlaneTruth,
     pub size: (usize, usize),
     pub format: PixelFormat,
     pub sensor: ImageSensor,
-    pub white: OnceLock<Shown>,
+    /// What a white picture shows, which is shown in every run.
+    pub white: Arc<Shown>,
 }
 
 impl PlaneWorld {
-    pub fn optics_of(&self, pattern: &Pattern) -> Result<Shown, SimError> {
-        let rows = self.setup.raster.rows;
-        let build = |weights: &[f32]| {
-            let (mosaic, projector) = (self.format.mosaic, &self.config.projector);
-            let table = row_table(&self.setup.raster, &projector.row_table, self.config.seed)?;
-            let optics = |scene| {
-                RasterOptics::new(scene, mosaic, self.first_row, projector, &table, weights).map(Arc::new)
-            };
-            self.scenes.iter().map(optics).collect::<Result<Shown, SimError>>()
+    /// What the projector shows under a pattern, with this subject before the camera.
+    pub fn show(&self, pattern: &Pattern, subject: Subject) -> Result<Arc<Shown>, SimError> {
+        let shown = match pattern {
+            Pattern::White => self.white.clone(),
+            _ => Arc::new(Shown::new(pattern.clone())),
         };
-        if *pattern == Pattern::White {
-            if let Some(white) = self.white.get() {
-                return Ok(white.clone());
+        self.prepare(&shown, subject)?;
+        Ok(shown)
+    }
+
+    /// Computes the light of a subject under what is shown, unless that is done.
+    pub fn prepare(&self, shown: &Shown, subject: Subject) -> Result<(), SimError> {
+        let Self { config, truth, .. } = self;
+        let view =
+            View { truth, projector: &config.projector, seed: config.seed, mosaic: self.format.mosaic };
+        match subject {
+            Subject::Scene if shown.scene.get().is_none() => {
+                let optics = |scene| RasterOptics::of_scene(scene, &view, &shown.pattern);
+                let keys =
+                    self.scenes.iter().map(optics).collect::<Result<Arc<[RasterOptics]>, SimError>>()?;
+                shown.scene.get_or_init(|| keys);
             }
-            let white = build(&vec![1.0; rows])?;
-            return Ok(self.white.get_or_init(|| white).clone());
+            Subject::Board if shown.board.get().is_none() => {
+                let optics = RasterOptics::of_board(&config.board, &view, &shown.pattern)?;
+                shown.board.get_or_init(|| optics);
+            }
+            _ => {}
         }
-        build(&pattern.row_weights(rows)?.ok_or(SimError::AlongRows)?)
+        Ok(())
     }
 
     /// Start of row `t`'s exposure relative to row 0.
     pub fn row_start_us(&self, shutter: Shutter, t: usize) -> f64 {
         match shutter {
-            Shutter::Rolling => t as f64 * self.setup.camera_row_time_us,
+            Shutter::Rolling => t as f64 * self.truth.camera_row_time_us,
             Shutter::Global => 0.0,
         }
     }
 
-    /// Ambient light of an exposure, in the scene's units.
-    pub fn ambient(&self, exposure: &Exposure) -> f32 {
+    /// Ambient light of an exposure, in the scene's units, in a row that begins `row_start_us` after row 0.
+    pub fn ambient(&self, exposure: &Exposure, row_start_us: f64) -> f32 {
         let ambient = &self.config.ambient;
         if ambient.level == 0.0 {
             return 0.0;
         }
         let exposure_s = exposure.settings.exposure_us * 1e-6;
-        let key = [exposure.key[0], exposure.key[1]];
-        let phase = uniform(&mut keyed(self.config.seed, Purpose::Flicker, &key));
-        let start_s = exposure.key[2] as f64 * self.setup.raster.period_us * 1e-6;
+        let phase_of = |key: &[u64]| uniform(&mut keyed(self.config.seed, Purpose::Flicker, key));
+        let (phase, start_s) = match ambient.phase {
+            FlickerPhase::Drawn => (
+                phase_of(&[exposure.key[0], exposure.key[1]]),
+                exposure.key[2] as f64 * self.setup.raster.period_us * 1e-6,
+            ),
+            FlickerPhase::Continuous => {
+                (phase_of(&[]), exposure.start_ns as f64 * 1e-9 + row_start_us * 1e-6)
+            }
+        };
         let angle = |time_s: f64| std::f64::consts::TAU * (phase + ambient.flicker_hz * time_s);
         // The integral of 1 + m sin(angle) over the exposure.
         let swing = (angle(start_s).cos() - angle(start_s + exposure_s).cos())
             / (std::f64::consts::TAU * ambient.flicker_hz.max(1e-9));
-        let rows = (exposure_s + ambient.flicker * swing) / (self.setup.raster.row_time_us * 1e-6);
+        let rows = (exposure_s + ambient.flicker * swing) / (self.truth.raster.row_time_us * 1e-6);
         (ambient.level * rows) as f32
     }
 
@@ -102,27 +125,29 @@ impl PlaneWorld {
             format: self.format,
             row_time_us: self.setup.camera_row_time_us,
             trigger_latency_us: camera.trigger_latency_us,
-            readout_us: self.readout_us(),
+            readout_us: self.readout_us(self.setup.camera_row_time_us),
             readout: camera.readout,
             exposure_us: camera.exposure_step_us..=1e6,
             trigger_delay_us: 0.0..=16e6,
         }
     }
 
-    fn readout_us(&self) -> f64 {
-        self.config.camera.readout_us.unwrap_or(self.size.0 as f64 * self.setup.camera_row_time_us)
+    fn readout_us(&self, row_time_us: f64) -> f64 {
+        self.config.camera.readout_us.unwrap_or(self.size.0 as f64 * row_time_us)
     }
 
     pub fn line_config(&self) -> LineConfig {
+        let row_time_us = self.truth.camera_row_time_us;
         LineConfig {
             seed: self.config.seed,
             period_ns: ns_from_us(self.setup.raster.period_us),
             vsync: self.config.vsync.clone(),
             projector: self.config.projector.clone(),
             camera: self.config.camera.clone(),
+            trigger_latency_us: self.truth.trigger_latency_us,
             motion: self.motion,
-            readout_ns: ns_from_us(self.readout_us()),
-            rolling_ns: ns_from_us(self.size.0.saturating_sub(1) as f64 * self.setup.camera_row_time_us),
+            readout_ns: ns_from_us(self.readout_us(row_time_us)),
+            rolling_ns: ns_from_us(self.size.0.saturating_sub(1) as f64 * row_time_us),
         }
     }
 }

@@ -8,12 +8,15 @@ use std::time::Duration;
 
 use ndarray::Array3;
 use raysweep_config::sim::SimConfig;
-use raysweep_config::sim::{RowTable, SimBeam, SimProjector, SimSensor, SimSpot, SimVsync};
+use raysweep_config::sim::{
+    FlickerPhase, RowTable, SimAmbient, SimBeam, SimBoard, SimProjector, SimSensor, SimSpot, SimTruth,
+    SimVsync,
+};
 use raysweep_core::{
     Camera, CameraSettings, DeviceErrorKind, Edge, FirstFrame, FramePool, FrameStamp, Pattern, PixelFormat,
-    Raster, SettingsId, Shutter,
+    Raster, SettingsId, Shutter, Subject,
 };
-use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup};
+use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
 
 const ROWS: usize = 8;
 const COLUMNS: usize = 4;
@@ -36,6 +39,15 @@ fn scene(folder: &Path) -> std::path::PathBuf {
 }
 
 fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
+    rig_of(RASTER, change).unwrap()
+}
+
+/// The scene in the middle of a taller frame, from projector row 8 on.
+fn tall_rig(change: impl FnOnce(&mut SimConfig)) -> Result<PlaneRig, SimError> {
+    rig_of(Raster { rows: 24, ..RASTER }, change)
+}
+
+fn rig_of(raster: Raster, change: impl FnOnce(&mut SimConfig)) -> Result<PlaneRig, SimError> {
     let folder = tempfile::tempdir().unwrap();
     let mut config = SimConfig {
         scene: scene(folder.path()),
@@ -46,7 +58,7 @@ fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
     config.camera.trigger_latency_us = 0.0;
     change(&mut config);
     let setup = PlaneSetup {
-        raster: RASTER,
+        raster,
         camera_row_time_us: TAU_US,
         row_pitch: 1.0,
         white_dn: WHITE,
@@ -54,7 +66,7 @@ fn rig(change: impl FnOnce(&mut SimConfig)) -> PlaneRig {
         format: PixelFormat::Mono12,
         first_row: None,
     };
-    PlaneRig::new(config, setup, Path::new("")).unwrap()
+    PlaneRig::new(config, setup, Path::new(""))
 }
 
 /// A running rig, with its VSYNC monitored on a separate thread because virtual time waits for every device.
@@ -62,12 +74,19 @@ struct Bench {
     camera: Option<Box<dyn Camera>>,
     edges: Receiver<Edge>,
     pool: FramePool,
+    subject: SubjectSwitch,
 }
 
 impl Bench {
     /// Shows a pattern (`None`: dark) and waits until the light shows it.
     fn lit(rig: &PlaneRig, pattern: Option<&Pattern>) -> Self {
-        let PlaneDevices { mut camera, mut vsync, mut projector, .. } = rig.open();
+        Self::lit_before(rig, Subject::Scene, pattern)
+    }
+
+    /// The same with this subject before the camera.
+    fn lit_before(rig: &PlaneRig, before: Subject, pattern: Option<&Pattern>) -> Self {
+        let PlaneDevices { mut camera, mut vsync, mut projector, subject, .. } = rig.open();
+        subject.place(before).unwrap();
         let (seen, edges) = channel();
         std::thread::spawn(move || {
             while let Ok(edge) = vsync.next_edge(Duration::from_secs(1)) {
@@ -81,7 +100,8 @@ impl Bench {
             Some(pattern) => projector.show(pattern).unwrap(),
             None => projector.blank().unwrap(),
         };
-        let mut bench = Self { camera: Some(camera), edges, pool: FramePool::new(1, ROWS * COLUMNS * 2) };
+        let pool = FramePool::new(1, ROWS * COLUMNS * 2);
+        let mut bench = Self { camera: Some(camera), edges, pool, subject };
         while bench.frame().1.exposure_start_ns < shown.not_before_ns {}
         bench
     }
@@ -317,4 +337,241 @@ fn rows_beside_the_scenes_window_shine_into_it() {
     };
     assert!((first_row(ROWS, 0) - (1.0 - 0.1068)).abs() < 1e-3, "nothing is drawn above the frame");
     assert!((first_row(20, 6) - 1.0).abs() < 1e-3, "rows above the window are drawn");
+}
+
+/// A long exposure of all rows under a pattern.
+fn pass(rig: &PlaneRig, before: Subject, pattern: &Pattern) -> Vec<Vec<f64>> {
+    Bench::lit_before(rig, before, Some(pattern)).expose(rolling(0.0, 16_000.0))
+}
+
+fn assert_near(seen: &[f64], expected: &[f64]) {
+    let is_near = seen.len() == expected.len()
+        && seen.iter().zip(expected).all(|(seen, expected)| (seen - expected).abs() <= 0.002);
+    assert!(is_near, "{seen:?} is not {expected:?}");
+}
+
+#[test]
+fn the_true_latency_moves_the_exposure_and_not_its_stamp() {
+    let rig = rig(|config| config.truth.trigger_latency_us = Some(10.0));
+    let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+    let own = bench.expose(rolling(490.0, TAU_US));
+    assert!(own.iter().flatten().all(|&light| light == 1.0), "{own:?}");
+    let (_, stamp) = bench.frame();
+    let edge = bench.edges.recv().unwrap();
+    assert_eq!((stamp.exposure_start_ns - edge.host_ns).rem_euclid(16_000_000), 490_000);
+    assert_eq!(bench.camera().capabilities().trigger_latency_us, 0.0);
+}
+
+#[test]
+fn true_row_times_and_counts_are_the_simulators_alone() {
+    let rig = rig(|config| {
+        config.truth = SimTruth {
+            first_row_us: Some(400.0),
+            row_time_us: Some(21.0),
+            camera_row_time_us: Some(21.0),
+            white_dn: Some(500.0),
+            black_dn: Some(100.0),
+            ..SimTruth::default()
+        };
+    });
+    let mut bench = Bench::lit(&rig, Some(&Pattern::White));
+    let own = bench.expose(rolling(400.0, 21.0));
+    assert!(own.iter().flatten().all(|&light| light == 0.6), "100 and 500 of {WHITE} counts: {own:?}");
+    assert_eq!(bench.camera().capabilities().row_time_us, TAU_US);
+    assert_eq!((rig.row_starts_us().unwrap()[8], rig.truth().raster.row_time_us), (568.0, 21.0));
+}
+
+#[test]
+fn all_light_of_a_pixel_comes_from_rows_about_its_true_place() {
+    let moved = |truth: SimTruth| tall_rig(|config| config.truth = truth).unwrap();
+    let under_row_11 = |rig: &PlaneRig| {
+        let line = Pattern::Line { row: 11 };
+        pass(rig, Subject::Scene, &line).iter().map(|row| row[0]).collect::<Vec<_>>()
+    };
+    assert_near(&under_row_11(&moved(SimTruth::default())), &[0.0, 0.0, 0.0, 1.0, 0.25, 0.0, 0.0, 0.0]);
+    let quarter = moved(SimTruth { row_offset_rows: 0.25, ..SimTruth::default() });
+    // Camera row 2 looks at 10.25 and camera row 3 at 11.25; a quarter of each row goes to the camera row below.
+    let expected = [0.0, 0.0, 0.25, 0.75 + 0.25 * 0.25, 0.25 * 0.75, 0.0, 0.0, 0.0];
+    assert_near(&under_row_11(&quarter), &expected);
+    let up = moved(SimTruth { row_offset_rows: -2.0, ..SimTruth::default() });
+    assert_near(&under_row_11(&up), &[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.25, 0.0]);
+    let first = moved(SimTruth { first_projector_row: Some(6), ..SimTruth::default() });
+    assert_near(&under_row_11(&first), &[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.25, 0.0]);
+    assert_eq!((first.first_row(), first.truth().first_row), (8, 6), "the rig file knows nothing of it");
+
+    let turned = moved(SimTruth { rotation_deg: 0.5_f64.atan().to_degrees(), ..SimTruth::default() });
+    let rows = pass(&turned, Subject::Board, &Pattern::Line { row: 11 });
+    // The columns look 0.75 and 0.25 rows above and below.
+    assert_near(&rows[3], &[0.25, 0.75, 0.75, 0.25]);
+    assert!((turned.truth().place(3, 0) - 10.25).abs() < 1e-9);
+    let larger = moved(SimTruth { magnification: 1.2, ..SimTruth::default() });
+    assert!((larger.truth().place(7, 0) - larger.truth().place(0, 0) - 8.4).abs() < 1e-9);
+    let rows = pass(&larger, Subject::Board, &Pattern::White);
+    assert!(rows.iter().flatten().all(|&light| (light - 1.0).abs() <= 0.002), "{rows:?}");
+}
+
+#[test]
+fn a_flying_spot_and_a_fractional_place_go_together() {
+    let rig = tall_rig(|config| {
+        config.projector.spot = SimSpot::OneWay;
+        config.truth.row_offset_rows = 0.5;
+    })
+    .unwrap();
+    for before in [Subject::Scene, Subject::Board] {
+        let mut bench = Bench::lit_before(&rig, before, Some(&Pattern::Line { row: 11 }));
+        // Row 11 is lit from 720 us on, and camera row 3 begins 60 us late: its first half has the first two columns.
+        let rows = bench.expose(rolling(660.0, TAU_US / 2.0));
+        // Half of the quarter from the scene row above, for half of the row's time.
+        let steady = if before == Subject::Scene { 0.25 * 0.5 * 0.5 } else { 0.0 };
+        assert_near(&rows[3], &[0.5 + steady, 0.5 + steady, steady, steady]);
+    }
+}
+
+#[test]
+fn truths_that_do_not_fit_are_refused_by_name() {
+    let refused = |truth: SimTruth| {
+        let Err(error) = tall_rig(|config| config.truth = truth.clone()) else {
+            panic!("{truth:?} is taken")
+        };
+        assert!(error.to_string().contains(&format!("sim.{}", error.key())), "{error}");
+        error.key()
+    };
+    let none = SimTruth::default;
+    assert_eq!(refused(SimTruth { row_time_us: Some(700.0), ..none() }), "truth.row_time_us");
+    assert_eq!(refused(SimTruth { first_row_us: Some(15_900.0), ..none() }), "truth.first_row_us");
+    assert_eq!(refused(SimTruth { first_projector_row: Some(17), ..none() }), "truth.first_projector_row");
+    assert_eq!(refused(SimTruth { row_offset_rows: 8.5, ..none() }), "truth.row_offset_rows");
+    assert_eq!(refused(SimTruth { rotation_deg: 45.1, ..none() }), "truth.rotation_deg");
+    assert_eq!(refused(SimTruth { magnification: 4.0, ..none() }), "truth.magnification");
+    assert_eq!(refused(SimTruth { row_pitch: Some(3.0), ..none() }), "truth.row_pitch");
+    assert_eq!(
+        refused(SimTruth { trigger_latency_us: Some(f64::NAN), ..none() }),
+        "truth.trigger_latency_us"
+    );
+}
+
+#[test]
+fn a_kernel_is_drawn_as_it_is_given_and_changes_down_the_frame() {
+    let kernel = |to: Option<Vec<f64>>| SimBeam::Kernel {
+        rows: vec![-1, 0, 1, 2],
+        weights: vec![1.0, 5.0, 3.0, 1.0],
+        to,
+    };
+    let under = |beam: SimBeam, row| {
+        let rig = tall_rig(|config| config.projector.beam = beam).unwrap();
+        pass(&rig, Subject::Board, &Pattern::Line { row }).iter().map(|row| row[0]).collect::<Vec<_>>()
+    };
+    assert_near(&under(kernel(None), 11), &[0.0, 0.0, 0.1, 0.5, 0.3, 0.1, 0.0, 0.0]);
+    // Row 11.5 of 0 to 23 is the middle.
+    let to = Some(vec![0.0, 1.0, 0.0, 0.0]);
+    let down = 11.0 / 23.0;
+    let expected = [0.1 - 0.1 * down, 0.5 + 0.5 * down, 0.3 - 0.3 * down, 0.1 - 0.1 * down];
+    assert_near(&under(kernel(to), 11)[2..6], &expected);
+    for (rows, weights) in [(vec![0, 0], vec![1.0; 2]), (vec![0], vec![0.0]), (vec![0, 1], vec![1.0, -1.0])] {
+        let beam = SimBeam::Kernel { rows, weights, to: None };
+        let Err(error) = tall_rig(|config| config.projector.beam = beam.clone()) else { panic!("{beam:?}") };
+        assert!(error.to_string().contains("kernel"), "{error}");
+    }
+}
+
+#[test]
+fn board_and_cap_stand_before_the_camera_at_once() {
+    let rig = tall_rig(|config| config.ambient.level = 0.001).unwrap();
+    let mut bench = Bench::lit(&rig, Some(&Pattern::Line { row: 11 }));
+    let ambient = 0.001 * 16_000.0 / TAU_US;
+    let column = |rows: Vec<Vec<f64>>| rows.iter().map(|row| row[0] - ambient).collect::<Vec<_>>();
+    let long = rolling(0.0, 16_000.0);
+    assert_near(&column(bench.expose(long)), &[0.0, 0.0, 0.0, 1.0, 0.25, 0.0, 0.0, 0.0]);
+    bench.subject.place(Subject::Board).unwrap();
+    assert_near(&column(bench.expose(long)), &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]);
+    bench.subject.place(Subject::Cap).unwrap();
+    assert!(bench.expose(long).iter().flatten().all(|&light| light == 0.0));
+    bench.subject.place(Subject::Scene).unwrap();
+    assert_near(&column(bench.expose(long))[4..5], &[0.25]);
+    let error = bench.subject.place(Subject::Diffuser).unwrap_err();
+    assert_eq!((error.device, error.kind), ("subject", DeviceErrorKind::OutOfRange));
+}
+
+#[test]
+fn a_board_scatters_as_much_as_it_is_said_to() {
+    let raster = Raster { rows: 64, ..RASTER };
+    let board = SimBoard { scatter_rows: 1.5, scatter_share: 0.15, ..SimBoard::default() };
+    let rig = rig_of(raster, |config| {
+        config.board = board;
+        config.truth.white_dn = Some(4.0 * WHITE);
+    })
+    .unwrap();
+    // Camera row 3 looks at row 31.
+    let share = |row| pass(&rig, Subject::Board, &Pattern::Line { row })[3][0] / 4.0;
+    let shares: Vec<f64> = (24..39).map(share).collect();
+    let total: f64 = shares.iter().sum();
+    let variance: f64 = (24..39).zip(&shares).map(|(row, share)| f64::from(row - 31).powi(2) * share).sum();
+    assert!((total - 1.0).abs() < 0.005, "{shares:?}");
+    assert!((variance / (0.15 * 1.5 * 1.5) - 1.0).abs() < 0.1, "{variance}");
+}
+
+#[test]
+fn columns_are_shown_to_the_board_and_to_built_in_scenes() {
+    let code = |bit, inverse| Pattern::GrayColumns { bit, inverse, block: 160 };
+    let rig = tall_rig(|_| {}).unwrap();
+    // Each of four columns sees two blocks, whose Gray codes are 0 1, 3 2, 6 7 and 5 4.
+    let seen = |bit| pass(&rig, Subject::Board, &code(bit, false))[2].clone();
+    assert_near(&seen(2), &[0.0, 0.0, 1.0, 1.0]);
+    assert_near(&seen(1), &[0.0, 1.0, 1.0, 0.0]);
+    assert_near(&seen(0), &[0.5, 0.5, 0.5, 0.5]);
+    let checkerboard = Pattern::Checkerboard { cell_px: 320, shift_px: (0, 0) };
+    assert_near(&pass(&rig, Subject::Board, &checkerboard)[2], &[1.0, 0.0, 1.0, 0.0]);
+
+    let mut devices = rig.open();
+    let error = devices.projector.show(&code(0, false)).unwrap_err();
+    assert!(error.to_string().contains("put the board"), "{error}");
+    devices.subject.place(Subject::Board).unwrap();
+    devices.projector.show(&code(0, false)).unwrap();
+    assert!(
+        devices.subject.place(Subject::Scene).is_err(),
+        "the scene cannot be simulated under what is shown"
+    );
+    let image = devices.projector.show(&Pattern::Image("a.png".into())).unwrap_err();
+    assert!(image.to_string().contains("files"), "{image}");
+
+    let built_in = tall_rig(|config| {
+        (config.scene, config.scene_rows, config.scene_columns) = ("v-groove".into(), ROWS, 8);
+    })
+    .unwrap();
+    let image = |pattern: &Pattern| {
+        let PlaneDevices { mut camera, vsync, mut projector, .. } = built_in.open();
+        drop(vsync);
+        camera.arm().unwrap();
+        let shown = projector.show(pattern).unwrap();
+        let mut data = FramePool::new(1, ROWS * 8 * 2).take();
+        camera.configure(SettingsId { point: 0, attempt: 0 }, &rolling(0.0, 16_000.0)).unwrap();
+        let mut pixels = [0; ROWS * 8];
+        while camera.next_frame(&mut data, Duration::from_secs(1)).unwrap().unwrap().exposure_start_ns
+            < shown.not_before_ns
+        {}
+        PixelFormat::Mono12.unpack_into(&data, &mut pixels).unwrap();
+        pixels.map(f64::from)
+    };
+    let (some, rest, white) = (image(&code(1, false)), image(&code(1, true)), image(&Pattern::White));
+    for ((some, rest), white) in some.iter().zip(rest).zip(white) {
+        assert!((some + rest - white).abs() <= 2.0, "{some} and {rest} are not {white}");
+    }
+    assert!(some.iter().any(|&dn| dn > 100.0) && rest.iter().any(|&dn| dn > 100.0));
+}
+
+#[test]
+fn a_continuous_lamp_is_seen_by_each_row_at_its_own_time() {
+    let rig = rig(|config| {
+        config.ambient =
+            SimAmbient { level: 0.5, flicker: 1.0, flicker_hz: 1000.0, phase: FlickerPhase::Continuous };
+    });
+    let mut bench = Bench::lit(&rig, None);
+    // Row 0 of frames at different delays sees what the rows of one frame see.
+    let rows = bench.expose(rolling(0.0, TAU_US));
+    let (_, stamp) = bench.frame();
+    let later = bench.expose(rolling(5.0 * TAU_US, TAU_US));
+    assert!((later[0][0] - rows[5][0]).abs() < 0.002, "{later:?} {rows:?}");
+    let levels = || rows.iter().map(|row| row[0]);
+    assert!(levels().fold(0.0, f64::max) - levels().fold(1.0, f64::min) > 0.02, "{rows:?}");
+    assert_eq!(stamp.exposure_start_ns % 1_000_000, 0, "frames begin at whole periods of the lamp");
 }

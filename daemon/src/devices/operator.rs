@@ -1,15 +1,16 @@
-//! The operator of a projector without a driver: the projector's questions pause the run, and `continue` answers
-//! them.
+//! The operator of a projector without a driver, and of what stands before a camera: questions pause the run, and
+//! `continue` answers them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
 
-use raysweep_core::{DeviceError, DeviceErrorKind, Pattern};
+use raysweep_core::{DeviceError, DeviceErrorKind, Pattern, Subject};
 use raysweep_drivers::projector::external::{Request, Wanted};
 use raysweep_proto::Event;
 
+use crate::rig::Stand;
 use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
 
@@ -86,9 +87,39 @@ fn tell(question: Request, board: &StatusBoard) {
     question.refuse("the run is over and did not wait for it");
 }
 
+/// Places a subject before the camera; waits for the operator if needed. `planes` is the number of calibration planes.
+///
+/// # Errors
+/// For a subject that the rig does not have.
+pub fn place(
+    stand: &Stand,
+    subject: Subject,
+    planes: usize,
+    orders: &Orders,
+    board: &StatusBoard,
+) -> Result<(), DeviceError> {
+    orders.wait_while_paused();
+    if !stand.place(subject)? {
+        let text = match subject {
+            Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
+            Subject::Plane(plane) => {
+                format!("put calibration plane {} of {} before the camera", plane + 1, planes)
+            }
+            Subject::Scene => "put the scene before the camera, and all else away".into(),
+            Subject::Board => "put the white board in the scene's place, so that it fills the view".into(),
+            Subject::Cap => "put the cap on the camera's lens".into(),
+        };
+        orders.give(Order::Pause);
+        board.ask(&text);
+        orders.wait_while_paused();
+    }
+    Ok(())
+}
+
 fn task(wanted: &Wanted) -> String {
     match wanted {
         Wanted::Pattern(Pattern::White) => "make the projector show a white picture".into(),
+        Wanted::Pattern(Pattern::Black) => "make the projector show a black picture".into(),
         Wanted::Pattern(pattern) => format!("make the projector show {pattern:?}"),
         Wanted::Dark => "turn the projector's light off, or cover its lens".into(),
     }

@@ -104,7 +104,7 @@ impl Opened {
     /// # Errors
     /// The first device that cannot be opened; a camera whose size differs from the task's.
     pub fn open(rig: &Rig, task: &Arc<PlaneTask>, run: &Run) -> Result<Self, RunError> {
-        let Devices { camera, vsync, projector, questions, clock, pace } = rig.open()?;
+        let Devices { camera, vsync, projector, questions, clock, pace, .. } = rig.open()?;
         let operator = questions
             .map(|questions| Operator::start(questions, run.orders.clone(), run.board.clone()))
             .transpose()?;

@@ -6,15 +6,15 @@ use std::time::Duration;
 
 use raysweep_config::DotRigFile;
 use raysweep_config::rig::dots::{DotCameraDriver, MirrorDriver};
-use raysweep_core::{Camera, Clock, DeviceError, MechanicalDeg, Mirror, Subject};
+use raysweep_core::{Camera, Clock, MechanicalDeg, Mirror};
 use raysweep_drivers::camera::replay::{ReplayCamera, ReplayConfig, ReplayPace};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::mirror::{
     LightGuard, Mti, MtiConfig, Optotune, OptotuneConfig, PlayzerX, PlayzerXConfig, RtsLaser,
 };
-use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth, SubjectSwitch};
+use raysweep_sim::dots::{DotsDevices, DotsRig, DotsSetup, DotsTruth};
 
-use super::{Pace, RigError, Source};
+use super::{Pace, RigError, Source, Stand};
 use crate::mirror;
 
 /// A dot rig whose devices can be opened, one run at a time.
@@ -42,31 +42,6 @@ pub struct DotDevices {
     pub pace: Pace,
     /// Ground truth of a simulated camera, for tests only.
     pub truth: Option<DotsTruth>,
-}
-
-/// Who or what places planes and scene in front of the camera.
-#[derive(Clone)]
-pub enum Stand {
-    /// The simulator, immediately.
-    Simulated(SubjectSwitch),
-    /// An operator: the run must wait for one.
-    Operator,
-    /// Nobody: the recording contains them in the plan's order.
-    Recorded,
-}
-
-impl Stand {
-    /// Places a subject if this needs no person; `false` if an operator must do it.
-    ///
-    /// # Errors
-    /// `OutOfRange` for a plane that the rig does not have.
-    pub fn place(&self, subject: Subject) -> Result<bool, DeviceError> {
-        match self {
-            Self::Simulated(switch) => switch.place(subject).map(|()| true),
-            Self::Recorded => Ok(true),
-            Self::Operator => Ok(false),
-        }
-    }
 }
 
 impl DotRig {
@@ -232,7 +207,7 @@ impl DotRig {
 
 #[cfg(test)]
 mod tests {
-    use raysweep_core::{DeviceState, FramePool};
+    use raysweep_core::{DeviceState, FramePool, Subject};
 
     use super::*;
     use crate::rig::AnyRig;

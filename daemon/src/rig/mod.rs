@@ -2,6 +2,7 @@
 
 mod dots;
 mod simulated;
+mod stand;
 mod vsync;
 
 use std::path::{Path, PathBuf};
@@ -20,7 +21,8 @@ use raysweep_sim::PlaneRig;
 
 use self::simulated::{Simulated, simulate};
 
-pub use self::dots::{DotDevices, DotRig, Stand};
+pub use self::dots::{DotDevices, DotRig};
+pub use self::stand::Stand;
 
 /// Why a rig cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -118,6 +120,8 @@ pub struct Devices {
     pub projector: Box<dyn Projector>,
     /// The projector's requests to its operator, if a person operates it.
     pub questions: Option<Receiver<Request>>,
+    /// Places scene, board and cap in front of the camera.
+    pub stand: Stand,
     /// The clock of their timestamps.
     pub clock: Clock,
     /// Whether the devices or the pipeline set the pace.
@@ -185,7 +189,7 @@ impl Rig {
         )))
     }
 
-    /// The simulated rig, if any device is simulated.
+    /// The simulated rig, if any device is simulated; its truth is for tests only.
     pub fn simulated(&self) -> Option<&PlaneRig> {
         self.sim.as_deref()
     }
@@ -217,9 +221,13 @@ impl Rig {
             CameraDriver::V4l2 => (self.open_v4l2()?, Clock::real()),
         };
         self.check_rows(camera.capabilities())?;
+        let stand = match self.file.camera.driver {
+            CameraDriver::Sim => simulated.stand()?,
+            CameraDriver::Aravis | CameraDriver::V4l2 => Stand::Operator,
+        };
         let by_the_clock = self.file.sim.realtime || self.file.camera.driver != CameraDriver::Sim;
         let pace = if by_the_clock { Pace::Devices } else { Pace::Pipeline };
-        Ok(Devices { camera, vsync, projector, questions, clock, pace })
+        Ok(Devices { camera, vsync, projector, questions, stand, clock, pace })
     }
 
     /// Real devices use the host's clock, so simulated devices beside them must run in real time.

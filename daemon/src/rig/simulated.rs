@@ -7,9 +7,9 @@ use raysweep_config::RigFile;
 use raysweep_config::rig::plane::CameraDriver;
 use raysweep_core::{Camera, Clock, Projector, Vsync};
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
-use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError};
+use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
 
-use super::{Rig, RigError};
+use super::{Rig, RigError, Stand};
 
 /// Builds the simulated rig that a file describes; scene paths are relative to `folder`.
 pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimError> {
@@ -31,6 +31,7 @@ pub(super) struct Simulated {
     camera: Option<(Box<dyn Camera>, Clock)>,
     vsync: Option<Box<dyn Vsync>>,
     projector: Option<Box<dyn Projector>>,
+    subject: Option<SubjectSwitch>,
     /// Socket of the bench process, if the devices are simulated there.
     bench: Option<PathBuf>,
 }
@@ -45,9 +46,10 @@ impl Simulated {
             }
             (Some(bench), _) => Ok(Self { bench: Some(bench.clone()), ..Self::default() }),
             (None, Some(sim)) => {
-                let PlaneDevices { camera, vsync, projector, clock, .. } = sim.open();
+                let PlaneDevices { camera, vsync, projector, subject, clock, .. } = sim.open();
                 let camera = Some((camera, clock));
-                Ok(Self { camera, vsync: Some(vsync), projector: Some(projector), bench: None })
+                let (vsync, projector, subject) = (Some(vsync), Some(projector), Some(subject));
+                Ok(Self { camera, vsync, projector, subject, bench: None })
             }
             (None, None) => Ok(Self::default()),
         }
@@ -72,6 +74,11 @@ impl Simulated {
             Some(bench) => Ok(Box::new(RemoteProjector::open(bench)?)),
             None => self.projector.take().ok_or_else(|| not_simulated("projector")),
         }
+    }
+
+    /// What places subjects before the camera.
+    pub(super) fn stand(&mut self) -> Result<Stand, RigError> {
+        self.subject.take().map(Stand::Simulated).ok_or_else(|| not_simulated("camera"))
     }
 }
 

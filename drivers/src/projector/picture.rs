@@ -43,24 +43,11 @@ pub enum PictureError {
 
 /// Red, green and blue codes of each pixel, row by row. A code is proportional to the weight, with 255 for weight 1.
 pub fn render(pattern: &Pattern, (columns, rows): (usize, usize)) -> Result<Vec<[u8; 3]>, PictureError> {
-    let weights = pattern.row_weights(rows)?;
     let code = |weight: f32| [(weight * 255.0).round() as u8; 3];
-    match (weights, pattern) {
-        (Some(weights), _) => {
-            Ok(weights.iter().flat_map(|&weight| std::iter::repeat_n(code(weight), columns)).collect())
-        }
-        (None, Pattern::Checkerboard { cell_px, shift_px }) => {
-            let cell = *cell_px as usize;
-            // The checkerboard repeats after two cells, so shifts are taken modulo two cells.
-            let lit_half = |at: usize, shift: u32| {
-                ((at + 2 * cell - shift as usize % (2 * cell)) / cell).is_multiple_of(2)
-            };
-            let pixel = |x, y| lit_half(x, shift_px.0) == lit_half(y, shift_px.1);
-            let pixels = (0..rows).flat_map(|y| (0..columns).map(move |x| (x, y)));
-            Ok(pixels.map(|(x, y)| code(if pixel(x, y) { 1.0 } else { 0.0 })).collect())
-        }
+    match (pattern.pixel_weights((columns, rows))?, pattern) {
+        (Some(weights), _) => Ok(weights.into_iter().map(code).collect()),
         (None, Pattern::Image(path)) => read_png(path, (columns, rows)),
-        // All other patterns have row weights.
+        // All other patterns have weights.
         (None, _) => Ok(vec![[0; 3]; columns * rows]),
     }
 }
@@ -101,6 +88,8 @@ mod tests {
         assert_eq!(pixels, [BLACK, BLACK, [51; 3], [51; 3], WHITE, WHITE]);
         let pixels = render(&Pattern::Line { row: 1 }, (1, 3)).unwrap();
         assert_eq!(pixels, [BLACK, WHITE, BLACK]);
+        let pixels = render(&Pattern::SparseColumns { phase: 1, period: 2 }, (3, 2)).unwrap();
+        assert_eq!(pixels, [BLACK, WHITE, BLACK, BLACK, WHITE, BLACK]);
     }
 
     #[test]

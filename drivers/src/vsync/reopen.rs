@@ -47,10 +47,7 @@ impl<V: Vsync> Reopened<V> {
 
 /// Whether opening the device again may help.
 fn is_loss(error: &DeviceError) -> bool {
-    matches!(
-        error.kind,
-        DeviceErrorKind::Disconnected | DeviceErrorKind::Timeout | DeviceErrorKind::Protocol
-    )
+    matches!(error.kind, DeviceErrorKind::Disconnected | DeviceErrorKind::Timeout | DeviceErrorKind::Protocol)
 }
 
 impl<V: Vsync> Vsync for Reopened<V> {

@@ -18,4 +18,4 @@ mod world;
 pub use bench::DotsSetup;
 pub use rig::{DotsDevices, DotsRig, DotsRigError};
 pub use scene::{BUILTIN_NAMES, DotSceneError};
-pub use world::{DotsTruth, FrameFate, FrameTruth, SubjectSwitch};
+pub use world::{DotsTruth, FrameFate, FrameTruth};

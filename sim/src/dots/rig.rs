@@ -11,8 +11,9 @@ use super::bench::{Bench, DotsSetup};
 use super::camera::DotCamera;
 use super::mirror::{DotMirror, WatchedMirror};
 use super::scene::{DotScene, DotSceneError};
-use super::world::{DotsTruth, SubjectSwitch, World};
+use super::world::{DotsTruth, World};
 use crate::sensor::{ImageSensor, Scale};
+use crate::subject::SubjectSwitch;
 use raysweep_config::sim::{DotsConfig, SimDotSensor, SimSensor};
 
 /// Why a simulated dot rig cannot be built.
@@ -109,7 +110,10 @@ impl DotsRig {
         DotsDevices {
             camera: Box::new(DotCamera::new(world.clone(), clock.register())),
             mirror,
-            subject: SubjectSwitch::new(world.clone()),
+            subject: SubjectSwitch::new({
+                let world = world.clone();
+                move |subject| world.place(subject)
+            }),
             truth: DotsTruth::new(world),
             clock,
         }

@@ -2,12 +2,13 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use raysweep_core::{Clock, DeviceError, DeviceErrorKind, MirrorPath, Subject, ns_from_us};
+use raysweep_core::{Clock, DeviceError, MirrorPath, Subject, ns_from_us};
 
 use super::bench::Bench;
 use super::scan::{Lit, MirrorScan};
 use super::scene::{SpotImages, Still};
 use crate::keyed::{Purpose, keyed, uniform};
+use crate::subject::not_there;
 
 /// Frames that a camera in real time buffers for a slow host.
 const CAMERA_BUFFERS: u64 = 64;
@@ -18,32 +19,6 @@ const DIFFUSER_LIGHT: f32 = 0.6;
 /// Light of a subject that is uniform over all pixels, independent of the mirror; `None` for other subjects.
 pub(super) fn even_light(subject: Subject) -> Option<f32> {
     (subject == Subject::Diffuser).then_some(DIFFUSER_LIGHT)
-}
-
-/// Changes the subject in front of the camera, as an operator would.
-#[derive(Clone)]
-pub struct SubjectSwitch(Arc<World>);
-
-impl SubjectSwitch {
-    pub(super) fn new(world: Arc<World>) -> Self {
-        Self(world)
-    }
-
-    /// Places a subject in front of the camera. A path keeps the subject that was in place when it began.
-    ///
-    /// # Errors
-    /// `OutOfRange` for a plane that does not exist on this rig.
-    pub fn place(&self, subject: Subject) -> Result<(), DeviceError> {
-        let planes = self.0.bench.scene.planes();
-        if let Subject::Plane(number) = subject
-            && number >= planes
-        {
-            let what = format!("plane {number}: sim.dots.plane_depths has {planes}, counted from 0");
-            return Err(DeviceError::new("subject", DeviceErrorKind::OutOfRange, what));
-        }
-        self.0.lock().subject = subject;
-        Ok(())
-    }
 }
 
 /// What happened to a frame.
@@ -208,6 +183,27 @@ impl World {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Places a subject in front of the camera. A path keeps the subject that was in place when it began.
+    ///
+    /// # Errors
+    /// `OutOfRange` for a subject that does not exist on this rig.
+    pub fn place(&self, subject: Subject) -> Result<(), DeviceError> {
+        let planes = self.bench.scene.planes();
+        match subject {
+            Subject::Plane(number) if number >= planes => {
+                let what = format!("plane {number}: sim.dots.plane_depths has {planes}, counted from 0");
+                return Err(not_there(what));
+            }
+            Subject::Board | Subject::Cap => {
+                let what = format!("{subject:?}: a dot rig has the scene, planes and a diffuser");
+                return Err(not_there(what));
+            }
+            Subject::Scene | Subject::Plane(_) | Subject::Diffuser => {}
+        }
+        self.lock().subject = subject;
+        Ok(())
+    }
+
     /// Starts a path whose first sample is played at `start_ns`, if already known.
     pub fn start(&self, path: MirrorPath, batches: u32, start_ns: Option<i64>) {
         let scan = MirrorScan::new(
@@ -354,7 +350,7 @@ impl World {
     fn still(&self, subject: Subject, rate_hz: f64, scan: &MirrorScan, batch: u64) -> Arc<dyn Still> {
         let plane = match subject {
             Subject::Plane(number) => self.bench.scene.plane(number),
-            Subject::Scene | Subject::Diffuser => None,
+            Subject::Scene | Subject::Diffuser | Subject::Board | Subject::Cap => None,
         };
         plane.unwrap_or_else(|| {
             let seconds = (batch * scan.samples_per_batch()) as f64 / rate_hz;

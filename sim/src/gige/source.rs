@@ -137,7 +137,7 @@ impl SourceControls for SceneControls {
 impl Pictures for ScenePictures {
     fn wait(&mut self, view: &FrameLayout, timeout: Duration) -> Option<ExposedPicture> {
         let exposure = self.camera.next_exposure(view.y, timeout)?;
-        let (seq, start_ns) = (exposure.seq, exposure.start_ns);
+        let (seq, start_ns) = (exposure.seq, exposure.stamped_ns);
         // Sequencer sets are keyed by their index; other settings have point 0.
         let [set, ..] = exposure.key;
         Some(ExposedPicture { seq, start_ns, exposure_us: exposure.settings.exposure_us, set })

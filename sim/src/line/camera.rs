@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use raysweep_core::{CameraSettings, SettingsId, Shutter, ns_from_us};
+use raysweep_core::{CameraSettings, SettingsId, Shutter, Subject, ns_from_us};
 
 /// One exposure of the camera.
 pub struct Exposure {
@@ -12,8 +12,12 @@ pub struct Exposure {
     pub key: [u64; 3],
     /// Settings of the exposure.
     pub settings: CameraSettings,
+    /// What stands before the camera.
+    pub subject: Subject,
     /// Start of row 0's exposure.
     pub start_ns: i64,
+    /// Start of row 0's exposure as the camera stamps it, by the trigger latency that it states.
+    pub stamped_ns: i64,
     /// When the frame arrives at the host.
     pub done_ns: i64,
     /// Whether the frame arrives.

@@ -221,7 +221,7 @@ const MAX_ROWS: u64 = 8192;
 
 /// Fraction by which the row times of camera and projector may differ. The model follows the drift of the delay;
 /// beyond this limit, a sweep would no longer cover the epipolar planes of all rows.
-const ROW_TIME_TOLERANCE: f64 = 0.01;
+const ROW_TIME_TOLERANCE: f64 = 0.05;
 
 impl RigFile {
     /// Reads a rig file.

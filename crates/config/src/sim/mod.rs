@@ -5,5 +5,6 @@ mod plane;
 
 pub use self::dots::{DotsConfig, SimDot, SimDotCamera, SimDotSensor, SimMirror};
 pub use self::plane::{
-    RowTable, SimAmbient, SimBeam, SimCamera, SimConfig, SimProjector, SimSensor, SimSpot, SimVsync,
+    FlickerPhase, RowTable, SimAmbient, SimBeam, SimBoard, SimCamera, SimConfig, SimProjector, SimSensor,
+    SimSpot, SimTruth, SimVsync,
 };

@@ -35,6 +35,10 @@ pub struct SimConfig {
     pub sensor: SimSensor,
     /// `[sim.ambient]`
     pub ambient: SimAmbient,
+    /// `[sim.board]`
+    pub board: SimBoard,
+    /// `[sim.truth]`
+    pub truth: SimTruth,
 }
 
 impl Default for SimConfig {
@@ -52,6 +56,8 @@ impl Default for SimConfig {
             camera: SimCamera::default(),
             sensor: SimSensor::default(),
             ambient: SimAmbient::default(),
+            board: SimBoard::default(),
+            truth: SimTruth::default(),
         }
     }
 }
@@ -121,6 +127,16 @@ pub enum SimBeam {
         up_rows: f64,
         /// Extent towards the last row.
         down_rows: f64,
+    },
+    /// Any profile over whole rows.
+    Kernel {
+        /// Offsets from the row, towards the last row, rising.
+        rows: Vec<i32>,
+        /// Light at each offset, as drawn by the first row.
+        weights: Vec<f64>,
+        /// Light at each offset, as drawn by the last row; the shares of rows between change linearly. Default: as
+        /// `weights`.
+        to: Option<Vec<f64>>,
     },
 }
 
@@ -256,10 +272,88 @@ pub struct SimAmbient {
     pub flicker: f64,
     /// Frequency of the flicker: twice the mains frequency.
     pub flicker_hz: f64,
+    /// The phase of the flicker.
+    pub phase: FlickerPhase,
+}
+
+/// The phase of ambient flicker.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FlickerPhase {
+    /// Drawn for each attempt at a point, and the same in all rows of a frame: the same seed gives the same bits
+    /// wherever a run was interrupted.
+    Drawn,
+    /// That of a lamp, which flickers in time: each row sees it at the time of its own exposure.
+    Continuous,
 }
 
 impl Default for SimAmbient {
     fn default() -> Self {
-        Self { level: 0.0, flicker: 0.0, flicker_hz: 100.0 }
+        Self { level: 0.0, flicker: 0.0, flicker_hz: 100.0, phase: FlickerPhase::Drawn }
+    }
+}
+
+/// The board of a calibration: flat, matt, white, in the scene's place.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimBoard {
+    /// Standard deviation, in projector rows, of the light that spreads inside the board.
+    pub scatter_rows: f64,
+    /// Share of the board's light that spreads inside it, 0..=1.
+    pub scatter_share: f64,
+    /// Projector columns, 0 to 1 across its width, that the image's left and right edges see on the board.
+    pub projector_columns: [f64; 2],
+}
+
+impl Default for SimBoard {
+    fn default() -> Self {
+        Self { scatter_rows: 0.0, scatter_share: 0.0, projector_columns: [0.0, 1.0] }
+    }
+}
+
+/// What is true of the simulated rig where the rest of the rig file says something else. The simulator alone knows it.
+/// Without a key, the rig file is right.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SimTruth {
+    /// `projector.first_row_us`
+    pub first_row_us: Option<f64>,
+    /// `projector.row_time_us`
+    pub row_time_us: Option<f64>,
+    /// `camera.row_pitch`
+    pub row_pitch: Option<f64>,
+    /// `camera.first_projector_row`
+    pub first_projector_row: Option<usize>,
+    /// `sim.camera.trigger_latency_us`, which stays the one that the camera states and stamps its frames by.
+    pub trigger_latency_us: Option<f64>,
+    /// `camera.row_time_us`
+    pub camera_row_time_us: Option<f64>,
+    /// `camera.white_dn`
+    pub white_dn: Option<f64>,
+    /// `camera.black_dn`
+    pub black_dn: Option<f64>,
+    /// Projector rows by which all pixels look further down.
+    pub row_offset_rows: f64,
+    /// Angle by which the camera's rows run down the projector's from left to right.
+    pub rotation_deg: f64,
+    /// Factor on the projector rows between the camera's rows, about the middle row.
+    pub magnification: f64,
+}
+
+impl Default for SimTruth {
+    fn default() -> Self {
+        Self {
+            first_row_us: None,
+            row_time_us: None,
+            row_pitch: None,
+            first_projector_row: None,
+            trigger_latency_us: None,
+            camera_row_time_us: None,
+            white_dn: None,
+            black_dn: None,
+            row_offset_rows: 0.0,
+            rotation_deg: 0.0,
+            magnification: 1.0,
+        }
     }
 }

@@ -84,14 +84,19 @@ fn errors(rig: &Rig, times: &RowTimes) -> Errors {
     // Light of the middle camera row.
     let middle = case.window.1 / 2;
     let place = case.window.0 + middle;
-    let latency_us = times.row_starts_us[place] - rig.starts_us[place]
+    let latency_us = times.row_starts_us[place]
+        - rig.starts_us[place]
         - middle as f64 * (times.camera_row_time_us.value - case.camera_row_time_us);
-    let mode = |times: &RowTimes| times.row_starts_modes.rows().into_iter().skip(4).map(|mode| mode.to_vec()).collect::<Vec<_>>();
+    let mode = |times: &RowTimes| {
+        times.row_starts_modes.rows().into_iter().skip(4).map(|mode| mode.to_vec()).collect::<Vec<_>>()
+    };
     let modes = mode(times);
     let middle_row = (first + end) as f64 / 2.0;
     let length = late.len() as f64;
     let slope_square: f64 = (first..=end).map(|v| (v as f64 - middle_row).powi(2)).sum();
-    let slope = (first..=end).zip(&late).map(|(v, late)| (v as f64 - middle_row) * (late - mean)).sum::<f64>() / slope_square;
+    let slope =
+        (first..=end).zip(&late).map(|(v, late)| (v as f64 - middle_row) * (late - mean)).sum::<f64>()
+            / slope_square;
     let within = (first..=end).zip(&late).filter(|(v, late)| {
         let rest = *late - mean - slope * (*v as f64 - middle_row);
         let sd = modes.iter().map(|mode| mode[*v].powi(2)).sum::<f64>().sqrt();
@@ -121,9 +126,18 @@ fn check(case: Case) -> (RowTimes, Errors) {
     let times = session.fit().unwrap();
     let errors = errors(&session.rig, &times);
     println!("{} frames, {:.2} s, {errors:.2e?}", session.frames.len(), start.elapsed().as_secs_f64());
-    println!("tau {:?} rc {:?} delta {:?} mode {:?} latency sd {:.3} jitter {:?} useful {} modes {} dropped {:?}",
-        times.row_time_us, times.camera_row_time_us, times.exposure_offset_us, times.mode_offset_us,
-        times.latency_sd_us, times.jitter_us, times.useful_frames, times.row_starts_modes.nrows(), times.dropped);
+    println!(
+        "tau {:?} rc {:?} delta {:?} mode {:?} latency sd {:.3} jitter {:?} useful {} modes {} dropped {:?}",
+        times.row_time_us,
+        times.camera_row_time_us,
+        times.exposure_offset_us,
+        times.mode_offset_us,
+        times.latency_sd_us,
+        times.jitter_us,
+        times.useful_frames,
+        times.row_starts_modes.nrows(),
+        times.dropped
+    );
     println!("{:?}", times.residuals.iter().map(|r| (r.exposure_us, r.chi2_per_sample)).collect::<Vec<_>>());
     assert!(errors.tau.abs() < 2e-4, "{case:?}: {errors:?}");
     assert!(errors.rows_rms < 0.02 && errors.rows_worst < 0.05, "{case:?}: {errors:?}");

@@ -109,7 +109,8 @@ impl Rig {
                 let piece = (v / 90).min(7);
                 let within = v as f64 / 90.0 - piece as f64;
                 let kink = kinks[piece] + within * (kinks[piece + 1] - kinks[piece]);
-                v as f64 * case.row_time_us - case.bend * sweep_us * 4.0 * x * (1.0 - x) + kink
+                v as f64 * case.row_time_us - case.bend * sweep_us * 4.0 * x * (1.0 - x)
+                    + kink
                     + nominal_first_row_us()
                     + case.latency_us
             })
@@ -142,7 +143,11 @@ impl Rig {
         });
         // A response is measured over 21 rows: 0.4 % in all, the same for neighbours.
         let errors: Vec<[f64; 16]> = (0..rows / 21 + 1)
-            .map(|_| std::array::from_fn(|d| if (3..12).contains(&d) { 0.001 * unit.sample(&mut random) } else { 0.0 }))
+            .map(|_| {
+                std::array::from_fn(
+                    |d| if (3..12).contains(&d) { 0.001 * unit.sample(&mut random) } else { 0.0 },
+                )
+            })
             .collect();
         let mut response = Array3::zeros((16, rows, case.columns));
         for ((t, s), &place) in place.indexed_iter().filter(|(_, place)| place.is_finite()) {
@@ -157,7 +162,18 @@ impl Rig {
             }
         }
         let jitters_us = Vec::new();
-        Self { case, starts_us, centres, brightness, white_dn, white_map_dn, place, response, random, jitters_us }
+        Self {
+            case,
+            starts_us,
+            centres,
+            brightness,
+            white_dn,
+            white_map_dn,
+            place,
+            response,
+            random,
+            jitters_us,
+        }
     }
 
     /// What is known before the calibration: no latency, an even sweep, row times 0.2 % off.

@@ -9,7 +9,7 @@ use raysweep_pipeline::{PipelineError, message_of};
 
 use super::camera::{Refused, Source, Wanted};
 use super::motion::Motion;
-use crate::devices::priority;
+use crate::devices::{operator, priority};
 use crate::rig::{Pace, Stand};
 use crate::run::board::StatusBoard;
 use crate::run::error::RunError;
@@ -33,20 +33,7 @@ impl Player<'_> {
     /// # Errors
     /// For a plane that the rig does not have.
     pub fn place(&self, subject: Subject, planes: usize) -> Result<(), RunError> {
-        self.orders.wait_while_paused();
-        if !self.stand.place(subject)? {
-            let text = match subject {
-                Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
-                Subject::Plane(plane) => {
-                    format!("put calibration plane {} of {} before the camera", plane + 1, planes)
-                }
-                Subject::Scene => "put the scene before the camera, and all else away".into(),
-            };
-            self.orders.give(Order::Pause);
-            self.board.ask(&text);
-            self.orders.wait_while_paused();
-        }
-        Ok(())
+        Ok(operator::place(&self.stand, subject, planes, self.orders, self.board)?)
     }
 
     /// Plays a path `rounds` times while the camera takes its frames. Ends with the path or, without a mirror, after

@@ -52,8 +52,7 @@ impl Coarse {
     ) -> Result<Self, TimesError> {
         nominal.check()?;
         let global = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Global);
-        let points: Vec<(f64, f64)> =
-            global().flat_map(|frame| borders(columns, frame, nominal)).collect();
+        let points: Vec<(f64, f64)> = global().flat_map(|frame| borders(columns, frame, nominal)).collect();
         let seen = columns.seen_rows();
         let first = points.iter().map(|point| point.0).fold(f64::MAX, f64::min);
         let last = points.iter().map(|point| point.0).fold(f64::MIN, f64::max);
@@ -131,8 +130,7 @@ fn borders(columns: &Columns, frame: &BoardFrame, nominal: &Nominal) -> Vec<(f64
 /// The place at which a group's light, smoothed over three rows, crosses one half upwards (`opening`) or downwards, if
 /// there is exactly one.
 fn crossing(columns: &Columns, frame: &BoardFrame, group: usize, opening: bool) -> Option<f64> {
-    let lit: Vec<usize> =
-        (0..columns.rows()).filter(|&row| columns.cell(row, group).pixels > 0).collect();
+    let lit: Vec<usize> = (0..columns.rows()).filter(|&row| columns.cell(row, group).pixels > 0).collect();
     let smooth = |rows: &[usize]| {
         let sum: f64 = rows.iter().map(|&row| f64::from(frame.light[[row, group]])).sum();
         (columns.cell(rows[1], group).place, sum / 3.0 - 0.5)

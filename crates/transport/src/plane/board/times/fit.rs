@@ -138,8 +138,7 @@ impl<'a> Fit<'a> {
         let lines: Vec<(f64, f64)> =
             points.iter().map(|&(row, place, time_us)| (row, coarse.time_us(place) - time_us)).collect();
         let (camera_row_us, at_row_0_us) = line(&lines);
-        let clocks =
-            [camera_row_us, -at_row_0_us, arrivals.exposure_offset_us];
+        let clocks = [camera_row_us, -at_row_0_us, arrivals.exposure_offset_us];
         let table = Table::new(nominal.projector_rows, &columns.seen_rows());
         // The table through the arrivals; where there are none, through the sweep seen by global frames.
         let count = table.coefficients;
@@ -191,11 +190,8 @@ impl<'a> Fit<'a> {
 
     fn comparison<'b>(&'b self, sweep: &'b Sweep) -> Comparison<'b> {
         let clocks = &self.unknowns[self.table.coefficients..];
-        let clocks = Clocks {
-            camera_row_us: clocks[0],
-            mode_offset_us: clocks[1],
-            exposure_offset_us: clocks[2],
-        };
+        let clocks =
+            Clocks { camera_row_us: clocks[0], mode_offset_us: clocks[1], exposure_offset_us: clocks[2] };
         let (columns, noise, variance_scale) = (self.columns, self.noise, self.variance_scale);
         Comparison { columns, sweep, clocks, noise, variance_scale }
     }
@@ -229,9 +225,14 @@ impl<'a> Fit<'a> {
         let prior = self.jitter_prior_us.powi(-2);
         let objective = |late_us: f64| {
             let mut chi2 = late_us * late_us * prior;
-            comparison.visit(&self.frames[frame], (late_us, longer_us), (SCAN_ROWS, true), |_, _, _, sums| {
-                chi2 += sums.chi2;
-            });
+            comparison.visit(
+                &self.frames[frame],
+                (late_us, longer_us),
+                (SCAN_ROWS, true),
+                |_, _, _, sums| {
+                    chi2 += sums.chi2;
+                },
+            );
             chi2
         };
         let mut best_us = 0.0;
@@ -593,9 +594,8 @@ impl<'a> Fit<'a> {
         let bend = |away: usize| curvature_us * (away as f64).powi(2) / 2.0;
         modes.push(DVector::from_fn(rows, |row, _| bend(seen.start.saturating_sub(row))));
         modes.push(DVector::from_fn(rows, |row, _| bend(row.saturating_sub(seen.end))));
-        let variance = |row: usize| {
-            whole.row(row).norm_squared() + modes[2][row].powi(2) + modes[3][row].powi(2)
-        };
+        let variance =
+            |row: usize| whole.row(row).norm_squared() + modes[2][row].powi(2) + modes[3][row].powi(2);
         let sd_us = (0..rows).map(|row| variance(row).sqrt()).collect();
         // Beyond the rows seen, the largest modes would be those of the extrapolation, which the bend covers.
         let inside = factor.rows(seen.start, seen.len() + 1).clone_owned();
