@@ -62,7 +62,7 @@ impl Runner {
         let (rig, camera, kind) = match rig.into() {
             AnyRig::Plane(rig) => {
                 let camera = rig.open()?.camera.capabilities().clone();
-                (LabRig::Plane(Arc::new(rig)), camera, "plane")
+                (LabRig::Plane(rig.into()), camera, "plane")
             }
             AnyRig::Dots(rig) => {
                 let camera = rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone();

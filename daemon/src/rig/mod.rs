@@ -46,14 +46,14 @@ pub enum RigError {
 /// A rig of either kind.
 pub enum AnyRig {
     /// Raster projector and rolling-shutter camera.
-    Plane(Rig),
+    Plane(Box<Rig>),
     /// Mirror and fast camera.
     Dots(DotRig),
 }
 
 impl From<Rig> for AnyRig {
     fn from(rig: Rig) -> Self {
-        Self::Plane(rig)
+        Self::Plane(Box::new(rig))
     }
 }
 
@@ -71,7 +71,7 @@ impl AnyRig {
     pub fn load(path: &Path) -> Result<Self, RigError> {
         let source = Source::read(path)?;
         match AnyRigFile::parse(&source.text).map_err(|error| source.shown(&error))? {
-            AnyRigFile::Plane(file) => Rig::of(*file, source).map(Self::Plane),
+            AnyRigFile::Plane(file) => Rig::of(*file, source).map(Self::from),
             AnyRigFile::Dots(file) => DotRig::of(*file, source).map(Self::Dots),
         }
     }

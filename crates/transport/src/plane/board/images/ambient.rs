@@ -495,7 +495,7 @@ fn level(
     let mut level_sd = level_dn_per_us.clone();
     let mut projector_black_dn = level_dn_per_us.clone();
     let variances = runs.iter().map(|run| {
-        let mean = mean_image(run.frames) - &run.dark_dn;
+        let mean = mean_image(run.frames) - run.dark_dn;
         noise.variance_dn2(f64::from(mean.sum()) / mean.len() as f64)
     });
     let variances: Vec<f64> = variances.collect();
