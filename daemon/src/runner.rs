@@ -66,7 +66,7 @@ impl Runner {
             }
             AnyRig::Dots(rig) => {
                 let camera = rig.open(&data, LEAST_FRAME_RATE_HZ)?.camera.capabilities().clone();
-                (LabRig::Dots(Arc::new(rig)), camera, "dots")
+                (LabRig::Dots(rig.into()), camera, "dots")
             }
         };
         Ok(Self {

@@ -48,7 +48,7 @@ pub enum AnyRig {
     /// Raster projector and rolling-shutter camera.
     Plane(Box<Rig>),
     /// Mirror and fast camera.
-    Dots(DotRig),
+    Dots(Box<DotRig>),
 }
 
 impl From<Rig> for AnyRig {
@@ -59,7 +59,7 @@ impl From<Rig> for AnyRig {
 
 impl From<DotRig> for AnyRig {
     fn from(rig: DotRig) -> Self {
-        Self::Dots(rig)
+        Self::Dots(Box::new(rig))
     }
 }
 
@@ -72,7 +72,7 @@ impl AnyRig {
         let source = Source::read(path)?;
         match AnyRigFile::parse(&source.text).map_err(|error| source.shown(&error))? {
             AnyRigFile::Plane(file) => Rig::of(*file, source).map(Self::from),
-            AnyRigFile::Dots(file) => DotRig::of(*file, source).map(Self::Dots),
+            AnyRigFile::Dots(file) => DotRig::of(*file, source).map(Self::from),
         }
     }
 }
