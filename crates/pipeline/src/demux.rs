@@ -101,7 +101,7 @@ impl DemuxFold {
         if taken.is_empty() {
             return Err(FoldError {
                 fold: "demux".into(),
-                what: "no point of the sweep is there with the dark image of its exposure: resume the run"
+                what: "no point of the sweep is stored together with the dark image of its exposure: resume the run"
                     .into(),
             });
         }

@@ -1,10 +1,12 @@
 //! Why a plan's stage cannot be created.
 
+use raysweep_core::decoding_message;
+
 /// Why a plan's stage cannot be created.
 #[derive(Debug, thiserror::Error)]
 pub enum RegistryError {
     /// The name does not exist.
-    #[error("stage name = {name:?}: known are {known}")]
+    #[error("stage name = {name:?}: must be one of {known}")]
     Unknown {
         /// The name in the plan.
         name: String,
@@ -12,7 +14,7 @@ pub enum RegistryError {
         known: String,
     },
     /// An option that the stage does not have, or a value that it does not accept.
-    #[error("stage {name}: {source}")]
+    #[error("stage {name}: {}", decoding_message(&source.to_string(), "table"))]
     Options {
         /// The stage's name.
         name: String,

@@ -53,7 +53,7 @@ impl FilmTask {
     pub fn stages(&self, registry: &Registry) -> std::result::Result<Arc<[Box<dyn Stage>]>, ConfigError> {
         let (stages, _) = self.task.made_stages(registry, |fold, _| {
             let name = fold.name();
-            (name != "demux").then(|| format!("{name} is not for films: their only fold is demux"))
+            (name != "demux").then(|| format!("{name} cannot be used in films: their only fold is demux"))
         })?;
         Ok(stages)
     }

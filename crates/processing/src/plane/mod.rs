@@ -10,7 +10,7 @@ pub use self::processing::Processing;
 use ndarray::Array2;
 use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
-use raysweep_core::SettingsId;
+use raysweep_core::{SettingsId, decoding_message};
 use raysweep_pipeline::{
     DemuxOptions, Entry, Fold, Point, Registry, RegistryError, Role, Scan, Schedule, Spot, Stage,
     SweepGeometry, Unit,
@@ -82,8 +82,10 @@ impl PlaneTask {
         let Some(stage) = self.stages.iter().find(|stage| stage.name == "demux") else {
             return Ok(DemuxOptions::default());
         };
-        serde_json::from_value(Value::Object(stage.options.clone()))
-            .map_err(|error| self.refuse(&["stage"], format!("stage demux: {error}")))
+        serde_json::from_value(Value::Object(stage.options.clone())).map_err(|error| {
+            let what = decoding_message(&error.to_string(), "table");
+            self.refuse(&["stage"], format!("stage demux: {what}"))
+        })
     }
 
     /// The stages and folds that the plan names.

@@ -66,8 +66,9 @@ impl SweepTask {
         let (stages, folds) = self.task.made_stages(registry, |fold, others| {
             let name = fold.name();
             let is_second = others.iter().any(|other| other.name() == name);
-            is_second
-                .then(|| format!("{name} stands twice: its products would overwrite each other; keep one"))
+            is_second.then(|| {
+                format!("{name} is named twice, and its products would overwrite each other: keep one")
+            })
         })?;
         // After the folds: they refuse a rig on which no product could be made.
         let products = self.products()?;
@@ -78,7 +79,7 @@ impl SweepTask {
     fn products(&self) -> Result<Vec<ProductSpec>, ConfigError> {
         let Some(tables) = &self.products else { return Ok(ProductSpec::defaults()) };
         if !tables.is_empty() && !self.task.stages.iter().any(|stage| stage.name == "demux") {
-            let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";
+            let what = "products need the light transport: add a [[stage]] with name = \"demux\"";
             return Err(self.task.refuse(&["product"], what));
         }
         let mut specs = Vec::new();
