@@ -36,11 +36,13 @@ impl Player<'_> {
         self.orders.wait_while_paused();
         if !self.stand.place(subject)? {
             let text = match subject {
-                Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
-                Subject::Plane(plane) => {
-                    format!("put calibration plane {} of {} before the camera", plane + 1, planes)
+                Subject::Diffuser => {
+                    "hold an evenly lit diffuser directly in front of the camera's lens".into()
                 }
-                Subject::Scene => "put the scene before the camera, and all else away".into(),
+                Subject::Plane(plane) => {
+                    format!("put calibration plane {} of {} in front of the camera", plane + 1, planes)
+                }
+                Subject::Scene => "put the scene in front of the camera and remove everything else".into(),
             };
             self.orders.give(Order::Pause);
             self.board.ask(&text);
