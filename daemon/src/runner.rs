@@ -140,7 +140,10 @@ impl Runner {
         let current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         let state = self.board.status().state;
         let Some(current) = current.as_ref().filter(|_| from.contains(&state)) else {
-            let what = format!("the daemon is {}: no run in progress", name_of(state));
+            let what = match state {
+                RunState::Idle | RunState::Faulted => "no run in progress".to_owned(),
+                _ => format!("not possible while the daemon is {}", name_of(state)),
+            };
             return Err(RpcError::new(ErrorCode::NotRunning, what));
         };
         if let Some(to) = to {
@@ -157,7 +160,7 @@ impl Runner {
     ) -> Result<Started, RpcError> {
         let mut current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         if self.closed.load(Ordering::Relaxed) {
-            return Err(RpcError::new(ErrorCode::Busy, "the daemon is ending: start it again first"));
+            return Err(RpcError::new(ErrorCode::Busy, "the daemon is shutting down: start it again first"));
         }
         self.board.go(RunState::Preparing).map_err(wrong_state)?;
         if let Some(last) = current.take() {
@@ -165,7 +168,7 @@ impl Runner {
             let _ = last.thread.join();
         }
         let begun = catch_unwind(AssertUnwindSafe(begin)).unwrap_or_else(|panic| {
-            let what = format!("preparing the run met a defect: {}", message_of(&*panic));
+            let what = format!("preparing the run failed because of a bug: {}", message_of(&*panic));
             Err(RpcError::new(ErrorCode::Internal, what))
         });
         match begun {
@@ -205,7 +208,9 @@ impl Runner {
         let thread = thread::Builder::new()
             .name("run".into())
             .spawn(move || conduct(procedure, run, shape.points()))
-            .map_err(|error| RpcError::new(ErrorCode::Internal, format!("no thread for the run: {error}")))?;
+            .map_err(|error| {
+                RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
+            })?;
         Ok((Started { session: dir }, Current { orders, thread }))
     }
 
@@ -219,7 +224,7 @@ impl Runner {
     fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
-                "the session needs {} MB, {} has {} MB: free some space or give the daemon another --data",
+                "the session needs {} MB, but {} has only {} MB free: free some space or give the daemon another --data",
                 report.disk_bytes / 1_000_000,
                 self.data.display(),
                 report.disk_free_bytes / 1_000_000
@@ -228,7 +233,7 @@ impl Runner {
         }
         if report.memory_bytes > report.memory_free_bytes {
             let what = format!(
-                "the run needs {} MB of memory, {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
+                "the run needs {} MB of memory, but only {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
                 report.memory_bytes / 1_000_000,
                 report.memory_free_bytes / 1_000_000
             );
@@ -270,7 +275,7 @@ impl Runner {
         let plan = read(session.plan_path())?;
         if read(session.rig_path())? != self.rig.text() {
             return Err(no_session(format!(
-                "{} was taken on another rig file than the daemon's: start the daemon with {}",
+                "{} was begun with another rig file than the daemon's: start the daemon with {}",
                 session.dir().display(),
                 session.rig_path().display()
             )));
@@ -284,9 +289,8 @@ impl Runner {
         let begun = ledger.state().session.shape;
         if foreseen.shape != begun {
             let what = format!(
-                "{}: plan.toml is not the one that the session was begun with: it makes {:?}, the ledger has {begun:?}; restore the session's own plan.toml",
-                session.dir().display(),
-                foreseen.shape,
+                "{} was changed after the session was begun: its points are not those of the ledger; restore the original",
+                session.plan_path().display(),
             );
             return Err(no_session(what));
         }

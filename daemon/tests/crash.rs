@@ -13,7 +13,7 @@ use process::Process;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use raysweep_core::Counts;
-use raysweep_proto::{Client, Event, RunParams};
+use raysweep_proto::{Client, ClientError, ErrorCode, Event, RunParams};
 use raysweep_session::Session;
 use raysweep_session::film::TransportFilm;
 use raysweep_session::ledger::{PointEntry, State};
@@ -442,8 +442,9 @@ fn a_film_that_is_killed_keeps_its_cycles_and_is_processed_not_resumed() {
     let state = session.state().unwrap();
     assert!(state.end.is_none() && state.cycles().count() > 5, "{} cycles", state.cycles().count());
     let mut daemon = Daemon::start(folder.path());
-    let refused = daemon.client().resume(&started.session).unwrap_err().to_string();
-    assert!(refused.contains("cannot be resumed") && refused.contains("raysweep process"), "{refused}");
+    let refused = daemon.client().resume(&started.session).unwrap_err();
+    let ClientError::Rpc(refused) = refused else { panic!("{refused}") };
+    assert_eq!(refused.name(), Some(ErrorCode::NoSession), "{refused}");
     drop(daemon);
 
     let processed = raysweep_processing::process(&started.session).unwrap();

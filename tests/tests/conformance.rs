@@ -76,7 +76,6 @@ fn camera_conforms(camera: &mut dyn Camera) {
     let impossible = CameraSettings { exposure_us: capabilities.exposure_us.end() * 10.0 + 1.0, ..settings };
     let error = camera.configure(id, &impossible).unwrap_err();
     assert_eq!(error.kind, DeviceErrorKind::OutOfRange, "{error}");
-    assert!(error.to_string().contains("exposure_us"), "{error}");
 
     let applied = camera.configure(id, &settings).unwrap();
     assert!(capabilities.allows(&applied.actual).is_ok(), "{applied:?}");

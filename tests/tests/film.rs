@@ -250,7 +250,6 @@ fn a_cancelled_film_is_a_short_one() {
 
     let refused = bench.runner.resume(ResumeParams { session: ended.session.clone() }).unwrap_err();
     assert_eq!(refused.name(), Some(ErrorCode::NoSession));
-    assert!(refused.message.contains("cannot be resumed"), "{refused}");
 }
 
 #[test]

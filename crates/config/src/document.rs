@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::ops::{Range, RangeInclusive};
 
+use raysweep_core::decoding_message;
 use serde::Deserialize;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
@@ -25,7 +26,7 @@ pub(crate) fn out_of_range<const N: usize>(
 ) -> impl Iterator<Item = Fault> {
     rules.into_iter().filter(|(_, value, allowed)| !allowed.contains(value)).map(|(key, value, allowed)| {
         let (low, high) = (allowed.start(), allowed.end());
-        Fault { key, message: format!(" = {value}: allowed is {low} to {high}") }
+        Fault { key, message: format!(" = {value}: must be from {low} to {high}") }
     })
 }
 
@@ -66,7 +67,7 @@ impl<'a> Document<'a> {
             Err(error) => {
                 let field = error.span().and_then(|span| self.places.path_at(&span));
                 let field = field.unwrap_or_else(|| key.to_owned());
-                let message = format!("{field}: {}", error.message());
+                let message = format!("{field}: {}", decoding_message(error.message(), "table"));
                 self.mistakes.push(ConfigMistake { message, field: Some(field), span: error.span() });
                 None
             }
@@ -86,7 +87,7 @@ impl<'a> Document<'a> {
     /// Decodes the value of a required key; `example` shows what to write.
     pub fn require<T: Deserialize<'a>>(&mut self, key: &str, example: &str) -> Option<T> {
         if !self.tables.contains_key(key) {
-            self.refuse(&[key], format!("missing field `{key}`: add {example}"));
+            self.refuse(&[key], format!("missing key `{key}`: add {example}"));
         }
         self.take(key)
     }
@@ -98,7 +99,7 @@ impl<'a> Document<'a> {
             let known = known.iter().map(|known| format!("`{known}`")).collect::<Vec<_>>().join(", ");
             let shown = key.escape_debug();
             let mut mistake =
-                self.places.mistake(&[key], format!("unknown field `{shown}`, expected one of {known}"));
+                self.places.mistake(&[key], format!("unknown key `{shown}`, expected one of {known}"));
             mistake.span = self.places.root.inside.get(key).map(|place| place.key.clone());
             self.mistakes.push(mistake);
         }
@@ -130,7 +131,7 @@ impl<'a> Document<'a> {
     pub fn check_range(&mut self, path: &[&str], value: f64, allowed: RangeInclusive<f64>) {
         if !allowed.contains(&value) {
             let (low, high) = (allowed.start(), allowed.end());
-            self.refuse(path, format!("{} = {value}: allowed is {low} to {high}", path.join(".")));
+            self.refuse(path, format!("{} = {value}: must be from {low} to {high}", path.join(".")));
         }
     }
 
@@ -138,14 +139,14 @@ impl<'a> Document<'a> {
     pub fn check_count(&mut self, path: &[&str], value: u64, allowed: RangeInclusive<u64>) {
         if !allowed.contains(&value) {
             let (low, high) = (allowed.start(), allowed.end());
-            self.refuse(path, format!("{} = {value}: {low} to {high} are allowed", path.join(".")));
+            self.refuse(path, format!("{} = {value}: must be from {low} to {high}", path.join(".")));
         }
     }
 
     /// Records a mistake unless a value is finite and greater than zero.
     pub fn check_positive(&mut self, path: &[&str], value: f64, unit: &str) {
         if !(value > 0.0 && value.is_finite()) {
-            self.refuse(path, format!("{} = {value}: give {unit} greater than 0", path.join(".")));
+            self.refuse(path, format!("{} = {value}: must be more than 0 {unit}", path.join(".")));
         }
     }
 

@@ -7,6 +7,7 @@
 mod clock;
 mod clock_model;
 mod counts;
+mod decoding;
 mod device;
 mod error;
 mod film;
@@ -21,6 +22,7 @@ mod units;
 pub use clock::{Clock, ClockHandle};
 pub use clock_model::{ClockModel, ClockQuality, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
+pub use decoding::decoding_message;
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Projector, Readout,
     SettingsId, SettingsLatency, Shown, Shutter, Vsync,

@@ -123,7 +123,7 @@ impl DemuxFold {
         if taken.is_empty() {
             return Err(NotSolved {
                 of: DEMUX,
-                what: "no point of the sweep is there with the dark image of its exposure: resume the run"
+                what: "no point of the sweep is stored together with the dark image of its exposure: resume the run"
                     .into(),
             });
         }

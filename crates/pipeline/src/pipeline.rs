@@ -37,7 +37,7 @@ pub enum PipelineError {
         source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// A thread of the pipeline panicked, which is a bug.
-    #[error("the {0} thread panicked; the log has its message. What was stored stays stored")]
+    #[error("the {0} thread panicked, which is a bug; see the log. The stored data are kept")]
     Panicked(&'static str),
 }
 

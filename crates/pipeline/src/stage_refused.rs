@@ -1,5 +1,6 @@
 //! Why a plan's stage cannot be created.
 
+use raysweep_core::decoding_message;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
@@ -7,7 +8,7 @@ use serde_json::Value;
 #[derive(Debug, thiserror::Error)]
 pub enum StageRefused {
     /// The name does not exist.
-    #[error("stage name = {name:?}: known are {known}")]
+    #[error("stage name = {name:?}: must be one of {known}")]
     Unknown {
         /// The name in the plan.
         name: String,
@@ -15,7 +16,7 @@ pub enum StageRefused {
         known: String,
     },
     /// An option that the stage does not have, or a value that it does not accept.
-    #[error("stage {name}: {source}")]
+    #[error("stage {name}: {}", decoding_message(&source.to_string(), "table"))]
     Options {
         /// The stage's name.
         name: String,

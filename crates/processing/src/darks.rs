@@ -132,7 +132,7 @@ fn read(stack: &Stack, state: &State, index: usize) -> std::result::Result<(Arra
         |why: String| format!("dark {index} is damaged ({why}): `raysweep resume` acquires it again");
     let sum = stack.read_point(ArrayName::Dark, index).map_err(|error| damaged(error.to_string()))?;
     if crc32(sum.view()) != entry.crc32 {
-        return Err(damaged("its checksum is not the ledger's".into()));
+        return Err(damaged("its checksum differs from the ledger's".into()));
     }
     if entry.frames == 0 {
         return Err(damaged("the ledger says that it has no frames".into()));
@@ -245,7 +245,7 @@ pub fn process(
 ) -> std::result::Result<Processed, ProcessError> {
     let Stored { session, state, plan, .. } = stored;
     if !asked.products.is_empty() {
-        let message = "a session of kind \"darks\" has no products to ask for: leave --product out";
+        let message = "a session of kind \"darks\" has no products: leave --product out";
         return Err(ProcessError::Product(message.into()));
     }
     let rig = stored.plane_rig()?;

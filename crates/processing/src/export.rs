@@ -13,7 +13,7 @@ use crate::stored::ProcessError;
 pub fn export(dir: &Path, to: &Path) -> Result<usize, ProcessError> {
     let session = Session::open(dir)?;
     if to.exists() {
-        return Err(ProcessError::Config(format!("{} exists: give a folder that does not", to.display())));
+        return Err(ProcessError::Config(format!("{} already exists: give a new folder", to.display())));
     }
     std::fs::create_dir(to).map_err(|source| ProcessError::Copy { path: to.to_owned(), source })?;
     let mut files =

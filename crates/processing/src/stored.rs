@@ -21,7 +21,7 @@ pub enum ProcessError {
     Product(String),
     /// The results do not fit into memory, not even in strips.
     #[error(
-        "the results take {} MB of memory even some camera rows at a time, and {} MB may be used: raise --memory, make shorter sequences, or end other programs",
+        "the results need {} MB of memory even if solved in strips of camera rows, but only {} MB may be used: raise --memory, make shorter sequences, or close other programs",
         needed_bytes / 1_000_000,
         available_bytes / 1_000_000
     )]
@@ -94,7 +94,7 @@ impl Stored<'_> {
             return Ok(());
         }
         Err(ProcessError::Config(format!(
-            "{} is not the plan that the session was begun with: it makes {planned:?}, the ledger has {stored:?}; restore it",
+            "{} was changed after the session was begun: its points are not those of the ledger; restore the original",
             self.session.plan_path().display()
         )))
     }

@@ -31,7 +31,7 @@ pub enum ClientError {
         source: io::Error,
     },
     /// This user may not use the socket.
-    #[error("{} may not be used by this user: {advice}", path.display())]
+    #[error("this user may not use {}: {advice}", path.display())]
     Permission {
         /// The socket.
         path: PathBuf,
@@ -49,7 +49,7 @@ pub enum ClientError {
         source: io::Error,
     },
     /// The connection broke.
-    #[error("the connection to {} was lost: {source}; see whether raysweepd still runs", path.display())]
+    #[error("the connection to {} was lost: {source}; check whether raysweepd still runs", path.display())]
     Lost {
         /// The socket.
         path: PathBuf,
@@ -67,7 +67,7 @@ pub enum ClientError {
         after: Duration,
     },
     /// The daemon sent something that a daemon of this version does not send.
-    #[error("what listens on {} does not speak as this version's raysweepd does: {what}", path.display())]
+    #[error("the program that listens on {} is not a raysweepd of this version: {what}", path.display())]
     Protocol {
         /// The socket.
         path: PathBuf,
@@ -216,16 +216,18 @@ impl Client {
             return Err(ClientError::Timeout { path: self.path.clone(), method: method.name(), after });
         };
         let Incoming::Response(response) = incoming else {
-            return Err(self.protocol(format!("an event came instead of the answer to `{}`", method.name())));
+            return Err(
+                self.protocol(format!("it sent an event instead of the answer to `{}`", method.name()))
+            );
         };
         match response.outcome {
             // An error without an id concerns the connection: too many clients, or a line that is too long.
             Outcome::Error(error) => Err(error.into()),
             Outcome::Result(_) if response.id != Id::Number(id.into()) => {
-                Err(self.protocol(format!("the answer to `{}` has the id of another request", method.name())))
+                Err(self.protocol(format!("its answer to `{}` has the id of another request", method.name())))
             }
             Outcome::Result(value) => serde_json::from_value(value)
-                .map_err(|error| self.protocol(format!("the result of `{}`: {error}", method.name()))),
+                .map_err(|error| self.protocol(format!("its result of `{}`: {error}", method.name()))),
         }
     }
 
@@ -255,7 +257,7 @@ impl Client {
             Ok(_) => {
                 let line = std::mem::take(&mut self.partial);
                 let message = serde_json::from_slice(&line)
-                    .map_err(|error| self.protocol(format!("a line is {error}")))?;
+                    .map_err(|error| self.protocol(format!("it sent an invalid line: {error}")))?;
                 Ok(Some(message))
             }
             Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => Ok(None),
@@ -293,7 +295,7 @@ impl Subscription {
             Some(Incoming::Event(notice)) => Ok(Some(notice.params)),
             Some(Incoming::Response(response)) => match response.outcome {
                 Outcome::Error(error) => Err(error.into()),
-                Outcome::Result(_) => Err(self.client.protocol("an answer that nobody asked for".into())),
+                Outcome::Result(_) => Err(self.client.protocol("it sent an unexpected answer".into())),
             },
             None => Ok(None),
         }
@@ -311,14 +313,14 @@ impl Iterator for Subscription {
 /// Tells a user without permission who may use the socket.
 fn advice(path: &Path) -> String {
     let Ok(metadata) = std::fs::metadata(path) else {
-        return "its folder is closed to this user; ask who runs the daemon".into();
+        return "no access to its folder; ask the daemon's administrator".into();
     };
     match Group::from_gid(Gid::from_raw(metadata.gid())) {
         Ok(Some(group)) => {
             format!("join the group `{0}` (`usermod -aG {0} USER` as root) and log in again", group.name)
         }
         _ => format!(
-            "its group, number {}, has no name on this machine; ask who runs the daemon",
+            "its group, number {}, has no name on this machine; ask the daemon's administrator",
             metadata.gid()
         ),
     }
@@ -353,9 +355,10 @@ mod tests {
         let path = folder.path().join("raysweepd.sock");
         let check = || {
             let error = Client::connect(&path).unwrap_err();
-            assert!(matches!(error, ClientError::NotRunning { .. }), "{error}");
-            let message = error.to_string();
-            assert!(message.contains(path.to_str().unwrap()) && message.contains("start it"), "{message}");
+            assert!(
+                matches!(&error, ClientError::NotRunning { path: named, .. } if *named == path),
+                "{error}"
+            );
         };
         check();
         drop(UnixListener::bind(&path).unwrap());

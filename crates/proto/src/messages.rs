@@ -411,15 +411,15 @@ pub enum ErrorCode {
     InvalidRequest = -32600,
     /// No such method.
     MethodNotFound = -32601,
-    /// Parameters of the wrong shape.
+    /// A parameter is missing, unknown or of the wrong type.
     InvalidParams = -32602,
-    /// A defect of the daemon.
+    /// A bug in the daemon.
     Internal = -32603,
-    /// The plan cannot be read or makes no sense.
+    /// The plan is invalid, or this rig cannot run it.
     InvalidPlan = 1,
-    /// A run is under way.
+    /// A run is in progress.
     Busy = 2,
-    /// No run is under way, or not in a state for this.
+    /// No run is in progress, or its state does not allow this.
     NotRunning = 3,
     /// The caller is an observer.
     Forbidden = 4,

@@ -92,28 +92,30 @@ impl Method {
                 "The methods with their schemas, the events, the error codes and the limits.",
             ),
             Self::Status => row::<Empty, Status>("status", Observer, "What the daemon is doing."),
-            Self::Check => {
-                row::<CheckParams, CheckReport>("check", Observer, "What a plan would do; nothing moves.")
-            }
+            Self::Check => row::<CheckParams, CheckReport>(
+                "check",
+                Observer,
+                "What a plan would do, without moving anything.",
+            ),
             Self::Run => row::<RunParams, Started>(
                 "run",
                 Operator,
-                "Begins a run and answers at once; the event `finished` ends it.",
+                "Starts a run and returns at once; the event `finished` reports its end.",
             ),
             Self::Resume => row::<ResumeParams, Started>(
                 "resume",
                 Operator,
-                "Begins to acquire the points that a session lacks, as `run` does.",
+                "Starts to acquire the missing points of a session, as `run` does.",
             ),
-            Self::Pause => row::<Empty, Empty>("pause", Operator, "Holds the run before its next point."),
-            Self::Continue => row::<Empty, Empty>("continue", Operator, "Goes on with a run that is held."),
+            Self::Pause => row::<Empty, Empty>("pause", Operator, "Pauses the run before its next point."),
+            Self::Continue => row::<Empty, Empty>("continue", Operator, "Continues a paused run."),
             Self::Cancel => {
-                row::<Empty, Empty>("cancel", Operator, "Ends the run in order; what was acquired is kept.")
+                row::<Empty, Empty>("cancel", Operator, "Cancels the run; what was acquired is kept.")
             }
             Self::ArmLight => row::<Empty, Empty>(
                 "arm_light",
                 Operator,
-                "Permits a mirror's light until the next boot, on a rig without an interlock.",
+                "Permits light until the next boot, on a rig with a mirror but no interlock.",
             ),
             Self::Sessions => row::<Empty, Vec<SessionInfo>>(
                 "sessions",

@@ -21,7 +21,7 @@ pub enum Error {
     },
     /// The folder is not a session.
     #[error(
-        "{} is not a session: {why}; give a folder that holds a ledger.jsonl (`raysweep sessions` lists them)",
+        "{} is not a session: {why}; give the folder of a session (`raysweep sessions` lists them)",
         path.display()
     )]
     NotASession {
@@ -37,7 +37,7 @@ pub enum Error {
         path: PathBuf,
     },
     /// A line of the ledger cannot be read, or must not be written.
-    #[error("{} line {line}: {why}; restore the line from a backup, since what it said is not stored elsewhere", path.display())]
+    #[error("{} line {line}: {why}; restore this line from a backup, because its content is stored nowhere else", path.display())]
     Ledger {
         /// The ledger.
         path: PathBuf,
@@ -47,7 +47,7 @@ pub enum Error {
         why: String,
     },
     /// An entry would not read back unchanged, so it was not written.
-    #[error("{}: an entry was refused: {why}", path.display())]
+    #[error("{}: an entry was not written: {why}", path.display())]
     Entry {
         /// The ledger.
         path: PathBuf,
@@ -55,7 +55,7 @@ pub enum Error {
         why: String,
     },
     /// The session was written by a newer raysweep.
-    #[error("{} has format {found}, this raysweep knows formats up to {known}; use a newer raysweep", path.display())]
+    #[error("{} has format {found}, but this raysweep reads formats up to {known}: use a newer raysweep", path.display())]
     NewerFormat {
         /// The file with that format.
         path: PathBuf,
@@ -65,7 +65,7 @@ pub enum Error {
         known: u32,
     },
     /// Data of the wrong shape.
-    #[error("{what} has the shape {found:?}, allowed is {allowed}")]
+    #[error("{what} has shape {found:?}, expected {allowed}")]
     Shape {
         /// The data.
         what: String,
@@ -133,5 +133,37 @@ impl Error {
     /// For `map_err`: the operation and its file.
     pub(crate) fn codec<E: ToString>(action: &'static str, what: impl ToString) -> impl FnOnce(E) -> Error {
         move |why| Error::Codec { action, what: what.to_string(), why: why.to_string() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write;
+
+    use super::Error;
+
+    #[test]
+    fn every_error_says_what_to_do() {
+        let refused = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
+        let errors = [
+            Error::Io { action: "read", path: "s/ledger.jsonl".into(), source: refused() },
+            Error::NotASession { path: "s".into(), why: "there is no ledger.jsonl".into() },
+            Error::InUse { path: "s/ledger.jsonl".into() },
+            Error::Ledger { path: "s/ledger.jsonl".into(), line: 3, why: "its checksum is wrong".into() },
+            Error::Entry { path: "s/ledger.jsonl".into(), why: "delays_us[0] = NaN".into() },
+            Error::NewerFormat { path: "s/ledger.jsonl".into(), found: 9, known: 2 },
+            Error::Shape { what: "a sum".into(), found: vec![2, 3], allowed: "[4, 5]".into() },
+            Error::Index { array: "sum", index: 75, len: 75 },
+            Error::NotStored { path: "s/stack.zarr".into(), array: "sum", index: 3 },
+            Error::Zarr { action: "open", path: "s/stack.zarr".into(), source: Box::new(refused()) },
+            Error::Codec { action: "write", what: "s/products/epipolar.exr".into(), why: "no pixels".into() },
+        ];
+        let mut shown = String::new();
+        for error in errors {
+            let debug = format!("{error:?}");
+            let variant = debug.split(' ').next().unwrap_or_default();
+            writeln!(shown, "{variant}: {error}\n").unwrap();
+        }
+        insta::assert_snapshot!(shown);
     }
 }

@@ -25,7 +25,9 @@ const PREAMBLE_BYTES: usize = 8;
 pub(crate) fn encode(channels: &[(&str, ArrayView2<f32>)], metadata: &Map<String, Value>) -> Result<Vec<u8>> {
     let (rows, columns) = channels.first().map_or((0, 0), |(_, values)| values.dim());
     if rows == 0 || columns == 0 {
-        return Err(Error::codec("encode", "an EXR image")(format!("{rows} x {columns} pixels are none")));
+        return Err(Error::codec("encode", "an EXR image")(format!(
+            "the image is empty: {rows} x {columns} pixels"
+        )));
     }
     let mut attributes = LayerAttributes::default();
     for (name, value) in metadata {

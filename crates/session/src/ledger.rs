@@ -89,11 +89,11 @@ impl Ledger {
         let mut line = serde_json::to_vec(entry).map_err(refused(&self.path))?;
         // JSON has no NaN or infinity: they would be written as `null`, which later readers reject.
         if serde_json::from_slice::<Entry>(&line).ok().as_ref() != Some(entry) {
-            return Err(refused(&self.path)("it would not read back as it is; every number must be finite"));
+            return Err(refused(&self.path)("it would not read back unchanged; every number must be finite"));
         }
         if self.broken {
             return Err(refused(&self.path)(
-                "an earlier line could not be taken back; open the session again",
+                "an earlier line could not be removed after a failed write; open the session again",
             ));
         }
         line.push(b'\n');

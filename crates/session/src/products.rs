@@ -175,7 +175,7 @@ impl Products {
         let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
         if name.is_empty() || !name.chars().all(plain) {
             return Err(Error::codec("write", format!("product `{name}`"))(
-                "a name is made of letters, digits, `-` and `_`",
+                "a name must have only letters, digits, `-` and `_`",
             ));
         }
         Ok(self.dir.join(format!("{name}.{extension}")))

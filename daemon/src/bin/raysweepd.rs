@@ -23,29 +23,29 @@ use tokio::signal::unix::{SignalKind, signal};
 #[command(
     name = "raysweepd",
     version,
-    after_help = "Exit status: 0 ended in order, 1 could not start or failed, 2 wrong usage."
+    after_help = "Exit codes:\n  0  shut down cleanly\n  1  could not start, or failed\n  2  wrong usage"
 )]
 struct Arguments {
     /// The rig file.
     #[arg(long, value_name = "FILE")]
     rig: PathBuf,
-    /// Where clients connect; not needed under systemd's socket activation.
+    /// Socket for clients; under systemd's socket activation, the passed socket is used instead.
     #[arg(long, value_name = "PATH", default_value = "/run/raysweep/raysweepd.sock")]
     socket: PathBuf,
     /// File with the newest live images, which clients map [default: `live` in the socket's folder]
     #[arg(long, value_name = "PATH")]
     live: Option<PathBuf>,
-    /// Where sessions are kept.
+    /// Data folder, in which sessions are stored.
     #[arg(long, value_name = "DIR", default_value = "/var/lib/raysweep")]
     data: PathBuf,
-    /// Group whose members may drive the rig; others who can connect may only look.
+    /// Group whose members may operate the rig; other users who can connect may only observe.
     #[arg(long, value_name = "GROUP", default_value = "raysweep")]
     operators: String,
-    /// Memory that the results of a run may take, such as 2GB: larger sweeps are solved some camera rows at a time, after
-    /// their end [default: what is free when the run begins]
+    /// Memory limit for the results of a run, such as 2GB; larger sweeps are solved in strips of camera rows after their
+    /// end [default: the free memory when the run begins]
     #[arg(long, value_name = "SIZE")]
     memory: Option<ByteSize>,
-    /// Reads the rig file, opens every device once, says what it found, and ends.
+    /// Read the rig file, open every device once, print what was found, and exit.
     #[arg(long)]
     check: bool,
 }
@@ -67,7 +67,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let rig = AnyRig::load(&arguments.rig)?;
     if !arguments.check {
         prepare_data(&arguments.data).map_err(|error| {
-            format!("--data {}: {error}: give a folder that can be written", arguments.data.display())
+            format!("--data {}: {error}; give a folder that raysweepd can write to", arguments.data.display())
         })?;
         // Must come before opening a mirror's driver, which refuses a mirror that was left unparked.
         park_left_behind(&arguments.data);
@@ -154,7 +154,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
                 _ = terminate.recv() => {}
                 _ = interrupt.recv() => {}
             }
-            tracing::info!("ending in order");
+            tracing::info!("shutting down");
             let _ = sd_notify::notify(&[NotifyState::Stopping]);
             // Keep serving clients until the run has ended, so that they learn the result.
             let _ = tokio::task::spawn_blocking(move || runner.shut_down()).await;

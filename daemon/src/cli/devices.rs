@@ -10,19 +10,19 @@ use super::printer::Printer;
 
 #[derive(Debug, Subcommand)]
 pub(super) enum CameraCommand {
-    /// Write all that the camera can be set to into a feature file
+    /// Write all settings of the camera to a feature file
     Save {
         /// The file to write
         file: PathBuf,
-        /// The camera's address or name [default: the only one that answers]
+        /// The camera's address or name [default: the only one that responds]
         #[arg(long, value_name = "NAME")]
         camera: Option<String>,
     },
-    /// Set the camera from a feature file, and say what it did not take
+    /// Set the camera from a feature file, and list the lines that it refused
     Load {
         /// The file to read
         file: PathBuf,
-        /// The camera's address or name [default: the only one that answers]
+        /// The camera's address or name [default: the only one that responds]
         #[arg(long, value_name = "NAME")]
         camera: Option<String>,
     },
@@ -94,7 +94,7 @@ mod with_aravis {
 
     fn table(found: &[Found]) -> String {
         if found.is_empty() {
-            return "no camera answers: is it powered, and on a network of this machine?".into();
+            return "no camera found: check its power, and that it is on a network of this machine".into();
         }
         let heading = ["NAME", "ADDRESS", "PROTOCOL", "VENDOR", "MODEL"].map(str::to_owned);
         let rows = found.iter().map(|camera| {

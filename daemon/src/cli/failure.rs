@@ -26,7 +26,7 @@ pub(super) enum CommandFailure {
     #[error("cannot write {}: {source}", path.display())]
     Write { path: PathBuf, source: io::Error },
     #[error(
-        "there is no live image: a run shows its first after some points; `raysweep preview --follow` waits for it"
+        "no live image yet: a run publishes its first after some points; `raysweep preview --follow` waits for it"
     )]
     NoLiveImage,
     #[error(transparent)]
@@ -37,7 +37,7 @@ pub(super) enum CommandFailure {
     #[error(transparent)]
     Device(#[from] DeviceError),
     #[cfg(feature = "aravis")]
-    #[error("which camera? Name one with --camera:\n{0}")]
+    #[error("choose a camera with --camera:\n{0}")]
     WhichCamera(String),
     #[cfg(not(feature = "aravis"))]
     #[error(
@@ -46,7 +46,7 @@ pub(super) enum CommandFailure {
     WithoutAravis,
     #[error(transparent)]
     Park(#[from] ParkError),
-    #[error("cannot watch for Ctrl-C: {0}")]
+    #[error("cannot handle Ctrl-C: {0}")]
     Signals(io::Error),
     #[error("cannot print: {0}")]
     Output(io::Error),

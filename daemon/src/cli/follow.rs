@@ -70,10 +70,9 @@ pub(super) fn follow(
                 OnInterrupt::Cancel(client) if !cancelled => {
                     cancelled = true;
                     match client.cancel() {
-                        Ok(()) => view.note("cancelling the run; Ctrl-C again leaves it to the daemon"),
-                        Err(error) => {
-                            view.note(&format!("{error}; Ctrl-C again leaves the run to the daemon"))
-                        }
+                        Ok(()) => view.note("cancelling the run; Ctrl-C again exits without waiting"),
+                        Err(error) => view
+                            .note(&format!("{error}; Ctrl-C again exits and leaves the run to the daemon")),
                     }
                 }
                 OnInterrupt::Cancel(_) => {

@@ -38,17 +38,17 @@ Exit codes:
   1  failed; a run has faulted
   2  wrong usage, or a file that cannot be read
   3  a run was cancelled, is incomplete, or was left running by a second Ctrl-C
-  4  no daemon can be reached, or it went away
+  4  the daemon cannot be reached, or the connection was lost
   5  the daemon refused: forbidden, busy, no such run or session, invalid plan";
 
-/// Asks raysweepd for sweeps of light transport and follows them.
+/// Controls raysweepd: checks and runs plans, follows runs, and processes sessions.
 #[derive(Debug, Parser)]
 #[command(name = "raysweep", version, after_help = EXIT_CODES)]
 struct Arguments {
     /// The daemon's socket [default: $RAYSWEEP_SOCKET, else /run/raysweep/raysweepd.sock]
     #[arg(long, global = true, value_name = "PATH")]
     socket: Option<PathBuf>,
-    /// Print JSON: one line a result, an event, or an error
+    /// Print JSON, one line for each result, event or error
     #[arg(long, global = true)]
     json: bool,
     #[command(subcommand)]
@@ -57,72 +57,72 @@ struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Say what the daemon is doing
+    /// Show what the daemon is doing
     Status,
-    /// List what can be asked of the daemon; with --json, with schemas
+    /// List the daemon's methods; with --json, including their schemas
     Describe,
-    /// List the cameras that answer; needs no daemon
+    /// List the cameras that respond; needs no daemon
     Devices,
-    /// Save and restore what a camera is set to; needs no daemon
+    /// Save and restore a camera's settings; needs no daemon
     #[command(subcommand)]
     Camera(CameraCommand),
-    /// Say what a plan would do; nothing moves
+    /// Show what a plan would do, without moving anything
     Check {
         /// The plan, a TOML file
         plan: PathBuf,
     },
-    /// Run a plan and follow the run; Ctrl-C cancels it, a second Ctrl-C leaves it to the daemon
+    /// Run a plan and follow the run; Ctrl-C cancels it, a second Ctrl-C exits without waiting for its end
     Run(RunArguments),
-    /// Acquire the points that a session lacks, and follow the run as `run` does
+    /// Acquire the missing points of a session, and follow the run as `run` does
     Resume {
         /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
-        /// Do not wait for the end
+        /// Return at once instead of following the run
         #[arg(long)]
         detach: bool,
     },
-    /// Follow the run that is under way to its end; Ctrl-C stops watching
+    /// Follow the run in progress to its end; Ctrl-C stops following
     Watch,
-    /// Write the running estimate as a picture: epipolar light on the left, indirect light on the right
+    /// Write the live estimate as a picture: epipolar light on the left, indirect light on the right
     Preview {
         /// The PNG file to write
         #[arg(long, value_name = "FILE", default_value = "preview.png")]
         output: PathBuf,
-        /// Write it again whenever the estimate is newer, to the end of the run
+        /// Write the picture again for each new estimate, until the end of the run
         #[arg(long)]
         follow: bool,
     },
-    /// Hold the run before its next point
+    /// Pause the run before its next point
     Pause,
-    /// Go on with a run that is held
+    /// Continue a paused run
     Continue,
-    /// End the run in order; what was acquired is kept
+    /// Cancel the run; what was acquired is kept
     Cancel,
-    /// Permit a mirror's light until the next boot, on a rig without an interlock
+    /// Permit light until the next boot, on a rig with a mirror but no interlock
     ArmLight,
-    /// Take a mirror that a daemon has left behind to the origin, light off first; needs no daemon
+    /// Turn off the light and park the mirror after a daemon has crashed; needs no daemon
     Park {
-        /// The mirror's state, in the daemon's data folder
+        /// The mirror's state file, in the daemon's data folder
         #[arg(long, value_name = "FILE", default_value = crate::mirror::DEFAULT_STATE)]
         state: PathBuf,
-        /// Wait until standard input is closed: how a daemon's guardian outlives it
+        /// Park when standard input is closed: raysweepd starts its guardian process like this
         #[arg(long)]
         when_closed: bool,
     },
     /// List the daemon's sessions, oldest first
     Sessions,
-    /// Make a session's products and report again from what is stored; needs no daemon
+    /// Make a session's products and report again from its stored data; needs no daemon
     Process {
         /// The session's folder
         session: PathBuf,
-        /// Make this too, a `[[product]]` in one line: 'kind = "epipolar", width_rows = 5'; may be given several times
+        /// Also make this product, a `[[product]]` in one line: 'kind = "epipolar", width_rows = 5'; may be repeated
         #[arg(long = "product", value_name = "KEYS")]
         products: Vec<String>,
-        /// Make the given products only, not the plan's
+        /// Make only these products, not the plan's
         #[arg(long, requires = "products")]
         only: bool,
-        /// Take no more memory than this for the results, such as 2GB: larger sweeps are solved some camera rows at a time
-        /// [default: what is free]
+        /// Memory limit for the results, such as 2GB; larger sweeps are solved in strips of camera rows [default: the free
+        /// memory]
         #[arg(long, value_name = "SIZE")]
         memory: Option<ByteSize>,
     },
@@ -130,7 +130,7 @@ enum Command {
     Export {
         /// The session's folder
         session: PathBuf,
-        /// The folder to make [default: SESSION's name with `-export`, here]
+        /// The folder to create [default: the session's name with `-export`, in the current folder]
         #[arg(long, value_name = "DIR")]
         to: Option<PathBuf>,
     },
@@ -140,19 +140,19 @@ enum Command {
 struct RunArguments {
     /// The plan, a TOML file
     plan: PathBuf,
-    /// Do not wait for the end
+    /// Return at once instead of following the run
     #[arg(long)]
     detach: bool,
-    /// Who runs it
+    /// Name of the operator
     #[arg(long)]
     operator: Option<String>,
-    /// What stands before the camera
+    /// Name of the sample
     #[arg(long)]
     sample: Option<String>,
-    /// Anything else
+    /// Any other remark
     #[arg(long)]
     note: Option<String>,
-    /// A word to find the session by; may be given several times
+    /// A tag to find the session by; may be repeated
     #[arg(long = "tag", value_name = "TAG")]
     tags: Vec<String>,
 }
@@ -203,16 +203,16 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         Command::Pause => {
             connect()?.pause()?;
             printer.print(&Empty {}, |_| {
-                "the run is held before its next point; `raysweep continue` goes on".into()
+                "the run pauses before its next point; `raysweep continue` continues it".into()
             })?;
         }
         Command::Continue => {
             connect()?.go_on()?;
-            printer.print(&Empty {}, |_| "the run goes on".into())?;
+            printer.print(&Empty {}, |_| "the run continues".into())?;
         }
         Command::Cancel => {
             connect()?.cancel()?;
-            printer.print(&Empty {}, |_| "the run is being ended; what was acquired is kept".into())?;
+            printer.print(&Empty {}, |_| "the run is being cancelled; what was acquired is kept".into())?;
         }
         Command::ArmLight => {
             connect()?.arm_light()?;
@@ -271,7 +271,7 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
     let status = Client::connect(socket)?.status()?;
     let under_way = !matches!(status.state, RunState::Idle | RunState::Faulted);
     let Some(session) = status.session.filter(|_| under_way) else {
-        let message = "no run is under way; `raysweep sessions` lists those that were";
+        let message = "no run in progress; `raysweep sessions` lists earlier runs";
         return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
     };
     let mut view = EventView::new(printer.json);

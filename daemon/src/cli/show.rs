@@ -50,7 +50,7 @@ pub(super) fn status(status: &Status) -> String {
         rows.push(("clock", format!("residual {residual_us:.1} us, {rate_ppm:+.2} ppm against the host's")));
     }
     if let Some(SettingsLatency { min_frames, max_frames }) = status.settings_latency {
-        rows.push(("settings", format!("act {min_frames} to {max_frames} frames late")));
+        rows.push(("settings", format!("take effect {min_frames} to {max_frames} frames late")));
     }
     if let Some(mirror) = &status.mirror {
         rows.push(("mirror", self::mirror(mirror)));
@@ -73,12 +73,14 @@ pub(super) fn parked_name(parked: Parked) -> serde_json::Value {
 /// Text of `park`.
 pub(super) fn parked(parked: Parked) -> String {
     match parked {
-        Parked::Already => "the mirror is parked, as it was".into(),
+        Parked::Already => "the mirror was already parked".into(),
         Parked::From(tilt) => {
             let [x, y] = tilt.deg();
-            format!("the mirror is parked; it was found at {x:.2}, {y:.2} degrees")
+            format!("the mirror is parked; it had been at {x:.2}, {y:.2} degrees")
         }
-        Parked::ByReset => "nobody knew where the mirror was: its controller was started anew".into(),
+        Parked::ByReset => {
+            "the mirror's position was unknown, so its controller was initialised again".into()
+        }
     }
 }
 
@@ -89,7 +91,7 @@ fn mirror(mirror: &MirrorStatus) -> String {
         "interlock_closed" => "the interlock is closed",
         "interlock_open" => "the interlock is open",
         "armed" => "light is armed",
-        _ => "nobody has armed the light since this boot: `raysweep arm-light`",
+        _ => "light is not permitted: `raysweep arm-light` permits it until the next boot",
     };
     format!("{place}, light {laser}; {word}")
 }
@@ -287,7 +289,7 @@ impl Ending<'_> {
         lines.extend(final_s.map(|seconds| format!("transport on disk {seconds:.2} s after the last frame")));
         lines.extend(report.map(|report| format!("report: {}", report.display())));
         if missing > 0 {
-            lines.push(format!("`raysweep resume {}` takes what is missing", name(session)));
+            lines.push(format!("`raysweep resume {}` acquires the missing points", name(session)));
         }
         lines.join("\n")
     }

@@ -89,7 +89,7 @@ impl EventView {
                 writeln!(io::stdout(), "{summary}")?;
             }
             Event::Skipped { events } => {
-                self.note(&format!("{events} events were skipped: this end was too slow"))
+                self.note(&format!("{events} events were skipped because this client was too slow"))
             }
         }
         Ok(())

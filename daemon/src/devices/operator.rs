@@ -87,7 +87,7 @@ fn tell(question: Request, board: &StatusBoard) {
     question.refuse("the run is over and did not wait for it");
 }
 
-/// Places a subject before the camera; waits for the operator if needed. `planes` is the number of calibration planes.
+/// Places a subject in front of the camera; waits for the operator if needed. `planes` is the number of calibration planes.
 ///
 /// # Errors
 /// For a subject that the rig does not have.
@@ -101,11 +101,11 @@ pub fn place(
     orders.wait_while_paused();
     if !stand.place(subject)? {
         let text = match subject {
-            Subject::Diffuser => "hold an evenly lit diffuser right before the camera's lens".into(),
+            Subject::Diffuser => "hold an evenly lit diffuser directly in front of the camera's lens".into(),
             Subject::Plane(plane) => {
-                format!("put calibration plane {} of {} before the camera", plane + 1, planes)
+                format!("put calibration plane {} of {} in front of the camera", plane + 1, planes)
             }
-            Subject::Scene => "put the scene before the camera, and all else away".into(),
+            Subject::Scene => "put the scene in front of the camera and remove everything else".into(),
             Subject::Board => "put the white board in the scene's place, so that it fills the view".into(),
             Subject::Cap => "put the cap on the camera's lens".into(),
         };

@@ -152,7 +152,7 @@ impl LiveFile {
         let metadata = Value::Object(metadata).to_string();
         if metadata.len() > METADATA_BYTES {
             return Err(refused(format!(
-                "metadata of {} bytes: {METADATA_BYTES} are allowed",
+                "metadata of {} bytes: at most {METADATA_BYTES} are allowed",
                 metadata.len()
             )));
         }
@@ -215,7 +215,7 @@ fn remove_stale(path: &Path) -> Result<(), LiveError> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
         Err(error) => return Err(failed()(error)),
         Ok(metadata) if !metadata.is_file() => {
-            let why = "it is no plain file; remove it, or choose another --live".into();
+            let why = "it is not a regular file; remove it, or choose another --live".into();
             return Err(LiveError::NotLive { path: path.to_owned(), why });
         }
         Ok(_) => {}
@@ -223,7 +223,7 @@ fn remove_stale(path: &Path) -> Result<(), LiveError> {
     let mut file = File::open(path).map_err(failed())?;
     let mut magic = [0; MAGIC.len()];
     if file.read_exact(&mut magic).is_err() || magic != MAGIC {
-        let why = "it begins otherwise; remove it, or choose another --live".into();
+        let why = "it does not begin like one; remove it, or choose another --live".into();
         return Err(LiveError::NotLive { path: path.to_owned(), why });
     }
     match file.try_lock() {

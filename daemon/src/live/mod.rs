@@ -28,7 +28,7 @@ pub const FLOODLIT: &str = "floodlit";
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
     /// The file cannot be created.
-    #[error("cannot make {}: {source}; its folder must exist and be writable, or choose another --live", path.display())]
+    #[error("cannot create {}: {source}; its folder must exist and be writable, or choose another --live", path.display())]
     Make {
         /// Path of the file.
         path: PathBuf,
@@ -49,7 +49,7 @@ pub enum LiveError {
     #[error("another raysweepd writes {}: stop it, or choose another --live", .0.display())]
     Taken(PathBuf),
     /// The path exists, but is not a live file.
-    #[error("{} is no live file: {why}", path.display())]
+    #[error("{} is not a live file: {why}", path.display())]
     NotLive {
         /// The file.
         path: PathBuf,
@@ -65,7 +65,7 @@ pub enum LiveError {
         why: String,
     },
     /// The writer overwrote the image during every attempt to read it.
-    #[error("{} was written too often to be read: try again", .0.display())]
+    #[error("{} changed during every attempt to read it: try again", .0.display())]
     Outrun(PathBuf),
 }
 

@@ -53,7 +53,7 @@ impl LiveReader {
         let version = u32_at(&header, 8);
         if header[..8] != MAGIC || version != VERSION {
             return Err(not_live(format!(
-                "it begins with {:?}, version {version}; known is version {VERSION}",
+                "it begins with {:?}, version {version}; this raysweep reads version {VERSION}",
                 String::from_utf8_lossy(&header[..8])
             )));
         }

@@ -65,7 +65,7 @@ impl Model {
         let headroom = geometry.saturation_dn / geometry.white_dn;
         if headroom < 1.2 {
             warnings.push(format!(
-                "a pixel saturates at {headroom:.2} of a white one over {brightest_rows:.0} rows: lower camera.white_dn (gain, aperture) to leave room for indirect light"
+                "a pixel saturates at {headroom:.2} times the direct light of a white one, and exposures collect light from up to {brightest_rows:.0} rows: lower camera.white_dn (gain, aperture) to leave room for indirect light"
             ));
         }
         warnings

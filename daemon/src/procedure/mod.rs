@@ -59,13 +59,13 @@ pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<F
             Ok(darks::foresee(lab, rig, &plan, own, begun.first_row, size)?)
         }
         (_, Procedure::Film(_)) => Err(Unresumable::Past(
-            "a film cannot be resumed: its time has passed. `raysweep process` makes the transports of the cycles that are there; run the plan again for another film",
+            "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
         )),
         (_, Procedure::Batches(_)) => Err(Unresumable::Past(
-            "batches cannot be resumed: their time has passed. `raysweep process` makes the products of those that are there; run the plan again for more",
+            "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more",
         )),
         (_, Procedure::Response(_)) => {
-            Err(Unresumable::Past("the records of a mirror's axes cannot be resumed: run the plan again"))
+            Err(Unresumable::Past("a run of kind \"response\" cannot be resumed: run the plan again"))
         }
         (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_)) => {
             Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())

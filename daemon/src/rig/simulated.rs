@@ -41,7 +41,7 @@ impl Simulated {
     pub(super) fn open(rig: &Rig) -> Result<Self, RigError> {
         match (&rig.file.sim.bench, rig.simulated()) {
             (Some(_), _) if rig.file.camera.driver == CameraDriver::Sim => {
-                let message = "sim.bench: the camera of a bench is reached over its wire: set camera.driver to the driver that does, or leave sim.bench out";
+                let message = "sim.bench: the camera of a bench is connected by a real wire: set camera.driver to the driver of that camera, or leave sim.bench out";
                 Err(RigError::Config(message.into()))
             }
             (Some(bench), _) => Ok(Self { bench: Some(bench.clone()), ..Self::default() }),
@@ -84,6 +84,6 @@ impl Simulated {
 
 fn not_simulated(section: &str) -> RigError {
     RigError::Config(format!(
-        "{section}.driver: nothing of this rig is simulated; name the driver of a real device"
+        "{section}.driver: no device of this rig is simulated; name the driver of a real device"
     ))
 }

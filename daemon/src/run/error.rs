@@ -24,7 +24,8 @@ pub enum RunError {
     Pipeline(#[from] PipelineError),
     /// The camera differs from the one that the session was begun with.
     #[error(
-        "the camera has {found:?} rows and columns, the session {expected:?}: resume it on the rig that it was begun on"
+        "the camera has {} rows and {} columns, but the session has {} and {}: resume it on the rig that it was begun on",
+        .found.0, .found.1, .expected.0, .expected.1
     )]
     OtherCamera {
         /// Rows and columns of the camera.
@@ -46,7 +47,7 @@ pub enum RunError {
     Plan(#[from] ConfigError),
     /// Points failed repeatedly.
     #[error(
-        "{points} points failed in {passes} passes in a row; frames of the last pass: {}, {interrupted} attempts interrupted. The ledger has the causes of each; mend them and resume the session",
+        "{points} points failed in {passes} passes in a row; frames of the last pass: {}, {interrupted} attempts interrupted. The ledger lists the cause of each failure: fix it and resume the session",
         .counts.losses()
     )]
     Hopeless {
@@ -61,10 +62,45 @@ pub enum RunError {
     },
     /// A thread of the run has ended unexpectedly; another error says which and why.
     #[error(
-        "a thread of the run has ended; the log has its message. What was stored stays stored; resume the session"
+        "a thread of the run has ended unexpectedly; see the log. The stored data are kept; resume the session"
     )]
     Interrupted,
     /// The run panicked, which is a bug.
-    #[error("the run panicked: {0}. What was stored stays stored; resume the session")]
+    #[error("the run panicked, which is a bug: {0}. The stored data are kept; resume the session")]
     Panicked(String),
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write;
+
+    use raysweep_core::DeviceErrorKind;
+
+    use super::*;
+
+    #[test]
+    fn every_error_of_a_run_says_what_to_do() {
+        let mut counts = Counts { expected: 300, averaged: 296, ..Counts::default() };
+        counts.lose(raysweep_core::LossCause::CameraGap, 4);
+        let errors: [RunError; _] = [
+            DeviceError::new("camera", DeviceErrorKind::NotReady, "no frame for 5.0 s").into(),
+            RigError::Config("rig.toml, line 3: camera.reopen_s = -1: must be from 0 to 3600".into()).into(),
+            raysweep_session::Error::InUse { path: "ledger.jsonl".into() }.into(),
+            PipelineError::Panicked("sink").into(),
+            RunError::OtherCamera { found: (480, 640), expected: (720, 1280) },
+            raysweep_transport::dots::DotsError::TooFew { what: "dark frames", given: 3, needed: 16 }.into(),
+            RunError::Frame("frame does not match its format".into()),
+            RunError::Plan(ConfigError::of_field("kind", "the plan's message")),
+            RunError::Hopeless { points: 3, passes: 8, counts, interrupted: 1 },
+            RunError::Interrupted,
+            RunError::Panicked("index out of bounds".into()),
+        ];
+        let mut shown = String::new();
+        for error in errors {
+            let debug = format!("{error:?}");
+            let variant = debug.split(|c: char| !c.is_alphanumeric()).next().unwrap_or_default();
+            writeln!(shown, "{variant}: {error}\n").unwrap();
+        }
+        insta::assert_snapshot!(shown);
+    }
 }

@@ -67,7 +67,8 @@ impl Access {
     /// The error for an observer who calls a method reserved for operators.
     pub(super) fn forbidden(&self, method: Method, peer: Peer) -> RpcError {
         let name = method.name();
-        let message = format!("`{name}` is for operators, and user number {} is an observer", peer.uid);
+        let message =
+            format!("`{name}` is reserved for operators, and the user with id {} is an observer", peer.uid);
         let help = match &self.operators {
             Some(group) => format!("join the group `{group}` (`usermod -aG {group} USER` as root)"),
             None => "call it as root or as the daemon's own user; no group of operators is set".into(),
@@ -131,6 +132,6 @@ mod tests {
     fn who_is_forbidden_learns_which_group_to_join() {
         let error = access(Some("raysweep")).forbidden(Method::Run, STRANGER);
         assert_eq!(error.name(), Some(ErrorCode::Forbidden));
-        assert!(error.message.contains("`run`") && error.message.contains("usermod -aG raysweep"), "{error}");
+        assert!(error.data.is_some_and(|data| data.help.is_some_and(|help| help.contains("raysweep"))));
     }
 }

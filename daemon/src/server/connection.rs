@@ -56,12 +56,12 @@ impl Connection {
                 line = self.lines.next() => match line? {
                     Line::Text(text) => self.answer(&text).await?,
                     Line::NotUtf8 => {
-                        let message = "not UTF-8; JSON is UTF-8";
+                        let message = "not UTF-8: encode JSON as UTF-8";
                         self.refuse(ErrorCode::ParseError, message).await?;
                     }
                     Line::TooLong => {
                         let bytes = self.desk.limits.message_bytes;
-                        let message = format!("a line is longer than {bytes} bytes, the longest allowed");
+                        let message = format!("the message is longer than {bytes} bytes, which is the limit");
                         return self.refuse(ErrorCode::TooLong, message).await;
                     }
                     Line::End => return Ok(()),
@@ -86,7 +86,7 @@ impl Connection {
 
     async fn call(&mut self, request: Request) -> Result<serde_json::Value, RpcError> {
         let Some(method) = Method::from_name(&request.method) else {
-            let message = format!("there is no method `{}`; `describe` lists them", request.method);
+            let message = format!("unknown method `{}`; `describe` lists the methods", request.method);
             return Err(RpcError::new(ErrorCode::MethodNotFound, message).of_field("method"));
         };
         if method.role() == Role::Operator && self.role != Role::Operator {
@@ -97,7 +97,8 @@ impl Connection {
         let reply = tokio::task::spawn_blocking(call).await.map_err(|error| {
             let name = method.name();
             tracing::error!(%error, method = name, "a call failed in the daemon");
-            let message = format!("`{name}` met a defect of the daemon, which goes on; its log says more");
+            let message =
+                format!("`{name}` failed because of a bug in the daemon, which keeps running; see its log");
             RpcError::new(ErrorCode::Internal, message)
         })??;
         if let Some(events) = reply.events {

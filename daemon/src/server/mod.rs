@@ -132,7 +132,7 @@ fn passes(error: &io::Error) -> bool {
 /// Tells a client that the server is full. A new socket's buffer is empty, so this does not wait.
 async fn turn_away(mut stream: UnixStream, limits: Limits) {
     let message =
-        format!("{} clients are connected already; end one of them, or try again later", limits.clients);
+        format!("{} clients are already connected; close one of them, or try again later", limits.clients);
     let response = Response::error(Id::Null, RpcError::new(ErrorCode::TooManyClients, message));
     if let Err(error) = connection::send(&mut stream, &response, limits.write_timeout).await {
         tracing::debug!(%error, "a client that was turned away did not listen");

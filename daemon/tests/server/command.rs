@@ -89,16 +89,16 @@ fn every_other_command_prints_for_people_and_for_programs() {
         (vec!["status"], "37 of 75 stored", "/progress/points_stored"),
         (vec!["status"], "parked, light off; light is armed", "/mirror/parked"),
         (vec!["arm-light"], "until the next boot", ""),
-        (vec!["describe"], "operator  Begins a run", "/methods/0/params/type"),
+        (vec!["describe"], "operator  Starts a run", "/methods/0/params/type"),
         (vec!["check", &plan], "relative rows -94 to 94", "/warnings/0"),
         (vec!["check", &plan], "assumed: state camera.electrons_per_dn", "/advice/noise/source"),
         (vec!["check", &plan], "epipolar 0.0062, short range 0.011, ", "/advice/expected/epipolar"),
         (vec!["check", &plan], "warning    few points\n\n[sweep]\naverage = 8\n", "/advice/better/sweep"),
         (vec!["sessions"], "20260101-000000_fake  complete   75/75  fake", "/0/state"),
         (vec!["run", &plan, "--detach"], "/data/20260101-000000_fake", ""),
-        (vec!["pause"], "held", ""),
+        (vec!["pause"], "pauses", ""),
         (vec!["status"], "to do      cover the lens", "/question"),
-        (vec!["continue"], "goes on", ""),
+        (vec!["continue"], "continues", ""),
         (vec!["cancel"], "kept", ""),
         (vec!["resume", "old", "--detach"], "/data/20260101-000000_fake", ""),
     ] {
@@ -119,11 +119,10 @@ fn the_preview_is_a_picture_of_both_images_and_is_followed_to_the_result() {
     let daemon = Daemon::start();
     let output = daemon.folder.path().join("seen.png");
     let arguments = ["preview", "--output", output.to_str().unwrap()];
-    let (exit, _, err) = run(&daemon, &arguments);
-    assert!(exit == 5 && err.contains("no live image"), "{exit} {err}");
+    assert_eq!(run(&daemon, &arguments).0, 5, "there is no live file");
     let live = LiveFile::create(&daemon.fake.live).unwrap();
-    let (exit, _, err) = run(&daemon, &arguments);
-    assert!(exit == 5 && err.contains("no live image") && !output.exists(), "{exit} {err}");
+    assert_eq!(run(&daemon, &arguments).0, 5, "the file has no image");
+    assert!(!output.exists());
 
     let show = |points: u32, last: bool| {
         let metadata = serde_json::json!({ "points": points, "last": last });
@@ -173,12 +172,16 @@ fn what_cannot_be_done_has_its_exit_code() {
     assert_eq!(exit, 2, "{err}");
     let (exit, _, err) = run(&daemon, &["run", "no/such/plan.toml"]);
     assert!(exit == 2 && err.contains("no/such/plan.toml"), "{exit} {err}");
-    let (exit, _, err) = run(&daemon, &["cancel"]);
-    assert!(exit == 5 && err.contains("no run"), "{exit} {err}");
-    let (exit, _, err) = run(&daemon, &["watch"]);
-    assert!(exit == 5 && err.contains("no run is under way"), "{exit} {err}");
-    let (exit, _, err) = run(&daemon, &["resume", "none"]);
-    assert!(exit == 5 && err.contains("no session `none`"), "{exit} {err}");
+    let refused = |daemon: &Daemon, arguments: &[&str], name: &str| {
+        let (exit, out, err) = run(daemon, &[arguments, &["--json"]].concat());
+        assert_eq!((exit, err.as_str()), (5, ""), "{arguments:?}");
+        let error = &json_lines(&out)[0]["error"];
+        assert_eq!(error["data"]["name"], name, "{arguments:?}: {error}");
+        error.clone()
+    };
+    refused(&daemon, &["cancel"], "not_running");
+    refused(&daemon, &["watch"], "not_running");
+    refused(&daemon, &["resume", "none"], "no_session");
     let (exit, _, err) = run(&daemon, &["process", "no/such/session"]);
     assert!(exit == 1 && !err.is_empty(), "{exit} {err}");
 
@@ -190,8 +193,8 @@ fn what_cannot_be_done_has_its_exit_code() {
 
     let access = Access::identified_by(Some("raysweep".into()), |_| Ok(Peer { uid: 65534, gid: 65534 }));
     let daemon = Daemon::with(Limits::default(), access);
-    let (exit, _, err) = run(&daemon, &["run", &plan(&daemon, "")]);
-    assert!(exit == 5 && err.contains("usermod -aG raysweep"), "{exit} {err}");
+    let error = refused(&daemon, &["run", &plan(&daemon, "")], "forbidden");
+    assert!(error["data"]["help"].is_string(), "{error}");
 }
 
 #[test]
@@ -234,7 +237,7 @@ fn watch_follows_anothers_run_and_ctrl_c_does_not_touch_it() {
     assert_eq!(left.wait().unwrap().code(), Some(0));
     assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Running);
     run(&daemon, &["cancel"]);
-    assert!(lines.last().unwrap().unwrap().contains("cancelled"));
+    assert_eq!(json_lines(&lines.last().unwrap().unwrap())[0]["state"], "cancelled");
     assert_eq!(stays.wait().unwrap().code(), Some(3));
 }
 
@@ -274,6 +277,6 @@ fn a_daemon_that_goes_away_ends_the_client() {
     let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
     lines.next().unwrap().unwrap();
     daemon.stop();
-    assert!(lines.last().unwrap().unwrap().contains("was lost"));
+    assert!(json_lines(&lines.last().unwrap().unwrap())[0]["error"]["message"].is_string());
     assert_eq!(child.wait().unwrap().code(), Some(4));
 }

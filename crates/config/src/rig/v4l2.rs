@@ -57,7 +57,8 @@ impl V4l2Config {
         match section {
             Some(config) => document.refuse_all(&["camera", "v4l2"], config.faults()),
             None => {
-                let message = "camera.driver = \"v4l2\": a table [camera.v4l2] with device, width and height is missing";
+                let message =
+                    "camera.driver = \"v4l2\" requires a table [camera.v4l2] with device, width and height";
                 document.refuse(&["camera", "driver"], message);
             }
         }

@@ -62,7 +62,9 @@ fn default_reopen_s() -> f64 {
 impl VsyncSection {
     pub(super) fn check(&self, document: &mut Document<'_>) {
         document.check_range(&["vsync", "period_us"], self.period_us, 4000.0..=1e6);
-        document.check_range(&["vsync", "gate_us"], self.gate_us, 1.0..=self.period_us / 4.0);
+        // If the period is out of its range, that is one mistake, not two.
+        let period_us = self.period_us.clamp(4000.0, 1e6);
+        document.check_range(&["vsync", "gate_us"], self.gate_us, 1.0..=period_us / 4.0);
         document.check_range(&["vsync", "reopen_s"], self.reopen_s, 0.0..=3600.0);
         let missing = match self.driver {
             VsyncDriver::ModemLine if self.modemline.is_none() => Some(("modemline", "port")),
@@ -71,8 +73,7 @@ impl VsyncSection {
             _ => None,
         };
         if let Some((table, keys)) = missing {
-            let message =
-                format!("vsync.driver = \"{table}\": a table [vsync.{table}] with {keys} is missing");
+            let message = format!("vsync.driver = \"{table}\" requires a table [vsync.{table}] with {keys}");
             document.refuse(&["vsync", "driver"], message);
         }
         if self.driver == VsyncDriver::Fx2Lafw {
@@ -185,7 +186,7 @@ impl Fx2LafwConfig {
         let is_divided = |clock_hz: u32| *sample_rate_hz > 0 && clock_hz.is_multiple_of(*sample_rate_hz);
         if !(Self::RATES_HZ.contains(sample_rate_hz) && Self::CLOCKS_HZ.into_iter().any(is_divided)) {
             let message = format!(
-                " = {sample_rate_hz}: allowed is 48000000 or 30000000 over a whole number, 20000 to 24000000; take 1000000"
+                " = {sample_rate_hz}: must be 48000000 or 30000000 divided by a whole number, from 20000 to 24000000; 1000000 is a good choice"
             );
             faults.push(Fault { key: "sample_rate_hz", message });
         }
@@ -195,7 +196,7 @@ impl Fx2LafwConfig {
             || inputs.len() < channels.len()
         {
             let message = format!(
-                " = {channels:?}: each is an input of its own, 0 to 7, and \"{}\" is one of them",
+                " = {channels:?}: must give each signal an input of its own, 0 to 7, and name one signal \"{}\"",
                 Self::VSYNC
             );
             faults.push(Fault { key: "channels", message });

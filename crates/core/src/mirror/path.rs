@@ -30,19 +30,19 @@ pub struct MirrorPath {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PathError {
     /// No points, or more than [`MAX_POINTS`].
-    #[error("path of {points} points: allowed is 1 to {MAX_POINTS}")]
+    #[error("the path has {points} points: must have 1 to {MAX_POINTS}")]
     Points {
         /// Number of points.
         points: usize,
     },
     /// The rate is not positive and finite.
-    #[error("rate_hz = {rate_hz}: give samples per second, more than 0")]
+    #[error("rate_hz = {rate_hz}: must be more than 0 samples per second")]
     Rate {
         /// The rate in Hz.
         rate_hz: f64,
     },
     /// Invalid parameter of a shape.
-    #[error("{field} = {value}: allowed is {allowed}")]
+    #[error("{field} = {value}: must be {allowed}")]
     Shape {
         /// Name of the parameter.
         field: &'static str,
@@ -67,7 +67,7 @@ pub enum PathError {
     },
     /// Two consecutive points too far apart.
     #[error(
-        "{axis} changes by {deg} degrees from point {point} to the next: allowed are {allowed_deg} degrees in a sample; take more points"
+        "{axis} changes by {deg} degrees from point {point} to the next: at most {allowed_deg} degrees per sample are allowed; take more points"
     )]
     Step {
         /// Index of the first of the two points.
@@ -81,7 +81,7 @@ pub enum PathError {
     },
     /// Two consecutive points too far apart for the rate.
     #[error(
-        "{axis} moves at {deg_per_s} degrees/s from point {point} to the next: allowed are {allowed_deg_per_s}; take more points or a lower rate_hz"
+        "{axis} moves at {deg_per_s} degrees/s from point {point} to the next: at most {allowed_deg_per_s} are allowed; take more points or a lower rate_hz"
     )]
     Slew {
         /// Index of the first of the two points.
@@ -95,7 +95,7 @@ pub enum PathError {
     },
     /// Too much movement above the bandwidth.
     #[error(
-        "{axis} moves by {deg} degrees (rms) above the bandwidth of {bandwidth_hz} Hz: allowed are {allowed_deg}; take more points, rounder turns, or a lower rate_hz"
+        "{axis} moves by {deg} degrees (rms) above the bandwidth of {bandwidth_hz} Hz: at most {allowed_deg} are allowed; take more points, rounder turns, or a lower rate_hz"
     )]
     Bandwidth {
         /// Name of the axis.

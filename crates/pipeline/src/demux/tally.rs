@@ -101,7 +101,7 @@ fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<Str
     let share = saturated as f64 / pixels as f64;
     (share > SATURATED_SHARE).then(|| {
         format!(
-            "{:.1} % of the pixels of {what} are saturated: take less gain, a smaller aperture or less ambient light",
+            "{:.1} % of the pixels of {what} are saturated: use less gain, a smaller aperture or less ambient light",
             share * 100.0
         )
     })

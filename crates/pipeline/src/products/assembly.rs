@@ -72,7 +72,7 @@ impl Assembly {
                     image: image.clone(),
                 },
                 None => {
-                    let what = "the regular image or its dark image is not there: resume the run";
+                    let what = "the regular image or its dark image is not stored: resume the run";
                     return Err(not_made(what.into()));
                 }
             },

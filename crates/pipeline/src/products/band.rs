@@ -33,7 +33,7 @@ impl Width {
             1 => Ok(self),
             _ => {
                 let what = format!(
-                    "width_rows = {}: give an odd number of rows, so that as many lie above as below",
+                    "width_rows = {}: must be an odd number of rows, so that as many lie above as below",
                     self.width_rows
                 );
                 Err(("width_rows", what))
@@ -104,8 +104,7 @@ impl Band {
     pub(super) fn check(self) -> Result<Self, (&'static str, String)> {
         match self.to_rows {
             Some(to_rows) if to_rows < self.from_rows => {
-                let what =
-                    format!("to_rows = {to_rows}: give at least from_rows, which is {}", self.from_rows);
+                let what = format!("to_rows = {to_rows}: must be at least from_rows = {}", self.from_rows);
                 Err(("to_rows", what))
             }
             _ => Ok(self),

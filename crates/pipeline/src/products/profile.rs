@@ -54,7 +54,9 @@ impl ProfileTable {
         let size = format!("the camera has {height} rows and {width} columns");
         let region = match (self.pixel, self.region) {
             (Some([t, s]), None) if t < height && s < width => [t, t + 1, s, s + 1],
-            (Some(pixel), None) => return Err(("pixel", format!("pixel = {pixel:?}, [t, s]: {size}"))),
+            (Some(pixel), None) => {
+                return Err(("pixel", format!("pixel = {pixel:?} is outside of the image: {size}")));
+            }
             (None, Some([t0, t1, s0, s1])) if t0 < t1 && t1 <= height && s0 < s1 && s1 <= width => {
                 [t0, t1, s0, s1]
             }
@@ -75,10 +77,13 @@ impl ProfileTable {
         exposures_us.dedup();
         match delays {
             MIN_DELAYS.. => Ok(ProfileOptions { region, exposure_us }),
-            0 => Err(("exposure_us", format!("exposure_us = {exposure_us}: the plan has {exposures_us:?}"))),
+            0 => Err((
+                "exposure_us",
+                format!("exposure_us = {exposure_us}: must be one of the plan's {exposures_us:?}"),
+            )),
             _ => {
                 let what = format!(
-                    "exposure_us = {exposure_us}: a profile takes {MIN_DELAYS} delays, the plan has {delays} at it"
+                    "exposure_us = {exposure_us}: a profile needs at least {MIN_DELAYS} delays, but the plan has {delays} at this exposure"
                 );
                 Err(("exposure_us", what))
             }
@@ -141,12 +146,12 @@ impl ProfileOptions {
         let taken = sums.settings.len();
         if taken < MIN_DELAYS {
             return Err(format!(
-                "{taken} images of {exposure_us} µs are there, a profile takes {MIN_DELAYS}: resume the run"
+                "{taken} images at {exposure_us} µs are stored, but a profile needs at least {MIN_DELAYS}: resume the run"
             ));
         }
         if sums.pixels == 0 {
             return Err(format!(
-                "every pixel of it saturates at some delay at {exposure_us} µs: choose a shorter exposure_us, or other pixels"
+                "each of its pixels saturates at some delay at {exposure_us} µs: choose a shorter exposure_us, or other pixels"
             ));
         }
         let [t0, t1, s0, s1] = self.region;

@@ -68,7 +68,7 @@ impl RowPattern {
             if (lowest..=highest).contains(&value) {
                 return Ok(());
             }
-            let message = format!("{} = {value}: allowed are {lowest} to {highest}, {what}", path.join("."));
+            let message = format!("{} = {value}: must be from {lowest} to {highest}, {what}", path.join("."));
             Err((path.iter().map(|&key| key.to_owned()).collect::<Vec<_>>(), message))
         };
         match self {
@@ -87,7 +87,7 @@ impl RowPattern {
                         "first to the projector's last row",
                     )?;
                     if !(piece.weight.is_finite() && piece.weight >= 0.0) {
-                        let what = format!("rows.{index}.weight = {}: give light of 0 or more", piece.weight);
+                        let what = format!("rows.{index}.weight = {}: must be 0 or more", piece.weight);
                         return Err((vec!["rows".into(), index, "weight".into()], what));
                     }
                 }

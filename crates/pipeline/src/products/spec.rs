@@ -8,6 +8,7 @@ use super::band::{Band, Width};
 use super::profile::{ProfileOptions, ProfileTable};
 use super::relight::RowPattern;
 use crate::schedule::{Schedule, SweepGeometry};
+use raysweep_core::decoding_message;
 
 /// Why a product is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -91,7 +92,7 @@ impl ProductSpec {
                 ProductKind::DelayProfile(table.check(schedule, geometry).map_err(one)?)
             }
             _ => {
-                return Err(refused(vec!["kind".into()], format!("kind = {kind:?}: known are {KINDS}")));
+                return Err(refused(vec!["kind".into()], format!("kind = {kind:?}: must be one of {KINDS}")));
             }
         };
         let name = match name {
@@ -156,10 +157,8 @@ fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Resul
             Segment::Enum { .. } | Segment::Unknown => None,
         };
         let path: Vec<String> = error.path().iter().filter_map(key).collect();
-        let what = match path.is_empty() {
-            true => error.inner().to_string(),
-            false => format!("{}: {}", path.join("."), error.inner()),
-        };
+        let what = decoding_message(&error.inner().to_string(), "table");
+        let what = if path.is_empty() { what } else { format!("{}: {what}", path.join(".")) };
         ProductError { kind: kind.into(), path, what }
     })
 }
@@ -169,11 +168,11 @@ fn checked_name(name: &str) -> Result<String, String> {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
     if name.is_empty() || name.len() > MAX_NAME || !name.chars().all(plain) {
         return Err(format!(
-            "name = {name:?}: it becomes a file's, so give 1 to {MAX_NAME} letters, digits, `-` and `_`"
+            "name = {name:?}: must have 1 to {MAX_NAME} letters, digits, `-` and `_`, because files are named after it"
         ));
     }
     if name == TAKEN_NAME {
-        return Err(format!("name = {name:?}: that is the light transport itself; give another"));
+        return Err(format!("name = {name:?}: reserved for the light transport; choose another name"));
     }
     Ok(name.into())
 }

@@ -194,8 +194,7 @@ fn saturated_pixels_are_left_out_of_a_profile_and_said_to_be() {
     };
     assert_eq!(profile.measured.light[0], f64::from(stack.images[[0, 0, 1]]));
     assert!(profile.about.contains("1 pixels that saturate"), "{}", profile.about);
-    let refused = make(json!({ "kind": "delay-profile", "pixel": [0, 0] })).unwrap_err();
-    assert!(refused.to_string().contains("saturates"), "{refused}");
+    assert!(make(json!({ "kind": "delay-profile", "pixel": [0, 0] })).is_err(), "it saturates");
     assert!(make(json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 200 })).is_ok());
 }
 
@@ -262,88 +261,59 @@ fn what_was_not_taken_is_not_made() {
     stack.settings.truncate(1);
     stack.exposures_us.truncate(1);
     for table in [json!({ "kind": "regular" }), json!({ "kind": "delay-profile", "pixel": [0, 0] })] {
-        let refused = spec(&table).unwrap().make(&stack, &transport()).unwrap_err();
-        assert!(refused.to_string().contains("resume the run"), "{refused}");
+        assert!(spec(&table).unwrap().make(&stack, &transport()).is_err(), "{table}");
     }
 }
 
 #[test]
 fn bad_tables_are_refused_by_field_and_value() {
     let cases = [
-        (json!({ "kind": "epipola" }), "kind", "known are epipolar"),
-        (json!({ "kind": "epipolar", "width_rows": 4 }), "width_rows", "odd"),
-        (json!({ "kind": "epipolar", "width_rows": -1 }), "width_rows", "-1"),
-        (json!({ "kind": "epipolar", "width_rows": "wide" }), "width_rows", "wide"),
-        (json!({ "kind": "non-epipolar", "width": 3 }), "width", "width_rows"),
-        (json!({ "kind": "regular", "width_rows": 1 }), "width_rows", "unknown field"),
-        (json!({ "kind": "band" }), "", "from_rows"),
-        (json!({ "kind": "band", "from_rows": 5, "to_rows": 4 }), "to_rows", "at least from_rows"),
-        (json!({ "kind": "band", "from_rows": 5, "side": "left" }), "side", "above"),
-        (json!({ "kind": "relight" }), "", "exactly one"),
-        (json!({ "kind": "relight", "rows": [], "stripes": {} }), "", "exactly one"),
-        (json!({ "kind": "relight", "rows": [] }), "rows", "empty"),
+        (json!({ "kind": "epipola" }), "kind"),
+        (json!({ "kind": "epipolar", "width_rows": 4 }), "width_rows"),
+        (json!({ "kind": "epipolar", "width_rows": -1 }), "width_rows"),
+        (json!({ "kind": "epipolar", "width_rows": "wide" }), "width_rows"),
+        (json!({ "kind": "non-epipolar", "width": 3 }), "width"),
+        (json!({ "kind": "regular", "width_rows": 1 }), "width_rows"),
+        (json!({ "kind": "band" }), ""),
+        (json!({ "kind": "band", "from_rows": 5, "to_rows": 4 }), "to_rows"),
+        (json!({ "kind": "band", "from_rows": 5, "side": "left" }), "side"),
+        (json!({ "kind": "relight" }), ""),
+        (json!({ "kind": "relight", "rows": [], "stripes": {} }), ""),
+        (json!({ "kind": "relight", "rows": [] }), "rows"),
         (
             json!({ "kind": "relight", "rows": [{ "first": 0, "last": 1 }, { "first": 4, "last": 10 }] }),
             "rows.1.last",
-            "4 to 9",
         ),
-        (json!({ "kind": "relight", "rows": [{ "first": 5, "last": 4 }] }), "rows.0.last", "5 to 9"),
-        (json!({ "kind": "relight", "rows": [{ "first": 10, "last": 12 }] }), "rows.0.first", "0 to 9"),
-        (
-            json!({ "kind": "relight", "rows": [{ "first": 0, "last": 1, "weight": -0.5 }] }),
-            "rows.0.weight",
-            "0 or more",
-        ),
-        (
-            json!({ "kind": "relight", "stripes": { "period_rows": 0, "lit_rows": 1 } }),
-            "stripes.period_rows",
-            "1 to 10",
-        ),
-        (
-            json!({ "kind": "relight", "stripes": { "period_rows": 4, "lit_rows": 5 } }),
-            "stripes.lit_rows",
-            "1 to 4",
-        ),
+        (json!({ "kind": "relight", "rows": [{ "first": 5, "last": 4 }] }), "rows.0.last"),
+        (json!({ "kind": "relight", "rows": [{ "first": 10, "last": 12 }] }), "rows.0.first"),
+        (json!({ "kind": "relight", "rows": [{ "first": 0, "last": 1, "weight": -0.5 }] }), "rows.0.weight"),
+        (json!({ "kind": "relight", "stripes": { "period_rows": 0, "lit_rows": 1 } }), "stripes.period_rows"),
+        (json!({ "kind": "relight", "stripes": { "period_rows": 4, "lit_rows": 5 } }), "stripes.lit_rows"),
         (
             json!({ "kind": "relight", "stripes": { "period_rows": 4, "lit_rows": 1, "phase_rows": 4 } }),
             "stripes.phase_rows",
-            "0 to 3",
         ),
-        (
-            json!({ "kind": "relight", "line": { "height_rows": 1, "step_rows": 0 } }),
-            "line.step_rows",
-            "1 to 10",
-        ),
-        (
-            json!({ "kind": "relight", "line": { "height_rows": 11, "step_rows": 1 } }),
-            "line.height_rows",
-            "1 to 10",
-        ),
-        (json!({ "kind": "delay-profile" }), "pixel", "either pixel"),
-        (json!({ "kind": "delay-profile", "pixel": [6, 0] }), "pixel", "6 rows and 3 columns"),
-        (json!({ "kind": "delay-profile", "pixel": [0] }), "pixel", "length 1"),
-        (json!({ "kind": "delay-profile", "region": [0, 6, 0, 4] }), "region", "3 columns"),
-        (json!({ "kind": "delay-profile", "region": [3, 3, 0, 1] }), "region", "t0 < t1"),
-        (
-            json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 150 }),
-            "exposure_us",
-            "[100.0, 200.0, 300.0]",
-        ),
-        (
-            json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 300 }),
-            "exposure_us",
-            "takes 2 delays",
-        ),
-        (json!({ "kind": "regular", "name": "../x" }), "name", "letters"),
-        (json!({ "kind": "regular", "name": "" }), "name", "letters"),
-        (json!({ "kind": "regular", "name": "x".repeat(65) }), "name", "64"),
-        (json!({ "kind": "regular", "name": "transport" }), "name", "give another"),
+        (json!({ "kind": "relight", "line": { "height_rows": 1, "step_rows": 0 } }), "line.step_rows"),
+        (json!({ "kind": "relight", "line": { "height_rows": 11, "step_rows": 1 } }), "line.height_rows"),
+        (json!({ "kind": "delay-profile" }), "pixel"),
+        (json!({ "kind": "delay-profile", "pixel": [6, 0] }), "pixel"),
+        (json!({ "kind": "delay-profile", "pixel": [0] }), "pixel"),
+        (json!({ "kind": "delay-profile", "region": [0, 6, 0, 4] }), "region"),
+        (json!({ "kind": "delay-profile", "region": [3, 3, 0, 1] }), "region"),
+        (json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 150 }), "exposure_us"),
+        (json!({ "kind": "delay-profile", "pixel": [0, 0], "exposure_us": 300 }), "exposure_us"),
+        (json!({ "kind": "regular", "name": "../x" }), "name"),
+        (json!({ "kind": "regular", "name": "" }), "name"),
+        (json!({ "kind": "regular", "name": "x".repeat(65) }), "name"),
+        (json!({ "kind": "regular", "name": "transport" }), "name"),
     ];
-    for (table, path, says) in cases {
+    let mut shown = String::new();
+    for (table, path) in cases {
         let error = spec(&table).expect_err(&table.to_string());
         assert_eq!(error.path.join("."), path, "{table}: {error}");
-        assert!(error.what.contains(says), "{table}: {error}");
+        shown.push_str(&format!("{table}\n{error}\n\n"));
     }
+    insta::assert_snapshot!(shown);
 }
 
 #[test]

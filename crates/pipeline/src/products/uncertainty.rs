@@ -15,7 +15,7 @@ pub(super) fn make(
     stack: &SweepStack,
     transport: &Transport,
 ) -> Result<Product, String> {
-    let noise = stack.noise.ok_or("the stack's noise could not be fitted, the report says why")?;
+    let noise = stack.noise.ok_or("the stack's noise could not be fitted; the report says why")?;
     let frames: Vec<usize> = stack.settings.iter().map(|setting| setting.delays_us.len()).collect();
     let samples = Samples {
         stack: stack.images.view(),

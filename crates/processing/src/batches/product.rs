@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use ndarray::{Array3, Array4, ArrayView3, Axis};
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{BatchesPlan, ConfigError, Plan, ProductTable};
+use raysweep_core::decoding_message;
 use raysweep_session::pattern;
 use raysweep_transport::dots::Batch;
 use raysweep_transport::dots::product::{
@@ -134,7 +135,7 @@ pub(super) struct Scene<'a> {
 }
 
 const NO_PLANE: &str =
-    "it needs a calibration plane: add [[batches.calibration]], and see that its batches are stored";
+    "it needs a calibration plane: add [[batches.calibration]], and check that its batches are stored";
 
 impl DotSpec {
     /// The products that the plan names; by default, those that its calibration allows.
@@ -187,7 +188,8 @@ impl DotSpec {
     fn new(table: &ProductTable) -> Result<Self, String> {
         let ProductTable { kind: kind_name, name, options } = table;
         fn read<T: for<'a> Deserialize<'a>>(kind: &str, options: Value) -> Result<T, String> {
-            serde_json::from_value(options).map_err(|error| format!("product {kind}: {error}"))
+            let plain = |error: serde_json::Error| decoding_message(&error.to_string(), "table");
+            serde_json::from_value(options).map_err(|error| format!("product {kind}: {}", plain(error)))
         }
         let options = Value::Object(options.clone());
         let (kind, default_name) = match kind_name.as_str() {
@@ -203,7 +205,7 @@ impl DotSpec {
                 for (key, value) in lengths {
                     if !(0.0..=1024.0).contains(&value) {
                         return Err(format!(
-                            "product {kind_name}: {key} = {value}: 0 to 1024 pixels are allowed"
+                            "product {kind_name}: {key} = {value}: must be from 0 to 1024 pixels"
                         ));
                     }
                 }
@@ -212,17 +214,18 @@ impl DotSpec {
             }
             "dual" => {
                 let size: DualSize = read(kind_name, options)?;
-                if size.size_px.is_some_and(|size| size.iter().any(|side| !(1..=8192).contains(side))) {
+                if let Some(sides) =
+                    size.size_px.filter(|sides| sides.iter().any(|side| !(1..=8192).contains(side)))
+                {
                     return Err(format!(
-                        "product {kind_name}: size_px = {:?}: 1 to 8192 pixels a side are allowed",
-                        size.size_px
+                        "product {kind_name}: size_px = {sides:?}: each side must be from 1 to 8192 pixels"
                     ));
                 }
                 (Kind::Dual(size), "dual")
             }
             _ => {
                 return Err(format!(
-                    "product kind = {kind_name:?}: of batches there are floodlit, relight, direct-global and dual"
+                    "product kind = {kind_name:?}: must be floodlit, relight, direct-global or dual for batches"
                 ));
             }
         };
@@ -230,7 +233,7 @@ impl DotSpec {
         let is_plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
         if name.is_empty() || !name.chars().all(is_plain) {
             return Err(format!(
-                "product {kind_name}: name = {name:?}: letters, digits, `-` and `_` are allowed"
+                "product {kind_name}: name = {name:?}: must have only letters, digits, `-` and `_`"
             ));
         }
         Ok(Self { name, kind })
@@ -312,7 +315,7 @@ impl DotSpec {
                         let measured_px = || {
                             let radius_px = calibration
                                 .radius_px
-                                .ok_or("no dot of the plane is one piece: give distance_px")?;
+                                .ok_or("no dot on the plane is in one piece, so the radius of a dot is unknown: give distance_px")?;
                             Ok::<_, String>(radius_px * REFERENCE_WIDTH_PX / batch.shape().width() as f64)
                         };
                         let distance_px = distance_px.map_or_else(measured_px, Ok)?;
@@ -396,19 +399,22 @@ mod tests {
         let two = "[[product]]\nkind = \"direct-global\"\nmethod = \"epipolar\"\nsigma_px = 0\n[[product]]\nkind = \"relight\"\npattern = \"checks\"";
         assert_eq!(names(specs(two).unwrap()), ["epipolar", "relit"]);
         let cases = [
-            ("kind = \"band\"", "floodlit, relight, direct-global and dual"),
-            ("kind = \"dual\"\nsize_px = [0, 4]", "1 to 8192"),
-            ("kind = \"direct-global\"\nmethod = \"guess\"", "unknown variant"),
-            ("kind = \"direct-global\"\ndistance_px = -1", "0 to 1024"),
-            ("kind = \"floodlit\"\nname = \"a/b\"", "letters"),
-            ("kind = \"floodlit\"\npixels = 3", "unknown field"),
-            ("kind = \"dual\"\n[[product]]\nkind = \"dual\"", "overwrite"),
+            ("kind = \"band\"", "product.0.kind"),
+            ("kind = \"dual\"\nsize_px = [0, 4]", "product.0.kind"),
+            ("kind = \"direct-global\"\nmethod = \"guess\"", "product.0.kind"),
+            ("kind = \"direct-global\"\ndistance_px = -1", "product.0.kind"),
+            ("kind = \"floodlit\"\nname = \"a/b\"", "product.0.kind"),
+            ("kind = \"floodlit\"\npixels = 3", "product.0.kind"),
+            ("kind = \"dual\"\n[[product]]\nkind = \"dual\"", "product.1.name"),
         ];
-        for (product, expected) in cases {
+        let mut shown = String::new();
+        for (product, field) in cases {
             let error = specs(&format!("[[product]]\n{product}")).unwrap_err();
-            assert!(error.to_string().contains(expected), "{product:?}: {error}");
+            assert_eq!(error.first().field.as_deref(), Some(field), "{product:?}: {error}");
             assert!(error.first().span.is_some(), "{product:?} has no place");
+            shown.push_str(&format!("{product}\n{error}\n\n"));
         }
+        insta::assert_snapshot!(shown);
         assert_eq!(DotSpec::of_argument("kind = \"dual\", name = \"d\"").unwrap()[0].name, "d");
     }
 }

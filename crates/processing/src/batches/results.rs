@@ -170,7 +170,7 @@ struct Encoder {
 
 impl Encoder {
     fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) {
-        const MISSING: &str = "ffmpeg is not installed: there are no video files, the PNG sequences are complete; install it and run `raysweep process`";
+        const MISSING: &str = "ffmpeg is not installed, so there are only PNG sequences and no video files: install it and run `raysweep process`";
         let target = products.join(format!("{name}.mp4"));
         let ended = Command::new("ffmpeg")
             .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
@@ -184,14 +184,14 @@ impl Encoder {
             Ok(output) if output.status.success() => {}
             Ok(output) => {
                 let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-                self.problems.push(format!("ffmpeg made no {name}.mp4: {said}"));
+                self.problems.push(format!("ffmpeg could not make {name}.mp4: {said}"));
             }
             Err(error) if error.kind() == ErrorKind::NotFound => {
                 if !self.problems.iter().any(|problem| problem == MISSING) {
                     self.problems.push(MISSING.into());
                 }
             }
-            Err(error) => self.problems.push(format!("ffmpeg made no {name}.mp4: {error}")),
+            Err(error) => self.problems.push(format!("ffmpeg could not make {name}.mp4: {error}")),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use raysweep_config::{BatchesPlan, ConfigError, DotRigFile, Places, Plan, StageTable};
-use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter};
+use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter, decoding_message};
 use raysweep_pipeline::dots::{ColumnStage, DotScan, column_stage};
 use raysweep_session::stack::Contents;
 use raysweep_transport::dots::{Correction, FrameShape, Region, Sampling};
@@ -187,26 +187,27 @@ fn stages(plan: &Plan, batches: &BatchesPlan) -> Result<(CorrectOptions, StageTa
         let refused = |message: String| plan.places.error(&["stage", &index.to_string(), "name"], message);
         if stage.name == "correct" {
             correct = serde_json::from_value(Value::Object(stage.options.clone()))
-                .map_err(|error| refused(format!("stage correct: {error}")))?;
+                .map_err(|error| decoding_message(&error.to_string(), "table"))
+                .map_err(|what| refused(format!("stage correct: {what}")))?;
             let CorrectOptions { hot_sigmas, background_batches, .. } = correct;
             if !(hot_sigmas > 0.0 && hot_sigmas.is_finite()) {
                 return Err(refused(format!(
-                    "stage correct: hot_sigmas = {hot_sigmas}: give more than 0, as 8"
+                    "stage correct: hot_sigmas = {hot_sigmas}: must be more than 0; 8 is usual"
                 )));
             }
             if background_batches == 0 {
                 return Err(refused(
-                    "stage correct: background_batches = 0: give at least 1; 64 is usual".into(),
+                    "stage correct: background_batches = 0: must be at least 1; 64 is usual".into(),
                 ));
             }
             if correct.flat_field.is_some() && batches.flat_frames > 0 {
                 return Err(refused(
-                    "stage correct: flat_field beside batches.flat_frames: take a flat field, or use an earlier session's".into(),
+                    "stage correct: flat_field and batches.flat_frames exclude each other: use an earlier session's flat field, or acquire one".into(),
                 ));
             }
         } else if denoise.replace(stage.clone()).is_some() {
             return Err(refused(format!(
-                "{} is a second stage that makes columns of frames: keep one",
+                "{} is the second stage that turns frames into columns: keep one",
                 stage.name
             )));
         }

@@ -29,7 +29,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     stored.check_contents(task.contents())?;
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {
-        let message = "a film has no products to ask for: leave --product out";
+        let message = "a film has no products: leave --product out";
         return Err(ProcessError::Product(message.into()));
     }
     let problems = make_transports(session, &task, state, &stages)?;
@@ -64,7 +64,10 @@ fn make_transports(
         let frames = match film.read(entry.cycle) {
             Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,
             Ok(_) => {
-                problems.push(format!("cycle {} is damaged: its checksum is not the ledger's", entry.cycle));
+                problems.push(format!(
+                    "cycle {} is damaged: its checksum differs from the ledger's",
+                    entry.cycle
+                ));
                 continue;
             }
             Err(error) => {

@@ -54,7 +54,7 @@ impl Processing {
                 read => {
                     let why = read
                         .err()
-                        .map_or("its checksum is not the ledger's".into(), |error| error.to_string());
+                        .map_or("its checksum differs from the ledger's".into(), |error| error.to_string());
                     self.problems.push(format!(
                         "{} {index} is damaged ({why}): `raysweep resume` acquires it again",
                         array.as_str()

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ndarray::Array2;
 use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
-use raysweep_core::SettingsId;
+use raysweep_core::{SettingsId, decoding_message};
 use raysweep_pipeline::{
     DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, Role, Scan, Schedule, Spot, Stages, SweepGeometry,
     Unit,
@@ -83,8 +83,10 @@ impl PlaneTask {
     /// When the plan has options that `demux` does not know.
     pub fn demux_options(&self) -> Result<DemuxOptions, ConfigError> {
         let Some(stage) = self.demux_table() else { return Ok(DemuxOptions::default()) };
-        serde_json::from_value(Value::Object(stage.options.clone()))
-            .map_err(|error| self.refuse(&["stage"], format!("stage demux: {error}")))
+        serde_json::from_value(Value::Object(stage.options.clone())).map_err(|error| {
+            let what = decoding_message(&error.to_string(), "table");
+            self.refuse(&["stage"], format!("stage demux: {what}"))
+        })
     }
 
     /// The stages that the plan names, and what demultiplexes their images.
@@ -104,7 +106,7 @@ impl PlaneTask {
                         .map_err(|error| refuse(error.to_string()))?;
                     if demux.replace(fold).is_some() {
                         return Err(refuse(format!(
-                            "{DEMUX} stands twice: its products would overwrite each other; keep one"
+                            "{DEMUX} is named twice, and its products would overwrite each other: keep one"
                         )));
                     }
                 }

@@ -20,7 +20,7 @@ const LEAST_SHOWN: f64 = 0.9;
 pub enum ResponseError {
     /// Too few frames show the dot.
     #[error(
-        "axis {axis}: {shown} of the {frames} frames of its chirp show the dot, {needed} are needed; {lost} never came. See that the plane is before the camera, the light on, response.exposure_us long enough, response.region where the dot is, and that the camera keeps up"
+        "axis {axis}: the dot is visible in {shown} of the {frames} frames of its chirp, but {needed} are needed; {lost} frames were lost. Check that the plane is in front of the camera, the light is on, response.exposure_us is long enough, response.region contains the dot, and the camera keeps up"
     )]
     Unseen {
         /// Name of the axis.
@@ -35,7 +35,7 @@ pub enum ResponseError {
         lost: usize,
     },
     /// The dot's movement shows no resonance.
-    #[error("axis {axis}, under whose chirp the dot moved by {rms_px:.3} px (rms): {source}")]
+    #[error("axis {axis} (its chirp moved the dot by {rms_px:.3} px rms): {source}")]
     Refused {
         /// Name of the axis.
         axis: &'static str,
@@ -128,7 +128,7 @@ impl FoundAxis {
         let is_narrowed = self.measured.first().is_some_and(|lowest| low_hz > lowest.hz);
         is_narrowed.then(|| {
             format!(
-                "axis {name}: only from {low_hz:.0} to {high_hz:.0} Hz does a resonance explain the movement; a low-pass, such as the controller's, bends it elsewhere. Paths that are distorted beforehand make good for the resonance alone: set the controller's bandwidth beyond it"
+                "axis {name}: a resonance explains the movement only from {low_hz:.0} to {high_hz:.0} Hz; elsewhere a low-pass, such as the controller's, changes it. Predistorted paths compensate for the resonance only: set the controller's bandwidth above it"
             )
         })
     }

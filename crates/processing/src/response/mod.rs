@@ -90,14 +90,14 @@ pub fn process(
 ) -> std::result::Result<Processed, ProcessError> {
     let Stored { session, state, plan, .. } = stored;
     if !asked.products.is_empty() {
-        let message = "a session of kind \"response\" has no products to ask for: leave --product out";
+        let message = "a session of kind \"response\" has no products: leave --product out";
         return Err(ProcessError::Product(message.into()));
     }
     let rig = stored.dot_rig()?;
     let (shape, axes) = (state.session.shape, state.stored_points());
     if axes < shape.points() {
         let message = format!(
-            "{} has the records of {axes} of {} axes: its run was ended early, and an axis alone makes no response; run the plan again",
+            "{} has the records of only {axes} of {} axes, because its run ended early: run the plan again",
             session.dir().display(),
             shape.points()
         );

@@ -63,7 +63,7 @@ impl SweepTask {
     fn products(&self) -> Result<Vec<ProductSpec>, ConfigError> {
         let Some(tables) = &self.products else { return Ok(ProductSpec::defaults()) };
         if !tables.is_empty() && self.task.demux_table().is_none() {
-            let what = "products are made of the light transport: add a [[stage]] with name = \"demux\"";
+            let what = "products need the light transport: add a [[stage]] with name = \"demux\"";
             return Err(self.task.refuse(&["product"], what));
         }
         let mut specs = Vec::new();

@@ -148,7 +148,6 @@ fn a_corrupt_line_in_the_middle_is_named() {
     fs::write(&path, text.replacen("\"index\":1", "\"index\":x", 1)).unwrap();
     for error in [read(&path).unwrap_err(), Ledger::open(&path).unwrap_err()] {
         assert!(matches!(error, Error::Ledger { line: 3, .. }), "{error}");
-        assert!(error.to_string().contains("ledger.jsonl line 3"), "{error}");
     }
 }
 

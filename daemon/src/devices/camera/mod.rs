@@ -413,7 +413,7 @@ impl Watchdog {
             "camera",
             DeviceErrorKind::Timeout,
             format!(
-                "no frame for {:.1} s: is VSYNC on its trigger input, and is the trigger mode on?",
+                "no frame for {:.1} s: check that VSYNC reaches its trigger input and that its trigger mode is on",
                 self.waited.as_secs_f64()
             ),
         ))

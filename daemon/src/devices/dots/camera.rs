@@ -99,7 +99,7 @@ impl Source<'_> {
                     return Ok(lost);
                 }
                 if waiting_since.get_or_insert_with(Instant::now).elapsed() > PATIENCE {
-                    let what = "no frame came for 5 s while the mirror plays its path: is the camera triggered by the mirror's sample clock?";
+                    let what = "no frame for 5 s while the mirror plays its path: check that the mirror's sample clock triggers the camera";
                     return Err(DeviceError::new("camera", DeviceErrorKind::Timeout, what));
                 }
                 continue;

@@ -64,7 +64,7 @@ fn of_cycles(film: &FilmTask, camera: &CameraCapabilities, reach_rows: u64) -> F
     let reason = match (missed, camera.readout) {
         (0, _) => "the camera answers every trigger".to_owned(),
         (1, Readout::Overlapped) => format!(
-            "its readout of {readout_us:.0} us leaves one trigger a cycle unanswered, where the delay falls back: take smaller gaps between the delays, or fewer camera rows"
+            "because of its readout of {readout_us:.0} us, the camera misses one trigger per cycle, where the delay jumps back: take smaller gaps between the delays, or fewer camera rows"
         ),
         _ => format!(
             "trigger delay, exposure and a readout of {readout_us:.0} us together are longer than a VSYNC period, which leaves {missed} triggers a cycle unanswered: fewer camera rows or a camera that overlaps readout and exposure would be faster"

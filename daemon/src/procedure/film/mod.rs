@@ -44,7 +44,7 @@ struct FilmRun {
 /// For a plan that cannot be run on this rig.
 pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Result<Foreseen, ConfigError> {
     if plan.products.is_some() {
-        let message = "kind = \"film\" has no [[product]]: each cycle has its transport; leave it out";
+        let message = "kind = \"film\" takes no [[product]], because its result is a transport for each cycle: leave it out";
         return Err(plan.places.error(&["product"], message));
     }
     let first_row = rig.first_row(lab.camera);

@@ -17,12 +17,12 @@ use crate::plane::foresight::periods;
 pub enum NoAdvice {
     /// Nothing is left to demultiplex.
     #[error(
-        "no error can be foreseen: every point of the sweep saturates a white pixel, or begins or ends while a flying spot draws the direct row; lower camera.white_dn (gain, aperture) or move the delays by a row"
+        "the errors cannot be predicted: every point of the sweep saturates a white pixel, or begins or ends while a flying spot draws the direct row; lower camera.white_dn (gain, aperture) or move the delays by a row"
     )]
     NothingUsable,
     /// The prediction would take too long.
     #[error(
-        "no error is foreseen and no other sweep looked for: {points} points over {rows} relative rows would take too long"
+        "the errors are not predicted, and no better sweep is sought: {points} points over {rows} relative rows would take too long"
     )]
     TooLarge {
         /// Points of the sweep.
@@ -31,7 +31,7 @@ pub enum NoAdvice {
         rows: usize,
     },
     /// The plan gives no model.
-    #[error("no error can be foreseen: {0}")]
+    #[error("the errors cannot be predicted: {0}")]
     NoModel(String),
 }
 
@@ -316,7 +316,7 @@ mod tests {
 
         let none = plan.replace("-500, ", "").replace("0, 300, 500", "300");
         let error = advised(&flying, &none, &camera()).unwrap_err();
-        assert!(error.to_string().contains("flying spot"), "{error}");
+        assert!(matches!(error, NoAdvice::NothingUsable), "{error}");
     }
 
     #[test]
@@ -345,7 +345,7 @@ mod tests {
         let rig = rig(4000.0);
         let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = [0]\n";
         let error = advise(&task(&rig, plan), &rig, &camera()).unwrap_err();
-        assert!(error.to_string().contains("saturates a white pixel"), "{error}");
+        assert!(matches!(error, NoAdvice::NothingUsable), "{error}");
     }
 
     #[test]
@@ -389,7 +389,7 @@ mod tests {
     fn a_sweep_that_takes_too_long_to_foresee_is_not_foreseen() {
         let plan = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -8000, stop = 8000, count = 1000 }\n";
         let error = advised(RIG, plan, &camera()).unwrap_err();
-        assert!(error.to_string().contains("5000 points"), "{error}");
+        assert!(matches!(error, NoAdvice::TooLarge { points: 5000, .. }), "{error}");
     }
 
     #[test]

@@ -35,7 +35,7 @@ pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Resu
     let slow = model.periods.iter().filter(|&&periods| periods > 1).count();
     if slow > 0 {
         warnings.push(format!(
-            "{slow} of {} points take more than one VSYNC period a frame, because trigger delay, exposure and readout together are longer: a faster or overlapped readout would save time",
+            "{slow} of {} points take more than one VSYNC period per frame, because trigger delay, exposure and readout together are longer: a faster or overlapped readout would save time",
             model.periods.len()
         ));
     }

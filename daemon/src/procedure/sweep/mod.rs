@@ -68,7 +68,7 @@ pub fn foresee(
         name: plan.name.clone(),
         shape,
         first_row,
-        instead: "even some camera rows at a time; make shorter sequences",
+        instead: "solving in strips of camera rows does not suffice, so make shorter sequences",
         procedure: Box::new(SweepRun {
             rig: rig.clone(),
             camera: lab.camera.clone(),

@@ -117,7 +117,7 @@ impl Device {
             .ok_or_else(|| no_camera(format!("{named} is no device that libaravis can open")))?;
         if device.downcast_ref::<GvDevice>().is_some_and(|device| !device.is_controller()) {
             let what = format!(
-                "{named} is controlled by another program: raysweepd holds it while a run is under way; a program that was killed frees it within 3 s"
+                "{named} is controlled by another program: raysweepd holds it while a run is in progress; a program that was killed frees it within 3 s"
             );
             return Err(DeviceError::new("camera", DeviceErrorKind::Busy, what));
         }

@@ -40,7 +40,7 @@ enum UsbError {
     #[error("the analyser did not come back within {RENUMERATION:?} with its firmware: plug it in again")]
     NotBack,
     #[error(
-        "the analyser's firmware is {major}.{minor}: {MAJOR}.x is spoken; unplug it, so that it takes another"
+        "unsupported firmware version {major}.{minor} of the analyser (this driver needs {MAJOR}.x): unplug it, so that it loads another"
     )]
     Version { major: u8, minor: u8 },
     #[error(

@@ -52,7 +52,9 @@ fn bytes_ns(link: TriggerBoxLink, bytes: usize) -> i64 {
 enum TriggerBoxError {
     #[error("vsync.period_us = {0}: a triggerbox makes 2000 to 262144; choose another period or driver")]
     Period(f64),
-    #[error("{port}: firmware {found} is spoken to as if it were {VERSION}: flash firmware {VERSION}")]
+    #[error(
+        "{port}: unsupported firmware version {found} (this driver was tested with {VERSION}): flash firmware {VERSION}"
+    )]
     Firmware { port: String, found: u8 },
     #[error("{port}: no answer within {HELLO_PATIENCE:?} ({garbage} bytes of garbage): is it a triggerbox?")]
     NoHello { port: String, garbage: u64 },
