@@ -101,46 +101,17 @@ impl Uncertainty<'_> {
         let Self { timing, settings, prior, .. } = *self;
         let objectives = Objectives { timing, settings, prior, reach: &reach, spot: None };
         let work = |problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
-            self.judge_tile(samples, bands, transport.u_min, problem, tile, rows)
+            let gains = problem.gains(bands, transport.u_min, tile, rows)?;
+            for (gains, &(at, column)) in gains.axis_chunks_iter(Axis(0), bands.len()).zip(&tile.pixels) {
+                let Data { t, sd, .. } = &mut rows[at].data;
+                let pixel = Pixel::new(self, samples, &problem.settings, *t, column);
+                let variances = gains.rows().into_iter().map(|gains| pixel.variance_of(gains));
+                sd.column_mut(column).iter_mut().zip(variances).for_each(|(sd, v)| *sd = v.sqrt() as f32);
+            }
+            Ok(())
         };
         objectives.for_each_tile(&mut judged, &|| true, &work)?;
         Ok(sd)
-    }
-
-    fn judge_tile(
-        &self,
-        samples: &Samples,
-        bands: &[Vec<RangeInclusive<i32>>],
-        u_min: i32,
-        problem: &Problem,
-        tile: &Tile,
-        rows: &mut [Row<Data>],
-    ) -> Result<(), PlaneError> {
-        let sums = problem.sums(bands);
-        let places: Vec<(usize, usize)> = problem.places(u_min).collect();
-        let shape = (tile.pixels.len() * bands.len(), problem.model.slots.len());
-        let mut linear = Array2::zeros(shape);
-        let mut free = Array2::from_elem(shape, true);
-        let of_pixels = linear.axis_chunks_iter_mut(Axis(0), bands.len());
-        let of_pixels = of_pixels.zip(free.axis_chunks_iter_mut(Axis(0), bands.len()));
-        for ((mut linear, mut free), &(at, column)) in of_pixels.zip(&tile.pixels) {
-            linear.assign(&sums);
-            let lit = problem.lit(&places, rows[at].data.profiles.column(column));
-            free.rows_mut().into_iter().for_each(|mut free| free.assign(&lit));
-        }
-        let solutions = minimise_free(SimdLevel::best(), &problem.quadratic, linear, free.view());
-        if solutions.iter().any(|entry| !entry.is_finite()) {
-            return Err(PlaneError::NotConvex);
-        }
-        // The derivative of each band of each pixel with respect to each sample.
-        let gains = solutions.dot(&problem.weights.t());
-        for (gains, &(at, column)) in gains.axis_chunks_iter(Axis(0), bands.len()).zip(&tile.pixels) {
-            let Data { t, sd, .. } = &mut rows[at].data;
-            let pixel = Pixel::new(self, samples, &problem.settings, *t, column);
-            let variances = gains.rows().into_iter().map(|gains| pixel.variance_of(gains));
-            sd.column_mut(column).iter_mut().zip(variances).for_each(|(sd, v)| *sd = v.sqrt() as f32);
-        }
-        Ok(())
     }
 
     fn check(&self, first_row: usize, transport: &Transport, samples: &Samples) -> Result<(), PlaneError> {
@@ -176,6 +147,33 @@ struct Data<'a> {
 }
 
 impl Problem<'_> {
+    /// The derivative of each band of each pixel of a tile with respect to each sample, `[pixels * bands, settings]`.
+    fn gains(
+        &self,
+        bands: &[Vec<RangeInclusive<i32>>],
+        u_min: i32,
+        tile: &Tile,
+        rows: &[Row<Data>],
+    ) -> Result<Array2<f64>, PlaneError> {
+        let sums = self.sums(bands);
+        let places: Vec<(usize, usize)> = self.places(u_min).collect();
+        let shape = (tile.pixels.len() * bands.len(), self.model.slots.len());
+        let mut linear = Array2::zeros(shape);
+        let mut free = Array2::from_elem(shape, true);
+        let of_pixels = linear.axis_chunks_iter_mut(Axis(0), bands.len());
+        let of_pixels = of_pixels.zip(free.axis_chunks_iter_mut(Axis(0), bands.len()));
+        for ((mut linear, mut free), &(at, column)) in of_pixels.zip(&tile.pixels) {
+            linear.assign(&sums);
+            let lit = self.lit(&places, rows[at].data.profiles.column(column));
+            free.rows_mut().into_iter().for_each(|mut free| free.assign(&lit));
+        }
+        let solutions = minimise_free(SimdLevel::best(), &self.quadratic, linear, free.view());
+        match solutions.iter().all(|entry| entry.is_finite()) {
+            true => Ok(solutions.dot(&self.weights.t())),
+            false => Err(PlaneError::NotConvex),
+        }
+    }
+
     /// The weight of each unknown in the light of each band, `[bands, slots]`.
     fn sums(&self, bands: &[Vec<RangeInclusive<i32>>]) -> Array2<f64> {
         let slots = &self.model.slots;
