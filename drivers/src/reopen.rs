@@ -52,8 +52,7 @@ impl Reopening {
         let Some(loss) = &mut self.loss else {
             tracing::warn!(%cause, "{} lost; opening it again", self.device);
             let cause = cause.to_string();
-            self.loss =
-                Some(Loss { since_ns: now_ns, attempt_ns: now_ns, pause_ns: FIRST_PAUSE_NS, cause });
+            self.loss = Some(Loss { since_ns: now_ns, attempt_ns: now_ns, pause_ns: FIRST_PAUSE_NS, cause });
             return Ok(());
         };
         tracing::debug!(%cause, "{} still lost", self.device);
