@@ -45,6 +45,9 @@ const SILENCE_NS: i64 = 900_000_000;
 const ROUND_TRIPS: usize = 100;
 /// Maximum wait on a channel or a stream before the camera's health is checked.
 const LOOK: Duration = Duration::from_millis(50);
+/// Opening a camera that is there takes less. One that is not there may block the owner thread for longer than it may
+/// stay away.
+const OPENING_TIME: Duration = Duration::from_secs(2);
 /// A killed program keeps the camera until its heartbeat is missed, after 3 s.
 const BUSY_PATIENCE: Duration = Duration::from_secs(5);
 /// Pause between attempts to open a camera that another program holds.
@@ -82,7 +85,9 @@ enum Link {
     },
     Lost,
     /// The owner thread is opening the lost camera.
-    Opening,
+    Opening {
+        since: Instant,
+    },
 }
 
 /// The newest complete frame.
@@ -253,7 +258,7 @@ impl AravisCamera {
                     return Ok(());
                 }
                 self.order(OwnerCommand::Open)?;
-                self.link = Link::Opening;
+                self.link = Link::Opening { since: Instant::now() };
                 continue;
             }
             match self.replies.recv_timeout(left) {
@@ -263,8 +268,13 @@ impl AravisCamera {
                     self.reopening.failed(&error.source)?;
                 }
                 Ok(OwnerReply::Done(..)) => {}
-                // The library may block the owner for longer than the camera may stay away.
-                Err(RecvTimeoutError::Timeout) => return self.reopening.check(),
+                Err(RecvTimeoutError::Timeout) => {
+                    return match self.link {
+                        // It may be there after a pause of the run in which nobody asked for frames.
+                        Link::Opening { since } if since.elapsed() < OPENING_TIME => Ok(()),
+                        _ => self.reopening.check(),
+                    };
+                }
                 Err(RecvTimeoutError::Disconnected) => return Err(thread_ended()),
             }
         }
@@ -396,7 +406,7 @@ impl Camera for AravisCamera {
 
     fn state(&self) -> DeviceState {
         match (&self.link, self.armed_ns) {
-            (Link::Lost | Link::Opening, _) => DeviceState::Lost,
+            (Link::Lost | Link::Opening { .. }, _) => DeviceState::Lost,
             (Link::Up { .. }, Some(_)) => DeviceState::Streaming,
             (Link::Up { .. }, None) => DeviceState::Ready,
         }
