@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceError, DeviceErrorKind};
 use raysweep_drivers::vsync::fx2lafw::scan::Scanner;
-use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig, Link};
+use raysweep_drivers::vsync::fx2lafw::{AnalyserLink, Fx2Lafw, Fx2LafwConfig};
 use raysweep_sim::usb::Signal;
 
 const RATE_HZ: u32 = 24_000_000;
@@ -25,7 +25,7 @@ struct Recorded<'a> {
     arrived_ns: i64,
 }
 
-impl Link for Recorded<'_> {
+impl AnalyserLink for Recorded<'_> {
     fn receive(&mut self, _: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError> {
         let over = || DeviceError::new("vsync", DeviceErrorKind::Disconnected, "the recording is over");
         let transfer = self.transfers.next().ok_or_else(over)?;

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Vsync};
 use raysweep_drivers::vsync::fx2lafw::scan::Scanner;
-use raysweep_drivers::vsync::fx2lafw::{Change, Fx2Lafw, Fx2LafwConfig, Link, Slope};
+use raysweep_drivers::vsync::fx2lafw::{AnalyserLink, Change, Fx2Lafw, Fx2LafwConfig, Slope};
 use raysweep_sim::usb::Signal;
 
 /// Host time of the first sample.
@@ -27,7 +27,7 @@ struct Scripted {
     last: u64,
 }
 
-impl Link for Scripted {
+impl AnalyserLink for Scripted {
     fn receive(&mut self, _: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError> {
         if self.transfers == self.last {
             return Err(DeviceError::new("vsync", DeviceErrorKind::Disconnected, "the script is over"));
@@ -173,7 +173,7 @@ fn the_line_s_edges_are_the_vsync_alone() {
 /// A link that delivers given bytes.
 struct Bytes(Vec<Vec<u8>>, i64);
 
-impl Link for Bytes {
+impl AnalyserLink for Bytes {
     fn receive(&mut self, _: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError> {
         self.1 += 60_000_000;
         match self.0.pop() {

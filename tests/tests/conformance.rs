@@ -21,7 +21,7 @@ use raysweep_core::{
     Camera, CameraSettings, Clock, DeviceErrorKind, DeviceState, FramePool, Pattern, Projector, SettingsId,
     Shutter, Vsync,
 };
-use raysweep_drivers::projector::external::Request;
+use raysweep_drivers::projector::external::ShowRequest;
 use raysweep_sim::mirror::{MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults};
 use raysweep_sim::triggerbox::TriggerBoxPty;
 use raysweep_tests::rig_text;
@@ -116,7 +116,7 @@ struct Terminal {
 }
 
 /// Forwards a projector's questions to the operator until the projector is dropped.
-fn ask(questions: Receiver<Request>, terminal: &mut Terminal) {
+fn ask(questions: Receiver<ShowRequest>, terminal: &mut Terminal) {
     for question in questions {
         writeln!(terminal.say, "projector: show {:?}, then press Enter", question.wanted).unwrap();
         match terminal.hear.read_line(&mut String::new()) {

@@ -3,10 +3,9 @@
 
 use std::fmt::Write;
 
-use raysweep::Runner;
+use raysweep::{Probes, Runner};
 use raysweep::control::Control;
 use raysweep::rig::{AnyRig, RigError};
-use raysweep_pipeline::Registry;
 use raysweep_processing::{Asked, process, process_asked};
 use raysweep_proto::{ErrorCode, ResumeParams, RpcError, RunParams, describe};
 use raysweep_tests::{Bench, dots, rig_text};
@@ -134,7 +133,7 @@ fn calls_that_are_refused() {
     refusals.push(("resume with another plan", ErrorCode::NoSession, resume(&bench, ended.session.clone())));
     std::fs::write(ended.session.join("rig.toml"), "").unwrap();
     refusals.push(("resume on another rig", ErrorCode::NoSession, resume(&bench, ended.session)));
-    bench.limit_memory(1, Registry::default());
+    bench.limit_memory(1, Probes::default());
     refusals.push(("too little memory", ErrorCode::Storage, run(&bench, PLAN)));
     bench.runner.shut_down();
     refusals.push(("run while the daemon ends", ErrorCode::Busy, run(&bench, PLAN)));
@@ -186,7 +185,7 @@ fn rigs_that_cannot_be_used() {
     let open = |text: &String| {
         std::fs::write(&path, text).unwrap();
         let rig = AnyRig::load(&path)?;
-        Runner::new(rig, folder.path().join("sessions"), Registry::default()).map(drop)
+        Runner::new(rig, folder.path().join("sessions")).map(drop)
     };
     let mut shown = String::new();
     for (name, text) in [

@@ -45,7 +45,9 @@ pub(super) use with_aravis::{camera, devices};
 mod with_aravis {
     use std::fs;
 
-    use raysweep_drivers::camera::aravis::{Found, Refused, discover, load_features, save_features};
+    use raysweep_drivers::camera::aravis::{
+        FoundCamera, RefusedLine, discover, load_features, save_features,
+    };
     use serde_json::json;
 
     use super::{CameraCommand, CommandFailure, Exit, Printer};
@@ -92,13 +94,13 @@ mod with_aravis {
         }
     }
 
-    fn table(found: &[Found]) -> String {
+    fn table(found: &[FoundCamera]) -> String {
         if found.is_empty() {
             return "no camera found: check its power, and that it is on a network of this machine".into();
         }
         let heading = ["NAME", "ADDRESS", "PROTOCOL", "VENDOR", "MODEL"].map(str::to_owned);
         let rows = found.iter().map(|camera| {
-            let Found { name, vendor, model, address, protocol } = camera.clone();
+            let FoundCamera { name, vendor, model, address, protocol } = camera.clone();
             [name, address, protocol, vendor, model]
         });
         let rows: Vec<[String; 5]> = [heading].into_iter().chain(rows).collect();
@@ -111,9 +113,9 @@ mod with_aravis {
         lines.collect::<Vec<_>>().join("\n")
     }
 
-    fn loaded(camera: &str, taken: usize, refused: &[Refused]) -> String {
+    fn loaded(camera: &str, taken: usize, refused: &[RefusedLine]) -> String {
         let mut text = format!("{taken} lines taken by {camera}");
-        for Refused { line, reason } in refused {
+        for RefusedLine { line, reason } in refused {
             text += &format!("\nrefused: {line}: {reason}");
         }
         text

@@ -7,7 +7,7 @@ use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
 
 use raysweep_core::{DeviceError, DeviceErrorKind, Pattern, Subject};
-use raysweep_drivers::projector::external::{Request, Wanted};
+use raysweep_drivers::projector::external::{ShowRequest, WantedPicture};
 use raysweep_proto::Event;
 
 use crate::rig::Stand;
@@ -26,7 +26,7 @@ impl Operator {
     /// # Errors
     /// When the thread cannot be started.
     pub fn start(
-        questions: Receiver<Request>,
+        questions: Receiver<ShowRequest>,
         orders: Arc<Orders>,
         board: Arc<StatusBoard>,
     ) -> Result<Self, DeviceError> {
@@ -64,7 +64,7 @@ impl Drop for Operator {
 }
 
 /// Pauses the run until the operator continues it.
-fn ask(question: Request, orders: &Orders, board: &StatusBoard) {
+fn ask(question: ShowRequest, orders: &Orders, board: &StatusBoard) {
     let text = task(&question.wanted);
     // The run may be paused for another reason: continuing from that pause does not answer this question.
     orders.wait_while_paused();
@@ -81,7 +81,7 @@ fn ask(question: Request, orders: &Orders, board: &StatusBoard) {
 }
 
 /// Tells the operator what remains to be done after the run.
-fn tell(question: Request, board: &StatusBoard) {
+fn tell(question: ShowRequest, board: &StatusBoard) {
     let text = task(&question.wanted);
     board.publish(Event::Ask { text: format!("{text}: the run is over and does not wait for it") });
     question.refuse("the run is over and did not wait for it");
@@ -116,12 +116,12 @@ pub fn place(
     Ok(())
 }
 
-fn task(wanted: &Wanted) -> String {
+fn task(wanted: &WantedPicture) -> String {
     match wanted {
-        Wanted::Pattern(Pattern::White) => "make the projector show a white picture".into(),
-        Wanted::Pattern(Pattern::Black) => "make the projector show a black picture".into(),
-        Wanted::Pattern(pattern) => format!("make the projector show {pattern:?}"),
-        Wanted::Dark => "turn the projector's light off, or cover its lens".into(),
+        WantedPicture::Pattern(Pattern::White) => "make the projector show a white picture".into(),
+        WantedPicture::Pattern(Pattern::Black) => "make the projector show a black picture".into(),
+        WantedPicture::Pattern(pattern) => format!("make the projector show {pattern:?}"),
+        WantedPicture::Dark => "turn the projector's light off, or cover its lens".into(),
     }
 }
 

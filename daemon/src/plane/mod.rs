@@ -19,7 +19,7 @@ use raysweep_session::ledger::State;
 
 pub use self::sink::{PointSink, Verdict};
 use crate::devices::camera::{
-    Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Line, Pass, Work,
+    Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Pass, TriggerLine, Work,
 };
 use crate::devices::operator::Operator;
 use crate::devices::vsync::VsyncThread;
@@ -194,7 +194,7 @@ impl Opened {
 }
 
 /// The line that triggers the camera through a task's settings. Dark points have their own pass.
-fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> Line {
+fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> TriggerLine {
     let points = &task.schedule.points;
     let is_lit = |point: &&Point| !matches!(point.role, Role::Dark(_));
     let all_dark = !points.iter().any(|point| is_lit(&point));
@@ -203,7 +203,7 @@ fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> Line {
         .filter(|point| all_dark || is_lit(point))
         .map(|point| task.geometry.shot(point, trigger_latency_us).settings)
         .collect();
-    Line::new(task.geometry.raster.period_us, task.max_jitter_us, &settings)
+    TriggerLine::new(task.geometry.raster.period_us, task.max_jitter_us, &settings)
 }
 
 /// The points of a task that the ledger does not list as stored, with the number of their next attempt.

@@ -16,7 +16,7 @@ use raysweep_config::{AnyRigFile, ConfigError, RigFile};
 use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
-use raysweep_drivers::projector::external::{External, Request};
+use raysweep_drivers::projector::external::{External, ShowRequest};
 use raysweep_sim::PlaneRig;
 
 use self::simulated::{Simulated, simulate};
@@ -119,7 +119,7 @@ pub struct Devices {
     /// The projector.
     pub projector: Box<dyn Projector>,
     /// The projector's requests to its operator, if a person operates it.
-    pub questions: Option<Receiver<Request>>,
+    pub questions: Option<Receiver<ShowRequest>>,
     /// Places scene, board and cap in front of the camera.
     pub stand: Stand,
     /// The clock of their timestamps.

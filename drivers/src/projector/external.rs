@@ -12,7 +12,7 @@ use super::DEVICE;
 
 /// What the operator should show.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Wanted {
+pub enum WantedPicture {
     /// This pattern.
     Pattern(Pattern),
     /// No light at all.
@@ -20,13 +20,13 @@ pub enum Wanted {
 }
 
 /// A request to the operator. If dropped without an answer, it counts as refused.
-pub struct Request {
+pub struct ShowRequest {
     /// What to show.
-    pub wanted: Wanted,
+    pub wanted: WantedPicture,
     answer: SyncSender<Result<(), String>>,
 }
 
-impl Request {
+impl ShowRequest {
     /// Confirms that it is shown.
     pub fn done(self) {
         // The driver no longer listens after its timeout.
@@ -43,29 +43,29 @@ impl Request {
 #[derive(Debug, thiserror::Error)]
 enum ExternalError {
     #[error("no operator is there to show {0:?}")]
-    Nobody(Wanted),
+    Nobody(WantedPicture),
     #[error("the operator has not shown {wanted:?} within {patience:?}: ask again when somebody is there")]
-    Late { wanted: Wanted, patience: Duration },
+    Late { wanted: WantedPicture, patience: Duration },
     #[error("the operator did not show {wanted:?}: {why}")]
-    Refused { wanted: Wanted, why: String },
+    Refused { wanted: WantedPicture, why: String },
 }
 
 /// An externally operated projector.
 pub struct External {
-    requests: SyncSender<Request>,
+    requests: SyncSender<ShowRequest>,
     patience: Duration,
-    shown: Option<Wanted>,
+    shown: Option<WantedPicture>,
     clock: Clock,
 }
 
 impl External {
     /// Returns the projector and the receiver of its requests.
-    pub fn new(patience: Duration) -> (Self, Receiver<Request>) {
+    pub fn new(patience: Duration) -> (Self, Receiver<ShowRequest>) {
         let (requests, receiver) = sync_channel(1);
         (Self { requests, patience, shown: None, clock: Clock::real() }, receiver)
     }
 
-    fn ask(&mut self, wanted: Wanted) -> Result<Shown, DeviceError> {
+    fn ask(&mut self, wanted: WantedPicture) -> Result<Shown, DeviceError> {
         if self.shown.as_ref() != Some(&wanted) {
             // Until the answer arrives, anything may be shown.
             self.shown = None;
@@ -82,9 +82,9 @@ impl External {
         Ok(Shown { not_before_ns: self.clock.now_ns() })
     }
 
-    fn answer(&self, wanted: &Wanted) -> Result<(), ExternalError> {
+    fn answer(&self, wanted: &WantedPicture) -> Result<(), ExternalError> {
         let (answer, answers) = sync_channel(1);
-        let request = Request { wanted: wanted.clone(), answer };
+        let request = ShowRequest { wanted: wanted.clone(), answer };
         // A full channel holds a request that nobody has read; another request would not help.
         self.requests.try_send(request).map_err(|_error| ExternalError::Nobody(wanted.clone()))?;
         let refused = |why| ExternalError::Refused { wanted: wanted.clone(), why };
@@ -100,11 +100,11 @@ impl External {
 
 impl Projector for External {
     fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
-        self.ask(Wanted::Pattern(pattern.clone()))
+        self.ask(WantedPicture::Pattern(pattern.clone()))
     }
 
     fn blank(&mut self) -> Result<Shown, DeviceError> {
-        self.ask(Wanted::Dark)
+        self.ask(WantedPicture::Dark)
     }
 }
 
@@ -117,9 +117,9 @@ mod tests {
 
     /// Answers one request per entry of the given answers and returns the requests.
     fn operator(
-        requests: Receiver<Request>,
+        requests: Receiver<ShowRequest>,
         answers: Vec<Result<(), &'static str>>,
-    ) -> std::thread::JoinHandle<(Vec<Wanted>, Receiver<Request>)> {
+    ) -> std::thread::JoinHandle<(Vec<WantedPicture>, Receiver<ShowRequest>)> {
         std::thread::spawn(move || {
             let asked = answers.into_iter().map(|answer| {
                 let request = requests.recv().unwrap();
@@ -146,8 +146,8 @@ mod tests {
         projector.blank().unwrap();
         projector.show(&Pattern::White).unwrap();
         let (asked, requests) = operator.join().unwrap();
-        let white = Wanted::Pattern(Pattern::White);
-        assert_eq!(asked, [white.clone(), Wanted::Dark, white]);
+        let white = WantedPicture::Pattern(Pattern::White);
+        assert_eq!(asked, [white.clone(), WantedPicture::Dark, white]);
         assert!(matches!(requests.try_recv(), Err(TryRecvError::Empty)));
     }
 

@@ -8,12 +8,12 @@ use super::DEVICE;
 use crate::reopen::Reopening;
 
 /// Opens a device again.
-pub type Opener<V> = Box<dyn FnMut() -> Result<V, DeviceError> + Send>;
+pub type VsyncOpener<V> = Box<dyn FnMut() -> Result<V, DeviceError> + Send>;
 
 /// A watcher that is opened again when its device comes back. The numbering of edges continues; it skips at least one
 /// number if edges may have been lost.
 pub struct Reopened<V> {
-    open: Opener<V>,
+    open: VsyncOpener<V>,
     reopening: Reopening,
     device: Option<V>,
     /// Added to the device's own edge numbers.
@@ -23,7 +23,7 @@ pub struct Reopened<V> {
 
 impl<V: Vsync> Reopened<V> {
     /// Watches with `device`. If it is lost, `open` opens it again, for up to `patience`.
-    pub fn new(device: V, open: Opener<V>, patience: Duration) -> Self {
+    pub fn new(device: V, open: VsyncOpener<V>, patience: Duration) -> Self {
         let reopening = Reopening::new(DEVICE, patience, Clock::real());
         Self { open, reopening, device: Some(device), base: 0, last_seq: 0 }
     }

@@ -2,7 +2,7 @@
 
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
-use raysweep_drivers::mirror::playzerx::protocol::{Reply, parse_response};
+use raysweep_drivers::mirror::playzerx::protocol::{PlayzerXReply, parse_response};
 use raysweep_drivers::mirror::{MtiReply, OptotuneReply, parse_mti, parse_optotune};
 use raysweep_drivers::serial::wire::{Parsed, Receiver};
 
@@ -37,17 +37,17 @@ fn finds<R: PartialEq + std::fmt::Debug>(
 #[test]
 fn playzerx() {
     survives(parse_response, b"pl-ok\ninfo\nXYM\x00\x01", |reply| match reply {
-        Reply::Alive | Reply::Left(_) => 6,
-        Reply::Info { device, firmware, format } => device.len() + firmware.len() + format.len() + 11,
+        PlayzerXReply::Alive | PlayzerXReply::Left(_) => 6,
+        PlayzerXReply::Info { device, firmware, format } => device.len() + firmware.len() + format.len() + 11,
     });
     finds(
         parse_response,
         &[
-            (b"pl-ok\n", Reply::Alive),
-            (b"pl-\x34\x12\x00", Reply::Left(0x1234)),
+            (b"pl-ok\n", PlayzerXReply::Alive),
+            (b"pl-\x34\x12\x00", PlayzerXReply::Left(0x1234)),
             (
                 b"pl-info\nA\nB\nXYM\n",
-                Reply::Info { device: "A".into(), firmware: "B".into(), format: "XYM".into() },
+                PlayzerXReply::Info { device: "A".into(), firmware: "B".into(), format: "XYM".into() },
             ),
         ],
         b"\x00\xFFlo-k\n",

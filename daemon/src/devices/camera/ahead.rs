@@ -39,7 +39,7 @@ use raysweep_core::{
 };
 use raysweep_pipeline::{EXPOSURE_TOLERANCE_US, Job};
 
-use super::triggers::Triggers;
+use super::triggers::TriggerTimes;
 
 /// A sensor has latched its registers by this time after an exposure has begun. [A]
 const HELD_AFTER_US: f64 = 500.0;
@@ -52,7 +52,7 @@ const FRAMES_UNDER_WAY: u64 = 4;
 
 /// Trigger line and settings of a run.
 #[derive(Debug, Clone, Copy)]
-pub struct Line {
+pub struct TriggerLine {
     /// Nominal period of the triggers.
     pub period_us: f64,
     /// Frames whose measured delay deviates by more than this are dropped.
@@ -63,7 +63,7 @@ pub struct Line {
     pub has_one_exposure: bool,
 }
 
-impl Line {
+impl TriggerLine {
     /// The line of a camera that goes through these settings.
     pub fn new(period_us: f64, max_jitter_us: f64, plan: &[CameraSettings]) -> Self {
         let phase_us = |settings: &CameraSettings| settings.trigger_delay_us.rem_euclid(period_us);
@@ -111,11 +111,11 @@ pub struct Written {
     /// From the write of the first register to that of the last.
     written_ns: (i64, i64),
     /// The job they are for; `None` if they only lead in to others.
-    pub work: Option<Wanted>,
+    pub work: Option<WantedFrames>,
 }
 
 /// Frames that a job waits for.
-pub struct Wanted {
+pub struct WantedFrames {
     /// The job as the assembler is told about it.
     pub job: Job,
     /// Whether the frames are exposed with the projector's light on.
@@ -135,7 +135,7 @@ pub struct Wanted {
     pub spare_frames: u32,
 }
 
-impl Wanted {
+impl WantedFrames {
     /// Whether it needs no more frames.
     pub fn is_complete(&self) -> bool {
         self.is_interrupted || self.passed >= self.frames || self.spare_frames == 0
@@ -152,7 +152,7 @@ impl Written {
     }
 
     /// The job, if it still needs frames.
-    pub fn open(&mut self) -> Option<&mut Wanted> {
+    pub fn open(&mut self) -> Option<&mut WantedFrames> {
         self.work.as_mut().filter(|wanted| !wanted.is_complete())
     }
 
@@ -219,9 +219,9 @@ pub struct Seen {
 /// The settings that were written, from those in force on.
 pub struct Ahead {
     camera: CameraCapabilities,
-    line: Line,
+    line: TriggerLine,
     written: VecDeque<Written>,
-    triggers: Triggers,
+    triggers: TriggerTimes,
     newest_seq: Option<u64>,
     frames_carry_exposure: bool,
     /// Whether the camera itself reports the first frame exactly.
@@ -231,10 +231,10 @@ pub struct Ahead {
 
 impl Ahead {
     /// Starts without knowledge of the camera's earlier settings.
-    pub fn new(camera: CameraCapabilities, line: Line) -> Self {
+    pub fn new(camera: CameraCapabilities, line: TriggerLine) -> Self {
         Self {
             camera,
-            triggers: Triggers::new(ns_from_us(line.period_us)),
+            triggers: TriggerTimes::new(ns_from_us(line.period_us)),
             line,
             written: VecDeque::new(),
             newest_seq: None,
@@ -280,7 +280,7 @@ impl Ahead {
     }
 
     /// The job that waits for its first frame, if no earlier job is open and frame `seq` may have its settings.
-    pub fn opening(&mut self, seq: u64) -> Option<&mut Wanted> {
+    pub fn opening(&mut self, seq: u64) -> Option<&mut WantedFrames> {
         let newest_seq = self.newest_seq;
         let next = self.written.iter_mut().find(|written| !written.is_complete(newest_seq))?;
         if seq < next.earliest() { None } else { next.open() }
@@ -325,7 +325,7 @@ impl Ahead {
     }
 
     /// The last frame before which other settings must not take effect: a job's last frame, plus its margin.
-    fn end_seq(&self, written: &Written, wanted: &Wanted) -> u64 {
+    fn end_seq(&self, written: &Written, wanted: &WantedFrames) -> u64 {
         let next_seq = self.newest_seq.map_or(0, |seq| seq + 1);
         let first_seq = if wanted.passed > 0 { next_seq } else { written.planned().max(next_seq) };
         first_seq + u64::from(wanted.frames - wanted.passed + wanted.margin_frames) - 1
@@ -377,7 +377,7 @@ impl Ahead {
     }
 
     /// Records settings that were written in the interval `written_ns`. Without `work` they only lead in to others.
-    pub fn push(&mut self, applied: Applied, written_ns: (i64, i64), work: Option<Wanted>) {
+    pub fn push(&mut self, applied: Applied, written_ns: (i64, i64), work: Option<WantedFrames>) {
         self.camera_is_exact = matches!(applied.first_frame, FirstFrame::Exactly(_));
         // If latencies vary, timestamps must decide for all points or for none: which frames of a point count must
         // not depend on the previous point, which a resumed run may not have acquired.

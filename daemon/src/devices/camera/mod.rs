@@ -17,7 +17,7 @@ use raysweep_core::{
 };
 use raysweep_pipeline::{Event, Failure, Input, Label, Point, QueueError, Shot, message_of};
 
-pub use self::ahead::Line;
+pub use self::ahead::TriggerLine;
 use self::ahead::{Ahead, Seen};
 pub use self::sequence::{FilmPass, FilmSetting};
 use super::priority;
@@ -123,7 +123,7 @@ pub struct Drive {
     /// Whether the devices or the pipeline set the pace.
     pub pace: Pace,
     /// The line that triggers the camera.
-    pub line: Line,
+    pub line: TriggerLine,
 }
 
 impl CameraThread {
@@ -150,16 +150,16 @@ impl CameraThread {
                     if drive.pace == Pace::Devices {
                         priority::for_device("camera");
                     }
-                    let mut sequencer = Sequencer::new(camera, drive, input, orders);
+                    let mut acquisition = Acquisition::new(camera, drive, input, orders);
                     for work in todo {
-                        if done.send(sequencer.work(work, &latency)).is_err() {
+                        if done.send(acquisition.work(work, &latency)).is_err() {
                             break;
                         }
                     }
-                    if let Err(error) = sequencer.camera.disarm() {
+                    if let Err(error) = acquisition.camera.disarm() {
                         tracing::warn!(%error, "camera not disarmed");
                     }
-                    sequencer.exposures
+                    acquisition.exposures
                 }
             })
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
@@ -197,7 +197,8 @@ impl CameraThread {
     }
 }
 
-struct Sequencer {
+/// What the camera's thread does: acquires points, one after the other.
+struct Acquisition {
     camera: Box<dyn Camera>,
     clock: Clock,
     input: Input<Event>,
@@ -209,7 +210,7 @@ struct Sequencer {
     warmed_up: bool,
     /// The longest time from edge to last row of any frame so far.
     longest_frame_us: f64,
-    line: Line,
+    line: TriggerLine,
     ahead: Ahead,
     /// The assembler knows the fate of every frame up to this one; `None` after a pause, whose frames do not count.
     told_seq: Option<u64>,
@@ -234,7 +235,7 @@ enum Taken {
     Lost,
 }
 
-impl Sequencer {
+impl Acquisition {
     fn new(camera: Box<dyn Camera>, drive: Drive, input: Input<Event>, orders: Arc<Orders>) -> Self {
         let Drive { clock, pace, line } = drive;
         let capabilities = camera.capabilities();

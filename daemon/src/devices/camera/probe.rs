@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use raysweep_core::{CameraSettings, DeviceError, SettingsLatency};
 
-use super::{POLL, Sequencer, Watchdog};
+use super::{Acquisition, POLL, Watchdog};
 
 /// Number of observed changes of settings: a latency that varies over four numbers of frames passes for constant once
 /// in 4^7.
@@ -14,7 +14,7 @@ const ENOUGH: usize = 4;
 /// Factor by which the exposure changes, if frames carry it.
 const EXPOSURE_FACTOR: f64 = 1.25;
 
-impl Sequencer {
+impl Acquisition {
     /// Changes settings back and forth and finds, from the frames' timestamps, when they take effect; `None` if too
     /// few changes could be seen.
     pub(super) fn probe(

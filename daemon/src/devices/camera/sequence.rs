@@ -8,8 +8,8 @@ use std::time::Duration;
 use raysweep_core::{Applied, Camera, CameraSettings, DeviceError, DeviceState, LossCause, SettingsId};
 use raysweep_pipeline::{Event, Job, Label, Point, Role, Shot};
 
-use super::ahead::Wanted;
-use super::{Attempt, MARGIN_FRAMES, POLL, Pass, Received, Sequencer, Taken, Watchdog, closed};
+use super::ahead::WantedFrames;
+use super::{Acquisition, Attempt, MARGIN_FRAMES, POLL, Pass, Received, Taken, Watchdog, closed};
 use crate::rig::Pace;
 use crate::run::orders::Order;
 
@@ -73,7 +73,7 @@ impl FilmPass {
     }
 }
 
-impl Sequencer {
+impl Acquisition {
     /// Takes points in order. Each ends in a unit or a failure.
     pub(super) fn sweep(&mut self, pass: Pass) -> Result<(), DeviceError> {
         self.warm_up(pass.not_before_ns)?;
@@ -199,7 +199,7 @@ impl Sequencer {
                 light_edges_later: shot.light_edges_later,
                 periods_from_last: slot.periods_from_last.filter(|_| runs_on),
             };
-            Some(Wanted {
+            Some(WantedFrames {
                 job,
                 is_lit: !matches!(point.role, Role::Dark(_)),
                 is_begun: false,
@@ -222,7 +222,7 @@ impl Sequencer {
         &mut self,
         id: SettingsId,
         settings: &CameraSettings,
-        work: impl FnOnce(Applied) -> Option<Wanted>,
+        work: impl FnOnce(Applied) -> Option<WantedFrames>,
     ) -> Result<(), DeviceError> {
         let clock = self.clock.clone();
         let written = self.when_there(|camera| Ok((clock.now_ns(), camera.configure(id, settings)?)))?;
@@ -337,7 +337,7 @@ impl Sequencer {
     }
 
     /// Ends the job in force early, if it is open and `is_over` holds.
-    fn interrupt_if(&mut self, is_over: impl FnOnce(&Wanted) -> bool) -> Result<(), DeviceError> {
+    fn interrupt_if(&mut self, is_over: impl FnOnce(&WantedFrames) -> bool) -> Result<(), DeviceError> {
         let wanted = self.ahead.front().and_then(|front| front.open());
         let Some(wanted) = wanted.filter(|wanted| is_over(wanted)) else { return Ok(()) };
         wanted.is_interrupted = true;

@@ -12,7 +12,7 @@ use raysweep_core::{Applied, CameraSettings, DeviceError, FirstFrame, FrameStamp
 use raysweep_pipeline::{EXPOSURE_TOLERANCE_US, Event, Job, Label, Role};
 
 use super::sequence::{FilmPass, Slot};
-use super::{Line, POLL, Sequencer, Taken, Watchdog, closed};
+use super::{Acquisition, POLL, Taken, TriggerLine, Watchdog, closed};
 use crate::run::orders::Order;
 
 /// Frames further apart than this are not compared: the line's period is not known precisely enough. [A]
@@ -20,7 +20,7 @@ const COMPARED_NS: i64 = 1_000_000_000;
 /// Number of cycles in which the phase must be found; otherwise the camera does not follow its sequence.
 const PATIENCE_CYCLES: usize = 8;
 
-impl Sequencer {
+impl Acquisition {
     /// Takes slots of a film with the camera's own sequencer, as far as that is usable.
     pub(super) fn take_by_sets(
         &mut self,
@@ -122,7 +122,7 @@ impl Sequencer {
 struct Phase {
     /// The settings of the sets, as the camera applied them.
     sets: Vec<CameraSettings>,
-    line: Line,
+    line: TriggerLine,
     /// Index of the set of frame 0, even if that frame was not in the sequence.
     known: Option<usize>,
     /// For each phase, the number of consecutive frames that agreed with it, each relative to the frame before.
@@ -139,7 +139,7 @@ struct Phase {
 }
 
 impl Phase {
-    fn new(sets: Vec<CameraSettings>, line: Line) -> Self {
+    fn new(sets: Vec<CameraSettings>, line: TriggerLine) -> Self {
         Self {
             known: None,
             agreeing: vec![0; sets.len()],
@@ -154,7 +154,7 @@ impl Phase {
     }
 
     /// Whether the timestamps of a cycle of frames distinguish all phases.
-    fn differ(sets: &[CameraSettings], line: &Line) -> bool {
+    fn differ(sets: &[CameraSettings], line: &TriggerLine) -> bool {
         let delay_us = |place: usize| sets[place % sets.len()].trigger_delay_us;
         let step_us = |place: usize| delay_us(place + 1) - delay_us(place);
         // Edges may be off by the permitted jitter, and frames are compared with the same tolerance.

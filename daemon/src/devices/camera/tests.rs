@@ -1,4 +1,4 @@
-//! Tests the sequencer with a scripted camera on a virtual clock.
+//! Tests the acquisition with a scripted camera on a virtual clock.
 
 mod ahead;
 mod sets;
@@ -281,15 +281,16 @@ fn play_plan(
         next_seq: 0,
         truth: truth.clone(),
     };
-    let drive = Drive { clock, pace: Pace::Pipeline, line: Line::new(PERIOD_NS as f64 * 1e-3, 50.0, plan) };
+    let drive =
+        Drive { clock, pace: Pace::Pipeline, line: TriggerLine::new(PERIOD_NS as f64 * 1e-3, 50.0, plan) };
     let (input, events) = Input::new(64, Policy::Wait);
     let follower = std::thread::spawn({
         let orders = orders.clone();
         move || follow(&events, frames, pause_after, &orders)
     });
-    let mut sequencer = Sequencer::new(Box::new(camera), drive, input, orders);
+    let mut acquisition = Acquisition::new(Box::new(camera), drive, input, orders);
     let latency = OnceLock::new();
-    let ended = sequencer.work(Work::Probe(plan[0]), &latency);
+    let ended = acquisition.work(Work::Probe(plan[0]), &latency);
     assert!(matches!(ended, Ended::Flushed(Ok(()))));
     let shot = |settings| Shot { settings, light_edges_later: 0 };
     let point = |index: u32, settings: CameraSettings| Point {
@@ -325,8 +326,8 @@ fn play_plan(
             not_before_ns: 0,
         }),
     };
-    assert!(matches!(sequencer.work(work, &latency), Ended::Flushed(Ok(()))));
-    drop(sequencer);
+    assert!(matches!(acquisition.work(work, &latency), Ended::Flushed(Ok(()))));
+    drop(acquisition);
     let (counted, short) = follower.join().unwrap();
     let (truth, told) = (truth.lock().unwrap().clone(), told.lock().unwrap().clone());
     Played { latency: latency.get().copied(), counted, short, truth, told }

@@ -6,14 +6,14 @@ const GATE_NS: i64 = 500_000;
 const RELOCK_AFTER: u32 = 3;
 
 /// Trigger times of the newest frames.
-pub struct Triggers {
+pub struct TriggerTimes {
     period_ns: i64,
     /// The newest frame with known settings, and its trigger time.
     newest: Option<(u64, i64)>,
     astray: u32,
 }
 
-impl Triggers {
+impl TriggerTimes {
     /// Starts without known triggers.
     pub fn new(period_ns: i64) -> Self {
         Self { period_ns, newest: None, astray: 0 }
@@ -72,7 +72,7 @@ mod tests {
 
     #[test]
     fn a_false_trigger_does_not_move_the_line_and_a_line_that_has_moved_is_found_again() {
-        let mut triggers = Triggers::new(PERIOD_NS);
+        let mut triggers = TriggerTimes::new(PERIOD_NS);
         triggers.note(1, 0);
         triggers.note(2, 7_000_000);
         assert_eq!(triggers.newest(), Some((1, 0)));
@@ -86,7 +86,7 @@ mod tests {
 
     #[test]
     fn moments_are_placed_between_triggers() {
-        let mut triggers = Triggers::new(PERIOD_NS);
+        let mut triggers = TriggerTimes::new(PERIOD_NS);
         assert_eq!(triggers.between_ns(123, (2_000_000, 15_000_000)), 123, "nothing is known");
         triggers.note(1, 1_000);
         let between =

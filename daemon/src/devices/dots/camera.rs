@@ -20,7 +20,7 @@ const MOST_ASKED: u64 = 1 << 16;
 
 /// What the caller wants next from the camera; asked before each frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Wanted {
+pub enum NextWanted {
     /// Frames; a long wait for one is an error.
     Frames,
     /// Frames that are still in transit: no more are triggered.
@@ -40,14 +40,14 @@ pub struct Source<'a> {
 }
 
 /// Why the pipeline did not take a frame.
-pub enum Refused {
+pub enum FrameRefused {
     /// There is no room, and the camera does not wait.
     Full(Arrival),
     /// The pipeline is closed.
     Closed,
 }
 
-impl From<QueueError<Arrival>> for Refused {
+impl From<QueueError<Arrival>> for FrameRefused {
     fn from(error: QueueError<Arrival>) -> Self {
         match error {
             QueueError::Full(arrival) => Self::Full(arrival),
@@ -70,8 +70,8 @@ impl Source<'_> {
     /// An error of the camera, or that no frames arrive.
     pub fn take(
         &mut self,
-        wanted: &dyn Fn() -> Wanted,
-        deliver: &mut dyn FnMut(Arrival) -> Result<(), Refused>,
+        wanted: &dyn Fn() -> NextWanted,
+        deliver: &mut dyn FnMut(Arrival) -> Result<(), FrameRefused>,
     ) -> Result<Vec<Loss>, DeviceError> {
         let format = self.camera.capabilities().format;
         let mut spare = None;
@@ -81,8 +81,8 @@ impl Source<'_> {
         let mut rest_frames = 0;
         loop {
             let before = wanted();
-            rest_frames += u32::from(before == Wanted::Rest);
-            if before == Wanted::Nothing || rest_frames > MOST_REST_FRAMES {
+            rest_frames += u32::from(before == NextWanted::Rest);
+            if before == NextWanted::Nothing || rest_frames > MOST_REST_FRAMES {
                 return Ok(lost);
             }
             let free = match self.pace {
@@ -95,7 +95,7 @@ impl Source<'_> {
                 None => spare.take().unwrap_or_else(|| self.pool.spare()),
             };
             let Some(stamp) = self.camera.next_frame(&mut data, POLL)? else {
-                if before == Wanted::Rest {
+                if before == NextWanted::Rest {
                     return Ok(lost);
                 }
                 if waiting_since.get_or_insert_with(Instant::now).elapsed() > PATIENCE {
@@ -119,11 +119,11 @@ impl Source<'_> {
             let frame = Frame { data, format, stamp };
             match deliver(Arrival { frame, lost_before: std::mem::take(&mut lost) }) {
                 Ok(()) => {}
-                Err(Refused::Full(Arrival { lost_before, .. })) => {
+                Err(FrameRefused::Full(Arrival { lost_before, .. })) => {
                     lost = lost_before;
                     note(&mut lost, u64::from(is_new), LossCause::QueueFull);
                 }
-                Err(Refused::Closed) => return Ok(lost),
+                Err(FrameRefused::Closed) => return Ok(lost),
             }
         }
     }
@@ -204,10 +204,10 @@ mod tests {
         let mut taken = Vec::new();
         let mut held = Vec::new();
         let rest = source
-            .take(&|| Wanted::Rest, &mut |arrival| {
+            .take(&|| NextWanted::Rest, &mut |arrival| {
                 match arrival.frame.stamp.seq {
                     // The pipeline is full, once.
-                    4 => return Err(Refused::Full(arrival)),
+                    4 => return Err(FrameRefused::Full(arrival)),
                     7 | 8 => held.push(arrival.frame),
                     seq => {
                         held.clear();
@@ -240,12 +240,12 @@ mod tests {
         let pool = FramePool::new(2, 1);
         let mut camera = scripted(vec![1]);
         let mut source = Source { camera: &mut camera, pool: &pool, pace: Pace::Pipeline };
-        let error = source.take(&|| Wanted::Frames, &mut |_| Ok(())).unwrap_err();
+        let error = source.take(&|| NextWanted::Frames, &mut |_| Ok(())).unwrap_err();
         assert_eq!(error.kind, DeviceErrorKind::Timeout);
         let asked = Cell::new(0);
         let until_third = || {
             asked.set(asked.get() + 1);
-            if asked.get() < 3 { Wanted::Frames } else { Wanted::Nothing }
+            if asked.get() < 3 { NextWanted::Frames } else { NextWanted::Nothing }
         };
         assert!(source.take(&until_third, &mut |_| Ok(())).unwrap().is_empty());
     }

@@ -7,7 +7,7 @@ use raysweep_core::{Camera, Clock, FramePool, MirrorPath, Subject};
 use raysweep_pipeline::dots::{Arrival, Loss};
 use raysweep_pipeline::{PipelineError, message_of};
 
-use super::camera::{Refused, Source, Wanted};
+use super::camera::{FrameRefused, NextWanted, Source};
 use super::motion::Motion;
 use crate::devices::{operator, priority};
 use crate::rig::{Pace, Stand};
@@ -48,7 +48,7 @@ impl Player<'_> {
         rounds: u32,
         frames: u64,
         enough: &AtomicBool,
-        deliver: &mut (dyn FnMut(Arrival) -> Result<(), Refused> + Send),
+        deliver: &mut (dyn FnMut(Arrival) -> Result<(), FrameRefused> + Send),
     ) -> Result<Vec<Loss>, RunError> {
         let orders = self.orders;
         let (path_over, camera_over) = (AtomicBool::new(false), AtomicBool::new(false));
@@ -64,9 +64,9 @@ impl Player<'_> {
                 false => enough.load(Ordering::Relaxed) || taken.load(Ordering::Relaxed) >= frames,
             };
             match (orders.go_on(), is_over) {
-                (true, false) => Wanted::Frames,
-                (true, true) if is_driven => Wanted::Rest,
-                _ => Wanted::Nothing,
+                (true, false) => NextWanted::Frames,
+                (true, true) if is_driven => NextWanted::Rest,
+                _ => NextWanted::Nothing,
             }
         };
         let mut deliver = |arrival| {

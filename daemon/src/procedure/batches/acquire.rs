@@ -15,7 +15,7 @@ use raysweep_session::ledger::Ledger;
 use raysweep_transport::dots::{DotsError, FlatField};
 
 use super::sink::{BatchSink, RawSink, StoredBatches, Writing};
-use crate::devices::dots::camera::Refused;
+use crate::devices::dots::camera::FrameRefused;
 use crate::devices::dots::motion::Motion;
 use crate::devices::dots::play::Player;
 use crate::devices::dots::{FRAMES_AT_WORK, frames_waiting};
@@ -197,7 +197,7 @@ impl DotPasses<'_> {
                     Ok(wants_more) => has_enough.store(!wants_more, Ordering::Relaxed),
                     Err(error) => {
                         failed = Some(error);
-                        return Err(Refused::Closed);
+                        return Err(FrameRefused::Closed);
                     }
                 }
             }

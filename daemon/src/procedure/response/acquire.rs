@@ -12,7 +12,7 @@ use raysweep_session::Session;
 use raysweep_session::ledger::{AxisEntry, Entry, Ledger};
 
 use crate::devices::dots::FRAMES_AT_WORK;
-use crate::devices::dots::camera::Refused;
+use crate::devices::dots::camera::FrameRefused;
 use crate::devices::dots::motion::Motion;
 use crate::devices::dots::play::Player;
 use crate::rig::{DotDevices, DotRig};
@@ -206,7 +206,7 @@ impl<'a> Arrivals<'a> {
         &mut self,
         arrival: &Arrival,
         each: impl FnOnce(usize, &[u16]) -> Result<(), RunError>,
-    ) -> Result<(), Refused> {
+    ) -> Result<(), FrameRefused> {
         self.lose(&arrival.lost_before);
         let seq = arrival.frame.stamp.seq;
         if self.ids.is_some_and(|(_, newest)| seq <= newest) {
@@ -222,7 +222,7 @@ impl<'a> Arrivals<'a> {
             .and_then(|()| each((seq - first) as usize, &self.pixels));
         done.map_err(|error| {
             self.failed = Some(error);
-            Refused::Closed
+            FrameRefused::Closed
         })
     }
 

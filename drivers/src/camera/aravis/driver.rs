@@ -18,9 +18,9 @@ use super::frames::{Frames, image_data};
 use super::ids::FrameIds;
 use super::library::Health;
 use super::losses::Losses;
-use super::owner::{Command, Done, Opened, Order, Owner, Reply, Shared};
+use super::owner::{Done, Opened, Owner, OwnerCommand, OwnerOrder, OwnerReply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
-use super::sequencer::Sequence;
+use super::sequencer::SequencerSets;
 use crate::reopen::Reopening;
 use raysweep_config::rig::aravis::{AravisConfig, TimestampAt};
 
@@ -45,6 +45,9 @@ const SILENCE_NS: i64 = 900_000_000;
 const ROUND_TRIPS: usize = 100;
 /// Maximum wait on a channel or a stream before the camera's health is checked.
 const LOOK: Duration = Duration::from_millis(50);
+/// Opening a camera that is there takes less. One that is not there may block the owner thread for longer than it may
+/// stay away.
+const OPENING_TIME: Duration = Duration::from_secs(2);
 /// A killed program keeps the camera until its heartbeat is missed, after 3 s.
 const BUSY_PATIENCE: Duration = Duration::from_secs(5);
 /// Pause between attempts to open a camera that another program holds.
@@ -59,8 +62,8 @@ pub struct AravisCamera {
     config: AravisConfig,
     facts: RigFacts,
     shared: Shared,
-    orders: Option<SyncSender<Order>>,
-    replies: Receiver<Reply>,
+    orders: Option<SyncSender<OwnerOrder>>,
+    replies: Receiver<OwnerReply>,
     owner: Option<JoinHandle<()>>,
     ticket: u64,
     link: Link,
@@ -82,7 +85,9 @@ enum Link {
     },
     Lost,
     /// The owner thread is opening the lost camera.
-    Opening,
+    Opening {
+        since: Instant,
+    },
 }
 
 /// The newest complete frame.
@@ -146,16 +151,16 @@ impl AravisCamera {
             .map_err(|error| DeviceError::new("camera", DeviceErrorKind::NotReady, error))?;
         let begun = Instant::now();
         let opened = loop {
-            let open = Order { ticket: 0, command: Command::Open };
+            let open = OwnerOrder { ticket: 0, command: OwnerCommand::Open };
             orders.send(open).map_err(|_closed| thread_ended())?;
             match replies.recv() {
-                Ok(Reply::Opened(Err(error)))
+                Ok(OwnerReply::Opened(Err(error)))
                     if error.kind == DeviceErrorKind::Busy && begun.elapsed() < BUSY_PATIENCE =>
                 {
                     thread::sleep(BUSY_PAUSE);
                 }
-                Ok(Reply::Opened(opened)) => break opened?,
-                Ok(Reply::Done(..)) | Err(_) => return Err(thread_ended()),
+                Ok(OwnerReply::Opened(opened)) => break opened?,
+                Ok(OwnerReply::Done(..)) | Err(_) => return Err(thread_ended()),
             }
         };
         let Opened { frames, chunks, capabilities, tells_time, .. } = opened;
@@ -192,15 +197,15 @@ impl AravisCamera {
     }
 
     /// Sends a command to the owner thread; the channel has room for it.
-    fn order(&mut self, command: Command) -> Result<(), DeviceError> {
+    fn order(&mut self, command: OwnerCommand) -> Result<(), DeviceError> {
         self.ticket += 1;
-        let order = Order { ticket: self.ticket, command };
+        let order = OwnerOrder { ticket: self.ticket, command };
         let sent = self.orders.as_ref().is_some_and(|orders| orders.try_send(order).is_ok());
         sent.then_some(()).ok_or_else(thread_ended)
     }
 
     /// Lets the owner thread execute a command; gives up if the camera is silent.
-    fn ask(&mut self, command: Command) -> Result<Done, DeviceError> {
+    fn ask(&mut self, command: OwnerCommand) -> Result<Done, DeviceError> {
         if !matches!(self.link, Link::Up { .. }) {
             return Err(lost());
         }
@@ -208,15 +213,15 @@ impl AravisCamera {
         self.order(command)?;
         loop {
             match self.replies.recv_timeout(LOOK) {
-                Ok(Reply::Done(ticket, Err(error))) if ticket == self.ticket => {
+                Ok(OwnerReply::Done(ticket, Err(error))) if ticket == self.ticket => {
                     if matches!(error.kind, DeviceErrorKind::Timeout | DeviceErrorKind::Disconnected) {
                         self.lose(&error.source)?;
                     }
                     return Err(error);
                 }
-                Ok(Reply::Done(ticket, done)) if ticket == self.ticket => return done,
-                // Reply to an order that was given up.
-                Ok(Reply::Done(..) | Reply::Opened(_)) => {}
+                Ok(OwnerReply::Done(ticket, done)) if ticket == self.ticket => return done,
+                // The reply to an order that was given up.
+                Ok(OwnerReply::Done(..) | OwnerReply::Opened(_)) => {}
                 Err(RecvTimeoutError::Timeout) if self.silent_since(asked_ns) => {
                     self.lose(&SILENT)?;
                     return Err(lost());
@@ -237,7 +242,7 @@ impl AravisCamera {
     /// Closes the failed camera, to be opened again, unless it is given up.
     fn lose(&mut self, cause: &dyn Display) -> Result<(), DeviceError> {
         if let Link::Up { frames, .. } = std::mem::replace(&mut self.link, Link::Lost) {
-            self.order(Command::Release(frames))?;
+            self.order(OwnerCommand::Release(frames))?;
         }
         self.reopening.failed(cause)
     }
@@ -252,19 +257,24 @@ impl AravisCamera {
                 if !self.reopening.is_due() {
                     return Ok(());
                 }
-                self.order(Command::Open)?;
-                self.link = Link::Opening;
+                self.order(OwnerCommand::Open)?;
+                self.link = Link::Opening { since: Instant::now() };
                 continue;
             }
             match self.replies.recv_timeout(left) {
-                Ok(Reply::Opened(Ok(opened))) => return self.resume(opened),
-                Ok(Reply::Opened(Err(error))) => {
+                Ok(OwnerReply::Opened(Ok(opened))) => return self.resume(opened),
+                Ok(OwnerReply::Opened(Err(error))) => {
                     self.link = Link::Lost;
                     self.reopening.failed(&error.source)?;
                 }
-                Ok(Reply::Done(..)) => {}
-                // The library may block the owner for longer than the camera may stay away.
-                Err(RecvTimeoutError::Timeout) => return self.reopening.check(),
+                Ok(OwnerReply::Done(..)) => {}
+                Err(RecvTimeoutError::Timeout) => {
+                    return match self.link {
+                        // It may be there after a pause of the run in which nobody asked for frames.
+                        Link::Opening { since } if since.elapsed() < OPENING_TIME => Ok(()),
+                        _ => self.reopening.check(),
+                    };
+                }
                 Err(RecvTimeoutError::Disconnected) => return Err(thread_ended()),
             }
         }
@@ -396,7 +406,7 @@ impl Camera for AravisCamera {
 
     fn state(&self) -> DeviceState {
         match (&self.link, self.armed_ns) {
-            (Link::Lost | Link::Opening, _) => DeviceState::Lost,
+            (Link::Lost | Link::Opening { .. }, _) => DeviceState::Lost,
             (Link::Up { .. }, Some(_)) => DeviceState::Streaming,
             (Link::Up { .. }, None) => DeviceState::Ready,
         }
@@ -405,7 +415,7 @@ impl Camera for AravisCamera {
     fn configure(&mut self, _: SettingsId, settings: &CameraSettings) -> Result<Applied, DeviceError> {
         self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         let triggers = self.triggers();
-        let Done { written_ns, actual, restarted, .. } = self.ask(Command::Configure(*settings))?;
+        let Done { written_ns, actual, restarted, .. } = self.ask(OwnerCommand::Configure(*settings))?;
         self.first_set = None;
         let actual = actual.unwrap_or(*settings);
         if restarted {
@@ -422,9 +432,9 @@ impl Camera for AravisCamera {
         for settings in settings {
             self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
         }
-        let Done { sequence, restarted, .. } = self.ask(Command::Sequence(settings.to_vec()))?;
+        let Done { sequence, restarted, .. } = self.ask(OwnerCommand::Sequence(settings.to_vec()))?;
         self.first_set = sequence.as_ref().map(|sequence| sequence.first_set);
-        let sequence = sequence.map(|Sequence { settings, .. }| settings);
+        let sequence = sequence.map(|SequencerSets { settings, .. }| settings);
         if restarted {
             self.drain();
             self.ids.restart(0);
@@ -450,7 +460,7 @@ impl Camera for AravisCamera {
         self.drain();
         self.ids.restart(0);
         let armed_ns = self.shared.clock.now_ns();
-        self.ask(Command::Arm)?;
+        self.ask(OwnerCommand::Arm)?;
         self.armed_ns = Some(armed_ns);
         Ok(())
     }
@@ -508,7 +518,7 @@ impl Camera for AravisCamera {
         if self.armed_ns.take().is_none() {
             return Ok(());
         }
-        self.ask(Command::Disarm)?;
+        self.ask(OwnerCommand::Disarm)?;
         Ok(())
     }
 }
@@ -517,7 +527,7 @@ impl Drop for AravisCamera {
     fn drop(&mut self) {
         let Some(orders) = self.orders.take() else { return };
         if let Link::Up { frames, .. } = std::mem::replace(&mut self.link, Link::Lost) {
-            let _ = orders.try_send(Order { ticket: 0, command: Command::Close(frames) });
+            let _ = orders.try_send(OwnerOrder { ticket: 0, command: OwnerCommand::Close(frames) });
         }
         drop(orders);
         // The owner of a dead camera may be blocked in the library, so the wait is limited.

@@ -13,7 +13,7 @@ use super::library::{Device, Health};
 
 /// A line of a feature file that the camera rejected.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Refused {
+pub struct RefusedLine {
     /// The line.
     pub line: String,
     /// The reason.
@@ -50,7 +50,7 @@ pub fn save_features(camera: &str) -> Result<String, DeviceError> {
 ///
 /// # Errors
 /// `Disconnected` if it does not answer, `Busy` if another program holds it, `OutOfRange` for a malformed line.
-pub fn load_features(camera: &str, text: &str) -> Result<(usize, Vec<Refused>), DeviceError> {
+pub fn load_features(camera: &str, text: &str) -> Result<(usize, Vec<RefusedLine>), DeviceError> {
     let mut lines = Vec::new();
     for (number, line) in text.lines().enumerate().map(|(index, line)| (index + 1, line.trim())) {
         if line.is_empty() || line.starts_with('#') {
@@ -70,7 +70,7 @@ pub fn load_features(camera: &str, text: &str) -> Result<(usize, Vec<Refused>), 
         refused.clear();
         for &(name, value) in &lines {
             if let Err(reason) = set(&genicam, name, value) {
-                refused.push(Refused { line: format!("{name}={value}"), reason });
+                refused.push(RefusedLine { line: format!("{name}={value}"), reason });
             }
         }
         if refused.is_empty() {

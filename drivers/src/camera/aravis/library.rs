@@ -18,7 +18,7 @@ use super::features::{FeatureError, Features, Result, first_present};
 
 /// A camera that answered.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Found {
+pub struct FoundCamera {
     /// Its name in a rig file: `camera.aravis.name`.
     pub name: String,
     /// Manufacturer.
@@ -35,14 +35,14 @@ pub struct Found {
 static LIBRARY: Mutex<Option<Aravis>> = Mutex::new(None);
 
 /// Searches all networks and the USB for cameras; takes about a second.
-pub fn discover() -> Vec<Found> {
+pub fn discover() -> Vec<FoundCamera> {
     let mut library = LIBRARY.lock().unwrap_or_else(PoisonError::into_inner);
     if library.is_none() {
         *library = Aravis::initialize().ok();
     }
     let devices = library.as_ref().map(Aravis::get_device_list).unwrap_or_default();
     let text = |text: &CStr| text.to_string_lossy().into_owned();
-    let found = devices.iter().map(|device| Found {
+    let found = devices.iter().map(|device| FoundCamera {
         name: text(&device.id),
         vendor: text(&device.vendor),
         model: text(&device.model),

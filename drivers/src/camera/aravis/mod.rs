@@ -21,6 +21,6 @@ mod settings;
 mod setup;
 
 pub use driver::{AravisCamera, RigFacts};
-pub use file::{Refused, load_features, save_features};
-pub use library::{Found, discover};
+pub use file::{RefusedLine, load_features, save_features};
+pub use library::{FoundCamera, discover};
 pub use raysweep_config::rig::aravis::{AravisConfig, SensorRegion, TimestampAt};

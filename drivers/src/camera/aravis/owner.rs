@@ -15,7 +15,7 @@ use super::features::{FeatureError, Features};
 use super::frames::Frames;
 use super::library::{Device, DeviceClock, Health, device_error};
 use super::network::{self, SocketBuffer};
-use super::sequencer::{self, Sequence};
+use super::sequencer::{self, SequencerSets};
 use super::settings::Writer;
 use super::setup::set_up;
 use raysweep_config::rig::aravis::AravisConfig;
@@ -31,7 +31,7 @@ const FORETOLD: u32 = 8;
 const FIRST_ASKS: usize = 8;
 
 /// A command to the owner.
-pub enum Command {
+pub enum OwnerCommand {
     /// Open the camera, with the settings written last, and start answering triggers if it did before.
     Open,
     /// Start answering triggers.
@@ -49,13 +49,13 @@ pub enum Command {
 }
 
 /// A command with a number that its reply repeats.
-pub struct Order {
+pub struct OwnerOrder {
     pub ticket: u64,
-    pub command: Command,
+    pub command: OwnerCommand,
 }
 
 /// A message from the owner.
-pub enum Reply {
+pub enum OwnerReply {
     /// The camera was opened, for the first time or again.
     Opened(Result<Opened, DeviceError>),
     /// An order was executed.
@@ -69,7 +69,7 @@ pub struct Done {
     /// The camera's settings, if some were written.
     pub actual: Option<CameraSettings>,
     /// The sequence of its sequencer, if it was started.
-    pub sequence: Option<Sequence>,
+    pub sequence: Option<SequencerSets>,
     /// Whether the camera had to be stopped, so that its frame count restarted.
     pub restarted: bool,
 }
@@ -110,8 +110,8 @@ pub struct Owner {
     pub config: AravisConfig,
     pub facts: RigFacts,
     pub shared: Shared,
-    pub orders: Receiver<Order>,
-    pub replies: SyncSender<Reply>,
+    pub orders: Receiver<OwnerOrder>,
+    pub replies: SyncSender<OwnerReply>,
     pub armed: bool,
     pub settings: Option<CameraSettings>,
     /// The settings of the camera's sequencer, which replace `settings`.
@@ -127,16 +127,16 @@ struct Connection {
 impl Owner {
     /// Opens the camera when asked to and serves it until it is released, until the driver closes it.
     pub fn run(mut self) {
-        while let Ok(Order { ticket, command }) = self.orders.recv() {
+        while let Ok(OwnerOrder { ticket, command }) = self.orders.recv() {
             let (connection, reply) = match command {
-                Command::Open => match self.connect() {
-                    Ok((connection, opened)) => (Some(connection), Reply::Opened(Ok(opened))),
-                    Err(error) => (None, Reply::Opened(Err(error))),
+                OwnerCommand::Open => match self.connect() {
+                    Ok((connection, opened)) => (Some(connection), OwnerReply::Opened(Ok(opened))),
+                    Err(error) => (None, OwnerReply::Opened(Err(error))),
                 },
-                Command::Close(_) => return,
+                OwnerCommand::Close(_) => return,
                 _ => {
                     let error = DeviceError::new("camera", DeviceErrorKind::Disconnected, "is not open");
-                    (None, Reply::Done(ticket, Err(error)))
+                    (None, OwnerReply::Done(ticket, Err(error)))
                 }
             };
             if self.replies.send(reply).is_err() {
@@ -229,11 +229,11 @@ impl Owner {
         let (mut asked, mut next_look) = (opened, opened + ASK_PERIOD);
         loop {
             match self.orders.recv_timeout(next_look.saturating_duration_since(Instant::now())) {
-                Ok(Order { command: Command::Release(frames), .. }) => {
+                Ok(OwnerOrder { command: OwnerCommand::Release(frames), .. }) => {
                     drop(frames);
                     return Ended::Released;
                 }
-                Ok(Order { command: Command::Close(frames), .. }) => {
+                Ok(OwnerOrder { command: OwnerCommand::Close(frames), .. }) => {
                     let _ = connection.device.execute("AcquisitionStop");
                     // Fails harmlessly if the camera is gone.
                     let _ = self.end_sequence(&mut connection);
@@ -241,9 +241,9 @@ impl Owner {
                     return Ended::Closed;
                 }
                 Err(RecvTimeoutError::Disconnected) => return Ended::Closed,
-                Ok(Order { ticket, command }) => {
+                Ok(OwnerOrder { ticket, command }) => {
                     let done = self.obey(&mut connection, command);
-                    if self.replies.send(Reply::Done(ticket, done)).is_err() {
+                    if self.replies.send(OwnerReply::Done(ticket, done)).is_err() {
                         return Ended::Closed;
                     }
                 }
@@ -290,20 +290,20 @@ impl Owner {
         Ok(())
     }
 
-    fn obey(&mut self, connection: &mut Connection, command: Command) -> Result<Done, DeviceError> {
+    fn obey(&mut self, connection: &mut Connection, command: OwnerCommand) -> Result<Done, DeviceError> {
         let Connection { device, writer, .. } = connection;
         let mut done = Done { written_ns: 0, actual: None, sequence: None, restarted: false };
         match command {
-            Command::Arm => {
+            OwnerCommand::Arm => {
                 device.execute("AcquisitionStart")?;
                 self.armed = true;
             }
-            Command::Disarm => {
+            OwnerCommand::Disarm => {
                 self.armed = false;
                 device.execute("AcquisitionStop")?;
                 self.end_sequence(connection)?;
             }
-            Command::Configure(settings) => {
+            OwnerCommand::Configure(settings) => {
                 self.settings = Some(settings);
                 let sequenced = self.sequence.take().is_some();
                 // Shutter modes are locked while a camera streams, and its sequencer may be, too.
@@ -320,7 +320,7 @@ impl Owner {
                 }
                 done.actual = Some(written?);
             }
-            Command::Sequence(settings) if sequencer::is_offered(device) => {
+            OwnerCommand::Sequence(settings) if sequencer::is_offered(device) => {
                 done.restarted = self.armed;
                 if done.restarted {
                     device.execute("AcquisitionStop")?;
@@ -343,7 +343,10 @@ impl Owner {
                     }
                 }
             }
-            Command::Sequence(_) | Command::Open | Command::Release(_) | Command::Close(_) => {}
+            OwnerCommand::Sequence(_)
+            | OwnerCommand::Open
+            | OwnerCommand::Release(_)
+            | OwnerCommand::Close(_) => {}
         }
         done.written_ns = self.shared.clock.now_ns();
         Ok(done)

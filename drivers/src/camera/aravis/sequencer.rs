@@ -12,7 +12,7 @@ const ADVANCED_BY: [&str; 2] = ["FrameStart", "ExposureStart"];
 
 /// A running sequence of the camera.
 #[derive(Debug, PartialEq)]
-pub struct Sequence {
+pub struct SequencerSets {
     /// The number of the first set.
     pub first_set: i64,
     /// The settings of each set, as the camera applied them.
@@ -39,7 +39,7 @@ pub fn stop(features: &impl Features) -> Result<()> {
 ///
 /// # Errors
 /// A missing feature, or a set that was not kept; the sequencer is then off.
-pub fn start(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<Sequence> {
+pub fn start(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<SequencerSets> {
     stop(features)?;
     require(features, &["SequencerConfigurationMode"], "a way to configure its sequencer")?;
     put_text(features, "SequencerConfigurationMode", "On")?;
@@ -51,7 +51,7 @@ pub fn start(features: &impl Features, names: &Names, settings: &[CameraSettings
     Ok(sequence)
 }
 
-fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<Sequence> {
+fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) -> Result<SequencerSets> {
     let delay = names.delay.map_or_else(|| require(features, &["TriggerDelay"], "a trigger delay"), Ok)?;
     enable(features, names.exposure, delay)?;
     let sets = features.integer_range("SequencerSetSelector")?;
@@ -95,7 +95,7 @@ fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) ->
             }
         }
     }
-    Ok(Sequence { first_set: *sets.start(), settings: actual })
+    Ok(SequencerSets { first_set: *sets.start(), settings: actual })
 }
 
 /// Includes exposure and delay in the sets, if that can be chosen.
@@ -138,7 +138,7 @@ mod tests {
         CameraSettings { shutter: Shutter::Rolling, exposure_us: 600.0, trigger_delay_us: delay_us }
     }
 
-    fn started(camera: &Scripted, delays_us: &[f64]) -> Result<Sequence> {
+    fn started(camera: &Scripted, delays_us: &[f64]) -> Result<SequencerSets> {
         let all: Vec<_> = delays_us.iter().map(|&delay_us| settings(delay_us)).collect();
         start(camera, &Names::probe(camera).unwrap(), &all)
     }
@@ -147,7 +147,7 @@ mod tests {
     fn settings_are_saved_in_a_ring_between_the_modes() {
         let camera = camera(4);
         // The table can play only one set: it stores nothing per set.
-        let sequence = Sequence { first_set: 0, settings: vec![settings(50.0)] };
+        let sequence = SequencerSets { first_set: 0, settings: vec![settings(50.0)] };
         assert_eq!(started(&camera, &[50.0]).unwrap(), sequence);
         let written = camera.take_written();
         let expected = [

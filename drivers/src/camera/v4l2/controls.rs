@@ -84,7 +84,7 @@ impl Controls {
         &self,
         stated: Option<&TimeControl>,
         row_time_us: f64,
-    ) -> Result<Timer, ControlError> {
+    ) -> Result<TimedControl, ControlError> {
         let control = match stated {
             Some(stated) => self.named("exposure", &stated.control)?,
             None => EXPOSURES
@@ -94,24 +94,27 @@ impl Controls {
         };
         let of_its_name =
             if spelt(&control.name).ends_with("_absolute") { ABSOLUTE_UNIT_US } else { row_time_us };
-        Ok(Timer::new(control, stated.and_then(|stated| stated.unit_us).unwrap_or(of_its_name)))
+        Ok(TimedControl::new(control, stated.and_then(|stated| stated.unit_us).unwrap_or(of_its_name)))
     }
 
     /// The trigger delay control, if the rig file names one.
-    pub(super) fn trigger_delay(&self, stated: Option<&TimeControl>) -> Result<Option<Timer>, ControlError> {
+    pub(super) fn trigger_delay(
+        &self,
+        stated: Option<&TimeControl>,
+    ) -> Result<Option<TimedControl>, ControlError> {
         let Some(stated) = stated else { return Ok(None) };
         let control = self.named("trigger_delay", &stated.control)?;
-        Ok(Some(Timer::new(control, stated.unit_us.unwrap_or(1.0))))
+        Ok(Some(TimedControl::new(control, stated.unit_us.unwrap_or(1.0))))
     }
 }
 
 /// A control that contains a time.
-pub(super) struct Timer {
+pub(super) struct TimedControl {
     control: Control,
     unit_us: f64,
 }
 
-impl Timer {
+impl TimedControl {
     fn new(control: &Control, unit_us: f64) -> Self {
         Self { control: control.clone(), unit_us }
     }
@@ -175,7 +178,7 @@ mod tests {
             maximum: 20,
             step: 3,
         };
-        let timer = Timer::new(&control, 10.0);
+        let timer = TimedControl::new(&control, 10.0);
         assert_eq!(timer.range_us(), 40.0..=200.0);
         for (wanted_us, nearest_us) in [(40.0, 40.0), (54.0, 40.0), (56.0, 70.0), (1e12, 200.0), (-5.0, 40.0)]
         {

@@ -23,7 +23,7 @@ use v4l::v4l_sys::{
 };
 use v4l::v4l2::{self, vidioc};
 
-use super::node::{Control, ControlKind, Filled, Format, Identity, Node, Opener};
+use super::node::{Control, ControlKind, Filled, Format, Identity, Node, NodeOpener};
 
 const VIDEO_CAPTURE: u32 = 1;
 const MEMORY_MMAP: u32 = 1;
@@ -37,7 +37,7 @@ const CTRL_NEXT: u32 = 0x8000_0000;
 /// Opens nodes of this machine's kernel.
 pub struct Kernel;
 
-impl Opener for Kernel {
+impl NodeOpener for Kernel {
     fn open(&mut self, path: &Path) -> io::Result<Box<dyn Node>> {
         let device = Device::with_path(path)?;
         let handle = device.handle();

@@ -9,7 +9,7 @@ mod formats;
 #[cfg(feature = "v4l2")]
 mod kernel;
 mod node;
-mod session;
+mod open_node;
 mod setup;
 mod timing;
 
@@ -25,10 +25,10 @@ use raysweep_core::{
 };
 
 pub use self::formats::fourcc;
-pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, Opener};
-use self::session::{Layout, Session};
+pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, NodeOpener};
+use self::open_node::{Layout, OpenNode};
 pub use self::setup::V4l2Setup;
-use self::timing::{Exposures, Ids, exposure_start_ns, is_monotonic};
+use self::timing::{ExposureTimes, Ids, exposure_start_ns, is_monotonic};
 use crate::reopen::Reopening;
 pub use raysweep_config::rig::v4l2::{TimeControl, V4l2Config};
 
@@ -55,13 +55,13 @@ pub fn open(_setup: V4l2Setup) -> Result<V4l2Camera, DeviceError> {
 /// A V4L2 camera.
 pub struct V4l2Camera {
     setup: V4l2Setup,
-    opener: Box<dyn Opener>,
+    opener: Box<dyn NodeOpener>,
     clock: Clock,
     capabilities: CameraCapabilities,
     layout: Layout,
     armed: bool,
     /// The connection to the device; `None` while it is lost.
-    session: Option<Box<Session>>,
+    open_node: Option<Box<OpenNode>>,
     reopening: Reopening,
     /// The settings written last: requested and applied.
     settings: (CameraSettings, CameraSettings),
@@ -72,7 +72,7 @@ pub struct V4l2Camera {
     newest_ns: Option<i64>,
     /// Frames missed while the camera was lost.
     away: Range<u64>,
-    exposures: Exposures,
+    exposures: ExposureTimes,
     /// Frames that were already complete when settings were written, oldest first.
     waiting: VecDeque<(u64, Filled, i64)>,
     warned_of_clock: bool,
@@ -83,23 +83,27 @@ impl V4l2Camera {
     ///
     /// # Errors
     /// As [`open`].
-    pub fn open(setup: V4l2Setup, mut opener: Box<dyn Opener>, clock: Clock) -> Result<Self, DeviceError> {
+    pub fn open(
+        setup: V4l2Setup,
+        mut opener: Box<dyn NodeOpener>,
+        clock: Clock,
+    ) -> Result<Self, DeviceError> {
         if let Some(fault) = setup.config.faults().into_iter().next() {
             return Err(error(DeviceErrorKind::OutOfRange, format!("camera.v4l2.{fault}")));
         }
-        let session = Session::open(opener.as_mut(), &setup)?;
-        let capabilities = session.capabilities(&setup);
-        let settings = session.settings().map_err(kernel_error)?;
+        let open_node = OpenNode::open(opener.as_mut(), &setup)?;
+        let capabilities = open_node.capabilities(&setup);
+        let settings = open_node.settings().map_err(kernel_error)?;
         Ok(Self {
-            layout: session.layout(),
-            exposures: Exposures::new(settings.exposure_us),
+            layout: open_node.layout(),
+            exposures: ExposureTimes::new(settings.exposure_us),
             waiting: VecDeque::with_capacity(setup.config.buffers as usize),
             reopening: Reopening::new("camera", setup.reopen, clock.clone()),
             opener,
             clock,
             capabilities,
             armed: false,
-            session: Some(session),
+            open_node: Some(open_node),
             settings: (settings, settings),
             certain: 0,
             ids: Ids::default(),
@@ -113,15 +117,15 @@ impl V4l2Camera {
     /// Closes the failed device, to be opened again, unless it is given up.
     fn lose(&mut self, cause: &io::Error) -> Result<(), DeviceError> {
         self.waiting.clear();
-        self.session = None;
+        self.open_node = None;
         self.reopening.failed(&format!("{}: {cause}", self.setup.config.device.display()))
     }
 
     /// Opens the device in its earlier state: same formats, same settings, and streaming if it was.
-    fn reopened(&mut self) -> Result<Box<Session>, DeviceError> {
-        let mut session = Session::open(self.opener.as_mut(), &self.setup)?;
-        let found = session.capabilities(&self.setup);
-        if found != self.capabilities || session.layout() != self.layout {
+    fn reopened(&mut self) -> Result<Box<OpenNode>, DeviceError> {
+        let mut open_node = OpenNode::open(self.opener.as_mut(), &self.setup)?;
+        let found = open_node.capabilities(&self.setup);
+        if found != self.capabilities || open_node.layout() != self.layout {
             let what = format!(
                 "at {} there is now {}, with other abilities than {}: plug the camera in again that the run began with",
                 self.setup.config.device.display(),
@@ -130,22 +134,22 @@ impl V4l2Camera {
             );
             return Err(error(DeviceErrorKind::Unsupported, what));
         }
-        session.write(&self.settings.0).map_err(kernel_error)?;
+        open_node.write(&self.settings.0).map_err(kernel_error)?;
         if self.armed {
-            session.start().map_err(kernel_error)?;
+            open_node.start().map_err(kernel_error)?;
         }
-        Ok(session)
+        Ok(open_node)
     }
 
     /// Tries to open a lost device if an attempt is due.
     fn reopen(&mut self) -> Result<(), DeviceError> {
-        if self.session.is_some() || !self.reopening.is_due() {
+        if self.open_node.is_some() || !self.reopening.is_due() {
             return Ok(());
         }
         match self.reopened() {
-            Ok(session) => {
+            Ok(open_node) => {
                 self.resume_ids();
-                self.session = Some(session);
+                self.open_node = Some(open_node);
                 Ok(())
             }
             Err(error) => self.reopening.failed(&error.source),
@@ -167,8 +171,8 @@ impl V4l2Camera {
 
     /// Takes a filled buffer from the kernel, with its id and the time of taking it.
     fn dequeue(&mut self) -> io::Result<Option<(u64, Filled, i64)>> {
-        let Some(session) = &mut self.session else { return Ok(None) };
-        let Some(filled) = session.node.dequeue()? else { return Ok(None) };
+        let Some(open_node) = &mut self.open_node else { return Ok(None) };
+        let Some(filled) = open_node.node.dequeue()? else { return Ok(None) };
         Ok(Some((self.ids.take(filled.sequence), filled, self.clock.now_ns())))
     }
 
@@ -189,11 +193,11 @@ impl V4l2Camera {
             Some(frame) => Some(frame),
             None => self.dequeue()?,
         };
-        let (Some((id, filled, dequeued_ns)), Some(session)) = (frame, &mut self.session) else {
+        let (Some((id, filled, dequeued_ns)), Some(open_node)) = (frame, &mut self.open_node) else {
             return Ok(None);
         };
-        let sound = session.copy(&filled, into)?;
-        session.node.queue(filled.index)?;
+        let sound = open_node.copy(&filled, into)?;
+        open_node.node.queue(filled.index)?;
         if !sound {
             // Its id is skipped, so it is counted as lost.
             tracing::debug!(id, flags = filled.flags, bytes = filled.bytes_used, "damaged frame");
@@ -223,8 +227,8 @@ impl V4l2Camera {
     /// Waits for a buffer or the deadline; if the device is lost, for the next attempt to open it.
     fn wait(&mut self, now_ns: i64, deadline_ns: i64) -> io::Result<()> {
         let left = Duration::from_nanos((deadline_ns - now_ns).unsigned_abs());
-        match &mut self.session {
-            Some(session) => session.node.wait(left),
+        match &mut self.open_node {
+            Some(open_node) => open_node.node.wait(left),
             None => {
                 self.reopening.sleep(left);
                 Ok(())
@@ -234,8 +238,8 @@ impl V4l2Camera {
 
     /// Writes settings; if the camera refuses them, the old ones are kept.
     fn write(&mut self, wanted: &CameraSettings) -> Result<CameraSettings, DeviceError> {
-        let Some(session) = &mut self.session else { return Err(lost()) };
-        let cause = match session.write(wanted) {
+        let Some(open_node) = &mut self.open_node else { return Err(lost()) };
+        let cause = match open_node.write(wanted) {
             Ok(actual) => return Ok(actual),
             Err(cause) => cause,
         };
@@ -245,7 +249,7 @@ impl V4l2Camera {
         }
         // The exposure may have been written before the delay was refused. If this fails too, the first error is more
         // useful.
-        let _ = session.write(&self.settings.0);
+        let _ = open_node.write(&self.settings.0);
         let what = format!(
             "exposure_us = {}, trigger_delay_us = {}: the camera's driver refuses them{}: {cause}",
             wanted.exposure_us,
@@ -262,7 +266,7 @@ impl V4l2Camera {
             return Err(error(DeviceErrorKind::Unsupported, what));
         }
         self.capabilities.allows(settings).map_err(|what| error(DeviceErrorKind::OutOfRange, what))?;
-        self.session.as_ref().map(|session| session.nearest(settings)).ok_or_else(lost)
+        self.open_node.as_ref().map(|open_node| open_node.nearest(settings)).ok_or_else(lost)
     }
 }
 
@@ -272,7 +276,7 @@ impl Camera for V4l2Camera {
     }
 
     fn state(&self) -> DeviceState {
-        match (&self.session, self.armed) {
+        match (&self.open_node, self.armed) {
             (None, _) => DeviceState::Lost,
             (Some(_), true) => DeviceState::Streaming,
             (Some(_), false) => DeviceState::Ready,
@@ -302,12 +306,12 @@ impl Camera for V4l2Camera {
         if self.armed {
             return Ok(());
         }
-        if let Some(session) = &mut self.session {
-            session.start().map_err(kernel_error)?;
+        if let Some(open_node) = &mut self.open_node {
+            open_node.start().map_err(kernel_error)?;
         } else {
-            let mut session = self.reopened()?;
-            session.start().map_err(kernel_error)?;
-            self.session = Some(session);
+            let mut open_node = self.reopened()?;
+            open_node.start().map_err(kernel_error)?;
+            self.open_node = Some(open_node);
         }
         self.ids.stream_begins(self.ids.next());
         self.newest_ns = None;
@@ -358,8 +362,8 @@ impl Camera for V4l2Camera {
         if !std::mem::replace(&mut self.armed, false) {
             return Ok(());
         }
-        let Some(session) = &mut self.session else { return Ok(()) };
-        if let Err(cause) = session.node.stop() {
+        let Some(open_node) = &mut self.open_node else { return Ok(()) };
+        if let Err(cause) = open_node.node.stop() {
             self.lose(&cause)?;
             return Err(kernel_error(cause));
         }

@@ -156,7 +156,7 @@ pub trait Node: Send {
 }
 
 /// Opens nodes, also repeatedly when they disappear and come back.
-pub trait Opener: Send {
+pub trait NodeOpener: Send {
     /// Opens the node at a path.
     ///
     /// # Errors

@@ -94,7 +94,7 @@ impl Script {
     }
 }
 
-impl Opener for Script {
+impl NodeOpener for Script {
     fn open(&mut self, _path: &Path) -> io::Result<Box<dyn Node>> {
         let mut device = self.device();
         device.calls.push("open".into());

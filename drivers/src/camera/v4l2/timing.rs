@@ -42,9 +42,9 @@ impl Ids {
 
 /// The exposure time of each frame: settings are written while earlier frames are still pending.
 #[derive(Debug)]
-pub(super) struct Exposures(VecDeque<(u64, f64)>);
+pub(super) struct ExposureTimes(VecDeque<(u64, f64)>);
 
-impl Exposures {
+impl ExposureTimes {
     pub(super) fn new(exposure_us: f64) -> Self {
         Self([(0, exposure_us)].into())
     }
@@ -101,7 +101,7 @@ mod tests {
 
     #[test]
     fn frames_on_their_way_keep_the_exposure_before() {
-        let mut exposures = Exposures::new(100.0);
+        let mut exposures = ExposureTimes::new(100.0);
         exposures.set(5, 200.0);
         exposures.set(7, 300.0);
         let of: Vec<f64> = [3, 4, 5, 6, 9].into_iter().map(|id| exposures.of(id)).collect();

@@ -18,8 +18,8 @@ use raysweep_core::{
     MirrorProgress, Tilt,
 };
 
-use self::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, parse_response};
-use self::stream::Stream;
+use self::protocol::{FIFO_SAMPLES, PADDING, PlayzerXCommand, PlayzerXReply, SAMPLE_BYTES, parse_response};
+use self::stream::SampleStream;
 use super::error::{DEVICE, fault};
 use super::light::LightGuard;
 use super::rules;
@@ -74,7 +74,7 @@ enum Phase {
     /// At the first point of this path, dark, FIFO empty.
     Ready(MirrorPath),
     /// Samples are being played.
-    Moving(Box<Stream>),
+    Moving(Box<SampleStream>),
 }
 
 impl PlayzerX {
@@ -122,8 +122,8 @@ impl PlayzerX {
         self.state.write(&self.state(rate_hz, Some(sequence.clone()))?).map_err(of_state)
     }
 
-    fn stream(&self, sequence: Sequence, rate_hz: f64) -> Box<Stream> {
-        Box::new(Stream::new(sequence, rate_hz, self.config.full_scale))
+    fn stream(&self, sequence: Sequence, rate_hz: f64) -> Box<SampleStream> {
+        Box::new(SampleStream::new(sequence, rate_hz, self.config.full_scale))
     }
 
     /// Sends a sequence and waits until it is played; returns the measured rate.
@@ -169,7 +169,7 @@ impl PlayzerX {
             ));
         }
         let mut set_rate = Vec::new();
-        Command::SetRate(rate_hz as u32).to_bytes(&mut set_rate);
+        PlayzerXCommand::SetRate(rate_hz as u32).to_bytes(&mut set_rate);
         self.port.send(&set_rate)?;
         let sequence = Sequence::approach(Tilt::ORIGIN, path.at(0).tilt, rate_hz, &limits);
         self.record(&sequence, rate_hz)?;
@@ -262,12 +262,12 @@ impl Drop for PlayzerX {
 /// Completes a frame that a cut-off write may have left on the wire, and asks for the controller's description.
 fn hello(port: &mut Port) -> Result<String, DeviceError> {
     let mut bytes = PADDING.to_vec();
-    Command::SetReport(0).to_bytes(&mut bytes);
-    Command::Info.to_bytes(&mut bytes);
+    PlayzerXCommand::SetReport(0).to_bytes(&mut bytes);
+    PlayzerXCommand::Info.to_bytes(&mut bytes);
     for _ in 0..3 {
         port.send(&bytes)?;
         let info = port.await_reply(REPLY_WAIT, parse_response, |reply| match reply {
-            Reply::Info { device, firmware, format } => Some((device, firmware, format)),
+            PlayzerXReply::Info { device, firmware, format } => Some((device, firmware, format)),
             _ => None,
         })?;
         match info {
@@ -292,7 +292,7 @@ fn hello(port: &mut Port) -> Result<String, DeviceError> {
 /// Queries the samples left up to three times, waiting `timeout` each time.
 fn samples_left(port: &mut Port, timeout: Duration) -> Result<Option<u32>, DeviceError> {
     let mut question = Vec::new();
-    Command::SamplesLeft.to_bytes(&mut question);
+    PlayzerXCommand::SamplesLeft.to_bytes(&mut question);
     for _ in 0..3 {
         port.send(&question)?;
         if let Some(left) = port.await_reply(timeout, parse_response, left_of)? {
@@ -302,9 +302,9 @@ fn samples_left(port: &mut Port, timeout: Duration) -> Result<Option<u32>, Devic
     Ok(None)
 }
 
-fn left_of(reply: Reply) -> Option<u32> {
+fn left_of(reply: PlayzerXReply) -> Option<u32> {
     match reply {
-        Reply::Left(left) => Some(left),
+        PlayzerXReply::Left(left) => Some(left),
         _ => None,
     }
 }
@@ -313,7 +313,7 @@ fn left_of(reply: Reply) -> Option<u32> {
 fn darken(port: &mut Port, place: Tilt, full_scale: MechanicalDeg) -> Result<(), DeviceError> {
     let mut bytes = Vec::new();
     let point = raysweep_core::MirrorPoint { tilt: place, light: 0 };
-    Command::Sample(protocol::Sample::of(point, full_scale)).to_bytes(&mut bytes);
+    PlayzerXCommand::Sample(protocol::Sample::of(point, full_scale)).to_bytes(&mut bytes);
     port.send(&bytes)
 }
 
@@ -333,7 +333,7 @@ pub(super) fn recover(
     let Some(left) = left else {
         // The reset switches off light and drive; the mirror springs back, damped by the drive's own filter.
         let mut bytes = PADDING.to_vec();
-        Command::Reset.to_bytes(&mut bytes);
+        PlayzerXCommand::Reset.to_bytes(&mut bytes);
         port.send(&bytes)?;
         std::thread::sleep(RESET_WAIT);
         return Ok(None);
@@ -345,13 +345,17 @@ pub(super) fn recover(
     let sequence = Sequence::travel(place, Tilt::ORIGIN, state.rate_hz, &state.limits);
     let travelling = MirrorState { playing: Some(sequence.clone()), ..state.clone() };
     file.write(&travelling).map_err(of_state)?;
-    let mut stream = Stream::new(sequence, state.rate_hz, *full_scale);
+    let mut stream = SampleStream::new(sequence, state.rate_hz, *full_scale);
     play_out(&mut stream, &mut port, Some(file))?;
     Ok(Some(place))
 }
 
 /// Sends samples and reads replies until all are played.
-fn play_out(stream: &mut Stream, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
+fn play_out(
+    stream: &mut SampleStream,
+    port: &mut Port,
+    record: Option<&StateFile>,
+) -> Result<(), DeviceError> {
     loop {
         stream.step(port, record)?;
         if stream.is_played() {

@@ -43,7 +43,7 @@ impl Sample {
 
 /// A command to the controller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Command {
+pub enum PlayzerXCommand {
     /// Appends one sample with its light to the FIFO.
     Sample(Sample),
     /// Sets the sample rate, 50..=50,000 samples per second.
@@ -62,7 +62,7 @@ pub enum Command {
     Reset,
 }
 
-impl Command {
+impl PlayzerXCommand {
     /// Appends the bytes of the command.
     pub fn to_bytes(self, out: &mut Vec<u8>) {
         let mut frame = |command: u8, data: &[u8]| {
@@ -88,7 +88,7 @@ impl Command {
 
 /// A reply from the controller.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Reply {
+pub enum PlayzerXReply {
     /// Answer to a ping.
     Alive,
     /// Its description.
@@ -105,7 +105,7 @@ pub enum Reply {
 }
 
 /// Parses the reply at the start of `bytes`.
-pub fn parse_response(bytes: &[u8]) -> Parsed<Reply> {
+pub fn parse_response(bytes: &[u8]) -> Parsed<PlayzerXReply> {
     const PREFIX: &[u8] = b"pl-";
     let begun = bytes.len().min(PREFIX.len());
     if bytes[..begun] != PREFIX[..begun] {
@@ -125,7 +125,7 @@ pub fn parse_response(bytes: &[u8]) -> Parsed<Reply> {
         return Parsed::Incomplete;
     }
     if begins_with(b"ok\n") {
-        return Parsed::Reply { reply: Reply::Alive, used: PREFIX.len() + 3 };
+        return Parsed::Reply { reply: PlayzerXReply::Alive, used: PREFIX.len() + 3 };
     }
     if begins_with(b"info\n") {
         return match said.len() {
@@ -134,13 +134,13 @@ pub fn parse_response(bytes: &[u8]) -> Parsed<Reply> {
         };
     }
     match u32::from_le_bytes([said[0], said[1], said[2], 0]) {
-        left @ 0..=FIFO_SAMPLES => Parsed::Reply { reply: Reply::Left(left), used: PREFIX.len() + 3 },
+        left @ 0..=FIFO_SAMPLES => Parsed::Reply { reply: PlayzerXReply::Left(left), used: PREFIX.len() + 3 },
         _ => Parsed::Garbage { used: PREFIX.len() },
     }
 }
 
 /// Parses the three lines after `pl-info`, which took `before` bytes.
-fn description(mut bytes: &[u8], before: usize) -> Parsed<Reply> {
+fn description(mut bytes: &[u8], before: usize) -> Parsed<PlayzerXReply> {
     let mut lines = [const { String::new() }; 3];
     let mut used = before;
     for line in &mut lines {
@@ -158,7 +158,7 @@ fn description(mut bytes: &[u8], before: usize) -> Parsed<Reply> {
         }
     }
     let [device, firmware, format] = lines;
-    Parsed::Reply { reply: Reply::Info { device, firmware, format }, used }
+    Parsed::Reply { reply: PlayzerXReply::Info { device, firmware, format }, used }
 }
 
 #[cfg(test)]
@@ -167,7 +167,7 @@ mod tests {
 
     use super::*;
 
-    fn bytes(command: Command) -> Vec<u8> {
+    fn bytes(command: PlayzerXCommand) -> Vec<u8> {
         let mut out = Vec::new();
         command.to_bytes(&mut out);
         out
@@ -175,15 +175,15 @@ mod tests {
 
     #[test]
     fn commands_are_the_documented_bytes() {
-        let sample = Command::Sample(Sample { x: 0xABC, y: 0x123, light: 0x7F });
+        let sample = PlayzerXCommand::Sample(Sample { x: 0xABC, y: 0x123, light: 0x7F });
         assert_eq!(bytes(sample), [b'p', b'l', b'd', 9, 0xBC, 0xA3, 0x12, 0x7F, 10]);
-        assert_eq!(bytes(Command::SetRate(39_000)), [b'p', b'l', b'r', 8, 0x58, 0x98, 0x00, 10]);
-        assert_eq!(bytes(Command::SetReport(1000)), [b'p', b'l', b'u', 7, 0xE8, 0x03, 10]);
-        assert_eq!(bytes(Command::Clear), b"plc\x05\n");
-        assert_eq!(bytes(Command::Ping), b"plp\x05\n");
-        assert_eq!(bytes(Command::Info), b"pln\x05\n");
-        assert_eq!(bytes(Command::SamplesLeft), b"plg\x05\n");
-        assert_eq!(bytes(Command::Reset), b"plb\x06\xEE\n");
+        assert_eq!(bytes(PlayzerXCommand::SetRate(39_000)), [b'p', b'l', b'r', 8, 0x58, 0x98, 0x00, 10]);
+        assert_eq!(bytes(PlayzerXCommand::SetReport(1000)), [b'p', b'l', b'u', 7, 0xE8, 0x03, 10]);
+        assert_eq!(bytes(PlayzerXCommand::Clear), b"plc\x05\n");
+        assert_eq!(bytes(PlayzerXCommand::Ping), b"plp\x05\n");
+        assert_eq!(bytes(PlayzerXCommand::Info), b"pln\x05\n");
+        assert_eq!(bytes(PlayzerXCommand::SamplesLeft), b"plg\x05\n");
+        assert_eq!(bytes(PlayzerXCommand::Reset), b"plb\x06\xEE\n");
     }
 
     #[test]
@@ -201,16 +201,17 @@ mod tests {
 
     #[test]
     fn replies_are_told_from_each_other_and_from_garbage() {
-        let whole = |bytes: &[u8], reply: Reply| {
+        let whole = |bytes: &[u8], reply: PlayzerXReply| {
             for cut in 0..bytes.len() {
                 assert_eq!(parse_response(&bytes[..cut]).clone_kind(), "incomplete", "cut after {cut}");
             }
             assert_eq!(parse_response(bytes), Parsed::Reply { reply, used: bytes.len() });
         };
-        whole(b"pl-ok\n", Reply::Alive);
-        whole(b"pl-\x48\xE8\x01", Reply::Left(125_000));
-        whole(b"pl-\x00\x00\x00", Reply::Left(0));
-        let info = Reply::Info { device: "PX1-G".into(), firmware: "2.1".into(), format: "XYM".into() };
+        whole(b"pl-ok\n", PlayzerXReply::Alive);
+        whole(b"pl-\x48\xE8\x01", PlayzerXReply::Left(125_000));
+        whole(b"pl-\x00\x00\x00", PlayzerXReply::Left(0));
+        let info =
+            PlayzerXReply::Info { device: "PX1-G".into(), firmware: "2.1".into(), format: "XYM".into() };
         whole(b"pl-info\nPX1-G\n2.1\nXYM\n", info);
         assert_eq!(parse_response(b"pl-\xFF\xFF\x7F"), Parsed::Garbage { used: 3 });
         assert_eq!(parse_response(b"xyzpl-ok\n"), Parsed::Garbage { used: 3 });

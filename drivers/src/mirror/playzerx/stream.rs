@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorProgress, Tilt};
 
 use super::REPLY_WAIT;
-use super::protocol::{Command, FIFO_SAMPLES, PADDING, Reply, SAMPLE_BYTES, Sample, parse_response};
+use super::protocol::{
+    FIFO_SAMPLES, PADDING, PlayzerXCommand, PlayzerXReply, SAMPLE_BYTES, Sample, parse_response,
+};
 use crate::mirror::error::fault;
 use crate::mirror::sequence::Sequence;
 use crate::mirror::state::{Sent, StateFile, of_state};
@@ -30,7 +32,7 @@ const QUIET: Duration = Duration::from_millis(3);
 const QUESTIONS: usize = 3;
 
 /// A sequence being played.
-pub struct Stream {
+pub struct SampleStream {
     sequence: Sequence,
     asked_rate_hz: f64,
     full_scale: MechanicalDeg,
@@ -55,7 +57,7 @@ pub struct Stream {
     pub light_checked: Instant,
 }
 
-impl Stream {
+impl SampleStream {
     /// The FIFO must be empty.
     pub fn new(sequence: Sequence, rate_hz: f64, full_scale: MechanicalDeg) -> Self {
         let now = Instant::now();
@@ -83,7 +85,7 @@ impl Stream {
     pub fn step(&mut self, port: &mut Port, record: Option<&StateFile>) -> Result<(), DeviceError> {
         let looked = Instant::now();
         while let Some(reply) = port.reply(parse_response)? {
-            if let Reply::Left(left) = reply {
+            if let PlayzerXReply::Left(left) = reply {
                 self.take_answer(u64::from(left))?;
             }
         }
@@ -113,11 +115,11 @@ impl Stream {
         let samples = room.min(WRITE_SAMPLES).min(self.sequence.len() - self.next);
         for index in self.next..self.next + samples {
             let sample = Sample::of(self.sequence.at(index), self.full_scale);
-            Command::Sample(sample).to_bytes(&mut self.out);
+            PlayzerXCommand::Sample(sample).to_bytes(&mut self.out);
         }
         self.next += samples;
         if self.question.is_none() && (is_in_doubt || self.asked.elapsed() >= ASK_EVERY) {
-            Command::SamplesLeft.to_bytes(&mut self.out);
+            PlayzerXCommand::SamplesLeft.to_bytes(&mut self.out);
         }
         !self.out.is_empty()
     }
@@ -270,9 +272,9 @@ impl Stream {
 /// answers the ping after the queries, it has processed them, and their answers are lost.
 pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceError> {
     let mut bytes = PADDING.to_vec();
-    (0..QUESTIONS).for_each(|_| Command::SamplesLeft.to_bytes(&mut bytes));
-    Command::Clear.to_bytes(&mut bytes);
-    Command::Ping.to_bytes(&mut bytes);
+    (0..QUESTIONS).for_each(|_| PlayzerXCommand::SamplesLeft.to_bytes(&mut bytes));
+    PlayzerXCommand::Clear.to_bytes(&mut bytes);
+    PlayzerXCommand::Ping.to_bytes(&mut bytes);
     port.send(&bytes)?;
     let (mut answers, mut last) = (0, None);
     loop {
@@ -280,9 +282,9 @@ pub fn halt(port: &mut Port, unanswered: usize) -> Result<Option<u32>, DeviceErr
         let known = last.filter(|_| answers > unanswered);
         let wait = if known.is_some() { QUIET } else { HALT_WAIT };
         match port.await_reply(wait, parse_response, Some)? {
-            Some(Reply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
-            Some(Reply::Info { .. }) => {}
-            Some(Reply::Alive) | None => return Ok(known),
+            Some(PlayzerXReply::Left(left)) => (answers, last) = (answers + 1, Some(left)),
+            Some(PlayzerXReply::Info { .. }) => {}
+            Some(PlayzerXReply::Alive) | None => return Ok(known),
         }
     }
 }

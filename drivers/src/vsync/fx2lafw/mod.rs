@@ -25,7 +25,7 @@ pub use usb::Usb;
 const STALL: Duration = Duration::from_millis(1000);
 
 /// The way to an analyser that samples.
-pub trait Link: Send {
+pub trait AnalyserLink: Send {
     /// Passes the next samples to `take`, with their arrival time on the host's clock. Does nothing if none arrived
     /// within `timeout`.
     ///
@@ -101,7 +101,7 @@ fn checked(config: &Fx2LafwConfig) -> Result<SampleRate, DeviceError> {
         .ok_or_else(|| refused(format!("sample_rate_hz = {}: no such rate", config.sample_rate_hz)))
 }
 
-impl<L: Link> Fx2Lafw<L> {
+impl<L: AnalyserLink> Fx2Lafw<L> {
     /// Uses an analyser that samples according to `config`.
     ///
     /// # Errors
@@ -189,7 +189,7 @@ impl Signals {
     }
 }
 
-impl<L: Link> Vsync for Fx2Lafw<L> {
+impl<L: AnalyserLink> Vsync for Fx2Lafw<L> {
     fn next_edge(&mut self, timeout: Duration) -> Result<Option<Edge>, DeviceError> {
         let deadline = Instant::now() + timeout;
         loop {

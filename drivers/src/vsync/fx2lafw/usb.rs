@@ -7,7 +7,7 @@ use nusb::transfer::{Bulk, Completion, ControlIn, ControlOut, ControlType, In, R
 use nusb::{Endpoint, Interface, MaybeFuture};
 use raysweep_core::{Clock, DeviceError, DeviceErrorKind};
 
-use super::Link;
+use super::AnalyserLink;
 use super::protocol::{
     CPUCS, FIRMWARE_BYTES, MAJOR, SAMPLES, START, SampleRate, VERSION, WRITE_BYTES, WRITE_RAM,
 };
@@ -118,7 +118,7 @@ impl Usb {
     }
 }
 
-impl Link for Usb {
+impl AnalyserLink for Usb {
     fn receive(&mut self, timeout: Duration, take: &mut dyn FnMut(&[u8], i64)) -> Result<(), DeviceError> {
         let Some(completion) = self.endpoint.wait_next_complete(timeout) else { return Ok(()) };
         let arrived_ns = self.clock.now_ns();

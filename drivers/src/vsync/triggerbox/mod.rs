@@ -14,7 +14,9 @@ use raysweep_core::{
     Clock, ClockModel, ClockQuality, DeviceError, DeviceErrorKind, Edge, RoundTrip, Vsync, ns_from_us,
 };
 
-use self::protocol::{Command, QUESTION_BYTES, REPLY_BYTES, Reply, Timer, VERSION, parse_reply};
+use self::protocol::{
+    QUESTION_BYTES, REPLY_BYTES, TriggerBoxCommand, TriggerBoxReply, TriggerBoxTimer, VERSION, parse_reply,
+};
 use super::DEVICE;
 use crate::serial::port::Port;
 
@@ -69,7 +71,7 @@ enum TriggerBoxError {
 /// A triggerbox.
 pub struct TriggerBox {
     config: TriggerBoxConfig,
-    timer: Timer,
+    timer: TriggerBoxTimer,
     port: Port,
     clock: Clock,
     stage: Stage,
@@ -125,7 +127,7 @@ impl TriggerBox {
     /// # Errors
     /// As [`Self::open`], except for a box that does not answer.
     pub fn connect(config: TriggerBoxConfig, period_us: f64) -> Result<Self, DeviceError> {
-        let Some(timer) = Timer::with_period_us(period_us) else {
+        let Some(timer) = TriggerBoxTimer::with_period_us(period_us) else {
             let error = TriggerBoxError::Period(period_us);
             return Err(DeviceError::new(DEVICE, DeviceErrorKind::OutOfRange, error));
         };
@@ -142,16 +144,18 @@ impl TriggerBox {
         let Stage::Greeting { asked } = &mut self.stage else { return Ok(()) };
         if asked.is_none_or(|asked| asked.elapsed() >= HELLO_EVERY) {
             *asked = Some(Instant::now());
-            self.port.send(&Command::Version.to_bytes())?;
+            self.port.send(&TriggerBoxCommand::Version.to_bytes())?;
         }
         let version = self.port.await_reply(timeout, parse_reply, |reply| match reply {
-            Reply::Version(version) => Some(version),
-            Reply::Time { .. } => None,
+            TriggerBoxReply::Version(version) => Some(version),
+            TriggerBoxReply::Time { .. } => None,
         })?;
         match version {
             None => Ok(()),
             Some(VERSION) => {
-                for command in [Command::Stop, Command::Period(self.timer), Command::Start] {
+                for command in
+                    [TriggerBoxCommand::Stop, TriggerBoxCommand::Period(self.timer), TriggerBoxCommand::Start]
+                {
                     self.port.send(&command.to_bytes())?;
                 }
                 self.stage = Stage::Running(Running::new());
@@ -175,7 +179,7 @@ impl TriggerBox {
             running.number = running.number.wrapping_add(1);
             running.next_question = Instant::now() + ASK_EVERY[usize::from(running.trips >= MIN_ROUND_TRIPS)];
             running.asked_ns = Some(self.clock.now_ns());
-            self.port.send(&Command::Time(running.number).to_bytes())?;
+            self.port.send(&TriggerBoxCommand::Time(running.number).to_bytes())?;
         }
         let wait = Duration::from_nanos(u64::try_from(until_ns - now_ns).unwrap_or(0));
         if running.asked_ns.is_none() {
@@ -186,7 +190,7 @@ impl TriggerBox {
         self.port.wait(wait.min(ANSWER_WAIT))?;
         let receive_ns = self.clock.now_ns();
         while let Some(reply) = self.port.reply(parse_reply)? {
-            let Reply::Time { number, pulses, ticks } = reply else { continue };
+            let TriggerBoxReply::Time { number, pulses, ticks } = reply else { continue };
             if number == running.number
                 && let Some(asked_ns) = running.asked_ns.take()
             {
@@ -227,7 +231,13 @@ impl Running {
     }
 
     /// Adds a reply to the fit if its time is unambiguous.
-    fn take(&mut self, timer: Timer, pulses: u32, ticks: u16, (request_ns, receive_ns): (i64, i64)) {
+    fn take(
+        &mut self,
+        timer: TriggerBoxTimer,
+        pulses: u32,
+        ticks: u16,
+        (request_ns, receive_ns): (i64, i64),
+    ) {
         if !timer.is_counted(ticks) || receive_ns < request_ns {
             return;
         }
@@ -251,7 +261,7 @@ impl Running {
     }
 
     /// The next pulse to report and when it began, or will begin.
-    fn next_edge(&self, timer: Timer) -> Option<Edge> {
+    fn next_edge(&self, timer: TriggerBoxTimer) -> Option<Edge> {
         if self.trips < MIN_ROUND_TRIPS {
             return None;
         }

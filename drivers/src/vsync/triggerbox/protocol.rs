@@ -17,7 +17,7 @@ const PAYLOAD_BYTES: u8 = 7;
 
 /// A command from the host.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Command {
+pub enum TriggerBoxCommand {
     /// Requests the firmware version.
     Version,
     /// Requests the time. The reply repeats the number.
@@ -27,10 +27,10 @@ pub enum Command {
     /// Starts the timer.
     Start,
     /// Sets the timer's period.
-    Period(Timer),
+    Period(TriggerBoxTimer),
 }
 
-impl Command {
+impl TriggerBoxCommand {
     /// The bytes of the command.
     pub fn to_bytes(self) -> Vec<u8> {
         match self {
@@ -38,7 +38,7 @@ impl Command {
             Self::Time(number) => vec![b'P', number],
             Self::Stop => b"S0".to_vec(),
             Self::Start => b"S1".to_vec(),
-            Self::Period(Timer { top, prescaler }) => {
+            Self::Period(TriggerBoxTimer { top, prescaler }) => {
                 let [low, high] = top.to_le_bytes();
                 vec![b'T', b'=', low, high, prescaler.key()]
             }
@@ -48,7 +48,7 @@ impl Command {
 
 /// The box's timer: it counts from 0 to `top` and starts again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Timer {
+pub struct TriggerBoxTimer {
     /// The last value.
     pub top: u16,
     /// The counting rate.
@@ -81,7 +81,7 @@ impl Prescaler {
     }
 }
 
-impl Timer {
+impl TriggerBoxTimer {
     /// The timer with the nearest period; `None` if the period is too short or too long.
     pub fn with_period_us(period_us: f64) -> Option<Self> {
         let timer = |prescaler: Prescaler| {
@@ -115,7 +115,7 @@ const PULSE_TICKS: u16 = 1000;
 
 /// A reply from the box.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reply {
+pub enum TriggerBoxReply {
     /// Its firmware version.
     Version(u8),
     /// Its time.
@@ -130,7 +130,7 @@ pub enum Reply {
 }
 
 /// Parses the reply at the start of `bytes`.
-pub fn parse_reply(bytes: &[u8]) -> Parsed<Reply> {
+pub fn parse_reply(bytes: &[u8]) -> Parsed<TriggerBoxReply> {
     let is_head = |bytes: &[u8]| matches!(bytes, [b'P' | b'V', PAYLOAD_BYTES, ..] | [b'P' | b'V'] | []);
     if !is_head(bytes) {
         let used = (1..bytes.len()).find(|&start| is_head(&bytes[start..])).unwrap_or(bytes.len());
@@ -142,8 +142,8 @@ pub fn parse_reply(bytes: &[u8]) -> Parsed<Reply> {
         return Parsed::Garbage { used: 1 };
     }
     let reply = match head {
-        b'V' => Reply::Version(first),
-        _ => Reply::Time {
+        b'V' => TriggerBoxReply::Version(first),
+        _ => TriggerBoxReply::Time {
             number: first,
             pulses: u32::from_le_bytes([p0, p1, p2, p3]),
             ticks: u16::from_le_bytes([t0, t1]),
@@ -158,30 +158,36 @@ mod tests {
 
     #[test]
     fn words_are_the_firmware_s() {
-        assert_eq!(Command::Version.to_bytes(), b"V?");
-        assert_eq!(Command::Time(7).to_bytes(), [b'P', 7]);
-        assert_eq!((Command::Stop.to_bytes(), Command::Start.to_bytes()), (b"S0".to_vec(), b"S1".to_vec()));
-        let timer = Timer { top: 0x3433, prescaler: Prescaler::By64 };
-        assert_eq!(Command::Period(timer).to_bytes(), b"T=342");
+        assert_eq!(TriggerBoxCommand::Version.to_bytes(), b"V?");
+        assert_eq!(TriggerBoxCommand::Time(7).to_bytes(), [b'P', 7]);
+        assert_eq!(
+            (TriggerBoxCommand::Stop.to_bytes(), TriggerBoxCommand::Start.to_bytes()),
+            (b"S0".to_vec(), b"S1".to_vec())
+        );
+        let timer = TriggerBoxTimer { top: 0x3433, prescaler: Prescaler::By64 };
+        assert_eq!(TriggerBoxCommand::Period(timer).to_bytes(), b"T=342");
     }
 
     #[test]
     fn periods_are_counted_as_finely_as_they_can_be() {
-        let timer = Timer::with_period_us(16_666.667).unwrap();
-        assert_eq!(timer, Timer { top: 33_332, prescaler: Prescaler::By8 });
+        let timer = TriggerBoxTimer::with_period_us(16_666.667).unwrap();
+        assert_eq!(timer, TriggerBoxTimer { top: 33_332, prescaler: Prescaler::By8 });
         assert_eq!(timer.device_ns(2, 5), (2 * 33_333 + 5) * 500);
-        assert_eq!(Timer::with_period_us(40_000.0).unwrap(), Timer { top: 9999, prescaler: Prescaler::By64 });
-        assert_eq!(Timer::with_period_us(32_768.0).unwrap().top, 65_535);
-        assert!([0.0, 1000.0, 1e6, f64::NAN].iter().all(|&us| Timer::with_period_us(us).is_none()));
+        assert_eq!(
+            TriggerBoxTimer::with_period_us(40_000.0).unwrap(),
+            TriggerBoxTimer { top: 9999, prescaler: Prescaler::By64 }
+        );
+        assert_eq!(TriggerBoxTimer::with_period_us(32_768.0).unwrap().top, 65_535);
+        assert!([0.0, 1000.0, 1e6, f64::NAN].iter().all(|&us| TriggerBoxTimer::with_period_us(us).is_none()));
     }
 
     #[test]
     fn replies_are_read_and_all_else_is_garbage() {
         let time = [b'P', 7, 3, 1, 0, 0, 0, 2, 0, 6];
-        let reply = Reply::Time { number: 3, pulses: 1, ticks: 2 };
+        let reply = TriggerBoxReply::Time { number: 3, pulses: 1, ticks: 2 };
         assert_eq!(parse_reply(&time), Parsed::Reply { reply, used: 10 });
         let version = [b'V', 7, 14, 0, 0, 0, 0, 0, 0, 14];
-        assert_eq!(parse_reply(&version), Parsed::Reply { reply: Reply::Version(14), used: 10 });
+        assert_eq!(parse_reply(&version), Parsed::Reply { reply: TriggerBoxReply::Version(14), used: 10 });
         for length in 0..10 {
             assert_eq!(parse_reply(&time[..length]), Parsed::Incomplete, "{length}");
         }

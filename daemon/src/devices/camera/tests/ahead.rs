@@ -103,7 +103,7 @@ fn frames_that_are_held_up_on_their_way_keep_their_settings() {
 
 #[test]
 fn settings_that_stamps_tell_apart() {
-    let line = |plan: &[CameraSettings]| Line::new(16_666.667, 50.0, plan);
+    let line = |plan: &[CameraSettings]| TriggerLine::new(16_666.667, 50.0, plan);
     let tells = |plan: &[CameraSettings]| line(plan).distinct;
     assert!(tells(&plan()));
     assert!(!tells(&[settings(100.0, 600.0), settings(149.0, 600.0)]));
@@ -116,7 +116,7 @@ fn settings_that_stamps_tell_apart() {
 fn a_frame_whose_stamps_leave_a_doubt_is_nobodys() {
     // Frame 1 has the first settings; frames 2 to 4 may have the second already.
     let owner = |second: CameraSettings, shown: CameraSettings, chunk: bool| {
-        let mut ahead = Ahead::new(capabilities(), Line::new(PERIOD_NS as f64 * 1e-3, 50.0, &plan()));
+        let mut ahead = Ahead::new(capabilities(), TriggerLine::new(PERIOD_NS as f64 * 1e-3, 50.0, &plan()));
         let see = |seq: u64, settings: CameraSettings, ahead: &mut Ahead| {
             let start_us = LATENCY_US + settings.trigger_delay_us;
             let start_ns = seq as i64 * PERIOD_NS + ns_from_us(start_us);

@@ -5,8 +5,8 @@ use std::io;
 use nix::libc::ENOTTY;
 use raysweep_core::{CameraCapabilities, CameraSettings, DeviceError, DeviceErrorKind, PixelFormat, Shutter};
 
-use super::controls::{ControlError, Controls, Timer};
-use super::node::{FLAG_ERROR, Filled, Format, Identity, Node, Opener};
+use super::controls::{ControlError, Controls, TimedControl};
+use super::node::{FLAG_ERROR, Filled, Format, Identity, Node, NodeOpener};
 use super::setup::V4l2Setup;
 use super::{error, fourcc, kernel_error, kernel_error_at};
 
@@ -37,18 +37,18 @@ impl Layout {
 }
 
 /// An open node, ready to stream.
-pub(super) struct Session {
+pub(super) struct OpenNode {
     pub(super) node: Box<dyn Node>,
     identity: Identity,
     layout: Layout,
     buffers: u32,
     row_time_us: f64,
-    exposure: Timer,
-    trigger_delay: Option<Timer>,
+    exposure: TimedControl,
+    trigger_delay: Option<TimedControl>,
 }
 
-impl Session {
-    pub(super) fn open(opener: &mut dyn Opener, setup: &V4l2Setup) -> Result<Box<Self>, DeviceError> {
+impl OpenNode {
+    pub(super) fn open(opener: &mut dyn NodeOpener, setup: &V4l2Setup) -> Result<Box<Self>, DeviceError> {
         let config = &setup.config;
         let at = |cause| kernel_error_at(&config.device.display().to_string(), cause);
         let mut node = opener.open(&config.device).map_err(at)?;
@@ -111,7 +111,7 @@ impl Session {
             readout_us: f64::from(config.height) * self.row_time_us,
             readout: config.readout,
             exposure_us: self.exposure.range_us(),
-            trigger_delay_us: self.trigger_delay.as_ref().map_or(0.0..=0.0, Timer::range_us),
+            trigger_delay_us: self.trigger_delay.as_ref().map_or(0.0..=0.0, TimedControl::range_us),
         }
     }
 
