@@ -1,6 +1,7 @@
 //! The table of all methods, and its description for programs.
 
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::generate::SchemaSettings;
+use schemars::{JsonSchema, Schema};
 use serde::{Deserialize, Serialize};
 
 use crate::live::{self, LiveLayout};
@@ -60,11 +61,16 @@ struct Row {
 }
 
 const fn row<P: JsonSchema, R: JsonSchema>(name: &'static str, role: Role, about: &'static str) -> Row {
-    Row { name, role, about, params: schema::<P>, result: schema::<R> }
+    Row { name, role, about, params: accepted::<P>, result: sent::<R> }
 }
 
-fn schema<T: JsonSchema>() -> Schema {
-    SchemaGenerator::default().into_root_schema_for::<T>()
+fn accepted<T: JsonSchema>() -> Schema {
+    SchemaSettings::default().into_generator().into_root_schema_for::<T>()
+}
+
+/// Requires fields that a reader does without: answers of earlier daemons lack them.
+fn sent<T: JsonSchema>() -> Schema {
+    SchemaSettings::default().for_serialize().into_generator().into_root_schema_for::<T>()
 }
 
 impl Method {
@@ -207,7 +213,7 @@ pub fn describe(version: &str) -> Description {
     Description {
         version: version.into(),
         methods: methods.into(),
-        event: schema::<Event>(),
+        event: sent::<Event>(),
         errors: error_codes(),
         limits: LimitsInfo { message_bytes: MAX_MESSAGE_BYTES, clients: MAX_CLIENTS },
         live: live::layout(),
@@ -216,7 +222,7 @@ pub fn describe(version: &str) -> Description {
 
 /// Names and meanings come from the schema that the type derives, so that no code can be missing here.
 fn error_codes() -> Vec<ErrorInfo> {
-    let schema = schema::<ErrorCode>();
+    let schema = sent::<ErrorCode>();
     let variants = schema.get("oneOf").and_then(|variants| variants.as_array());
     let info = |variant: &serde_json::Value| {
         let name = ErrorCode::deserialize(variant.get("const")?).ok()?;
@@ -259,6 +265,8 @@ mod tests {
         let run = methods.iter().find(|method| method["name"] == "run").unwrap();
         assert_eq!(run["params"]["required"], json!(["plan"]));
         assert_eq!(run["params"]["additionalProperties"], false);
+        let counts = &description["event"]["$defs"]["Counts"];
+        assert!(counts["required"].as_array().unwrap().contains(&json!("lost")), "{counts}");
 
         let codes = describe("1").errors;
         assert_eq!(codes.len(), 14, "a code without a doc comment would be left out");
