@@ -1,11 +1,13 @@
 //! What users read when the daemon or `raysweep process` refuses something. The tests assert kind and field of each
 //! refusal; the snapshots hold the messages.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
 use std::fmt::Write;
 
-use raysweep::{Probes, Runner};
 use raysweep::control::Control;
 use raysweep::rig::{AnyRig, RigError};
+use raysweep::{Probes, Runner};
 use raysweep_processing::{Asked, process, process_asked};
 use raysweep_proto::{ErrorCode, ResumeParams, RpcError, RunParams, describe};
 use raysweep_tests::{Bench, dots, rig_text};

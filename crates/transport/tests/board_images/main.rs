@@ -1,5 +1,7 @@
 //! Estimates of each pixel's properties from simulated images of the board, against the truth.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
 mod scene;
 
 use std::time::Instant;
