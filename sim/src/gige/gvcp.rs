@@ -113,11 +113,12 @@ impl<'a> GvcpRequest<'a> {
         }
     }
 
-    /// Starts an answer, to which the caller appends data; [`seal`] completes it.
+    /// Starts an answer, to which the caller appends data; [`seal`] completes it. Its code is the request's plus one,
+    /// which wraps for the last code, as any client may send it.
     pub fn answer(&self, status: GvcpStatus, reply: &mut Vec<u8>) {
         reply.clear();
         reply.extend_from_slice(&(status as u16).to_be_bytes());
-        reply.extend_from_slice(&(self.code + 1).to_be_bytes());
+        reply.extend_from_slice(&self.code.wrapping_add(1).to_be_bytes());
         reply.extend_from_slice(&[0; 2]);
         reply.extend_from_slice(&self.id.to_be_bytes());
     }

@@ -350,7 +350,7 @@ proptest! {
                 prop::collection::vec(any::<u8>(), 0..700),
                 // Datagrams that resemble requests reach more of the code.
                 (
-                    prop_oneof![Just(2_u16), Just(0x40), Just(0x80), Just(0x82), Just(0x84), Just(0x86), any::<u16>()],
+                    prop_oneof![Just(2_u16), Just(0x40), Just(0x80), Just(0x82), Just(0x84), Just(0x86), Just(0xFFFF), any::<u16>()],
                     any::<u8>(),
                     prop::collection::vec(
                         prop_oneof![any::<u32>(), 0_u32..0x1000, 0x1_0000_u32..0x1_0400, Just(0x10_0000), 0_u32..600],
