@@ -14,7 +14,8 @@ use raysweep_core::{
 use raysweep_sim::{PlaneDevices, PlaneRig, SubjectSwitch};
 use raysweep_tests::{data, rig_text};
 use raysweep_transport::plane::board::images::{
-    CappedFrames, CodedPictures, DarkFit, LightLevel, Phases, Responses, WhiteMap, locate_rows, photon_transfer,
+    CappedFrames, CodedPictures, DarkFit, LightLevel, Phases, Responses, WhiteMap, locate_rows,
+    photon_transfer,
 };
 use raysweep_transport::plane::board::times::{
     self, BoardFrame, BoardSetting, Coarse, Columns, Nominal, RowTimes, arrival_settings, check_settings,
@@ -53,8 +54,7 @@ impl Studio {
         });
         camera.arm().unwrap();
         let capabilities = camera.capabilities();
-        let (size, latency_us) =
-            ((capabilities.height, capabilities.width), capabilities.trigger_latency_us);
+        let (size, latency_us) = ((capabilities.height, capabilities.width), capabilities.trigger_latency_us);
         let pool = FramePool::new(1, size.0 * size.1 * 2);
         Self {
             camera: Some(camera),
@@ -159,8 +159,10 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     for exposure_us in [60.0, 600.0, 1200.0, WHOLE_US] {
         dark.push((exposure_us, studio.take(Shutter::Rolling, 8000.0, exposure_us, 16)));
     }
-    let runs: Vec<CappedFrames> =
-        dark.iter().map(|(exposure_us, frames)| CappedFrames { exposure_us: *exposure_us, frames: frames.view() }).collect();
+    let runs: Vec<CappedFrames> = dark
+        .iter()
+        .map(|(exposure_us, frames)| CappedFrames { exposure_us: *exposure_us, frames: frames.view() })
+        .collect();
     let dark = DarkFit::new(&runs).unwrap();
 
     let around_us = stated.raster.row_centre_us(stated.first_row) - 1600.0;
@@ -203,17 +205,18 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     let columns = Columns::new(responses.place.view(), responses.response.view()).unwrap();
     studio.show(Subject::Board, Some(&Pattern::White));
     let mut frames = Vec::new();
-    let mut shoot = |studio: &mut Studio, frames: &mut Vec<BoardFrame>, setting: BoardSetting, count: usize| {
-        let shutter = match setting.shutter {
-            times::Shutter::Global => Shutter::Global,
-            times::Shutter::Rolling => Shutter::Rolling,
+    let mut shoot =
+        |studio: &mut Studio, frames: &mut Vec<BoardFrame>, setting: BoardSetting, count: usize| {
+            let shutter = match setting.shutter {
+                times::Shutter::Global => Shutter::Global,
+                times::Shutter::Rolling => Shutter::Rolling,
+            };
+            for _ in 0..count {
+                let image = studio.mean(shutter, setting.delay_us, setting.exposure_us, 1);
+                let light = (image - dark.image(setting.exposure_us)) / &white.white_dn;
+                frames.push(BoardFrame { setting, light: columns.average(light.view()).unwrap() });
+            }
         };
-        for _ in 0..count {
-            let image = studio.mean(shutter, setting.delay_us, setting.exposure_us, 1);
-            let light = (image - dark.image(setting.exposure_us)) / &white.white_dn;
-            frames.push(BoardFrame { setting, light: columns.average(light.view()).unwrap() });
-        }
-    };
     for setting in sweep_settings(&nominal, columns.seen_rows()).unwrap() {
         shoot(studio, &mut frames, setting, 1);
     }
@@ -306,7 +309,8 @@ fn error(known: &Known, stated: &Stated, sweep: &[(f64, f64, Array2<f32>)], scen
     let transport = demux.solve(stack.view(), None).unwrap();
     // Rows far from all others of the plan are seen by few settings.
     let kept = -94..=94;
-    let found = transport.t.slice(s![(-94 - transport.u_min) as usize..=(94 - transport.u_min) as usize, .., ..]);
+    let found =
+        transport.t.slice(s![(-94 - transport.u_min) as usize..=(94 - transport.u_min) as usize, .., ..]);
     median_profile_error(found, relative_rows(scene, &kept).view())
 }
 

@@ -223,6 +223,9 @@ const MAX_ROWS: u64 = 8192;
 /// beyond this limit, a sweep would no longer cover the epipolar planes of all rows.
 const ROW_TIME_TOLERANCE: f64 = 0.05;
 
+/// The same for a projector with a flying spot.
+const SPOT_ROW_TIME_TOLERANCE: f64 = 0.01;
+
 impl RigFile {
     /// Reads a rig file.
     ///
@@ -360,6 +363,24 @@ impl RigFile {
         if self.sim.projector.spot != SimSpot::Uniform && camera.row_pitch != 1.0 {
             let message = "sim.projector.spot: flying spots are simulated for camera.row_pitch = 1 only; use \"uniform\"";
             document.refuse(&["sim", "projector", "spot"], message);
+        }
+        if projector.spot == SpotKind::Flying && camera.row_pitch.fract() != 0.0 {
+            let message = format!(
+                "projector.spot = \"flying\" with camera.row_pitch = {}: must be a whole number, because a flying spot is modelled only for camera rows that look at the middle of projector rows",
+                camera.row_pitch
+            );
+            document.refuse(&["projector", "spot"], message);
+        }
+        let drifts =
+            (self.camera_row_time_us() - self.pace_us()).abs() > SPOT_ROW_TIME_TOLERANCE * self.pace_us();
+        if projector.spot == SpotKind::Flying && is_paced && drifts {
+            let message = format!(
+                "projector.spot = \"flying\" with camera.row_time_us = {}: must be within {} % of camera.row_pitch x projector.row_time_us = {}, because otherwise the edges of nearly all exposures cross the direct row of some camera row",
+                self.camera_row_time_us(),
+                100.0 * SPOT_ROW_TIME_TOLERANCE,
+                self.pace_us()
+            );
+            document.refuse(&["projector", "spot"], message);
         }
         if let Some(row) = camera.first_projector_row.filter(|row| *row >= projector.rows) {
             let message = format!(

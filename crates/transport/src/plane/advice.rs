@@ -77,7 +77,7 @@ pub fn expected_error(
     noise: &Noise,
 ) -> Result<ExpectedError, PlaneError> {
     timing.check(settings)?;
-    let RowModel { slots, weights } = RowModel::of_middle(timing, settings, reach);
+    let RowModel { slots, weights } = RowModel::typical(timing, settings, reach, timing.camera_rows() / 2);
     let differences = prior.differences(&slots);
     let smoothness = differences.t().dot(&differences) * prior.alpha();
     let n = slots.len();
@@ -143,9 +143,8 @@ fn add_square(to: &mut Array2<f64>, factor: f64, x: &Array1<f64>) {
 
 /// The light that the pixel of [`ExpectedError`] collects with a setting.
 pub fn white_light(timing: &RowTiming, setting: &Setting) -> f64 {
-    let row = timing.camera_rows() / 2;
-    let weights = timing.weights(row, setting);
-    let own = weights[timing.camera().own_row(row)];
+    let (weights, own_row) = timing.typical_weights(timing.camera_rows() / 2, setting);
+    let own = weights[own_row];
     own + INDIRECT_PER_ROW * (weights.iter().sum::<f64>() - own)
 }
 

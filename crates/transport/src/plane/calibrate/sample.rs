@@ -3,7 +3,7 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, ArrayView3, Axis, concatenate, s};
 use rayon::prelude::*;
 
-use super::super::model::{ResponseClass, collected, drawn};
+use super::super::model::{ResponseClass, WIDEST_RESPONSE_SIGMA_ROWS, collected, drawn};
 use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Shares, Slot, reach};
 use super::problem::RowProblem;
 use super::{CalibrateError, SpikeMap};
@@ -253,7 +253,8 @@ impl SampledClass {
                 collected(self.ideal.row(n), shares, self.own_row + i64::from(self.slots[slot].u))
             });
         }
-        let beam = between_rows(beam_shares(beam_sigma_rows), self.fraction);
+        let is_wide = beam_sigma_rows > WIDEST_RESPONSE_SIGMA_ROWS;
+        let beam = between_rows(beam_shares(beam_sigma_rows), if is_wide { 0.0 } else { self.fraction });
         let projector_rows = self.ideal.ncols();
         let mut weights = Array2::zeros((self.ideal.nrows(), self.slots.len()));
         for (mut weights, slot) in weights.columns_mut().into_iter().zip(&self.slots) {

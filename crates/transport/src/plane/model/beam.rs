@@ -20,6 +20,10 @@ pub enum Beam {
 /// A Gaussian's tail is cut off after this many standard deviations: less than 1e-6 of the light is beyond.
 const TAIL_SIGMAS: f64 = 5.0;
 
+/// Standard deviation in rows up to which a response of 16 rows holds 98 % of a beam's light. Beyond it, half a row
+/// more or less hardly matters.
+pub(in super::super) const WIDEST_RESPONSE_SIGMA_ROWS: f64 = 3.0;
+
 impl Beam {
     /// A Gaussian beam, or the ideal beam for a standard deviation of 0.
     pub fn of_sigma(sigma_rows: f64) -> Self {
@@ -51,7 +55,8 @@ impl Beam {
         }
     }
 
-    /// The shares of the rows drawn around a row in its light, if a response is long enough for them.
+    /// `k(d)`: the shares of the rows drawn `d` rows below a row in that row's light. `None` for beams that are wider
+    /// than a response. The beam is symmetric, so its sign does not matter here.
     pub(super) fn shares(&self) -> Option<Shares> {
         let share = |d: f64| match *self {
             Self::Ideal => f64::from(u8::from(d == 0.0)),
@@ -59,8 +64,7 @@ impl Beam {
         };
         let shares: Shares = std::array::from_fn(|index| share(index as f64 + f64::from(FIRST_RESPONSE_ROW)));
         let total: f64 = shares.iter().sum();
-        let fits = TAIL_SIGMAS * self.sigma_rows() <= -f64::from(FIRST_RESPONSE_ROW);
-        fits.then(|| shares.map(|share| share / total))
+        (self.sigma_rows() <= WIDEST_RESPONSE_SIGMA_ROWS).then(|| shares.map(|share| share / total))
     }
 
     /// Converts the weights of the drawn rows to those of the scene's rows: `A' = A B`, for one row of `A`. Both have

@@ -4,14 +4,11 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
 use super::super::PlaneError;
-use super::response::{ResponseClass, collected};
+use super::response::{PLACE_STEPS, ResponseClass, collected};
 use super::{RowTiming, Setting};
 
 /// A row is an unknown if some setting collects at least this share of its dwell.
 pub const MIN_WEIGHT: f64 = 0.05;
-
-/// Steps of a pixel's measured place per projector row: pixels within one step share a model.
-const PLACE_STEPS: f32 = 32.0;
 
 /// The relative rows that a plan can estimate: the contiguous range of `u` whose largest weight over all settings and
 /// camera rows, in the frame that the delays refer to, is at least [`MIN_WEIGHT`].
@@ -105,13 +102,13 @@ impl RowModel {
             .collect()
     }
 
-    /// The model of the pixel in the middle of the image, as a typical one.
-    pub(in super::super) fn of_middle(
+    /// The model of the pixel in the middle of camera row `t`, as a typical one.
+    pub(in super::super) fn typical(
         timing: &RowTiming,
         settings: &[Setting],
         reach: &RangeInclusive<i32>,
+        t: usize,
     ) -> Self {
-        let t = timing.camera_rows() / 2;
         let Some(response) = timing.response() else { return Self::new(timing, settings, reach, t) };
         let (_, columns) = response.size();
         let middle = std::iter::once(columns / 2);
@@ -180,14 +177,16 @@ pub fn predict(
             expected: vec![rows.min(most_rows), timing.camera_rows(), columns],
         });
     }
+    timing.check_columns(columns)?;
     let mut image = Array2::zeros((camera_rows, columns));
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(t, mut image_row)| {
         let mut sum = vec![0.0; columns];
-        let weights = timing.weights(t, setting);
-        for (v, &weight) in weights[timing.first_row()..].iter().enumerate().take(rows) {
-            if weight > 0.0 {
-                let light = transport.slice(s![v, t, ..]);
-                sum.iter_mut().zip(light).for_each(|(sum, &light)| *sum += weight * f64::from(light));
+        for (weights, alike) in timing.pixel_weights(t, columns, setting) {
+            for (v, &weight) in weights[timing.first_row()..].iter().enumerate().take(rows) {
+                if weight > 0.0 {
+                    let light = transport.slice(s![v, t, ..]);
+                    alike.iter().for_each(|&column| sum[column] += weight * f64::from(light[column]));
+                }
             }
         }
         image_row.iter_mut().zip(sum).for_each(|(pixel, sum)| *pixel = sum as f32);

@@ -9,6 +9,7 @@ mod timing;
 mod transport;
 
 pub use beam::Beam;
+pub(super) use beam::WIDEST_RESPONSE_SIGMA_ROWS;
 pub(super) use forward::drawn;
 pub use forward::{MIN_WEIGHT, RowModel, Slot, SlotKind, predict, reach, relative_rows};
 pub use response::{FIRST_RESPONSE_ROW, PixelResponse, RESPONSE_ROWS, Shares};

@@ -11,8 +11,11 @@ pub const RESPONSE_ROWS: usize = 16;
 /// Row of index 0 of a response, relative to the pixel's own row: a response covers rows -7 to 8.
 pub const FIRST_RESPONSE_ROW: i32 = -7;
 
-/// Where each pixel looks, and how its direct light is divided among the rows drawn around that place, as a
-/// calibration measured it.
+/// Steps of a pixel's place per projector row: pixels within one step share a model.
+pub(super) const PLACE_STEPS: f32 = 32.0;
+
+/// Where each pixel looks, and how its direct light is divided among the rows drawn around that place (its line spread
+/// function over projector rows), as a calibration measured it.
 ///
 /// With it, relative rows count from the pixel's own row, the drawn row nearest to its place, and `T(u)` is the light
 /// that the pixel would receive from the place `u` rows below its own. Light that leaves the projector towards one
@@ -23,7 +26,11 @@ pub const FIRST_RESPONSE_ROW: i32 = -7;
 /// ```
 ///
 /// where `S_i(v)` is the share of row `v`'s dwell that falls inside exposure `i`. Direct light lies at `u = 0` by
-/// definition, whatever the shape of the beam and wherever the pixel looks between two rows.
+/// definition, whatever the shape of the beam and wherever the pixel looks between two rows. Row `own row + d` of a
+/// projector whose beam spreads light downwards reaches the pixel from above: `k` is large at negative `d`.
+///
+/// Pixels of one camera row that look at the same fraction of a row, to 1/32, are solved with the mean of their
+/// responses, so that a response may change from top to bottom of the image, but not from left to right.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PixelResponse {
     /// `[t, s]`, in projector rows; one column stands for all.

@@ -1,10 +1,11 @@
 use std::cmp::Ordering::Less;
 use std::sync::Arc;
 
-use ndarray::Array2;
+use ndarray::{Array1, Array2, ArrayView2};
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
+use super::response::{PLACE_STEPS, ResponseClass, collected};
 use super::{Beam, PixelResponse, Setting};
 
 /// When each projector row is lit, how its light spreads, and which projector rows the camera's rows see.
@@ -145,8 +146,8 @@ impl RowTiming {
         Ok(Self { response: Response::Measured(Arc::new(response)), ..self })
     }
 
-    /// The response that follows from the beam, if the camera's rows look between projector rows. Beams of many rows
-    /// are left as they are: they blur what lies between rows.
+    /// The response that follows from the beam, if the camera's rows look between projector rows. Wider beams than a
+    /// response can hold are left as they are: they blur what lies between rows.
     fn between_rows(self) -> Result<Self, PlaneError> {
         let camera = self.camera;
         let is_between = (0..camera.rows).any(|t| camera.place(t).fract() != 0.0);
@@ -165,7 +166,8 @@ impl RowTiming {
     ///
     /// # Errors
     /// [`PlaneError::OutOfRange`] for a pitch or a row time that is not positive; [`PlaneError::Window`] if there are
-    /// no camera rows, or they extend beyond the projector.
+    /// no camera rows, or they extend beyond the projector; [`PlaneError::Shape`] if a response was measured with other
+    /// camera rows.
     pub fn with_camera(self, camera: CameraRows) -> Result<Self, PlaneError> {
         for (field, value) in [("row_pitch", camera.pitch), ("camera row_time_us", camera.row_time_us)] {
             if !(value.is_finite() && value > 0.0) {
@@ -181,6 +183,9 @@ impl RowTiming {
             .map_or(camera.first_row, |last| camera.own_row(last).saturating_add(1));
         if camera.rows == 0 || end > projector_rows {
             return Err(PlaneError::Window { first_row: camera.first_row, end, projector_rows });
+        }
+        if let Some(measured) = self.measured_response() {
+            check_shape("response", "[camera rows]", &[measured.size().0], &[camera.rows])?;
         }
         Self { camera, ..self }.between_rows()
     }
@@ -237,6 +242,45 @@ impl RowTiming {
             Response::Beam => None,
             Response::BetweenRows(response) | Response::Measured(response) => Some(response),
         }
+    }
+
+    /// The same timing for pixels whose direct light lies `u0_rows[t, s]` rows below their own row, if the camera's
+    /// rows look between projector rows; `None` if they do not.
+    pub(in super::super) fn displaced(&self, u0_rows: ArrayView2<f32>) -> Result<Option<Self>, PlaneError> {
+        let Response::BetweenRows(response) = &self.response else { return Ok(None) };
+        let Some(shares) = self.beam.shares() else { return Ok(None) };
+        check_shape("u0_rows", "[camera rows]", &[u0_rows.nrows()], &[response.places().nrows()])?;
+        let displaced = PixelResponse::with_beam(&response.places() + &u0_rows, &shares)?;
+        Ok(Some(Self { response: Response::BetweenRows(Arc::new(displaced)), ..self.clone() }))
+    }
+
+    /// [`Self::weights`] of the pixels of camera row `t`: one entry for all, unless they have responses.
+    pub(super) fn pixel_weights(
+        &self,
+        t: usize,
+        columns: usize,
+        setting: &Setting,
+    ) -> Vec<(Vec<f64>, Vec<usize>)> {
+        let Some(response) = self.response() else {
+            return vec![(self.weights(t, setting), (0..columns).collect())];
+        };
+        let drawn = Array1::from(self.drawn(t, setting));
+        let weights = |class: ResponseClass| {
+            let of_row = |v: usize| collected(drawn.view(), &class.shares, v as i64);
+            ((0..drawn.len()).map(of_row).collect(), class.columns)
+        };
+        response.classes(t, 0..columns, PLACE_STEPS).into_iter().map(weights).collect()
+    }
+
+    /// The weights of the pixel in the middle of camera row `t`, `[projector_rows]`, and its own row.
+    pub(in super::super) fn typical_weights(&self, t: usize, setting: &Setting) -> (Vec<f64>, usize) {
+        let columns = self.response().map_or(1, |response| response.size().1);
+        let own_row = self.response().and_then(|response| response.own_rows(t, columns).nth(columns / 2));
+        let own_row = own_row.map_or(self.camera.own_row(t), |row| row.max(0) as usize);
+        let mut by_class = self.pixel_weights(t, columns, setting);
+        by_class.retain(|(_, alike)| alike.contains(&(columns / 2)));
+        let weights = by_class.pop().map_or_else(|| self.weights(t, setting), |(weights, _)| weights);
+        (weights, own_row.min(self.projector_rows() - 1))
     }
 
     /// The response, if it was measured.

@@ -16,7 +16,8 @@ use super::{Prior, SimdLevel};
 /// `||A T - I||^2 + alpha ||D T||^2 + beta sum(T)` over `T >= 0` (the paper's section 4).
 ///
 /// All pixels of a camera row share one model, and rows with the same model share its factors, so that a pixel costs
-/// only a few small triangular systems. Tiles of pixels are solved in parallel. The result is the same to the bit for
+/// only a few small triangular systems. With a [`super::super::PixelResponse`], pixels of a row that look at the same
+/// place between rows share a model, and other rows do not. Tiles of pixels are solved in parallel. The result is the same to the bit for
 /// any number of threads, and a row's result does not depend on which other rows are solved. Channels are treated as
 /// pixels: an RGB stack is solved as one with three times the columns, a Bayer mosaic without demosaicing.
 #[derive(Debug, Clone)]
@@ -83,15 +84,29 @@ impl Demux {
                 allowed: "within -1 to 1: rectify camera and projector better",
             });
         }
-        Ok(Self { u0_rows: Some(Arc::new(u0_rows)), ..self.clone() })
+        // Where camera rows look between projector rows anyway, the offset adds to the place.
+        let timing = match self.timing.displaced(u0_rows.view())? {
+            Some(displaced) => displaced,
+            None => self.timing.clone(),
+        };
+        Ok(Self { timing, u0_rows: Some(Arc::new(u0_rows)), ..self.clone() })
     }
 
     /// Sets the moment of direct light within its row, which matters for settings with an edge on the row. Valid for
-    /// beams no wider than a row.
+    /// beams no wider than a row, and for camera rows that look at the middle of projector rows.
     ///
     /// # Errors
-    /// [`PlaneError::OutOfRange`] for a column outside 0..=1.
+    /// [`PlaneError::OutOfRange`] for a column outside 0..=1, or for camera rows that look between projector rows.
     pub fn with_spot(&self, spot: FlyingSpot) -> Result<Self, PlaneError> {
+        if self.timing.response().is_some() {
+            let allowed =
+                "a whole number of projector rows for each camera row: a flying spot is modelled there only";
+            return Err(PlaneError::OutOfRange {
+                field: "row_pitch",
+                value: self.timing.camera().pitch,
+                allowed,
+            });
+        }
         if let Some(&value) = spot.columns.iter().find(|column| !(0.0..=1.0).contains(*column)) {
             let allowed = "from 0 to 1: divide the projector's column by its width";
             return Err(PlaneError::OutOfRange { field: "columns", value, allowed });
@@ -134,13 +149,9 @@ impl Demux {
     /// # Errors
     /// [`PlaneError::NotConvex`].
     pub fn condition(&self, row: usize) -> Result<f64, PlaneError> {
-        let model = self.model(row);
+        let model = RowModel::typical(&self.timing, &self.settings, &self.reach, row);
         let quadratic = Quadratic::new(model.weights.view(), &model.slots, &self.prior)?;
         Ok(largest_eigenvalue(quadratic.h()) * largest_eigenvalue(quadratic.inverse()))
-    }
-
-    fn model(&self, row: usize) -> RowModel {
-        RowModel::new(&self.timing, &self.settings, &self.reach, row)
     }
 
     /// Estimates the transport from `stack`, shape `[settings, camera_rows, columns]`, in units of the light that a
