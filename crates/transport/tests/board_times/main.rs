@@ -156,3 +156,163 @@ fn the_whole_raster() {
 fn a_window_of_128_rows() {
     check(Case::window(1));
 }
+
+#[test]
+fn camera_and_projector_of_different_row_times() {
+    for (seed, camera_row_time_us, jitter) in
+        [(2, 22.22 * 1.03, Jitter::Uniform(5.0)), (3, 22.22 * 0.97, Jitter::Normal(5.0))]
+    {
+        check(Case { camera_row_time_us, jitter, latency_us: 100.0, ..Case::full(seed) });
+        check(Case { camera_row_time_us, jitter, latency_us: -100.0, ..Case::window(seed) });
+    }
+}
+
+#[test]
+fn rows_outside_the_window_are_uncertain() {
+    let session = Session::taken(Case::window(4));
+    let times = session.fit().unwrap();
+    assert_eq!(times.seen_rows, session.columns.seen_rows());
+    let wrong = |v: usize| (times.row_starts_us[v] - session.rig.starts_us[v]).abs();
+    for v in [0, 150, 250, 500, 600, 720] {
+        assert!(times.row_starts_sd_us[v] > times.row_starts_sd_us[360] * 2.0, "row {v}");
+        // The kinks of this sweep are sharper than the bend that is allowed for.
+        assert!(wrong(v) < 3.0 * times.row_starts_sd_us[v] + 40.0, "row {v}: {}", wrong(v));
+    }
+    assert!(times.row_starts_sd_us[0] > 100.0 && times.row_starts_sd_us[360] < 1.0);
+}
+
+#[test]
+fn the_modes_are_the_covariance() {
+    let times = Session::taken(Case::window(5)).fit().unwrap();
+    for v in times.seen_rows.clone() {
+        let sd_us = times.row_starts_modes.column(v).iter().map(|mode| mode * mode).sum::<f64>().sqrt();
+        assert!((sd_us / times.row_starts_sd_us[v] - 1.0).abs() < 0.01, "row {v}");
+    }
+}
+
+#[test]
+fn each_frames_jitter_is_found_and_frames_of_another_trigger_are_dropped() {
+    let mut session = Session::taken(Case::window(6));
+    let jitters_us = session.rig.jitters_us.clone();
+    // One frame comes 60 us late, and one has the light of other settings.
+    let late = session.frames.iter().position(|frame| frame.setting.shutter == Shutter::Rolling).unwrap() + 60;
+    let setting = session.frames[late].setting;
+    let light = session.rig.late_picture(setting, 60.0, |_| true);
+    session.frames[late].light = session.columns.average(light.view()).unwrap();
+    let times = session.fit().unwrap();
+    assert!(times.dropped.iter().any(|dropped| dropped.0 == late), "{:?}", times.dropped);
+    for shutter in [Shutter::Global, Shutter::Rolling] {
+        let pairs: Vec<(f64, f64)> = (0..session.frames.len())
+            .filter(|&frame| session.frames[frame].setting.shutter == shutter)
+            .filter_map(|frame| times.jitters[frame].map(|found| (found.late_us, jitters_us[frame])))
+            .collect();
+        let mean = pairs.iter().map(|(found, truth)| found - truth).sum::<f64>() / pairs.len() as f64;
+        let rms = pairs.iter().map(|(found, truth)| (found - truth - mean).powi(2)).sum::<f64>();
+        let rms = (rms / pairs.len() as f64).sqrt();
+        println!("{shutter:?}: jitters within {rms:.3} us rms");
+        assert!(rms < 0.5, "{shutter:?}: {rms}");
+    }
+    assert!((times.jitter_us.value - 5.0).abs() < 1.0, "{:?}", times.jitter_us);
+}
+
+#[test]
+fn a_trigger_delay_that_does_not_act_is_refused() {
+    let error = Session::new(Case { global_delay_acts: false, ..Case::full(7) }).sweep().unwrap_err();
+    assert!(matches!(error, TimesError::TooFewBorders { .. }), "{error}");
+}
+
+#[test]
+fn a_trigger_that_is_not_the_vsync_is_refused() {
+    let error = Session::taken(Case { jitter: Jitter::Normal(45.0), ..Case::full(8) }).fit().unwrap_err();
+    assert!(matches!(error, TimesError::Jitter { .. }), "{error}");
+}
+
+#[test]
+fn a_granular_exposure_is_refused() {
+    let error = Session::taken(Case { exposure_step_us: 4.0, ..Case::full(9) }).fit().unwrap_err();
+    assert!(matches!(error, TimesError::Granular { .. }), "{error}");
+}
+
+/// Exposures longer than the light's arrival show one edge a frame, which the frame's jitter hides.
+#[test]
+fn long_exposures_for_arrivals_are_refused_or_uncertain() {
+    let mut session = Session::new(Case::full(10));
+    let coarse = session.sweep().unwrap();
+    let nominal = session.rig.nominal();
+    let mut arrivals = arrival_settings(&session.columns, &coarse, &nominal).unwrap();
+    arrivals.iter_mut().for_each(|setting| setting.exposure_us = 600.0);
+    let sweep = session.frames.len();
+    session.take(&arrivals, 1);
+    let error = session.fit().unwrap_err();
+    assert!(matches!(error, TimesError::ArrivalsCut { .. }), "{error}");
+
+    // With delays over both edges.
+    session.frames.truncate(sweep);
+    let earlier = arrivals.iter().map(|setting| BoardSetting { delay_us: setting.delay_us - 600.0, ..*setting });
+    let all: Vec<BoardSetting> = earlier.chain(arrivals.iter().copied()).collect();
+    session.take(&all, 2);
+    let (long, short) = (session.fit().unwrap(), Session::taken(Case::full(10)).fit().unwrap());
+    println!("delta {:?} against {:?}", long.exposure_offset_us, short.exposure_offset_us);
+    let error = (long.exposure_offset_us.value - 3.2) / long.exposure_offset_us.sd;
+    assert!(error.abs() < 3.0, "{error}");
+    assert!(long.exposure_offset_us.sd > 1.5 * short.exposure_offset_us.sd);
+}
+
+#[test]
+fn spots_are_recognised() {
+    for slopes in [[0.0, 0.0], [1.0, 1.0], [1.0, -1.0]] {
+        let mut session = Session::new(Case { slopes, ..Case::window(11) });
+        let coarse = session.sweep().unwrap();
+        let nominal = session.rig.nominal();
+        // Steps of one row.
+        let settings: Vec<_> =
+            arrival_settings(&session.columns, &coarse, &nominal).unwrap().into_iter().step_by(2).collect();
+        let mut pictures = |parity: usize| -> Vec<BoardFrame> {
+            let frames = settings.iter().flat_map(|&setting| [setting, setting]);
+            frames
+                .map(|setting| {
+                    let light = session.rig.picture(setting, |v| v % 2 == parity);
+                    BoardFrame { setting, light: session.columns.average(light.view()).unwrap() }
+                })
+                .collect()
+        };
+        let (even, odd) = (pictures(0), pictures(1));
+        let column = |s: usize| ((s as f64 + 0.5) / session.rig.case().columns as f64) as f32;
+        let columns_map = ndarray::Array2::from_shape_fn(session.rig.place.dim(), |(_, s)| column(s));
+        let columns_map = session.columns.average(columns_map.view()).unwrap();
+        let found = spot_slopes(&session.columns, &coarse, &columns_map, &even, &odd).unwrap();
+        println!("{slopes:?}: {found:.3?}");
+        assert!((found.even.value - slopes[0]).abs() < 0.1, "{slopes:?}: {found:?}");
+        assert!((found.odd.value - slopes[1]).abs() < 0.1, "{slopes:?}: {found:?}");
+    }
+}
+
+#[test]
+fn a_flying_spot_does_not_fit() {
+    let error = Session::taken(Case { slopes: [1.0, -1.0], ..Case::window(12) }).fit().unwrap_err();
+    println!("{error}");
+    assert!(matches!(error, TimesError::Misfit { .. }), "{error}");
+}
+
+/// Share of errors within one standard deviation: `cargo test -p raysweep-transport --test board_times -- --ignored
+/// --nocapture coverage`.
+#[test]
+#[ignore = "takes minutes"]
+fn coverage() {
+    for case in [Case::full as fn(u64) -> Case, Case::window] {
+        let mut within = [0; 5];
+        let (mut rows, mut squares) = (0.0, [0.0; 5]);
+        let runs = 30;
+        for seed in 0..runs {
+            let session = Session::taken(case(100 + seed));
+            let errors = errors(&session.rig, &session.fit().unwrap());
+            println!("{errors:.2e?}");
+            for (index, sds) in errors.sds.iter().enumerate() {
+                within[index] += usize::from(sds.abs() < 1.0);
+                squares[index] += sds * sds / runs as f64;
+            }
+            rows += errors.rows_within_sd / runs as f64;
+        }
+        println!("tau, rc, delta, mode, latency: {within:?} of {runs}, rms {:.2?}, rows {rows:.2}", squares.map(f64::sqrt));
+    }
+}

@@ -42,7 +42,7 @@ const DIFFERENCE_SDS: f64 = 3.0;
 /// What single exposures may differ from the others, while it is fixed and while it is fitted.
 const FIXED_US: f64 = 1e-4;
 const FREE_US: f64 = 20.0;
-/// Variance that a mode of the table may leave unexplained.
+/// Share of the variance beside offset and slope that the modes may leave unexplained.
 const MODES_REST: f64 = 0.01;
 /// How much more a sweep may bend beyond the rows seen: the time by which it is early in its middle, as a share of it.
 const BEND: f64 = 0.02;
@@ -603,7 +603,7 @@ impl<'a> Fit<'a> {
         let mut order: Vec<usize> = (0..count).collect();
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
         let mut rest: f64 = eigen.eigenvalues.iter().sum();
-        let enough = MODES_REST * whole.rows(seen.start, seen.len() + 1).norm_squared();
+        let enough = MODES_REST * rest;
         for index in order {
             if rest <= enough {
                 break;

@@ -8,7 +8,8 @@
 //!
 //! The order of calls is: [`Columns::new`] from the map of places and the responses; frames of [`sweep_settings`], each
 //! reduced by [`Columns::average`]; [`Coarse::from_borders`]; frames of [`arrival_settings`] and [`check_settings`];
-//! [`RowTimes::fit`]; and, if the projector may draw its rows with a flying spot, [`spot_slopes`].
+//! [`RowTimes::fit`], which takes all of these frames; and, with pictures of even and of odd rows, [`spot_slopes`],
+//! which tells a flying spot from rows that are lit evenly.
 
 mod coarse;
 mod columns;

@@ -67,10 +67,10 @@ impl Sweep {
             return Edge { row: rows - 1, fraction: 1.0, rows_per_us: 0.0, periods };
         }
         let mut row = near.min(rows - 1);
-        while self.starts_us[row] > time_us {
+        while row > 0 && self.starts_us[row] > time_us {
             row -= 1;
         }
-        while self.starts_us[row + 1] <= time_us {
+        while row + 1 < rows && self.starts_us[row + 1] <= time_us {
             row += 1;
         }
         let rows_per_us = (self.starts_us[row + 1] - self.starts_us[row]).recip();

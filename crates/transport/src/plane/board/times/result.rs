@@ -22,7 +22,7 @@ pub struct RowTimes {
     /// Standard deviations of the row starts; they grow quickly beyond the rows seen.
     pub row_starts_sd_us: Vec<f64>,
     /// Modes `[r, projector_rows + 1]` whose outer products sum to the covariance of the row starts: the offset, the
-    /// slope, two for the rows beyond those seen, and then the largest until 99 % of the variance.
+    /// slope, two for the rows beyond those seen, and then the largest until 99 % of what these leave.
     pub row_starts_modes: Array2<f64>,
     /// Rows that the image sees. Outside them, the table continues with its outermost slope.
     pub seen_rows: Range<usize>,

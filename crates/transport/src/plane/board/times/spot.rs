@@ -1,9 +1,10 @@
 use ndarray::Array2;
 
 use super::super::super::error::check_shape;
+use super::coarse::Coarse;
 use super::columns::Columns;
 use super::error::TimesError;
-use super::result::{Measured, RowTimes};
+use super::result::Measured;
 use super::settings::BoardFrame;
 
 /// How far a row's light arrives later at the right side of the projector's image than at the left, in row times.
@@ -29,7 +30,7 @@ const MIN_SPAN: f64 = 0.2;
 /// [`TimesError::Narrow`]; [`super::super::super::PlaneError::Shape`] for arrays that were averaged otherwise.
 pub fn spot_slopes(
     columns: &Columns,
-    times: &RowTimes,
+    coarse: &Coarse,
     projector_columns: &Array2<f32>,
     even: &[BoardFrame],
     odd: &[BoardFrame],
@@ -39,13 +40,13 @@ pub fn spot_slopes(
     for frame in even.iter().chain(odd) {
         check_shape("light of a frame", "[row, group]", frame.light.shape(), &expected)?;
     }
-    let slope = |frames, parity| slope(columns, times, projector_columns, frames, parity);
+    let slope = |frames, parity| slope(columns, coarse, projector_columns, frames, parity);
     Ok(SpotSlopes { even: slope(even, 0)?, odd: slope(odd, 1)? })
 }
 
 fn slope(
     columns: &Columns,
-    times: &RowTimes,
+    coarse: &Coarse,
     projector_columns: &Array2<f32>,
     frames: &[BoardFrame],
     parity: usize,
@@ -53,14 +54,14 @@ fn slope(
     let mut frames: Vec<&BoardFrame> = frames.iter().collect();
     frames.sort_by(|a, b| a.setting.delay_us.total_cmp(&b.setting.delay_us));
     // Deviations of (column, lateness) from their means over each camera row, so that neither the jitter of frames nor
-    // an error of the table enters, and their weights.
+    // an error of the sweep enters, and their weights.
     let mut points: Vec<(f64, f64, f64)> = Vec::new();
     let (mut left, mut right) = (f64::MAX, f64::MIN);
     for row in 0..columns.rows() {
         let cells: Vec<(f64, f64, f64)> = (0..columns.groups())
             .filter_map(|group| {
                 let column = f64::from(projector_columns[[row, group]]);
-                let (late_us, weight) = lateness_us(columns, times, &frames, parity, (row, group))?;
+                let (late_us, weight) = lateness_us(columns, coarse, &frames, parity, (row, group))?;
                 Some((column, late_us, weight))
             })
             .collect();
@@ -79,29 +80,31 @@ fn slope(
     let square: f64 = points.iter().map(|(x, _, weight)| weight * x * x).sum();
     let slope_us = points.iter().map(|(x, y, weight)| weight * x * y).sum::<f64>() / square;
     let scatter = points.iter().map(|(x, y, weight)| (weight * x * (y - slope_us * x)).powi(2)).sum::<f64>();
-    let row_us = times.row_time_us.value;
+    let seen = columns.seen_rows();
+    let (first, end) = (seen.start as f64, seen.end as f64);
+    let row_us = (coarse.time_us(end) - coarse.time_us(first)) / (end - first);
     Ok(Measured { value: slope_us / row_us, sd: scatter.sqrt() / square / row_us })
 }
 
-/// How much later the light of one parity arrives in a cell than table and response say, and the cell's light.
+/// How much later the light of one parity arrives in a cell than sweep and response say, apart from a constant of each
+/// camera row, and the cell's light.
 fn lateness_us(
     columns: &Columns,
-    times: &RowTimes,
+    coarse: &Coarse,
     frames: &[&BoardFrame],
     parity: usize,
     (row, group): (usize, usize),
 ) -> Option<(f64, f64)> {
-    let starts_us = &times.row_starts_us;
     let cell = columns.cell(row, group);
     if cell.pixels == 0 {
         return None;
     }
-    let near = (cell.place as usize).saturating_sub(12)..(cell.place as usize + 13).min(starts_us.len() - 1);
+    let near = (cell.place as usize).saturating_sub(12)..cell.place as usize + 13;
     let (mut share, mut expected_us) = (0.0, 0.0);
     for drawn in near.filter(|drawn| drawn % 2 == parity) {
         let (_, light) = columns.light_before(row, group, drawn as f64 + 0.5);
         share += light;
-        expected_us += light * (starts_us[drawn] + starts_us[drawn + 1]) / 2.0;
+        expected_us += light * coarse.time_us(drawn as f64 + 0.5);
     }
     let (mut sum, mut moment_us) = (0.0, 0.0);
     for (index, frame) in frames.iter().enumerate() {
@@ -109,10 +112,7 @@ fn lateness_us(
         let step_us = next_us - frames[index.saturating_sub(1)].setting.delay_us;
         let light = f64::from(frame.light[[row, group]]) * step_us;
         sum += light;
-        let true_exposure_us = frame.setting.exposure_us + times.exposure_offset_us.value;
-        moment_us += light * (frame.setting.delay_us + true_exposure_us / 2.0);
+        moment_us += light * (frame.setting.delay_us + frame.setting.exposure_us / 2.0);
     }
-    let lit = share > 0.2 && sum > 0.0;
-    let row_us = row as f64 * times.camera_row_time_us.value;
-    lit.then(|| (moment_us / sum + row_us - expected_us / share, share))
+    (share > 0.2 && sum > 0.0).then(|| (moment_us / sum - expected_us / share, share))
 }
