@@ -222,7 +222,7 @@ fn saturation_lies_below_each_pixels_plateau() {
     // Pixels of the upper half fill at 3900 DN, the others are cut off by 12 bits; one column is dark.
     let ladder = [1.0, 2.0, 3.0, 4.0].map(|light| {
         let mut frames = frames(&Array2::from_elem(shape, 1200.0 * light), 8, 0.0, light as u64);
-        let read = Normal::new(0.0, 5.4).unwrap();
+        let read = Normal::new(0.0_f64, 5.4).unwrap();
         let mut random = random(99 + light as u64);
         for ((_, t, s), dn) in frames.indexed_iter_mut() {
             if s == 0 {
