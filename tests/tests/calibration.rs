@@ -21,6 +21,7 @@ use raysweep_transport::plane::board::times::{
     self, BoardFrame, BoardSetting, Coarse, Columns, Nominal, RowTimes, arrival_settings, check_settings,
     sweep_settings,
 };
+use raysweep_transport::plane::calibrate::latency;
 use raysweep_transport::plane::{
     CameraRows, Demux, NoiseModel, PixelResponse, Prior, RESPONSE_ROWS, RowTiming, Setting, relative_rows,
 };
@@ -121,6 +122,7 @@ impl Drop for Studio {
 }
 
 /// What is known of a rig when a sweep is solved.
+#[derive(Clone)]
 struct Known {
     row_starts_us: Vec<f64>,
     camera_row_time_us: f64,
@@ -166,7 +168,7 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     let dark = DarkFit::new(&runs).unwrap();
 
     let around_us = stated.raster.row_centre_us(stated.first_row) - 1600.0;
-    let mut whole = |studio: &mut Studio, pattern: &Pattern, frames: usize| {
+    let whole = |studio: &mut Studio, pattern: &Pattern, frames: usize| {
         studio.show(Subject::Board, Some(pattern));
         studio.take(Shutter::Rolling, around_us, WHOLE_US, frames)
     };
@@ -185,7 +187,7 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     white.check(FULL_SCALE_DN).unwrap();
     let black_dn = black.mean_axis(Axis(0)).unwrap();
 
-    let mut mean = |studio: &mut Studio, pattern: &Pattern, frames: usize| {
+    let mean = |studio: &mut Studio, pattern: &Pattern, frames: usize| {
         whole(studio, pattern, frames).mean_axis(Axis(0)).unwrap()
     };
     let rows = |image: Vec<Array2<f32>>| {
@@ -205,18 +207,17 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     let columns = Columns::new(responses.place.view(), responses.response.view()).unwrap();
     studio.show(Subject::Board, Some(&Pattern::White));
     let mut frames = Vec::new();
-    let mut shoot =
-        |studio: &mut Studio, frames: &mut Vec<BoardFrame>, setting: BoardSetting, count: usize| {
-            let shutter = match setting.shutter {
-                times::Shutter::Global => Shutter::Global,
-                times::Shutter::Rolling => Shutter::Rolling,
-            };
-            for _ in 0..count {
-                let image = studio.mean(shutter, setting.delay_us, setting.exposure_us, 1);
-                let light = (image - dark.image(setting.exposure_us)) / &white.white_dn;
-                frames.push(BoardFrame { setting, light: columns.average(light.view()).unwrap() });
-            }
+    let shoot = |studio: &mut Studio, frames: &mut Vec<BoardFrame>, setting: BoardSetting, count: usize| {
+        let shutter = match setting.shutter {
+            times::Shutter::Global => Shutter::Global,
+            times::Shutter::Rolling => Shutter::Rolling,
         };
+        for _ in 0..count {
+            let image = studio.mean(shutter, setting.delay_us, setting.exposure_us, 1);
+            let light = (image - dark.image(setting.exposure_us)) / &white.white_dn;
+            frames.push(BoardFrame { setting, light: columns.average(light.view()).unwrap() });
+        }
+    };
     for setting in sweep_settings(&nominal, columns.seen_rows()).unwrap() {
         shoot(studio, &mut frames, setting, 1);
     }
@@ -273,8 +274,15 @@ fn truth(rig: &PlaneRig, stated: &Stated, beam: &[(i32, f64)], found: &Known) ->
     }
 }
 
-/// Median error of the transport of the rig's scene, from a sweep of these images.
-fn error(known: &Known, stated: &Stated, sweep: &[(f64, f64, Array2<f32>)], scene: ArrayView3<f32>) -> f64 {
+/// Median error of the transport of the rig's scene, from a sweep of these images, and by how much its light is found to
+/// be late.
+fn error(
+    known: &Known,
+    stated: &Stated,
+    sweep: &[(f64, f64, Array2<f32>)],
+    scene: ArrayView3<f32>,
+    refine: bool,
+) -> (f64, f64) {
     let raster = &stated.raster;
     let nominal_us = raster.row_centre_us(stated.first_row);
     let camera = CameraRows {
@@ -305,13 +313,25 @@ fn error(known: &Known, stated: &Stated, sweep: &[(f64, f64, Array2<f32>)], scen
         .map(|(_, exposure_us, image)| (image - &known.dark.image(*exposure_us)) / &known.white_dn)
         .collect();
     let stack = ndarray::stack(Axis(0), &light.iter().map(|image| image.view()).collect::<Vec<_>>()).unwrap();
-    let demux = Demux::new(timing, settings, Prior::Split { alpha: 0.01, beta: 0.001 }).unwrap();
+    let late_us = match refine {
+        true => {
+            let found = latency(&timing, &settings, stack.view(), None).unwrap();
+            println!("{found:?}");
+            found.late_us
+        }
+        false => 0.0,
+    };
+    let settings = settings.into_iter().map(|mut setting| {
+        setting.delays_us.iter_mut().for_each(|delay_us| *delay_us -= late_us);
+        setting
+    });
+    let demux = Demux::new(timing, settings.collect(), Prior::Split { alpha: 0.01, beta: 0.001 }).unwrap();
     let transport = demux.solve(stack.view(), None).unwrap();
     // Rows far from all others of the plan are seen by few settings.
     let kept = -94..=94;
     let found =
         transport.t.slice(s![(-94 - transport.u_min) as usize..=(94 - transport.u_min) as usize, .., ..]);
-    median_profile_error(found, relative_rows(scene, &kept).view())
+    (median_profile_error(found, relative_rows(scene, &kept).view()), late_us)
 }
 
 /// The paper's sweep of the scene, about the light that `known` expects at the middle row: openings, exposures, means.
@@ -332,7 +352,24 @@ fn sweep(studio: &mut Studio, known: &Known, size: (usize, usize)) -> Vec<(f64, 
     images
 }
 
-fn recover(sim: &str, beam: &[(i32, f64)]) -> (f64, f64) {
+/// Median errors of the transport.
+#[derive(Debug)]
+struct Recovered {
+    /// With the calibration alone.
+    calibrated: f64,
+    /// With the calibration, and the latency from the sweep itself.
+    refined: f64,
+    /// With what the simulator knows.
+    with_truth: f64,
+    /// Errors of the times at which the rows seen are lit, as calibrated.
+    row_errors_us: Vec<f64>,
+    /// Error of the camera's row time.
+    camera_row_time_error_us: f64,
+    /// By how much the sweep's light is later than calibrated.
+    late_us: f64,
+}
+
+fn recover(sim: &str, beam: &[(i32, f64)]) -> Recovered {
     let folder = tempfile::tempdir().unwrap();
     let text = rig_text(720, &format!("scene = {:?}", data("p2r_corner.npz")), sim);
     let path = folder.path().join("rig.toml");
@@ -359,7 +396,18 @@ fn recover(sim: &str, beam: &[(i32, f64)]) -> (f64, f64) {
         found.response.places()[middle],
         known.response.places()[middle]
     );
-    (error(&found, &stated, &images, scene.view()), error(&known, &stated, &images, scene.view()))
+    let (calibrated, _) = error(&found, &stated, &images, scene.view(), false);
+    let (refined, late_us) = error(&found, &stated, &images, scene.view(), true);
+    let (with_truth, _) = error(&known, &stated, &images, scene.view(), false);
+    let rows = stated.first_row..stated.first_row + stated.size.0;
+    Recovered {
+        calibrated,
+        refined,
+        with_truth,
+        row_errors_us: rows.map(|row| found.row_starts_us[row] - known.row_starts_us[row]).collect(),
+        camera_row_time_error_us: found.camera_row_time_us - known.camera_row_time_us,
+        late_us,
+    }
 }
 
 #[test]
@@ -367,13 +415,27 @@ fn a_rig_that_nobody_knows_is_found_on_a_board() {
     // A flat top from 0.5 rows above to 1.2 below, as the simulator samples it.
     let total = 1.0 + 0.7;
     let beam = [(0, 1.0 / total), (1, 0.7 / total)];
-    let (found, known) = recover(
+    let recovered = recover(
         "[sim.projector]\nbeam = { kind = \"flat-top\", up_rows = 0.5, down_rows = 1.2 }\nphase_jitter_us = 5.0\n\
          row_table = { kind = \"quadratic\", percent = 1.0 }\n\
          [sim.sensor]\nvignetting_percent = 20.0\n\
          [sim.truth]\ncamera_row_time_us = 22.6\nrow_offset_rows = 0.4\nrotation_deg = 0.2\ntrigger_latency_us = 30.0\n",
         &beam,
     );
-    println!("error {found:.4}, with the truth {known:.4}");
-    assert!(found < 1.15 * known && known < 0.1, "{found} against {known}");
+    let Recovered { calibrated, refined, with_truth, row_errors_us, camera_row_time_error_us, late_us } =
+        recovered;
+    println!(
+        "errors: {calibrated:.4} calibrated, {refined:.4} refined by {late_us:.2} us, {with_truth:.4} with the truth"
+    );
+    assert!(refined < 1.15 * with_truth && calibrated < 1.3 * with_truth && with_truth < 0.05);
+    let mean_us = row_errors_us.iter().sum::<f64>() / row_errors_us.len() as f64;
+    let from_mean_us = || row_errors_us.iter().map(|error_us| error_us - mean_us);
+    let rms_us =
+        (from_mean_us().map(|error_us| error_us.powi(2)).sum::<f64>() / row_errors_us.len() as f64).sqrt();
+    let most_us = from_mean_us().fold(0.0, |most: f64, error_us| most.max(error_us.abs()));
+    println!("rows: {mean_us:.3} us off, {rms_us:.3} us rms, {most_us:.3} us at most");
+    assert!(rms_us < 0.02 * 22.22 && most_us < 0.05 * 22.22, "{row_errors_us:?}");
+    // The rest is the mean of the jitter of about 125 frames of the board, and of those of the sweep.
+    assert!(mean_us.abs() < 1.5 && (mean_us + late_us).abs() < 1.0, "{mean_us} and {late_us}");
+    assert!(camera_row_time_error_us.abs() < 2e-4 * 22.6, "{camera_row_time_error_us}");
 }

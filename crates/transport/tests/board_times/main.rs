@@ -125,7 +125,7 @@ fn check(case: Case) -> (RowTimes, Errors) {
     let start = Instant::now();
     let times = session.fit().unwrap();
     let errors = errors(&session.rig, &times);
-    println!("{} frames, {:.2} s, {errors:.2e?}", session.frames.len(), start.elapsed().as_secs_f64());
+    println!("{} frames, {:.2} s, {errors:.6?}", session.frames.len(), start.elapsed().as_secs_f64());
     println!(
         "tau {:?} rc {:?} delta {:?} mode {:?} latency sd {:.3} jitter {:?} useful {} modes {} dropped {:?}",
         times.row_time_us,
@@ -195,7 +195,8 @@ fn each_frames_jitter_is_found_and_frames_of_another_trigger_are_dropped() {
     let mut session = Session::taken(Case::window(6));
     let jitters_us = session.rig.jitters_us.clone();
     // One frame comes 60 us late, and one has the light of other settings.
-    let late = session.frames.iter().position(|frame| frame.setting.shutter == Shutter::Rolling).unwrap() + 60;
+    let late =
+        session.frames.iter().position(|frame| frame.setting.shutter == Shutter::Rolling).unwrap() + 60;
     let setting = session.frames[late].setting;
     let light = session.rig.late_picture(setting, 60.0, |_| true);
     session.frames[late].light = session.columns.average(light.view()).unwrap();
@@ -248,7 +249,8 @@ fn long_exposures_for_arrivals_are_refused_or_uncertain() {
 
     // With delays over both edges.
     session.frames.truncate(sweep);
-    let earlier = arrivals.iter().map(|setting| BoardSetting { delay_us: setting.delay_us - 600.0, ..*setting });
+    let earlier =
+        arrivals.iter().map(|setting| BoardSetting { delay_us: setting.delay_us - 600.0, ..*setting });
     let all: Vec<BoardSetting> = earlier.chain(arrivals.iter().copied()).collect();
     session.take(&all, 2);
     let (long, short) = (session.fit().unwrap(), Session::taken(Case::full(10)).fit().unwrap());
@@ -306,13 +308,16 @@ fn coverage() {
         for seed in 0..runs {
             let session = Session::taken(case(100 + seed));
             let errors = errors(&session.rig, &session.fit().unwrap());
-            println!("{errors:.2e?}");
+            println!("{errors:.6?}");
             for (index, sds) in errors.sds.iter().enumerate() {
                 within[index] += usize::from(sds.abs() < 1.0);
                 squares[index] += sds * sds / runs as f64;
             }
             rows += errors.rows_within_sd / runs as f64;
         }
-        println!("tau, rc, delta, mode, latency: {within:?} of {runs}, rms {:.2?}, rows {rows:.2}", squares.map(f64::sqrt));
+        println!(
+            "tau, rc, delta, mode, latency: {within:?} of {runs}, rms {:.2?}, rows {rows:.2}",
+            squares.map(f64::sqrt)
+        );
     }
 }

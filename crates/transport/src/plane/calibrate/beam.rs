@@ -203,7 +203,7 @@ fn golden_section(
 }
 
 /// The minimum of the split prior's objective for each pixel.
-fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
+pub(super) fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
     let by_class: Vec<Vec<f64>> = sample
         .classes
         .par_iter()
@@ -222,12 +222,12 @@ fn in_sample(sample: &Sample, optics: &Optics) -> Result<Vec<f64>, PlaneError> {
 }
 
 /// The logarithm makes each pixel count relative to its own noise.
-fn log(objective: f64) -> f64 {
+pub(super) fn log(objective: f64) -> f64 {
     objective.max(f64::MIN_POSITIVE).ln()
 }
 
 /// Only the pixels in which direct light stands out: the others do not depend on the beam but add noise.
-fn with_direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Sample, CalibrateError> {
+pub(super) fn with_direct_light(sample: &Sample, beam_sigma_rows: f64) -> Result<Sample, CalibrateError> {
     let light = direct_light(sample, beam_sigma_rows)?;
     let direct: HashSet<(usize, usize)> =
         light.iter().filter(|light| light.stands_out).map(|light| (light.t, light.s)).collect();
