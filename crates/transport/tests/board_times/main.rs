@@ -84,14 +84,19 @@ fn errors(rig: &Rig, times: &RowTimes) -> Errors {
     // Light of the middle camera row.
     let middle = case.window.1 / 2;
     let place = case.window.0 + middle;
-    let latency_us = times.row_starts_us[place] - rig.starts_us[place]
+    let latency_us = times.row_starts_us[place]
+        - rig.starts_us[place]
         - middle as f64 * (times.camera_row_time_us.value - case.camera_row_time_us);
-    let mode = |times: &RowTimes| times.row_starts_modes.rows().into_iter().skip(4).map(|mode| mode.to_vec()).collect::<Vec<_>>();
+    let mode = |times: &RowTimes| {
+        times.row_starts_modes.rows().into_iter().skip(4).map(|mode| mode.to_vec()).collect::<Vec<_>>()
+    };
     let modes = mode(times);
     let middle_row = (first + end) as f64 / 2.0;
     let length = late.len() as f64;
     let slope_square: f64 = (first..=end).map(|v| (v as f64 - middle_row).powi(2)).sum();
-    let slope = (first..=end).zip(&late).map(|(v, late)| (v as f64 - middle_row) * (late - mean)).sum::<f64>() / slope_square;
+    let slope =
+        (first..=end).zip(&late).map(|(v, late)| (v as f64 - middle_row) * (late - mean)).sum::<f64>()
+            / slope_square;
     let within = (first..=end).zip(&late).filter(|(v, late)| {
         let rest = *late - mean - slope * (*v as f64 - middle_row);
         let sd = modes.iter().map(|mode| mode[*v].powi(2)).sum::<f64>().sqrt();
@@ -120,10 +125,19 @@ fn check(case: Case) -> (RowTimes, Errors) {
     let start = Instant::now();
     let times = session.fit().unwrap();
     let errors = errors(&session.rig, &times);
-    println!("{} frames, {:.2} s, {errors:.2e?}", session.frames.len(), start.elapsed().as_secs_f64());
-    println!("tau {:?} rc {:?} delta {:?} mode {:?} latency sd {:.3} jitter {:?} useful {} modes {} dropped {:?}",
-        times.row_time_us, times.camera_row_time_us, times.exposure_offset_us, times.mode_offset_us,
-        times.latency_sd_us, times.jitter_us, times.useful_frames, times.row_starts_modes.nrows(), times.dropped);
+    println!("{} frames, {:.2} s, {errors:.6?}", session.frames.len(), start.elapsed().as_secs_f64());
+    println!(
+        "tau {:?} rc {:?} delta {:?} mode {:?} latency sd {:.3} jitter {:?} useful {} modes {} dropped {:?}",
+        times.row_time_us,
+        times.camera_row_time_us,
+        times.exposure_offset_us,
+        times.mode_offset_us,
+        times.latency_sd_us,
+        times.jitter_us,
+        times.useful_frames,
+        times.row_starts_modes.nrows(),
+        times.dropped
+    );
     println!("{:?}", times.residuals.iter().map(|r| (r.exposure_us, r.chi2_per_sample)).collect::<Vec<_>>());
     assert!(errors.tau.abs() < 2e-4, "{case:?}: {errors:?}");
     assert!(errors.rows_rms < 0.02 && errors.rows_worst < 0.05, "{case:?}: {errors:?}");
@@ -181,7 +195,8 @@ fn each_frames_jitter_is_found_and_frames_of_another_trigger_are_dropped() {
     let mut session = Session::taken(Case::window(6));
     let jitters_us = session.rig.jitters_us.clone();
     // One frame comes 60 us late, and one has the light of other settings.
-    let late = session.frames.iter().position(|frame| frame.setting.shutter == Shutter::Rolling).unwrap() + 60;
+    let late =
+        session.frames.iter().position(|frame| frame.setting.shutter == Shutter::Rolling).unwrap() + 60;
     let setting = session.frames[late].setting;
     let light = session.rig.late_picture(setting, 60.0, |_| true);
     session.frames[late].light = session.columns.average(light.view()).unwrap();
@@ -234,7 +249,8 @@ fn long_exposures_for_arrivals_are_refused_or_uncertain() {
 
     // With delays over both edges.
     session.frames.truncate(sweep);
-    let earlier = arrivals.iter().map(|setting| BoardSetting { delay_us: setting.delay_us - 600.0, ..*setting });
+    let earlier =
+        arrivals.iter().map(|setting| BoardSetting { delay_us: setting.delay_us - 600.0, ..*setting });
     let all: Vec<BoardSetting> = earlier.chain(arrivals.iter().copied()).collect();
     session.take(&all, 2);
     let (long, short) = (session.fit().unwrap(), Session::taken(Case::full(10)).fit().unwrap());
@@ -250,9 +266,7 @@ fn spots_are_recognised() {
         let mut session = Session::new(Case { slopes, ..Case::window(11) });
         let coarse = session.sweep().unwrap();
         let nominal = session.rig.nominal();
-        // Steps of one row.
-        let settings: Vec<_> =
-            arrival_settings(&session.columns, &coarse, &nominal).unwrap().into_iter().step_by(2).collect();
+        let settings = arrival_settings(&session.columns, &coarse, &nominal).unwrap();
         let mut pictures = |parity: usize| -> Vec<BoardFrame> {
             let frames = settings.iter().flat_map(|&setting| [setting, setting]);
             frames
@@ -292,13 +306,16 @@ fn coverage() {
         for seed in 0..runs {
             let session = Session::taken(case(100 + seed));
             let errors = errors(&session.rig, &session.fit().unwrap());
-            println!("{errors:.2e?}");
+            println!("{errors:.6?}");
             for (index, sds) in errors.sds.iter().enumerate() {
                 within[index] += usize::from(sds.abs() < 1.0);
                 squares[index] += sds * sds / runs as f64;
             }
             rows += errors.rows_within_sd / runs as f64;
         }
-        println!("tau, rc, delta, mode, latency: {within:?} of {runs}, rms {:.2?}, rows {rows:.2}", squares.map(f64::sqrt));
+        println!(
+            "tau, rc, delta, mode, latency: {within:?} of {runs}, rms {:.2?}, rows {rows:.2}",
+            squares.map(f64::sqrt)
+        );
     }
 }

@@ -109,7 +109,8 @@ impl Rig {
                 let piece = (v / 90).min(7);
                 let within = v as f64 / 90.0 - piece as f64;
                 let kink = kinks[piece] + within * (kinks[piece + 1] - kinks[piece]);
-                v as f64 * case.row_time_us - case.bend * sweep_us * 4.0 * x * (1.0 - x) + kink
+                v as f64 * case.row_time_us - case.bend * sweep_us * 4.0 * x * (1.0 - x)
+                    + kink
                     + nominal_first_row_us()
                     + case.latency_us
             })
@@ -140,9 +141,13 @@ impl Rig {
             let centre = centres[[t, s]] - (BEAM_BELOW - BEAM_ABOVE) / 2.0;
             if lit(t, s) { centre as f32 } else { f32::NAN }
         });
-        // A response is measured over 21 rows: 0.4 % in all, the same for neighbours.
-        let errors: Vec<[f64; 16]> = (0..rows / 21 + 1)
-            .map(|_| std::array::from_fn(|d| if (3..12).contains(&d) { 0.001 * unit.sample(&mut random) } else { 0.0 }))
+        // A response is measured over 21 rows: 0.4 % in all, the same for neighbours in a column.
+        let errors: Vec<[f64; 16]> = (0..(rows / 21 + 1) * case.columns)
+            .map(|_| {
+                std::array::from_fn(
+                    |d| if (3..12).contains(&d) { 0.001 * unit.sample(&mut random) } else { 0.0 },
+                )
+            })
             .collect();
         let mut response = Array3::zeros((16, rows, case.columns));
         for ((t, s), &place) in place.indexed_iter().filter(|(_, place)| place.is_finite()) {
@@ -150,14 +155,28 @@ impl Rig {
             for (v, share) in seen_rows(centres[[t, s]]) {
                 shares[(v as i64 - place.round() as i64 + 7) as usize] += share;
             }
-            shares.iter_mut().zip(errors[t / 21]).for_each(|(share, error)| *share += error);
+            shares
+                .iter_mut()
+                .zip(errors[t / 21 * case.columns + s])
+                .for_each(|(share, error)| *share += error);
             let sum: f64 = shares.iter().sum();
             for d in 0..16 {
                 response[[d, t, s]] = (shares[d] / sum) as f32;
             }
         }
         let jitters_us = Vec::new();
-        Self { case, starts_us, centres, brightness, white_dn, white_map_dn, place, response, random, jitters_us }
+        Self {
+            case,
+            starts_us,
+            centres,
+            brightness,
+            white_dn,
+            white_map_dn,
+            place,
+            response,
+            random,
+            jitters_us,
+        }
     }
 
     /// What is known before the calibration: no latency, an even sweep, row times 0.2 % off.

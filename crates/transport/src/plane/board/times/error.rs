@@ -67,7 +67,9 @@ pub enum TimesError {
         back_us: f64,
     },
     /// The normal equations cannot be solved.
-    #[error("the frames do not determine the times of the rows: take those of sweep_settings and arrival_settings")]
+    #[error(
+        "the frames do not determine the times of the rows: take those of sweep_settings and arrival_settings"
+    )]
     Undetermined,
     /// The model does not describe the frames.
     #[error(

@@ -154,9 +154,7 @@ pub fn arrival_settings(
     let steps = ((last_us - first_us + 2.0 * margin_us) / (row_us / 2.0)).ceil() as usize;
     let first_us = first_us - exposure_us / 2.0 - margin_us;
     let delays = (0..=steps).map(|step| first_us + step as f64 * row_us / 2.0);
-    Ok(delays
-        .map(|delay_us| BoardSetting { shutter: Shutter::Rolling, delay_us, exposure_us })
-        .collect())
+    Ok(delays.map(|delay_us| BoardSetting { shutter: Shutter::Rolling, delay_us, exposure_us }).collect())
 }
 
 /// The rolling settings that check the length of longer exposures: 600 and 1200 us, 6 delays each with the opening and
