@@ -266,9 +266,7 @@ fn spots_are_recognised() {
         let mut session = Session::new(Case { slopes, ..Case::window(11) });
         let coarse = session.sweep().unwrap();
         let nominal = session.rig.nominal();
-        // Steps of one row.
-        let settings: Vec<_> =
-            arrival_settings(&session.columns, &coarse, &nominal).unwrap().into_iter().step_by(2).collect();
+        let settings = arrival_settings(&session.columns, &coarse, &nominal).unwrap();
         let mut pictures = |parity: usize| -> Vec<BoardFrame> {
             let frames = settings.iter().flat_map(|&setting| [setting, setting]);
             frames

@@ -24,6 +24,8 @@ const MIN_BORDERS: usize = 12;
 const END_ROWS: f64 = 12.0;
 /// Errors beyond this count less.
 const BORDER_SCATTER_US: f64 = 10.0;
+/// Borders beyond this error are not those of the sweep.
+const BORDER_ERROR_US: f64 = 150.0;
 /// How much the coefficients may differ from a nominal sweep, which keeps a fit to few rows from oscillating.
 const PRIOR_US: [f64; 4] = [1e4, 1e4, 500.0, 200.0];
 /// Error of a measured sweep, and how far the shutter modes may be apart.
@@ -53,6 +55,7 @@ impl Coarse {
         nominal.check()?;
         let global = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Global);
         let points: Vec<(f64, f64)> = global().flat_map(|frame| borders(columns, frame, nominal)).collect();
+<<<<<<< HEAD
         let seen = columns.seen_rows();
         let first = points.iter().map(|point| point.0).fold(f64::MAX, f64::min);
         let last = points.iter().map(|point| point.0).fold(f64::MIN, f64::max);
@@ -60,11 +63,22 @@ impl Coarse {
         if points.len() < MIN_BORDERS || covered < 0.5 {
             return Err(TimesError::TooFewBorders {
                 borders: points.len(),
+=======
+        let few = |borders: &[(f64, f64)]| {
+            let (first, last) = ends(borders);
+            let covered = (last - first).max(0.0) / columns.seen_rows().len() as f64;
+            (borders.len() < MIN_BORDERS || covered < 0.5).then(|| TimesError::TooFewBorders {
+                borders: borders.len(),
+>>>>>>> h-g
                 needed: MIN_BORDERS,
                 frames: global().count(),
                 covered_percent: covered * 100.0,
-            });
+            })
+        };
+        if let Some(error) = few(&points) {
+            return Err(error);
         }
+        let (first, last) = ends(&points);
         let (middle_row, half_rows) = ((first + last) / 2.0, (last - first) / 2.0);
         let mut coarse =
             Self { middle_row, half_rows, error_us: MEASURED_ERROR_US, ..Self::nominal(nominal) };
@@ -83,7 +97,9 @@ impl Coarse {
             let solution = normal.cholesky().ok_or(TimesError::Undetermined)?.solve(&right);
             coarse.late_us = solution;
         }
-        Ok(coarse)
+        // Borders that a delay does not move lie anywhere.
+        let on_sweep = |&(row, time_us): &(f64, f64)| (coarse.time_us(row) - time_us).abs() < BORDER_ERROR_US;
+        few(&points.iter().copied().filter(on_sweep).collect::<Vec<_>>()).map_or(Ok(coarse), Err)
     }
 
     /// When a row, or a fraction of it, begins to be lit, as counted by frames with a global shutter.
@@ -104,6 +120,12 @@ impl Coarse {
         let x = (row - self.middle_row) / self.half_rows;
         Vector4::new(1.0, x, x * x, x * x * x)
     }
+}
+
+/// First and last row of some borders.
+fn ends(borders: &[(f64, f64)]) -> (f64, f64) {
+    let rows = || borders.iter().map(|border| border.0);
+    (rows().fold(f64::MAX, f64::min), rows().fold(f64::MIN, f64::max))
 }
 
 /// Places of the opening and closing border of a global frame, with their times. A place is that of drawing: half a

@@ -26,6 +26,8 @@ pub struct Columns {
     cells: Vec<Cell>,
     /// Cumulative responses, `[row * groups + group, rows]`.
     cumulative: Array2<f64>,
+    /// For each camera row, the drawn rows that any of its cells sees.
+    reach: Vec<(f64, f64)>,
 }
 
 /// The lit pixels of one camera row in one group of columns.
@@ -93,7 +95,15 @@ impl Columns {
                 cumulative[index + 1] = cumulative[index] + response.get(index).unwrap_or(&0.0);
             }
         }
-        Ok(Self { lit, groups, cells, cumulative })
+        let mut reach = vec![(f64::MAX, f64::MIN); rows];
+        for (index, (cell, response)) in cells.iter().zip(&responses).enumerate() {
+            let (first, end) = &mut reach[index / count];
+            for (row, _) in (cell.first_row..).zip(response).filter(|(_, share)| **share != 0.0) {
+                *first = first.min(row as f64);
+                *end = end.max(row as f64 + 1.0);
+            }
+        }
+        Ok(Self { lit, groups, cells, cumulative, reach })
     }
 
     /// The mean of an image over the lit pixels of each group, `[rows, groups]`; 0 where a group has none.
@@ -139,6 +149,13 @@ impl Columns {
 
     pub(super) fn cell(&self, row: usize, group: usize) -> &Cell {
         &self.cells[row * self.groups.len() + group]
+    }
+
+    /// Whether drawing at this row, or fraction of it, lights a camera row.
+    #[inline]
+    pub(super) fn reached(&self, row: usize, drawn: f64) -> bool {
+        let (first, end) = self.reach[row];
+        drawn > first && drawn < end
     }
 
     /// Mean place of a camera row's lit pixels, if it has any.

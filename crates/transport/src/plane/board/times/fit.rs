@@ -5,7 +5,7 @@ use super::super::super::error::check_shape;
 use super::coarse::{Arrivals, Coarse, arrivals, median};
 use super::columns::Columns;
 use super::error::TimesError;
-use super::model::{Clocks, Comparison, Edge, Sums, Sweep};
+use super::model::{Clocks, Comparison, Edge, Samples, Sums, Sweep};
 use super::result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
 use super::settings::{BoardFrame, Nominal, Shutter};
 use super::table::Table;
@@ -34,6 +34,8 @@ const MISFIT: f64 = 9.0;
 const NO_EDGE_SD_US: f64 = 2.0;
 /// Smallest jitter; smaller ones cannot be told from the noise.
 const LEAST_JITTER_US: f64 = 0.05;
+/// Camera rows whose responses have errors in common, because they are averaged over as many.
+const BLOCK_ROWS: usize = 21;
 /// Limits of what is accepted.
 const MAX_CHI2_PER_SAMPLE: f64 = 3.0;
 const MAX_EXPOSURE_DIFFERENCE_US: f64 = 0.3;
@@ -228,7 +230,11 @@ impl<'a> Fit<'a> {
             comparison.visit(
                 &self.frames[frame],
                 (late_us, longer_us),
+<<<<<<< HEAD
                 (SCAN_ROWS, true),
+=======
+                Samples::EveryRow(SCAN_ROWS),
+>>>>>>> h-g
                 |_, _, _, sums| {
                     chi2 += sums.chi2;
                 },
@@ -249,7 +255,7 @@ impl<'a> Fit<'a> {
         }
         for _ in 0..4 {
             let (mut weight, mut right) = (prior, -best_us * prior);
-            comparison.visit(&self.frames[frame], (best_us, longer_us), (1, false), |_, _, _, sums| {
+            comparison.visit(&self.frames[frame], (best_us, longer_us), Samples::OnEdges, |_, _, _, sums| {
                 weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
                 right += sums.opening_residual - sums.closing_residual;
             });
@@ -258,16 +264,33 @@ impl<'a> Fit<'a> {
         best_us
     }
 
+    /// Derivatives of the times of a frame's opening and closing edge.
+    fn edges(&self, frame: usize, row: usize, opening: &Edge, closing: &Edge) -> [Sparse; 2] {
+        let coefficients = self.table.coefficients;
+        let mut edges = [opening, closing].map(|place| {
+            let mut edge = Sparse::default();
+            edge.add_table(&self.table, place);
+            match self.frames[frame].setting.shutter {
+                Shutter::Rolling => edge.push(coefficients, row as f64),
+                Shutter::Global => edge.push(coefficients + 1, 1.0),
+            }
+            edge
+        });
+        edges[1].push(coefficients + 2, 1.0);
+        if let Some(unknown) = self.own_exposure(frame) {
+            edges[1].push(unknown, 1.0);
+        }
+        edges
+    }
+
     /// The normal equations at the present values. `free` frees the differences between exposures.
     fn normal(&self, free: bool) -> Normal {
         let sweep = self.sweep();
         let comparison = self.comparison(&sweep);
         let count = self.unknowns.len();
-        let coefficients = self.table.coefficients;
         let mut matrix = DMatrix::zeros(count, count);
         let mut right = DVector::zeros(count);
         let mut frames = Vec::new();
-        let (mut opening_edge, mut closing_edge) = (Sparse::default(), Sparse::default());
         for frame in self.used() {
             let prior = self.jitter_prior_us.powi(-2);
             let mut own = FrameNormal {
@@ -276,41 +299,32 @@ impl<'a> Fit<'a> {
                 weight: prior,
                 right: -self.late_us[frame] * prior,
             };
-            let shutter = self.frames[frame].setting.shutter;
-            let own_exposure = self.own_exposure(frame);
             let late = (self.late_us[frame], self.longer_us(frame));
-            comparison.visit(&self.frames[frame], late, (1, false), |row, opening, closing, sums| {
-                opening_edge.clear();
-                closing_edge.clear();
-                for (edge, place) in [(&mut opening_edge, opening), (&mut closing_edge, closing)] {
-                    edge.add_table(&self.table, place);
-                    match shutter {
-                        Shutter::Rolling => edge.push(coefficients, row as f64),
-                        Shutter::Global => edge.push(coefficients + 1, 1.0),
-                    }
-                }
-                closing_edge.push(coefficients + 2, 1.0);
-                if let Some(unknown) = own_exposure {
-                    closing_edge.push(unknown, 1.0);
-                }
-                own.add(&opening_edge, &closing_edge, sums, &mut matrix, &mut right);
+            comparison.visit(&self.frames[frame], late, Samples::OnEdges, |row, opening, closing, sums| {
+                let edges = self.edges(frame, row, opening, closing);
+                own.add(&edges, sums, &mut matrix, &mut right);
             });
             matrix.ger(-own.weight.recip(), &own.mixed, &own.mixed, 1.0);
             right.axpy(-own.right / own.weight, &own.mixed, 1.0);
             frames.push(own);
         }
+        self.add_priors(&mut matrix, &mut right, free);
+        Normal { matrix, right, frames }
+    }
+
+    fn add_priors(&self, matrix: &mut DMatrix<f64>, right: &mut DVector<f64>, free: bool) {
+        let coefficients = self.table.coefficients;
         for index in 0..coefficients {
             let weight = COEFFICIENT_PRIOR_US.powi(-2);
             matrix[(index, index)] += weight;
             right[index] += weight * (self.start[index] - self.unknowns[index]);
         }
-        add_third_differences(&mut matrix, &mut right, Some(self.coefficients()), SMOOTHNESS);
+        add_third_differences(matrix, right, Some(self.coefficients()), SMOOTHNESS);
         let weight = if free { FREE_US } else { FIXED_US }.powi(-2);
-        for index in coefficients + 3..count {
+        for index in coefficients + 3..self.unknowns.len() {
             matrix[(index, index)] += weight;
             right[index] -= weight * self.unknowns[index];
         }
-        Normal { matrix, right, frames }
     }
 
     /// Joint steps until they are small, at most `limit`.
@@ -339,7 +353,7 @@ impl<'a> Fit<'a> {
     fn misfit(&self, comparison: &Comparison, frame: usize) -> (f64, f64) {
         let (mut chi2, mut samples) = (0.0, 0.0);
         let late = (self.late_us[frame], self.longer_us(frame));
-        comparison.visit(&self.frames[frame], late, (1, false), |_, _, _, sums| {
+        comparison.visit(&self.frames[frame], late, Samples::OnEdges, |_, _, _, sums| {
             chi2 += sums.chi2;
             samples += sums.samples;
         });
@@ -488,9 +502,66 @@ impl<'a> Fit<'a> {
         Ok(())
     }
 
+    /// Covariance of the unknowns.
+    ///
+    /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
+    /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
+    /// small. So the scatter of the scores is summed over camera rows, and over blocks of rows in a group of columns,
+    /// and what both contain is subtracted (clustered in two ways). Jitters and priors are independent and enter as
+    /// they are.
+    fn covariance(&self) -> Result<DMatrix<f64>, TimesError> {
+        let Normal { matrix, frames, .. } = self.normal(false);
+        let count = self.unknowns.len();
+        let (rows, groups) = (self.columns.rows(), self.columns.groups());
+        let sweep = self.sweep();
+        let comparison = self.comparison(&sweep);
+        let mut cells = DMatrix::zeros(count, rows * groups);
+        let mut by_jitter = DMatrix::zeros(frames.len(), rows * groups);
+        let mut jitters = DMatrix::zeros(count, frames.len());
+        for (index, own) in frames.iter().enumerate() {
+            let frame = &self.frames[own.frame];
+            let late = (self.late_us[own.frame], self.longer_us(own.frame));
+            jitters.set_column(index, &(&own.mixed / own.weight));
+            comparison.visit(frame, late, Samples::OnEdges, |row, opening, closing, _| {
+                let edges = self.edges(own.frame, row, opening, closing);
+                for group in 0..groups {
+                    let cell = row * groups + group;
+                    let sums = comparison.compare(frame, row, group..group + 1, (opening, closing), false);
+                    let residuals = [-sums.opening_residual, sums.closing_residual];
+                    for (edge, residual) in edges.iter().zip(residuals) {
+                        edge.entries().iter().for_each(|&(a, x)| cells[(a, cell)] += residual * x);
+                        by_jitter[(index, cell)] -= residual;
+                    }
+                }
+            });
+        }
+        cells -= &jitters * by_jitter;
+        let summed = |clusters: usize, cluster: &dyn Fn(usize, usize) -> usize| {
+            let mut sums = DMatrix::zeros(count, clusters);
+            for (row, group) in (0..rows).flat_map(|row| (0..groups).map(move |group| (row, group))) {
+                let mut sum = sums.column_mut(cluster(row, group));
+                sum += cells.column(row * groups + group);
+            }
+            &sums * sums.transpose()
+        };
+        let by_row = summed(rows, &|row, _| row);
+        let blocks = rows.div_ceil(BLOCK_ROWS);
+        let by_block = summed(blocks * groups, &|row, group| row / BLOCK_ROWS * groups + group);
+        let mut scatter = by_row + by_block - &cells * cells.transpose();
+        scatter += &jitters * jitters.transpose() * self.jitter_prior_us.powi(-2);
+        let mut right = DVector::zeros(count);
+        self.add_priors(&mut scatter, &mut right, false);
+        let inverse = matrix.cholesky().ok_or(TimesError::Undetermined)?.inverse();
+        let covariance = &inverse * scatter * &inverse;
+        // A difference of sums of squares may be slightly negative.
+        let mut eigen = ((&covariance + covariance.transpose()) / 2.0).symmetric_eigen();
+        let least = eigen.eigenvalues.amax() * 1e-12;
+        eigen.eigenvalues.apply(|value| *value = value.max(least));
+        Ok(eigen.recompose())
+    }
+
     fn result(&self, jitter_us: Measured, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
-        let Normal { matrix, .. } = self.normal(false);
-        let covariance = matrix.cholesky().ok_or(TimesError::Undetermined)?.inverse();
+        let covariance = self.covariance()?;
         let coefficients = self.table.coefficients;
         let seen_rows = self.columns.seen_rows();
         let unknown = |index: usize| {
@@ -620,23 +691,24 @@ impl FrameNormal {
     /// Adds the samples of one camera row. The light is `closing` minus `opening`, and late light is an early edge.
     fn add(
         &mut self,
-        opening: &Sparse,
-        closing: &Sparse,
+        [opening, closing]: &[Sparse; 2],
         sums: &Sums,
         matrix: &mut DMatrix<f64>,
         right: &mut DVector<f64>,
     ) {
+        let count = right.len();
+        let matrix = matrix.as_mut_slice();
         for &(a, x) in opening.entries() {
-            opening.entries().iter().for_each(|&(b, y)| matrix[(b, a)] += sums.opening_square * x * y);
+            opening.entries().iter().for_each(|&(b, y)| matrix[b * count + a] += sums.opening_square * x * y);
             for &(b, y) in closing.entries() {
-                matrix[(b, a)] -= sums.mixed * x * y;
-                matrix[(a, b)] -= sums.mixed * x * y;
+                matrix[b * count + a] -= sums.mixed * x * y;
+                matrix[a * count + b] -= sums.mixed * x * y;
             }
             right[a] -= sums.opening_residual * x;
             self.mixed[a] -= (sums.opening_square - sums.mixed) * x;
         }
         for &(a, x) in closing.entries() {
-            closing.entries().iter().for_each(|&(b, y)| matrix[(b, a)] += sums.closing_square * x * y);
+            closing.entries().iter().for_each(|&(b, y)| matrix[b * count + a] += sums.closing_square * x * y);
             right[a] += sums.closing_residual * x;
             self.mixed[a] -= (sums.closing_square - sums.mixed) * x;
         }
@@ -653,10 +725,6 @@ struct Sparse {
 }
 
 impl Sparse {
-    fn clear(&mut self) {
-        self.count = 0;
-    }
-
     fn push(&mut self, unknown: usize, value: f64) {
         self.entries[self.count] = (unknown, value);
         self.count += 1;

@@ -1,3 +1,5 @@
+use std::ops::Range;
+
 use super::super::super::NoiseModel;
 use super::columns::Columns;
 use super::settings::{BoardFrame, Shutter};
@@ -48,6 +50,22 @@ pub(super) struct Sums {
     pub closing_residual: f64,
 }
 
+/// Which samples of a frame are compared.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Samples {
+    /// Those that an edge meets.
+    OnEdges,
+    /// All of every so many camera rows.
+    EveryRow(usize),
+}
+
+impl Edge {
+    /// Rows drawn, with the fraction.
+    fn drawn(&self) -> f64 {
+        self.row as f64 + self.fraction
+    }
+}
+
 impl Sweep {
     pub fn new(mut starts_us: Vec<f64>, period_us: f64) -> Self {
         let rows = starts_us.len() - 1;
@@ -89,15 +107,19 @@ pub(super) struct Comparison<'a> {
 }
 
 impl Comparison<'_> {
-    /// Visits every `step`th camera row of a frame whose light is late by `late_us` and whose exposure is `longer_us`
-    /// longer than that of other frames. Only samples that an edge meets count, or all of them with `everywhere`.
+    /// Visits the camera rows of a frame whose light is late by `late_us` and whose exposure is `longer_us`
+    /// longer than that of other frames.
     pub fn visit(
         &self,
         frame: &BoardFrame,
         (late_us, longer_us): (f64, f64),
-        (step, everywhere): (usize, bool),
+        samples: Samples,
         mut visitor: impl FnMut(usize, &Edge, &Edge, &Sums),
     ) {
+        let (step, everywhere) = match samples {
+            Samples::OnEdges => (1, false),
+            Samples::EveryRow(step) => (step, true),
+        };
         let setting = frame.setting;
         let exposure_us = setting.exposure_us + self.clocks.exposure_offset_us + longer_us;
         let (mut opening, mut closing) = (self.sweep.edge(-late_us, 0), self.sweep.edge(-late_us, 0));
@@ -109,25 +131,30 @@ impl Comparison<'_> {
             let from_us = setting.delay_us + starts_us - late_us;
             opening = self.sweep.edge(from_us, opening.row);
             closing = self.sweep.edge(from_us + exposure_us, closing.row);
-            let sums = self.compare(frame, row, &opening, &closing, everywhere);
+            let reached = |edge: &Edge| edge.rows_per_us > 0.0 && self.columns.reached(row, edge.drawn());
+            if !everywhere && !reached(&opening) && !reached(&closing) {
+                continue;
+            }
+            let groups = 0..self.columns.groups();
+            let sums = self.compare(frame, row, groups, (&opening, &closing), everywhere);
             if sums.samples > 0.0 {
                 visitor(row, &opening, &closing, &sums);
             }
         }
     }
 
-    fn compare(
+    /// Compares some groups of a camera row.
+    pub fn compare(
         &self,
         frame: &BoardFrame,
         row: usize,
-        opening: &Edge,
-        closing: &Edge,
+        groups: Range<usize>,
+        (opening, closing): (&Edge, &Edge),
         everywhere: bool,
     ) -> Sums {
         let mut sums = Sums::default();
-        let (opening_row, closing_row) =
-            (opening.row as f64 + opening.fraction, closing.row as f64 + closing.fraction);
-        for group in 0..self.columns.groups() {
+        let (opening_row, closing_row) = (opening.drawn(), closing.drawn());
+        for group in groups {
             let pixels = self.columns.cell(row, group).pixels;
             if pixels == 0 {
                 continue;
