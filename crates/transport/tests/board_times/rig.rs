@@ -141,13 +141,8 @@ impl Rig {
             let centre = centres[[t, s]] - (BEAM_BELOW - BEAM_ABOVE) / 2.0;
             if lit(t, s) { centre as f32 } else { f32::NAN }
         });
-<<<<<<< HEAD
-        // A response is measured over 21 rows: 0.4 % in all, the same for neighbours.
-        let errors: Vec<[f64; 16]> = (0..rows / 21 + 1)
-=======
         // A response is measured over 21 rows: 0.4 % in all, the same for neighbours in a column.
         let errors: Vec<[f64; 16]> = (0..(rows / 21 + 1) * case.columns)
->>>>>>> h-g
             .map(|_| {
                 std::array::from_fn(
                     |d| if (3..12).contains(&d) { 0.001 * unit.sample(&mut random) } else { 0.0 },

@@ -55,21 +55,11 @@ impl Coarse {
         nominal.check()?;
         let global = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Global);
         let points: Vec<(f64, f64)> = global().flat_map(|frame| borders(columns, frame, nominal)).collect();
-<<<<<<< HEAD
-        let seen = columns.seen_rows();
-        let first = points.iter().map(|point| point.0).fold(f64::MAX, f64::min);
-        let last = points.iter().map(|point| point.0).fold(f64::MIN, f64::max);
-        let covered = (last - first).max(0.0) / seen.len() as f64;
-        if points.len() < MIN_BORDERS || covered < 0.5 {
-            return Err(TimesError::TooFewBorders {
-                borders: points.len(),
-=======
         let few = |borders: &[(f64, f64)]| {
             let (first, last) = ends(borders);
             let covered = (last - first).max(0.0) / columns.seen_rows().len() as f64;
             (borders.len() < MIN_BORDERS || covered < 0.5).then(|| TimesError::TooFewBorders {
                 borders: borders.len(),
->>>>>>> h-g
                 needed: MIN_BORDERS,
                 frames: global().count(),
                 covered_percent: covered * 100.0,

@@ -230,11 +230,7 @@ impl<'a> Fit<'a> {
             comparison.visit(
                 &self.frames[frame],
                 (late_us, longer_us),
-<<<<<<< HEAD
-                (SCAN_ROWS, true),
-=======
                 Samples::EveryRow(SCAN_ROWS),
->>>>>>> h-g
                 |_, _, _, sums| {
                     chi2 += sums.chi2;
                 },
