@@ -19,7 +19,7 @@ use raysweep::rig::AnyRig;
 use raysweep::{Probes, Runner};
 use raysweep_config::{DotRigFile, Plan, Procedure};
 use raysweep_core::{Clock, MirrorLimits};
-use raysweep_drivers::mirror::playzerx::protocol::Sample;
+use raysweep_drivers::mirror::playzerx::protocol::MirrorSample;
 use raysweep_drivers::mirror::{Parked, park};
 use raysweep_pipeline::dots::{ColumnStage, ColumnWorker};
 use raysweep_proto::{Client, Event, RunParams, RunState};
@@ -191,7 +191,7 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
         .points()
         .iter()
         .map(|point| Sample::of(*point, MirrorLimits::A7B2_3_3600AL.max_tilt))
-        .map(|Sample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
+        .map(|MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
         .collect();
     let first = codes.iter().position(|held| held.light > 0).unwrap();
     let begin = truth.held.iter().position(|held| held.light > 0).unwrap() - first;

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use guest::{Monitor, PATIENCE, wait_for};
 use nix::fcntl::OFlag;
 use raysweep_core::{DeviceErrorKind, Mirror, MirrorLimits, MirrorPath, Tilt};
-use raysweep_drivers::mirror::playzerx::protocol::Sample;
+use raysweep_drivers::mirror::playzerx::protocol::MirrorSample;
 use raysweep_drivers::mirror::{LightGuard, MirrorReport, PlayzerX, PlayzerXConfig, PlayzerXLink, arm_light};
 use raysweep_sim::mirror::{Held, MechanicsConfig, MirrorPty, PlayzerXController, PlayzerXControllerConfig};
 use suite::{BATCHES, mirror_conforms};
@@ -104,8 +104,8 @@ fn batch() -> MirrorPath {
 
 fn codes(path: &MirrorPath) -> Vec<Held> {
     let full_scale = MechanicsConfig::default().max_tilt;
-    let held = |Sample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light };
-    path.points().iter().map(|point| held(Sample::of(*point, full_scale))).collect()
+    let held = |MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light };
+    path.points().iter().map(|point| held(MirrorSample::of(*point, full_scale))).collect()
 }
 
 #[test]

@@ -13,7 +13,7 @@ use self::camera::{CameraLine, RunningSequence, WrittenSettings};
 pub use self::camera::{Exposure, Sets, TriggeredBy};
 use crate::keyed::{Purpose, keyed, uniform};
 use crate::scene::SceneMotion;
-use crate::shown::Shown;
+use crate::shown::ShownOptics;
 use raysweep_config::sim::{SimCamera, SimProjector, SimVsync};
 
 /// One projector frame: the time of its edge and what it shows (`None`: dark).
@@ -24,7 +24,7 @@ pub struct Light {
     /// Start of the light: the edge plus a phase error that no device measures.
     pub start_ns: i64,
     /// What is shown.
-    pub shown: Option<Arc<Shown>>,
+    pub shown: Option<Arc<ShownOptics>>,
     /// Key position of the scene's motion.
     pub key: usize,
 }
@@ -59,9 +59,9 @@ pub struct VsyncLine {
     pending: VecDeque<PendingEdge>,
     /// Light of the most recent periods and the next one.
     lights: VecDeque<Light>,
-    shown: Option<Arc<Shown>>,
+    shown: Option<Arc<ShownOptics>>,
     /// The next pattern, and the period from which the projector shows it.
-    next_shown: Option<(i64, Option<Arc<Shown>>)>,
+    next_shown: Option<(i64, Option<Arc<ShownOptics>>)>,
     /// What stands before the camera.
     subject: Subject,
     seen: VecDeque<Edge>,
@@ -410,7 +410,7 @@ impl VsyncLine {
     }
 
     /// Changes what is shown (`None`: dark); returns the time from which the light shows it.
-    pub fn show(&mut self, now_ns: i64, shown: Option<Arc<Shown>>) -> i64 {
+    pub fn show(&mut self, now_ns: i64, shown: Option<Arc<ShownOptics>>) -> i64 {
         self.advance(now_ns);
         let from_period = self.next_period + i64::from(self.config.projector.video_latency_frames);
         self.next_shown = Some((from_period, shown));
@@ -429,7 +429,7 @@ impl VsyncLine {
     }
 
     /// All that is shown to exposures that are triggered from now on.
-    pub fn all_shown(&self) -> Vec<Arc<Shown>> {
+    pub fn all_shown(&self) -> Vec<Arc<ShownOptics>> {
         let lit = self.lights.iter().filter_map(|light| light.shown.as_ref());
         let next = self.next_shown.iter().filter_map(|(_, shown)| shown.as_ref());
         lit.chain(&self.shown).chain(next).cloned().collect()

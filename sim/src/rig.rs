@@ -12,7 +12,7 @@ use crate::line::VsyncLine;
 use crate::optics;
 use crate::scene::{Scene, SceneMotion, SceneSize};
 use crate::sensor::{ImageSensor, Scale};
-use crate::shown::Shown;
+use crate::shown::ShownOptics;
 use crate::truth::{PlaneTruth, Stated};
 use crate::wire::{self, WireDevices};
 use crate::world::{PlaneSetup, PlaneWorld};
@@ -60,7 +60,7 @@ impl PlaneRig {
             size,
             format: setup.format,
             sensor,
-            white: Arc::new(Shown::new(Pattern::White)),
+            white: Arc::new(ShownOptics::new(Pattern::White)),
         };
         world.prepare(&world.white, Subject::Scene)?;
         Ok(Self { world: Arc::new(world) })

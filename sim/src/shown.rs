@@ -7,14 +7,14 @@ use raysweep_core::{Pattern, Subject};
 use crate::optics::RasterOptics;
 
 /// A pattern, and the subjects under it as far as they have stood before the camera.
-pub struct Shown {
+pub struct ShownOptics {
     pub pattern: Pattern,
     /// The scene in each key position of its motion.
     pub scene: OnceLock<Arc<[RasterOptics]>>,
     pub board: OnceLock<RasterOptics>,
 }
 
-impl Shown {
+impl ShownOptics {
     pub fn new(pattern: Pattern) -> Self {
         Self { pattern, scene: OnceLock::new(), board: OnceLock::new() }
     }

@@ -11,7 +11,7 @@ use crate::line::{Exposure, LineConfig};
 use crate::optics::{RasterOptics, View};
 use crate::scene::{Scene, SceneMotion};
 use crate::sensor::ImageSensor;
-use crate::shown::Shown;
+use crate::shown::ShownOptics;
 use crate::truth::PlaneTruth;
 
 /// Parameters from the rest of the rig file that the simulation needs.
@@ -47,22 +47,22 @@ pub(crate) struct PlaneWorld {
     pub format: PixelFormat,
     pub sensor: ImageSensor,
     /// What a white picture shows, which is shown in every run.
-    pub white: Arc<Shown>,
+    pub white: Arc<ShownOptics>,
 }
 
 impl PlaneWorld {
     /// What the projector shows under a pattern, with this subject before the camera.
-    pub fn show(&self, pattern: &Pattern, subject: Subject) -> Result<Arc<Shown>, SimError> {
+    pub fn show(&self, pattern: &Pattern, subject: Subject) -> Result<Arc<ShownOptics>, SimError> {
         let shown = match pattern {
             Pattern::White => self.white.clone(),
-            _ => Arc::new(Shown::new(pattern.clone())),
+            _ => Arc::new(ShownOptics::new(pattern.clone())),
         };
         self.prepare(&shown, subject)?;
         Ok(shown)
     }
 
     /// Computes the light of a subject under what is shown, unless that is done.
-    pub fn prepare(&self, shown: &Shown, subject: Subject) -> Result<(), SimError> {
+    pub fn prepare(&self, shown: &ShownOptics, subject: Subject) -> Result<(), SimError> {
         let Self { config, truth, .. } = self;
         let view =
             View { truth, projector: &config.projector, seed: config.seed, mosaic: self.format.mosaic };

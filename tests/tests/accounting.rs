@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use raysweep_config::RigFile;
 use raysweep_core::{CameraSettings, Counts, Frame, FramePool, LossCause, SettingsId, Shutter};
-use raysweep_pipeline::{Assembler, AssemblerConfig, Decision, Event, Job, Label};
+use raysweep_pipeline::{Assembler, AssemblerConfig, Decision, DeviceEvent, Job, Label};
 use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup};
 use raysweep_tests::rig_text;
 
@@ -61,7 +61,7 @@ fn observe(faults: &str) -> (Counts, Truth) {
             counts.add(&account);
         });
     };
-    push(Event::Begin(Job {
+    push(DeviceEvent::Begin(Job {
         id,
         frames: FRAMES + 1,
         applied,
@@ -74,11 +74,11 @@ fn observe(faults: &str) -> (Counts, Truth) {
         let mut data = pool.take();
         let stamp = camera.next_frame(&mut data, Duration::from_secs(5)).unwrap().unwrap();
         last_seq = stamp.seq;
-        edges.try_iter().for_each(|edge| push(Event::Edge(edge)));
-        push(Event::Frame(Frame { data, format: capabilities.format, stamp }, Label::Counted));
+        edges.try_iter().for_each(|edge| push(DeviceEvent::Edge(edge)));
+        push(DeviceEvent::Frame(Frame { data, format: capabilities.format, stamp }, Label::Counted));
     }
     let truth = truth.read();
-    push(Event::Flush);
+    push(DeviceEvent::Flush);
     drop((camera, edges));
     watcher.join().unwrap();
     assert!(counts.balanced(), "{counts:?}");

@@ -18,8 +18,8 @@ use raysweep_transport::plane::board::images::{
     photon_transfer,
 };
 use raysweep_transport::plane::board::times::{
-    self, BoardFrame, BoardSetting, Coarse, Columns, Nominal, RowTimes, arrival_settings, check_settings,
-    sweep_settings,
+    self, BoardFrame, BoardSetting, CoarseSweep, Columns, Nominal, RowTimes, arrival_settings,
+    check_settings, sweep_settings,
 };
 use raysweep_transport::plane::calibrate::latency;
 use raysweep_transport::plane::{
@@ -221,7 +221,7 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     for setting in sweep_settings(&nominal, columns.seen_rows()).unwrap() {
         shoot(studio, &mut frames, setting, 1);
     }
-    let coarse = Coarse::from_borders(&columns, &frames, &nominal).unwrap();
+    let coarse = CoarseSweep::from_borders(&columns, &frames, &nominal).unwrap();
     for setting in arrival_settings(&columns, &coarse, &nominal).unwrap() {
         shoot(studio, &mut frames, setting, 3);
     }

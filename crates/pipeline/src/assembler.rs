@@ -51,7 +51,7 @@ pub enum Label {
 }
 
 /// Messages from the device threads to the assembler, in order.
-pub enum Event {
+pub enum DeviceEvent {
     /// An edge of the VSYNC line.
     Edge(Edge),
     /// The camera has been configured for an attempt.
@@ -203,23 +203,23 @@ impl Assembler {
     }
 
     /// Processes an event; passes what can be decided now to `decide`, in order.
-    pub fn push(&mut self, event: Event, mut decide: impl FnMut(Decision)) {
+    pub fn push(&mut self, event: DeviceEvent, mut decide: impl FnMut(Decision)) {
         match event {
-            Event::Edge(edge) => {
+            DeviceEvent::Edge(edge) => {
                 self.newest_ns = self.newest_ns.max(edge.host_ns);
                 self.tracker.push(edge);
             }
-            Event::Begin(job) => self.waiting.push_back(Waiting::Begin(job)),
-            Event::Frame(frame, label) => {
+            DeviceEvent::Begin(job) => self.waiting.push_back(Waiting::Begin(job)),
+            DeviceEvent::Frame(frame, label) => {
                 self.newest_ns = self.newest_ns.max(frame.stamp.host_ns);
                 self.waiting.push_back(Waiting::Frame(frame, label));
             }
-            Event::Lost(seq, cause) => self.waiting.push_back(Waiting::Lost(seq, cause)),
-            Event::End => self.waiting.push_back(Waiting::End),
-            Event::Interrupt => self.waiting.push_back(Waiting::Interrupt),
-            Event::Idle => self.waiting.push_back(Waiting::Idle),
-            Event::Settle(decided) => self.waiting.push_back(Waiting::Settle(decided)),
-            Event::Flush => self.waiting.push_back(Waiting::Flush),
+            DeviceEvent::Lost(seq, cause) => self.waiting.push_back(Waiting::Lost(seq, cause)),
+            DeviceEvent::End => self.waiting.push_back(Waiting::End),
+            DeviceEvent::Interrupt => self.waiting.push_back(Waiting::Interrupt),
+            DeviceEvent::Idle => self.waiting.push_back(Waiting::Idle),
+            DeviceEvent::Settle(decided) => self.waiting.push_back(Waiting::Settle(decided)),
+            DeviceEvent::Flush => self.waiting.push_back(Waiting::Flush),
         }
         while let Some(next) = self.waiting.pop_front() {
             let flushing = self.waiting.iter().chain([&next]).any(|item| matches!(item, Waiting::Flush));

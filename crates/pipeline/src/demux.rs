@@ -15,7 +15,7 @@ pub use self::options::{DEMUX, DemuxOptions};
 use self::tally::Tally;
 pub use self::tally::{PREDICTED_SHARE, SweepSummary};
 use crate::findings::{Choices, choose, rows_to_choose_by};
-use crate::schedule::{Role, Schedule, SweepGeometry};
+use crate::schedule::{PointRole, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
 use crate::stage_refused::StageRefused;
 use crate::strips::{NotSolved, Strip};
@@ -35,9 +35,9 @@ pub struct DemuxFold {
     schedule: Arc<Schedule>,
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
-    taken: BTreeMap<Role, Arc<SweepImage>>,
+    taken: BTreeMap<PointRole, Arc<SweepImage>>,
     /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
-    not_kept: Option<BTreeMap<Role, (u32, Setting)>>,
+    not_kept: Option<BTreeMap<PointRole, (u32, Setting)>>,
 }
 
 /// The camera rows of a sweep to be solved, and the neighbouring rows on which they depend.
@@ -104,22 +104,26 @@ impl DemuxFold {
     /// # Errors
     /// If delays and exposures do not give a valid model on this rig.
     pub fn demux(&self) -> Result<Demux, PlaneError> {
-        let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
+        let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_)));
         let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
         Demux::new(self.timing.clone(), planned, self.options.prior())
     }
 
     /// The dark image for the exposure of a role's image, if it was taken.
-    fn dark_of(&self, taken: &BTreeMap<Role, Arc<SweepImage>>, role: Role) -> Option<Arc<SweepImage>> {
+    fn dark_of(
+        &self,
+        taken: &BTreeMap<PointRole, Arc<SweepImage>>,
+        role: PointRole,
+    ) -> Option<Arc<SweepImage>> {
         let point = self.schedule.points.iter().find(|point| point.role == role)?;
         taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
     }
 
     /// The sweep in these images, without those whose dark image is missing. Each image is dropped as soon as it is
     /// in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
-    fn stack(&self, mut taken: BTreeMap<Role, Arc<SweepImage>>) -> Result<SweepStack, NotSolved> {
-        let darks = taken.extract_if(.., |role, _| matches!(role, Role::Dark(_))).collect();
-        taken.retain(|role, _| matches!(role, Role::Sweep(_)) && self.dark_of(&darks, *role).is_some());
+    fn stack(&self, mut taken: BTreeMap<PointRole, Arc<SweepImage>>) -> Result<SweepStack, NotSolved> {
+        let darks = taken.extract_if(.., |role, _| matches!(role, PointRole::Dark(_))).collect();
+        taken.retain(|role, _| matches!(role, PointRole::Sweep(_)) && self.dark_of(&darks, *role).is_some());
         if taken.is_empty() {
             return Err(NotSolved {
                 of: DEMUX,
@@ -134,7 +138,7 @@ impl DemuxFold {
         let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
-        let point_of = |role: &Role| self.schedule.points.iter().find(|point| point.role == *role);
+        let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
@@ -160,8 +164,8 @@ impl DemuxFold {
     }
 
     /// The camera rows starting at `first_row`, to which the images belong.
-    fn hold(&self, first_row: usize, taken: BTreeMap<Role, Arc<SweepImage>>) -> Result<Held, NotSolved> {
-        let regular = taken.get(&Role::Regular).cloned().zip(self.dark_of(&taken, Role::Regular));
+    fn hold(&self, first_row: usize, taken: BTreeMap<PointRole, Arc<SweepImage>>) -> Result<Held, NotSolved> {
+        let regular = taken.get(&PointRole::Regular).cloned().zip(self.dark_of(&taken, PointRole::Regular));
         Ok(Held { first_row, stack: self.stack(taken)?, regular })
     }
 
@@ -245,8 +249,8 @@ impl DemuxFold {
 
 impl Snapshot for DemuxFold {
     fn points(&self) -> usize {
-        let taken = |role: Role| self.taken.contains_key(&role);
-        let lit = self.schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
+        let taken = |role: PointRole| self.taken.contains_key(&role);
+        let lit = self.schedule.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_)));
         lit.filter(|point| taken(point.role) && self.schedule.dark_of(point.exposure_us).is_some_and(taken))
             .count()
     }

@@ -22,7 +22,7 @@ mod strips;
 mod unit;
 
 pub use assembler::{
-    Assembler, AssemblerConfig, Decision, EXPOSURE_TOLERANCE_US, Event, Failure, Job, Label,
+    Assembler, AssemblerConfig, Decision, DeviceEvent, EXPOSURE_TOLERANCE_US, Failure, Job, Label,
 };
 pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solved, SweepSummary};
 pub use edges::{EdgeTracker, Line};
@@ -32,7 +32,7 @@ pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};
 pub use product::{Product, Profile};
 pub use products::{Assembly, NotMade, ProductError, ProductSpec};
 pub use queue::{Input, Policy, QueueError, Receiver};
-pub use schedule::{Point, Role, Scan, Schedule, Shot, Spot, SweepGeometry};
+pub use schedule::{Point, PointRole, Schedule, Shot, Spot, SpotScan, SweepGeometry};
 pub use stack::SweepStack;
 pub use stage::{HotPixels, PlaneStage, Stage, StageError, Stages, message_of, run_stages};
 pub use stage_refused::StageRefused;

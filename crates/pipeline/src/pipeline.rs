@@ -7,7 +7,7 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 use ndarray::Array2;
 use raysweep_core::{Counts, SettingsId, VsyncStats};
 
-use crate::assembler::{Assembler, AssemblerConfig, Decision, Event, Failure};
+use crate::assembler::{Assembler, AssemblerConfig, Decision, DeviceEvent, Failure};
 use crate::queue::{Input, Policy};
 use crate::stage::{StageError, Stages, run_stages};
 use crate::unit::Unit;
@@ -78,7 +78,7 @@ impl<S: Sink + 'static> Pipeline<S> {
         assembler: AssemblerConfig,
         stages: Stages,
         sink: S,
-    ) -> Result<(Self, Input<Event>), PipelineError> {
+    ) -> Result<(Self, Input<DeviceEvent>), PipelineError> {
         let workers = rayon::ThreadPoolBuilder::new()
             .num_threads(config.worker_threads)
             .thread_name(|index| format!("stage-{index}"))
@@ -130,7 +130,7 @@ struct Dispatch {
     permits: Receiver<()>,
 }
 
-fn run_assembler(mut assembler: Assembler, events: &Receiver<Event>, dispatch: &Dispatch) {
+fn run_assembler(mut assembler: Assembler, events: &Receiver<DeviceEvent>, dispatch: &Dispatch) {
     let mut seq = 0;
     for event in events {
         assembler.push(event, |decision| {

@@ -9,7 +9,7 @@ use serde::Deserialize;
 
 /// The purpose of a point's image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Role {
+pub enum PointRole {
     /// Projector dark; the index counts the exposures, shortest first.
     Dark(u32),
     /// One whole VSYNC period of exposure: every row is lit once.
@@ -22,7 +22,7 @@ pub enum Role {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
     /// Purpose of its image.
-    pub role: Role,
+    pub role: PointRole,
     /// Wanted delay t_d.
     pub delay_us: f64,
     /// Wanted exposure t_e.
@@ -41,17 +41,18 @@ pub struct Schedule {
 impl Schedule {
     /// Number of points in the plan's sweep.
     pub fn sweep_len(&self) -> usize {
-        self.points.iter().filter(|point| matches!(point.role, Role::Sweep(_))).count()
+        self.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_))).count()
     }
 
     /// Number of dark points.
     pub fn dark_len(&self) -> usize {
-        self.points.iter().filter(|point| matches!(point.role, Role::Dark(_))).count()
+        self.points.iter().filter(|point| matches!(point.role, PointRole::Dark(_))).count()
     }
 
     /// The dark point of an exposure.
-    pub fn dark_of(&self, exposure_us: f64) -> Option<Role> {
-        let dark = |point: &&Point| matches!(point.role, Role::Dark(_)) && point.exposure_us == exposure_us;
+    pub fn dark_of(&self, exposure_us: f64) -> Option<PointRole> {
+        let dark =
+            |point: &&Point| matches!(point.role, PointRole::Dark(_)) && point.exposure_us == exposure_us;
         self.points.iter().find(dark).map(|point| point.role)
     }
 }
@@ -92,13 +93,13 @@ pub enum Spot {
     /// The whole row at once: evenly over the row's time.
     Uniform,
     /// By a spot that flies along the row: at the time when it passes the projector column that the pixel sees.
-    Flying(Scan),
+    Flying(SpotScan),
 }
 
 /// Direction of a flying spot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
-pub enum Scan {
+pub enum SpotScan {
     /// Unknown.
     Unknown,
     /// Every row from the first column to the last.
@@ -139,9 +140,9 @@ impl SweepGeometry {
     /// The path of a flying spot over the camera's columns, if the rig file gives it.
     pub fn flying_spot(&self) -> Option<FlyingSpot> {
         let scan = match self.spot {
-            Spot::Uniform | Spot::Flying(Scan::Unknown) => return None,
-            Spot::Flying(Scan::OneWay) => calibrate::Scan::OneWay,
-            Spot::Flying(Scan::Bidirectional) => calibrate::Scan::Bidirectional,
+            Spot::Uniform | Spot::Flying(SpotScan::Unknown) => return None,
+            Spot::Flying(SpotScan::OneWay) => calibrate::Scan::OneWay,
+            Spot::Flying(SpotScan::Bidirectional) => calibrate::Scan::Bidirectional,
         };
         let [left, right] = self.projector_columns?;
         let column = |s: usize| left + (right - left) * (s as f64 + 0.5) / self.width as f64;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ndarray::{Array2, Array3, Axis};
 use raysweep_config::plan::DarksPlan;
 use raysweep_config::{Plan, RigFile};
-use raysweep_pipeline::{Point, Role, Schedule};
+use raysweep_pipeline::{Point, PointRole, Schedule};
 use raysweep_session::ledger::State;
 use raysweep_session::report::{Block, NoteLevel, Picture, Report, Section, Table, ToneMap};
 use raysweep_session::stack::{ArrayName, Contents, Stack, crc32};
@@ -35,7 +35,7 @@ impl DarksTask {
     pub fn new(plan: &Plan, darks: DarksPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
         let pairs = darks.exposure_us.values().into_iter().flat_map(|exposure_us| [exposure_us; 2]);
         let image = |(index, exposure_us)| Point {
-            role: Role::Dark(index),
+            role: PointRole::Dark(index),
             delay_us: 0.0,
             exposure_us,
             frames: darks.frames,

@@ -12,12 +12,13 @@ use raysweep_transport::dots::product::{
     EpipolarMask, MaskRule, Separation, column_energies, compensate, coverage, dual, epipolar, fill_holes,
     floodlit, pattern_weights, relight, relight_sequence, shadow_dot, shadow_neighbours,
 };
-use raysweep_transport::dots::{Batch, BatchArrays, DotsError, FrameShape, Outcome, SparseColumn};
+use raysweep_transport::dots::{Batch, BatchArrays, ColumnOutcome, DotsError, FrameShape, SparseColumn};
 
 /// A column with the pixels above `least` and the means of the rest, computed without the denoiser.
 fn column(shape: FrameShape, image: &Array3<f32>, least: f32) -> SparseColumn {
     let channels = shape.channels();
-    let mut column = SparseColumn { outcome: Outcome { discs: 1, capped: false }, ..SparseColumn::default() };
+    let mut column =
+        SparseColumn { outcome: ColumnOutcome { discs: 1, capped: false }, ..SparseColumn::default() };
     let mut rest = vec![(0.0_f64, 0_usize); shape.blocks() * channels];
     for (pixel, value) in image.rows().into_iter().enumerate() {
         if value.iter().any(|&value| value > least) {

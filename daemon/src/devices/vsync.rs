@@ -6,7 +6,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use raysweep_core::{DeviceError, DeviceErrorKind, DeviceState, Vsync};
-use raysweep_pipeline::{EdgeTracker, Event, Input, Line};
+use raysweep_pipeline::{DeviceEvent, EdgeTracker, Input, Line};
 use raysweep_proto::Event as Told;
 
 use super::priority;
@@ -82,7 +82,7 @@ impl VsyncThread {
         line: Line,
         pace: Pace,
         board: Arc<StatusBoard>,
-        input: Input<Event>,
+        input: Input<DeviceEvent>,
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         let stop = Arc::new(AtomicBool::new(false));
@@ -101,7 +101,7 @@ impl VsyncThread {
                         match vsync.next_edge(POLL) {
                             Ok(Some(edge)) => {
                                 meter.tracker.push(edge);
-                                if input.send(Event::Edge(edge)).is_err() {
+                                if input.send(DeviceEvent::Edge(edge)).is_err() {
                                     break;
                                 }
                             }

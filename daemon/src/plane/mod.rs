@@ -12,7 +12,7 @@ use raysweep_core::{
     Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
     SettingsLatency, Shown, Vsync,
 };
-use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, Policy, Role, Sink, Stages};
+use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, PointRole, Policy, Sink, Stages};
 use raysweep_processing::plane::{PlaneTask, place};
 use raysweep_proto::RunState;
 use raysweep_session::ledger::State;
@@ -196,7 +196,7 @@ impl Opened {
 /// The line that triggers the camera through a task's settings. Dark points have their own pass.
 fn line_of(task: &PlaneTask, trigger_latency_us: f64) -> TriggerLine {
     let points = &task.schedule.points;
-    let is_lit = |point: &&Point| !matches!(point.role, Role::Dark(_));
+    let is_lit = |point: &&Point| !matches!(point.role, PointRole::Dark(_));
     let all_dark = !points.iter().any(|point| is_lit(&point));
     let settings: Vec<CameraSettings> = points
         .iter()
@@ -254,7 +254,7 @@ impl Passes<'_> {
             let before = todo.len();
             let mut counts = Counts::default();
             let (dark, lit): (Vec<_>, Vec<_>) =
-                todo.into_iter().partition(|attempt| matches!(attempt.point.role, Role::Dark(_)));
+                todo.into_iter().partition(|attempt| matches!(attempt.point.role, PointRole::Dark(_)));
             todo = Vec::new();
             if !dark.is_empty() {
                 let Some(shown) = self.projector.show(None, self.orders)? else { return Ok(()) };

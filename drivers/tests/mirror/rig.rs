@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use raysweep_core::{Mirror, MirrorLimits, MirrorPath, MirrorProgress, Tilt};
-use raysweep_drivers::mirror::playzerx::protocol::Sample;
+use raysweep_drivers::mirror::playzerx::protocol::MirrorSample;
 use raysweep_drivers::mirror::{self, LightGuard, PlayzerX, arm_light};
 use raysweep_sim::mirror::{
     Held, MechanicsConfig, MirrorPty, PlayzerXController, PlayzerXControllerConfig, SerialLink, WireFaults,
@@ -128,7 +128,7 @@ pub fn codes(path: &MirrorPath) -> Vec<Held> {
     path.points()
         .iter()
         .map(|point| Sample::of(*point, MechanicsConfig::default().max_tilt))
-        .map(|Sample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
+        .map(|MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
         .collect()
 }
 

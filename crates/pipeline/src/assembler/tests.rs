@@ -42,13 +42,13 @@ impl Feed {
         Self { assembler: Assembler::new(config()), decisions: Vec::new(), pool, seq: 0 }
     }
 
-    fn push(&mut self, event: Event) {
+    fn push(&mut self, event: DeviceEvent) {
         let decisions = &mut self.decisions;
         self.assembler.push(event, |decision| decisions.push(decision));
     }
 
     fn edge(&mut self, host_ns: i64) {
-        self.push(Event::Edge(Edge { seq: 0, host_ns }));
+        self.push(DeviceEvent::Edge(Edge { seq: 0, host_ns }));
     }
 
     /// Edges number `from..to` of a perfectly regular line.
@@ -68,7 +68,7 @@ impl Feed {
         light_edges_later: u32,
     ) {
         let actual = CameraSettings { shutter: Shutter::Rolling, exposure_us: EXPOSURE_US, trigger_delay_us };
-        self.push(Event::Begin(Job {
+        self.push(DeviceEvent::Begin(Job {
             id: SettingsId { point: 7, attempt: 0 },
             frames,
             applied: Applied { actual, first_frame: FirstFrame::Exactly(0) },
@@ -83,7 +83,7 @@ impl Feed {
         let mut data = self.pool.take();
         PixelFormat::Mono12.pack_into(&[counts; 2], &mut data).unwrap();
         let stamp = self.stamp(trigger_ns + ns_from_us(delay_us));
-        self.push(Event::Frame(Frame { data, format: PixelFormat::Mono12, stamp }, label));
+        self.push(DeviceEvent::Frame(Frame { data, format: PixelFormat::Mono12, stamp }, label));
     }
 
     fn stamp(&mut self, exposure_start_ns: i64) -> FrameStamp {
@@ -124,7 +124,7 @@ fn frames_are_summed_once_their_edges_are_known() {
     feed.frame(2, 100);
     feed.edge(3 * PERIOD_NS);
     feed.frame(3, 23);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     assert!(feed.decisions.is_empty(), "the edge after the last frame may still change its verdict");
     feed.edge(4 * PERIOD_NS);
     let unit = feed.unit();
@@ -143,7 +143,7 @@ fn the_delay_is_measured_against_the_edge_of_the_light_not_of_the_trigger() {
     feed.begin(1, trigger_delay_us, 1);
     feed.edge(3 * PERIOD_NS + 30_000);
     feed.frame_at(2 * PERIOD_NS, trigger_delay_us, 5, Label::Counted);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     feed.edge(4 * PERIOD_NS);
     assert!((feed.unit().delays_us[0] + 30.0).abs() < 0.01, "{:?}", feed.unit().delays_us);
 }
@@ -157,7 +157,7 @@ fn a_frame_by_a_false_edge_does_not_count() {
     feed.edge(false_ns);
     feed.frame_at(false_ns, 700.0, 9, Label::Counted);
     feed.edges(3, 5);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     assert_eq!(feed.failed().lost, [(LossCause::FalseEdge, 1)].into());
     assert!(feed.failed().balanced());
 }
@@ -168,7 +168,7 @@ fn a_frame_without_its_edge_waits_and_then_does_not_count() {
     feed.edges(0, 3);
     feed.begin(1, 700.0, 0);
     feed.frame(3, 9);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     assert!(feed.decisions.is_empty());
     feed.edge(4 * PERIOD_NS);
     assert_eq!(feed.failed().lost, [(LossCause::EdgeMissing, 1)].into());
@@ -180,7 +180,7 @@ fn a_line_that_has_died_does_not_hold_frames_for_ever() {
     feed.edges(0, 3);
     feed.begin(1, 700.0, 0);
     feed.frame(3, 9);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     // A frame 100 ms later on the host's clock shows that the edge will not come.
     feed.frame_at(10 * PERIOD_NS, 700.0, 9, Label::Cancelled);
     assert_eq!(feed.failed().lost, [(LossCause::EdgeMissing, 1)].into());
@@ -192,9 +192,9 @@ fn whoever_waits_for_decisions_is_told_of_the_last_one() {
     feed.edges(0, 3);
     feed.begin(1, 700.0, 0);
     feed.frame(2, 9);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     let decided = Arc::new(AtomicBool::new(false));
-    feed.push(Event::Settle(decided.clone()));
+    feed.push(DeviceEvent::Settle(decided.clone()));
     assert!(
         !decided.load(Ordering::Acquire) && feed.decisions.is_empty(),
         "the edge after the frame is to come"
@@ -210,8 +210,8 @@ fn a_flush_decides_what_waits() {
     feed.edges(0, 3);
     feed.begin(1, 700.0, 0);
     feed.frame(2, 9);
-    feed.push(Event::End);
-    feed.push(Event::Flush);
+    feed.push(DeviceEvent::End);
+    feed.push(DeviceEvent::Flush);
     assert!(matches!(&feed.decisions[..], [Decision::Unit(_), Decision::Flushed(..)]));
 }
 
@@ -225,9 +225,9 @@ fn jitter_beyond_the_plans_limit_and_foreign_exposures_do_not_count() {
     data.fill(0);
     let start_ns = 3 * PERIOD_NS + 700_000;
     let stamp = FrameStamp { exposure_us: Some(900.0), ..feed.stamp(start_ns) };
-    feed.push(Event::Frame(Frame { data, format: PixelFormat::Mono12, stamp }, Label::Counted));
+    feed.push(DeviceEvent::Frame(Frame { data, format: PixelFormat::Mono12, stamp }, Label::Counted));
     feed.edges(3, 5);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     let lost = [(LossCause::SettingsMismatch, 1), (LossCause::Jitter, 1)].into();
     assert_eq!(feed.failed().lost, lost);
 }
@@ -241,7 +241,7 @@ fn gaps_in_frame_ids_and_unanswered_edges_are_counted_where_they_happen() {
     feed.seq += 2; // two frames exposed by edges 3 and 4, and lost on the way
     feed.frame(5, 1);
     feed.frame(8, 1); // edges 6 and 7 triggered no frame
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     let counts = &feed.unit().counts;
     assert_eq!(counts.lost, [(LossCause::CameraGap, 2), (LossCause::MissedTrigger, 2)].into());
     assert_eq!((counts.expected, counts.averaged), (7, 3));
@@ -256,7 +256,7 @@ fn a_camera_that_needs_two_periods_misses_no_trigger_by_answering_every_second()
     feed.begin(2, 700.0 + 16_000.0, 0);
     feed.frame_at(2 * PERIOD_NS, 16_700.0, 1, Label::Counted);
     feed.frame_at(4 * PERIOD_NS, 16_700.0, 1, Label::Counted);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     assert!(!feed.failed().lost.contains_key(&LossCause::MissedTrigger), "{:?}", feed.failed());
 }
 
@@ -265,15 +265,15 @@ fn settling_and_idle_frames_have_columns_of_their_own() {
     let mut feed = Feed::new();
     feed.edges(0, 12);
     feed.frame_at(PERIOD_NS, 0.0, 1, Label::Cancelled);
-    feed.push(Event::Idle);
+    feed.push(DeviceEvent::Idle);
     feed.seq += 5; // frames that nobody took
     feed.begin(1, 700.0, 0);
     feed.frame_at(2 * PERIOD_NS, 0.0, 1, Label::Settling);
     feed.frame(3, 1);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     let counts = feed.unit().counts.clone();
     assert_eq!((counts.expected, counts.averaged, counts.settling, counts.cancelled), (7, 1, 1, 5));
-    feed.push(Event::Flush);
+    feed.push(DeviceEvent::Flush);
     let Some(Decision::Flushed(outside, _)) = feed.decisions.last() else { panic!() };
     assert_eq!((outside.expected, outside.cancelled), (1, 1));
 }
@@ -288,7 +288,7 @@ fn spare_frames_stand_in_for_unsound_ones_and_are_left_when_they_need_not() {
     feed.frame(3, 10);
     feed.frame(4, 20);
     feed.frame(5, 1000);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     let unit = feed.unit();
     assert_eq!(unit.sum[[0, 0]], 30);
     assert_eq!((unit.counts.averaged, unit.counts.cancelled, unit.counts.lost_total()), (2, 1, 1));
@@ -301,7 +301,7 @@ fn a_flush_ends_an_attempt_that_a_failing_device_left_open() {
     feed.edges(0, 3);
     feed.begin(2, 700.0, 0);
     feed.frame(2, 9);
-    feed.push(Event::Flush);
+    feed.push(DeviceEvent::Flush);
     let [Decision::Failed(_, Failure::Interrupted, counts), Decision::Flushed(..)] = &feed.decisions[..]
     else {
         panic!()
@@ -315,7 +315,7 @@ fn an_attempt_that_is_interrupted_is_not_to_blame_for_what_it_lacks() {
     feed.edges(0, 3);
     feed.begin(2, 700.0, 0);
     feed.frame_at(2 * PERIOD_NS, 700.0 + 60.0, 9, Label::Counted);
-    feed.push(Event::Interrupt);
+    feed.push(DeviceEvent::Interrupt);
     feed.edges(3, 5);
     let [Decision::Failed(_, Failure::Interrupted, counts)] = &feed.decisions[..] else { panic!() };
     assert_eq!(counts.lost, [(LossCause::Jitter, 1)].into());
@@ -337,7 +337,7 @@ fn a_frame_that_a_false_edge_may_have_triggered_under_the_settings_before_does_n
         feed.frame_at(3 * PERIOD_NS, 700.0, 100, label(false_ns));
         feed.edges(3, 6);
         feed.frame(4, 100);
-        feed.push(Event::End);
+        feed.push(DeviceEvent::End);
         feed.decisions
     };
     assert!(matches!(&decide(false)[..], [Decision::Unit(_)]));
@@ -358,7 +358,7 @@ fn frame_ids_that_fall_back_do_no_harm() {
     feed.seq = 0; // 16-bit ids wrap around
     feed.frame(3, 1);
     feed.frame(4, 1);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     assert!(feed.unit().counts.balanced());
 }
 
@@ -372,7 +372,7 @@ fn triggers_that_a_film_misses_between_two_settings_are_counted() {
         let periods = [None, Some(1), Some(2), Some(1), Some(1)][job];
         feed.begin_after(periods, 1, 700.0, 0);
         feed.frame(edge, 100);
-        feed.push(Event::End);
+        feed.push(DeviceEvent::End);
     }
     let missed = feed.decisions.iter().map(|decision| match decision {
         Decision::Unit(unit) => unit.counts.lost_total(),
@@ -388,9 +388,9 @@ fn a_frame_that_found_no_room_is_lost_once() {
     feed.begin(2, 700.0, 0);
     feed.frame(2, 100);
     let lost = feed.stamp(3 * PERIOD_NS);
-    feed.push(Event::Lost(lost.seq, Some(LossCause::PoolEmpty)));
+    feed.push(DeviceEvent::Lost(lost.seq, Some(LossCause::PoolEmpty)));
     feed.frame(4, 100);
-    feed.push(Event::End);
+    feed.push(DeviceEvent::End);
     let counts = &feed.unit().counts;
     assert_eq!((counts.expected, counts.lost_total()), (3, 1), "its trigger was answered");
 }

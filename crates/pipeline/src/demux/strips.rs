@@ -12,7 +12,7 @@ use raysweep_transport::plane::{PlaneError, Setting};
 use super::tally::{SweepSummary, Tally};
 use super::{DEMUX, DemuxFold, SweepImage, refused};
 use crate::findings::rows_to_choose_by;
-use crate::schedule::Role;
+use crate::schedule::PointRole;
 use crate::strips::{ImageRows, InStrips, NotSolved};
 
 impl DemuxFold {
@@ -44,13 +44,13 @@ impl DemuxFold {
     /// completely: one at a time, because several together may be larger than the memory.
     fn read_to_choose_by(
         &self,
-        not_kept: &BTreeMap<Role, (u32, Setting)>,
+        not_kept: &BTreeMap<PointRole, (u32, Setting)>,
         images: &dyn ImageRows,
         go_on: &(dyn Fn() -> bool + Sync),
-    ) -> Result<BTreeMap<Role, Arc<SweepImage>>, NotSolved> {
+    ) -> Result<BTreeMap<PointRole, Arc<SweepImage>>, NotSolved> {
         let height = self.geometry.height;
         let rows = rows_to_choose_by(height);
-        let of_rows = |(role, (point, setting)): (&Role, &(u32, Setting))| {
+        let of_rows = |(role, (point, setting)): (&PointRole, &(u32, Setting))| {
             if !go_on() {
                 return Err(refused(PlaneError::Stopped));
             }
@@ -63,10 +63,10 @@ impl DemuxFold {
 
 /// Reads some camera rows of the images.
 fn read_rows(
-    not_kept: &BTreeMap<Role, (u32, Setting)>,
+    not_kept: &BTreeMap<PointRole, (u32, Setting)>,
     images: &dyn ImageRows,
     rows: &Range<usize>,
-) -> Result<BTreeMap<Role, Arc<SweepImage>>, NotSolved> {
+) -> Result<BTreeMap<PointRole, Arc<SweepImage>>, NotSolved> {
     not_kept
         .par_iter()
         .map(|(role, (point, setting))| {
@@ -116,12 +116,13 @@ mod tests {
     fn schedule() -> Schedule {
         let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames: 1 };
         let regular = [
-            point(Role::Dark(0), 0.0, 60.0),
-            point(Role::Dark(1), 0.0, 3000.0),
-            point(Role::Regular, 0.0, 3000.0),
+            point(PointRole::Dark(0), 0.0, 60.0),
+            point(PointRole::Dark(1), 0.0, 3000.0),
+            point(PointRole::Regular, 0.0, 3000.0),
         ];
         let delays_us = (-4..=4).map(|step| f64::from(step) * 25.0);
-        let sweep = (0..).zip(delays_us).map(|(index, delay_us)| point(Role::Sweep(index), delay_us, 60.0));
+        let sweep =
+            (0..).zip(delays_us).map(|(index, delay_us)| point(PointRole::Sweep(index), delay_us, 60.0));
         Schedule { points: regular.into_iter().chain(sweep).collect() }
     }
 
@@ -136,7 +137,7 @@ mod tests {
             };
             let weights = timing.weights(t, &setting);
             let lit: f64 = weights.iter().enumerate().map(|(v, weight)| weight * light(v)).sum();
-            let lit = if matches!(point.role, Role::Dark(_)) { 0.0 } else { lit };
+            let lit = if matches!(point.role, PointRole::Dark(_)) { 0.0 } else { lit };
             let seed = ((ordinal * HEIGHT + t) * WIDTH + s) as f64;
             let noise = (seed * 12.9898).sin() * 43_758.545_3;
             let highlight = if (t, s, ordinal) == (HEIGHT - 2, 3, 6) { 4000.0 } else { 0.0 };

@@ -6,7 +6,7 @@ use raysweep_transport::plane::{DelayProfile, Setting, Transport};
 use serde::Deserialize;
 
 use crate::product::{Product, Profile};
-use crate::schedule::{Role, Schedule, SweepGeometry};
+use crate::schedule::{PointRole, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
 
 /// Options of `delay-profile`, as given in a plan.
@@ -68,7 +68,7 @@ impl ProfileTable {
             }
             _ => return Err(("pixel", "give either pixel = [t, s] or region = [t0, t1, s0, s1]".into())),
         };
-        let sweep = schedule.points.iter().filter(|point| matches!(point.role, Role::Sweep(_)));
+        let sweep = schedule.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_)));
         let mut exposures_us: Vec<f64> = sweep.map(|point| point.exposure_us).collect();
         exposures_us.sort_by(f64::total_cmp);
         let shortest_us = exposures_us.first().copied().unwrap_or_default();

@@ -8,7 +8,7 @@ use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting, Transport
 
 use super::*;
 use crate::product::Product;
-use crate::schedule::{Point, Role, Schedule, Spot, SweepGeometry};
+use crate::schedule::{Point, PointRole, Schedule, Spot, SweepGeometry};
 use crate::stack::SweepStack;
 
 /// A camera with 6 rows and 3 columns that sees the rows of a 10-row projector starting at row 2.
@@ -34,7 +34,7 @@ fn geometry() -> SweepGeometry {
 fn schedule() -> Schedule {
     let grid = [100.0, 200.0].into_iter().flat_map(|us| [-60.0, 0.0, 60.0].map(|delay_us| (delay_us, us)));
     let points = (0..).zip(grid.chain([(0.0, 300.0)])).map(|(index, (delay_us, exposure_us))| Point {
-        role: Role::Sweep(index),
+        role: PointRole::Sweep(index),
         delay_us,
         exposure_us,
         frames: 1,

@@ -123,7 +123,7 @@ struct DualSize {
 }
 
 /// One image of the scene: what all products of it share.
-pub(super) struct Scene<'a> {
+pub(super) struct SceneBatches<'a> {
     /// The calibration; `None` without planes.
     pub calibration: Option<&'a Calibration>,
     /// Index of the image, from 0, and number of images.
@@ -282,7 +282,7 @@ impl DotSpec {
     pub(super) fn draw(
         &self,
         batch: &Batch,
-        scene: &Scene,
+        scene: &SceneBatches,
         patterns: Option<&Array4<f32>>,
     ) -> Result<Vec<Array3<f32>>, String> {
         let calibrated = || scene.calibration.ok_or_else(|| NO_PLANE.to_owned());

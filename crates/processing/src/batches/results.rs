@@ -15,7 +15,7 @@ use raysweep_session::{Result, Session, manifest, pattern};
 use serde_json::{Map, Value, json};
 
 use super::calibration::{Calibration, read_batch};
-use super::product::{DotSpec, Scene, light_of, read_pattern};
+use super::product::{DotSpec, SceneBatches, light_of, read_pattern};
 use super::report::{self, VideoStrip};
 use super::task::DotTask;
 use crate::mirror_response::Predistortion;
@@ -62,7 +62,7 @@ pub fn make(
         }
         let Ok((batch, seen)) = read_batch(&dots, task.shape, entry) else { continue };
         let light = light_of(&batch);
-        let scene = Scene {
+        let scene = SceneBatches {
             calibration: calibration.as_ref(),
             image: (image, sound.len()),
             seen: &seen,

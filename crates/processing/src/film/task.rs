@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan, RigFile};
-use raysweep_pipeline::{FilmSolver, Point, Role, Schedule, Stages};
+use raysweep_pipeline::{FilmSolver, Point, PointRole, Schedule, Stages};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
@@ -65,8 +65,9 @@ impl FilmTask {
 /// could be compared, the scene has moved.
 fn schedule(film: &FilmPlan) -> Schedule {
     let exposure_us = film.exposure_us;
-    let dark = Point { role: Role::Dark(0), delay_us: 0.0, exposure_us, frames: DARK_FRAMES };
-    let setting = |(index, delay_us)| Point { role: Role::Sweep(index), delay_us, exposure_us, frames: 1 };
+    let dark = Point { role: PointRole::Dark(0), delay_us: 0.0, exposure_us, frames: DARK_FRAMES };
+    let setting =
+        |(index, delay_us)| Point { role: PointRole::Sweep(index), delay_us, exposure_us, frames: 1 };
     let settings = (0..).zip(film.delay_us.values()).map(setting);
     Schedule { points: std::iter::once(dark).chain(settings).collect() }
 }

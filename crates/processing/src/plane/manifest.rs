@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use raysweep_config::RigFile;
-use raysweep_pipeline::{Role, Schedule};
+use raysweep_pipeline::{PointRole, Schedule};
 use raysweep_session::ledger::State;
 use raysweep_session::{Result, Session, manifest};
 use serde_json::{Map, json};
@@ -42,7 +42,7 @@ pub fn write(session: &Session, state: &State, task: &PlaneTask, rig: &RigFile) 
 
 /// The exposures as the hardware took them: the sweep's, or, where there is none, those of the dark images.
 fn taken_exposures(state: &State, schedule: &Schedule) -> Vec<f64> {
-    let is_sweep = |role: Role| matches!(role, Role::Sweep(_));
+    let is_sweep = |role: PointRole| matches!(role, PointRole::Sweep(_));
     let is_any = !schedule.points.iter().any(|point| is_sweep(point.role));
     let mut exposures: Vec<f64> = schedule
         .points

@@ -7,8 +7,8 @@ use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
 use raysweep_core::{SettingsId, decoding_message};
 use raysweep_pipeline::{
-    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, Role, Scan, Schedule, Spot, Stages, SweepGeometry,
-    Unit,
+    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, Stages,
+    SweepGeometry, Unit,
 };
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
@@ -64,7 +64,7 @@ impl PlaneTask {
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
     pub fn settings(&self) -> impl Iterator<Item = (u32, &Point)> {
-        (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, Role::Sweep(_)))
+        (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, PointRole::Sweep(_)))
     }
 
     /// An error about a value of the plan.
@@ -139,18 +139,18 @@ impl PlaneTask {
 fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
     match (kind, scan) {
         (SpotKind::Uniform, _) => Spot::Uniform,
-        (SpotKind::Flying, None | Some(ScanKind::Unknown)) => Spot::Flying(Scan::Unknown),
-        (SpotKind::Flying, Some(ScanKind::OneWay)) => Spot::Flying(Scan::OneWay),
-        (SpotKind::Flying, Some(ScanKind::Bidirectional)) => Spot::Flying(Scan::Bidirectional),
+        (SpotKind::Flying, None | Some(ScanKind::Unknown)) => Spot::Flying(SpotScan::Unknown),
+        (SpotKind::Flying, Some(ScanKind::OneWay)) => Spot::Flying(SpotScan::OneWay),
+        (SpotKind::Flying, Some(ScanKind::Bidirectional)) => Spot::Flying(SpotScan::Bidirectional),
     }
 }
 
 /// Position of a point in the stack.
-pub fn place(role: Role) -> (ArrayName, usize) {
+pub fn place(role: PointRole) -> (ArrayName, usize) {
     match role {
-        Role::Sweep(index) => (ArrayName::Sum, index as usize),
-        Role::Dark(index) => (ArrayName::Dark, index as usize),
-        Role::Regular => (ArrayName::Regular, 0),
+        PointRole::Sweep(index) => (ArrayName::Sum, index as usize),
+        PointRole::Dark(index) => (ArrayName::Dark, index as usize),
+        PointRole::Regular => (ArrayName::Regular, 0),
     }
 }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use raysweep_config::{ConfigError, Plan, ProductTable, RigFile, SweepPlan};
-use raysweep_pipeline::{Point, ProductSpec, Role, Schedule};
+use raysweep_pipeline::{Point, PointRole, ProductSpec, Schedule};
 use raysweep_session::stack::Contents;
 
 use crate::plane::{PlaneTask, Processing};
@@ -81,7 +81,7 @@ impl SweepTask {
 fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
     let frames = sweep.average;
     let point = |role, delay_us, exposure_us| {
-        let frames = if matches!(role, Role::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+        let frames = if matches!(role, PointRole::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
         Point { role, delay_us, exposure_us, frames }
     };
     let exposures = sweep.exposure_us.values();
@@ -94,14 +94,14 @@ fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
         }
     }
     let mut points: Vec<Point> =
-        (0..).zip(&dark_exposures).map(|(index, &us)| point(Role::Dark(index), 0.0, us)).collect();
-    points.push(point(Role::Regular, 0.0, period_us));
+        (0..).zip(&dark_exposures).map(|(index, &us)| point(PointRole::Dark(index), 0.0, us)).collect();
+    points.push(point(PointRole::Regular, 0.0, period_us));
     let grid =
         exposures.iter().flat_map(|&exposure_us| delays.iter().map(move |&delay_us| (delay_us, exposure_us)));
     points.extend(
         (0..)
             .zip(grid)
-            .map(|(index, (delay_us, exposure_us))| point(Role::Sweep(index), delay_us, exposure_us)),
+            .map(|(index, (delay_us, exposure_us))| point(PointRole::Sweep(index), delay_us, exposure_us)),
     );
     Schedule { points }
 }

@@ -1,7 +1,7 @@
 use super::column::bits;
 use super::error::check_shape;
 use super::shape::BLOCK_PX;
-use super::{DotsError, FrameShape, Outcome, SparseColumn};
+use super::{ColumnOutcome, DotsError, FrameShape, SparseColumn};
 
 /// The columns of one batch in the layout in which they are stored: each field is one array of a file.
 ///
@@ -207,8 +207,8 @@ impl Batch {
     ///
     /// # Panics
     /// If the dot does not exist.
-    pub fn outcome(&self, dot: usize) -> Outcome {
-        Outcome { discs: self.arrays.discs[dot], capped: self.arrays.capped[dot] }
+    pub fn outcome(&self, dot: usize) -> ColumnOutcome {
+        ColumnOutcome { discs: self.arrays.discs[dot], capped: self.arrays.capped[dot] }
     }
 }
 

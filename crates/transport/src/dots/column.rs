@@ -4,7 +4,7 @@ use super::shape::BLOCK_PX;
 
 /// The outcome of Algorithm 1 for one frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Outcome {
+pub struct ColumnOutcome {
     /// Number of discs taken; 0 if nothing exceeded the noise of the background.
     pub discs: u32,
     /// Whether it stopped at the limit on discs, so that some light may remain.
@@ -26,7 +26,7 @@ pub struct SparseColumn {
     /// Mean of each block's pixels outside the mask, `[block rows, block columns, channels]`; 0 where there are none.
     pub residual: Vec<f32>,
     /// Outcome of the denoising.
-    pub outcome: Outcome,
+    pub outcome: ColumnOutcome,
 }
 
 impl SparseColumn {
@@ -43,7 +43,7 @@ impl SparseColumn {
         self.masks.clear();
         self.values.clear();
         self.residual.clear();
-        self.outcome = Outcome::default();
+        self.outcome = ColumnOutcome::default();
     }
 }
 

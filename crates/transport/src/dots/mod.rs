@@ -19,7 +19,7 @@ mod synchronise;
 
 pub use background::{Background, BackgroundMean, NoiseFloor};
 pub use batch::{Batch, BatchArrays, BatchCounts, Column};
-pub use column::{Outcome, SparseColumn};
+pub use column::{ColumnOutcome, SparseColumn};
 pub use correction::{Correction, Sampling};
 pub use denoise::{DenoiseSettings, Denoiser, Scratch, StopRule, false_alarm_sigmas, reference};
 pub use error::DotsError;

@@ -9,8 +9,8 @@ use std::time::Instant;
 use ndarray::{Array2, Array3, ArrayView2, Axis};
 use rand_distr::{Distribution, Normal};
 use raysweep_transport::plane::board::images::{
-    BlackFrames, CappedFrames, DarkFit, ImagesError, LightLevel, Linearity, Narrower, Places, RESPONSE_ROWS,
-    Responses, SaturationLimit, WhiteMap, ambient, compare_responses, locate_columns, locate_rows,
+    BlackFrames, CappedFrames, DarkFit, ImagesError, LightLevel, Linearity, Narrower, RESPONSE_ROWS,
+    Responses, RowPlaces, SaturationLimit, WhiteMap, ambient, compare_responses, locate_columns, locate_rows,
     photon_transfer, prnu,
 };
 
@@ -289,7 +289,7 @@ struct Measured {
     scene: Scene,
     pictures: Pictures,
     white: WhiteMap,
-    places: Places,
+    places: RowPlaces,
     responses: Responses,
 }
 

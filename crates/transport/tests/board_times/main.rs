@@ -7,8 +7,8 @@ mod rig;
 use std::time::Instant;
 
 use raysweep_transport::plane::board::times::{
-    BoardFrame, BoardSetting, Coarse, Columns, Measured, RowTimes, Shutter, TimesError, arrival_settings,
-    check_settings, spot_slopes, sweep_settings,
+    BoardFrame, BoardSetting, CoarseSweep, Columns, ExposureMode, Measured, RowTimes, TimesError,
+    arrival_settings, check_settings, spot_slopes, sweep_settings,
 };
 use rig::{Case, Jitter, Rig};
 
@@ -35,10 +35,10 @@ impl Session {
         }
     }
 
-    fn sweep(&mut self) -> Result<Coarse, TimesError> {
+    fn sweep(&mut self) -> Result<CoarseSweep, TimesError> {
         let nominal = self.rig.nominal();
         self.take(&sweep_settings(&nominal, self.columns.seen_rows()).unwrap(), 1);
-        Coarse::from_borders(&self.columns, &self.frames, &nominal)
+        CoarseSweep::from_borders(&self.columns, &self.frames, &nominal)
     }
 
     /// All steps of the procedure, with about 150 frames or more on the light.
@@ -196,13 +196,13 @@ fn each_frames_jitter_is_found_and_frames_of_another_trigger_are_dropped() {
     let jitters_us = session.rig.jitters_us.clone();
     // One frame comes 60 us late, and one has the light of other settings.
     let late =
-        session.frames.iter().position(|frame| frame.setting.shutter == Shutter::Rolling).unwrap() + 60;
+        session.frames.iter().position(|frame| frame.setting.shutter == ExposureMode::Rolling).unwrap() + 60;
     let setting = session.frames[late].setting;
     let light = session.rig.late_picture(setting, 60.0, |_| true);
     session.frames[late].light = session.columns.average(light.view()).unwrap();
     let times = session.fit().unwrap();
     assert!(times.dropped.iter().any(|dropped| dropped.0 == late), "{:?}", times.dropped);
-    for shutter in [Shutter::Global, Shutter::Rolling] {
+    for shutter in [ExposureMode::Global, ExposureMode::Rolling] {
         let pairs: Vec<(f64, f64)> = (0..session.frames.len())
             .filter(|&frame| session.frames[frame].setting.shutter == shutter)
             .filter_map(|frame| times.jitters[frame].map(|found| (found.late_us, jitters_us[frame])))

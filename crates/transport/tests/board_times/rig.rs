@@ -6,7 +6,7 @@ use rand_distr::{Distribution, Normal, Uniform};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::SeedableRng;
 use raysweep_transport::plane::NoiseModel;
-use raysweep_transport::plane::board::times::{BoardSetting, Nominal, Shutter};
+use raysweep_transport::plane::board::times::{BoardSetting, ExposureMode, Nominal};
 
 pub const WHITE_DN: f64 = 2500.0;
 pub const ELECTRONS_PER_DN: f64 = 1.66;
@@ -228,9 +228,9 @@ impl Rig {
         let unit = Normal::new(0.0, 1.0).unwrap();
         Array2::from_shape_fn(self.centres.dim(), |(t, s)| {
             let opens_us = match setting.shutter {
-                Shutter::Rolling => setting.delay_us + t as f64 * case.camera_row_time_us,
-                Shutter::Global if case.global_delay_acts => setting.delay_us + case.mode_offset_us,
-                Shutter::Global => case.mode_offset_us,
+                ExposureMode::Rolling => setting.delay_us + t as f64 * case.camera_row_time_us,
+                ExposureMode::Global if case.global_delay_acts => setting.delay_us + case.mode_offset_us,
+                ExposureMode::Global => case.mode_offset_us,
             };
             let closes_us = opens_us + exposure_us;
             let column = (s as f64 + 0.5) / case.columns as f64;

@@ -15,7 +15,7 @@ use raysweep_core::{
     Camera, CameraSettings, Clock, DeviceError, DeviceErrorKind, DeviceState, Frame, FrameBuf, FramePool,
     FrameStamp, LossCause, SettingsId, SettingsLatency, ns_from_us,
 };
-use raysweep_pipeline::{Event, Failure, Input, Label, Point, QueueError, Shot, message_of};
+use raysweep_pipeline::{DeviceEvent, Failure, Input, Label, Point, QueueError, Shot, message_of};
 
 pub use self::ahead::TriggerLine;
 use self::ahead::{Ahead, Seen};
@@ -134,7 +134,7 @@ impl CameraThread {
     pub fn start(
         mut camera: Box<dyn Camera>,
         drive: Drive,
-        input: Input<Event>,
+        input: Input<DeviceEvent>,
         orders: Arc<Orders>,
     ) -> Result<Self, DeviceError> {
         camera.arm()?;
@@ -201,7 +201,7 @@ impl CameraThread {
 struct Acquisition {
     camera: Box<dyn Camera>,
     clock: Clock,
-    input: Input<Event>,
+    input: Input<DeviceEvent>,
     pace: Pace,
     pool: FramePool,
     /// Receives frames that are dropped for lack of a buffer.
@@ -236,7 +236,7 @@ enum Taken {
 }
 
 impl Acquisition {
-    fn new(camera: Box<dyn Camera>, drive: Drive, input: Input<Event>, orders: Arc<Orders>) -> Self {
+    fn new(camera: Box<dyn Camera>, drive: Drive, input: Input<DeviceEvent>, orders: Arc<Orders>) -> Self {
         let Drive { clock, pace, line } = drive;
         let capabilities = camera.capabilities();
         let bytes = capabilities.format.frame_bytes(capabilities.width * capabilities.height);
@@ -273,7 +273,7 @@ impl Acquisition {
             Work::Pass(pass) => self.sweep(pass),
             Work::Film(film) => self.film(&film),
         };
-        match self.input.send(Event::Flush) {
+        match self.input.send(DeviceEvent::Flush) {
             Ok(()) => Ended::Flushed(acquired),
             Err(_) => Ended::NotFlushed,
         }
@@ -354,7 +354,7 @@ impl Acquisition {
         self.told_seq = Some(stamp.seq);
         let Some(data) = data else { return self.lose(stamp, label, LossCause::PoolEmpty) };
         let frame = Frame { data, format: self.camera.capabilities().format, stamp };
-        match self.input.offer(Event::Frame(frame, label)) {
+        match self.input.offer(DeviceEvent::Frame(frame, label)) {
             Ok(()) => Ok(Taken::Passed),
             Err(QueueError::Full(_)) => self.lose(stamp, label, LossCause::QueueFull),
             Err(error @ QueueError::Closed) => Err(closed(error)),
@@ -367,7 +367,7 @@ impl Acquisition {
         for lost in first..seq {
             let cause = self.camera.loss_of(lost);
             if cause != LossCause::CameraGap {
-                self.input.send(Event::Lost(lost, Some(cause))).map_err(closed)?;
+                self.input.send(DeviceEvent::Lost(lost, Some(cause))).map_err(closed)?;
             }
         }
         Ok(())
@@ -376,8 +376,8 @@ impl Acquisition {
     /// Only frames that a point waits for count as lost; others are merely skipped.
     fn lose(&mut self, stamp: FrameStamp, label: Label, cause: LossCause) -> Result<Taken, DeviceError> {
         let event = match label {
-            Label::Counted | Label::CountedUnless { .. } => Event::Lost(stamp.seq, Some(cause)),
-            Label::Settling | Label::Cancelled => Event::Lost(stamp.seq, None),
+            Label::Counted | Label::CountedUnless { .. } => DeviceEvent::Lost(stamp.seq, Some(cause)),
+            Label::Settling | Label::Cancelled => DeviceEvent::Lost(stamp.seq, None),
         };
         self.input.send(event).map_err(closed)?;
         Ok(Taken::Lost)

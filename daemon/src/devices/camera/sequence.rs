@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use raysweep_core::{Applied, Camera, CameraSettings, DeviceError, DeviceState, LossCause, SettingsId};
-use raysweep_pipeline::{Event, Job, Label, Point, Role, Shot};
+use raysweep_pipeline::{DeviceEvent, Job, Label, Point, PointRole, Shot};
 
 use super::ahead::WantedFrames;
 use super::{Acquisition, Attempt, MARGIN_FRAMES, POLL, Pass, Received, Taken, Watchdog, closed};
@@ -47,7 +47,7 @@ pub struct FilmSetting {
 }
 
 /// A position in the sequence.
-pub(super) struct Slot {
+pub(super) struct SequenceSlot {
     pub attempt: Attempt,
     pub periods_from_last: Option<u32>,
     /// Position in a film's cycle.
@@ -57,12 +57,12 @@ pub(super) struct Slot {
 }
 
 impl FilmPass {
-    fn slots(&self) -> impl Iterator<Item = Slot> {
+    fn slots(&self) -> impl Iterator<Item = SequenceSlot> {
         (0..self.cycles).flat_map(|cycle| {
             self.settings.iter().enumerate().map(move |(place, setting)| {
                 let FilmSetting { ordinal, point, shot, periods_from_last } = *setting;
                 let id = SettingsId { point: ordinal, attempt: cycle };
-                Slot {
+                SequenceSlot {
                     attempt: Attempt { id, point, shot, interruptions: 0 },
                     periods_from_last: Some(periods_from_last),
                     place,
@@ -77,7 +77,7 @@ impl Acquisition {
     /// Takes points in order. Each ends in a unit or a failure.
     pub(super) fn sweep(&mut self, pass: Pass) -> Result<(), DeviceError> {
         self.warm_up(pass.not_before_ns)?;
-        let slot = |attempt| Slot { attempt, periods_from_last: None, place: 0, may_hold: true };
+        let slot = |attempt| SequenceSlot { attempt, periods_from_last: None, place: 0, may_hold: true };
         self.sequence(pass.attempts.into_iter().map(slot))
     }
 
@@ -90,7 +90,7 @@ impl Acquisition {
         self.sequence(slots)
     }
 
-    fn sequence(&mut self, slots: impl Iterator<Item = Slot>) -> Result<(), DeviceError> {
+    fn sequence(&mut self, slots: impl Iterator<Item = SequenceSlot>) -> Result<(), DeviceError> {
         let mut slots = slots.peekable();
         let mut watchdog = Watchdog::default();
         // Start with settings that belong to no point, so that a point's frames do not depend on what came before.
@@ -122,7 +122,7 @@ impl Acquisition {
                 if slots.peek().is_none() {
                     break;
                 }
-                self.input.send(Event::Idle).map_err(closed)?;
+                self.input.send(DeviceEvent::Idle).map_err(closed)?;
                 self.orders.wait_while_paused();
                 self.told_seq = None;
                 self.ahead.lose_track();
@@ -149,7 +149,7 @@ impl Acquisition {
             return self.pass_frames(MARGIN_FRAMES, i64::MIN);
         }
         let decided = Arc::new(AtomicBool::new(false));
-        self.input.send(Event::Settle(decided.clone())).map_err(closed)?;
+        self.input.send(DeviceEvent::Settle(decided.clone())).map_err(closed)?;
         let mut left = MARGIN_FRAMES;
         let mut watchdog = Watchdog::default();
         while left > 0 && !decided.load(Ordering::Acquire) && self.orders.go_on() {
@@ -186,7 +186,7 @@ impl Acquisition {
         self.configure(id, settings, |_| None)
     }
 
-    fn write(&mut self, slot: &Slot, runs_on: bool) -> Result<(), DeviceError> {
+    fn write(&mut self, slot: &SequenceSlot, runs_on: bool) -> Result<(), DeviceError> {
         let Attempt { id, point, shot, interruptions } = slot.attempt;
         // The more often a point failed, the more spare frames it gets.
         let spared = |failures: u32| failures.min(MOST_SPARED_FOR) * point.frames.div_ceil(4);
@@ -201,7 +201,7 @@ impl Acquisition {
             };
             Some(WantedFrames {
                 job,
-                is_lit: !matches!(point.role, Role::Dark(_)),
+                is_lit: !matches!(point.role, PointRole::Dark(_)),
                 is_begun: false,
                 is_interrupted: false,
                 // In a film, the attempt is the number of the cycle.
@@ -273,14 +273,14 @@ impl Acquisition {
             if let Some(next) = self.ahead.opening(seq)
                 && !std::mem::replace(&mut next.is_begun, true)
             {
-                self.input.send(Event::Begin(next.job)).map_err(closed)?;
+                self.input.send(DeviceEvent::Begin(next.job)).map_err(closed)?;
             }
             self.hand_on(received, Label::Settling)?;
             return Ok(());
         };
         let (job, is_lit) = (wanted.job, wanted.is_lit);
         if !std::mem::replace(&mut wanted.is_begun, true) {
-            self.input.send(Event::Begin(job)).map_err(closed)?;
+            self.input.send(DeviceEvent::Begin(job)).map_err(closed)?;
         }
         let stamp = received.stamp;
         let label = match seen.else_triggered_ns {
@@ -294,7 +294,7 @@ impl Acquisition {
             Taken::Lost => wanted.spare_frames -= 1,
         }
         if wanted.is_complete() {
-            self.input.send(Event::End).map_err(closed)?;
+            self.input.send(DeviceEvent::End).map_err(closed)?;
         }
         if let Taken::Passed = taken {
             self.note_exposure(&stamp, &job.applied.actual, is_lit);
@@ -322,16 +322,16 @@ impl Acquisition {
         }
         let Some(wanted) = self.ahead.front().and_then(|front| front.open()) else { return Ok(()) };
         if !std::mem::replace(&mut wanted.is_begun, true) {
-            self.input.send(Event::Begin(wanted.job)).map_err(closed)?;
+            self.input.send(DeviceEvent::Begin(wanted.job)).map_err(closed)?;
         }
         for lost_seq in lost {
             let cause = self.camera.loss_of(lost_seq);
-            self.input.send(Event::Lost(lost_seq, Some(cause))).map_err(closed)?;
+            self.input.send(DeviceEvent::Lost(lost_seq, Some(cause))).map_err(closed)?;
             self.told_seq = Some(lost_seq);
             wanted.passed += 1;
         }
         if wanted.is_complete() {
-            self.input.send(Event::End).map_err(closed)?;
+            self.input.send(DeviceEvent::End).map_err(closed)?;
         }
         Ok(())
     }
@@ -342,8 +342,8 @@ impl Acquisition {
         let Some(wanted) = wanted.filter(|wanted| is_over(wanted)) else { return Ok(()) };
         wanted.is_interrupted = true;
         if !std::mem::replace(&mut wanted.is_begun, true) {
-            self.input.send(Event::Begin(wanted.job)).map_err(closed)?;
+            self.input.send(DeviceEvent::Begin(wanted.job)).map_err(closed)?;
         }
-        self.input.send(Event::Interrupt).map_err(closed)
+        self.input.send(DeviceEvent::Interrupt).map_err(closed)
     }
 }

@@ -9,9 +9,9 @@
 use std::iter::Peekable;
 
 use raysweep_core::{Applied, CameraSettings, DeviceError, FirstFrame, FrameStamp, LossCause, us_from_ns};
-use raysweep_pipeline::{EXPOSURE_TOLERANCE_US, Event, Job, Label, Role};
+use raysweep_pipeline::{DeviceEvent, EXPOSURE_TOLERANCE_US, Job, Label, PointRole};
 
-use super::sequence::{FilmPass, Slot};
+use super::sequence::{FilmPass, SequenceSlot};
 use super::{Acquisition, POLL, Taken, TriggerLine, Watchdog, closed};
 use crate::run::orders::Order;
 
@@ -25,7 +25,7 @@ impl Acquisition {
     pub(super) fn take_by_sets(
         &mut self,
         film: &FilmPass,
-        slots: &mut Peekable<impl Iterator<Item = Slot>>,
+        slots: &mut Peekable<impl Iterator<Item = SequenceSlot>>,
     ) -> Result<(), DeviceError> {
         let settings: Vec<CameraSettings> =
             film.settings.iter().map(|setting| setting.shot.settings).collect();
@@ -52,7 +52,7 @@ impl Acquisition {
                 return Ok(());
             }
             if slots.peek().is_some() && self.orders.go_on() {
-                self.input.send(Event::Idle).map_err(closed)?;
+                self.input.send(DeviceEvent::Idle).map_err(closed)?;
                 self.orders.wait_while_paused();
                 self.told_seq = None;
             }
@@ -64,7 +64,7 @@ impl Acquisition {
     /// go through its sets.
     fn take_frames(
         &mut self,
-        slots: &mut Peekable<impl Iterator<Item = Slot>>,
+        slots: &mut Peekable<impl Iterator<Item = SequenceSlot>>,
         mut phase: Phase,
     ) -> Result<bool, DeviceError> {
         let mut watchdog = Watchdog::default();
@@ -84,9 +84,9 @@ impl Acquisition {
                 let cause = self.camera.loss_of(lost_seq);
                 if let Some(slot) = slots.next_if(|slot| phase.set_of(lost_seq) == Some(slot.place)) {
                     let job = phase.job(&slot, lost_seq, slot_before.replace(lost_seq));
-                    self.input.send(Event::Begin(job)).map_err(closed)?;
-                    self.input.send(Event::Lost(lost_seq, Some(cause))).map_err(closed)?;
-                    self.input.send(Event::End).map_err(closed)?;
+                    self.input.send(DeviceEvent::Begin(job)).map_err(closed)?;
+                    self.input.send(DeviceEvent::Lost(lost_seq, Some(cause))).map_err(closed)?;
+                    self.input.send(DeviceEvent::End).map_err(closed)?;
                     self.told_seq = Some(lost_seq);
                 }
                 if cause == LossCause::CameraLost {
@@ -106,11 +106,11 @@ impl Acquisition {
                 continue;
             };
             let job = phase.job(&slot, stamp.seq, slot_before.replace(stamp.seq));
-            self.input.send(Event::Begin(job)).map_err(closed)?;
+            self.input.send(DeviceEvent::Begin(job)).map_err(closed)?;
             let taken = self.hand_on(received, Label::Counted)?;
-            self.input.send(Event::End).map_err(closed)?;
+            self.input.send(DeviceEvent::End).map_err(closed)?;
             if let Taken::Passed = taken {
-                let is_lit = !matches!(slot.attempt.point.role, Role::Dark(_));
+                let is_lit = !matches!(slot.attempt.point.role, PointRole::Dark(_));
                 self.note_exposure(&stamp, &job.applied.actual, is_lit);
             }
         }
@@ -228,7 +228,7 @@ impl Phase {
     }
 
     /// The assembler's job for frame `seq`, which has a slot's set; `before` is the frame of the previous slot.
-    fn job(&self, slot: &Slot, seq: u64, before: Option<u64>) -> Job {
+    fn job(&self, slot: &SequenceSlot, seq: u64, before: Option<u64>) -> Job {
         let runs_on = before.is_some_and(|before| before + 1 == seq);
         Job {
             id: slot.attempt.id,

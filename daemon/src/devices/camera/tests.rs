@@ -6,7 +6,7 @@ mod sets;
 use std::sync::Mutex;
 
 use raysweep_core::{Applied, CameraCapabilities, ClockHandle, FirstFrame, PixelFormat, Readout, Shutter};
-use raysweep_pipeline::{Policy, Role};
+use raysweep_pipeline::{PointRole, Policy};
 
 use super::*;
 use crate::run::orders::Order;
@@ -294,7 +294,7 @@ fn play_plan(
     assert!(matches!(ended, Ended::Flushed(Ok(()))));
     let shot = |settings| Shot { settings, light_edges_later: 0 };
     let point = |index: u32, settings: CameraSettings| Point {
-        role: Role::Sweep(index),
+        role: PointRole::Sweep(index),
         delay_us: settings.trigger_delay_us,
         exposure_us: settings.exposure_us,
         frames,
@@ -334,7 +334,7 @@ fn play_plan(
 }
 
 fn follow(
-    events: &raysweep_pipeline::Receiver<Event>,
+    events: &raysweep_pipeline::Receiver<DeviceEvent>,
     frames: u32,
     pause_after: Option<usize>,
     orders: &Orders,
@@ -343,11 +343,11 @@ fn follow(
     let mut open: Option<(u32, u32)> = None;
     for event in events.iter() {
         match event {
-            Event::Begin(job) => {
+            DeviceEvent::Begin(job) => {
                 assert!(open.is_none(), "a job begins within another");
                 open = Some((job.id.point, 0));
             }
-            Event::Frame(frame, Label::Counted | Label::CountedUnless { .. }) => {
+            DeviceEvent::Frame(frame, Label::Counted | Label::CountedUnless { .. }) => {
                 let (point, passed) = open.as_mut().expect("a job");
                 *passed += 1;
                 counted.push((*point, frame.stamp.seq));
@@ -355,8 +355,8 @@ fn follow(
                     orders.give(Order::Pause);
                 }
             }
-            Event::Idle => orders.give(Order::Go),
-            Event::End | Event::Interrupt => {
+            DeviceEvent::Idle => orders.give(Order::Go),
+            DeviceEvent::End | DeviceEvent::Interrupt => {
                 let (point, passed) = open.take().expect("a job");
                 if passed < frames {
                     short.push(point);

@@ -2,7 +2,7 @@
 
 use raysweep_config::ConfigError;
 use raysweep_core::{CameraCapabilities, Readout};
-use raysweep_pipeline::Role;
+use raysweep_pipeline::PointRole;
 use raysweep_processing::film::FilmTask;
 use raysweep_processing::memory::MemoryNeed;
 use raysweep_proto::{CheckReport, FilmCheck};
@@ -28,7 +28,7 @@ pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError>
     let room = lab.room(memory.bytes(lab.memory_free_bytes()), disk_bytes);
     let (mut dark_frames, mut dark_periods) = (0, 0);
     for (point, periods) in task.schedule.points.iter().zip(&model.periods) {
-        if matches!(point.role, Role::Dark(_)) {
+        if matches!(point.role, PointRole::Dark(_)) {
             dark_frames += u64::from(point.frames);
             dark_periods += periods * u64::from(point.frames);
         }

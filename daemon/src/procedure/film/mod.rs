@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
-use raysweep_pipeline::{CycleOrder, Point, Role, Stages};
+use raysweep_pipeline::{CycleOrder, Point, PointRole, Stages};
 use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_session::Session;
@@ -92,7 +92,7 @@ impl FilmRun {
         let opened = Opened::open(&self.rig, task, &run)?;
         let stack = run.session.stack()?;
         let is_setting =
-            |id: &SettingsId| matches!(task.schedule.points[id.point as usize].role, Role::Sweep(_));
+            |id: &SettingsId| matches!(task.schedule.points[id.point as usize].role, PointRole::Sweep(_));
         // A film is never resumed, so no cycle has been stored yet.
         let mut missing = missing(task, run.ledger.state());
         missing.retain(|id| !is_setting(id));

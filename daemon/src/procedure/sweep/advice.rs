@@ -3,7 +3,7 @@
 use raysweep_config::rig::plane::NoiseOrigin;
 use raysweep_config::{Axis, RigFile, SweepPlan};
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point, Role, Spot, prior_name};
+use raysweep_pipeline::{DemuxFold, Point, PointRole, Spot, prior_name};
 use raysweep_processing::sweep::SweepTask;
 use raysweep_proto::{BetterSweep, ExpectedError, NoiseEstimate, NoiseSource, SweepAdvice};
 use raysweep_transport::plane::advice::{self, Noise, SweepGrid, white_light};
@@ -71,7 +71,7 @@ pub fn advise(
     let gain = 1.0 / (white_dn * known.electrons_per_dn);
     // Rounding to counts adds a variance of 1/12 count^2.
     let read = (known.read_noise_e * gain).hypot(12_f64.sqrt().recip() / white_dn);
-    let dark = task.schedule.points.iter().find(|point| matches!(point.role, Role::Dark(_)));
+    let dark = task.schedule.points.iter().find(|point| matches!(point.role, PointRole::Dark(_)));
     let dark_frames = dark.map(|point| point.frames);
     let noise = Noise { read, gain, frames: sweep.sweep.average, dark_frames };
 

@@ -18,7 +18,7 @@ use super::frames::{Frames, image_data};
 use super::ids::FrameIds;
 use super::library::Health;
 use super::losses::Losses;
-use super::owner::{Done, Opened, Owner, OwnerCommand, OwnerOrder, OwnerReply, Shared};
+use super::owner::{Done, OpenedCamera, Owner, OwnerCommand, OwnerOrder, OwnerReply, Shared};
 use super::promise::{Latency, Promises, Triggers, first_frame};
 use super::sequencer::SequencerSets;
 use crate::reopen::Reopening;
@@ -154,16 +154,16 @@ impl AravisCamera {
             let open = OwnerOrder { ticket: 0, command: OwnerCommand::Open };
             orders.send(open).map_err(|_closed| thread_ended())?;
             match replies.recv() {
-                Ok(OwnerReply::Opened(Err(error)))
+                Ok(OwnerReply::OpenedCamera(Err(error)))
                     if error.kind == DeviceErrorKind::Busy && begun.elapsed() < BUSY_PATIENCE =>
                 {
                     thread::sleep(BUSY_PAUSE);
                 }
-                Ok(OwnerReply::Opened(opened)) => break opened?,
+                Ok(OwnerReply::OpenedCamera(opened)) => break opened?,
                 Ok(OwnerReply::Done(..)) | Err(_) => return Err(thread_ended()),
             }
         };
-        let Opened { frames, chunks, capabilities, tells_time, .. } = opened;
+        let OpenedCamera { frames, chunks, capabilities, tells_time, .. } = opened;
         let mut ids = FrameIds::default();
         ids.restart(1);
         Ok(Self {
@@ -221,7 +221,7 @@ impl AravisCamera {
                 }
                 Ok(OwnerReply::Done(ticket, done)) if ticket == self.ticket => return done,
                 // The reply to an order that was given up.
-                Ok(OwnerReply::Done(..) | OwnerReply::Opened(_)) => {}
+                Ok(OwnerReply::Done(..) | OwnerReply::OpenedCamera(_)) => {}
                 Err(RecvTimeoutError::Timeout) if self.silent_since(asked_ns) => {
                     self.lose(&SILENT)?;
                     return Err(lost());
@@ -262,8 +262,8 @@ impl AravisCamera {
                 continue;
             }
             match self.replies.recv_timeout(left) {
-                Ok(OwnerReply::Opened(Ok(opened))) => return self.resume(opened),
-                Ok(OwnerReply::Opened(Err(error))) => {
+                Ok(OwnerReply::OpenedCamera(Ok(opened))) => return self.resume(opened),
+                Ok(OwnerReply::OpenedCamera(Err(error))) => {
                     self.link = Link::Lost;
                     self.reopening.failed(&error.source)?;
                 }
@@ -281,8 +281,8 @@ impl AravisCamera {
     }
 
     /// Goes on with a camera that was opened again, if it is the same as before.
-    fn resume(&mut self, opened: Opened) -> Result<(), DeviceError> {
-        let Opened { frames, chunks, capabilities: found, tells_time, armed_ns } = opened;
+    fn resume(&mut self, opened: OpenedCamera) -> Result<(), DeviceError> {
+        let OpenedCamera { frames, chunks, capabilities: found, tells_time, armed_ns } = opened;
         self.link = Link::Up { frames, chunks, tells_time };
         if found != self.capabilities {
             return self.lose(&format!(

@@ -16,7 +16,7 @@ use super::frames::Frames;
 use super::library::{Device, DeviceClock, Health, device_error};
 use super::network::{self, SocketBuffer};
 use super::sequencer::{self, SequencerSets};
-use super::settings::Writer;
+use super::settings::FeatureWriter;
 use super::setup::set_up;
 use raysweep_config::rig::aravis::AravisConfig;
 
@@ -57,7 +57,7 @@ pub struct OwnerOrder {
 /// A message from the owner.
 pub enum OwnerReply {
     /// The camera was opened, for the first time or again.
-    Opened(Result<Opened, DeviceError>),
+    OpenedCamera(Result<OpenedCamera, DeviceError>),
     /// An order was executed.
     Done(u64, Result<Done, DeviceError>),
 }
@@ -75,7 +75,7 @@ pub struct Done {
 }
 
 /// An open camera, for the thread that takes its frames.
-pub struct Opened {
+pub struct OpenedCamera {
     pub frames: Frames,
     pub chunks: Option<Chunks>,
     pub capabilities: CameraCapabilities,
@@ -120,7 +120,7 @@ pub struct Owner {
 
 struct Connection {
     device: Device,
-    writer: Writer,
+    writer: FeatureWriter,
     clock: Option<DeviceClock>,
 }
 
@@ -130,8 +130,8 @@ impl Owner {
         while let Ok(OwnerOrder { ticket, command }) = self.orders.recv() {
             let (connection, reply) = match command {
                 OwnerCommand::Open => match self.connect() {
-                    Ok((connection, opened)) => (Some(connection), OwnerReply::Opened(Ok(opened))),
-                    Err(error) => (None, OwnerReply::Opened(Err(error))),
+                    Ok((connection, opened)) => (Some(connection), OwnerReply::OpenedCamera(Ok(opened))),
+                    Err(error) => (None, OwnerReply::OpenedCamera(Err(error))),
                 },
                 OwnerCommand::Close(_) => return,
                 _ => {
@@ -150,7 +150,7 @@ impl Owner {
         }
     }
 
-    fn connect(&mut self) -> Result<(Connection, Opened), DeviceError> {
+    fn connect(&mut self) -> Result<(Connection, OpenedCamera), DeviceError> {
         let Self { config, facts, shared, .. } = self;
         let named = config.device().ok_or_else(|| {
             let what = "camera.aravis.address or camera.aravis.name: give one of them";
@@ -208,7 +208,7 @@ impl Owner {
         };
         let parser = device.camera.create_chunk_parser();
         let chunks = parser.map(|parser| Chunks::new(parser, set_up.chunks));
-        let mut writer = Writer::new(set_up.names);
+        let mut writer = FeatureWriter::new(set_up.names);
         if let Some(settings) = &self.settings {
             writer.write(&device, settings)?;
         }
@@ -220,7 +220,7 @@ impl Owner {
         if self.armed {
             device.execute("AcquisitionStart")?;
         }
-        let opened = Opened { frames, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
+        let opened = OpenedCamera { frames, chunks, capabilities, tells_time: clock.is_some(), armed_ns };
         Ok((Connection { device, writer, clock }, opened))
     }
 

@@ -4,7 +4,7 @@
 use raysweep_core::{CameraSettings, DeviceErrorKind};
 
 use super::features::{FeatureError, Features, Result, first_present, put_boolean, put_integer, put_text};
-use super::settings::{Names, Writer};
+use super::settings::{FeatureWriter, Names};
 use super::setup::require;
 
 /// Events that advance the sets: each occurs once per frame.
@@ -61,7 +61,7 @@ fn load(features: &impl Features, names: &Names, settings: &[CameraSettings]) ->
             format!("{} sets are needed, {} to {} are there", settings.len(), sets.start(), sets.end());
         return Err(FeatureError::new("SequencerSetSelector", DeviceErrorKind::OutOfRange, what));
     }
-    let mut writer = Writer::new(*names);
+    let mut writer = FeatureWriter::new(*names);
     let mut actual = Vec::with_capacity(settings.len());
     for (set, settings) in (*sets.start()..=last).zip(settings) {
         put_integer(features, "SequencerSetSelector", set)?;

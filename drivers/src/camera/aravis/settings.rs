@@ -42,13 +42,13 @@ impl Names {
 
 /// Writes settings to a camera and remembers them.
 #[derive(Debug)]
-pub struct Writer {
+pub struct FeatureWriter {
     names: Names,
     /// The settings as requested and as applied; `None` if the camera's settings are unknown.
     last: Option<(CameraSettings, CameraSettings)>,
 }
 
-impl Writer {
+impl FeatureWriter {
     pub fn new(names: Names) -> Self {
         Self { names, last: None }
     }
@@ -117,7 +117,7 @@ mod tests {
             .with("ExposureTimeAbs", Value::Float(1.0, 1.0..=1e6))
             .with("TriggerDelayAbs", Value::Float(0.0, 0.0..=1e6))
             .with_text("ShutterMode", &["GlobalResetRelease", "Rolling"]);
-        let mut writer = Writer::new(Names::probe(&camera).unwrap());
+        let mut writer = FeatureWriter::new(Names::probe(&camera).unwrap());
         assert!(writer.changes_shutter(&settings(600.0, 0.0)));
         let actual = writer.write(&camera, &settings(600.2, 100.0)).unwrap();
         assert_eq!((actual.exposure_us, actual.trigger_delay_us), (600.0, 100.0));
@@ -137,7 +137,7 @@ mod tests {
     #[test]
     fn after_a_failure_everything_is_written_again() {
         let camera = Scripted::default().with("ExposureTime", Value::Float(1.0, 1.0..=1e6));
-        let mut writer = Writer::new(Names::probe(&camera).unwrap());
+        let mut writer = FeatureWriter::new(Names::probe(&camera).unwrap());
         writer.write(&camera, &settings(600.0, 0.0)).unwrap();
         camera.take_written();
         let global = CameraSettings { shutter: Shutter::Global, ..settings(600.0, 0.0) };

@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 
 use nix::libc::ERANGE;
 
-use super::node::{Control, ControlKind, Node};
+use super::node::{ControlKind, Node, NodeControl};
 use raysweep_config::rig::v4l2::TimeControl;
 
 /// Exposure controls of the kernel, in order of preference. The absolute ones are in units of 100 us, that of a
@@ -24,18 +24,18 @@ pub(super) enum ControlError {
 }
 
 /// The controls of a node.
-pub(super) struct Controls(Vec<Control>);
+pub(super) struct Controls(Vec<NodeControl>);
 
 impl Controls {
     pub(super) fn of(node: &dyn Node) -> io::Result<Self> {
         node.controls().map(Self)
     }
 
-    fn find(&self, name: &str) -> Option<&Control> {
+    fn find(&self, name: &str) -> Option<&NodeControl> {
         self.0.iter().find(|control| spelt(&control.name) == spelt(name))
     }
 
-    fn named(&self, key: &str, name: &str) -> Result<&Control, ControlError> {
+    fn named(&self, key: &str, name: &str) -> Result<&NodeControl, ControlError> {
         self.find(name).ok_or_else(|| {
             let names: Vec<String> = self.0.iter().map(|control| spelt(&control.name)).collect();
             ControlError::Value(format!(
@@ -110,12 +110,12 @@ impl Controls {
 
 /// A control that contains a time.
 pub(super) struct TimedControl {
-    control: Control,
+    control: NodeControl,
     unit_us: f64,
 }
 
 impl TimedControl {
-    fn new(control: &Control, unit_us: f64) -> Self {
+    fn new(control: &NodeControl, unit_us: f64) -> Self {
         Self { control: control.clone(), unit_us }
     }
 
@@ -129,7 +129,7 @@ impl TimedControl {
     }
 
     fn value(&self, time_us: f64) -> i64 {
-        let Control { minimum, maximum, step, .. } = self.control;
+        let NodeControl { minimum, maximum, step, .. } = self.control;
         let steps = ((time_us / self.unit_us - minimum as f64) / step as f64).round() as i64;
         minimum.saturating_add(steps.saturating_mul(step)).clamp(minimum, maximum)
     }
@@ -170,7 +170,7 @@ mod tests {
 
     #[test]
     fn times_go_to_the_nearest_step_within_the_range() {
-        let control = Control {
+        let control = NodeControl {
             id: 1,
             name: "Exposure".into(),
             kind: ControlKind::Number,

@@ -23,7 +23,7 @@ use v4l::v4l_sys::{
 };
 use v4l::v4l2::{self, vidioc};
 
-use super::node::{Control, ControlKind, Filled, Format, Identity, Node, NodeOpener};
+use super::node::{ControlKind, Filled, Format, Identity, Node, NodeControl, NodeOpener};
 
 const VIDEO_CAPTURE: u32 = 1;
 const MEMORY_MMAP: u32 = 1;
@@ -129,7 +129,7 @@ impl Node for KernelNode {
         })
     }
 
-    fn controls(&self) -> io::Result<Vec<Control>> {
+    fn controls(&self) -> io::Result<Vec<NodeControl>> {
         let mut controls = Vec::new();
         let mut found: v4l2_query_ext_ctrl = blank();
         loop {
@@ -161,7 +161,7 @@ impl Node for KernelNode {
             };
             // Arrays have several values.
             if found.flags & CTRL_DISABLED == 0 && found.elems <= 1 {
-                controls.push(Control {
+                controls.push(NodeControl {
                     id: found.id,
                     name: text(&found.name.map(|character| character as u8)),
                     kind,
@@ -173,7 +173,7 @@ impl Node for KernelNode {
         }
     }
 
-    fn control(&self, control: &Control) -> io::Result<i64> {
+    fn control(&self, control: &NodeControl) -> io::Result<i64> {
         if control.kind == ControlKind::Wide {
             return match self.device.control(control.id)?.value {
                 Value::Integer(value) => Ok(value),
@@ -185,7 +185,7 @@ impl Node for KernelNode {
         Ok(value.value.into())
     }
 
-    fn set_control(&mut self, control: &Control, value: i64) -> io::Result<()> {
+    fn set_control(&mut self, control: &NodeControl, value: i64) -> io::Result<()> {
         if control.kind == ControlKind::Wide {
             return self.device.set_control(v4l::Control { id: control.id, value: Value::Integer(value) });
         }

@@ -25,7 +25,7 @@ use raysweep_core::{
 };
 
 pub use self::formats::fourcc;
-pub use self::node::{Control, ControlKind, Filled, Format, Identity, Node, NodeOpener};
+pub use self::node::{ControlKind, Filled, Format, Identity, Node, NodeControl, NodeOpener};
 use self::open_node::{Layout, OpenNode};
 pub use self::setup::V4l2Setup;
 use self::timing::{ExposureTimes, Ids, exposure_start_ns, is_monotonic};

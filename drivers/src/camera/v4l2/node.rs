@@ -30,7 +30,7 @@ pub enum ControlKind {
 
 /// A control of a node.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Control {
+pub struct NodeControl {
     /// The kernel's id. Ids of different vendors collide, so find controls by name.
     pub id: u32,
     /// The name as in the kernel driver.
@@ -85,19 +85,19 @@ pub trait Node: Send {
     ///
     /// # Errors
     /// The kernel's error.
-    fn controls(&self) -> io::Result<Vec<Control>>;
+    fn controls(&self) -> io::Result<Vec<NodeControl>>;
 
     /// A control's value.
     ///
     /// # Errors
     /// The kernel's error.
-    fn control(&self, control: &Control) -> io::Result<i64>;
+    fn control(&self, control: &NodeControl) -> io::Result<i64>;
 
     /// Writes a control. The kernel driver may apply another value: read it back.
     ///
     /// # Errors
     /// The kernel's error.
-    fn set_control(&mut self, control: &Control, value: i64) -> io::Result<()>;
+    fn set_control(&mut self, control: &NodeControl, value: i64) -> io::Result<()>;
 
     /// Requests a format (`VIDIOC_S_FMT`) and returns the one that the driver applied.
     ///

@@ -36,7 +36,7 @@ pub struct Device {
     /// Errors of the next open calls.
     pub refusals: VecDeque<i32>,
     pub identity: Identity,
-    pub controls: Vec<(Control, i64)>,
+    pub controls: Vec<(NodeControl, i64)>,
     /// How the device changes a requested format.
     pub format: fn(Format) -> Format,
     pub frame_rate_max: f64,
@@ -56,10 +56,10 @@ pub struct Script {
     pub clock: Clock,
 }
 
-pub fn control(name: &str, minimum: i64, maximum: i64, step: i64, value: i64) -> (Control, i64) {
+pub fn control(name: &str, minimum: i64, maximum: i64, step: i64, value: i64) -> (NodeControl, i64) {
     // Ids of different vendors collide: here all of them do.
     let kind = if name == "Pixel Rate" { ControlKind::Wide } else { ControlKind::Number };
-    (Control { id: 1, name: name.into(), kind, minimum, maximum, step }, value)
+    (NodeControl { id: 1, name: name.into(), kind, minimum, maximum, step }, value)
 }
 
 impl Script {
@@ -158,17 +158,17 @@ impl Node for ScriptedNode {
         Ok(self.call("identity".into())?.identity.clone())
     }
 
-    fn controls(&self) -> io::Result<Vec<Control>> {
+    fn controls(&self) -> io::Result<Vec<NodeControl>> {
         Ok(self.call("controls".into())?.controls.iter().map(|(control, _)| control.clone()).collect())
     }
 
-    fn control(&self, control: &Control) -> io::Result<i64> {
+    fn control(&self, control: &NodeControl) -> io::Result<i64> {
         let device = self.call(format!("control {}", control.name))?;
         let found = device.controls.iter().find(|(known, _)| known.name == control.name);
         found.map(|(_, value)| *value).ok_or_else(|| io::Error::from_raw_os_error(EINVAL))
     }
 
-    fn set_control(&mut self, control: &Control, value: i64) -> io::Result<()> {
+    fn set_control(&mut self, control: &NodeControl, value: i64) -> io::Result<()> {
         let mut device = self.call(format!("set_control {} {value}", control.name))?;
         let found = device.controls.iter_mut().find(|(known, _)| known.name == control.name);
         let (_, held) = found.ok_or_else(|| io::Error::from_raw_os_error(EINVAL))?;

@@ -313,7 +313,7 @@ fn left_of(reply: PlayzerXReply) -> Option<u32> {
 fn darken(port: &mut Port, place: Tilt, full_scale: MechanicalDeg) -> Result<(), DeviceError> {
     let mut bytes = Vec::new();
     let point = raysweep_core::MirrorPoint { tilt: place, light: 0 };
-    PlayzerXCommand::Sample(protocol::Sample::of(point, full_scale)).to_bytes(&mut bytes);
+    PlayzerXCommand::Sample(protocol::MirrorSample::of(point, full_scale)).to_bytes(&mut bytes);
     port.send(&bytes)
 }
 

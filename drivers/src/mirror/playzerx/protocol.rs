@@ -20,7 +20,7 @@ pub const PADDING: [u8; 11] = [0; 11];
 
 /// A sample in the controller's format: 12 bits per axis, 8 bits of light.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Sample {
+pub struct MirrorSample {
     /// 0..=4095; 2048 is the origin.
     pub x: u16,
     /// As `x`, for the other axis.
@@ -29,7 +29,7 @@ pub struct Sample {
     pub light: u8,
 }
 
-impl Sample {
+impl MirrorSample {
     /// Converts a point for a controller whose codes reach `full_scale` at -1 and +1. Values beyond that are clamped.
     pub fn of(point: MirrorPoint, full_scale: MechanicalDeg) -> Self {
         let code = |deg: f64| {
@@ -45,7 +45,7 @@ impl Sample {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PlayzerXCommand {
     /// Appends one sample with its light to the FIFO.
-    Sample(Sample),
+    Sample(MirrorSample),
     /// Sets the sample rate, 50..=50,000 samples per second.
     SetRate(u32),
     /// Sets the period in ms of unrequested reports of the samples left; 0: none.
@@ -71,7 +71,7 @@ impl PlayzerXCommand {
             out.push(b'\n');
         };
         match self {
-            Self::Sample(Sample { x, y, light }) => {
+            Self::Sample(MirrorSample { x, y, light }) => {
                 let mixed = ((x >> 4) & 0xF0) as u8 | (y & 0x0F) as u8;
                 frame(b'd', &[x as u8, mixed, (y >> 4) as u8, light]);
             }
@@ -175,7 +175,7 @@ mod tests {
 
     #[test]
     fn commands_are_the_documented_bytes() {
-        let sample = PlayzerXCommand::Sample(Sample { x: 0xABC, y: 0x123, light: 0x7F });
+        let sample = PlayzerXCommand::Sample(MirrorSample { x: 0xABC, y: 0x123, light: 0x7F });
         assert_eq!(bytes(sample), [b'p', b'l', b'd', 9, 0xBC, 0xA3, 0x12, 0x7F, 10]);
         assert_eq!(bytes(PlayzerXCommand::SetRate(39_000)), [b'p', b'l', b'r', 8, 0x58, 0x98, 0x00, 10]);
         assert_eq!(bytes(PlayzerXCommand::SetReport(1000)), [b'p', b'l', b'u', 7, 0xE8, 0x03, 10]);
@@ -190,7 +190,7 @@ mod tests {
     fn the_origin_is_its_code_and_the_full_scale_is_symmetric() {
         let code = |deg: f64| {
             let tilt = Tilt::new(deg, -deg);
-            let sample = Sample::of(MirrorPoint { tilt, light: 1 }, MechanicalDeg(6.5));
+            let sample = MirrorSample::of(MirrorPoint { tilt, light: 1 }, MechanicalDeg(6.5));
             (sample.x, sample.y)
         };
         assert_eq!(code(0.0), (2048, 2048));

@@ -6,7 +6,7 @@ use raysweep_core::{DeviceError, DeviceErrorKind, MechanicalDeg, MirrorProgress,
 
 use super::REPLY_WAIT;
 use super::protocol::{
-    FIFO_SAMPLES, PADDING, PlayzerXCommand, PlayzerXReply, SAMPLE_BYTES, Sample, parse_response,
+    FIFO_SAMPLES, MirrorSample, PADDING, PlayzerXCommand, PlayzerXReply, SAMPLE_BYTES, parse_response,
 };
 use crate::mirror::error::fault;
 use crate::mirror::sequence::Sequence;
@@ -114,7 +114,7 @@ impl SampleStream {
         };
         let samples = room.min(WRITE_SAMPLES).min(self.sequence.len() - self.next);
         for index in self.next..self.next + samples {
-            let sample = Sample::of(self.sequence.at(index), self.full_scale);
+            let sample = MirrorSample::of(self.sequence.at(index), self.full_scale);
             PlayzerXCommand::Sample(sample).to_bytes(&mut self.out);
         }
         self.next += samples;

@@ -4,7 +4,7 @@ mod findings;
 mod products;
 
 use ndarray::{Array1, Array2};
-use raysweep_pipeline::{PREDICTED_SHARE, Role, SweepSummary};
+use raysweep_pipeline::{PREDICTED_SHARE, PointRole, SweepSummary};
 use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::report::{
     Block, ContactSheet, Marker, NoteLevel, Picture, Plot, Report, Section, Series, ToneSamples,
@@ -170,7 +170,7 @@ struct SweepImages<'a> {
 
 impl SweepImages<'_> {
     /// A point's image minus its dark image, in the scene's units.
-    fn light(&self, role: Role) -> Result<Option<Array2<f32>>> {
+    fn light(&self, role: PointRole) -> Result<Option<Array2<f32>>> {
         let Some(point) = self.task.task.schedule.points.iter().find(|point| point.role == role) else {
             return Ok(None);
         };
@@ -186,7 +186,7 @@ impl SweepImages<'_> {
         Ok(Some((image - dark) / self.task.task.geometry.white_dn as f32))
     }
 
-    fn mean(&self, role: Role) -> Result<Option<Array2<f32>>> {
+    fn mean(&self, role: PointRole) -> Result<Option<Array2<f32>>> {
         let (array, index) = place(role);
         let Some(entry) = self.state.point(array, index) else { return Ok(None) };
         // Damaged points are listed among the problems; the report shows them as missing.
@@ -198,7 +198,7 @@ impl SweepImages<'_> {
     fn at_exposure(&self, exposure_us: f64, markers: &[Marker]) -> Result<Vec<(f64, Vec<f32>)>> {
         let mut lights = Vec::new();
         for point in &self.task.task.schedule.points {
-            if matches!(point.role, Role::Sweep(_))
+            if matches!(point.role, PointRole::Sweep(_))
                 && point.exposure_us == exposure_us
                 && let Some(image) = self.light(point.role)?
             {
@@ -222,7 +222,7 @@ impl SweepImages<'_> {
         let mut samples = ToneSamples::new(self.stored_px());
         let mut thumbnails = Vec::with_capacity(places);
         for index in 0..places as u32 {
-            let light = self.light(Role::Sweep(index))?;
+            let light = self.light(PointRole::Sweep(index))?;
             light.iter().for_each(|light| samples.add(light.view()));
             thumbnails.push(light.map(|light| Picture::reduced(light.view())));
         }

@@ -39,7 +39,7 @@ impl Survey {
 }
 
 /// Raw counts minus background of one frame, without hot pixels.
-pub(super) trait Differences {
+pub(super) trait CountDifferences {
     /// Visits each pixel once. Returns false if the counts exceed what the implementation supports.
     fn survey(&self, survey: &mut Survey) -> bool;
 
@@ -55,14 +55,14 @@ fn words_of(segment: usize, words: usize) -> std::ops::Range<usize> {
 }
 
 /// Differences in 16 bits, for counts below 2^12.
-pub(super) struct Narrow<'a, L> {
+pub(super) struct NarrowCounts<'a, L> {
     lanes: L,
     raw: &'a [[u16; BLOCK_PX]],
     background: &'a [[u16; BLOCK_PX]],
     correction: &'a Correction,
 }
 
-impl<'a, L: Lanes> Narrow<'a, L> {
+impl<'a, L: Lanes> NarrowCounts<'a, L> {
     #[inline(always)]
     pub fn new(lanes: L, raw: &'a [u16], background: &'a Background, correction: &'a Correction) -> Self {
         let (raw, _) = raw.as_chunks();
@@ -94,7 +94,7 @@ impl<'a, L: Lanes> Narrow<'a, L> {
     }
 }
 
-impl<L: Lanes> Differences for Narrow<'_, L> {
+impl<L: Lanes> CountDifferences for NarrowCounts<'_, L> {
     #[inline(always)]
     fn survey(&self, survey: &mut Survey) -> bool {
         let (lanes, columns) = (self.lanes, survey.lanes.len());
@@ -179,7 +179,7 @@ impl Wide<'_> {
     }
 }
 
-impl Differences for Wide<'_> {
+impl CountDifferences for Wide<'_> {
     fn survey(&self, survey: &mut Survey) -> bool {
         let shape = self.correction.shape();
         survey.block_sums.fill(0);

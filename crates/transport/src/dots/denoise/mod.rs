@@ -11,14 +11,14 @@ use rayon::prelude::*;
 
 pub use rule::{DenoiseSettings, StopRule, false_alarm_sigmas};
 
-use self::counts::{Differences, Narrow, Survey, Wide};
+use self::counts::{CountDifferences, NarrowCounts, Survey, Wide};
 use self::disc::Disc;
 use self::lanes::{Lanes, Portable};
 use super::background::luminance;
 use super::column::{bits, runs};
 use super::error::check_shape;
 use super::shape::BLOCK_PX;
-use super::{Background, Batch, BatchArrays, Correction, DotsError, NoiseFloor, Outcome, SparseColumn};
+use super::{Background, Batch, BatchArrays, ColumnOutcome, Correction, DotsError, NoiseFloor, SparseColumn};
 use crate::plane::SimdLevel;
 
 /// Number of frames that one thread takes at a time.
@@ -186,7 +186,7 @@ impl<L: Lanes> NullaryFnOnce for OnLanes<'_, L> {
             }
         }
         let raw: &[u16] = if gray.is_empty() { task.frame } else { &gray };
-        let narrow = Narrow::new(lanes, raw, task.background, correction);
+        let narrow = NarrowCounts::new(lanes, raw, task.background, correction);
         let outcome = match task.background.narrow && narrow.survey(&mut task.scratch.survey) {
             true => task.take_discs(&narrow),
             false => {
@@ -213,7 +213,7 @@ struct Left {
 impl FrameTask<'_> {
     /// Takes discs until the stop rule is met.
     #[inline(always)]
-    fn take_discs(&mut self, differences: &impl Differences) -> Result<Outcome, DotsError> {
+    fn take_discs(&mut self, differences: &impl CountDifferences) -> Result<ColumnOutcome, DotsError> {
         let Self { denoiser, frame, background, floor, scratch, .. } = self;
         let shape = denoiser.correction.shape();
         let printed = match &denoiser.settings.stop {
@@ -232,7 +232,7 @@ impl FrameTask<'_> {
             sum: scratch.survey.block_sums.iter().map(|&sum| i64::from(sum)).sum(),
             squares: scratch.survey.squares as i64,
         };
-        let mut outcome = Outcome::default();
+        let mut outcome = ColumnOutcome::default();
         loop {
             let largest = scratch.survey.maxima.iter().fold(counts::NOTHING, |a, &b| a.max(b));
             if largest < least {

@@ -5,7 +5,7 @@ use super::{DenoiseSettings, StopRule};
 use crate::dots::background::luminance;
 use crate::dots::error::check_shape;
 use crate::dots::shape::BLOCK_PX;
-use crate::dots::{Background, Correction, DotsError, NoiseFloor, Outcome, SparseColumn};
+use crate::dots::{Background, ColumnOutcome, Correction, DotsError, NoiseFloor, SparseColumn};
 
 /// Denoises one raw frame, `[height, width, channels]`: for every disc the whole frame is searched again.
 ///
@@ -38,7 +38,7 @@ pub fn column(
         StopRule::FalseAlarms { .. } => floor,
     };
 
-    let mut outcome = Outcome::default();
+    let mut outcome = ColumnOutcome::default();
     loop {
         let mut brightest: Option<(usize, i64)> = None;
         for (pixel, value) in left.iter().enumerate() {

@@ -92,8 +92,8 @@ pub struct Tile {
 }
 
 /// The processing of a tile, whose pixels lie in these rows.
-pub trait Work<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
-impl<T, F: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync> Work<T> for F {}
+pub trait TileWork<T>: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync {}
+impl<T, F: Fn(&Problem, &Tile, &mut [Row<T>]) -> Result<(), PlaneError> + Sync> TileWork<T> for F {}
 
 impl Objectives<'_> {
     /// Calls `work` for all pixels of some camera rows, ascending, for as long as `go_on` returns true. Tiles are
@@ -105,7 +105,7 @@ impl Objectives<'_> {
         &self,
         rows: &mut [Row<T>],
         go_on: &(dyn Fn() -> bool + Sync),
-        work: &impl Work<T>,
+        work: &impl TileWork<T>,
     ) -> Result<(), PlaneError> {
         if self.timing.response().is_some() {
             rows.iter().try_for_each(|row| self.timing.check_columns(row.columns))?;
@@ -135,7 +135,7 @@ impl Objectives<'_> {
         &self,
         row: &mut Row<T>,
         go_on: &(dyn Fn() -> bool + Sync),
-        work: &impl Work<T>,
+        work: &impl TileWork<T>,
     ) -> Result<(), PlaneError> {
         let direct = Direct { step: 0, weights: None };
         let models = RowModel::of_pixels(self.timing, self.settings, self.reach, row.t, row.columns);
@@ -156,7 +156,7 @@ impl Objectives<'_> {
         model: &RowModel,
         rows: &mut [Row<T>],
         go_on: &(dyn Fn() -> bool + Sync),
-        work: &impl Work<T>,
+        work: &impl TileWork<T>,
     ) -> Result<(), PlaneError> {
         for row in &mut *rows {
             row.groups = self.group(model, row)?;
@@ -187,7 +187,7 @@ impl Objectives<'_> {
         problem: &Problem,
         direct: &Direct,
         rows: &mut [Row<T>],
-        work: &impl Work<T>,
+        work: &impl TileWork<T>,
     ) -> Result<(), PlaneError> {
         let mut tile = Tile::default();
         for at in 0..rows.len() {

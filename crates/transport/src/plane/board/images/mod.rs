@@ -23,8 +23,10 @@ pub use dark::{CappedFrames, DarkFit};
 pub use error::ImagesError;
 pub use linearity::{LightLevel, Linearity, SaturationLimit};
 pub use photon_transfer::{PhotonTransfer, photon_transfer, prnu};
-pub use place::{CodedPictures, Phases, Places, locate_columns, locate_rows};
-pub use response::{Comparison, Narrower, RESPONSE_ROWS, ResponseChecks, Responses, compare_responses};
+pub use place::{CodedPictures, Phases, RowPlaces, locate_columns, locate_rows};
+pub use response::{
+    Narrower, RESPONSE_ROWS, ResponseChecks, ResponseComparison, Responses, compare_responses,
+};
 pub use white::WhiteMap;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};

@@ -1,7 +1,7 @@
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
-use super::smooth::{Point, SmoothMap};
+use super::smooth::{SmoothMap, SmoothPoint};
 use super::{ImagesError, check_frames, check_range, check_shape};
 
 /// Number of pictures in which every 16th line is lit.
@@ -38,7 +38,7 @@ pub struct CodedPictures<'a> {
 
 /// Which line of the projector each pixel sees.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Places {
+pub struct RowPlaces {
     /// Position on the scale of the projector's lines by the smooth map, `[t, s]`; NaN where the pixel is not lit or
     /// lies outside the projector's picture.
     pub place: Array2<f32>,
@@ -60,7 +60,7 @@ pub fn locate_rows(
     code: &CodedPictures,
     lit: ArrayView2<bool>,
     projector_rows: usize,
-) -> Result<Places, ImagesError> {
+) -> Result<RowPlaces, ImagesError> {
     locate(phases, code, lit, projector_rows, "row")
 }
 
@@ -85,15 +85,15 @@ fn locate(
     lit: ArrayView2<bool>,
     lines: usize,
     name: &'static str,
-) -> Result<Places, ImagesError> {
+) -> Result<RowPlaces, ImagesError> {
     check(phases, code, lit, lines)?;
     let shape = lit.dim();
-    let mut points: Vec<Point> = (0..shape.0)
+    let mut points: Vec<SmoothPoint> = (0..shape.0)
         .into_par_iter()
         .flat_map_iter(|t| {
             (0..shape.1).filter(move |&s| lit[[t, s]]).filter_map(move |s| {
                 let value = own_place(phases, code, lines, t, s)?;
-                Some(Point { t, s, value })
+                Some(SmoothPoint { t, s, value })
             })
         })
         .collect();
@@ -106,10 +106,10 @@ fn locate(
     if points.len() < MIN_POINTS {
         return Err(too_few(points.len()));
     }
-    let fit = |points: &[Point]| {
+    let fit = |points: &[SmoothPoint]| {
         // An odd step, so that the points do not lie in a few columns only.
         let step = (points.len() / MAX_POINTS) | 1;
-        let few: Vec<Point> = points.iter().copied().step_by(step).collect();
+        let few: Vec<SmoothPoint> = points.iter().copied().step_by(step).collect();
         SmoothMap::fit(shape, &few).ok_or_else(|| too_few(few.len()))
     };
     // Where the code changes, it may be read one block off, and the place is then wrong by 16 lines.
@@ -141,7 +141,7 @@ fn locate(
             *place = f32::NAN;
         }
     });
-    Ok(Places { place, rms, misread })
+    Ok(RowPlaces { place, rms, misread })
 }
 
 fn check(

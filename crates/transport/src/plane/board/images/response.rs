@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, Array3, ArrayView1, Axis};
 use rayon::prelude::*;
 
-use super::place::{PHASES, Phases, Places};
+use super::place::{PHASES, Phases, RowPlaces};
 use super::{Estimate, ImagesError, WhiteMap, check_frames, check_shape, median};
 
 /// The drawn rows of a response, relative to the row nearest to the pixel's place.
@@ -95,7 +95,7 @@ impl Responses {
     pub fn new(
         phases: &Phases,
         white: &WhiteMap,
-        places: &Places,
+        places: &RowPlaces,
         projector_rows: usize,
     ) -> Result<Self, ImagesError> {
         let shape = places.place.dim();
@@ -353,7 +353,7 @@ pub enum Narrower {
 
 /// Widths of the responses of two boards, as second central moments in rows^2.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Comparison {
+pub struct ResponseComparison {
     /// The board whose responses are to be taken.
     pub narrower: Narrower,
     /// Mean second moment of each board.
@@ -362,7 +362,7 @@ pub struct Comparison {
     pub difference: Estimate,
 }
 
-impl fmt::Display for Comparison {
+impl fmt::Display for ResponseComparison {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         let [first, second] = self.second_moments;
         let Estimate { value, sd } = self.difference;
@@ -401,7 +401,7 @@ const DIFFERENCE_SHARE: f64 = 0.02;
 ///
 /// # Errors
 /// [`ImagesError::TooFew`] if the boards have no fraction in common.
-pub fn compare_responses(first: &Responses, second: &Responses) -> Result<Comparison, ImagesError> {
+pub fn compare_responses(first: &Responses, second: &Responses) -> Result<ResponseComparison, ImagesError> {
     let [of_first, of_second] = [first, second].map(moments_by_fraction);
     let (mut sums, mut variance, mut groups) = ([0.0; 2], 0.0, 0);
     for (a, b) in of_first.iter().zip(&of_second) {
@@ -427,7 +427,7 @@ pub fn compare_responses(first: &Responses, second: &Responses) -> Result<Compar
         value if value < -least => Narrower::Second,
         _ => Narrower::Neither,
     };
-    Ok(Comparison { narrower, second_moments, difference })
+    Ok(ResponseComparison { narrower, second_moments, difference })
 }
 
 /// Mean second moment of the pixels of each fraction of a row, if there are enough of them.

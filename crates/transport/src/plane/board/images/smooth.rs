@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 /// A value at a pixel.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Point {
+pub(super) struct SmoothPoint {
     pub t: usize,
     pub s: usize,
     pub value: f64,
@@ -28,7 +28,7 @@ const TUKEY_SIGMAS: f64 = 4.685;
 
 impl SmoothMap {
     /// The robust fit to points of an image of this shape; `None` if they do not determine it.
-    pub fn fit(shape: (usize, usize), points: &[Point]) -> Option<Self> {
+    pub fn fit(shape: (usize, usize), points: &[SmoothPoint]) -> Option<Self> {
         let degree_t = (shape.0 / PIXELS_PER_DEGREE).clamp(1, DEGREES.0);
         let degree_s = (shape.1 / PIXELS_PER_DEGREE).clamp(1, DEGREES.1);
         let terms: Vec<(usize, usize)> = (0..=degree_t)
@@ -87,7 +87,7 @@ impl SmoothMap {
         self.coefficients.iter().zip(basis).map(|(a, b)| a * b).sum()
     }
 
-    fn solve(&mut self, rows: &[Vec<f64>], points: &[Point], weights: &[f64]) -> Option<()> {
+    fn solve(&mut self, rows: &[Vec<f64>], points: &[SmoothPoint], weights: &[f64]) -> Option<()> {
         let n = self.terms.len();
         if points.len() < 2 * n {
             return None;
@@ -130,14 +130,14 @@ mod tests {
             let (x, y) = (t as f64 / 200.0, s as f64 / 160.0);
             300.0 + 200.0 * x + 2.0 * y + 0.5 * x * y * y - 0.3 * x.powi(4)
         };
-        let points: Vec<Point> = (0..200)
+        let points: Vec<SmoothPoint> = (0..200)
             .flat_map(|t| (0..160).map(move |s| (t, s)))
             .enumerate()
             .map(|(n, (t, s))| {
                 // One in 20 is read 16 rows too high.
                 let outlier = if n % 20 == 7 { 16.0 } else { 0.0 };
                 let noise = 0.01 * (n as f64 * 12.9898).sin();
-                Point { t, s, value: truth(t, s) + outlier + noise }
+                SmoothPoint { t, s, value: truth(t, s) + outlier + noise }
             })
             .collect();
         let map = SmoothMap::fit((200, 160), &points).unwrap();
@@ -150,7 +150,7 @@ mod tests {
 
     #[test]
     fn points_on_one_line_do_not_determine_a_map() {
-        let points: Vec<Point> = (0..100).map(|t| Point { t, s: 3, value: t as f64 }).collect();
+        let points: Vec<SmoothPoint> = (0..100).map(|t| SmoothPoint { t, s: 3, value: t as f64 }).collect();
         assert!(SmoothMap::fit((100, 100), &points).is_none());
     }
 }

@@ -2,13 +2,13 @@ use nalgebra::{Matrix4, Vector4};
 
 use super::columns::Columns;
 use super::error::TimesError;
-use super::settings::{BoardFrame, Nominal, Shutter};
+use super::settings::{BoardFrame, ExposureMode, Nominal};
 
 /// The sweep as global frames see it, to within 10 us: a cubic through the borders between dark and light.
 ///
 /// Its times are those of exposures with a global shutter, which differ from those of rolling exposures by a constant.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Coarse {
+pub struct CoarseSweep {
     nominal: Nominal,
     /// Middle and half width of the rows that the borders cover.
     middle_row: f64,
@@ -31,7 +31,7 @@ const PRIOR_US: [f64; 4] = [1e4, 1e4, 500.0, 200.0];
 /// Error of a measured sweep, and how far the shutter modes may be apart.
 const MEASURED_ERROR_US: f64 = 20.0;
 
-impl Coarse {
+impl CoarseSweep {
     /// A sweep of which only the nominal numbers are known.
     pub fn nominal(nominal: &Nominal) -> Self {
         Self {
@@ -53,7 +53,7 @@ impl Coarse {
         nominal: &Nominal,
     ) -> Result<Self, TimesError> {
         nominal.check()?;
-        let global = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Global);
+        let global = || frames.iter().filter(|frame| frame.setting.shutter == ExposureMode::Global);
         let points: Vec<(f64, f64)> = global().flat_map(|frame| borders(columns, frame, nominal)).collect();
         let few = |borders: &[(f64, f64)]| {
             let (first, last) = ends(borders);
@@ -180,7 +180,7 @@ const CUT_LIGHT: f64 = 0.1;
 /// When the light of each camera row arrives: the centroid of its light over the delays of the shortest rolling
 /// exposure.
 pub(super) fn arrivals(columns: &Columns, frames: &[BoardFrame]) -> Result<Arrivals, TimesError> {
-    let rolling = || frames.iter().filter(|frame| frame.setting.shutter == Shutter::Rolling);
+    let rolling = || frames.iter().filter(|frame| frame.setting.shutter == ExposureMode::Rolling);
     let exposure_us = rolling().map(|frame| frame.setting.exposure_us).fold(f64::MAX, f64::min);
     let mut short: Vec<&BoardFrame> =
         rolling().filter(|frame| frame.setting.exposure_us == exposure_us).collect();

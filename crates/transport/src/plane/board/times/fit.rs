@@ -2,13 +2,13 @@ use nalgebra::{DMatrix, DVector};
 
 use super::super::super::NoiseModel;
 use super::super::super::error::check_shape;
-use super::coarse::{Arrivals, Coarse, arrivals, median};
+use super::coarse::{Arrivals, CoarseSweep, arrivals, median};
 use super::columns::Columns;
 use super::error::TimesError;
-use super::model::{Clocks, Comparison, Edge, Samples, Sums, Sweep};
+use super::model::{Clocks, ExposureEdge, FrameComparison, BoardSamples, Sums, Sweep};
 use super::result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
-use super::settings::{BoardFrame, Nominal, Shutter};
-use super::table::Table;
+use super::settings::{BoardFrame, ExposureMode, Nominal};
+use super::table::SplineTable;
 
 /// What each frame's light may be late, before it is measured.
 const JITTER_PRIOR_US: f64 = 8.0;
@@ -65,7 +65,7 @@ impl RowTimes {
         for frame in frames {
             check_shape("light of a frame", "[row, group]", frame.light.shape(), &expected)?;
         }
-        let coarse = Coarse::from_borders(columns, frames, nominal)?;
+        let coarse = CoarseSweep::from_borders(columns, frames, nominal)?;
         let arrivals = arrivals(columns, frames)?;
         let mut fit = Fit::start(columns, frames, nominal, noise, &coarse, &arrivals)?;
         fit.scan_jitters();
@@ -95,7 +95,7 @@ struct Fit<'a> {
     frames: &'a [BoardFrame],
     nominal: &'a Nominal,
     noise: NoiseModel,
-    table: Table,
+    table: SplineTable,
     /// Different exposures; the first is that of the arrivals.
     exposures_us: Vec<f64>,
     start: Vec<f64>,
@@ -129,7 +129,7 @@ impl<'a> Fit<'a> {
         frames: &'a [BoardFrame],
         nominal: &'a Nominal,
         noise: NoiseModel,
-        coarse: &Coarse,
+        coarse: &CoarseSweep,
         arrivals: &Arrivals,
     ) -> Result<Self, TimesError> {
         // Places of drawing and arrivals, by camera row.
@@ -141,7 +141,7 @@ impl<'a> Fit<'a> {
             points.iter().map(|&(row, place, time_us)| (row, coarse.time_us(place) - time_us)).collect();
         let (camera_row_us, at_row_0_us) = line(&lines);
         let clocks = [camera_row_us, -at_row_0_us, arrivals.exposure_offset_us];
-        let table = Table::new(nominal.projector_rows, &columns.seen_rows());
+        let table = SplineTable::new(nominal.projector_rows, &columns.seen_rows());
         // The table through the arrivals; where there are none, through the sweep seen by global frames.
         let count = table.coefficients;
         let mut matrix = DMatrix::zeros(count, count);
@@ -190,12 +190,12 @@ impl<'a> Fit<'a> {
         Sweep::new(self.table.starts_us(self.coefficients()), self.nominal.period_us)
     }
 
-    fn comparison<'b>(&'b self, sweep: &'b Sweep) -> Comparison<'b> {
+    fn comparison<'b>(&'b self, sweep: &'b Sweep) -> FrameComparison<'b> {
         let clocks = &self.unknowns[self.table.coefficients..];
         let clocks =
             Clocks { camera_row_us: clocks[0], mode_offset_us: clocks[1], exposure_offset_us: clocks[2] };
         let (columns, noise, variance_scale) = (self.columns, self.noise, self.variance_scale);
-        Comparison { columns, sweep, clocks, noise, variance_scale }
+        FrameComparison { columns, sweep, clocks, noise, variance_scale }
     }
 
     /// The unknown that says what a frame's exposure has more than that of the arrivals, unless it is the same.
@@ -222,7 +222,7 @@ impl<'a> Fit<'a> {
         late_us.into_iter().for_each(|(frame, late_us)| self.late_us[frame] = late_us);
     }
 
-    fn scan_jitter(&self, comparison: &Comparison, frame: usize) -> f64 {
+    fn scan_jitter(&self, comparison: &FrameComparison, frame: usize) -> f64 {
         let longer_us = self.longer_us(frame);
         let prior = self.jitter_prior_us.powi(-2);
         let objective = |late_us: f64| {
@@ -230,7 +230,7 @@ impl<'a> Fit<'a> {
             comparison.visit(
                 &self.frames[frame],
                 (late_us, longer_us),
-                Samples::EveryRow(SCAN_ROWS),
+                BoardSamples::EveryRow(SCAN_ROWS),
                 |_, _, _, sums| {
                     chi2 += sums.chi2;
                 },
@@ -251,7 +251,7 @@ impl<'a> Fit<'a> {
         }
         for _ in 0..4 {
             let (mut weight, mut right) = (prior, -best_us * prior);
-            comparison.visit(&self.frames[frame], (best_us, longer_us), Samples::OnEdges, |_, _, _, sums| {
+            comparison.visit(&self.frames[frame], (best_us, longer_us), BoardSamples::OnEdges, |_, _, _, sums| {
                 weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
                 right += sums.opening_residual - sums.closing_residual;
             });
@@ -261,14 +261,14 @@ impl<'a> Fit<'a> {
     }
 
     /// Derivatives of the times of a frame's opening and closing edge.
-    fn edges(&self, frame: usize, row: usize, opening: &Edge, closing: &Edge) -> [Sparse; 2] {
+    fn edges(&self, frame: usize, row: usize, opening: &ExposureEdge, closing: &ExposureEdge) -> [Sparse; 2] {
         let coefficients = self.table.coefficients;
         let mut edges = [opening, closing].map(|place| {
             let mut edge = Sparse::default();
             edge.add_table(&self.table, place);
             match self.frames[frame].setting.shutter {
-                Shutter::Rolling => edge.push(coefficients, row as f64),
-                Shutter::Global => edge.push(coefficients + 1, 1.0),
+                ExposureMode::Rolling => edge.push(coefficients, row as f64),
+                ExposureMode::Global => edge.push(coefficients + 1, 1.0),
             }
             edge
         });
@@ -296,7 +296,7 @@ impl<'a> Fit<'a> {
                 right: -self.late_us[frame] * prior,
             };
             let late = (self.late_us[frame], self.longer_us(frame));
-            comparison.visit(&self.frames[frame], late, Samples::OnEdges, |row, opening, closing, sums| {
+            comparison.visit(&self.frames[frame], late, BoardSamples::OnEdges, |row, opening, closing, sums| {
                 let edges = self.edges(frame, row, opening, closing);
                 own.add(&edges, sums, &mut matrix, &mut right);
             });
@@ -346,10 +346,10 @@ impl<'a> Fit<'a> {
     }
 
     /// chi^2 and number of samples of a frame.
-    fn misfit(&self, comparison: &Comparison, frame: usize) -> (f64, f64) {
+    fn misfit(&self, comparison: &FrameComparison, frame: usize) -> (f64, f64) {
         let (mut chi2, mut samples) = (0.0, 0.0);
         let late = (self.late_us[frame], self.longer_us(frame));
-        comparison.visit(&self.frames[frame], late, Samples::OnEdges, |_, _, _, sums| {
+        comparison.visit(&self.frames[frame], late, BoardSamples::OnEdges, |_, _, _, sums| {
             chi2 += sums.chi2;
             samples += sums.samples;
         });
@@ -357,7 +357,7 @@ impl<'a> Fit<'a> {
     }
 
     /// The frames of a shutter mode that are used, with their jitters.
-    fn jitters_of(&self, shutter: Shutter) -> Vec<(usize, f64)> {
+    fn jitters_of(&self, shutter: ExposureMode) -> Vec<(usize, f64)> {
         self.used()
             .filter(|&frame| self.frames[frame].setting.shutter == shutter)
             .map(|frame| (frame, self.late_us[frame]))
@@ -370,7 +370,7 @@ impl<'a> Fit<'a> {
                 self.dropped[frame] = Some(Dropped::NoEdge);
             }
         }
-        for shutter in [Shutter::Global, Shutter::Rolling] {
+        for shutter in [ExposureMode::Global, ExposureMode::Rolling] {
             let jitters = self.jitters_of(shutter);
             let middle_us = median(&mut jitters.iter().map(|jitter| jitter.1).collect::<Vec<_>>());
             let mut away_us: Vec<f64> = jitters.iter().map(|jitter| (jitter.1 - middle_us).abs()).collect();
@@ -401,7 +401,7 @@ impl<'a> Fit<'a> {
     /// Standard deviation of the frames' jitters about the mean of their shutter mode.
     fn check_jitter(&self) -> Result<Measured, TimesError> {
         let (mut squares, mut count) = (0.0, 0.0);
-        for shutter in [Shutter::Global, Shutter::Rolling] {
+        for shutter in [ExposureMode::Global, ExposureMode::Rolling] {
             let jitters = self.jitters_of(shutter);
             let mean_us = jitters.iter().map(|jitter| jitter.1).sum::<f64>() / jitters.len() as f64;
             squares += jitters.iter().map(|jitter| (jitter.1 - mean_us).powi(2)).sum::<f64>();
@@ -518,7 +518,7 @@ impl<'a> Fit<'a> {
             let frame = &self.frames[own.frame];
             let late = (self.late_us[own.frame], self.longer_us(own.frame));
             jitters.set_column(index, &(&own.mixed / own.weight));
-            comparison.visit(frame, late, Samples::OnEdges, |row, opening, closing, _| {
+            comparison.visit(frame, late, BoardSamples::OnEdges, |row, opening, closing, _| {
                 let edges = self.edges(own.frame, row, opening, closing);
                 for group in 0..groups {
                     let cell = row * groups + group;
@@ -591,11 +591,11 @@ impl<'a> Fit<'a> {
             let jitters = self.jitters_of(shutter);
             jitters.iter().map(|jitter| jitter.1).sum::<f64>() / jitters.len() as f64
         };
-        let means_us = (late_us(Shutter::Global), late_us(Shutter::Rolling));
+        let means_us = (late_us(ExposureMode::Global), late_us(ExposureMode::Rolling));
         let jitter = |frame: usize| {
             let mean_us = match self.frames[frame].setting.shutter {
-                Shutter::Global => means_us.0,
-                Shutter::Rolling => means_us.1,
+                ExposureMode::Global => means_us.0,
+                ExposureMode::Rolling => means_us.1,
             };
             self.dropped[frame].is_none().then(|| FrameJitter {
                 late_us: self.late_us[frame] - mean_us,
@@ -614,7 +614,7 @@ impl<'a> Fit<'a> {
             covariance: products,
             jitter_us,
             jitters: (0..self.frames.len()).map(jitter).collect(),
-            useful_frames: self.jitters_of(Shutter::Rolling).len(),
+            useful_frames: self.jitters_of(ExposureMode::Rolling).len(),
             residuals,
             dropped: self
                 .dropped
@@ -731,7 +731,7 @@ impl Sparse {
     }
 
     /// The light is late by the table at the place that is being drawn at the edge, not at the pixel's place.
-    fn add_table(&mut self, table: &Table, edge: &Edge) {
+    fn add_table(&mut self, table: &SplineTable, edge: &ExposureEdge) {
         for (row, share) in [(edge.row, 1.0 - edge.fraction), (edge.row + 1, edge.fraction)] {
             let (first, weights) = table.weights(row);
             weights.iter().enumerate().for_each(|(index, weight)| self.push(first + index, -share * weight));

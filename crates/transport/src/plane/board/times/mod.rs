@@ -1,13 +1,13 @@
 //! When each projector row is lit, from images of the white board.
 //!
 //! Each image is one frame, as a share of one pass of white. In frames with a global shutter, the edges of the exposure
-//! appear as borders between dark and light: [`Coarse`] reads the sweep from their places to within 10 us, without any
+//! appear as borders between dark and light: [`CoarseSweep`] reads the sweep from their places to within 10 us, without any
 //! model. Rolling frames of about three row times then find when the light of each camera row arrives. [`RowTimes`]
 //! fits a model of all frames: a smooth table of row starts, the camera's row time, the offset between the shutter
 //! modes, what exposures have more than their nominal length, and how late the light of each frame is.
 //!
 //! The order of calls is: [`Columns::new`] from the map of places and the responses; frames of [`sweep_settings`], each
-//! reduced by [`Columns::average`]; [`Coarse::from_borders`]; frames of [`arrival_settings`] and [`check_settings`];
+//! reduced by [`Columns::average`]; [`CoarseSweep::from_borders`]; frames of [`arrival_settings`] and [`check_settings`];
 //! [`RowTimes::fit`], which takes all of these frames; and, with pictures of even and of odd rows, [`spot_slopes`],
 //! which tells a flying spot from rows that are lit evenly.
 
@@ -21,11 +21,11 @@ mod settings;
 mod spot;
 mod table;
 
-pub use coarse::Coarse;
+pub use coarse::CoarseSweep;
 pub use columns::Columns;
 pub use error::TimesError;
 pub use result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
 pub use settings::{
-    BoardFrame, BoardSetting, Nominal, Shutter, arrival_settings, check_settings, sweep_settings,
+    BoardFrame, BoardSetting, ExposureMode, Nominal, arrival_settings, check_settings, sweep_settings,
 };
 pub use spot::{SpotSlopes, spot_slopes};

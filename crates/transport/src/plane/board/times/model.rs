@@ -2,7 +2,7 @@ use std::ops::Range;
 
 use super::super::super::NoiseModel;
 use super::columns::Columns;
-use super::settings::{BoardFrame, Shutter};
+use super::settings::{BoardFrame, ExposureMode};
 
 /// Variance of a share of light that the model does not explain: brightness of single rows, errors of responses.
 const MODEL_VARIANCE: f64 = 0.006 * 0.006;
@@ -27,7 +27,7 @@ pub(super) struct Sweep {
 
 /// Where the drawing stands at an edge of an exposure.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Edge {
+pub(super) struct ExposureEdge {
     /// The row being drawn, and the fraction of it that has been drawn.
     pub row: usize,
     pub fraction: f64,
@@ -52,14 +52,14 @@ pub(super) struct Sums {
 
 /// Which samples of a frame are compared.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Samples {
+pub(super) enum BoardSamples {
     /// Those that an edge meets.
     OnEdges,
     /// All of every so many camera rows.
     EveryRow(usize),
 }
 
-impl Edge {
+impl ExposureEdge {
     /// Rows drawn, with the fraction.
     fn drawn(&self) -> f64 {
         self.row as f64 + self.fraction
@@ -77,12 +77,12 @@ impl Sweep {
     }
 
     /// The edge at a time. `near` is a row at which to begin the search.
-    fn edge(&self, time_us: f64, near: usize) -> Edge {
+    fn edge(&self, time_us: f64, near: usize) -> ExposureEdge {
         let rows = self.starts_us.len() - 1;
         let periods = ((time_us - self.starts_us[0]) / self.period_us).floor();
         let time_us = time_us - periods * self.period_us;
         if time_us >= self.starts_us[rows] {
-            return Edge { row: rows - 1, fraction: 1.0, rows_per_us: 0.0, periods };
+            return ExposureEdge { row: rows - 1, fraction: 1.0, rows_per_us: 0.0, periods };
         }
         let mut row = near.min(rows - 1);
         while row > 0 && self.starts_us[row] > time_us {
@@ -92,12 +92,12 @@ impl Sweep {
             row += 1;
         }
         let rows_per_us = (self.starts_us[row + 1] - self.starts_us[row]).recip();
-        Edge { row, fraction: (time_us - self.starts_us[row]) * rows_per_us, rows_per_us, periods }
+        ExposureEdge { row, fraction: (time_us - self.starts_us[row]) * rows_per_us, rows_per_us, periods }
     }
 }
 
 /// Compares frames with the light that a sweep sends.
-pub(super) struct Comparison<'a> {
+pub(super) struct FrameComparison<'a> {
     pub columns: &'a Columns,
     pub sweep: &'a Sweep,
     pub clocks: Clocks,
@@ -106,32 +106,33 @@ pub(super) struct Comparison<'a> {
     pub variance_scale: f64,
 }
 
-impl Comparison<'_> {
+impl FrameComparison<'_> {
     /// Visits the camera rows of a frame whose light is late by `late_us` and whose exposure is `longer_us`
     /// longer than that of other frames.
     pub fn visit(
         &self,
         frame: &BoardFrame,
         (late_us, longer_us): (f64, f64),
-        samples: Samples,
-        mut visitor: impl FnMut(usize, &Edge, &Edge, &Sums),
+        samples: BoardSamples,
+        mut visitor: impl FnMut(usize, &ExposureEdge, &ExposureEdge, &Sums),
     ) {
         let (step, everywhere) = match samples {
-            Samples::OnEdges => (1, false),
-            Samples::EveryRow(step) => (step, true),
+            BoardSamples::OnEdges => (1, false),
+            BoardSamples::EveryRow(step) => (step, true),
         };
         let setting = frame.setting;
         let exposure_us = setting.exposure_us + self.clocks.exposure_offset_us + longer_us;
         let (mut opening, mut closing) = (self.sweep.edge(-late_us, 0), self.sweep.edge(-late_us, 0));
         for row in (0..self.columns.rows()).step_by(step) {
             let starts_us = match setting.shutter {
-                Shutter::Global => self.clocks.mode_offset_us,
-                Shutter::Rolling => row as f64 * self.clocks.camera_row_us,
+                ExposureMode::Global => self.clocks.mode_offset_us,
+                ExposureMode::Rolling => row as f64 * self.clocks.camera_row_us,
             };
             let from_us = setting.delay_us + starts_us - late_us;
             opening = self.sweep.edge(from_us, opening.row);
             closing = self.sweep.edge(from_us + exposure_us, closing.row);
-            let reached = |edge: &Edge| edge.rows_per_us > 0.0 && self.columns.reached(row, edge.drawn());
+            let reached =
+                |edge: &ExposureEdge| edge.rows_per_us > 0.0 && self.columns.reached(row, edge.drawn());
             if !everywhere && !reached(&opening) && !reached(&closing) {
                 continue;
             }
@@ -149,7 +150,7 @@ impl Comparison<'_> {
         frame: &BoardFrame,
         row: usize,
         groups: Range<usize>,
-        (opening, closing): (&Edge, &Edge),
+        (opening, closing): (&ExposureEdge, &ExposureEdge),
         everywhere: bool,
     ) -> Sums {
         let mut sums = Sums::default();

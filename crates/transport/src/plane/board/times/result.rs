@@ -2,7 +2,7 @@ use std::ops::Range;
 
 use ndarray::Array2;
 
-use super::settings::Shutter;
+use super::settings::ExposureMode;
 
 /// A number with its standard deviation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -82,7 +82,7 @@ pub enum Dropped {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Residual {
     /// The mode.
-    pub shutter: Shutter,
+    pub shutter: ExposureMode,
     /// The exposure.
     pub exposure_us: f64,
     /// Number of frames used.

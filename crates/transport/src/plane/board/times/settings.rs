@@ -3,12 +3,12 @@ use std::ops::Range;
 use ndarray::Array2;
 
 use super::super::super::PlaneError;
-use super::coarse::Coarse;
+use super::coarse::CoarseSweep;
 use super::columns::Columns;
 
 /// How the rows of the camera are exposed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Shutter {
+pub enum ExposureMode {
     /// All rows at once.
     Global,
     /// One row after the other.
@@ -19,7 +19,7 @@ pub enum Shutter {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoardSetting {
     /// How the rows are exposed.
-    pub shutter: Shutter,
+    pub shutter: ExposureMode,
     /// Time from the trigger edge to the start of camera row 0's exposure, as the rig believes it. An unknown constant
     /// of each shutter mode may be missing.
     pub delay_us: f64,
@@ -115,7 +115,7 @@ pub fn sweep_settings(nominal: &Nominal, seen_rows: Range<usize>) -> Result<Vec<
     // ends after the last row into the next.
     let margin_us = (nominal.error_us() + BEAM_ROWS * row_time_us).min((period_us - lit_us) / 2.0);
     let setting = |from_us: f64, exposure_us: f64| BoardSetting {
-        shutter: Shutter::Global,
+        shutter: ExposureMode::Global,
         delay_us: start_us + from_us,
         exposure_us,
     };
@@ -143,7 +143,7 @@ pub fn sweep_settings(nominal: &Nominal, seen_rows: Range<usize>) -> Result<Vec<
 /// Those of [`Nominal::check`].
 pub fn arrival_settings(
     columns: &Columns,
-    coarse: &Coarse,
+    coarse: &CoarseSweep,
     nominal: &Nominal,
 ) -> Result<Vec<BoardSetting>, PlaneError> {
     nominal.check()?;
@@ -154,7 +154,9 @@ pub fn arrival_settings(
     let steps = ((last_us - first_us + 2.0 * margin_us) / (row_us / 2.0)).ceil() as usize;
     let first_us = first_us - exposure_us / 2.0 - margin_us;
     let delays = (0..=steps).map(|step| first_us + step as f64 * row_us / 2.0);
-    Ok(delays.map(|delay_us| BoardSetting { shutter: Shutter::Rolling, delay_us, exposure_us }).collect())
+    Ok(delays
+        .map(|delay_us| BoardSetting { shutter: ExposureMode::Rolling, delay_us, exposure_us })
+        .collect())
 }
 
 /// The rolling settings that check the length of longer exposures: 600 and 1200 us, 6 delays each with the opening and
@@ -164,7 +166,7 @@ pub fn arrival_settings(
 /// Those of [`Nominal::check`].
 pub fn check_settings(
     columns: &Columns,
-    coarse: &Coarse,
+    coarse: &CoarseSweep,
     nominal: &Nominal,
 ) -> Result<Vec<BoardSetting>, PlaneError> {
     nominal.check()?;
@@ -173,7 +175,7 @@ pub fn check_settings(
     let settings = CHECK_EXPOSURES_US.iter().flat_map(|&exposure_us| {
         (0..CHECK_DELAYS).flat_map(move |step| {
             [edge_us(step), edge_us(step) - exposure_us].map(|delay_us| BoardSetting {
-                shutter: Shutter::Rolling,
+                shutter: ExposureMode::Rolling,
                 delay_us,
                 exposure_us,
             })
@@ -183,7 +185,7 @@ pub fn check_settings(
 }
 
 /// First and last time at which light arrives, counted from the start of each camera row.
-fn arrivals_range_us(columns: &Columns, coarse: &Coarse, nominal: &Nominal) -> (f64, f64) {
+fn arrivals_range_us(columns: &Columns, coarse: &CoarseSweep, nominal: &Nominal) -> (f64, f64) {
     let cells = (0..columns.rows()).flat_map(|row| (0..columns.groups()).map(move |group| (row, group)));
     cells
         .map(|(row, group)| (row, columns.cell(row, group)))

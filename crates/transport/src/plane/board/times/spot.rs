@@ -1,7 +1,7 @@
 use ndarray::Array2;
 
 use super::super::super::error::check_shape;
-use super::coarse::Coarse;
+use super::coarse::CoarseSweep;
 use super::columns::Columns;
 use super::error::TimesError;
 use super::result::Measured;
@@ -30,7 +30,7 @@ const MIN_SPAN: f64 = 0.2;
 /// [`TimesError::Narrow`]; [`super::super::super::PlaneError::Shape`] for arrays that were averaged otherwise.
 pub fn spot_slopes(
     columns: &Columns,
-    coarse: &Coarse,
+    coarse: &CoarseSweep,
     projector_columns: &Array2<f32>,
     even: &[BoardFrame],
     odd: &[BoardFrame],
@@ -46,7 +46,7 @@ pub fn spot_slopes(
 
 fn slope(
     columns: &Columns,
-    coarse: &Coarse,
+    coarse: &CoarseSweep,
     projector_columns: &Array2<f32>,
     frames: &[BoardFrame],
     parity: usize,
@@ -90,7 +90,7 @@ fn slope(
 /// camera row, and the cell's light.
 fn lateness_us(
     columns: &Columns,
-    coarse: &Coarse,
+    coarse: &CoarseSweep,
     frames: &[&BoardFrame],
     parity: usize,
     (row, group): (usize, usize),

@@ -7,14 +7,14 @@ const BORDER_ROWS: usize = 4;
 
 /// The table of row starts as a cubic B-spline over the rows seen, continued with its outermost slopes.
 #[derive(Debug, Clone)]
-pub(super) struct Table {
+pub(super) struct SplineTable {
     /// Number of coefficients.
     pub coefficients: usize,
     /// For each row start, the first of four coefficients and their weights.
     weights: Vec<(usize, [f64; 4])>,
 }
 
-impl Table {
+impl SplineTable {
     pub fn new(projector_rows: usize, seen_rows: &Range<usize>) -> Self {
         let first = seen_rows.start.saturating_sub(BORDER_ROWS);
         let end = (seen_rows.end + BORDER_ROWS).min(projector_rows);
@@ -81,7 +81,7 @@ mod tests {
 
     #[test]
     fn a_straight_table_stays_straight_beyond_the_rows_seen() {
-        let table = Table::new(720, &(296..424));
+        let table = SplineTable::new(720, &(296..424));
         // Coefficient k belongs to row 292 + 8 (k - 1).
         let coefficients: Vec<f64> =
             (0..table.coefficients).map(|k| 22.22 * (292.0 + 8.0 * (k as f64 - 1.0))).collect();
