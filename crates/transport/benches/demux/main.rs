@@ -1,6 +1,6 @@
 //! Benchmark of the demultiplexer: seconds, share of the machine's GEMM peak, and the distance of all results from
-//! the f64 reference; on request also common alternatives for the same problem. Run it with `cargo xtask bench
-//! demux`.
+//! the f64 reference; its linear algebra beside nalgebra's; on request also common alternatives for the same problem.
+//! Run it with `cargo xtask bench demux`.
 //!
 //! Options: `--json` prints JSON lines for the table; `--peers PYTHON` times `tests/python/peers.py` with that
 //! interpreter on the same stacks. `--large PRIOR` is internal: the 1280x720 case runs in its own process, so that
@@ -11,6 +11,7 @@ mod check;
 #[path = "../../tests/common/mod.rs"]
 mod common;
 mod gemm;
+mod linear;
 mod peers;
 mod print;
 mod scene;
@@ -97,8 +98,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
 
     let peak = gemm::peak();
+    let mut compared = Vec::new();
     let mut measured: Vec<(Figures, Vec<Peer>)> = Vec::new();
     for case in [scene::paper_sized()?, scene::paper_sweep()?] {
+        compared.extend(linear::compare(&case, Prior::PAPER)?);
         for prior in PRIORS {
             let (figures, best) = measure(&case, prior, SimdLevel::best())?;
             let timed = match &options.peers {
@@ -118,8 +121,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
     }
     match options.json {
-        true => print::json_lines(&measured, &peak),
-        false => print::tables(&measured, &peak),
+        true => print::json_lines(&measured, &compared, &peak),
+        false => print::tables(&measured, &compared, &peak),
     }
     Ok(())
 }

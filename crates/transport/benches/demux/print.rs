@@ -3,11 +3,12 @@ use serde_json::json;
 
 use super::Figures;
 use super::gemm::Peak;
+use super::linear::Compared;
 use super::peers::Peer;
 
 /// One line for each method and case. `seconds` is the minimum of the repetitions, `ratio` the method's seconds over
 /// raysweep's on the same stack, `gap` the largest relative distance from the least objective.
-pub fn json_lines(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
+pub fn json_lines(measured: &[(Figures, Vec<Peer>)], compared: &[Compared], peak: &Peak) {
     for (figures, peers) in measured {
         let mut own = json!({
             "bench": "demux",
@@ -41,10 +42,25 @@ pub fn json_lines(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
             );
         }
     }
+    for Compared { task, seconds, nalgebra_seconds, difference } in compared {
+        for (method, seconds_taken) in [("raysweep", seconds), ("nalgebra", nalgebra_seconds)] {
+            println!(
+                "{}",
+                json!({
+                    "bench": "demux",
+                    "case": task,
+                    "method": method,
+                    "seconds": seconds_taken,
+                    "ratio": seconds_taken / seconds,
+                    "difference": difference,
+                })
+            );
+        }
+    }
 }
 
 /// Prints the same as readable tables.
-pub fn tables(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
+pub fn tables(measured: &[(Figures, Vec<Peer>)], compared: &[Compared], peak: &Peak) {
     let gflops = |flops: f64| format!("{:.0} GFLOP/s", flops / 1e9);
     println!(
         "{} threads; solved with {} where nothing else is said; GEMM peak {} in f32, {} in f64",
@@ -109,6 +125,13 @@ pub fn tables(measured: &[(Figures, Vec<Peer>)], peak: &Peak) {
                 figures.peak_memory_mib,
             );
         }
+    }
+    println!("\nlinear algebra on one thread, beside nalgebra in the same run; least of the repetitions");
+    println!("{:<50} {:>8} {:>11} {:>7} {:>10}", "", "ms", "nalgebra ms", "ratio", "difference");
+    for Compared { task, seconds, nalgebra_seconds, difference } in compared {
+        let ratio = nalgebra_seconds / seconds;
+        let [ms, nalgebra_ms] = [seconds, nalgebra_seconds].map(|seconds| 1e3 * seconds);
+        println!("{task:<50} {ms:>8.3} {nalgebra_ms:>11.3} {ratio:>7.1} {difference:>10.0e}");
     }
     for (figures, peers) in measured.iter().filter(|(_, peers)| !peers.is_empty()) {
         println!(

@@ -15,3 +15,11 @@ pub use demux::Demux;
 pub use prior::Prior;
 pub use simd::SimdLevel;
 pub use tiles::objectives_bytes;
+
+/// The linear algebra by itself, for the benchmark `demux`.
+#[doc(hidden)]
+pub mod linear {
+    pub use super::cholesky::invert;
+    pub use super::pivot::minimise_free;
+    pub use super::quadratic::Quadratic;
+}
