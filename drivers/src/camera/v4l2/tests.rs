@@ -359,6 +359,21 @@ fn a_camera_that_stays_away_ends_the_run() {
 }
 
 #[test]
+fn a_camera_that_opens_again_and_then_stays_silent_ends_the_run() {
+    let script = Script::new([Step::Gone]);
+    let mut feed = Feed::new(&script, V4l2Setup { reopen: Duration::from_secs(3), ..setup("") });
+    let silent = loop {
+        match feed.camera.next_frame(&mut feed.buf, WAIT) {
+            Ok(stamp) => assert_eq!((stamp, feed.camera.state()), (None, DeviceState::Lost)),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!((silent.kind, script.device().opened), (DeviceErrorKind::Disconnected, 2));
+    assert!(silent.to_string().contains("delivered nothing within camera.reopen_s = 3 s"), "{silent}");
+    assert_eq!(feed.camera.clock.now_ns(), 3_000_000_000);
+}
+
+#[test]
 fn another_camera_at_the_same_place_is_not_taken() {
     let script = Script::new([Step::Gone]);
     let mut feed = Feed::new(&script, setup(""));
