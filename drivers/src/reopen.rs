@@ -55,7 +55,8 @@ impl Reopening {
     pub fn failed(&mut self, cause: &dyn Display) -> Result<(), DeviceError> {
         let now_ns = self.clock.now_ns();
         let Some(loss) = &mut self.loss else {
-            tracing::warn!(%cause, "{} lost; opening it again", self.device);
+            let reopen_s = self.patience.as_secs_f64();
+            tracing::warn!(%cause, "{0} lost; it may stay away for {0}.reopen_s = {reopen_s} s", self.device);
             self.loss = Some(Loss {
                 since_ns: now_ns,
                 attempt_ns: now_ns,
