@@ -173,7 +173,7 @@ fn what_a_camera_cannot_do_is_told_with_what_it_can() {
             DeviceErrorKind::OutOfRange,
             "rows take 20.000 us",
         ),
-        ("buffers = 1", |_| (), DeviceErrorKind::OutOfRange, "buffers = 1: allowed is 2 to 32"),
+        ("buffers = 1", |_| (), DeviceErrorKind::OutOfRange, "buffers = 1: must be from 2 to 32"),
     ];
     for (keys, prepare, kind, expected) in cases {
         let script = Script::new([]);
