@@ -142,7 +142,7 @@ fn what_it_lacks_or_does_not_take_is_refused_by_name() {
     let error = refused(&line7, PixelFormat::Mono8);
     assert!(error.to_string().contains("TriggerSource: \"Line7\""), "{error}");
     let error = refused(&config(1000, 4096), PixelFormat::Mono8);
-    assert!(error.to_string().contains("Width: 4096 was asked for; allowed is 1 to 2048"), "{error}");
+    assert!(error.to_string().contains("Width: 4096 was asked for: must be from 1 to 2048"), "{error}");
 
     let mut camera = AravisCamera::open(&config(1000, 256), FACTS).unwrap();
     let delayed = CameraSettings { trigger_delay_us: 100.0, ..SETTINGS };

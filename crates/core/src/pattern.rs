@@ -85,7 +85,7 @@ pub enum PatternError {
         rows: usize,
     },
     /// A weight outside 0..=1.
-    #[error("weight {weight} of row {row}: allowed is 0 to 1")]
+    #[error("weight {weight} of row {row}: must be from 0 to 1")]
     Weight {
         /// The row.
         row: usize,
@@ -96,7 +96,7 @@ pub enum PatternError {
     #[error("checkerboard with cell_px = 0: give at least 1")]
     Cell,
     /// A level outside 0..=1.
-    #[error("grey of level {0}: allowed is 0 to 1")]
+    #[error("grey of level {0}: must be from 0 to 1")]
     Level(f32),
     /// A phase that is not within the period.
     #[error("sparse pattern with phase {phase} and period {period}: give a phase below the period")]

@@ -141,7 +141,7 @@ fn what_a_camera_cannot_do_is_told_with_what_it_can() {
             "controls = [[\"gain\", 256]]",
             |_| (),
             DeviceErrorKind::OutOfRange,
-            "gain = 256: allowed is 0 to 255",
+            "gain = 256: must be from 0 to 255",
         ),
         (
             "controls = [[\"coarse\", 7]]",
