@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
 
-use raysweep_core::{DeviceError, DeviceErrorKind, Pattern, Subject};
+use raysweep_core::{DeviceError, DeviceErrorKind, Subject};
 use raysweep_drivers::projector::external::{ShowRequest, WantedPicture};
 use raysweep_proto::Event;
 
@@ -118,9 +118,7 @@ pub fn place(
 
 fn task(wanted: &WantedPicture) -> String {
     match wanted {
-        WantedPicture::Pattern(Pattern::White) => "make the projector show a white picture".into(),
-        WantedPicture::Pattern(Pattern::Black) => "make the projector show a black picture".into(),
-        WantedPicture::Pattern(pattern) => format!("make the projector show {pattern:?}"),
+        WantedPicture::Pattern(pattern) => format!("make the projector show {pattern}"),
         WantedPicture::Dark => "turn the projector's light off, or cover its lens".into(),
     }
 }
@@ -129,7 +127,7 @@ fn task(wanted: &WantedPicture) -> String {
 mod tests {
     use std::time::Duration;
 
-    use raysweep_core::Projector;
+    use raysweep_core::{Pattern, Projector};
     use raysweep_drivers::projector::external::External;
     use raysweep_proto::RunState;
 
