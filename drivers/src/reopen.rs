@@ -9,6 +9,9 @@ use raysweep_core::{Clock, DeviceError, DeviceErrorKind};
 const FIRST_PAUSE_NS: i64 = 100_000_000;
 /// Maximum pause: how long a device that is back may go unnoticed.
 const LONGEST_PAUSE_NS: i64 = 1_000_000_000;
+/// How long a device that was opened may take to deliver, even if its time is over: after a pause of the run, in which
+/// nobody asked for frames, it may be opened only then.
+const FIRST_DELIVERY_NS: i64 = 2_000_000_000;
 
 /// Decides when a lost device is opened again. A loss begins with a failure and ends with the next frame or edge: a
 /// device that can be opened but fails before it delivers anything is still lost. A loss is logged when it begins and
@@ -27,6 +30,8 @@ struct Loss {
     attempt_ns: i64,
     /// Pause before the attempt after that.
     pause_ns: i64,
+    /// When it was opened, if it has not failed since.
+    opened_ns: Option<i64>,
     /// What failed last.
     cause: String,
 }
@@ -50,13 +55,20 @@ impl Reopening {
     pub fn failed(&mut self, cause: &dyn Display) -> Result<(), DeviceError> {
         let now_ns = self.clock.now_ns();
         let Some(loss) = &mut self.loss else {
-            tracing::warn!(%cause, "{} lost; opening it again", self.device);
-            let cause = cause.to_string();
-            self.loss = Some(Loss { since_ns: now_ns, attempt_ns: now_ns, pause_ns: FIRST_PAUSE_NS, cause });
+            let reopen_s = self.patience.as_secs_f64();
+            tracing::warn!(%cause, "{0} lost; it may stay away for {0}.reopen_s = {reopen_s} s", self.device);
+            self.loss = Some(Loss {
+                since_ns: now_ns,
+                attempt_ns: now_ns,
+                pause_ns: FIRST_PAUSE_NS,
+                opened_ns: None,
+                cause: cause.to_string(),
+            });
             return Ok(());
         };
         tracing::debug!(%cause, "{} still lost", self.device);
         loss.cause = cause.to_string();
+        loss.opened_ns = None;
         let last_ns = loss.since_ns.saturating_add(nanoseconds(self.patience));
         loss.attempt_ns = (now_ns + loss.pause_ns).min(last_ns);
         loss.pause_ns = (2 * loss.pause_ns).min(LONGEST_PAUSE_NS);
@@ -67,15 +79,21 @@ impl Reopening {
     /// `Disconnected` if the device is lost and the time that it may stay away is over.
     pub fn check(&self) -> Result<(), DeviceError> {
         let Some(loss) = &self.loss else { return Ok(()) };
-        if self.clock.now_ns() - loss.since_ns < nanoseconds(self.patience) {
+        let now_ns = self.clock.now_ns();
+        if now_ns - loss.since_ns < nanoseconds(self.patience)
+            || loss.opened_ns.is_some_and(|opened_ns| now_ns - opened_ns < FIRST_DELIVERY_NS)
+        {
             return Ok(());
         }
-        let what = format!(
-            "was lost and did not come back within {}.reopen_s = {} s: {}",
-            self.device,
-            self.patience.as_secs_f64(),
-            loss.cause
-        );
+        let (device, reopen_s, cause) = (self.device, self.patience.as_secs_f64(), &loss.cause);
+        let what = match loss.opened_ns {
+            None => {
+                format!("was lost and did not come back within {device}.reopen_s = {reopen_s} s: {cause}")
+            }
+            Some(_) => format!(
+                "was lost ({cause}) and opened again, but delivered nothing within {device}.reopen_s = {reopen_s} s: check the signal at its input"
+            ),
+        };
         Err(DeviceError::new(self.device, DeviceErrorKind::Disconnected, what))
     }
 
@@ -89,6 +107,13 @@ impl Reopening {
         let until_ns = self.clock.now_ns().saturating_add(nanoseconds(timeout));
         let attempt_ns = self.loss.as_ref().map_or(i64::MAX, |loss| loss.attempt_ns);
         self.clock.register().sleep_until(until_ns.min(attempt_ns));
+    }
+
+    /// The device was opened or armed. If it was lost, it still is until it delivers.
+    pub fn opened(&mut self) {
+        if let Some(loss) = &mut self.loss {
+            loss.opened_ns = Some(self.clock.now_ns());
+        }
     }
 
     /// The device has delivered a frame or an edge: it is not lost, or no longer.
@@ -145,6 +170,22 @@ mod tests {
         reopening.failed(&"unplugged").unwrap();
         let (attempts_ms, _) = fail_until_given_up(&mut reopening, &clock);
         assert_eq!(attempts_ms, [3000, 3100, 3300, 3700, 4500, 5500, 6000], "a new loss");
+    }
+
+    #[test]
+    fn a_device_that_opens_late_has_some_time_to_deliver() {
+        let clock = Clock::simulated();
+        let mut reopening = Reopening::new("camera", Duration::from_secs(3), clock.clone());
+        reopening.failed(&"unplugged").unwrap();
+        clock.register().sleep_until(10_000_000_000);
+        reopening.opened();
+        clock.register().sleep_until(11_999_999_999);
+        assert!(reopening.is_lost() && reopening.check().is_ok());
+        clock.register().sleep_until(12_000_000_000);
+        let silent = reopening.check().unwrap_err().to_string();
+        assert!(silent.contains("(unplugged)") && silent.contains("camera.reopen_s = 3 s"), "{silent}");
+        reopening.opened();
+        assert!(reopening.failed(&"no frame").is_err(), "a device that fails has no such time");
     }
 
     #[test]

@@ -142,7 +142,7 @@ fn controls_are_set_and_read_back() {
     assert_eq!(refused.kind, DeviceErrorKind::OutOfRange);
     drop(camera);
     let refused = v4l2::open(device.setup(PixelFormat::Mono8, &[("contrast", 1000)])).err().unwrap();
-    assert!(refused.to_string().contains("contrast = 1000: allowed is 0 to 255"), "{refused}");
+    assert!(refused.to_string().contains("contrast = 1000: must be from 0 to 255"), "{refused}");
     let refused = v4l2::open(device.setup(PixelFormat::Mono8, &[("no_such_control", 1)])).err().unwrap();
     assert!(refused.to_string().contains("brightness"), "{refused}");
 }

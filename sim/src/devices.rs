@@ -96,7 +96,7 @@ pub fn open(world: &Arc<PlaneWorld>, line: VsyncLine, clock: Clock) -> PlaneDevi
 fn subject_switch(world: Arc<PlaneWorld>, line: SharedLine, clock: Clock) -> SubjectSwitch {
     SubjectSwitch::new(move |subject| {
         if matches!(subject, Subject::Plane(_) | Subject::Diffuser) {
-            return Err(not_there(format!("{subject:?}: a plane rig has the scene, a board and a cap")));
+            return Err(not_there(format!("{subject}: a plane rig has the scene, a board and a cap")));
         }
         let shown = line.lock().all_shown();
         for shown in shown {

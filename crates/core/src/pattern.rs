@@ -1,5 +1,6 @@
 //! What a projector shows.
 
+use std::fmt;
 use std::path::PathBuf;
 
 /// What a projector shows. Rows and columns count from the top left of its picture.
@@ -65,6 +66,40 @@ pub enum Pattern {
     Image(PathBuf),
 }
 
+/// What to show, for an operator: completes "make the projector show".
+impl fmt::Display for Pattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::White => write!(f, "a white picture"),
+            Self::Black => write!(f, "a black picture"),
+            Self::Line { row } => write!(f, "row {row} lit"),
+            Self::Rows(weights) => write!(f, "{} rows, each with a brightness of its own", weights.len()),
+            Self::Checkerboard { cell_px, shift_px: (x, y) } => {
+                write!(
+                    f,
+                    "a checkerboard of squares of {cell_px} pixels, shifted by {x} to the right and {y} down"
+                )
+            }
+            Self::Grey { level } => write!(f, "a grey picture of level {level}"),
+            Self::SparseRows { phase, period } => write_sparse(f, "rows", *phase, *period),
+            Self::GrayRows { bit, inverse, block } => write_gray(f, "row", *bit, *inverse, *block),
+            Self::SparseColumns { phase, period } => write_sparse(f, "columns", *phase, *period),
+            Self::GrayColumns { bit, inverse, block } => write_gray(f, "column", *bit, *inverse, *block),
+            Self::Image(path) => write!(f, "the picture {}", path.display()),
+        }
+    }
+}
+
+fn write_sparse(f: &mut fmt::Formatter<'_>, lines: &str, phase: usize, period: usize) -> fmt::Result {
+    let second = phase.saturating_add(period);
+    write!(f, "{lines} {phase}, {second}, {}, ... lit", second.saturating_add(period))
+}
+
+fn write_gray(f: &mut fmt::Formatter<'_>, line: &str, bit: u32, inverse: bool, block: usize) -> fmt::Result {
+    let inverted = if inverse { ", inverted" } else { "" };
+    write!(f, "the Gray code of {line} blocks of {block}, bit {bit}{inverted}")
+}
+
 /// Why a pattern does not fit a projector.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum PatternError {
@@ -85,7 +120,7 @@ pub enum PatternError {
         rows: usize,
     },
     /// A weight outside 0..=1.
-    #[error("weight {weight} of row {row}: allowed is 0 to 1")]
+    #[error("weight {weight} of row {row}: must be from 0 to 1")]
     Weight {
         /// The row.
         row: usize,
@@ -96,7 +131,7 @@ pub enum PatternError {
     #[error("checkerboard with cell_px = 0: give at least 1")]
     Cell,
     /// A level outside 0..=1.
-    #[error("grey of level {0}: allowed is 0 to 1")]
+    #[error("grey of level {0}: must be from 0 to 1")]
     Level(f32),
     /// A phase that is not within the period.
     #[error("sparse pattern with phase {phase} and period {period}: give a phase below the period")]
@@ -246,6 +281,33 @@ mod tests {
         let gray = Pattern::GrayColumns { bit: 0, inverse: false, block: 1 };
         assert_eq!(gray.column_weights(4), Ok(Some(vec![0.0, 1.0, 1.0, 0.0])));
         assert_eq!(Pattern::White.column_weights(4), Ok(None));
+    }
+
+    #[test]
+    fn patterns_are_described_in_words() {
+        for (pattern, words) in [
+            (Pattern::White, "a white picture"),
+            (Pattern::Line { row: 7 }, "row 7 lit"),
+            (Pattern::Rows(vec![0.5; 4]), "4 rows, each with a brightness of its own"),
+            (
+                Pattern::Checkerboard { cell_px: 8, shift_px: (4, 0) },
+                "a checkerboard of squares of 8 pixels, shifted by 4 to the right and 0 down",
+            ),
+            (Pattern::Grey { level: 0.5 }, "a grey picture of level 0.5"),
+            (Pattern::SparseRows { phase: 3, period: 16 }, "rows 3, 19, 35, ... lit"),
+            (Pattern::SparseColumns { phase: 0, period: 2 }, "columns 0, 2, 4, ... lit"),
+            (
+                Pattern::GrayRows { bit: 3, inverse: true, block: 4 },
+                "the Gray code of row blocks of 4, bit 3, inverted",
+            ),
+            (
+                Pattern::GrayColumns { bit: 0, inverse: false, block: 1 },
+                "the Gray code of column blocks of 1, bit 0",
+            ),
+            (Pattern::Image("board.png".into()), "the picture board.png"),
+        ] {
+            assert_eq!(pattern.to_string(), words);
+        }
     }
 
     #[test]

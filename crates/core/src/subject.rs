@@ -1,5 +1,7 @@
 //! What is in front of the camera of a rig.
 
+use std::fmt;
+
 /// What is in front of the camera.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Subject {
@@ -13,4 +15,17 @@ pub enum Subject {
     Board,
     /// A cap on the lens of a plane rig's camera: no light at all.
     Cap,
+}
+
+/// Its name for an operator, who counts planes from 1.
+impl fmt::Display for Subject {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Scene => write!(f, "the scene"),
+            Self::Plane(plane) => write!(f, "calibration plane {}", plane + 1),
+            Self::Diffuser => write!(f, "a diffuser"),
+            Self::Board => write!(f, "the white board"),
+            Self::Cap => write!(f, "the lens cap"),
+        }
+    }
 }

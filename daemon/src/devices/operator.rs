@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::thread::{self, JoinHandle};
 
-use raysweep_core::{DeviceError, DeviceErrorKind, Pattern, Subject};
+use raysweep_core::{DeviceError, DeviceErrorKind, Subject};
 use raysweep_drivers::projector::external::{ShowRequest, WantedPicture};
 use raysweep_proto::Event;
 
@@ -39,7 +39,7 @@ impl Operator {
                     for question in questions {
                         match dismissed.load(Ordering::Relaxed) {
                             true => tell(question, &board),
-                            false => ask(question, &orders, &board),
+                            false => answer(question, &orders, &board),
                         }
                     }
                 }
@@ -63,21 +63,25 @@ impl Drop for Operator {
     }
 }
 
-/// Pauses the run until the operator continues it.
-fn ask(question: ShowRequest, orders: &Orders, board: &StatusBoard) {
-    let text = task(&question.wanted);
+/// Answers the projector's question once the operator has.
+fn answer(question: ShowRequest, orders: &Orders, board: &StatusBoard) {
+    match ask(&task(&question.wanted), orders, board) {
+        true => question.done(),
+        false => question.refuse("the run was ended before"),
+    }
+}
+
+/// Asks the operator to do this and pauses the run until the operator continues it. Returns whether the run goes on.
+fn ask(text: &str, orders: &Orders, board: &StatusBoard) -> bool {
     // The run may be paused for another reason: continuing from that pause does not answer this question.
     orders.wait_while_paused();
     orders.give(Order::Pause);
     if orders.go_on() {
         tracing::info!("waiting for the operator: {text}");
-        board.ask(&text);
+        board.ask(text);
         orders.wait_while_paused();
     }
-    match orders.go_on() {
-        true => question.done(),
-        false => question.refuse("the run was ended before"),
-    }
+    orders.go_on()
 }
 
 /// Tells the operator what remains to be done after the run.
@@ -87,7 +91,8 @@ fn tell(question: ShowRequest, board: &StatusBoard) {
     question.refuse("the run is over and did not wait for it");
 }
 
-/// Places a subject in front of the camera; waits for the operator if needed. `planes` is the number of calibration planes.
+/// Places a subject in front of the camera; waits for the operator if needed. `planes` is the number of calibration
+/// planes.
 ///
 /// # Errors
 /// For a subject that the rig does not have.
@@ -102,25 +107,19 @@ pub fn place(
     if !stand.place(subject)? {
         let text = match subject {
             Subject::Diffuser => "hold an evenly lit diffuser directly in front of the camera's lens".into(),
-            Subject::Plane(plane) => {
-                format!("put calibration plane {} of {} in front of the camera", plane + 1, planes)
-            }
+            Subject::Plane(_) => format!("put {subject} of {planes} in front of the camera"),
             Subject::Scene => "put the scene in front of the camera and remove everything else".into(),
             Subject::Board => "put the white board in the scene's place, so that it fills the view".into(),
             Subject::Cap => "put the cap on the camera's lens".into(),
         };
-        orders.give(Order::Pause);
-        board.ask(&text);
-        orders.wait_while_paused();
+        ask(&text, orders, board);
     }
     Ok(())
 }
 
 fn task(wanted: &WantedPicture) -> String {
     match wanted {
-        WantedPicture::Pattern(Pattern::White) => "make the projector show a white picture".into(),
-        WantedPicture::Pattern(Pattern::Black) => "make the projector show a black picture".into(),
-        WantedPicture::Pattern(pattern) => format!("make the projector show {pattern:?}"),
+        WantedPicture::Pattern(pattern) => format!("make the projector show {pattern}"),
         WantedPicture::Dark => "turn the projector's light off, or cover its lens".into(),
     }
 }
@@ -129,7 +128,7 @@ fn task(wanted: &WantedPicture) -> String {
 mod tests {
     use std::time::Duration;
 
-    use raysweep_core::Projector;
+    use raysweep_core::{Pattern, Projector};
     use raysweep_drivers::projector::external::External;
     use raysweep_proto::RunState;
 

@@ -1,6 +1,6 @@
 //! Controllers that answer each line with a line.
 
-use std::fmt::{Debug, Display};
+use std::fmt::Display;
 use std::path::Path;
 use std::time::Duration;
 
@@ -32,10 +32,10 @@ impl<R> LinePort<R> {
     }
 
     /// Sends a command and waits for the reply.
-    pub fn ask(&mut self, command: impl Display + Debug, wait: Duration) -> Result<R, DeviceError> {
+    pub fn ask(&mut self, command: impl Display, wait: Duration) -> Result<R, DeviceError> {
         self.port.send(format!("{command}{}", self.line_end).as_bytes())?;
         self.port.await_reply(wait, self.parse, Some)?.ok_or_else(|| {
-            let what = format!("no answer to {command:?}: check the controller's power and cable");
+            let what = format!("no answer to \"{command}\": check the controller's power and cable");
             fault(DeviceErrorKind::Timeout, what)
         })
     }

@@ -134,7 +134,7 @@ impl MtiLine {
     fn tell(&mut self, command: MtiCommand, wait: Duration) -> Result<(), DeviceError> {
         match self.port.ask(command, wait)? {
             MtiReply::Refused(why) => {
-                Err(fault(DeviceErrorKind::Protocol, format!("the controller refuses {command:?}: {why}")))
+                Err(fault(DeviceErrorKind::Protocol, format!("the controller refuses \"{command}\": {why}")))
             }
             MtiReply::Done | MtiReply::Device(_) => Ok(()),
         }

@@ -106,6 +106,18 @@ pub enum OptotuneReply {
     TooHigh,
 }
 
+/// The controller's word and its meaning.
+impl fmt::Display for OptotuneReply {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Ok => write!(f, "OK"),
+            Self::No => write!(f, "NO (not understood)"),
+            Self::TooLow => write!(f, "OL (below the minimum)"),
+            Self::TooHigh => write!(f, "OU (above the maximum)"),
+        }
+    }
+}
+
 /// Parses the reply at the start of `bytes`.
 pub fn parse_optotune(bytes: &[u8]) -> Parsed<OptotuneReply> {
     parse_line(bytes, |text| match text {
@@ -147,7 +159,7 @@ impl OptotuneLine {
         match self.port.ask(command, REPLY_WAIT)? {
             OptotuneReply::Ok => Ok(()),
             refused => {
-                let what = format!("the controller answers {refused:?} to {command:?}");
+                let what = format!("the controller answers {refused} to \"{command}\"");
                 Err(fault(DeviceErrorKind::Protocol, what))
             }
         }

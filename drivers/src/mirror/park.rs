@@ -10,6 +10,9 @@ use super::{mti, optotune, playzerx};
 
 /// Maximum wait for a dying process to release the mirror.
 const LOCK_WAIT: Duration = Duration::from_secs(2);
+/// Maximum wait for a dying process to release the port: it closes its files one after the other, so it may release
+/// the port after the lock.
+const PORT_WAIT: Duration = Duration::from_secs(2);
 
 /// Why a mirror could not be parked.
 #[derive(Debug, thiserror::Error)]
@@ -53,7 +56,7 @@ pub(super) fn park_left(file: &StateFile) -> Result<Parked, ParkError> {
     if state.playing.is_none() {
         return Ok(Parked::Already);
     }
-    let deadline = Instant::now() + LOCK_WAIT;
+    let deadline = Instant::now() + PORT_WAIT;
     let found = loop {
         let recovered = match &state.reach {
             Reach::PlayzerX { .. } => playzerx::recover(file, &state, sent),
@@ -61,7 +64,6 @@ pub(super) fn park_left(file: &StateFile) -> Result<Parked, ParkError> {
             Reach::Optotune { .. } => optotune::recover(&state, sent),
         };
         match recovered {
-            // A dying process closes its files one after the other: it may release the port after the lock.
             Err(error) if error.kind == DeviceErrorKind::Busy && Instant::now() < deadline => {
                 std::thread::sleep(Duration::from_millis(1));
             }

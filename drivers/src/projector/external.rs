@@ -3,6 +3,7 @@
 //! The driver sends requests; the component that talks to the operator (a terminal, the daemon's socket) answers. The
 //! driver does not ask again for what is already shown, so a sweep of many passes needs one answer.
 
+use std::fmt;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::time::Duration;
 
@@ -17,6 +18,15 @@ pub enum WantedPicture {
     Pattern(Pattern),
     /// No light at all.
     Dark,
+}
+
+impl fmt::Display for WantedPicture {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Pattern(pattern) => pattern.fmt(f),
+            Self::Dark => write!(f, "no light at all"),
+        }
+    }
 }
 
 /// A request to the operator. If dropped without an answer, it counts as refused.
@@ -42,11 +52,11 @@ impl ShowRequest {
 /// Why the run cannot continue with the operator's answer.
 #[derive(Debug, thiserror::Error)]
 enum ExternalError {
-    #[error("no operator is there to show {0:?}")]
+    #[error("no operator is there to show {0}")]
     Nobody(WantedPicture),
-    #[error("the operator has not shown {wanted:?} within {patience:?}: ask again when somebody is there")]
+    #[error("the operator has not shown {wanted} within {patience:?}: ask again when somebody is there")]
     Late { wanted: WantedPicture, patience: Duration },
-    #[error("the operator did not show {wanted:?}: {why}")]
+    #[error("the operator did not show {wanted}: {why}")]
     Refused { wanted: WantedPicture, why: String },
 }
 
@@ -157,7 +167,7 @@ mod tests {
         let operator = operator(requests, vec![Err("the lamp is broken"), Ok(())]);
         let error = projector.show(&Pattern::White).unwrap_err();
         assert_eq!(error.kind, DeviceErrorKind::NotReady);
-        assert!(error.to_string().contains("the lamp is broken"), "{error}");
+        assert_eq!(error.source.to_string(), "the operator did not show a white picture: the lamp is broken");
         projector.show(&Pattern::White).unwrap();
         operator.join().unwrap();
     }

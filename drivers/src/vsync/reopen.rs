@@ -38,6 +38,7 @@ impl<V: Vsync> Reopened<V> {
             Ok(device) => {
                 self.device = Some(device);
                 self.base = self.last_seq + 1;
+                self.reopening.opened();
                 Ok(())
             }
             Err(error) => self.reopening.failed(&error.source),

@@ -195,7 +195,7 @@ impl World {
                 return Err(not_there(what));
             }
             Subject::Board | Subject::Cap => {
-                let what = format!("{subject:?}: a dot rig has the scene, planes and a diffuser");
+                let what = format!("{subject}: a dot rig has the scene, planes and a diffuser");
                 return Err(not_there(what));
             }
             Subject::Scene | Subject::Plane(_) | Subject::Diffuser => {}

@@ -291,6 +291,7 @@ impl AravisCamera {
             ));
         }
         self.armed_ns = self.armed_ns.and(armed_ns);
+        self.reopening.opened();
         self.resume_ids();
         Ok(())
     }
@@ -407,6 +408,8 @@ impl Camera for AravisCamera {
     fn state(&self) -> DeviceState {
         match (&self.link, self.armed_ns) {
             (Link::Lost | Link::Opening { .. }, _) => DeviceState::Lost,
+            // It is open again but has delivered nothing.
+            _ if self.reopening.is_lost() => DeviceState::Lost,
             (Link::Up { .. }, Some(_)) => DeviceState::Streaming,
             (Link::Up { .. }, None) => DeviceState::Ready,
         }
@@ -462,6 +465,7 @@ impl Camera for AravisCamera {
         let armed_ns = self.shared.clock.now_ns();
         self.ask(OwnerCommand::Arm)?;
         self.armed_ns = Some(armed_ns);
+        self.reopening.opened();
         Ok(())
     }
 
@@ -487,7 +491,7 @@ impl Camera for AravisCamera {
                 if self.silent_since(alive_ns) {
                     self.lose(&SILENT)?;
                 } else if left.is_zero() {
-                    return Ok(None);
+                    return self.reopening.check().map(|()| None);
                 }
                 continue;
             };

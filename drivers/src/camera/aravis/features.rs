@@ -60,7 +60,8 @@ pub fn first_present(features: &impl Features, names: &[&'static str]) -> Option
 pub fn put_text(features: &impl Features, name: &str, value: &str) -> Result<()> {
     features.set_text(name, value).map_err(|mut error| {
         if let Ok(choices) = features.choices(name) {
-            error.what = format!("{value:?} was refused ({}); allowed is {}", error.what, choices.join(", "));
+            error.what =
+                format!("{value:?} was refused ({}): must be one of {}", error.what, choices.join(", "));
         }
         error
     })?;
@@ -71,7 +72,7 @@ pub fn put_text(features: &impl Features, name: &str, value: &str) -> Result<()>
 pub fn put_integer(features: &impl Features, name: &str, value: i64) -> Result<()> {
     let range = features.integer_range(name)?;
     if !range.contains(&value) {
-        let what = format!("{value} was asked for; allowed is {} to {}", range.start(), range.end());
+        let what = format!("{value} was asked for: must be from {} to {}", range.start(), range.end());
         return Err(FeatureError::new(name, DeviceErrorKind::OutOfRange, what));
     }
     features.set_integer(name, value)?;

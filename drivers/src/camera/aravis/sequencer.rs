@@ -195,7 +195,7 @@ mod tests {
         assert!(error.contains("set 0 was saved with 10 and has 20"), "{error}");
         is_off(&forgetful);
         let by_line = camera(4).with_text("SequencerTriggerSource", &["Off", "Line1"]);
-        assert!(started(&by_line, &[10.0]).unwrap_err().to_string().contains("allowed is Off, Line1"));
+        assert!(started(&by_line, &[10.0]).unwrap_err().to_string().contains("must be one of Off, Line1"));
         is_off(&by_line);
         let fixed = camera(4).with_text("SequencerFeatureSelector", &["ExposureTime"]);
         let fixed = fixed.with("SequencerFeatureEnable", Value::Boolean(true));

@@ -34,7 +34,7 @@ impl Names {
         let choices = features.choices(name)?;
         let word = words.iter().find(|word| choices.iter().any(|choice| choice == *word));
         word.map(|word| (*word).to_owned()).ok_or_else(|| {
-            let what = format!("a {shutter:?} shutter was asked for; allowed is {}", choices.join(", "));
+            let what = format!("a {shutter:?} shutter was asked for: must be one of {}", choices.join(", "));
             FeatureError::new(name, DeviceErrorKind::Unsupported, what)
         })
     }

@@ -344,6 +344,6 @@ mod tests {
         assert!(refused(sfnc(), &line2, PixelFormat::Mono8).contains("Software, Line0, Line1"));
         let wide = SensorRegion { x: 0, y: 0, width: 1601, height: 8 };
         let message = refused(sfnc(), &AravisConfig { region: Some(wide), ..config }, PixelFormat::Mono8);
-        assert!(message.contains("Width: 1601 was asked for; allowed is 8 to 1600"), "{message}");
+        assert!(message.contains("Width: 1601 was asked for: must be from 8 to 1600"), "{message}");
     }
 }

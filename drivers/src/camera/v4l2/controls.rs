@@ -50,7 +50,7 @@ impl Controls {
         let control = self.named("controls", name)?;
         let refused = |found: &str| {
             ControlError::Value(format!(
-                "camera.v4l2.controls: {name} = {value}{found}: allowed is {} to {} in steps of {}",
+                "camera.v4l2.controls: {name} = {value}{found}: must be from {} to {} in steps of {}",
                 control.minimum, control.maximum, control.step
             ))
         };

@@ -150,6 +150,7 @@ impl V4l2Camera {
             Ok(open_node) => {
                 self.resume_ids();
                 self.open_node = Some(open_node);
+                self.reopening.opened();
                 Ok(())
             }
             Err(error) => self.reopening.failed(&error.source),
@@ -276,10 +277,11 @@ impl Camera for V4l2Camera {
     }
 
     fn state(&self) -> DeviceState {
-        match (&self.open_node, self.armed) {
-            (None, _) => DeviceState::Lost,
-            (Some(_), true) => DeviceState::Streaming,
-            (Some(_), false) => DeviceState::Ready,
+        match self.armed {
+            // Also if it is open again but has delivered nothing.
+            _ if self.reopening.is_lost() => DeviceState::Lost,
+            true => DeviceState::Streaming,
+            false => DeviceState::Ready,
         }
     }
 
@@ -316,6 +318,7 @@ impl Camera for V4l2Camera {
         self.ids.stream_begins(self.ids.next());
         self.newest_ns = None;
         self.armed = true;
+        self.reopening.opened();
         Ok(())
     }
 
@@ -342,7 +345,7 @@ impl Camera for V4l2Camera {
             let now_ns = self.clock.now_ns();
             match self.take(buf) {
                 Ok(Some(stamp)) => return Ok(Some(stamp)),
-                Ok(None) if now_ns >= deadline_ns => return Ok(None),
+                Ok(None) if now_ns >= deadline_ns => return self.reopening.check().map(|()| None),
                 Ok(None) => {
                     if let Err(cause) = self.wait(now_ns, deadline_ns) {
                         self.lose(&cause)?;

@@ -141,7 +141,7 @@ fn what_a_camera_cannot_do_is_told_with_what_it_can() {
             "controls = [[\"gain\", 256]]",
             |_| (),
             DeviceErrorKind::OutOfRange,
-            "gain = 256: allowed is 0 to 255",
+            "gain = 256: must be from 0 to 255",
         ),
         (
             "controls = [[\"coarse\", 7]]",
@@ -173,7 +173,7 @@ fn what_a_camera_cannot_do_is_told_with_what_it_can() {
             DeviceErrorKind::OutOfRange,
             "rows take 20.000 us",
         ),
-        ("buffers = 1", |_| (), DeviceErrorKind::OutOfRange, "buffers = 1: allowed is 2 to 32"),
+        ("buffers = 1", |_| (), DeviceErrorKind::OutOfRange, "buffers = 1: must be from 2 to 32"),
     ];
     for (keys, prepare, kind, expected) in cases {
         let script = Script::new([]);
@@ -355,6 +355,21 @@ fn a_camera_that_stays_away_ends_the_run() {
     };
     assert_eq!(gone.kind, DeviceErrorKind::Disconnected);
     assert!(gone.to_string().contains("camera.reopen_s = 3 s"), "{gone}");
+    assert_eq!(feed.camera.clock.now_ns(), 3_000_000_000);
+}
+
+#[test]
+fn a_camera_that_opens_again_and_then_stays_silent_ends_the_run() {
+    let script = Script::new([Step::Gone]);
+    let mut feed = Feed::new(&script, V4l2Setup { reopen: Duration::from_secs(3), ..setup("") });
+    let silent = loop {
+        match feed.camera.next_frame(&mut feed.buf, WAIT) {
+            Ok(stamp) => assert_eq!((stamp, feed.camera.state()), (None, DeviceState::Lost)),
+            Err(error) => break error,
+        }
+    };
+    assert_eq!((silent.kind, script.device().opened), (DeviceErrorKind::Disconnected, 2));
+    assert!(silent.to_string().contains("delivered nothing within camera.reopen_s = 3 s"), "{silent}");
     assert_eq!(feed.camera.clock.now_ns(), 3_000_000_000);
 }
 

@@ -170,7 +170,7 @@ fn load(blank: nusb::DeviceInfo, firmware: Option<&Path>) -> Result<nusb::Device
     let refused = |what: String| UsbError::Firmware { path: path.display().to_string(), what };
     let image = std::fs::read(path).map_err(|error| refused(error.to_string()))?;
     if image.is_empty() || image.len() > FIRMWARE_BYTES {
-        return Err(refused(format!("{} bytes: allowed is 1 to {FIRMWARE_BYTES}", image.len())));
+        return Err(refused(format!("{} bytes: must be from 1 to {FIRMWARE_BYTES}", image.len())));
     }
     let interface = claim(&blank)?;
     write(&interface, WRITE_RAM, CPUCS, &[1])?;
