@@ -81,7 +81,7 @@ fn groups_of(level: &LightLevel, full_scale_dn: f32, usable: Option<ArrayView2<b
     let mean = mean_image(level.frames);
     let signal = &mean - &level.dark_dn;
     let kept = |t: usize, s: usize| is_usable(usable, t, s) && mean[[t, s]] < HIGHEST_SHARE * full_scale_dn;
-    let factors: Vec<f32> = (0..n).into_par_iter().map(|frame| level.factor(frame, &signal, &kept)).collect();
+    let factors: Vec<f32> = (0..n).into_par_iter().map(|frame| level.factor(frame, &signal, kept)).collect();
     let mut pixels: Vec<(f32, f32)> = (0..signal.nrows())
         .into_par_iter()
         .flat_map_iter(|t| {
