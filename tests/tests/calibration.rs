@@ -209,8 +209,8 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
     let mut frames = Vec::new();
     let shoot = |studio: &mut Studio, frames: &mut Vec<BoardFrame>, setting: BoardSetting, count: usize| {
         let shutter = match setting.shutter {
-            times::Shutter::Global => Shutter::Global,
-            times::Shutter::Rolling => Shutter::Rolling,
+            times::ExposureMode::Global => Shutter::Global,
+            times::ExposureMode::Rolling => Shutter::Rolling,
         };
         for _ in 0..count {
             let image = studio.mean(shutter, setting.delay_us, setting.exposure_us, 1);

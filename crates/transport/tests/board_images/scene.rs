@@ -135,7 +135,7 @@ pub struct Scene {
     pub brightness: Vec<f64>,
     /// A picture with few lit rows is brighter by this factor.
     pub boost: f64,
-    /// Share of a second image of each row, 4 rows below it.
+    /// Share of a second image of each row, 6 rows below it.
     pub ghost: f64,
     /// Share of each row's light that is spread over the whole board.
     pub haze: f64,
@@ -174,7 +174,7 @@ impl Scene {
                     .map(|v| {
                         let x = centre - v as f64;
                         let share =
-                            (1.0 - self.ghost) * self.row.share(x) + self.ghost * self.row.share(x - 4.0);
+                            (1.0 - self.ghost) * self.row.share(x) + self.ghost * self.row.share(x - 6.0);
                         self.brightness[v] * share
                     })
                     .sum();

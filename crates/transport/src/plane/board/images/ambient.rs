@@ -68,6 +68,8 @@ const LEAST_EVIDENCE: f64 = 40.0;
 const ALIAS_EVIDENCE: f64 = 16.0;
 /// Light is not negative, so an amplitude cannot much exceed the level.
 const MOST_SHARE: f64 = 1.2;
+/// Number of times that the rows' levels and the flicker are fitted in turn.
+const LEVEL_STEPS: usize = 4;
 /// Distance from multiples of the frame rate from which flicker can be separated.
 const SEPARABLE_HZ: f64 = 0.5;
 /// Largest accepted amplitude of flicker that cannot be separated, of white in a row's dwell.
@@ -92,8 +94,8 @@ pub fn ambient(
 ) -> Result<Ambient, ImagesError> {
     noise.check()?;
     check(runs, camera_row_time_us, frame_rate_hz)?;
-    let rows = RowMeans::new(runs, camera_row_time_us, usable)?;
-    let flicker = rows.flicker(frame_rate_hz);
+    let mut rows = RowMeans::new(runs, camera_row_time_us, frame_rate_hz, usable)?;
+    let flicker = rows.flicker();
     let shares =
         |run: usize, frame: usize, t: usize| flicker.map_or(0.0, |found| rows.share(&found, run, frame, t));
     let mut ambient = level(runs, noise, shares);
@@ -171,12 +173,15 @@ struct RowMeans {
     /// DN per us, `[t]`.
     level: Array1<f64>,
     row_time_s: f64,
+    frame_rate_hz: f64,
     /// Middle of the record.
     reference_s: f64,
 }
 
 struct Run {
     exposure_s: f64,
+    /// Means of the rows, `[n, t]`, in DN.
+    mean: Array2<f64>,
     /// Mid-exposure of row 0 after the middle of the record.
     time_s: Vec<f64>,
     /// Deviation from the run's mean over frames, `[n, t]`, in DN.
@@ -187,6 +192,7 @@ impl RowMeans {
     fn new(
         runs: &[BlackFrames],
         camera_row_time_us: f64,
+        frame_rate_hz: f64,
         usable: Option<ArrayView2<bool>>,
     ) -> Result<Self, ImagesError> {
         let (_, rows, columns) = runs[0].frames.dim();
@@ -212,49 +218,62 @@ impl RowMeans {
             );
             means
         });
-        let mut means: Vec<Array2<f64>> = means.collect();
-        let of_runs: Vec<Array1<f64>> = means.iter().filter_map(|means| means.mean_axis(Axis(0))).collect();
-        let level = row_levels(runs, &of_runs);
-        for (means, of_run) in means.iter_mut().zip(&of_runs) {
-            *means -= of_run;
-        }
+        let means: Vec<Array2<f64>> = means.collect();
         let mut times: Vec<f64> = runs.iter().flat_map(|run| run.opened_s).copied().collect();
         times.sort_by(f64::total_cmp);
         let row_time_s = camera_row_time_us * 1e-6;
         let reference_s = (times[0] + times[times.len() - 1] + rows as f64 * row_time_s) / 2.0;
-        let runs = runs.iter().zip(means).map(|(run, deviation)| {
+        let runs = runs.iter().zip(means).map(|(run, mean)| {
             let exposure_s = run.exposure_us * 1e-6;
             let time_s = run.opened_s.iter().map(|open| open + exposure_s / 2.0 - reference_s).collect();
-            Run { exposure_s, time_s, deviation }
+            let sums = mean.sum_axis(Axis(0));
+            let deviation = &mean - &(sums / mean.nrows() as f64);
+            Run { exposure_s, mean, time_s, deviation }
         });
-        Ok(Self { runs: runs.collect(), level, row_time_s, reference_s })
+        let runs: Vec<Run> = runs.collect();
+        let mut of_rows = Self { runs, level: Array1::zeros(rows), row_time_s, frame_rate_hz, reference_s };
+        of_rows.level = of_rows.levels(None);
+        Ok(of_rows)
+    }
+
+    /// Level of each row in DN per us, given the flicker, `[t]`.
+    fn levels(&self, flicker: Option<&Flicker>) -> Array1<f64> {
+        let two = self.runs.iter().any(|run| run.exposure_s != self.runs[0].exposure_s);
+        Array1::from_shape_fn(self.level.len(), |t| {
+            let [mut n, mut h1, mut h2, mut y, mut hy] = [0.0; 5];
+            for run in &self.runs {
+                for (time, mean) in run.time_s.iter().zip(run.mean.column(t)) {
+                    let time = time + self.row_time_s * t as f64;
+                    let share = flicker.map_or(0.0, |flicker| flicker.share_at(run.exposure_s, time));
+                    let h = run.exposure_s * 1e6 * (1.0 + share);
+                    n += 1.0;
+                    h1 += h;
+                    h2 += h * h;
+                    y += mean;
+                    hy += h * mean;
+                }
+            }
+            if two { (n * hy - h1 * y) / (n * h2 - h1 * h1) } else { hy / h2 }
+        })
     }
 
     /// The sinusoid that explains the rows best, if any does.
-    fn flicker(&self, frame_rate_hz: f64) -> Option<Flicker> {
+    fn flicker(&mut self) -> Option<Flicker> {
         let scan = self.scan();
         let (best_hz, explained) = scan.iter().copied().max_by(|a, b| a.1.total_cmp(&b.1))?;
-        let fit = self.refine(best_hz)?;
-        let evidence = |explained: f64| explained / fit.bin_variance;
-        if evidence(explained) < LEAST_EVIDENCE {
-            return None;
+        let mut fit = self.refine(best_hz)?;
+        // Over a few frames, flicker does not average out of the rows' levels.
+        for _ in 0..LEVEL_STEPS {
+            self.level = self.levels(Some(&fit.flicker));
+            fit = self.refine(fit.flicker.frequency_hz.value)?;
         }
+        let evidence = |explained: f64| explained / fit.bin_variance;
         let others = scan.iter().filter(|(frequency, _)| (frequency - best_hz).abs() > 1.0);
         let alias = others.copied().max_by(|a, b| a.1.total_cmp(&b.1));
         let alias_hz = alias
             .filter(|(_, other)| evidence(explained - other) < ALIAS_EVIDENCE)
             .map(|(frequency, _)| frequency);
-        let frequency = fit.frequency_hz.value;
-        let from_multiple = (frequency - frame_rate_hz * (frequency / frame_rate_hz).round()).abs();
-        Some(Flicker {
-            frequency_hz: fit.frequency_hz,
-            share: fit.share,
-            phase_rad: fit.phase_rad,
-            reference_s: self.reference_s,
-            alias_hz,
-            separable: from_multiple >= SEPARABLE_HZ,
-            frame_rate_hz,
-        })
+        (evidence(explained) >= LEAST_EVIDENCE).then_some(Flicker { alias_hz, ..fit.flicker })
     }
 
     /// What a sinusoid of each frequency explains of the sum of squares.
@@ -310,10 +329,17 @@ impl RowMeans {
                 + by[1] * by[1] * covariance[(1, 1)];
             variance.max(0.0).sqrt()
         };
+        let multiple = self.frame_rate_hz * (frequency / self.frame_rate_hz).round();
         Some(Fit {
-            frequency_hz: Estimate { value: frequency, sd: covariance[(2, 2)].sqrt() },
-            share: Estimate { value: share, sd: sd(by_share) },
-            phase_rad: Estimate { value: (-b).atan2(a), sd: sd(by_phase) },
+            flicker: Flicker {
+                frequency_hz: Estimate { value: frequency, sd: covariance[(2, 2)].sqrt() },
+                share: Estimate { value: share, sd: sd(by_share) },
+                phase_rad: Estimate { value: (-b).atan2(a), sd: sd(by_phase) },
+                reference_s: self.reference_s,
+                alias_hz: None,
+                separable: (frequency - multiple).abs() >= SEPARABLE_HZ,
+                frame_rate_hz: self.frame_rate_hz,
+            },
             bin_variance: variance / Binned::rows_per_bin(self) as f64,
         })
     }
@@ -361,43 +387,32 @@ impl RowMeans {
     /// Deviation of a row's light from the level, as a share of it.
     fn share(&self, flicker: &Flicker, run: usize, frame: usize, t: usize) -> f64 {
         let run = &self.runs[run];
-        let frequency = flicker.frequency_hz.value;
-        let time = run.time_s[frame] + self.row_time_s * t as f64;
-        let phase = TAU * frequency * time + flicker.phase_rad.value;
-        sinc(frequency * run.exposure_s) * flicker.share.value * phase.cos()
+        flicker.share_at(run.exposure_s, run.time_s[frame] + self.row_time_s * t as f64)
+    }
+}
+
+impl Flicker {
+    /// Deviation from the level, as a share of it, of an exposure whose middle lies `time_s` after the reference.
+    fn share_at(&self, exposure_s: f64, time_s: f64) -> f64 {
+        let frequency = self.frequency_hz.value;
+        let phase = TAU * frequency * time_s + self.phase_rad.value;
+        sinc(frequency * exposure_s) * self.share.value * phase.cos()
     }
 }
 
 struct Fit {
-    frequency_hz: Estimate,
-    share: Estimate,
-    phase_rad: Estimate,
+    flicker: Flicker,
     /// Variance of the rest, of a bin of rows.
     bin_variance: f64,
-}
-
-/// Level of each row in DN per us from the means of each run, `[t]`.
-fn row_levels(runs: &[BlackFrames], of_runs: &[Array1<f64>]) -> Array1<f64> {
-    let frames = |run: &BlackFrames| run.frames.len_of(Axis(0)) as f64;
-    let total: f64 = runs.iter().map(frames).sum();
-    let centre = match has_two_exposures(runs) {
-        true => runs.iter().map(|run| frames(run) * run.exposure_us).sum::<f64>() / total,
-        false => 0.0,
-    };
-    let spread: f64 = runs.iter().map(|run| frames(run) * (run.exposure_us - centre).powi(2)).sum();
-    let mut level = Array1::zeros(of_runs[0].len());
-    for (run, mean) in runs.iter().zip(of_runs) {
-        level.scaled_add(frames(run) * (run.exposure_us - centre) / spread, mean);
-    }
-    level
 }
 
 /// Row means averaged over a few rows each, in single precision, for the scan.
 struct Binned {
     /// Time between bins.
     step_s: f64,
-    /// Level times exposure of each bin, for each run.
-    scales: Vec<Vec<f32>>,
+    /// Level times exposure of each run. The level is that of all rows: close to multiples of the frame rate, the
+    /// levels of single rows contain the flicker.
+    scales: Vec<f32>,
     runs: Vec<BinnedRun>,
 }
 
@@ -418,13 +433,8 @@ impl Binned {
         let rows = Self::rows_per_bin(of);
         // Rows that do not fill a bin are left out of the scan.
         let bins = of.level.len() / rows;
-        let level =
-            |bin: usize| of.level.slice(ndarray::s![bin * rows..(bin + 1) * rows]).sum() / rows as f64;
-        let scales = of
-            .runs
-            .iter()
-            .map(|run| (0..bins).map(|bin| (level(bin) * run.exposure_s * 1e6) as f32).collect())
-            .collect();
+        let level = of.level.sum() / of.level.len() as f64;
+        let scales = of.runs.iter().map(|run| (level * run.exposure_s * 1e6) as f32).collect();
         let runs = of.runs.iter().map(|run| BinnedRun {
             exposure_s: run.exposure_s,
             time_s: run.time_s.iter().map(|time| time + of.row_time_s * (rows - 1) as f64 / 2.0).collect(),
@@ -438,7 +448,7 @@ impl Binned {
 
     /// Part of the sum of squares that a sinusoid explains beside the levels of the rows.
     fn explained(&self, frequency: f64) -> f64 {
-        let bins = self.scales[0].len();
+        let bins = self.runs[0].deviation.ncols();
         let turns = |time: f64| {
             let (sin, cos) = (TAU * (frequency * time).fract()).sin_cos();
             (cos as f32, sin as f32)
@@ -448,7 +458,7 @@ impl Binned {
         let in_bin = sinc(frequency * self.step_s) as f32;
         let [mut cc, mut cs, mut ss, mut cx, mut sx] = [0.0_f64; 5];
         let mut sums = vec![[0.0_f32; 7]; bins];
-        for (run, scales) in self.runs.iter().zip(&self.scales) {
+        for (run, scale) in self.runs.iter().zip(&self.scales) {
             sums.fill([0.0; 7]);
             for (frame, &time) in run.deviation.rows().into_iter().zip(&run.time_s) {
                 let (cos, sin) = turns(time);
@@ -465,8 +475,8 @@ impl Binned {
             }
             let n = run.time_s.len() as f32;
             let kept = in_bin * sinc(frequency * run.exposure_s) as f32;
-            for (&[c, s, c2, c_s, s2, c_x, s_x], scale) in sums.iter().zip(scales) {
-                let scale = kept * scale;
+            let scale = kept * scale;
+            for &[c, s, c2, c_s, s2, c_x, s_x] in &sums {
                 cc += f64::from(scale * scale * (c2 - c * c / n));
                 cs += f64::from(scale * scale * (c_s - c * s / n));
                 ss += f64::from(scale * scale * (s2 - s * s / n));

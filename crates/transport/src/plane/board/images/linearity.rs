@@ -97,24 +97,37 @@ impl Linearity {
     }
 }
 
-/// The `a` for which `y (1 + a y)` of each kept pixel is closest to its own multiple of the levels' light. Levels are
-/// weighted with 1 / light, as is shot noise.
+/// Pixels are averaged over blocks of this many rows and columns: noise does not average out of squares.
+const BLOCK: usize = 16;
+
+/// The `a` for which `y (1 + a y)` of each block of kept pixels is closest to its own multiple of the levels' light.
+/// Levels are weighted with 1 / light, as is shot noise.
 fn curve(levels: &[LightLevel], images: &[ArrayView2<f32>], kept: &Array2<bool>) -> f64 {
     let light: f64 = levels.iter().map(|level| level.light).sum();
-    let sums = (0..kept.nrows()).into_par_iter().map(|t| {
+    let (rows, columns) = kept.dim();
+    let sums = (0..rows.div_ceil(BLOCK)).into_par_iter().map(|block_row| {
         let mut sums = [0.0; 2];
-        for s in (0..kept.ncols()).filter(|&s| kept[[t, s]]) {
+        for first in (0..columns).step_by(BLOCK) {
+            let inside = || {
+                let rows = block_row * BLOCK..((block_row + 1) * BLOCK).min(rows);
+                rows.flat_map(move |t| (first..(first + BLOCK).min(columns)).map(move |s| (t, s)))
+                    .filter(|at| kept[*at])
+            };
+            let pixels = inside().count() as f64;
+            if pixels == 0.0 {
+                continue;
+            }
             let [mut y1, mut y2, mut y3, mut y4] = [0.0; 4];
             for (level, image) in levels.iter().zip(images) {
-                let y = f64::from(image[[t, s]] - level.dark_dn[[t, s]]);
+                let y = inside().map(|at| f64::from(image[at] - level.dark_dn[at])).sum::<f64>() / pixels;
                 y1 += y;
                 y2 += y * y;
                 y3 += y.powi(3) / level.light;
                 y4 += y.powi(4) / level.light;
             }
-            // The parts of y and y^2 that are proportional to the light are the pixel's own brightness.
-            sums[0] += y3 - y2 * y1 / light;
-            sums[1] += y4 - y2 * y2 / light;
+            // The parts of y and y^2 that are proportional to the light are the block's own brightness.
+            sums[0] += pixels * (y3 - y2 * y1 / light);
+            sums[1] += pixels * (y4 - y2 * y2 / light);
         }
         sums
     });

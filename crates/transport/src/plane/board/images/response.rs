@@ -86,7 +86,7 @@ impl ResponseChecks {
 
 impl Responses {
     /// Averages the counts of each row over pixels with the same fraction of a row, within 10 camera rows and 4
-    /// columns, and divides by their sum. Standard deviations are those of the scatter between the camera rows, so
+    /// columns, and divides by their sum. What is left of a difference in place is removed by a line. Standard deviations are those of the scatter between the camera rows, so
     /// that they contain the unevenness of the projector's rows as well as noise.
     ///
     /// # Errors
@@ -175,11 +175,13 @@ struct Pixel {
     response_sd: [f32; PHASES],
 }
 
-/// Counts of one camera row's pixels, by relative row.
+/// Mean counts of one camera row's pixels, by relative row.
 #[derive(Clone, Copy)]
-struct RowSum {
-    counts: [f32; PHASES],
-    pixels: f32,
+struct RowMean {
+    counts: [f64; PHASES],
+    pixels: f64,
+    /// Mean of what their places differ by from a whole number of rows.
+    shift_rows: f64,
     /// Projector row that corresponds to the pixel's own.
     own_row: i32,
 }
@@ -191,23 +193,24 @@ impl Window<'_> {
             return None;
         }
         let own_row = place.round() as i32;
-        let mut sums = [RowSum { counts: [0.0; PHASES], pixels: 0.0, own_row }; 2 * REACH_ROWS + 1];
+        let empty = RowMean { counts: [0.0; PHASES], pixels: 0.0, shift_rows: 0.0, own_row };
+        let mut means = [empty; 2 * REACH_ROWS + 1];
         let mut used = 0;
         for row in t.saturating_sub(REACH_ROWS)..(t + REACH_ROWS + 1).min(self.place.nrows()) {
-            if let Some(sum) = self.row(row, s, place) {
-                sums[used] = sum;
+            if let Some(mean) = self.row(row, s, place) {
+                means[used] = mean;
                 used += 1;
             }
         }
-        // A single camera row has no scatter to judge by.
-        (used > 1).then(|| self.average(&sums[..used], own_row)).flatten()
+        // A line through two camera rows leaves no scatter to judge by.
+        (used > 2).then(|| self.average(&means[..used], own_row)).flatten()
     }
 
     /// The pixels of a camera row whose places differ from `place` by a whole number of rows.
-    fn row(&self, t: usize, s: usize, place: f32) -> Option<RowSum> {
+    fn row(&self, t: usize, s: usize, place: f32) -> Option<RowMean> {
         let columns = s.saturating_sub(REACH_COLUMNS)..(s + REACH_COLUMNS + 1).min(self.place.ncols());
-        let mut by_phase = [0.0; PHASES];
-        let (mut pixels, mut steps) = (0, 0.0);
+        let mut by_phase = [0.0_f32; PHASES];
+        let (mut pixels, mut steps, mut shifts) = (0, 0.0, 0.0);
         let places = self.place.row(t);
         for column in columns {
             let difference = places[column] - place;
@@ -216,6 +219,7 @@ impl Window<'_> {
             let same = (difference - whole).abs() <= MOST_SHIFT_ROWS && (pixels == 0 || whole == steps);
             if same {
                 steps = whole;
+                shifts += difference - whole;
                 pixels += 1;
                 let light = self.light.slice(ndarray::s![t, column, ..]);
                 let light = light.to_slice()?.first_chunk::<PHASES>()?;
@@ -225,56 +229,61 @@ impl Window<'_> {
             }
         }
         let own_row = place.round() as i32 + steps as i32;
-        let counts = std::array::from_fn(|index| by_phase[phase(own_row + index as i32 - OWN)]);
-        (pixels > 0).then_some(RowSum { counts, pixels: pixels as f32, own_row })
+        let n = f64::from(pixels);
+        (pixels > 0).then(|| RowMean {
+            counts: std::array::from_fn(|index| f64::from(by_phase[phase(own_row + index as i32 - OWN)]) / n),
+            pixels: n,
+            shift_rows: f64::from(shifts) / n,
+            own_row,
+        })
     }
 
     fn exists(&self, row: i32) -> bool {
         (0..self.projector_rows as i32).contains(&row)
     }
 
-    fn average(&self, sums: &[RowSum], own_row: i32) -> Option<Pixel> {
+    /// Counts of each relative row at the pixel's own place, by a line over the shift, as shares of their sum.
+    fn average(&self, means: &[RowMean], own_row: i32) -> Option<Pixel> {
         // At the border of the picture, a relative row is averaged over those pixels only for which it is drawn.
-        let drawn = |sum: &RowSum, index: usize| self.exists(sum.own_row + index as i32 - OWN);
-        let (mut counts, mut pixels) = ([0.0; PHASES], [0.0; PHASES]);
-        for sum in sums {
-            for index in (0..PHASES).filter(|&index| drawn(sum, index)) {
-                counts[index] += sum.counts[index];
-                pixels[index] += sum.pixels;
+        let drawn = |row: &RowMean, index: usize| self.exists(row.own_row + index as i32 - OWN);
+        let mut sums = [[0.0; 5]; PHASES];
+        for row in means {
+            let (n, x) = (row.pixels, row.shift_rows);
+            for (index, sum) in sums.iter_mut().enumerate().filter(|(index, _)| drawn(row, *index)) {
+                let y = row.counts[index];
+                let terms = [1.0, x, x * x, y, x * y];
+                sum.iter_mut().zip(terms).for_each(|(sum, term)| *sum += n * term);
             }
         }
-        let mean: [f32; PHASES] =
-            std::array::from_fn(
-                |index| if pixels[index] > 0.0 { counts[index] / pixels[index] } else { 0.0 },
-            );
-        let total: f32 = mean.iter().sum();
+        let lines = sums.map(Line::new);
+        let total: f64 = lines.iter().map(|line| line.counts).sum();
         if total.is_nan() || total <= 0.0 {
             return None;
         }
-        let share = mean.map(|mean| mean / total);
-        let centroid: f32 = share.iter().zip(RESPONSE_ROWS).map(|(share, d)| share * d as f32).sum();
+        let share = lines.map(|line| line.counts / total);
+        let centroid: f64 = share.iter().zip(RESPONSE_ROWS).map(|(share, d)| share * f64::from(d)).sum();
         // What each camera row contributes to the deviation of each share, and of the centroid.
-        let (mut squares, mut centroid_squares) = ([0.0; PHASES], 0.0);
-        for sum in sums {
+        let (mut squares, mut centroid_square) = ([0.0; PHASES], 0.0);
+        for row in means {
             let mut deviation = [0.0; PHASES];
-            for index in (0..PHASES).filter(|&index| drawn(sum, index)) {
-                deviation[index] = (sum.counts[index] - mean[index] * sum.pixels) / (pixels[index] * total);
+            for index in (0..PHASES).filter(|&index| drawn(row, index)) {
+                deviation[index] = lines[index].deviation(row, index) / total;
             }
-            let common: f32 = deviation.iter().sum();
+            let common: f64 = deviation.iter().sum();
             let mut moment = 0.0;
             for (index, d) in RESPONSE_ROWS.enumerate() {
                 squares[index] += (deviation[index] - share[index] * common).powi(2);
-                moment += deviation[index] * (d as f32 - centroid);
+                moment += deviation[index] * (f64::from(d) - centroid);
             }
-            centroid_squares += moment * moment;
+            centroid_square += moment * moment;
         }
-        let degrees = (sums.len() - 1) as f32;
         // Few rows underestimate the scatter half of the time: the factor makes 68 % of the errors smaller (Student).
-        let factor = ((degrees + 1.0) / degrees).sqrt() * (1.0 + 0.55 / degrees);
-        let place = own_row as f32 + centroid;
+        let degrees = (means.len() - 2) as f64;
+        let factor = ((degrees + 2.0) / degrees).sqrt() * (1.0 + 0.55 / degrees);
+        let place = f64::from(own_row) + centroid;
         // The response refers to the row nearest to the new place.
-        let moved = place.round() as i32 - own_row;
-        let turned = |values: &[f32; PHASES]| -> [f32; PHASES] {
+        let moved = (place as f32).round() as i32 - own_row;
+        let turned = |values: &[f64; PHASES]| -> [f64; PHASES] {
             std::array::from_fn(|index| values[phase(index as i32 + moved)])
         };
         let mut response = turned(&share);
@@ -283,13 +292,48 @@ impl Window<'_> {
                 *share = 0.0;
             }
         }
-        let kept: f32 = response.iter().sum();
+        let kept: f64 = response.iter().sum();
         Some(Pixel {
-            place,
-            place_sd: factor * centroid_squares.sqrt(),
-            response: response.map(|share| share / kept),
-            response_sd: turned(&squares).map(|square| factor * square.sqrt() / kept),
+            place: place as f32,
+            place_sd: (factor * centroid_square.sqrt()) as f32,
+            response: response.map(|share| (share / kept) as f32),
+            response_sd: turned(&squares).map(|square| (factor * square.sqrt() / kept) as f32),
         })
+    }
+}
+
+/// A slope takes shifts of this many rows to be determined; below, it counts as 0.
+const LEAST_SPREAD_ROWS: f64 = 0.01;
+
+/// Counts of one relative row as a line over the shift.
+#[derive(Clone, Copy)]
+struct Line {
+    /// At shift 0.
+    counts: f64,
+    per_row: f64,
+    /// Sums over the camera rows of 1, shift and shift^2, weighted with their pixels, and the determinant.
+    sums: [f64; 3],
+    determinant: f64,
+}
+
+impl Line {
+    /// From the weighted sums of 1, x, x^2, y, xy.
+    fn new([n, x, xx, y, xy]: [f64; 5]) -> Self {
+        let xx = xx + n * LEAST_SPREAD_ROWS.powi(2);
+        let determinant = n * xx - x * x;
+        let (mut counts, mut per_row) = (0.0, 0.0);
+        if determinant > 0.0 {
+            counts = (xx * y - x * xy) / determinant;
+            per_row = (n * xy - x * y) / determinant;
+        }
+        Self { counts, per_row, sums: [n, x, xx], determinant }
+    }
+
+    /// What the deviation of one camera row from the line adds to the counts at shift 0.
+    fn deviation(&self, row: &RowMean, index: usize) -> f64 {
+        let [_, x, xx] = self.sums;
+        let weight = row.pixels * (xx - row.shift_rows * x) / self.determinant;
+        weight * (row.counts[index] - self.counts - self.per_row * row.shift_rows)
     }
 }
 

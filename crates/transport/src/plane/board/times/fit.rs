@@ -5,7 +5,7 @@ use super::super::super::error::check_shape;
 use super::coarse::{Arrivals, CoarseSweep, arrivals, median};
 use super::columns::Columns;
 use super::error::TimesError;
-use super::model::{Clocks, ExposureEdge, FrameComparison, BoardSamples, Sums, Sweep};
+use super::model::{BoardSamples, Clocks, ExposureEdge, FrameComparison, Sums, Sweep};
 use super::result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
 use super::settings::{BoardFrame, ExposureMode, Nominal};
 use super::table::SplineTable;
@@ -251,10 +251,15 @@ impl<'a> Fit<'a> {
         }
         for _ in 0..4 {
             let (mut weight, mut right) = (prior, -best_us * prior);
-            comparison.visit(&self.frames[frame], (best_us, longer_us), BoardSamples::OnEdges, |_, _, _, sums| {
-                weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
-                right += sums.opening_residual - sums.closing_residual;
-            });
+            comparison.visit(
+                &self.frames[frame],
+                (best_us, longer_us),
+                BoardSamples::OnEdges,
+                |_, _, _, sums| {
+                    weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
+                    right += sums.opening_residual - sums.closing_residual;
+                },
+            );
             best_us += (right / weight).clamp(-STEP_US, STEP_US);
         }
         best_us
@@ -296,10 +301,15 @@ impl<'a> Fit<'a> {
                 right: -self.late_us[frame] * prior,
             };
             let late = (self.late_us[frame], self.longer_us(frame));
-            comparison.visit(&self.frames[frame], late, BoardSamples::OnEdges, |row, opening, closing, sums| {
-                let edges = self.edges(frame, row, opening, closing);
-                own.add(&edges, sums, &mut matrix, &mut right);
-            });
+            comparison.visit(
+                &self.frames[frame],
+                late,
+                BoardSamples::OnEdges,
+                |row, opening, closing, sums| {
+                    let edges = self.edges(frame, row, opening, closing);
+                    own.add(&edges, sums, &mut matrix, &mut right);
+                },
+            );
             matrix.ger(-own.weight.recip(), &own.mixed, &own.mixed, 1.0);
             right.axpy(-own.right / own.weight, &own.mixed, 1.0);
             frames.push(own);
