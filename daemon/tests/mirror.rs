@@ -190,7 +190,7 @@ fn sixty_batches_reach_the_mirror_bit_for_bit() {
     let codes: Vec<Held> = path
         .points()
         .iter()
-        .map(|point| Sample::of(*point, MirrorLimits::A7B2_3_3600AL.max_tilt))
+        .map(|point| MirrorSample::of(*point, MirrorLimits::A7B2_3_3600AL.max_tilt))
         .map(|MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
         .collect();
     let first = codes.iter().position(|held| held.light > 0).unwrap();
