@@ -1,6 +1,8 @@
 //! What users read about faulty rig and plan files. The cases assert which fields are refused, each with a place in the
 //! text; the snapshots hold the messages.
 
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
 use std::fmt::Write;
 
 use raysweep_config::plan::products_of_argument;

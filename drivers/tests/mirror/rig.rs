@@ -127,7 +127,7 @@ pub fn largest_step(held: &[Held]) -> f64 {
 pub fn codes(path: &MirrorPath) -> Vec<Held> {
     path.points()
         .iter()
-        .map(|point| Sample::of(*point, MechanicsConfig::default().max_tilt))
+        .map(|point| MirrorSample::of(*point, MechanicsConfig::default().max_tilt))
         .map(|MirrorSample { x, y, light }| Held { x: f64::from(x), y: f64::from(y), light })
         .collect()
 }

@@ -50,7 +50,7 @@ fn inverses(quadratic: &Quadratic) -> Result<Compared, Box<dyn Error>> {
         pulp::Arch::new().dispatch(|| invert(&mut matrix, n)).ok().map(|()| matrix)
     };
     let other = || Cholesky::new(DMatrix::from_column_slice(n, n, &h)).map(|factor| factor.inverse());
-    let (seconds, nalgebra_seconds) = take_turns(&own, &other);
+    let (seconds, nalgebra_seconds) = take_turns(own, other);
     let (Some(own), Some(other)) = (own(), other()) else { return Err("H is not positive definite".into()) };
     let lower = (0..n).flat_map(|i| (0..=i).map(move |j| (i, j)));
     let difference = difference(lower.map(|(i, j)| (own[i * n + j], other[(i, j)])));
@@ -74,7 +74,7 @@ fn minima(quadratic: &Quadratic, linear: &Array2<f64>, free: ArrayView2<bool>) -
         }
         minima
     };
-    let (seconds, nalgebra_seconds) = take_turns(&own, &other);
+    let (seconds, nalgebra_seconds) = take_turns(own, other);
     let difference = difference(own().into_iter().zip(other()));
     let mean = free.iter().filter(|free| **free).count() as f64 / free.nrows() as f64;
     let task = format!("{} systems of {mean:.0} rows, {}", free.nrows(), SimdLevel::best().name());
