@@ -248,7 +248,7 @@ fn calibrate(studio: &mut Studio, stated: &Stated) -> Known {
         row_starts_us: times.row_starts_us,
         camera_row_time_us: times.camera_row_time_us.value,
         exposure_offset_us: times.exposure_offset_us.value,
-        response: PixelResponse::new(responses.place, responses.response).unwrap(),
+        response: responses.pixel_response().unwrap(),
         white_dn: white.white_dn,
         dark,
     }

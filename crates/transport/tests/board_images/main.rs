@@ -1,6 +1,6 @@
 //! Estimates of each pixel's properties from simulated images of the board, against the truth.
 
-#![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 mod scene;
 
@@ -8,10 +8,11 @@ use std::time::Instant;
 
 use ndarray::{Array2, Array3, ArrayView2, Axis};
 use rand_distr::{Distribution, Normal};
+use raysweep_transport::plane::FIRST_RESPONSE_ROW;
 use raysweep_transport::plane::board::images::{
-    BlackFrames, CappedFrames, DarkFit, ImagesError, LightLevel, Linearity, Narrower, RESPONSE_ROWS,
-    Responses, RowPlaces, SaturationLimit, WhiteMap, ambient, compare_responses, locate_columns, locate_rows,
-    photon_transfer, prnu,
+    BlackFrames, CappedFrames, DarkFit, ImagesError, LightLevel, Linearity, Narrower, Responses, RowPlaces,
+    SaturationLimit, WhiteMap, ambient, compare_responses, locate_columns, locate_rows, photon_transfer,
+    prnu,
 };
 
 use scene::{
@@ -359,7 +360,7 @@ fn responses_and_places() {
         for &(t, s) in pixels.iter().step_by(97) {
             let shares = measured.responses.response.slice(ndarray::s![.., t, s]);
             let place = measured.responses.place[[t, s]];
-            let centroid: f32 = shares.iter().zip(RESPONSE_ROWS).map(|(k, d)| k * d as f32).sum();
+            let centroid: f32 = shares.iter().zip(FIRST_RESPONSE_ROW..).map(|(k, d)| k * d as f32).sum();
             assert!((place.round() + centroid - place).abs() < 0.005 && (shares.sum() - 1.0).abs() < 1e-5);
         }
     }
@@ -377,7 +378,9 @@ fn rows_beyond_the_picture_have_no_share() {
     for ((t, s), place) in measured.responses.place.indexed_iter().filter(|(_, place)| !place.is_nan()) {
         errors.push((f64::from(*place) - measured.scene.place(t, s)).abs());
         let own_row = place.round() as i32;
-        for (share, d) in measured.responses.response.slice(ndarray::s![.., t, s]).iter().zip(RESPONSE_ROWS) {
+        for (share, d) in
+            measured.responses.response.slice(ndarray::s![.., t, s]).iter().zip(FIRST_RESPONSE_ROW..)
+        {
             let exists = (0..124).contains(&(own_row + d));
             assert!(exists || *share == 0.0);
             border += usize::from(!exists);

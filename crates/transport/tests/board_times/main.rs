@@ -1,14 +1,15 @@
 //! The times of rows, found in frames of a simulated board, compared with those with which the frames were made.
 
-#![allow(clippy::unwrap_used)] // helpers outside #[test] functions are tests too
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
 mod rig;
 
 use std::time::Instant;
 
+use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::{
-    BoardFrame, BoardSetting, CoarseSweep, Columns, ExposureMode, Measured, RowTimes, TimesError,
-    arrival_settings, check_settings, spot_slopes, sweep_settings,
+    BoardFrame, BoardSetting, CoarseSweep, Columns, ExposureMode, RowTimes, TimesError, arrival_settings,
+    check_settings, spot_slopes, sweep_settings,
 };
 use rig::{Case, Jitter, Rig};
 
@@ -80,7 +81,7 @@ fn errors(rig: &Rig, times: &RowTimes) -> Errors {
     let mean = late.iter().sum::<f64>() / late.len() as f64;
     let rows: Vec<f64> = late.iter().map(|late| (late - mean) / case.row_time_us).collect();
     let tau = (rig.starts_us[end] - rig.starts_us[first]) / (end - first) as f64;
-    let sds = |measured: Measured, truth: f64| (measured.value - truth) / measured.sd;
+    let sds = |measured: Estimate, truth: f64| (measured.value - truth) / measured.sd;
     // Light of the middle camera row.
     let middle = case.window.1 / 2;
     let place = case.window.0 + middle;

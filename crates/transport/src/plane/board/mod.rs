@@ -5,5 +5,12 @@
 //! around that row. [`times`] turns images of the white board with different delays and exposures into the time at
 //! which each projector row is lit. All functions are pure; no device takes part.
 
+//!
+//! `tests/tests/calibration.rs` shows the order of all steps on the simulated rig. No procedure of the daemon runs them
+//! yet.
+
+mod estimate;
 pub mod images;
 pub mod times;
+
+pub use estimate::Estimate;

@@ -24,27 +24,19 @@ pub use error::ImagesError;
 pub use linearity::{LightLevel, Linearity, SaturationLimit};
 pub use photon_transfer::{PhotonTransfer, photon_transfer, prnu};
 pub use place::{CodedPictures, Phases, RowPlaces, locate_columns, locate_rows};
-pub use response::{
-    Narrower, RESPONSE_ROWS, ResponseChecks, ResponseComparison, Responses, compare_responses,
-};
+pub use response::{Narrower, ResponseChecks, ResponseComparison, Responses, compare_responses};
 pub use white::WhiteMap;
 
 use ndarray::{Array2, ArrayView2, ArrayView3, Axis};
 use rayon::prelude::*;
 
+use super::Estimate;
+use error::{check_frames, check_range, check_shape};
+
 /// Variance of rounding to whole DN.
 const ROUNDING_DN2: f64 = 1.0 / 12.0;
 /// Scales a median absolute deviation to the standard deviation of normal noise.
 const MAD_TO_SIGMA: f64 = 1.4826;
-
-/// A value and its standard deviation.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Estimate {
-    /// The value.
-    pub value: f64,
-    /// Its standard deviation.
-    pub sd: f64,
-}
 
 /// The noise of one frame of the camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,8 +76,6 @@ impl SensorNoise {
         )
     }
 }
-
-use error::{check_frames, check_range, check_shape};
 
 /// Mean over the frames.
 fn mean_image(frames: ArrayView3<f32>) -> Array2<f32> {

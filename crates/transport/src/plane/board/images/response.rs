@@ -4,14 +4,16 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, Array3, ArrayView1, Axis};
 use rayon::prelude::*;
 
+use super::super::super::PlaneError;
+use super::super::super::model::{FIRST_RESPONSE_ROW, PixelResponse, RESPONSE_ROWS};
 use super::place::{PHASES, Phases, RowPlaces};
 use super::{Estimate, ImagesError, WhiteMap, check_frames, check_shape, median};
 
 /// The drawn rows of a response, relative to the row nearest to the pixel's place.
-pub const RESPONSE_ROWS: RangeInclusive<i32> = -7..=8;
+const ROWS: RangeInclusive<i32> = FIRST_RESPONSE_ROW..=FIRST_RESPONSE_ROW + RESPONSE_ROWS as i32 - 1;
 
 /// A pixel's own row is at this index of its response.
-const OWN: i32 = -*RESPONSE_ROWS.start();
+const OWN: i32 = -FIRST_RESPONSE_ROW;
 /// Counts are averaged over this many camera rows above and below.
 const REACH_ROWS: usize = 10;
 /// Counts are averaged over at most this many columns to the left and right.
@@ -40,7 +42,7 @@ pub struct Responses {
     pub place: Array2<f32>,
     /// Its standard deviation, `[t, s]`.
     pub place_sd: Array2<f32>,
-    /// Share of row `round(place) + d` for each `d` of [`RESPONSE_ROWS`], `[16, t, s]`. Sums to 1; NaN where unlit.
+    /// Share of row `round(place) + d` for each `d` from -7 to 8, `[16, t, s]`. Sums to 1; NaN where unlit.
     pub response: Array3<f32>,
     /// Its standard deviation, `[16, t, s]`.
     pub response_sd: Array3<f32>,
@@ -85,6 +87,34 @@ impl ResponseChecks {
 }
 
 impl Responses {
+    /// The response for the forward model, which needs one in every pixel: an unlit pixel takes that of the nearest lit
+    /// one, at a place that is farther down by as many rows as the pixel is.
+    ///
+    /// # Errors
+    /// [`PlaneError::OutOfRange`] if no pixel is lit, or the shares of a pixel do not add up to 1.
+    pub fn pixel_response(&self) -> Result<PixelResponse, PlaneError> {
+        let lit: Vec<(usize, usize)> = self
+            .place
+            .indexed_iter()
+            .filter(|(_, place)| place.is_finite())
+            .map(|(pixel, _)| pixel)
+            .collect();
+        let (mut places, mut shares) = (self.place.clone(), self.response.clone());
+        let unlit = self.place.indexed_iter().filter(|(_, place)| !place.is_finite());
+        for ((t, s), _) in unlit {
+            let distance =
+                |&&(lit_t, lit_s): &&(usize, usize)| lit_t.abs_diff(t).pow(2) + lit_s.abs_diff(s).pow(2);
+            let Some(&(lit_t, lit_s)) = lit.iter().min_by_key(distance) else { break };
+            places[[t, s]] = self.place[[lit_t, lit_s]] + (t as f32 - lit_t as f32);
+            shares.slice_mut(ndarray::s![.., t, s]).assign(&self.response.slice(ndarray::s![
+                ..,
+                lit_t,
+                lit_s
+            ]));
+        }
+        PixelResponse::new(places, shares)
+    }
+
     /// Averages the counts of each row over pixels with the same fraction of a row, within 10 camera rows and 4
     /// columns, and divides by their sum. What is left of a difference in place is removed by a line. Standard deviations are those of the scatter between the camera rows, so
     /// that they contain the unevenness of the projector's rows as well as noise.
@@ -140,7 +170,7 @@ impl Responses {
     /// Second central moment of a pixel's response, in rows^2; NaN where unlit.
     fn second_moment(&self, t: usize, s: usize) -> f64 {
         let [mut first, mut second] = [0.0; 2];
-        for (&share, d) in self.response.slice(ndarray::s![.., t, s]).iter().zip(RESPONSE_ROWS) {
+        for (&share, d) in self.response.slice(ndarray::s![.., t, s]).iter().zip(ROWS) {
             first += f64::from(share) * f64::from(d);
             second += f64::from(share) * f64::from(d).powi(2);
         }
@@ -261,7 +291,7 @@ impl Window<'_> {
             return None;
         }
         let share = lines.map(|line| line.counts / total);
-        let centroid: f64 = share.iter().zip(RESPONSE_ROWS).map(|(share, d)| share * f64::from(d)).sum();
+        let centroid: f64 = share.iter().zip(ROWS).map(|(share, d)| share * f64::from(d)).sum();
         // What each camera row contributes to the deviation of each share, and of the centroid.
         let (mut squares, mut centroid_square) = ([0.0; PHASES], 0.0);
         for row in means {
@@ -271,7 +301,7 @@ impl Window<'_> {
             }
             let common: f64 = deviation.iter().sum();
             let mut moment = 0.0;
-            for (index, d) in RESPONSE_ROWS.enumerate() {
+            for (index, d) in ROWS.enumerate() {
                 squares[index] += (deviation[index] - share[index] * common).powi(2);
                 moment += deviation[index] * (f64::from(d) - centroid);
             }
@@ -287,7 +317,7 @@ impl Window<'_> {
             std::array::from_fn(|index| values[phase(index as i32 + moved)])
         };
         let mut response = turned(&share);
-        for (share, d) in response.iter_mut().zip(RESPONSE_ROWS) {
+        for (share, d) in response.iter_mut().zip(ROWS) {
             if !self.exists(own_row + moved + d) {
                 *share = 0.0;
             }
@@ -360,7 +390,7 @@ fn checks(response: &Array3<f32>) -> ResponseChecks {
         if shares[0].is_nan() {
             continue;
         }
-        let beyond = shares.iter().zip(RESPONSE_ROWS).filter(|(_, d)| d.abs() > NEAR_ROWS);
+        let beyond = shares.iter().zip(ROWS).filter(|(_, d)| d.abs() > NEAR_ROWS);
         far.push(beyond.map(|(&share, _)| f64::from(share)).sum());
         two_peaks += usize::from(has_two_peaks(shares));
     }
@@ -492,4 +522,28 @@ fn moments_by_fraction(responses: &Responses) -> Vec<Option<Estimate>> {
         })
     };
     groups.into_iter().map(estimate).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unlit_pixels_take_the_response_of_the_nearest_lit_one() {
+        let place =
+            Array2::from_shape_vec((2, 3), vec![10.2, 10.3, f32::NAN, 11.2, f32::NAN, f32::NAN]).unwrap();
+        let response =
+            Array3::from_shape_fn((RESPONSE_ROWS, 2, 3), |(d, t, s)| match place[[t, s]].is_finite() {
+                true => f32::from(u8::from(d == 7 + s)),
+                false => f32::NAN,
+            });
+        let checks =
+            ResponseChecks { sum_of_phases: 1.0, two_peaks: 0.0, far_light: 0.0, place_rms_rows: 0.0 };
+        let (place_sd, response_sd) = (place.clone(), response.clone());
+        let responses = Responses { place, place_sd, response, response_sd, checks };
+        let filled = responses.pixel_response().unwrap();
+        assert_eq!(filled.places().as_slice().unwrap(), [10.2, 10.3, 10.3, 11.2, 11.3, 11.3]);
+        assert_eq!(filled.shares()[[8, 0, 2]], 1.0);
+        assert_eq!(filled.shares()[[8, 1, 2]], 1.0);
+    }
 }

@@ -4,14 +4,11 @@ use ndarray::{Array2, ArrayView1, ArrayView2, ArrayView3, s};
 
 use super::super::super::PlaneError;
 use super::super::super::error::check_shape;
+use super::super::super::model::{FIRST_RESPONSE_ROW, RESPONSE_ROWS};
 
 /// Largest number of groups into which the columns of the image are averaged. More groups hardly help: they differ
 /// only in the fraction of a row at which their pixels lie.
 const GROUPS: usize = 12;
-/// Number of drawn rows in a pixel's response.
-const RESPONSE_ROWS: usize = 16;
-/// The response's first row, relative to the row nearest to the pixel's place.
-const FIRST_RESPONSE_ROW: i64 = -7;
 
 /// What each camera row sees of each drawn row, averaged over groups of neighbouring columns.
 ///
@@ -44,7 +41,7 @@ pub(super) struct Cell {
 }
 
 impl Columns {
-    /// From each pixel's `place` in projector rows, NaN where it is unlit, and its `response` `[16, rows, columns]`:
+    /// From each pixel's `place` in projector rows, NaN where it is unlit, and its `response` `[16, t, s]`:
     /// the share of its light that drawn row `round(place) + d` sends, for `d` from -7 to 8.
     ///
     /// # Errors
@@ -52,7 +49,7 @@ impl Columns {
     /// pixel whose sum is not 1 to within 1 %, or for an image without lit pixels.
     pub fn new(place: ArrayView2<f32>, response: ArrayView3<f32>) -> Result<Self, PlaneError> {
         let (rows, columns) = place.dim();
-        check_shape("response", "[d, row, column]", response.shape(), &[RESPONSE_ROWS, rows, columns])?;
+        check_shape("response", "[16, t, s]", response.shape(), &[RESPONSE_ROWS, rows, columns])?;
         let lit = place.mapv(f32::is_finite);
         if !lit.iter().any(|&lit| lit) {
             return Err(PlaneError::OutOfRange {
@@ -82,7 +79,7 @@ impl Columns {
                 cells.push(Cell {
                     pixels: pixels.len(),
                     place: places.sum::<f64>() / pixels.len() as f64,
-                    first_row: first + FIRST_RESPONSE_ROW,
+                    first_row: first + i64::from(FIRST_RESPONSE_ROW),
                     rows: sum.len(),
                 });
                 responses.push(sum.iter().map(|sum| sum / pixels.len().max(1) as f64).collect());

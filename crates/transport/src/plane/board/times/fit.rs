@@ -2,11 +2,12 @@ use nalgebra::{DMatrix, DVector};
 
 use super::super::super::NoiseModel;
 use super::super::super::error::check_shape;
+use super::super::Estimate;
 use super::coarse::{Arrivals, CoarseSweep, arrivals, median};
 use super::columns::Columns;
 use super::error::TimesError;
 use super::model::{BoardSamples, Clocks, ExposureEdge, FrameComparison, Sums, Sweep};
-use super::result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
+use super::result::{Dropped, FrameJitter, Residual, RowTimes};
 use super::settings::{BoardFrame, ExposureMode, Nominal};
 use super::table::SplineTable;
 
@@ -409,7 +410,7 @@ impl<'a> Fit<'a> {
     }
 
     /// Standard deviation of the frames' jitters about the mean of their shutter mode.
-    fn check_jitter(&self) -> Result<Measured, TimesError> {
+    fn check_jitter(&self) -> Result<Estimate, TimesError> {
         let (mut squares, mut count) = (0.0, 0.0);
         for shutter in [ExposureMode::Global, ExposureMode::Rolling] {
             let jitters = self.jitters_of(shutter);
@@ -425,7 +426,7 @@ impl<'a> Fit<'a> {
         if jitter_us > limit_us {
             return Err(TimesError::Jitter { jitter_us, limit_us });
         }
-        Ok(Measured { value: jitter_us, sd: jitter_us / (2.0 * count).sqrt() })
+        Ok(Estimate { value: jitter_us, sd: jitter_us / (2.0 * count).sqrt() })
     }
 
     fn check_residuals(&self) -> Result<Vec<Residual>, TimesError> {
@@ -566,7 +567,7 @@ impl<'a> Fit<'a> {
         Ok(eigen.recompose())
     }
 
-    fn result(&self, jitter_us: Measured, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
+    fn result(&self, jitter_us: Estimate, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
         let covariance = self.covariance()?;
         let coefficients = self.table.coefficients;
         let seen_rows = self.columns.seen_rows();
@@ -590,7 +591,7 @@ impl<'a> Fit<'a> {
         let place = self.columns.row_place(middle).unwrap_or(first);
         let latency = start_of(place + 0.5) - &camera_row * middle as f64;
         let values = DVector::from_column_slice(&self.unknowns);
-        let measured = |weights: &DVector<f64>| Measured {
+        let measured = |weights: &DVector<f64>| Estimate {
             value: weights.dot(&values),
             sd: weights.dot(&(&covariance * weights)).sqrt(),
         };

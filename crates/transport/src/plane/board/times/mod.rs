@@ -24,7 +24,7 @@ mod table;
 pub use coarse::CoarseSweep;
 pub use columns::Columns;
 pub use error::TimesError;
-pub use result::{Dropped, FrameJitter, Measured, Residual, RowTimes};
+pub use result::{Dropped, FrameJitter, Residual, RowTimes};
 pub use settings::{
     BoardFrame, BoardSetting, ExposureMode, Nominal, arrival_settings, check_settings, sweep_settings,
 };

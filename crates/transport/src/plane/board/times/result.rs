@@ -2,16 +2,8 @@ use std::ops::Range;
 
 use ndarray::Array2;
 
+use super::super::Estimate;
 use super::settings::ExposureMode;
-
-/// A number with its standard deviation.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measured {
-    /// The number.
-    pub value: f64,
-    /// Its standard deviation.
-    pub sd: f64,
-}
 
 /// When each projector row is lit, and what belongs to it.
 #[derive(Debug, Clone, PartialEq)]
@@ -27,13 +19,13 @@ pub struct RowTimes {
     /// Rows that the image sees. Outside them, the table continues with its outermost slope.
     pub seen_rows: Range<usize>,
     /// Mean time per row over the rows seen.
-    pub row_time_us: Measured,
+    pub row_time_us: Estimate,
     /// Time from one camera row to the next.
-    pub camera_row_time_us: Measured,
+    pub camera_row_time_us: Estimate,
     /// What each exposure has more than its nominal length.
-    pub exposure_offset_us: Measured,
+    pub exposure_offset_us: Estimate,
     /// How much later a global exposure opens than row 0 of a rolling exposure with the same delay.
-    pub mode_offset_us: Measured,
+    pub mode_offset_us: Estimate,
     /// Standard deviation of the time at which light arrives in the middle camera row: jitter over the root of the
     /// number of rolling frames with edges on the light.
     pub latency_sd_us: f64,
@@ -41,7 +33,7 @@ pub struct RowTimes {
     /// `row_time_us`, in this order.
     pub covariance: [[f64; 4]; 4],
     /// Standard deviation, over frames, of the time of light after the trigger, and its own standard deviation.
-    pub jitter_us: Measured,
+    pub jitter_us: Estimate,
     /// How late the light of each frame was; `None` for frames that were dropped.
     pub jitters: Vec<Option<FrameJitter>>,
     /// Number of rolling frames with edges on the light.

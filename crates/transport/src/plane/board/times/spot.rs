@@ -1,10 +1,10 @@
 use ndarray::Array2;
 
 use super::super::super::error::check_shape;
+use super::super::Estimate;
 use super::coarse::CoarseSweep;
 use super::columns::Columns;
 use super::error::TimesError;
-use super::result::Measured;
 use super::settings::BoardFrame;
 
 /// How far a row's light arrives later at the right side of the projector's image than at the left, in row times.
@@ -14,9 +14,9 @@ use super::settings::BoardFrame;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpotSlopes {
     /// Slope of even rows.
-    pub even: Measured,
+    pub even: Estimate,
     /// Slope of odd rows.
-    pub odd: Measured,
+    pub odd: Estimate,
 }
 
 /// Smallest share of the projector's width.
@@ -50,7 +50,7 @@ fn slope(
     projector_columns: &Array2<f32>,
     frames: &[BoardFrame],
     parity: usize,
-) -> Result<Measured, TimesError> {
+) -> Result<Estimate, TimesError> {
     let mut frames: Vec<&BoardFrame> = frames.iter().collect();
     frames.sort_by(|a, b| a.setting.delay_us.total_cmp(&b.setting.delay_us));
     // Deviations of (column, lateness) from their means over each camera row, so that neither the jitter of frames nor
@@ -83,7 +83,7 @@ fn slope(
     let seen = columns.seen_rows();
     let (first, end) = (seen.start as f64, seen.end as f64);
     let row_us = (coarse.time_us(end) - coarse.time_us(first)) / (end - first);
-    Ok(Measured { value: slope_us / row_us, sd: scatter.sqrt() / square / row_us })
+    Ok(Estimate { value: slope_us / row_us, sd: scatter.sqrt() / square / row_us })
 }
 
 /// How much later the light of one parity arrives in a cell than sweep and response say, apart from a constant of each
