@@ -1,5 +1,8 @@
 //! Cholesky factors of small dense matrices, computed row by row, so that every inner loop runs over contiguous
 //! memory.
+//!
+//! Benefit: nalgebra takes 2.2 to 2.9 times as long to invert the `H` of 75 settings (128 and 189 rows, AVX-512;
+//! benchmark `demux`).
 
 /// A matrix is not positive definite.
 #[derive(Debug)]

