@@ -264,7 +264,7 @@ fn long_exposures_for_arrivals_are_refused_or_uncertain() {
 #[test]
 fn spots_are_recognised() {
     for slopes in [[0.0, 0.0], [1.0, 1.0], [1.0, -1.0]] {
-        let mut session = Session::new(Case { slopes, ..Case::window(11) });
+        let mut session = Session::new(Case { slopes, ..Case::full(11) });
         let coarse = session.sweep().unwrap();
         let nominal = session.rig.nominal();
         let settings = arrival_settings(&session.columns, &coarse, &nominal).unwrap();

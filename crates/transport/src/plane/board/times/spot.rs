@@ -21,10 +21,15 @@ pub struct SpotSlopes {
 
 /// Smallest share of the projector's width.
 const MIN_SPAN: f64 = 0.2;
+/// Camera rows whose errors are taken as common.
+const BLOCK_ROWS: usize = 21;
 
 /// The slopes of even and odd rows, from rolling frames of pictures with the even and with the odd rows white, with the
 /// delays of the arrivals. Light is a share of white with all rows. `projector_columns` is the map of projector columns
 /// (0 to 1), averaged by [`Columns::average`].
+///
+/// The jitter of frames adds errors of a few hundredths for a whole raster, and of up to 0.2 for a window of 128 rows,
+/// all of which see the same frames; the standard deviations do not contain the latter.
 ///
 /// # Errors
 /// [`TimesError::Narrow`]; [`super::super::super::PlaneError::Shape`] for arrays that were averaged otherwise.
@@ -44,6 +49,21 @@ pub fn spot_slopes(
     Ok(SpotSlopes { even: slope(even, 0)?, odd: slope(odd, 1)? })
 }
 
+/// A group of columns in a camera row, relative to the mean of the row.
+struct Point {
+    row: usize,
+    column: f64,
+    late_us: f64,
+    weight: f64,
+}
+
+impl Point {
+    /// Weighted product of the column and another quantity.
+    fn moment(&self, quantity: f64) -> f64 {
+        self.weight * self.column * quantity
+    }
+}
+
 fn slope(
     columns: &Columns,
     coarse: &CoarseSweep,
@@ -53,9 +73,9 @@ fn slope(
 ) -> Result<Estimate, TimesError> {
     let mut frames: Vec<&BoardFrame> = frames.iter().collect();
     frames.sort_by(|a, b| a.setting.delay_us.total_cmp(&b.setting.delay_us));
-    // Deviations of (column, lateness) from their means over each camera row, so that neither the jitter of frames nor
-    // an error of the sweep enters, and their weights.
-    let mut points: Vec<(f64, f64, f64)> = Vec::new();
+    // Deviations from their means over each camera row, so that neither the jitter of frames nor an error of the sweep
+    // enters where all columns see the light of the same frames.
+    let mut points: Vec<Point> = Vec::new();
     let (mut left, mut right) = (f64::MAX, f64::MIN);
     for row in 0..columns.rows() {
         let cells: Vec<(f64, f64, f64)> = (0..columns.groups())
@@ -70,16 +90,21 @@ fn slope(
         let late_us: f64 = cells.iter().map(|cell| cell.1 * cell.2).sum::<f64>() / sum;
         for cell in cells {
             (left, right) = (left.min(cell.0), right.max(cell.0));
-            points.push((cell.0 - column, cell.1 - late_us, cell.2));
+            points.push(Point { row, column: cell.0 - column, late_us: cell.1 - late_us, weight: cell.2 });
         }
     }
     let span = (right - left).max(0.0);
     if span < MIN_SPAN {
         return Err(TimesError::Narrow { span_percent: span * 100.0, needed_percent: MIN_SPAN * 100.0 });
     }
-    let square: f64 = points.iter().map(|(x, _, weight)| weight * x * x).sum();
-    let slope_us = points.iter().map(|(x, y, weight)| weight * x * y).sum::<f64>() / square;
-    let scatter = points.iter().map(|(x, y, weight)| (weight * x * (y - slope_us * x)).powi(2)).sum::<f64>();
+    let square: f64 = points.iter().map(|point| point.moment(point.column)).sum();
+    let slope_us = points.iter().map(|point| point.moment(point.late_us)).sum::<f64>() / square;
+    // Camera rows near each other have the errors of the same frames.
+    let scatter: f64 = points
+        .chunk_by(|a, b| a.row / BLOCK_ROWS == b.row / BLOCK_ROWS)
+        .map(|block| block.iter().map(|point| point.moment(point.late_us - slope_us * point.column)).sum())
+        .map(|sum: f64| sum * sum)
+        .sum();
     let seen = columns.seen_rows();
     let (first, end) = (seen.start as f64, seen.end as f64);
     let row_us = (coarse.time_us(end) - coarse.time_us(first)) / (end - first);
