@@ -213,7 +213,7 @@ fn bad_plans_and_sessions_are_refused_and_the_daemon_goes_on() {
         ("kind = ", None),
         ("kind = \"flim\"", Some("kind")),
         ("kind = \"film\"\n[sweep]\naverage = 3", Some("sweep")),
-        ("kind = \"film\"\n[film]\ndelay_us = [0, 1e9]", Some("film.delay_us")),
+        ("kind = \"film\"\n[film]\ndelay_us = [0, 1e9]", Some("stage.0.name")),
         ("kind = \"sweep\"\n[sweep]\naverag = 3", Some("sweep.averag")),
         ("kind = \"sweep\"\n[sweep]\naverage = \"many\"", Some("sweep.average")),
         ("kind = \"sweep\"\n[sweep]\ndelay_us = [1e9]", Some("sweep.delay_us")),

@@ -121,10 +121,10 @@ impl DotTask {
         self.places.error(path, message)
     }
 
-    /// An error about the plan's stage of this name.
-    pub fn refuse_stage(&self, name: &str, message: impl Into<String>) -> ConfigError {
+    /// An error about a key of the plan's stage of this name.
+    pub fn refuse_stage(&self, name: &str, key: &str, message: impl Into<String>) -> ConfigError {
         let index = self.stages.iter().position(|stage| stage.name == name).unwrap_or(0);
-        self.refuse(&["stage", &index.to_string(), "name"], message)
+        self.refuse(&["stage", &index.to_string(), key], message)
     }
 
     /// Whether a dot shows the scene.
@@ -155,7 +155,7 @@ impl DotTask {
     pub fn stage(&self, correction: &Correction) -> Result<Arc<dyn ColumnStage>, ConfigError> {
         let StageTable { name, options } = &self.denoise;
         column_stage(name, Value::Object(options.clone()), correction)
-            .map_err(|error| self.refuse_stage(name, error.to_string()))
+            .map_err(|error| self.refuse_stage(name, "name", error.to_string()))
     }
 }
 

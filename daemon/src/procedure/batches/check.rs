@@ -26,8 +26,9 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
         .allows(&task.camera_settings())
         .map_err(|message| task.refuse(&["batches", "exposure_us"], format!("batches.{message}")))?;
     task.stage(&Correction::none(task.shape))?;
-    task.earlier_flat_field(lab.data)
-        .map_err(|error| task.refuse_stage("correct", format!("stage correct: flat_field: {error}")))?;
+    task.earlier_flat_field(lab.data).map_err(|error| {
+        task.refuse_stage("correct", "flat_field", format!("stage correct: flat_field: {error}"))
+    })?;
     let planes: Vec<u32> = plan.calibration.iter().map(|plane| plane.batches).collect();
     let passes = planes.iter().copied().chain([plan.count]);
     let still: u32 = [plan.dark_frames, plan.flat_frames].map(|frames| plan.dark_rounds(frames)).iter().sum();
