@@ -9,8 +9,10 @@
 //! `tests/tests/calibration.rs` shows the order of all steps on the simulated rig. No procedure of the daemon runs them
 //! yet.
 
+mod calibration;
 mod estimate;
 pub mod images;
 pub mod times;
 
+pub use calibration::BoardCalibration;
 pub use estimate::Estimate;
