@@ -2,6 +2,7 @@
 //! which chooses the plan's.
 
 mod batches;
+mod calibration;
 mod darks;
 mod film;
 pub mod lab;
@@ -27,15 +28,20 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
         (LabRig::Plane(rig), Procedure::Darks(own)) => {
             darks::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
         }
+        (LabRig::Plane(rig), Procedure::Calibration(own)) => {
+            calibration::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+        }
         (LabRig::Plane(rig), Procedure::Film(own)) => film::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
-        (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => {
-            Err(of_another_rig(&plan, "a plane rig runs plans of kind \"sweep\", \"film\" and \"darks\""))
-        }
-        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_)) => {
-            Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\""))
-        }
+        (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => Err(of_another_rig(
+            &plan,
+            "a plane rig runs plans of kind \"sweep\", \"film\", \"darks\" and \"calibration\"",
+        )),
+        (
+            LabRig::Dots(_),
+            Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_) | Procedure::Calibration(_),
+        ) => Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"")),
     }
 }
 
@@ -58,6 +64,10 @@ pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<F
             let size = (begun.shape.rows, begun.shape.columns);
             Ok(darks::foresee(lab, rig, &plan, own, begun.first_row, size)?)
         }
+        (LabRig::Plane(rig), Procedure::Calibration(own)) => {
+            let size = (begun.shape.rows, begun.shape.columns);
+            Ok(calibration::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+        }
         (_, Procedure::Film(_)) => Err(Unresumable::Past(
             "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
         )),
@@ -67,7 +77,7 @@ pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<F
         (_, Procedure::Response(_)) => {
             Err(Unresumable::Past("a run of kind \"response\" cannot be resumed: run the plan again"))
         }
-        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_)) => {
+        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_)) => {
             Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())
         }
     }

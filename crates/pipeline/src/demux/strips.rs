@@ -158,6 +158,7 @@ mod tests {
             let unit = Unit {
                 id: SettingsId { point: ordinal, attempt: 0 },
                 frames: 1,
+                delay_us: point.delay_us,
                 exposure_us: point.exposure_us,
                 delays_us: vec![point.delay_us],
                 last_exposure_ns: None,

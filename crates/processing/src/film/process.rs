@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ndarray::{Array2, Axis};
 use raysweep_config::FilmPlan;
 use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Stages, Unit, run_stages};
+use raysweep_pipeline::{Point, Stages, Unit, run_stages};
 use raysweep_session::Session;
 use raysweep_session::film::{CycleEntry, crc32};
 use raysweep_session::ledger::State;
@@ -76,8 +76,8 @@ fn make_transports(
             }
         };
         let images = frames.axis_iter(Axis(0)).zip(task.task.settings()).zip(&entry.delays_us).map(
-            |((frame, (ordinal, _)), &delay_us)| {
-                let unit = frame_unit(ordinal, entry, delay_us, frame.mapv(u32::from));
+            |((frame, (ordinal, point)), &delay_us)| {
+                let unit = frame_unit((ordinal, point), entry, delay_us, frame.mapv(u32::from));
                 let setting = Setting::new(delay_us, entry.exposure_us);
                 run_stages(stages, &unit).map(|image| (setting, Arc::new(image)))
             },
@@ -94,10 +94,11 @@ fn make_transports(
     Ok(problems)
 }
 
-fn frame_unit(ordinal: u32, entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
+fn frame_unit((ordinal, point): (u32, &Point), entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.cycle as u32 },
         frames: 1,
+        delay_us: point.delay_us,
         exposure_us: entry.exposure_us,
         delays_us: vec![delay_us],
         last_exposure_ns: None,

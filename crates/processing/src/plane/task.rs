@@ -159,6 +159,7 @@ pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Uni
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.attempt },
         frames: entry.frames,
+        delay_us: entry.delay_us,
         exposure_us: entry.exposure_us,
         delays_us: entry.delays_us.clone(),
         last_exposure_ns: None,
