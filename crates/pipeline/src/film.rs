@@ -116,6 +116,19 @@ impl Cycle {
 pub struct FilmSolver {
     demux: Demux,
     geometry: SweepGeometry,
+    /// Light per count of each pixel, `[t, s]`.
+    scale: Array2<f32>,
+    /// Which pixels have a scale.
+    measured: Array2<bool>,
+    /// By how much later than calibrated light arrives, as far as the film has shown.
+    late_us: f64,
+}
+
+/// The frames of a cycle, ready to be demultiplexed; see [`crate::SweepStack`].
+struct FilmStack {
+    settings: Vec<Setting>,
+    images: Array3<f32>,
+    valid: Option<Array3<bool>>,
 }
 
 impl FilmSolver {
@@ -131,7 +144,9 @@ impl FilmSolver {
         let demux = DemuxFold::new(options, schedule, geometry)?
             .demux()
             .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
-        Ok(Self { demux, geometry: geometry.clone() })
+        let white = geometry.white_of(&(0..geometry.height).collect::<Vec<_>>());
+        let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
+        Ok(Self { demux, geometry: geometry.clone(), scale, measured, late_us: 0.0 })
     }
 
     /// The relative rows that are estimated: first and last.
@@ -140,8 +155,8 @@ impl FilmSolver {
         (*reach.start(), *reach.end())
     }
 
-    /// The transport from one frame of each setting, in the settings' order. `dark` is the image `[t, s]` without
-    /// light. Stops early, with an error, soon after `go_on` returns false.
+    /// The transport from one frame of each setting, in the settings' order, with the delays and the exposure that the
+    /// camera states. `dark` is the image `[t, s]` without light. Stops early, with an error, soon after `go_on` returns false.
     ///
     /// It does not start from the previous cycle's transport: the noise of single frames determines which rows are 0,
     /// so this would save no steps (5.2 per pixel with and without), and the bits would depend on what was solved
@@ -155,26 +170,34 @@ impl FilmSolver {
         dark: &Array2<f32>,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
-        let (height, width) = (self.geometry.height, self.geometry.width);
-        let scale = (1.0 / self.geometry.white_dn) as f32;
-        let is_valid = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
-        let shape = (frames.len(), height, width);
-        let saturates = frames.iter().any(|(_, image)| image.iter().any(|&counts| !is_valid(counts)));
-        let mut valid = saturates.then(|| Array3::from_elem(shape, true));
-        let mut stack = Array3::zeros(shape);
-        for (index, (_, image)) in frames.iter().enumerate() {
-            if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&image.mapv(is_valid));
-            }
-            stack.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * scale));
-        }
-        let settings = frames.iter().map(|(setting, _)| setting.clone()).collect();
+        let FilmStack { settings, images, valid } = self.stack(frames, dark);
+        let settings = settings.iter().map(|setting| setting.earlier(self.late_us)).collect();
         self.demux
             .with_settings(settings)
             .and_then(|demux| {
-                demux.solve_while(stack.view(), valid.as_ref().map(|valid| valid.view()), go_on)
+                demux.solve_while(images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
             })
             .map_err(|error| NotSolved { of: "film", what: error.to_string() })
+    }
+
+    /// These frames as the model sees them.
+    fn stack(&self, frames: &[(Setting, Arc<Array2<f32>>)], dark: &Array2<f32>) -> FilmStack {
+        let is_unsaturated = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
+        let shape = (frames.len(), self.geometry.height, self.geometry.width);
+        let saturates =
+            || frames.iter().any(|(_, image)| image.iter().any(|&counts| !is_unsaturated(counts)));
+        let is_masked = self.measured.iter().any(|measured| !measured) || saturates();
+        let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
+        let mut images = Array3::zeros(shape);
+        for (index, (_, image)) in frames.iter().enumerate() {
+            if let Some(valid) = &mut valid {
+                valid.index_axis_mut(Axis(0), index).assign(&(image.mapv(is_unsaturated) & &self.measured));
+            }
+            images.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * &self.scale));
+        }
+        let setting =
+            |(setting, _): &(Setting, _)| self.geometry.setting(&setting.delays_us, setting.exposure_us);
+        FilmStack { settings: frames.iter().map(setting).collect(), images, valid }
     }
 }
 

@@ -7,6 +7,8 @@ use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::Contents;
 
+use crate::plane::KnownRig;
+
 /// Why a session cannot be processed.
 #[derive(Debug, thiserror::Error)]
 pub enum ProcessError {
@@ -105,6 +107,13 @@ impl Stored<'_> {
     /// When it cannot be read.
     pub(crate) fn plane_rig(&self) -> Result<RigFile, ProcessError> {
         self.rig(RigFile::parse)
+    }
+
+    /// What is known of the plane rig that the session was recorded on; `rig` is its file.
+    pub(crate) fn known<'a>(&self, rig: &'a RigFile) -> KnownRig<'a> {
+        let (shape, first_row) = (self.state.session.shape, self.state.session.first_row);
+        // Sessions hold no calibration yet.
+        KnownRig { file: rig, first_row, size: (shape.rows, shape.columns), calibration: None }
     }
 
     /// The rig file of a session of the dot rig.

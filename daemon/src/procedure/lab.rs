@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use raysweep_core::CameraCapabilities;
 use raysweep_processing::memory::available_bytes;
+use raysweep_processing::plane::KnownRig;
 use raysweep_proto::CheckReport;
 use raysweep_session::durable;
 
@@ -66,6 +67,12 @@ impl Lab<'_> {
     pub fn camera_at(&self, rate_hz: f64) -> CameraCapabilities {
         let exposure_us = *self.camera.exposure_us.start()..=1e6 / rate_hz;
         CameraCapabilities { exposure_us, ..self.camera.clone() }
+    }
+
+    /// What is known of a plane rig whose camera has `size` (rows, columns), when a plan is to run on it.
+    pub fn known<'a>(&self, rig: &'a Rig, first_row: usize, size: (usize, usize)) -> KnownRig<'a> {
+        // Nothing calibrates rigs yet.
+        KnownRig { file: &rig.file, first_row, size, calibration: None }
     }
 
     /// Rows and columns of the frames.

@@ -28,13 +28,14 @@ impl DemuxFold {
         let InStrips { images, strip_rows, take } = strips;
         let not_kept = self.not_kept.take().unwrap_or_default();
         let height = self.geometry.height;
-        let choices = self.choose(self.stack(self.read_to_choose_by(&not_kept, images, go_on)?)?)?;
+        let sampled = self.read_to_choose_by(&not_kept, images, go_on)?;
+        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?)?;
         let mut tally = Tally::default();
         for first_row in (0..height).step_by(strip_rows) {
             let rows = first_row..height.min(first_row + strip_rows);
             let halo_rows = choices.halo_rows();
             let around = first_row.saturating_sub(halo_rows)..height.min(rows.end + halo_rows);
-            let held = self.hold(around.start, read_rows(&not_kept, images, &around)?)?;
+            let held = self.hold(around.clone(), read_rows(&not_kept, images, &around)?)?;
             take(&choices.findings, self.strip(&choices, rows, held, &mut tally, go_on)?)?;
         }
         Ok(tally.summary(choices.findings))
@@ -110,6 +111,7 @@ mod tests {
             width: WIDTH,
             white_dn: 1000.0,
             saturation_dn: 3900.0,
+            calibration: None,
         }
     }
 

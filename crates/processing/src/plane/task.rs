@@ -12,6 +12,7 @@ use raysweep_pipeline::{
 };
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
+use raysweep_transport::plane::board::BoardCalibration;
 use serde_json::{Map, Value, json};
 
 use crate::saturation::saturation_dn;
@@ -30,21 +31,38 @@ pub struct PlaneTask {
     pub schedule: Schedule,
     /// The model that turns counts into light transport.
     pub geometry: SweepGeometry,
+    /// When the calibration was made that the model uses, as its file says it; `None` without one.
+    pub calibration_made: Option<String>,
     places: Places,
 }
 
+/// A plane rig, as far as it is known before a plan runs on it.
+#[derive(Debug, Clone)]
+pub struct KnownRig<'a> {
+    /// Its file.
+    pub file: &'a RigFile,
+    /// The projector row that camera row 0 sees, according to the file.
+    pub first_row: usize,
+    /// Rows and columns of the camera's images.
+    pub size: (usize, usize),
+    /// What a calibration of this rig says of it, if there is one.
+    pub calibration: Option<KnownCalibration>,
+}
+
+/// A calibration, and when it was made.
+#[derive(Debug, Clone)]
+pub struct KnownCalibration {
+    /// Date and time, as reports and metadata should give it.
+    pub made: String,
+    /// What it measured.
+    pub board: Arc<BoardCalibration>,
+}
+
 impl PlaneTask {
-    /// The points of `plan` on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
-    /// `first_row`.
-    pub fn new(
-        plan: &Plan,
-        schedule: Schedule,
-        max_jitter_us: f64,
-        rig: &RigFile,
-        first_row: usize,
-        size: (usize, usize),
-    ) -> Self {
-        let geometry = SweepGeometry {
+    /// The points of `plan` on a rig.
+    pub fn new(plan: &Plan, schedule: Schedule, max_jitter_us: f64, rig: &KnownRig<'_>) -> Self {
+        let &KnownRig { file: rig, first_row, size, ref calibration } = rig;
+        let stated = SweepGeometry {
             raster: rig.raster(),
             row_table_us: rig.projector.row_table.as_deref().map(Into::into),
             beam_sigma_rows: rig.projector.beam_sigma_rows,
@@ -57,9 +75,14 @@ impl PlaneTask {
             width: size.1,
             white_dn: rig.camera.white_dn(),
             saturation_dn: saturation_dn(rig.camera.pixel_format),
+            calibration: None,
+        };
+        let (geometry, calibration_made) = match calibration {
+            Some(KnownCalibration { made, board }) => (stated.calibrated(board.clone()), Some(made.clone())),
+            None => (stated, None),
         };
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
-        Self { name, stages, max_jitter_us, schedule, geometry, places }
+        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, places }
     }
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
@@ -118,19 +141,24 @@ impl PlaneTask {
     /// Metadata that all products share.
     pub(crate) fn metadata(&self) -> Map<String, Value> {
         let geometry = &self.geometry;
-        let entries = [
+        let mut entries = vec![
             ("units", json!("1 = a white pixel lit by its own projector row")),
             ("plan", json!(self.name)),
             (DEMUX, json!(self.demux_table().map(|stage| &stage.options))),
             ("row_time_us", json!(geometry.raster.row_time_us)),
-            ("row_table", json!(geometry.row_table_us.is_some())),
-            ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
             ("first_row", json!(geometry.first_row)),
             ("row_pitch", json!(geometry.row_pitch)),
             ("camera_row_time_us", json!(geometry.camera_row_time_us)),
-            ("white_dn", json!(geometry.white_dn)),
             ("software", json!(SOFTWARE)),
         ];
+        match &self.calibration_made {
+            Some(made) => entries.push(("calibration", json!({ "made": made }))),
+            None => entries.extend([
+                ("row_table", json!(geometry.row_table_us.is_some())),
+                ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
+                ("white_dn", json!(geometry.white_dn)),
+            ]),
+        }
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
 }

@@ -41,7 +41,7 @@ pub fn foresee(
     first_row: usize,
     size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
-    let darks = DarksTask::new(plan, own, &rig.file, first_row, size);
+    let darks = DarksTask::new(plan, own, &lab.known(rig, first_row, size));
     Ok(Foreseen {
         report: check::check(&darks, lab)?,
         kind: plan.procedure.kind(),

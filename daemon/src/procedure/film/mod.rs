@@ -48,7 +48,7 @@ pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Res
         return Err(plan.places.error(&["product"], message));
     }
     let first_row = rig.first_row(lab.camera);
-    let film = FilmTask::new(plan, own, &rig.file, first_row, lab.size());
+    let film = FilmTask::new(plan, own, &lab.known(rig, first_row, lab.size()));
     let stages = lab.probes.after(&film.stages()?);
     let shape = StackShape { contents: film.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {

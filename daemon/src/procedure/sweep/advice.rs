@@ -233,6 +233,7 @@ fn axis(values: &[f64]) -> String {
 mod tests {
     use raysweep_config::{Plan, Procedure};
     use raysweep_core::{PixelFormat, Readout};
+    use raysweep_processing::plane::KnownRig;
     use raysweep_transport::plane::Prior;
     use raysweep_transport::plane::advice::expected_error;
 
@@ -258,7 +259,8 @@ mod tests {
     fn task(rig: &RigFile, plan: &str) -> SweepTask {
         let plan = Plan::parse(plan).unwrap();
         let Procedure::Sweep(sweep) = plan.procedure.clone() else { panic!("{plan:?}") };
-        SweepTask::new(&plan, sweep, rig, 0, (720, 16))
+        let rig = KnownRig { file: rig, first_row: 0, size: (720, 16), calibration: None };
+        SweepTask::new(&plan, sweep, &rig)
     }
 
     fn advised(rig: &str, plan: &str, camera: &CameraCapabilities) -> Result<SweepAdvice, NoAdvice> {

@@ -51,7 +51,7 @@ pub fn foresee(
     first_row: usize,
     size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
-    let sweep = SweepTask::new(plan, own, &rig.file, first_row, size);
+    let sweep = SweepTask::new(plan, own, &lab.known(rig, first_row, size));
     let mut processing = sweep.processing()?;
     processing.stages = lab.probes.after(&processing.stages);
     let report = check::check(&sweep, &processing.products, lab)?;
