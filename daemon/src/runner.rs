@@ -282,9 +282,11 @@ impl Runner {
         }
         let ledger = session.resume().map_err(|error| storage(&error))?;
         let foreseen =
-            foresee_rest(&self.lab(), &plan, &ledger.state().session).map_err(|error| match error {
-                Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
-                Unresumable::Plan(error) => invalid_plan(&error),
+            foresee_rest(&self.lab(), &plan, session.dir(), &ledger.state().session).map_err(|error| {
+                match error {
+                    Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
+                    Unresumable::Plan(error) => invalid_plan(&error),
+                }
             })?;
         let begun = ledger.state().session.shape;
         if foreseen.shape != begun {

@@ -250,7 +250,7 @@ pub fn process(
     }
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let task = DarksTask::new(plan, darks, &stored.known(&rig));
+    let task = DarksTask::new(plan, darks, &stored.known(&rig)?);
     stored.check_contents(task.contents())?;
     let problems = make(session, state, &task, &rig)?;
     let (report, points) = (session.report_path(), shape.points());

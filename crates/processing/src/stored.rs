@@ -7,6 +7,7 @@ use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::Contents;
 
+use crate::calibration::KeptCalibration;
 use crate::plane::KnownRig;
 
 /// Why a session cannot be processed.
@@ -110,10 +111,15 @@ impl Stored<'_> {
     }
 
     /// What is known of the plane rig that the session was recorded on; `rig` is its file.
-    pub(crate) fn known<'a>(&self, rig: &'a RigFile) -> KnownRig<'a> {
+    ///
+    /// # Errors
+    /// When the session's calibration cannot be read.
+    pub(crate) fn known<'a>(&self, rig: &'a RigFile) -> Result<KnownRig<'a>, ProcessError> {
         let (shape, first_row) = (self.state.session.shape, self.state.session.first_row);
-        // Sessions hold no calibration yet.
-        KnownRig { file: rig, first_row, size: (shape.rows, shape.columns), calibration: None }
+        let refused = |error: ConfigError| ProcessError::Config(error.to_string());
+        let kept = KeptCalibration::of(rig, self.session.dir(), None).map_err(refused)?;
+        let calibration = kept.as_ref().map(KeptCalibration::known).transpose().map_err(refused)?;
+        Ok(KnownRig { file: rig, first_row, size: (shape.rows, shape.columns), calibration })
     }
 
     /// The rig file of a session of the dot rig.

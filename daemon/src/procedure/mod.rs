@@ -9,10 +9,13 @@ pub mod lab;
 mod response;
 mod sweep;
 
+use std::path::Path;
+
 use raysweep_config::{ConfigError, Plan, Procedure};
+use raysweep_processing::calibration::current_in;
 use raysweep_session::ledger::SessionEntry;
 
-use self::lab::{Lab, LabRig};
+use self::lab::{Lab, LabRig, RigOfRun};
 use crate::run::life::Foreseen;
 
 /// Predicts a plan's run on the lab's rig.
@@ -21,17 +24,20 @@ use crate::run::life::Foreseen;
 /// For a plan that cannot be run on it, with the positions in the text.
 pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse(text)?;
+    let in_use = current_in(lab.data);
     match (lab.rig, plan.procedure.clone()) {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
-            sweep::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+            sweep::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
         }
         (LabRig::Plane(rig), Procedure::Darks(own)) => {
-            darks::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+            darks::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
         }
         (LabRig::Plane(rig), Procedure::Calibration(own)) => {
-            calibration::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+            calibration::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
         }
-        (LabRig::Plane(rig), Procedure::Film(own)) => film::foresee(lab, rig, &plan, own),
+        (LabRig::Plane(rig), Procedure::Film(own)) => {
+            film::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
+        }
         (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
         (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => Err(of_another_rig(
@@ -49,24 +55,28 @@ fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {
     plan.places.error(&["kind"], format!("kind = \"{}\": {what}", plan.procedure.kind()))
 }
 
-/// Predicts the rest of a session that was begun with this plan.
+/// Predicts the rest of a session, given by its folder, that was begun with this plan.
 ///
 /// # Errors
 /// If nothing can be resumed, or the plan cannot be run on this rig.
-pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<Foreseen, Unresumable> {
+pub fn foresee_rest(
+    lab: &Lab<'_>,
+    text: &str,
+    session: &Path,
+    begun: &SessionEntry,
+) -> Result<Foreseen, Unresumable> {
     let plan = Plan::parse(text)?;
     match (lab.rig, plan.procedure.clone()) {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
-            let size = (begun.shape.rows, begun.shape.columns);
-            Ok(sweep::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+            // As it was when the session began.
+            let rig = RigOfRun::of_begun(rig, begun).calibrated(lab, session)?;
+            Ok(sweep::foresee(lab, rig, &plan, own)?)
         }
         (LabRig::Plane(rig), Procedure::Darks(own)) => {
-            let size = (begun.shape.rows, begun.shape.columns);
-            Ok(darks::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+            Ok(darks::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
         (LabRig::Plane(rig), Procedure::Calibration(own)) => {
-            let size = (begun.shape.rows, begun.shape.columns);
-            Ok(calibration::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+            Ok(calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
         (_, Procedure::Film(_)) => Err(Unresumable::Past(
             "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",

@@ -17,6 +17,8 @@ use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::plane::KnownCalibration;
+
 /// Version of the files' format.
 pub(super) const SCHEMA: u32 = 1;
 /// Older calibrations cause a warning.
@@ -301,11 +303,20 @@ impl KeptCalibration {
         old.into_iter().chain(changed).collect()
     }
 
-    /// The calibration as sweeps and films use it.
+    /// The calibration as sweeps and films use it, with its date.
     ///
     /// # Errors
     /// When the arrays hold no usable response.
-    pub fn board(&self) -> Result<Arc<BoardCalibration>, ConfigError> {
+    pub fn known(&self) -> Result<KnownCalibration, ConfigError> {
+        let made = self.header.made.strftime("%Y-%m-%d %H:%M UTC").to_string();
+        Ok(KnownCalibration { made, board: self.board()? })
+    }
+
+    /// The calibration as the model uses it.
+    ///
+    /// # Errors
+    /// When the arrays hold no usable response.
+    fn board(&self) -> Result<Arc<BoardCalibration>, ConfigError> {
         let Timing { camera_row_time_us, exposure_offset_us, latency_sd_us, .. } = self.header.timing;
         let [white_dn, white_sd] = self.header.light.white_dn;
         let place_sd: Vec<f32> = self.arrays.place_sd.iter().copied().filter(|sd| sd.is_finite()).collect();

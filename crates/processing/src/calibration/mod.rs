@@ -19,7 +19,7 @@ use self::file::{CalibrationArrays, Light, Pair, SCHEMA, Timing};
 pub use self::file::{CalibrationHeader, KeptCalibration, ValidFor, current_in};
 pub use self::images::{BoardPixels, CalibrationError, StoredImages};
 pub use self::task::{CalibrationTask, Purpose, View};
-use crate::plane::manifest;
+use crate::plane::{KnownRig, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
 /// Latency that is known no better than this is said to be uncertain.
@@ -173,7 +173,9 @@ pub fn process(
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
     let size = (shape.rows, shape.columns);
-    let task = CalibrationTask::new(plan, calibration, &rig, state.session.first_row, size);
+    let first_row = state.session.first_row;
+    let known = KnownRig { file: &rig, first_row, size, calibration: None };
+    let task = CalibrationTask::new(plan, calibration, &known);
     stored.check_contents(task.contents())?;
     let before = KeptCalibration::read(session.dir()).map_err(ProcessError::Config)?;
     let refused = |error: CalibrationError| ProcessError::Config(error.to_string());

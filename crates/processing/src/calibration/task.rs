@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
+use raysweep_config::Plan;
 use raysweep_config::plan::CalibrationPlan;
-use raysweep_config::{Plan, RigFile};
 use raysweep_core::{Pattern, Raster, Shutter, Subject};
 use raysweep_pipeline::{Point, PointRole, Schedule};
 use raysweep_session::ledger::PointEntry;
@@ -14,7 +14,7 @@ use raysweep_transport::plane::board::times::{
     sweep_settings,
 };
 
-use crate::plane::PlaneTask;
+use crate::plane::{KnownRig, PlaneTask};
 
 /// What an image shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -81,13 +81,8 @@ pub struct CalibrationTask {
 
 impl CalibrationTask {
     /// A calibration on a rig; see [`PlaneTask::new`].
-    pub fn new(
-        plan: &Plan,
-        calibration: CalibrationPlan,
-        rig: &RigFile,
-        first_row: usize,
-        size: (usize, usize),
-    ) -> Self {
+    pub fn new(plan: &Plan, calibration: CalibrationPlan, known: &KnownRig<'_>) -> Self {
+        let (rig, size) = (known.file, known.size);
         let purposes = purposes(&calibration, rig.projector.rows);
         let raster = rig.raster();
         let lag_us = size.0 as f64 / 2.0
@@ -113,7 +108,7 @@ impl CalibrationTask {
             Point { role, delay_us, exposure_us, frames }
         };
         let schedule = Schedule { points: purposes.iter().map(&mut point).collect() };
-        let task = PlaneTask::new(plan, schedule, calibration.max_jitter_us, rig, first_row, size);
+        let task = PlaneTask::new(plan, schedule, calibration.max_jitter_us, known);
         Self { calibration, task: Arc::new(task), purposes }
     }
 

@@ -25,7 +25,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let task = FilmTask::new(plan, film, &stored.known(&rig));
+    let task = FilmTask::new(plan, film, &stored.known(&rig)?);
     stored.check_contents(task.contents())?;
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {

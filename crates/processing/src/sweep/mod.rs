@@ -37,7 +37,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let sweep = SweepTask::new(plan, sweep, &stored.known(&rig));
+    let sweep = SweepTask::new(plan, sweep, &stored.known(&rig)?);
     stored.check_contents(sweep.contents())?;
     let task = &*sweep.task;
     let mut processing = sweep.processing().map_err(|error| stored.in_plan(&error))?;

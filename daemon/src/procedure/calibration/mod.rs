@@ -18,7 +18,7 @@ use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
 
 use crate::plane::{Opened, Passes, PointSink, Taken, missing};
-use crate::procedure::lab::Lab;
+use crate::procedure::lab::{Lab, RigOfRun};
 use crate::rig::Rig;
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
@@ -35,29 +35,26 @@ struct CalibrationRun {
     camera: String,
 }
 
-/// Predicts a calibration of a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
-/// `first_row`.
+/// Predicts a calibration.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
 pub fn foresee(
     lab: &Lab<'_>,
-    rig: &Arc<Rig>,
+    rig: RigOfRun<'_>,
     plan: &Plan,
     own: CalibrationPlan,
-    first_row: usize,
-    size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
-    let calibration = CalibrationTask::new(plan, own, &rig.file, first_row, size);
+    let calibration = CalibrationTask::new(plan, own, &rig.known()?);
     Ok(Foreseen {
         report: check::check(&calibration, lab)?,
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
-        shape: StackShape { contents: calibration.contents(), rows: size.0, columns: size.1 },
-        first_row,
+        shape: StackShape { contents: calibration.contents(), rows: rig.size.0, columns: rig.size.1 },
+        first_row: rig.first_row,
         instead: "take fewer frames",
         procedure: Box::new(CalibrationRun {
-            rig: rig.clone(),
+            rig: rig.rig.clone(),
             calibration,
             camera: lab.camera.model.clone(),
         }),
