@@ -9,12 +9,13 @@ use std::thread::{self, JoinHandle};
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
 use raysweep_pipeline::message_of;
+use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
 use raysweep_proto::{
-    CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
-    Started, Status,
+    CalibrationInfo, CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState,
+    SessionInfo, Started, Status,
 };
-use raysweep_session::Session;
 use raysweep_session::ledger::{EndState, Ledger, SessionEntry};
+use raysweep_session::{Session, SessionSummary};
 use tokio::sync::broadcast;
 
 use crate::control::Control;
@@ -30,6 +31,9 @@ use crate::run::orders::{Order, Orders};
 
 /// Frame rate at which a dot rig's camera is opened to check that it is present; each run opens it at its own rate.
 const LEAST_FRAME_RATE_HZ: f64 = 100.0;
+
+/// The procedure whose sessions hold calibrations.
+const CALIBRATION: &str = "calibration";
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
@@ -360,6 +364,40 @@ impl Control for Runner {
             state: "unreadable".into(),
         });
         Ok(readable.chain(unreadable).collect())
+    }
+
+    fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError> {
+        let listing = raysweep_session::list(&self.data).map_err(|error| storage(&error))?;
+        let in_use = CalibrationHeader::read(&current_in(&self.data)).ok().flatten();
+        let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
+        let info = |session: SessionSummary| {
+            let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let (header, problem) = match CalibrationHeader::read(&session.dir) {
+                Ok(header @ Some(_)) => (header, None),
+                Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
+                Err(problem) => (None, Some(problem)),
+            };
+            CalibrationInfo {
+                session: session.dir,
+                made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
+                camera: header.map_or_else(String::new, |header| header.valid_for.camera),
+                in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
+                problem,
+            }
+        };
+        Ok(measured.map(info).collect())
+    }
+
+    fn use_calibration(&self, session: &Path) -> Result<(), RpcError> {
+        let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
+        let folder = self.data.join(session);
+        let kept = KeptCalibration::read(&folder).map_err(no_session)?.ok_or_else(|| {
+            no_session(format!(
+                "{} has no calibration.toml: give a session of kind \"calibration\" whose run succeeded; `raysweep calibration list` lists them",
+                folder.display()
+            ))
+        })?;
+        kept.use_in(&self.data).map_err(|error| storage(&error))
     }
 
     fn events(&self) -> broadcast::Receiver<Event> {

@@ -12,8 +12,8 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::{
-    CheckParams, CheckReport, Description, Empty, Event, Id, Incoming, Method, Outcome, Request,
-    ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
+    CalibrationInfo, CheckParams, CheckReport, Description, Empty, Event, Id, Incoming, Method, Outcome,
+    Request, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status, UseCalibrationParams,
 };
 
 /// Maximum time for an answer. No call waits for a run, so a longer wait means that the daemon hangs.
@@ -188,6 +188,23 @@ impl Client {
     /// As [`Client::describe`].
     pub fn sessions(&mut self) -> Result<Vec<SessionInfo>, ClientError> {
         self.call(Method::Sessions, &Empty {})
+    }
+
+    /// Lists the calibrations in the daemon's data folder, oldest first.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn calibrations(&mut self) -> Result<Vec<CalibrationInfo>, ClientError> {
+        self.call(Method::Calibrations, &Empty {})
+    }
+
+    /// Makes a session's calibration the one that later runs use.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn use_calibration(&mut self, session: impl Into<PathBuf>) -> Result<(), ClientError> {
+        let params = UseCalibrationParams { session: session.into() };
+        self.call(Method::UseCalibration, &params).map(|Empty {}| ())
     }
 
     /// Streams all events from now on. The connection then carries nothing else; open another one for calls.

@@ -31,6 +31,8 @@ pub(super) enum CommandFailure {
     NoLiveImage,
     #[error(transparent)]
     Live(#[from] LiveError),
+    #[error("{0}")]
+    Calibration(String),
     #[error(transparent)]
     Process(#[from] ProcessError),
     #[cfg(feature = "aravis")]
@@ -125,7 +127,7 @@ impl CommandFailure {
             },
             Self::Client(_) => Exit::Unreachable,
             Self::Plan(_) => Exit::Refused,
-            Self::File { .. } | Self::Process(ProcessError::Product(_)) => Exit::Usage,
+            Self::File { .. } | Self::Calibration(_) | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             #[cfg(feature = "aravis")]
             Self::WhichCamera(_) => Exit::Usage,
             #[cfg(feature = "aravis")]

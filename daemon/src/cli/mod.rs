@@ -1,5 +1,6 @@
 //! The command line `raysweep`: what it takes, whom it asks, how it ends.
 
+mod calibration;
 mod devices;
 mod exit;
 mod failure;
@@ -21,6 +22,7 @@ use raysweep_drivers::mirror;
 use raysweep_proto::{Client, ClientError, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started};
 use serde_json::json;
 
+use self::calibration::CalibrationCommand;
 use self::devices::CameraCommand;
 use self::exit::Exit;
 use self::failure::CommandFailure;
@@ -73,6 +75,17 @@ enum Command {
     },
     /// Run a plan and follow the run; Ctrl-C cancels it, a second Ctrl-C exits without waiting for its end
     Run(RunArguments),
+    /// Calibrate the rig from a white board, and follow the run as `run` does
+    Calibrate {
+        /// A plan of kind "calibration" [default: one with nothing but its kind]
+        #[arg(long, value_name = "FILE")]
+        plan: Option<PathBuf>,
+        #[command(flatten)]
+        about: RunDescription,
+    },
+    /// Show, list, choose and compare calibrations
+    #[command(subcommand)]
+    Calibration(CalibrationCommand),
     /// Acquire the missing points of a session, and follow the run as `run` does
     Resume {
         /// The session's folder, or its name within the daemon's data folder
@@ -140,6 +153,12 @@ enum Command {
 struct RunArguments {
     /// The plan, a TOML file
     plan: PathBuf,
+    #[command(flatten)]
+    about: RunDescription,
+}
+
+#[derive(Debug, clap::Args)]
+struct RunDescription {
     /// Return at once instead of following the run
     #[arg(long)]
     detach: bool,
@@ -183,14 +202,16 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                 connect()?.check(&text).map_err(|error| CommandFailure::of_plan(error, &plan, &text))?;
             printer.print(&report, show::check)?;
         }
-        Command::Run(RunArguments { plan, detach, operator, sample, note, tags }) => {
-            let text = read_plan(&plan)?;
-            let params = RunParams { plan: text.clone(), operator, sample, note, tags };
-            let begin = |client: &mut Client| {
-                client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &text))
-            };
-            return begin_run(&socket, printer, detach, begin);
+        Command::Run(RunArguments { plan, about }) => {
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
         }
+        Command::Calibrate { plan: Some(plan), about } => {
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
+        }
+        Command::Calibrate { plan: None, about } => {
+            return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about);
+        }
+        Command::Calibration(command) => return calibration::calibration(&socket, command, printer),
         Command::Resume { session, detach } => {
             // The daemon's working directory is another: what exists here is named in full.
             let session = fs::canonicalize(&session).unwrap_or(session);
@@ -243,6 +264,21 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         }
     }
     Ok(Exit::Done)
+}
+
+/// Runs a plan, given by its path and its text.
+fn run(
+    socket: &Path,
+    printer: Printer,
+    path: &Path,
+    text: &str,
+    about: RunDescription,
+) -> Result<Exit, CommandFailure> {
+    let RunDescription { detach, operator, sample, note, tags } = about;
+    let params = RunParams { plan: text.to_owned(), operator, sample, note, tags };
+    begin_run(socket, printer, detach, |client| {
+        client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
+    })
 }
 
 /// Begins a run and follows it, unless it is to be left alone.

@@ -240,19 +240,7 @@ impl KeptCalibration {
     /// # Errors
     /// Says which file is damaged, and how.
     pub fn read(folder: &Path) -> Result<Option<Self>, String> {
-        let path = folder.join("calibration.toml");
-        let in_file = |why: String| format!("{}: {why}", path.display());
-        let text = match File::open(&path) {
-            Ok(file) => limited(file, MAX_HEADER_BYTES).map_err(in_file)?,
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(in_file(error.to_string())),
-        };
-        let text = String::from_utf8(text).map_err(|error| in_file(error.to_string()))?;
-        let header: CalibrationHeader = toml::from_str(&text).map_err(|error| in_file(error.to_string()))?;
-        if header.schema != SCHEMA {
-            let schema = header.schema;
-            return Err(in_file(format!("schema = {schema}: this version reads {SCHEMA}; calibrate again")));
-        }
+        let Some(header) = CalibrationHeader::read(folder)? else { return Ok(None) };
         let path = folder.join("calibration.npz");
         let in_file = |why: String| format!("{}: {why}", path.display());
         let file = File::open(&path).map_err(|error| in_file(error.to_string()))?;
@@ -337,6 +325,27 @@ impl KeptCalibration {
 }
 
 impl CalibrationHeader {
+    /// Reads the header alone; `None` if the folder has none.
+    ///
+    /// # Errors
+    /// Says how the file is damaged.
+    pub fn read(folder: &Path) -> Result<Option<Self>, String> {
+        let path = folder.join("calibration.toml");
+        let in_file = |why: String| format!("{}: {why}", path.display());
+        let text = match File::open(&path) {
+            Ok(file) => limited(file, MAX_HEADER_BYTES).map_err(in_file)?,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(in_file(error.to_string())),
+        };
+        let text = String::from_utf8(text).map_err(|error| in_file(error.to_string()))?;
+        let header: Self = toml::from_str(&text).map_err(|error| in_file(error.to_string()))?;
+        if header.schema != SCHEMA {
+            let schema = header.schema;
+            return Err(in_file(format!("schema = {schema}: this version reads {SCHEMA}; calibrate again")));
+        }
+        Ok(Some(header))
+    }
+
     /// The largest `calibration.npz` that belongs to this header.
     fn most_bytes(&self) -> u64 {
         let [rows, columns] = self.valid_for.size.map(|side| side as u64);

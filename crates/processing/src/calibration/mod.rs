@@ -15,8 +15,8 @@ use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::RowTimes;
 
-use self::file::{CalibrationArrays, Light, Pair, SCHEMA, Timing};
-pub use self::file::{CalibrationHeader, KeptCalibration, ValidFor, current_in};
+use self::file::{CalibrationArrays, Light, SCHEMA, Timing};
+pub use self::file::{CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in};
 pub use self::images::{BoardPixels, CalibrationError, StoredImages};
 pub use self::task::{CalibrationTask, Purpose, View};
 use crate::plane::{KnownRig, manifest};
