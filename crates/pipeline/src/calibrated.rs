@@ -54,8 +54,9 @@ impl CalibrationDrift {
                 let than = if late_us < 0.0 { "earlier" } else { "later" };
                 let comes = format!("light comes {:.2} us {than} than calibrated", late_us.abs());
                 if late_us.abs() > ADOPTED_US {
-                    let warning = "which is not believed: the rig has moved: calibrate again";
-                    self.warnings.push(format!("{comes}, {warning}"));
+                    self.warnings.push(format!(
+                        "{comes}, too much to be corrected: the times of the calibration are kept, but the rig has moved: calibrate again"
+                    ));
                 } else {
                     self.late_us = late_us;
                     if late_us.abs() > NEAR_US {
