@@ -14,7 +14,7 @@ const NEAR_ROWS: f64 = 0.1;
 
 /// How a rig has changed since its calibration.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Drift {
+pub struct CalibrationDrift {
     /// By how much later than calibrated light arrives; 0 if it was not found, or is not to be believed.
     pub late_us: f64,
     /// Median distance of direct light from its place, in projector rows; `None` if it was not found.
@@ -36,9 +36,9 @@ pub(crate) struct Images<'a> {
     pub valid: Option<ArrayView3<'a, bool>>,
 }
 
-impl Drift {
+impl CalibrationDrift {
     /// Finds it from images with these settings.
-    pub fn of(timing: &RowTiming, settings: &[Setting], images: &Images<'_>) -> Self {
+    pub(crate) fn of(timing: &RowTiming, settings: &[Setting], images: &Images<'_>) -> Self {
         let mut drift = Self { late_us: 0.0, u0_rows: None, remarks: Vec::new(), warnings: Vec::new() };
         drift.find_latency(timing, settings, images);
         drift.find_place(timing, settings, images);
@@ -54,8 +54,9 @@ impl Drift {
                 let than = if late_us < 0.0 { "earlier" } else { "later" };
                 let comes = format!("light comes {:.2} us {than} than calibrated", late_us.abs());
                 if late_us.abs() > ADOPTED_US {
-                    let warning = "which is not believed: the rig has moved: calibrate again";
-                    self.warnings.push(format!("{comes}, {warning}"));
+                    self.warnings.push(format!(
+                        "{comes}, too much to be corrected: the times of the calibration are kept, but the rig has moved: calibrate again"
+                    ));
                 } else {
                     self.late_us = late_us;
                     if late_us.abs() > NEAR_US {

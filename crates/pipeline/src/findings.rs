@@ -167,7 +167,7 @@ impl Findings {
     fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize]) {
         let valid = stack.valid.as_ref().map(|valid| valid.view());
         let images = calibrated::Images { rows, images: stack.images.view(), valid };
-        let drift = calibrated::Drift::of(&stack.timing, &stack.settings, &images);
+        let drift = calibrated::CalibrationDrift::of(&stack.timing, &stack.settings, &images);
         stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(drift.late_us));
         self.late_us = Some(drift.late_us);
         self.u0_rows = drift.u0_rows.unwrap_or(0.0);

@@ -167,7 +167,7 @@ impl SweepGeometry {
 
     /// Counts above black that a white pixel collects in the time of one projector row, `[t, s]` of these camera rows;
     /// infinite where a calibration has not measured it, so that no light is found there.
-    pub(crate) fn white_of(&self, rows: &[usize]) -> Array2<f64> {
+    pub fn white_of(&self, rows: &[usize]) -> Array2<f64> {
         let Some(calibration) = &self.calibration else {
             return Array2::from_elem((rows.len(), self.width), self.white_dn);
         };

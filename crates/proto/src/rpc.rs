@@ -206,7 +206,7 @@ pub enum Incoming {
     /// The answer to a request.
     Response(Response),
     /// An event.
-    Event(EventNotice),
+    Event(Box<EventNotice>),
 }
 
 #[cfg(test)]

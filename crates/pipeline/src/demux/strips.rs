@@ -85,6 +85,8 @@ fn not_read(what: String) -> NotSolved {
 mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
+    use raysweep_transport::plane::board::{BoardCalibration, Estimate};
+    use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS};
 
     use super::*;
     use crate::demux::{DemuxOptions, Solved};
@@ -171,11 +173,41 @@ mod tests {
         }
     }
 
+    /// The same rig, calibrated: its white level falls off to one side, and a corner is not lit.
+    fn calibrated() -> SweepGeometry {
+        let stated = geometry();
+        let timing = stated.timing().unwrap();
+        let places = Array2::from_shape_fn((HEIGHT, WIDTH), |(t, s)| (5 + t) as f32 + 0.03 * s as f32);
+        let mut shares = [0.0; RESPONSE_ROWS];
+        shares[7] = 1.0;
+        let mut white_dn = Array2::from_shape_fn((HEIGHT, WIDTH), |(t, s)| 1000.0 - (t + 10 * s) as f32);
+        white_dn[[HEIGHT - 1, WIDTH - 1]] = f32::NAN;
+        stated.calibrated(Arc::new(BoardCalibration {
+            row_starts_us: timing.row_starts_us().to_vec(),
+            camera_row_time_us: Estimate { value: 20.0, sd: 0.0 },
+            exposure_offset_us: Estimate { value: 0.5, sd: 0.0 },
+            latency_sd_us: 0.0,
+            response: PixelResponse::with_beam(places, &shares).unwrap(),
+            place_sd_rows: 0.0,
+            white_dn,
+            white_relative_sd: 0.0,
+        }))
+    }
+
     #[test]
     fn strips_that_do_not_divide_the_image_have_the_bits_of_the_whole() {
+        has_the_bits_of_the_whole(&geometry());
+    }
+
+    #[test]
+    fn so_have_strips_of_a_calibrated_rig() {
+        has_the_bits_of_the_whole(&calibrated());
+    }
+
+    fn has_the_bits_of_the_whole(geometry: &SweepGeometry) {
         let points = schedule().points;
         let images = Kept(points.iter().enumerate().map(|(ordinal, point)| image(ordinal, point)).collect());
-        let fold = || DemuxFold::new(DemuxOptions::default(), &schedule(), &geometry()).unwrap();
+        let fold = || DemuxFold::new(DemuxOptions::default(), &schedule(), geometry).unwrap();
 
         let mut whole = fold();
         push_all(&mut whole, &images);

@@ -50,7 +50,7 @@ fn make_transports(
     state: &State,
     stages: &Stages,
 ) -> raysweep_session::Result<Vec<String>> {
-    let solver = match task.solver() {
+    let mut solver = match task.solver() {
         Ok(solver) => solver,
         Err(error) => return Ok(vec![error.to_string()]),
     };
@@ -82,12 +82,22 @@ fn make_transports(
                 run_stages(stages, &unit).map(|image| (setting, Arc::new(image)))
             },
         );
-        let solved = images
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(|error| error.to_string())
-            .and_then(|images| solver.solve(&images, &dark, &|| true).map_err(|error| error.to_string()));
+        let solved =
+            images.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string()).and_then(|images| {
+                match solver.solve(&images, &dark, &|| true) {
+                    Ok(transport) => Ok((transport, images)),
+                    Err(error) => Err(error.to_string()),
+                }
+            });
         match solved {
-            Ok(transport) => transports.write(entry.cycle, transport.t.view())?,
+            Ok((transport, images)) => {
+                transports.write(entry.cycle, transport.t.view())?;
+                let drift = solver.learn(&images, &dark);
+                // Otherwise the ledger says what the film itself found.
+                problems.extend(
+                    drift.filter(|_| state.film.is_none()).into_iter().flat_map(|drift| drift.warnings),
+                );
+            }
             Err(error) => problems.push(format!("cycle {}: {error}", entry.cycle)),
         }
     }

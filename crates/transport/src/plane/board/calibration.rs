@@ -8,7 +8,8 @@ use super::Estimate;
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoardCalibration {
     /// Start of each projector row and end of the last, after the trigger edge, for a rolling exposure that opens the
-    /// camera's row 0 at its trigger delay: the projector's latency less the camera's.
+    /// camera's row 0 at its trigger delay and stated latency: the projector's latency less what the camera's is more
+    /// than stated.
     pub row_starts_us: Vec<f64>,
     /// Time from one row of the camera to the next.
     pub camera_row_time_us: Estimate,
