@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use raysweep_config::ConfigError;
-use raysweep_core::CameraCapabilities;
+use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
 use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
 use raysweep_proto::{
@@ -23,7 +23,7 @@ use crate::live::{LiveFile, Outlet};
 use crate::mirror;
 use crate::probes::Probes;
 use crate::procedure::lab::{Lab, LabRig};
-use crate::procedure::{Unresumable, foresee, foresee_rest};
+use crate::procedure::{Unresumable, foresee, foresee_rest, past};
 use crate::rig::{AnyRig, RigError};
 use crate::run::board::{StatusBoard, WrongState};
 use crate::run::life::{Foreseen, Run, conduct};
@@ -144,9 +144,18 @@ impl Runner {
         let current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         let state = self.board.status().state;
         let Some(current) = current.as_ref().filter(|_| from.contains(&state)) else {
-            let what = match state {
-                RunState::Idle | RunState::Faulted => "no run in progress".to_owned(),
-                _ => format!("not possible while the daemon is {}", name_of(state)),
+            let what = match (state, order) {
+                (RunState::Idle | RunState::Faulted, _) => "no run in progress".to_owned(),
+                (RunState::Paused, Order::Pause) => {
+                    "the run is already paused; `raysweep continue` goes on".to_owned()
+                }
+                (RunState::Running, Order::Go) => "the run is not paused, so it goes on anyway".to_owned(),
+                (RunState::Draining, _) => {
+                    "the run is ending: wait for its end, or `raysweep cancel`".to_owned()
+                }
+                (_, _) => {
+                    "the run is still being prepared: wait until it is running, or `raysweep cancel`".to_owned()
+                }
             };
             return Err(RpcError::new(ErrorCode::NotRunning, what));
         };
@@ -228,18 +237,18 @@ impl Runner {
     fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
-                "the session needs {} MB, but {} has only {} MB free: free some space or give the daemon another --data",
-                report.disk_bytes / 1_000_000,
+                "the session needs {}, but {} has only {} free: free some space or give the daemon another --data",
+                Size(report.disk_bytes),
                 self.data.display(),
-                report.disk_free_bytes / 1_000_000
+                Size(report.disk_free_bytes)
             );
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
         if report.memory_bytes > report.memory_free_bytes {
             let what = format!(
-                "the run needs {} MB of memory, but only {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
-                report.memory_bytes / 1_000_000,
-                report.memory_free_bytes / 1_000_000
+                "the run needs {} of memory, but only {} may be used: {instead}, give the daemon more --memory, or take a larger machine",
+                Size(report.memory_bytes),
+                Size(report.memory_free_bytes)
             );
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
@@ -274,9 +283,13 @@ impl Runner {
             Session::open(&self.data.join(&params.session)).map_err(|error| no_session(error.to_string()))?;
         let read = |path: PathBuf| {
             std::fs::read_to_string(&path)
-                .map_err(|error| no_session(format!("cannot read {}: {error}", path.display())))
+                .map_err(|error| no_session(format!("cannot read {}: {}", path.display(), io_text(&error))))
         };
         let plan = read(session.plan_path())?;
+        // Another rig file would not help.
+        if let Some(what) = past(&plan) {
+            return Err(no_session(format!("{}: {what}", session.dir().display())));
+        }
         if read(session.rig_path())? != self.rig.text() {
             return Err(no_session(format!(
                 "{} was begun with another rig file than the daemon's: start the daemon with {}",
@@ -289,7 +302,10 @@ impl Runner {
             foresee_rest(&self.lab(), &plan, session.dir(), &ledger.state().session).map_err(|error| {
                 match error {
                     Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
-                    Unresumable::Plan(error) => invalid_plan(&error),
+                    Unresumable::Plan(error) => RpcError {
+                        message: error.render(&session.plan_path().display().to_string(), &plan),
+                        ..invalid_plan(&error)
+                    },
                 }
             })?;
         let begun = ledger.state().session.shape;
@@ -342,6 +358,14 @@ impl Control for Runner {
     }
 
     fn arm_light(&self) -> Result<(), RpcError> {
+        let is_without_mirror = match &self.rig {
+            LabRig::Plane(_) => true,
+            LabRig::Dots(rig) => rig.file.mirror.is_none(),
+        };
+        if is_without_mirror {
+            let what = "this rig has no mirror: there is no light to permit";
+            return Err(RpcError::new(ErrorCode::MethodNotFound, what));
+        }
         mirror::arm_light(&self.data)
     }
 

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::unistd::{Gid, Group};
+use raysweep_core::io_text;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
@@ -41,7 +42,7 @@ pub enum ClientError {
         source: io::Error,
     },
     /// Connecting failed for another reason.
-    #[error("cannot connect to {}: {source}", path.display())]
+    #[error("cannot connect to {}: {}", path.display(), io_text(source))]
     Connect {
         /// The socket.
         path: PathBuf,
@@ -49,7 +50,7 @@ pub enum ClientError {
         source: io::Error,
     },
     /// The connection broke.
-    #[error("the connection to {} was lost: {source}; check whether raysweepd still runs", path.display())]
+    #[error("the connection to {} was lost: {}; check whether raysweepd still runs", path.display(), io_text(source))]
     Lost {
         /// The socket.
         path: PathBuf,

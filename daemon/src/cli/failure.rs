@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use miette::{Diagnostic, LabeledSpan, NamedSource};
+use raysweep_core::io_text;
 #[cfg(feature = "aravis")]
 use raysweep_core::{DeviceError, DeviceErrorKind};
 use raysweep_drivers::mirror::ParkError;
@@ -21,9 +22,9 @@ pub(super) enum CommandFailure {
     Client(#[from] ClientError),
     #[error("{0}")]
     Plan(Box<PlanProblem>),
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {}", path.display(), io_text(source))]
     File { path: PathBuf, source: io::Error },
-    #[error("cannot write {}: {source}", path.display())]
+    #[error("cannot write {}: {}", path.display(), io_text(source))]
     Write { path: PathBuf, source: io::Error },
     #[error(
         "no live image yet: a run publishes its first after some points; `raysweep preview --follow` waits for it"

@@ -18,7 +18,7 @@ use std::process::ExitCode;
 
 use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
-use raysweep_drivers::mirror;
+use raysweep_drivers::mirror::{self, Parked};
 use raysweep_proto::{Client, ClientError, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started};
 use serde_json::json;
 
@@ -136,7 +136,7 @@ enum Command {
         only: bool,
         /// Memory limit for the results, such as 2GB; larger sweeps are solved in strips of camera rows [default: the free
         /// memory]
-        #[arg(long, value_name = "SIZE")]
+        #[arg(long, value_name = "SIZE", value_parser = memory_size)]
         memory: Option<ByteSize>,
     },
     /// Copy a session's products, report and manifest; needs no daemon
@@ -240,12 +240,19 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&Empty {}, |_| "light is permitted until the next boot".into())?;
         }
         Command::Park { state, when_closed } => {
+            let is_there = state.exists();
             let parked = if when_closed {
                 mirror::park_when_closed(io::stdin(), &state)?
             } else {
                 mirror::park(&state)?
             };
-            printer.print(&show::parked_name(parked), |_| show::parked(parked))?;
+            match parked {
+                // Exit code 0, because a service also parks after runs of a rig without a mirror.
+                Parked::Already if !is_there && !when_closed => {
+                    printer.print(&show::nothing_parked_name(), |_| show::nothing_parked(&state))?;
+                }
+                parked => printer.print(&show::parked_name(parked), |_| show::parked(parked))?,
+            }
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
         Command::Process { session, products, only, memory } => {
@@ -279,6 +286,14 @@ fn run(
     begin_run(socket, printer, detach, |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
     })
+}
+
+/// Reads the size of a memory limit.
+///
+/// # Errors
+/// What to give instead.
+pub fn memory_size(text: &str) -> Result<ByteSize, String> {
+    text.parse().map_err(|_| "give a size, such as 2GB or 512MiB".to_owned())
 }
 
 /// Begins a run and follows it, unless it is to be left alone.

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use raysweep_config::ConfigError;
-use raysweep_core::CameraCapabilities;
+use raysweep_core::{CameraCapabilities, Size};
 use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::available_bytes;
 use raysweep_processing::plane::KnownRig;
@@ -155,8 +155,8 @@ impl Room {
         ];
         let short = needs.into_iter().filter(|(_, needed, free)| needed > free);
         let warning = |(what, needed, free)| {
-            let (needed, free) = (needed / 1_000_000, free / 1_000_000);
-            format!("{needed} MB of {what} are needed and {free} MB are free: the run would be refused")
+            let (needed, free) = (Size(needed), Size(free));
+            format!("{needed} of {what} are needed and {free} are free: the run would be refused")
         };
         short.map(warning).collect()
     }

@@ -78,18 +78,26 @@ pub fn foresee_rest(
         (LabRig::Plane(rig), Procedure::Calibration(own)) => {
             Ok(calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
-        (_, Procedure::Film(_)) => Err(Unresumable::Past(
-            "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
-        )),
-        (_, Procedure::Batches(_)) => Err(Unresumable::Past(
-            "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more",
-        )),
-        (_, Procedure::Response(_)) => {
-            Err(Unresumable::Past("a run of kind \"response\" cannot be resumed: run the plan again"))
-        }
+        (_, Procedure::Film(_)) => Err(Unresumable::Past(FILM_IS_PAST)),
+        (_, Procedure::Batches(_)) => Err(Unresumable::Past(BATCHES_ARE_PAST)),
+        (_, Procedure::Response(_)) => Err(Unresumable::Past(RESPONSE_IS_PAST)),
         (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_)) => {
             Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())
         }
+    }
+}
+
+const FILM_IS_PAST: &str = "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film";
+const BATCHES_ARE_PAST: &str = "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more";
+const RESPONSE_IS_PAST: &str = "a run of kind \"response\" cannot be resumed: run the plan again";
+
+/// Why no session of this plan can be resumed on any rig.
+pub fn past(text: &str) -> Option<&'static str> {
+    match Plan::parse(text).ok()?.procedure {
+        Procedure::Film(_) => Some(FILM_IS_PAST),
+        Procedure::Batches(_) => Some(BATCHES_ARE_PAST),
+        Procedure::Response(_) => Some(RESPONSE_IS_PAST),
+        Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_) => None,
     }
 }
 

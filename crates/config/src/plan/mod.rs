@@ -104,6 +104,11 @@ impl Kind {
     }
 }
 
+/// Whether plans have this kind.
+pub(crate) fn is_kind(name: &str) -> bool {
+    Kind::ALL.iter().any(|kind| kind.name() == name)
+}
+
 fn read<'a, T: Deserialize<'a> + Default>(
     document: &mut Document<'a>,
     table: &str,
@@ -137,6 +142,11 @@ impl Plan {
     /// Everything that makes the plan invalid, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
+        if let Some(rig @ ("plane" | "dots")) = document.string("kind") {
+            let message = format!("kind = {rig:?}: this is a rig file; give a plan, such as one with kind = \"sweep\"");
+            document.refuse(&["kind"], message);
+            return document.finish(None);
+        }
         let Some(kind) = document.require::<Kind>("kind", "kind = \"sweep\", for example") else {
             return document.finish(None);
         };

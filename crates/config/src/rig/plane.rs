@@ -374,12 +374,12 @@ impl RigFile {
             document.refuse(&["camera", "row_time_us"], message);
         }
         if self.sim.projector.spot != SimSpot::Uniform && camera.row_pitch != 1.0 {
-            let message = "sim.projector.spot: flying spots are simulated for camera.row_pitch = 1 only; use \"uniform\"";
+            let message = "sim.projector.spot: flying spots are simulated only with camera.row_pitch = 1: set that, or use \"uniform\"";
             document.refuse(&["sim", "projector", "spot"], message);
         }
         if projector.spot == SpotKind::Flying && camera.row_pitch.fract() != 0.0 {
             let message = format!(
-                "projector.spot = \"flying\" with camera.row_pitch = {}: must be a whole number, because a flying spot is modelled only for camera rows that look at the middle of projector rows",
+                "camera.row_pitch = {}: must be a whole number with projector.spot = \"flying\", because a flying spot is modelled only for camera rows that look at the middle of projector rows; use projector.spot = \"uniform\", or a whole pitch",
                 camera.row_pitch
             );
             document.refuse(&["projector", "spot"], message);

@@ -45,7 +45,13 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
         processing.products.clear();
     }
     for argument in &asked.products {
+        let planned = processing.products.len();
         append_argument(&mut processing.products, argument, task).map_err(ProcessError::Product)?;
+        let reach = processing.demux.as_ref().and_then(|fold| fold.demux().ok()).map(|demux| demux.reach());
+        let mut asked = processing.products[planned..].iter();
+        if let Some(what) = reach.and_then(|reach| asked.find_map(|spec| spec.beyond((*reach.start(), *reach.end())))) {
+            return Err(ProcessError::Product(format!("--product {argument}: {what}")));
+        }
     }
     let memory = MemoryNeed::of_sweep(task, &processing.products)
         .map_err(|error| ProcessError::Config(error.to_string()))?;

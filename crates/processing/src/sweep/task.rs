@@ -126,10 +126,12 @@ pub(super) fn append_product(
         .map_err(|error| refused(&error.path, error.to_string()))?;
     if specs.iter().any(|other| other.name() == spec.name()) {
         let message = format!(
-            "product {kind}: two products are named {:?} and would overwrite each other: give one another name",
+            "product {kind}: two products are named {:?} and would overwrite each other: give one of them another `name`",
             spec.name()
         );
-        return Err(refused(&["name".into()], message));
+        // A name that is not in the file follows from the kind.
+        let path: &[String] = if name.is_some() { &["name".into()] } else { &[] };
+        return Err(refused(path, message));
     }
     specs.push(spec);
     Ok(())
