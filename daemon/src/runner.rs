@@ -153,9 +153,8 @@ impl Runner {
                 (RunState::Draining, _) => {
                     "the run is ending: wait for its end, or `raysweep cancel`".to_owned()
                 }
-                (_, _) => {
-                    "the run is still being prepared: wait until it is running, or `raysweep cancel`".to_owned()
-                }
+                (_, _) => "the run is still being prepared: wait until it is running, or `raysweep cancel`"
+                    .to_owned(),
             };
             return Err(RpcError::new(ErrorCode::NotRunning, what));
         };

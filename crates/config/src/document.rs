@@ -89,7 +89,8 @@ impl<'a> Document<'a> {
                 let field = error.span().and_then(|span| self.places.path_at(&span));
                 let field = field.unwrap_or_else(|| key.to_owned());
                 let mut message = format!("{field}: {}", decoding_message(error.message(), "table"));
-                let missing = message.split_once("missing key `").and_then(|(_, rest)| rest.strip_suffix('`'));
+                let missing =
+                    message.split_once("missing key `").and_then(|(_, rest)| rest.strip_suffix('`'));
                 if let Some((key, takes)) = missing.and_then(|key| Some((key, required(key)?))) {
                     message = format!("{message}: add {key} = .., {takes}");
                 }

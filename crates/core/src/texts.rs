@@ -39,6 +39,9 @@ mod tests {
         let missing = io::Error::from_raw_os_error(2);
         assert_eq!(io_text(&missing), "No such file or directory");
         assert_eq!(io_text(&io::Error::other("no luck")), "no luck");
-        assert_eq!([Size(512), Size(1536), Size(3 << 30)].map(|size| size.to_string()), ["512 B", "1.50 KiB", "3.00 GiB"]);
+        assert_eq!(
+            [Size(512), Size(1536), Size(3 << 30)].map(|size| size.to_string()),
+            ["512 B", "1.50 KiB", "3.00 GiB"]
+        );
     }
 }

@@ -32,7 +32,8 @@ impl DarksPlan {
     pub(super) fn check(&self, document: &mut Document<'_>) {
         let exposures = self.exposure_us.len();
         if !(1..=MAX_EXPOSURES).contains(&exposures) {
-            let message = format!("darks.exposure_us has {}: give 1 to {MAX_EXPOSURES}", counted(exposures, "value"));
+            let message =
+                format!("darks.exposure_us has {}: give 1 to {MAX_EXPOSURES}", counted(exposures, "value"));
             document.refuse(&["darks", "exposure_us"], message);
         } else if let Some(value) =
             self.exposure_us.values().into_iter().find(|us| !(us.is_finite() && *us > 0.0))

@@ -52,7 +52,8 @@ impl FilmPlan {
                 document.refuse(&["film", "delay_us"], message);
             }
         } else {
-            let message = format!("film.delay_us has {}: give 2 to {MAX_SETTINGS}", counted(settings, "value"));
+            let message =
+                format!("film.delay_us has {}: give 2 to {MAX_SETTINGS}", counted(settings, "value"));
             document.refuse(&["film", "delay_us"], message);
         }
         document.check_positive(&["film", "exposure_us"], self.exposure_us, "microseconds");

@@ -143,7 +143,8 @@ impl Plan {
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
         if let Some(rig @ ("plane" | "dots")) = document.string("kind") {
-            let message = format!("kind = {rig:?}: this is a rig file; give a plan, such as one with kind = \"sweep\"");
+            let message =
+                format!("kind = {rig:?}: this is a rig file; give a plan, such as one with kind = \"sweep\"");
             document.refuse(&["kind"], message);
             return document.finish(None);
         }

@@ -133,7 +133,8 @@ impl SweepPlan {
         let mut is_grid = true;
         for (key, axis) in [("delay_us", &self.delay_us), ("exposure_us", &self.exposure_us)] {
             if !(1..=MAX_AXIS).contains(&(axis.len() as u64)) {
-                let message = format!("sweep.{key} has {}: give 1 to {MAX_AXIS}", counted(axis.len(), "value"));
+                let message =
+                    format!("sweep.{key} has {}: give 1 to {MAX_AXIS}", counted(axis.len(), "value"));
                 document.refuse(&["sweep", key, "count"], message);
                 is_grid = false;
             } else if let Some(value) = axis.values().into_iter().find(|value| !value.is_finite()) {

@@ -42,8 +42,9 @@ impl AnyRigFile {
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
         if let Some(plan) = document.string("kind").filter(|kind| is_kind(kind)) {
-            let message =
-                format!("kind = {plan:?}: this is a plan; give a rig file, with kind = \"plane\" or kind = \"dots\"");
+            let message = format!(
+                "kind = {plan:?}: this is a plan; give a rig file, with kind = \"plane\" or kind = \"dots\""
+            );
             document.refuse(&["kind"], message);
             return document.finish(None);
         }

@@ -189,7 +189,8 @@ impl DotSpec {
     fn new(table: &ProductTable) -> Result<Self, String> {
         let ProductTable { kind: kind_name, name, options } = table;
         fn read<T: for<'a> Deserialize<'a>>(kind: &str, options: Value) -> Result<T, String> {
-            let plain = |error: serde_json::Error| decoding_message_beside(&error.to_string(), "table", "name");
+            let plain =
+                |error: serde_json::Error| decoding_message_beside(&error.to_string(), "table", "name");
             serde_json::from_value(options).map_err(|error| format!("product {kind}: {}", plain(error)))
         }
         let options = Value::Object(options.clone());
@@ -261,7 +262,8 @@ impl DotSpec {
             }
             Kind::DirectGlobal(Separation { method, compensate, .. }) => {
                 let even = if *compensate { ", over the dots' coverage" } else { "" };
-                let about = |what: &str| format!("{what} light, by the method {}; camera counts", method.name());
+                let about =
+                    |what: &str| format!("{what} light, by the method {}; camera counts", method.name());
                 vec![
                     (format!("{name}-direct"), about("direct") + even),
                     (format!("{name}-global"), about("global")),
@@ -406,7 +408,7 @@ mod tests {
             ("kind = \"direct-global\"\ndistance_px = -1", "product.0.kind"),
             ("kind = \"floodlit\"\nname = \"a/b\"", "product.0.kind"),
             ("kind = \"floodlit\"\npixels = 3", "product.0.kind"),
-            ("kind = \"dual\"\n[[product]]\nkind = \"dual\"", "product.1.name"),
+            ("kind = \"dual\"\n[[product]]\nkind = \"dual\"", "product.1.kind"),
         ];
         let mut shown = String::new();
         for (product, field) in cases {

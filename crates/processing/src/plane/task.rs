@@ -7,8 +7,8 @@ use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
 use raysweep_core::{PixelFormat, SettingsId, decoding_message};
 use raysweep_pipeline::{
-    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, Stages,
-    StageRefused, SweepGeometry, Unit,
+    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, StageRefused,
+    Stages, SweepGeometry, Unit,
 };
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
@@ -204,7 +204,8 @@ impl PlaneTask {
 
     fn delays_text(&self) -> String {
         let delays = || self.settings().map(|(_, point)| point.delay_us);
-        let (low, high) = (delays().fold(f64::INFINITY, f64::min), delays().fold(f64::NEG_INFINITY, f64::max));
+        let (low, high) =
+            (delays().fold(f64::INFINITY, f64::min), delays().fold(f64::NEG_INFINITY, f64::max));
         if low == high { format!(" = {low}") } else { format!(" from {low} to {high}") }
     }
 

@@ -49,7 +49,9 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
         append_argument(&mut processing.products, argument, task).map_err(ProcessError::Product)?;
         let reach = processing.demux.as_ref().and_then(|fold| fold.demux().ok()).map(|demux| demux.reach());
         let mut asked = processing.products[planned..].iter();
-        if let Some(what) = reach.and_then(|reach| asked.find_map(|spec| spec.beyond((*reach.start(), *reach.end())))) {
+        if let Some(what) =
+            reach.and_then(|reach| asked.find_map(|spec| spec.beyond((*reach.start(), *reach.end()))))
+        {
             return Err(ProcessError::Product(format!("--product {argument}: {what}")));
         }
     }
