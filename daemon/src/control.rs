@@ -1,6 +1,9 @@
 //! The daemon's interface to its server: everything that a client can request.
 
-use raysweep_proto::{CheckReport, Event, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status};
+use raysweep_proto::{
+    CheckReport, DesignParams, DesignReport, Event, ResumeParams, RpcError, RunParams, SessionInfo, Started,
+    Status,
+};
 use tokio::sync::broadcast;
 
 /// What a client can request of a daemon. Calls may block on the disk; none waits for a run.
@@ -13,6 +16,12 @@ pub trait Control: Send + Sync + 'static {
     /// # Errors
     /// `InvalidPlan`, with the position in the plan's text.
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError>;
+
+    /// Searches the settings of a plan for a wanted error or a time of light.
+    ///
+    /// # Errors
+    /// `InvalidPlan`, with the position in the plan's text; `BadParams`.
+    fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError>;
 
     /// Starts a run.
     ///

@@ -7,11 +7,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use raysweep_config::ConfigError;
+use raysweep_config::plan::with_tables;
 use raysweep_core::CameraCapabilities;
 use raysweep_pipeline::message_of;
 use raysweep_proto::{
-    CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState, SessionInfo,
-    Started, Status,
+    CheckReport, DesignParams, DesignReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams,
+    RunState, SessionInfo, Started, Status,
 };
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndState, Ledger, SessionEntry};
@@ -311,6 +312,12 @@ impl Control for Runner {
         let Foreseen { mut report, procedure, .. } = self.foresee(plan)?;
         procedure.advise(&mut report);
         Ok(report)
+    }
+
+    fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
+        let report = self.foresee(&params.plan)?.procedure.design(params)?;
+        let plan = with_tables(&params.plan, &report.plan).map_err(|error| invalid_plan(&error))?;
+        Ok(DesignReport { plan, ..report })
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
