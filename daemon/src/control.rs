@@ -1,8 +1,10 @@
 //! The daemon's interface to its server: everything that a client can request.
 
+use std::path::Path;
+
 use raysweep_proto::{
-    CheckReport, DesignParams, DesignReport, Event, ResumeParams, RpcError, RunParams, SessionInfo, Started,
-    Status,
+    CalibrationInfo, CheckReport, DesignParams, DesignReport, Event, ResumeParams, RpcError, RunParams,
+    SessionInfo, Started, Status,
 };
 use tokio::sync::broadcast;
 
@@ -64,6 +66,18 @@ pub trait Control: Send + Sync + 'static {
     /// # Errors
     /// `Storage`.
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError>;
+
+    /// The calibrations in the data folder, oldest first.
+    ///
+    /// # Errors
+    /// `Storage`.
+    fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError>;
+
+    /// Makes a session's calibration the one that later runs use.
+    ///
+    /// # Errors
+    /// `NoSession`, `Storage`.
+    fn use_calibration(&self, session: &Path) -> Result<(), RpcError>;
 
     /// Subscribes to all events from now on.
     fn events(&self) -> broadcast::Receiver<Event>;

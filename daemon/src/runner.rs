@@ -8,14 +8,15 @@ use std::thread::{self, JoinHandle};
 
 use raysweep_config::ConfigError;
 use raysweep_config::plan::with_tables;
-use raysweep_core::CameraCapabilities;
+use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
+use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
 use raysweep_proto::{
-    CheckReport, DesignParams, DesignReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams,
-    RunState, SessionInfo, Started, Status,
+    CalibrationInfo, CheckReport, DesignParams, DesignReport, ErrorCode, Event, Mistake, ResumeParams,
+    RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
-use raysweep_session::Session;
 use raysweep_session::ledger::{EndState, Ledger, SessionEntry};
+use raysweep_session::{Session, SessionSummary};
 use tokio::sync::broadcast;
 
 use crate::control::Control;
@@ -23,7 +24,7 @@ use crate::live::{LiveFile, Outlet};
 use crate::mirror;
 use crate::probes::Probes;
 use crate::procedure::lab::{Lab, LabRig};
-use crate::procedure::{Unresumable, foresee, foresee_rest};
+use crate::procedure::{Unresumable, foresee, foresee_rest, past};
 use crate::rig::{AnyRig, RigError};
 use crate::run::board::{StatusBoard, WrongState};
 use crate::run::life::{Foreseen, Run, conduct};
@@ -31,6 +32,9 @@ use crate::run::orders::{Order, Orders};
 
 /// Frame rate at which a dot rig's camera is opened to check that it is present; each run opens it at its own rate.
 const LEAST_FRAME_RATE_HZ: f64 = 100.0;
+
+/// The procedure whose sessions hold calibrations.
+const CALIBRATION: &str = "calibration";
 
 /// The daemon's core: a rig, a data folder, and at most one run.
 pub struct Runner {
@@ -141,9 +145,17 @@ impl Runner {
         let current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
         let state = self.board.status().state;
         let Some(current) = current.as_ref().filter(|_| from.contains(&state)) else {
-            let what = match state {
-                RunState::Idle | RunState::Faulted => "no run in progress".to_owned(),
-                _ => format!("not possible while the daemon is {}", name_of(state)),
+            let what = match (state, order) {
+                (RunState::Idle | RunState::Faulted, _) => "no run in progress".to_owned(),
+                (RunState::Paused, Order::Pause) => {
+                    "the run is already paused; `raysweep continue` goes on".to_owned()
+                }
+                (RunState::Running, Order::Go) => "the run is not paused, so it goes on anyway".to_owned(),
+                (RunState::Draining, _) => {
+                    "the run is ending: wait for its end, or `raysweep cancel`".to_owned()
+                }
+                (_, _) => "the run is still being prepared: wait until it is running, or `raysweep cancel`"
+                    .to_owned(),
             };
             return Err(RpcError::new(ErrorCode::NotRunning, what));
         };
@@ -225,18 +237,18 @@ impl Runner {
     fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
-                "the session needs {} MB, but {} has only {} MB free: free some space or give the daemon another --data",
-                report.disk_bytes / 1_000_000,
+                "the session needs {}, but {} has only {} free: free some space or give the daemon another --data",
+                Size(report.disk_bytes),
                 self.data.display(),
-                report.disk_free_bytes / 1_000_000
+                Size(report.disk_free_bytes)
             );
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
         if report.memory_bytes > report.memory_free_bytes {
             let what = format!(
-                "the run needs {} MB of memory, but only {} MB may be used: {instead}, give the daemon more --memory, or take a larger machine",
-                report.memory_bytes / 1_000_000,
-                report.memory_free_bytes / 1_000_000
+                "the run needs {} of memory, but only {} may be used: {instead}, give the daemon more --memory, or take a larger machine",
+                Size(report.memory_bytes),
+                Size(report.memory_free_bytes)
             );
             return Err(RpcError::new(ErrorCode::Storage, what));
         }
@@ -271,9 +283,13 @@ impl Runner {
             Session::open(&self.data.join(&params.session)).map_err(|error| no_session(error.to_string()))?;
         let read = |path: PathBuf| {
             std::fs::read_to_string(&path)
-                .map_err(|error| no_session(format!("cannot read {}: {error}", path.display())))
+                .map_err(|error| no_session(format!("cannot read {}: {}", path.display(), io_text(&error))))
         };
         let plan = read(session.plan_path())?;
+        // Another rig file would not help.
+        if let Some(what) = past(&plan) {
+            return Err(no_session(format!("{}: {what}", session.dir().display())));
+        }
         if read(session.rig_path())? != self.rig.text() {
             return Err(no_session(format!(
                 "{} was begun with another rig file than the daemon's: start the daemon with {}",
@@ -283,9 +299,14 @@ impl Runner {
         }
         let ledger = session.resume().map_err(|error| storage(&error))?;
         let foreseen =
-            foresee_rest(&self.lab(), &plan, &ledger.state().session).map_err(|error| match error {
-                Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
-                Unresumable::Plan(error) => invalid_plan(&error),
+            foresee_rest(&self.lab(), &plan, session.dir(), &ledger.state().session).map_err(|error| {
+                match error {
+                    Unresumable::Past(what) => no_session(format!("{}: {what}", session.dir().display())),
+                    Unresumable::Plan(error) => RpcError {
+                        message: error.render(&session.plan_path().display().to_string(), &plan),
+                        ..invalid_plan(&error)
+                    },
+                }
             })?;
         let begun = ledger.state().session.shape;
         if foreseen.shape != begun {
@@ -343,6 +364,14 @@ impl Control for Runner {
     }
 
     fn arm_light(&self) -> Result<(), RpcError> {
+        let is_without_mirror = match &self.rig {
+            LabRig::Plane(_) => true,
+            LabRig::Dots(rig) => rig.file.mirror.is_none(),
+        };
+        if is_without_mirror {
+            let what = "this rig has no mirror: there is no light to permit";
+            return Err(RpcError::new(ErrorCode::MethodNotFound, what));
+        }
         mirror::arm_light(&self.data)
     }
 
@@ -365,6 +394,40 @@ impl Control for Runner {
             state: "unreadable".into(),
         });
         Ok(readable.chain(unreadable).collect())
+    }
+
+    fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError> {
+        let listing = raysweep_session::list(&self.data).map_err(|error| storage(&error))?;
+        let in_use = CalibrationHeader::read(&current_in(&self.data)).ok().flatten();
+        let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
+        let info = |session: SessionSummary| {
+            let name = session.dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let (header, problem) = match CalibrationHeader::read(&session.dir) {
+                Ok(header @ Some(_)) => (header, None),
+                Ok(None) => (None, Some("its run did not succeed: see its report and ledger".into())),
+                Err(problem) => (None, Some(problem)),
+            };
+            CalibrationInfo {
+                session: session.dir,
+                made: header.as_ref().map_or_else(String::new, |header| header.made.to_string()),
+                camera: header.map_or_else(String::new, |header| header.valid_for.camera),
+                in_use: in_use.as_ref().is_some_and(|in_use| in_use.session == name),
+                problem,
+            }
+        };
+        Ok(measured.map(info).collect())
+    }
+
+    fn use_calibration(&self, session: &Path) -> Result<(), RpcError> {
+        let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
+        let folder = self.data.join(session);
+        let kept = KeptCalibration::read(&folder).map_err(no_session)?.ok_or_else(|| {
+            no_session(format!(
+                "{} has no calibration.toml: give a session of kind \"calibration\" whose run succeeded; `raysweep calibration list` lists them",
+                folder.display()
+            ))
+        })?;
+        kept.use_in(&self.data).map_err(|error| storage(&error))
     }
 
     fn events(&self) -> broadcast::Receiver<Event> {

@@ -10,6 +10,14 @@ pub enum SimError {
     /// The scene cannot be read or computed.
     #[error("sim.scene: {0}")]
     Scene(#[from] SceneError),
+    /// A built-in scene has more rows than the projector.
+    #[error("sim.scene_rows = {rows}: must be at most projector.rows = {most}")]
+    TooManyRows {
+        /// Rows of the scene.
+        rows: usize,
+        /// Rows of the projector.
+        most: usize,
+    },
     /// The scene has more rows than the projector below its first row.
     #[error(
         "sim.scene has {scene_rows} rows, which do not fit below row {first_row} of the projector's {projector_rows}: raise projector.rows, lower camera.first_projector_row or take a smaller scene"
@@ -87,7 +95,7 @@ pub enum SimError {
     #[error("the simulated projector shows no pictures from files: take another pattern")]
     Picture,
     /// A key of `[sim]` outside its range.
-    #[error("sim.{key} = {value}: allowed is {allowed}")]
+    #[error("sim.{key} = {value}: must be {allowed}")]
     Range {
         /// Key below `[sim]`.
         key: &'static str,
@@ -108,6 +116,7 @@ impl SimError {
             | Self::Pattern(_)
             | Self::AlongRows
             | Self::Picture => "scene",
+            Self::TooManyRows { .. } => "scene_rows",
             Self::RowTable => "projector.row_table",
             Self::Beam | Self::Kernel => "projector.beam",
             Self::TruthPeriod { key, .. } | Self::TruthRows { key, .. } | Self::Range { key, .. } => key,

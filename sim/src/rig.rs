@@ -33,6 +33,9 @@ impl PlaneRig {
         let scenes = if config.scene.extension().is_some_and(|extension| extension == "npz") {
             vec![Scene::load(&folder.join(&config.scene))?]
         } else {
+            if config.scene_rows > setup.raster.rows {
+                return Err(SimError::TooManyRows { rows: config.scene_rows, most: setup.raster.rows });
+            }
             let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
             Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?
         };

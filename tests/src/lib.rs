@@ -197,6 +197,7 @@ impl Ended {
         let array = match state.session.shape.contents {
             Contents::Sweep { .. } => ArrayName::Sum,
             Contents::Darks { .. } => ArrayName::Dark,
+            Contents::Board { .. } => ArrayName::Sum,
             Contents::Film { .. } => {
                 assert!(state.cycles().all(|cycle| cycle.counts.balanced()));
                 return self;

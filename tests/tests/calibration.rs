@@ -315,7 +315,8 @@ fn error(
     let stack = ndarray::stack(Axis(0), &light.iter().map(|image| image.view()).collect::<Vec<_>>()).unwrap();
     let late_us = match refine {
         true => {
-            let found = latency(&timing, &settings, stack.view(), None).unwrap();
+            let rows: Vec<usize> = (0..stated.size.0).collect();
+            let found = latency(&timing, &settings, &rows, stack.view(), None).unwrap();
             println!("{found:?}");
             found.late_us
         }

@@ -30,6 +30,27 @@ pub(crate) fn out_of_range<const N: usize>(
     })
 }
 
+/// A number of things, such as "1 value" and "3 values".
+pub(crate) fn counted(number: usize, noun: &str) -> String {
+    format!("{number} {noun}{}", if number == 1 { "" } else { "s" })
+}
+
+/// What a required key takes, for messages about files that lack it.
+fn required(key: &str) -> Option<&'static str> {
+    Some(match key {
+        "max_tilt" => "a mechanical tilt in degrees, 0.01 to 45",
+        "max_step" => "the largest step per sample in degrees, 0.0001 to max_tilt",
+        "max_slew_deg_per_s" => "the largest speed in degrees per second, 0.001 to 1e7",
+        "bandwidth_hz" => "a bandwidth in Hz, 1 to 1e5",
+        "out_of_band" => "a tilt in degrees, 0 to max_tilt",
+        "sigma_rows" => "a standard deviation in rows, above 0, at most 100",
+        "up_rows" | "down_rows" => "an extent in rows, 0 or more; both together are above 0 and at most 500",
+        "start" | "stop" => "the first and the last value of a range",
+        "count" => "the number of values in the range",
+        _ => return None,
+    })
+}
+
 /// A text that is being read.
 pub(crate) struct Document<'a> {
     tables: DeTable<'a>,
@@ -67,10 +88,23 @@ impl<'a> Document<'a> {
             Err(error) => {
                 let field = error.span().and_then(|span| self.places.path_at(&span));
                 let field = field.unwrap_or_else(|| key.to_owned());
-                let message = format!("{field}: {}", decoding_message(error.message(), "table"));
+                let mut message = format!("{field}: {}", decoding_message(error.message(), "table"));
+                let missing =
+                    message.split_once("missing key `").and_then(|(_, rest)| rest.strip_suffix('`'));
+                if let Some((key, takes)) = missing.and_then(|key| Some((key, required(key)?))) {
+                    message = format!("{message}: add {key} = .., {takes}");
+                }
                 self.mistakes.push(ConfigMistake { message, field: Some(field), span: error.span() });
                 None
             }
+        }
+    }
+
+    /// The value of a key of the file, if it is a string.
+    pub fn string(&self, key: &str) -> Option<&str> {
+        match self.tables.get(key)?.get_ref() {
+            DeValue::String(text) => Some(text),
+            _ => None,
         }
     }
 

@@ -60,7 +60,8 @@ impl ConfigError {
             };
             let line = text[..span.start].matches('\n').count();
             let shown = text.lines().nth(line).unwrap_or_default();
-            format!("{file}, line {}: {message}\n  {shown}", line + 1)
+            let excerpt = if shown.trim().is_empty() { String::new() } else { format!("\n  {shown}") };
+            format!("{file}, line {}: {message}{excerpt}", line + 1)
         });
         rendered.collect::<Vec<_>>().join("\n")
     }

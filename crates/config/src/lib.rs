@@ -8,6 +8,7 @@ mod error;
 pub mod plan;
 pub mod rig;
 pub mod sim;
+mod whole;
 
 pub use document::{Fault, Places};
 pub use error::{ConfigError, ConfigMistake};

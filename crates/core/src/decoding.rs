@@ -19,6 +19,23 @@ pub fn decoding_message(message: &str, table: &str) -> String {
     format!("{what}, expected {expected}")
 }
 
+/// Like [`decoding_message`], for a table that also has the key `beside`, which was read before.
+pub fn decoding_message_beside(message: &str, table: &str, beside: &str) -> String {
+    let text = decoding_message(message, table);
+    if !text.starts_with("unknown key") {
+        return text;
+    }
+    let Some((what, expected)) = text.split_once(", expected ") else {
+        return text.replace("no further keys are allowed", &format!("expected `{beside}`"));
+    };
+    let known = expected.strip_prefix("one of ").unwrap_or(expected).replace(" or ", ", ");
+    if known.contains(", ") {
+        format!("{what}, expected one of {known}, `{beside}`")
+    } else {
+        format!("{what}, expected {known} or `{beside}`")
+    }
+}
+
 /// What serde expected, by its name in Rust.
 fn kind(expected: &str, table: &str) -> String {
     let (first, rest) = expected.split_once(' ').unwrap_or((expected, ""));
@@ -69,6 +86,22 @@ fn article(noun: &str) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::decoding_message;
+
+    #[test]
+    fn a_key_that_was_read_before_is_expected_too() {
+        for (serde, ours) in [
+            ("unknown field `a`, there are no fields", "unknown key `a`, expected `name`"),
+            ("unknown field `a`, expected `b`", "unknown key `a`, expected `b` or `name`"),
+            ("unknown field `a`, expected `b` or `c`", "unknown key `a`, expected one of `b`, `c`, `name`"),
+            (
+                "unknown field `a`, expected one of `b`, `c`, `d`",
+                "unknown key `a`, expected one of `b`, `c`, `d`, `name`",
+            ),
+            ("missing field `a`", "missing key `a`"),
+        ] {
+            assert_eq!(super::decoding_message_beside(serde, "table", "name"), ours);
+        }
+    }
 
     #[test]
     fn types_of_rust_become_those_of_the_file() {

@@ -17,12 +17,13 @@ mod pattern;
 mod pixel;
 mod raster;
 mod subject;
+mod texts;
 mod units;
 
 pub use clock::{Clock, ClockHandle};
 pub use clock_model::{ClockModel, ClockQuality, RoundTrip};
 pub use counts::{Counts, LossCause, VsyncStats};
-pub use decoding::decoding_message;
+pub use decoding::{decoding_message, decoding_message_beside};
 pub use device::{
     Applied, Camera, CameraCapabilities, CameraSettings, DeviceState, FirstFrame, Projector, Readout,
     SettingsId, SettingsLatency, Shown, Shutter, Vsync,
@@ -38,4 +39,5 @@ pub use pattern::{Pattern, PatternError};
 pub use pixel::{Mosaic, Packing, PixelError, PixelFormat, UnknownPixelFormat, UnpackLevel};
 pub use raster::{Raster, Trigger};
 pub use subject::Subject;
+pub use texts::{Size, io_text};
 pub use units::{ns_from_us, us_from_ns};

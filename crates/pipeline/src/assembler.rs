@@ -445,6 +445,7 @@ impl AttemptFrames {
         Decision::Unit(Unit {
             id: self.job.id,
             frames: self.averaged,
+            delay_us: self.job.delay_us,
             exposure_us: self.job.applied.actual.exposure_us,
             delays_us: self.delays_us,
             last_exposure_ns: self.last_exposure_ns,

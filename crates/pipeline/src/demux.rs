@@ -105,7 +105,8 @@ impl DemuxFold {
     /// If delays and exposures do not give a valid model on this rig.
     pub fn demux(&self) -> Result<Demux, PlaneError> {
         let sweep = self.schedule.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_)));
-        let planned = sweep.map(|point| Setting::new(point.delay_us, point.exposure_us)).collect();
+        let planned =
+            sweep.map(|point| self.geometry.setting(&[point.delay_us], point.exposure_us)).collect();
         Demux::new(self.timing.clone(), planned, self.options.prior())
     }
 
@@ -119,9 +120,13 @@ impl DemuxFold {
         taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
     }
 
-    /// The sweep in these images, without those whose dark image is missing. Each image is dropped as soon as it is
-    /// in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
-    fn stack(&self, mut taken: BTreeMap<PointRole, Arc<SweepImage>>) -> Result<SweepStack, NotSolved> {
+    /// The sweep in these images of camera rows `rows`, without those whose dark image is missing. Each image is dropped
+    /// as soon as it is in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
+    fn stack(
+        &self,
+        rows: &[usize],
+        mut taken: BTreeMap<PointRole, Arc<SweepImage>>,
+    ) -> Result<SweepStack, NotSolved> {
         let darks = taken.extract_if(.., |role, _| matches!(role, PointRole::Dark(_))).collect();
         taken.retain(|role, _| matches!(role, PointRole::Sweep(_)) && self.dark_of(&darks, *role).is_some());
         if taken.is_empty() {
@@ -131,21 +136,22 @@ impl DemuxFold {
                     .into(),
             });
         }
-        let scale = (1.0 / self.geometry.white_dn) as f32;
+        let white = self.geometry.white_of(rows);
+        let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
         let saturates = |taken: &Arc<SweepImage>| self.valid(taken.image.view()).iter().any(|valid| !valid);
-        let rows = taken.values().next().map_or(0, |taken| taken.image.nrows());
-        let shape = (taken.len(), rows, self.geometry.width);
-        let mut valid = taken.values().any(saturates).then(|| Array3::from_elem(shape, true));
+        let shape = (taken.len(), rows.len(), self.geometry.width);
+        let is_masked = measured.iter().any(|measured| !measured) || taken.values().any(saturates);
+        let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&self.valid(sample.image.view()));
+                valid.index_axis_mut(Axis(0), index).assign(&(self.valid(sample.image.view()) & &measured));
             }
             if let Some(dark) = self.dark_of(&darks, role) {
-                images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * scale));
+                images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * &scale));
             }
             settings.push(sample.setting.clone());
         }
@@ -164,10 +170,15 @@ impl DemuxFold {
         })
     }
 
-    /// The camera rows starting at `first_row`, to which the images belong.
-    fn hold(&self, first_row: usize, taken: BTreeMap<PointRole, Arc<SweepImage>>) -> Result<Held, NotSolved> {
+    /// Camera rows `rows`, to which the images belong.
+    fn hold(
+        &self,
+        rows: Range<usize>,
+        taken: BTreeMap<PointRole, Arc<SweepImage>>,
+    ) -> Result<Held, NotSolved> {
         let regular = taken.get(&PointRole::Regular).cloned().zip(self.dark_of(&taken, PointRole::Regular));
-        Ok(Held { first_row, stack: self.stack(taken)?, regular })
+        let first_row = rows.start;
+        Ok(Held { first_row, stack: self.stack(&rows.collect::<Vec<_>>(), taken)?, regular })
     }
 
     /// Chooses how to demultiplex, from a stack that contains only the rows of [`rows_to_choose_by`].
@@ -190,12 +201,14 @@ impl DemuxFold {
         let Held { first_row: held_from, mut stack, regular } = held;
         let first_row = rows.start;
         let inner = rows.start - held_from..rows.end - held_from;
+        let white = self.geometry.white_of(&rows.clone().collect::<Vec<_>>());
+        let measured = white.mapv(f64::is_finite);
         let transport = choices.solve(rows, held_from, &mut stack, go_on).map_err(refused)?;
-        tally.add_sweep(stack.settings.len(), &transport);
+        tally.add_sweep(stack.settings.len(), &measured, &transport);
         if let Some((regular, dark)) = regular {
             let [image, dark] = [&regular, &dark].map(|taken| taken.image.slice(s![inner.clone(), ..]));
-            let light = (&image - &dark) / self.geometry.white_dn as f32;
-            tally.add_regular(&self.valid(image), &light, &transport);
+            let light = (&image - &dark) / white.mapv(|dn| dn as f32);
+            tally.add_regular(&self.valid(image), &measured, &light, &transport);
             stack.regular = Some(light);
         }
         Ok(Strip { first_row, stack, transport })
@@ -211,7 +224,7 @@ impl DemuxFold {
     /// Takes the next unit; a later attempt at a point replaces an earlier one.
     pub fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
         let Some(point) = self.schedule.points.get(unit.id.point as usize) else { return };
-        let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
+        let setting = self.geometry.setting(&unit.delays_us, unit.exposure_us);
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {
@@ -236,7 +249,7 @@ impl DemuxFold {
         let taken = std::mem::take(&mut self.taken);
         let mut tally = Tally::default();
         let height = self.geometry.height;
-        let held = self.hold(0, taken)?;
+        let held = self.hold(0..height, taken)?;
         let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)))?;
         let Strip { stack, transport, .. } = self.strip(&choices, 0..height, held, &mut tally, go_on)?;
         Ok(Solved { stack, transport, summary: tally.summary(choices.findings) })
@@ -261,7 +274,8 @@ impl Snapshot for DemuxFold {
         before: Option<&Transport>,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
-        let SweepStack { settings, images, valid, .. } = self.stack(self.taken.clone())?;
+        let rows: Vec<usize> = (0..self.geometry.height).collect();
+        let SweepStack { settings, images, valid, .. } = self.stack(&rows, self.taken.clone())?;
         let valid = valid.as_ref().map(|valid| valid.view());
         self.demux()
             .and_then(|demux| demux.with_settings(settings))

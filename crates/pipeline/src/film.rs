@@ -6,6 +6,7 @@ use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{CameraCapabilities, CameraSettings, Counts};
 use raysweep_transport::plane::{Demux, Setting, Transport};
 
+use crate::calibrated::{CalibrationDrift, Images};
 use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage_refused::StageRefused;
@@ -112,10 +113,36 @@ impl Cycle {
     }
 }
 
+/// Cycles from whose mean a film's latency is found: enough for single frames' noise and jitter, and no more than wait
+/// for a solver at a time, so that a film processed again finds it from the same cycles.
+const LATENCY_CYCLES: usize = 4;
+
 /// Computes a cycle's light transport from its frames.
 pub struct FilmSolver {
     demux: Demux,
     geometry: SweepGeometry,
+    /// Light per count of each pixel, `[t, s]`.
+    scale: Array2<f32>,
+    /// Which pixels have a scale.
+    measured: Array2<bool>,
+    /// By how much later than calibrated light arrives, as far as the film has shown.
+    late_us: f64,
+    /// The film's first cycles; `None` without a calibration, or after they have shown the latency.
+    first: Option<FirstCycles>,
+}
+
+/// The sum of a film's first cycles.
+#[derive(Default)]
+struct FirstCycles {
+    cycles: usize,
+    sum: Option<FilmStack>,
+}
+
+/// The frames of a cycle, ready to be demultiplexed; see [`crate::SweepStack`].
+struct FilmStack {
+    settings: Vec<Setting>,
+    images: Array3<f32>,
+    valid: Option<Array3<bool>>,
 }
 
 impl FilmSolver {
@@ -131,7 +158,10 @@ impl FilmSolver {
         let demux = DemuxFold::new(options, schedule, geometry)?
             .demux()
             .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
-        Ok(Self { demux, geometry: geometry.clone() })
+        let white = geometry.white_of(&(0..geometry.height).collect::<Vec<_>>());
+        let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
+        let first = geometry.calibration.as_ref().map(|_| FirstCycles::default());
+        Ok(Self { demux, geometry: geometry.clone(), scale, measured, late_us: 0.0, first })
     }
 
     /// The relative rows that are estimated: first and last.
@@ -140,8 +170,8 @@ impl FilmSolver {
         (*reach.start(), *reach.end())
     }
 
-    /// The transport from one frame of each setting, in the settings' order. `dark` is the image `[t, s]` without
-    /// light. Stops early, with an error, soon after `go_on` returns false.
+    /// The transport from one frame of each setting, in the settings' order, with the delays and the exposure that the
+    /// camera states. `dark` is the image `[t, s]` without light. Stops early, with an error, soon after `go_on` returns false.
     ///
     /// It does not start from the previous cycle's transport: the noise of single frames determines which rows are 0,
     /// so this would save no steps (5.2 per pixel with and without), and the bits would depend on what was solved
@@ -155,26 +185,76 @@ impl FilmSolver {
         dark: &Array2<f32>,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
-        let (height, width) = (self.geometry.height, self.geometry.width);
-        let scale = (1.0 / self.geometry.white_dn) as f32;
-        let is_valid = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
-        let shape = (frames.len(), height, width);
-        let saturates = frames.iter().any(|(_, image)| image.iter().any(|&counts| !is_valid(counts)));
-        let mut valid = saturates.then(|| Array3::from_elem(shape, true));
-        let mut stack = Array3::zeros(shape);
-        for (index, (_, image)) in frames.iter().enumerate() {
-            if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&image.mapv(is_valid));
-            }
-            stack.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * scale));
-        }
-        let settings = frames.iter().map(|(setting, _)| setting.clone()).collect();
+        let FilmStack { settings, images, valid } = self.stack(frames, dark);
+        let settings = settings.iter().map(|setting| setting.earlier(self.late_us)).collect();
         self.demux
             .with_settings(settings)
             .and_then(|demux| {
-                demux.solve_while(stack.view(), valid.as_ref().map(|valid| valid.view()), go_on)
+                demux.solve_while(images.view(), valid.as_ref().map(|valid| valid.view()), go_on)
             })
             .map_err(|error| NotSolved { of: "film", what: error.to_string() })
+    }
+
+    /// Takes the frames of another complete cycle, as for [`Self::solve`]. Once it has the first few, it finds from
+    /// their mean by how much later than calibrated light arrives, which the cycles after them are solved with, and
+    /// returns what it found. Takes about as long as solving a small cycle, and only this once.
+    pub fn learn(
+        &mut self,
+        frames: &[(Setting, Arc<Array2<f32>>)],
+        dark: &Array2<f32>,
+    ) -> Option<CalibrationDrift> {
+        let mut first = self.first.take()?;
+        first.add(self.stack(frames, dark));
+        if first.cycles < LATENCY_CYCLES {
+            self.first = Some(first);
+            return None;
+        }
+        let FilmStack { settings, mut images, valid } = first.sum?;
+        images /= first.cycles as f32;
+        let rows: Vec<usize> = (0..self.geometry.height).collect();
+        let valid = valid.as_ref().map(|valid| valid.view());
+        let images = Images { rows: &rows, images: images.view(), valid };
+        let drift = CalibrationDrift::of(self.demux.timing(), &settings, &images);
+        self.late_us = drift.late_us;
+        Some(drift)
+    }
+
+    /// These frames as the model sees them.
+    fn stack(&self, frames: &[(Setting, Arc<Array2<f32>>)], dark: &Array2<f32>) -> FilmStack {
+        let is_unsaturated = |counts: f32| f64::from(counts) < self.geometry.saturation_dn;
+        let shape = (frames.len(), self.geometry.height, self.geometry.width);
+        let saturates =
+            || frames.iter().any(|(_, image)| image.iter().any(|&counts| !is_unsaturated(counts)));
+        let is_masked = self.measured.iter().any(|measured| !measured) || saturates();
+        let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
+        let mut images = Array3::zeros(shape);
+        for (index, (_, image)) in frames.iter().enumerate() {
+            if let Some(valid) = &mut valid {
+                valid.index_axis_mut(Axis(0), index).assign(&(image.mapv(is_unsaturated) & &self.measured));
+            }
+            images.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * &self.scale));
+        }
+        let setting =
+            |(setting, _): &(Setting, _)| self.geometry.setting(&setting.delays_us, setting.exposure_us);
+        FilmStack { settings: frames.iter().map(setting).collect(), images, valid }
+    }
+}
+
+impl FirstCycles {
+    fn add(&mut self, cycle: FilmStack) {
+        self.cycles += 1;
+        let Some(sum) = &mut self.sum else {
+            self.sum = Some(cycle);
+            return;
+        };
+        for (sum, setting) in sum.settings.iter_mut().zip(cycle.settings) {
+            sum.delays_us.extend(setting.delays_us);
+        }
+        sum.images += &cycle.images;
+        sum.valid = match (sum.valid.take(), cycle.valid) {
+            (Some(a), Some(b)) => Some(a & b),
+            (a, b) => a.or(b),
+        };
     }
 }
 

@@ -6,13 +6,14 @@ use std::ops::Range;
 
 use ndarray::{Array3, Axis, s};
 use raysweep_transport::plane::calibrate::{
-    BeamEstimate, CalibrateError, Choice, FlyingSpot, OpticsEstimate, Sample, candidates, choose_prior,
-    estimate_optics, settings_on_direct_row,
+    BeamEstimate, CalibrateError, Choice, FlyingSpot, Optics, OpticsEstimate, Sample, candidates,
+    choose_prior, estimate_optics, settings_on_direct_row,
 };
 use raysweep_transport::plane::{
     Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, RowTiming, Transport,
 };
 
+use crate::calibrated;
 use crate::demux::DemuxOptions;
 use crate::schedule::{Spot, SweepGeometry};
 use crate::stack::SweepStack;
@@ -27,9 +28,11 @@ pub struct Findings {
     pub prior: Prior,
     /// The held-out errors of the priors compared; `None` if the plan names its prior, or the comparison failed.
     pub choice: Option<Choice>,
-    /// Standard deviation of the beam in rows, 0 for an ideal one.
-    pub beam_sigma_rows: f64,
-    /// Median position of direct light in projector rows, 0 if it lies in its own row.
+    /// Standard deviation of the beam in rows, 0 for an ideal one; `None` if a calibration measured it pixel by pixel.
+    pub beam_sigma_rows: Option<f64>,
+    /// By how much later than calibrated the light was taken to arrive; `None` without a calibration.
+    pub late_us: Option<f64>,
+    /// Median position of direct light in projector rows, 0 if it lies in its own row, or where it was calibrated.
     pub u0_rows: f64,
     /// Whether the rows `|u| <= 2` are one band, because no setting tells where in it direct light lies.
     pub one_band: bool,
@@ -50,6 +53,8 @@ pub struct Choices {
     kept: Vec<usize>,
     /// Which of these images may be coupled.
     steady: Vec<usize>,
+    /// By how much later than modelled light arrives.
+    late_us: f64,
     noise: Option<NoiseModel>,
     coupling: Option<Coupling>,
     /// The reasons for the choices.
@@ -80,7 +85,11 @@ pub fn choose(
     let mut findings = Findings {
         prior: planned.prior(),
         choice: None,
-        beam_sigma_rows: geometry.beam_sigma_rows.unwrap_or(0.0),
+        beam_sigma_rows: match geometry.calibration {
+            Some(_) => None,
+            None => geometry.beam_sigma_rows.or(Some(0.0)),
+        },
+        late_us: None,
         u0_rows: 0.0,
         one_band: false,
         left_out_us: Vec::new(),
@@ -91,6 +100,10 @@ pub fn choose(
     let settings = stack.settings.clone();
     let (cut, spot) = cut_by_the_spot(geometry, &stack, &mut findings)?;
     stack.keep(|n| !cut.contains(&n));
+    if geometry.calibration.is_some() {
+        findings.check_calibration(&mut stack, rows);
+    }
+    let late_us = findings.late_us.unwrap_or(0.0);
     let uncut: Vec<usize> = all.iter().copied().filter(|n| !cut.contains(n)).collect();
     let planned = planned.with_settings(stack.settings.clone())?;
     let sample_of = |images: &Array3<f32>| {
@@ -105,7 +118,10 @@ pub fn choose(
             (noise, coupling, coupled)
         },
         // From the images before coupling.
-        || estimate_optics(&sample_of(&stack.images)?, geometry.beam_sigma_rows),
+        || {
+            let estimate = || estimate_optics(&sample_of(&stack.images)?, geometry.beam_sigma_rows);
+            geometry.calibration.is_none().then(estimate)
+        },
     );
     let coupled = coupled.transpose()?;
     if let Some(Coupled { variance_ratio, .. }) = &coupled {
@@ -119,26 +135,48 @@ pub fn choose(
     }
     // From the images that will be solved.
     let sample = || sample_of(coupled.as_ref().map_or(&stack.images, |coupled| &coupled.stack));
-    let calibrated =
-        optics.and_then(|optics| calibrate(&planned, options, &stack.timing, optics, &sample, &mut findings));
-    let demux = match calibrated {
-        Ok(demux) => demux,
-        Err(error) => {
-            findings.remarks.push(("calibration", format!("nothing is estimated from the stack: {error}")));
-            planned
+    let demux = match optics {
+        None => choose_among_priors(&planned, options, &Optics::default(), &sample, &mut findings)?,
+        Some(optics) => {
+            let calibrated = optics.and_then(|optics| {
+                calibrate(&planned, options, &stack.timing, optics, &sample, &mut findings)
+            });
+            match calibrated {
+                Ok(demux) => demux,
+                Err(error) => {
+                    let said = format!("nothing is estimated from the stack: {error}");
+                    findings.remarks.push(("calibration", said));
+                    planned
+                }
+            }
         }
     };
     Ok(match spot {
         // Neighbours see the spot at other times, so images that depend on it are not coupled.
         Some(spot) => {
             let demux = demux.with_settings(settings)?.with_spot(spot)?;
-            Choices { demux, kept: all, steady: uncut, noise, coupling, findings }
+            Choices { demux, kept: all, steady: uncut, late_us, noise, coupling, findings }
         }
         None => {
             let steady = (0..uncut.len()).collect();
-            Choices { demux, kept: uncut, steady, noise, coupling, findings }
+            Choices { demux, kept: uncut, steady, late_us, noise, coupling, findings }
         }
     })
+}
+
+impl Findings {
+    /// Checks the calibration by a stack that contains only the camera rows `rows`, and corrects the delays of its
+    /// images for the latency found.
+    fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize]) {
+        let valid = stack.valid.as_ref().map(|valid| valid.view());
+        let images = calibrated::Images { rows, images: stack.images.view(), valid };
+        let drift = calibrated::CalibrationDrift::of(&stack.timing, &stack.settings, &images);
+        stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(drift.late_us));
+        self.late_us = Some(drift.late_us);
+        self.u0_rows = drift.u0_rows.unwrap_or(0.0);
+        self.remarks.extend(drift.remarks);
+        self.warnings.extend(drift.warnings);
+    }
 }
 
 impl Choices {
@@ -163,6 +201,7 @@ impl Choices {
         if self.kept.len() < stack.settings.len() {
             stack.keep(|n| self.kept.contains(&n));
         }
+        stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
         let inner = rows.start - held_from..rows.end - held_from;
         let mut coupled = None;
         if let Some((noise, coupling)) = self.noise.zip(self.coupling) {
@@ -223,7 +262,7 @@ fn couple(coupling: &Coupling, noise: &NoiseModel, stack: &SweepStack) -> Result
     coupling.apply(stack.images.view(), valid, noise, &frames_of(stack))
 }
 
-/// Adopts the estimated optics, and chooses the prior for a sample of the images that will be solved.
+/// Adopts the estimated optics, and chooses the prior.
 fn calibrate(
     planned: &Demux,
     options: &DemuxOptions,
@@ -242,7 +281,7 @@ fn calibrate(
     let sigma_rows = optics.beam_sigma_rows;
     let beam = Beam::of_sigma(sigma_rows);
     let mut demux = planned.with_timing(timing.clone().with_beam(beam)?)?;
-    findings.beam_sigma_rows = sigma_rows;
+    findings.beam_sigma_rows = Some(sigma_rows);
 
     let said = match &spike {
         // A measured response states the place, and needs no edge.
@@ -270,7 +309,17 @@ fn calibrate(
         }
     };
     findings.remarks.push(("direct light", said));
+    Ok(choose_among_priors(&demux, options, &optics, sample, findings)?)
+}
 
+/// Chooses the prior for a sample of the images that will be solved, unless the plan states it.
+fn choose_among_priors(
+    demux: &Demux,
+    options: &DemuxOptions,
+    optics: &Optics,
+    sample: &dyn Fn() -> Result<Sample, CalibrateError>,
+    findings: &mut Findings,
+) -> Result<Demux, PlaneError> {
     let prior = match options.states_prior() {
         true => format!("{}, as the plan says", name(findings.prior)),
         false => {
@@ -278,7 +327,7 @@ fn calibrate(
             let others = candidates().into_iter().filter(|prior| *prior != default);
             let compared: Vec<Prior> = std::iter::once(default).chain(others).collect();
             // More noise requires more smoothness, but coupling has removed most of the noise.
-            match sample().and_then(|sample| choose_prior(&sample, &optics, &compared)) {
+            match sample().and_then(|sample| choose_prior(&sample, optics, &compared)) {
                 Ok(choice) => {
                     findings.prior = choice.prior();
                     let reason = choice.reason();
@@ -290,7 +339,7 @@ fn calibrate(
         }
     };
     findings.remarks.push(("prior", prior));
-    Ok(demux.with_prior(findings.prior)?)
+    demux.with_prior(findings.prior)
 }
 
 fn say_beam(estimate: Option<&Result<BeamEstimate, CalibrateError>>, sigma_rows: f64) -> String {

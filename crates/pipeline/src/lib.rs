@@ -4,6 +4,7 @@
 //! This crate accesses no devices, files or sockets. Threads are named `std` threads, workers are rayon's.
 
 mod assembler;
+mod calibrated;
 mod demux;
 pub mod dots;
 mod edges;
@@ -24,6 +25,7 @@ mod unit;
 pub use assembler::{
     Assembler, AssemblerConfig, Decision, DeviceEvent, EXPOSURE_TOLERANCE_US, Failure, Job, Label,
 };
+pub use calibrated::CalibrationDrift;
 pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solved, SweepSummary};
 pub use edges::{EdgeTracker, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};

@@ -2,9 +2,11 @@
 
 use std::sync::Arc;
 
+use ndarray::{Array2, Axis};
 use raysweep_core::{CameraSettings, Raster, Shutter};
+use raysweep_transport::plane::board::BoardCalibration;
 use raysweep_transport::plane::calibrate::{self, FlyingSpot};
-use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming};
+use raysweep_transport::plane::{Beam, CameraRows, PlaneError, RowTiming, Setting};
 use serde::Deserialize;
 
 /// The purpose of a point's image.
@@ -57,7 +59,11 @@ impl Schedule {
     }
 }
 
-/// The properties of the rig that convert counts and times into light transport, from the rig file.
+/// Share of the median white level below which a pixel does not count as measured: there the board was not lit.
+const LEAST_WHITE: f64 = 0.05;
+
+/// The properties of the rig that convert counts and times into light transport: those of the rig file, or of a
+/// calibration where [`Self::calibrated`] has put them in their place.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SweepGeometry {
     /// Nominal timing of the projector's rows, to which delays refer.
@@ -81,10 +87,13 @@ pub struct SweepGeometry {
     pub height: usize,
     /// Number of camera columns.
     pub width: usize,
-    /// Counts above black that a white pixel collects in the time of one projector row.
+    /// Counts above black that a white pixel collects in the time of one projector row; with a calibration, the median
+    /// of its pixels.
     pub white_dn: f64,
     /// Counts from which a pixel is saturated.
     pub saturation_dn: f64,
+    /// What a calibration measured, in place of row table, beam and white level.
+    pub calibration: Option<Arc<BoardCalibration>>,
 }
 
 /// How the light of a row is drawn, which determines when within its row a pixel's direct light arrives.
@@ -118,10 +127,59 @@ pub struct Shot {
 }
 
 impl SweepGeometry {
+    /// The same rig as a calibration found it. Delays then refer to the direct light of the middle camera row, as it
+    /// was measured. [`Self::timing`] refuses a calibration of another camera or projector.
+    #[must_use]
+    pub fn calibrated(self, calibration: Arc<BoardCalibration>) -> Self {
+        let (height, width) = calibration.response.size();
+        let (t, camera_row_time_us) = (height / 2, calibration.camera_row_time_us.value);
+        let own_row = calibration.response.own_rows(t, width).nth(width / 2).unwrap_or_default();
+        let above = (t as f64 * self.row_pitch).round() as i64;
+        let below = (self.height.saturating_sub(1) as f64 * self.row_pitch).ceil() as i64;
+        let first_row = (own_row - above).clamp(0, (self.raster.rows as i64 - 1 - below).max(0)) as usize;
+        let first_light_us = calibration.direct_light_us(t) - t as f64 * camera_row_time_us;
+        let mut raster = self.raster;
+        raster.first_row_us += first_light_us - raster.row_centre_us(first_row);
+        let mut white_dn: Vec<f32> = calibration.white_dn.iter().copied().filter(|dn| *dn > 0.0).collect();
+        white_dn.sort_by(f32::total_cmp);
+        Self {
+            raster,
+            row_table_us: None,
+            beam_sigma_rows: None,
+            first_row,
+            camera_row_time_us,
+            white_dn: white_dn.get(white_dn.len() / 2).map_or(self.white_dn, |&dn| f64::from(dn)),
+            calibration: Some(calibration),
+            ..self
+        }
+    }
+
+    /// The model's setting for images taken with these delays and this exposure, as the camera states them: a
+    /// calibrated camera exposes longer or shorter, from the same beginning.
+    pub fn setting(&self, delays_us: &[f64], exposure_us: f64) -> Setting {
+        let longer_us =
+            self.calibration.as_ref().map_or(0.0, |calibration| calibration.exposure_offset_us.value);
+        Setting {
+            delays_us: delays_us.iter().map(|delay_us| delay_us + longer_us / 2.0).collect(),
+            exposure_us: exposure_us + longer_us,
+        }
+    }
+
+    /// Counts above black that a white pixel collects in the time of one projector row, `[t, s]` of these camera rows;
+    /// infinite where a calibration has not measured it, so that no light is found there.
+    pub fn white_of(&self, rows: &[usize]) -> Array2<f64> {
+        let Some(calibration) = &self.calibration else {
+            return Array2::from_elem((rows.len(), self.width), self.white_dn);
+        };
+        let is_measured = |dn: f64| dn >= LEAST_WHITE * self.white_dn;
+        let white = |dn: f32| Some(f64::from(dn)).filter(|dn| is_measured(*dn)).unwrap_or(f64::INFINITY);
+        calibration.white_dn.select(Axis(0), rows).mapv(white)
+    }
+
     /// The timing of projector and camera rows for the model. An unknown beam counts as ideal.
     ///
     /// # Errors
-    /// If table, beam or camera rows do not fit the raster.
+    /// If table, beam or camera rows do not fit the raster, or a calibration does not fit the rig.
     pub fn timing(&self) -> Result<RowTiming, PlaneError> {
         let raster = &self.raster;
         let mut timing = RowTiming::new(raster.rows, raster.row_time_us, raster.period_us)?;
@@ -134,7 +192,22 @@ impl SweepGeometry {
             pitch: self.row_pitch,
             row_time_us: self.camera_row_time_us,
         };
-        timing.with_camera(camera)?.with_beam(Beam::of_sigma(self.beam_sigma_rows.unwrap_or(0.0)))
+        let timing = timing.with_camera(camera)?;
+        match &self.calibration {
+            Some(calibration) => {
+                let (rows, columns) = calibration.response.size();
+                if (rows, columns) != (self.height, self.width) {
+                    return Err(PlaneError::Shape {
+                        array: "calibration",
+                        axes: "[camera rows, columns]",
+                        actual: vec![rows, columns],
+                        expected: vec![self.height, self.width],
+                    });
+                }
+                calibration.timing(timing, raster.first_row_us)
+            }
+            None => timing.with_beam(Beam::of_sigma(self.beam_sigma_rows.unwrap_or(0.0))),
+        }
     }
 
     /// The path of a flying spot over the camera's columns, if the rig file gives it.

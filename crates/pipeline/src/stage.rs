@@ -162,6 +162,7 @@ mod tests {
         Unit {
             id: SettingsId { point: 0, attempt: 0 },
             frames: 1,
+            delay_us: 0.0,
             exposure_us: 1.0,
             delays_us: vec![0.0],
             last_exposure_ns: None,

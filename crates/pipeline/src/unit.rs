@@ -12,6 +12,8 @@ pub struct Unit {
     pub id: SettingsId,
     /// Frames summed.
     pub frames: u32,
+    /// Wanted delay t_d.
+    pub delay_us: f64,
     /// The actual exposure of the hardware.
     pub exposure_us: f64,
     /// True delay t_d of each frame, relative to the VSYNC edge of its light.

@@ -12,7 +12,7 @@ use raysweep_session::stack::{ArrayName, Contents, Stack, crc32};
 use raysweep_session::{Result, Session, durable};
 use serde_json::json;
 
-use crate::plane::{PlaneTask, manifest};
+use crate::plane::{KnownRig, PlaneTask, manifest};
 use crate::report::{accounts, subtitle};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
@@ -32,7 +32,7 @@ pub struct DarksTask {
 
 impl DarksTask {
     /// Dark images on a rig; see [`PlaneTask::new`].
-    pub fn new(plan: &Plan, darks: DarksPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
+    pub fn new(plan: &Plan, darks: DarksPlan, rig: &KnownRig<'_>) -> Self {
         let pairs = darks.exposure_us.values().into_iter().flat_map(|exposure_us| [exposure_us; 2]);
         let image = |(index, exposure_us)| Point {
             role: PointRole::Dark(index),
@@ -41,7 +41,7 @@ impl DarksTask {
             frames: darks.frames,
         };
         let schedule = Schedule { points: (0..).zip(pairs).map(image).collect() };
-        let task = PlaneTask::new(plan, schedule, MAX_JITTER_US, rig, first_row, size);
+        let task = PlaneTask::new(plan, schedule, MAX_JITTER_US, rig);
         Self { darks, task: Arc::new(task) }
     }
 
@@ -250,7 +250,7 @@ pub fn process(
     }
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let task = DarksTask::new(plan, darks, &rig, state.session.first_row, (shape.rows, shape.columns));
+    let task = DarksTask::new(plan, darks, &stored.known(&rig)?);
     stored.check_contents(task.contents())?;
     let problems = make(session, state, &task, &rig)?;
     let (report, points) = (session.report_path(), shape.points());

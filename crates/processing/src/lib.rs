@@ -4,6 +4,7 @@
 //! Needs no rig, socket or device.
 
 pub mod batches;
+pub mod calibration;
 pub mod darks;
 mod export;
 pub mod film;
@@ -54,5 +55,6 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
         Procedure::Batches(own) => batches::process(&stored, own, asked),
         Procedure::Response(own) => response::process(&stored, own, asked),
         Procedure::Darks(own) => darks::process(&stored, own, asked),
+        Procedure::Calibration(own) => calibration::process(&stored, own, asked),
     }
 }

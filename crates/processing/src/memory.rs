@@ -82,8 +82,10 @@ struct Solver {
 impl Solver {
     fn of(task: &PlaneTask) -> Result<Self, PlaneError> {
         let geometry = &task.geometry;
-        let settings: Vec<Setting> =
-            task.settings().map(|(_, point)| Setting::new(point.delay_us, point.exposure_us)).collect();
+        let settings: Vec<Setting> = task
+            .settings()
+            .map(|(_, point)| geometry.setting(&[point.delay_us], point.exposure_us))
+            .collect();
         let reach_rows = reach(&geometry.timing()?, &settings)?.count() as u64;
         let threads = std::thread::available_parallelism().map_or(1, |threads| threads.get() as u64);
         let pixels = (geometry.height * geometry.width) as u64;

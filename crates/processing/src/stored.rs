@@ -3,9 +3,13 @@
 use std::path::{Path, PathBuf};
 
 use raysweep_config::{ConfigError, DotRigFile, Plan, RigFile};
+use raysweep_core::{Size, io_text};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::stack::Contents;
+
+use crate::calibration::KeptCalibration;
+use crate::plane::KnownRig;
 
 /// Why a session cannot be processed.
 #[derive(Debug, thiserror::Error)]
@@ -21,9 +25,9 @@ pub enum ProcessError {
     Product(String),
     /// The results do not fit into memory, not even in strips.
     #[error(
-        "the results need {} MB of memory even if solved in strips of camera rows, but only {} MB may be used: raise --memory, make shorter sequences, or close other programs",
-        needed_bytes / 1_000_000,
-        available_bytes / 1_000_000
+        "the results need {} of memory even if solved in strips of camera rows, but only {} may be used: raise --memory, make shorter sequences, or close other programs",
+        Size(*needed_bytes),
+        Size(*available_bytes)
     )]
     Memory {
         /// Memory needed.
@@ -32,7 +36,7 @@ pub enum ProcessError {
         available_bytes: u64,
     },
     /// A file cannot be copied.
-    #[error("cannot copy to {}: {source}", path.display())]
+    #[error("cannot copy to {}: {}", path.display(), io_text(source))]
     Copy {
         /// Destination.
         path: PathBuf,
@@ -107,6 +111,18 @@ impl Stored<'_> {
         self.rig(RigFile::parse)
     }
 
+    /// What is known of the plane rig that the session was recorded on; `rig` is its file.
+    ///
+    /// # Errors
+    /// When the session's calibration cannot be read.
+    pub(crate) fn known<'a>(&self, rig: &'a RigFile) -> Result<KnownRig<'a>, ProcessError> {
+        let (shape, first_row) = (self.state.session.shape, self.state.session.first_row);
+        let refused = |error: ConfigError| ProcessError::Config(error.to_string());
+        let kept = KeptCalibration::of(rig, self.session.dir(), None).map_err(refused)?;
+        let calibration = kept.as_ref().map(KeptCalibration::known).transpose().map_err(refused)?;
+        Ok(KnownRig { file: rig, first_row, size: (shape.rows, shape.columns), calibration })
+    }
+
     /// The rig file of a session of the dot rig.
     ///
     /// # Errors
@@ -125,5 +141,5 @@ impl Stored<'_> {
 /// Reads a text file of a session.
 pub(crate) fn read(path: &Path) -> Result<String, ProcessError> {
     std::fs::read_to_string(path)
-        .map_err(|error| ProcessError::Config(format!("cannot read {}: {error}", path.display())))
+        .map_err(|error| ProcessError::Config(format!("cannot read {}: {}", path.display(), io_text(&error))))
 }

@@ -7,13 +7,15 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use nix::unistd::{Gid, Group};
+use raysweep_core::io_text;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::{
-    CheckParams, CheckReport, Description, DesignParams, DesignReport, Empty, Event, Id, Incoming, Method,
-    Outcome, Request, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
+    CalibrationInfo, CheckParams, CheckReport, Description, DesignParams, DesignReport, Empty, Event, Id,
+    Incoming, Method, Outcome, Request, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
+    UseCalibrationParams,
 };
 
 /// Maximum time for an answer. No call waits for a run, so a longer wait means that the daemon hangs.
@@ -41,7 +43,7 @@ pub enum ClientError {
         source: io::Error,
     },
     /// Connecting failed for another reason.
-    #[error("cannot connect to {}: {source}", path.display())]
+    #[error("cannot connect to {}: {}", path.display(), io_text(source))]
     Connect {
         /// The socket.
         path: PathBuf,
@@ -49,7 +51,7 @@ pub enum ClientError {
         source: io::Error,
     },
     /// The connection broke.
-    #[error("the connection to {} was lost: {source}; check whether raysweepd still runs", path.display())]
+    #[error("the connection to {} was lost: {}; check whether raysweepd still runs", path.display(), io_text(source))]
     Lost {
         /// The socket.
         path: PathBuf,
@@ -196,6 +198,23 @@ impl Client {
     /// As [`Client::describe`].
     pub fn sessions(&mut self) -> Result<Vec<SessionInfo>, ClientError> {
         self.call(Method::Sessions, &Empty {})
+    }
+
+    /// Lists the calibrations in the daemon's data folder, oldest first.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn calibrations(&mut self) -> Result<Vec<CalibrationInfo>, ClientError> {
+        self.call(Method::Calibrations, &Empty {})
+    }
+
+    /// Makes a session's calibration the one that later runs use.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn use_calibration(&mut self, session: impl Into<PathBuf>) -> Result<(), ClientError> {
+        let params = UseCalibrationParams { session: session.into() };
+        self.call(Method::UseCalibration, &params).map(|Empty {}| ())
     }
 
     /// Streams all events from now on. The connection then carries nothing else; open another one for calls.

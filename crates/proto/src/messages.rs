@@ -323,6 +323,29 @@ pub struct SessionInfo {
     pub state: String,
 }
 
+/// One entry of `calibrations`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct CalibrationInfo {
+    /// Folder of the session that measured it.
+    pub session: PathBuf,
+    /// When it was measured (RFC 3339); empty if it cannot be read.
+    pub made: String,
+    /// Maker, model and serial number of the camera.
+    pub camera: String,
+    /// Whether runs use it.
+    pub in_use: bool,
+    /// Why it cannot be used; `None` if it is sound.
+    pub problem: Option<String>,
+}
+
+/// Parameters of `use_calibration`.
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct UseCalibrationParams {
+    /// Folder of a session of kind `calibration`, or its name in the daemon's data folder.
+    pub session: PathBuf,
+}
+
 /// What `subscribe` streams, as notifications of the method `event`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "event", rename_all = "snake_case")]

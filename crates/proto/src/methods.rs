@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::live::{self, LiveLayout};
 use crate::{
-    CheckParams, CheckReport, DesignParams, DesignReport, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES,
-    ResumeParams, RunParams, SessionInfo, Started, Status,
+    CalibrationInfo, CheckParams, CheckReport, DesignParams, DesignReport, ErrorCode, Event, MAX_CLIENTS,
+    MAX_MESSAGE_BYTES, ResumeParams, RunParams, SessionInfo, Started, Status, UseCalibrationParams,
 };
 
 /// Role of a caller.
@@ -50,6 +50,10 @@ pub enum Method {
     ArmLight,
     /// Lists the sessions on disk.
     Sessions,
+    /// Lists the calibrations on disk.
+    Calibrations,
+    /// Chooses the calibration for later runs.
+    UseCalibration,
     /// Streams all events from now on.
     Subscribe,
 }
@@ -77,7 +81,7 @@ fn sent<T: JsonSchema>() -> Schema {
 
 impl Method {
     /// Every method.
-    pub const ALL: [Method; 12] = [
+    pub const ALL: [Method; 14] = [
         Self::Describe,
         Self::Status,
         Self::Check,
@@ -89,6 +93,8 @@ impl Method {
         Self::Cancel,
         Self::ArmLight,
         Self::Sessions,
+        Self::Calibrations,
+        Self::UseCalibration,
         Self::Subscribe,
     ];
 
@@ -135,6 +141,16 @@ impl Method {
                 "sessions",
                 Observer,
                 "The sessions of the daemon's data folder, oldest first.",
+            ),
+            Self::Calibrations => row::<Empty, Vec<CalibrationInfo>>(
+                "calibrations",
+                Observer,
+                "The calibrations in the daemon's data folder, oldest first.",
+            ),
+            Self::UseCalibration => row::<UseCalibrationParams, Empty>(
+                "use_calibration",
+                Operator,
+                "Makes a session's calibration the one that later runs use.",
             ),
             Self::Subscribe => row::<Empty, Empty>(
                 "subscribe",

@@ -56,7 +56,13 @@ impl Request {
     /// readable.
     pub fn parse(line: &str) -> Result<Self, Box<Response>> {
         let value: Value = serde_json::from_str(line).map_err(|error| {
-            let message = format!("not JSON: {error}; send one JSON object per line");
+            let message = if line.trim().is_empty() {
+                "an empty line is not a request: send one JSON object per line".to_owned()
+            } else if error.is_eof() {
+                "not JSON: the line ends within the object; send one whole JSON object per line".to_owned()
+            } else {
+                format!("not JSON: {error}; send one JSON object per line")
+            };
             Response::error(Id::Null, RpcError::new(ErrorCode::ParseError, message))
         })?;
         let mut object = match value {
@@ -134,7 +140,12 @@ pub fn params<T: DeserializeOwned>(params: Map<String, Value>) -> Result<T, RpcE
         let reason = decoding_message(&error.into_inner().to_string(), "object");
         // The path of an error about the object as a whole (a field missing) is ".".
         if path == "." {
-            return RpcError::new(ErrorCode::InvalidParams, format!("params: {reason}"));
+            let refused = RpcError::new(ErrorCode::InvalidParams, format!("params: {reason}"));
+            let missing = reason.split_once("missing key `").and_then(|(_, rest)| rest.strip_suffix('`'));
+            return match missing {
+                Some(key) => refused.of_field(key),
+                None => refused,
+            };
         }
         RpcError::new(ErrorCode::InvalidParams, format!("params.{path}: {reason}")).of_field(path)
     })
@@ -206,7 +217,7 @@ pub enum Incoming {
     /// The answer to a request.
     Response(Response),
     /// An event.
-    Event(EventNotice),
+    Event(Box<EventNotice>),
 }
 
 #[cfg(test)]

@@ -3,6 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+use raysweep_core::io_text;
+
 /// A result of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
 
@@ -10,7 +12,7 @@ pub type Result<T> = std::result::Result<T, Error>;
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The file system refused an operation.
-    #[error("cannot {action} {}: {source}", path.display())]
+    #[error("cannot {action} {}: {}", path.display(), io_text(source))]
     Io {
         /// The operation, as a verb.
         action: &'static str,
@@ -21,7 +23,7 @@ pub enum Error {
     },
     /// The folder is not a session.
     #[error(
-        "{} is not a session: {why}; give the folder of a session (`raysweep sessions` lists them)",
+        "{} is not a session: {why}; give the folder of a session; `raysweep sessions` lists the names of those in the daemon's data folder",
         path.display()
     )]
     NotASession {

@@ -51,7 +51,10 @@ impl Session {
         match session.shape.contents {
             Contents::Batches { .. } => drop(Dots::create(&created.dots_path(), &session.shape)?),
             Contents::Film { .. } => drop(Film::create(&created.film_path(), &session.shape)?),
-            Contents::Sweep { .. } | Contents::Axes { .. } | Contents::Darks { .. } => {}
+            Contents::Sweep { .. }
+            | Contents::Axes { .. }
+            | Contents::Darks { .. }
+            | Contents::Board { .. } => {}
         }
         let ledger = Ledger::create(&created.ledger_path(), session)?;
         Ok((created, ledger))

@@ -108,6 +108,13 @@ pub enum Contents {
         /// Number of images.
         images: usize,
     },
+    /// Images of a white board, in `stack.zarr` with those of the capped lens.
+    Board {
+        /// Number of images of the board.
+        images: usize,
+        /// Number of images of the capped lens.
+        capped: usize,
+    },
 }
 
 /// A shape as ledgers have it. Those written before there was `contents` tell it by what is 0.
@@ -133,6 +140,7 @@ enum Kind {
     Batches,
     Axes,
     Darks,
+    Board,
 }
 
 /// Most camera rows or columns.
@@ -152,6 +160,7 @@ impl From<StackShape> for StoredShape {
             Contents::Batches { batches, dots } => (Kind::Batches, batches, 0, 0, dots),
             Contents::Axes { axes } => (Kind::Axes, axes, 0, 0, 0),
             Contents::Darks { images } => (Kind::Darks, images, images, 0, 0),
+            Contents::Board { images, capped } => (Kind::Board, images, capped, 0, 0),
         };
         Self { contents: Some(kind), points, exposures, rows, columns, settings, dots }
     }
@@ -174,6 +183,7 @@ impl TryFrom<StoredShape> for StackShape {
             Kind::Batches => Contents::Batches { batches: points, dots },
             Kind::Axes => Contents::Axes { axes: points },
             Kind::Darks => Contents::Darks { images: points },
+            Kind::Board => Contents::Board { images: points, capped: exposures },
         };
         let shape = Self { contents, rows, columns };
         shape.check().map(|()| shape).map_err(|error| error.to_string())
@@ -188,19 +198,21 @@ impl StackShape {
             Contents::Film { cycles, .. } => cycles,
             Contents::Batches { batches, .. } => batches,
             Contents::Axes { axes } => axes,
-            Contents::Darks { images } => images,
+            Contents::Darks { images } | Contents::Board { images, .. } => images,
         }
     }
 
     /// Number of points of an array.
     pub fn len(&self, array: ArrayName) -> usize {
         match (array, self.contents) {
-            (ArrayName::Sum, Contents::Sweep { points, .. }) => points,
+            (ArrayName::Sum, Contents::Sweep { points, .. } | Contents::Board { images: points, .. }) => {
+                points
+            }
             (ArrayName::Regular, Contents::Sweep { .. }) => 1,
             (ArrayName::Dark, Contents::Sweep { exposures, .. } | Contents::Film { exposures, .. }) => {
                 exposures
             }
-            (ArrayName::Dark, Contents::Darks { images }) => images,
+            (ArrayName::Dark, Contents::Darks { images } | Contents::Board { capped: images, .. }) => images,
             _ => 0,
         }
     }
@@ -210,6 +222,7 @@ impl StackShape {
         match self.contents {
             Contents::Sweep { .. } => &ArrayName::ALL,
             Contents::Film { .. } | Contents::Darks { .. } => &[ArrayName::Dark],
+            Contents::Board { .. } => &[ArrayName::Dark, ArrayName::Sum],
             Contents::Batches { .. } | Contents::Axes { .. } => &[],
         }
     }
@@ -243,6 +256,7 @@ impl StackShape {
             Contents::Batches { batches, dots } => ("batches, dots", vec![batches, dots]),
             Contents::Axes { axes } => ("axes", vec![axes]),
             Contents::Darks { images } => ("images", vec![images]),
+            Contents::Board { images, capped } => ("images, capped", vec![images, capped]),
         };
         let found: Vec<usize> = counts.into_iter().chain([self.rows, self.columns]).collect();
         let is_side = |pixels| pixels <= MAX_SIDE_PX;

@@ -14,6 +14,7 @@ use raysweep::live::{LiveError, LiveFile};
 use raysweep::mirror;
 use raysweep::rig::AnyRig;
 use raysweep::server::{self, Access, Listening};
+use raysweep_core::io_text;
 use raysweep_drivers::mirror::{Parked, park};
 use sd_notify::NotifyState;
 use tokio::signal::unix::{SignalKind, signal};
@@ -43,7 +44,7 @@ struct Arguments {
     operators: String,
     /// Memory limit for the results of a run, such as 2GB; larger sweeps are solved in strips of camera rows after their
     /// end [default: the free memory when the run begins]
-    #[arg(long, value_name = "SIZE")]
+    #[arg(long, value_name = "SIZE", value_parser = raysweep::cli::memory_size)]
     memory: Option<ByteSize>,
     /// Read the rig file, open every device once, print what was found, and exit.
     #[arg(long)]
@@ -53,11 +54,18 @@ struct Arguments {
 fn main() -> ExitCode {
     let colours = std::io::stderr().is_terminal();
     tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).with_ansi(colours).init();
-    let arguments = Arguments::parse();
+    let mut arguments = Arguments::parse();
+    // Clients print the paths of sessions, in other working directories.
+    if let Ok(data) = std::path::absolute(&arguments.data) {
+        arguments.data = data;
+    }
     match run(&arguments) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("raysweepd: {error}");
+            for line in error.to_string().lines() {
+                // Excerpts of files are indented.
+                if line.starts_with("  ") { eprintln!("{line}") } else { eprintln!("raysweepd: {line}") }
+            }
             ExitCode::FAILURE
         }
     }
@@ -67,7 +75,11 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
     let rig = AnyRig::load(&arguments.rig)?;
     if !arguments.check {
         prepare_data(&arguments.data).map_err(|error| {
-            format!("--data {}: {error}; give a folder that raysweepd can write to", arguments.data.display())
+            format!(
+                "--data {}: {}; give a folder that raysweepd can write to",
+                arguments.data.display(),
+                io_text(&error)
+            )
         })?;
         // Must come before opening a mirror's driver, which refuses a mirror that was left unparked.
         park_left_behind(&arguments.data);
@@ -143,6 +155,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
         Some(listening) => listening,
         None => Listening::bind(&arguments.socket)?,
     };
+    tracing::info!("listening on {}", listening_on(&listener, &arguments.socket).display());
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let watchdog = tokio::spawn(feed_watchdog(runner.clone()));
@@ -166,6 +179,12 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
     watchdog.abort();
     drop(file);
     Ok(served?)
+}
+
+/// The path of a socket: its own, or the one that was asked for.
+fn listening_on(listener: &tokio::net::UnixListener, asked: &Path) -> PathBuf {
+    let own = listener.local_addr().ok().and_then(|address| address.as_pathname().map(Path::to_owned));
+    own.unwrap_or_else(|| asked.to_owned())
 }
 
 /// Notifies systemd's watchdog as often as the unit asks, but only while the daemon still responds.

@@ -4,6 +4,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use miette::{Diagnostic, LabeledSpan, NamedSource};
+use raysweep_core::io_text;
 #[cfg(feature = "aravis")]
 use raysweep_core::{DeviceError, DeviceErrorKind};
 use raysweep_drivers::mirror::ParkError;
@@ -21,9 +22,9 @@ pub(super) enum CommandFailure {
     Client(#[from] ClientError),
     #[error("{0}")]
     Plan(Box<PlanProblem>),
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {}", path.display(), io_text(source))]
     File { path: PathBuf, source: io::Error },
-    #[error("cannot write {}: {source}", path.display())]
+    #[error("cannot write {}: {}", path.display(), io_text(source))]
     Write { path: PathBuf, source: io::Error },
     #[error(
         "no live image yet: a run publishes its first after some points; `raysweep preview --follow` waits for it"
@@ -31,6 +32,8 @@ pub(super) enum CommandFailure {
     NoLiveImage,
     #[error(transparent)]
     Live(#[from] LiveError),
+    #[error("{0}")]
+    Calibration(String),
     #[error(transparent)]
     Process(#[from] ProcessError),
     #[cfg(feature = "aravis")]
@@ -125,7 +128,7 @@ impl CommandFailure {
             },
             Self::Client(_) => Exit::Unreachable,
             Self::Plan(_) => Exit::Refused,
-            Self::File { .. } | Self::Process(ProcessError::Product(_)) => Exit::Usage,
+            Self::File { .. } | Self::Calibration(_) | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             #[cfg(feature = "aravis")]
             Self::WhichCamera(_) => Exit::Usage,
             #[cfg(feature = "aravis")]

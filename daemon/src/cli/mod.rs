@@ -1,5 +1,6 @@
 //! The command line `raysweep`: what it takes, whom it asks, how it ends.
 
+mod calibration;
 mod devices;
 mod exit;
 mod failure;
@@ -17,12 +18,13 @@ use std::process::ExitCode;
 
 use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
-use raysweep_drivers::mirror;
+use raysweep_drivers::mirror::{self, Parked};
 use raysweep_proto::{
     Client, ClientError, DesignParams, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started,
 };
 use serde_json::json;
 
+use self::calibration::CalibrationCommand;
 use self::devices::CameraCommand;
 use self::exit::Exit;
 use self::failure::CommandFailure;
@@ -89,6 +91,17 @@ enum Command {
     },
     /// Run a plan and follow the run; Ctrl-C cancels it, a second Ctrl-C exits without waiting for its end
     Run(RunArguments),
+    /// Calibrate the rig from a white board, and follow the run as `run` does
+    Calibrate {
+        /// A plan of kind "calibration" [default: one with nothing but its kind]
+        #[arg(long, value_name = "FILE")]
+        plan: Option<PathBuf>,
+        #[command(flatten)]
+        about: RunDescription,
+    },
+    /// Show, list, choose and compare calibrations
+    #[command(subcommand)]
+    Calibration(CalibrationCommand),
     /// Acquire the missing points of a session, and follow the run as `run` does
     Resume {
         /// The session's folder, or its name within the daemon's data folder
@@ -139,7 +152,7 @@ enum Command {
         only: bool,
         /// Memory limit for the results, such as 2GB; larger sweeps are solved in strips of camera rows [default: the free
         /// memory]
-        #[arg(long, value_name = "SIZE")]
+        #[arg(long, value_name = "SIZE", value_parser = memory_size)]
         memory: Option<ByteSize>,
     },
     /// Copy a session's products, report and manifest; needs no daemon
@@ -156,6 +169,12 @@ enum Command {
 struct RunArguments {
     /// The plan, a TOML file
     plan: PathBuf,
+    #[command(flatten)]
+    about: RunDescription,
+}
+
+#[derive(Debug, clap::Args)]
+struct RunDescription {
     /// Return at once instead of following the run
     #[arg(long)]
     detach: bool,
@@ -206,14 +225,16 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                 connect()?.design(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &text))?;
             printer.print(&report, show::design)?;
         }
-        Command::Run(RunArguments { plan, detach, operator, sample, note, tags }) => {
-            let text = read_plan(&plan)?;
-            let params = RunParams { plan: text.clone(), operator, sample, note, tags };
-            let begin = |client: &mut Client| {
-                client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &text))
-            };
-            return begin_run(&socket, printer, detach, begin);
+        Command::Run(RunArguments { plan, about }) => {
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
         }
+        Command::Calibrate { plan: Some(plan), about } => {
+            return run(&socket, printer, &plan, &read_plan(&plan)?, about);
+        }
+        Command::Calibrate { plan: None, about } => {
+            return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about);
+        }
+        Command::Calibration(command) => return calibration::calibration(&socket, command, printer),
         Command::Resume { session, detach } => {
             // The daemon's working directory is another: what exists here is named in full.
             let session = fs::canonicalize(&session).unwrap_or(session);
@@ -242,12 +263,19 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&Empty {}, |_| "light is permitted until the next boot".into())?;
         }
         Command::Park { state, when_closed } => {
+            let is_there = state.exists();
             let parked = if when_closed {
                 mirror::park_when_closed(io::stdin(), &state)?
             } else {
                 mirror::park(&state)?
             };
-            printer.print(&show::parked_name(parked), |_| show::parked(parked))?;
+            match parked {
+                // Exit code 0, because a service also parks after runs of a rig without a mirror.
+                Parked::Already if !is_there && !when_closed => {
+                    printer.print(&show::nothing_parked_name(), |_| show::nothing_parked(&state))?;
+                }
+                parked => printer.print(&show::parked_name(parked), |_| show::parked(parked))?,
+            }
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
         Command::Process { session, products, only, memory } => {
@@ -266,6 +294,29 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
         }
     }
     Ok(Exit::Done)
+}
+
+/// Runs a plan, given by its path and its text.
+fn run(
+    socket: &Path,
+    printer: Printer,
+    path: &Path,
+    text: &str,
+    about: RunDescription,
+) -> Result<Exit, CommandFailure> {
+    let RunDescription { detach, operator, sample, note, tags } = about;
+    let params = RunParams { plan: text.to_owned(), operator, sample, note, tags };
+    begin_run(socket, printer, detach, |client| {
+        client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
+    })
+}
+
+/// Reads the size of a memory limit.
+///
+/// # Errors
+/// What to give instead.
+pub fn memory_size(text: &str) -> Result<ByteSize, String> {
+    text.parse().map_err(|_| "give a size, such as 2GB or 512MiB".to_owned())
 }
 
 /// Begins a run and follows it, unless it is to be left alone.

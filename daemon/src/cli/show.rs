@@ -24,7 +24,7 @@ pub(super) fn status(status: &Status) -> String {
         rows.push(("session", session.display().to_string()));
     }
     if let Some(progress) = &status.progress {
-        rows.push(("points", format!("{} of {} stored", progress.points_stored, progress.points_planned)));
+        rows.push(("stored", format!("{} of {}", progress.points_stored, progress.points_planned)));
         rows.push(("pace", pace(progress)));
         rows.push(("elapsed", duration(progress.elapsed_s)));
     }
@@ -50,7 +50,7 @@ pub(super) fn status(status: &Status) -> String {
         rows.push(("clock", format!("residual {residual_us:.1} us, {rate_ppm:+.2} ppm against the host's")));
     }
     if let Some(SettingsLatency { min_frames, max_frames }) = status.settings_latency {
-        rows.push(("settings", format!("take effect {min_frames} to {max_frames} frames late")));
+        rows.push(("settings", settings_latency(min_frames, max_frames)));
     }
     if let Some(mirror) = &status.mirror {
         rows.push(("mirror", self::mirror(mirror)));
@@ -59,6 +59,27 @@ pub(super) fn status(status: &Status) -> String {
         rows.push(("error", error.clone()));
     }
     block(&rows)
+}
+
+fn settings_latency(min_frames: u32, max_frames: u32) -> String {
+    match (min_frames, max_frames) {
+        (0, 0) => "take effect with the next frame".into(),
+        (min, max) if min == max => format!("take effect {min} frames late"),
+        (min, max) => format!("take effect {min} to {max} frames late"),
+    }
+}
+
+/// Result of `park` without a state file, for programs.
+pub(super) fn nothing_parked_name() -> serde_json::Value {
+    serde_json::json!({ "parked": "nothing" })
+}
+
+/// Text of `park` without a state file.
+pub(super) fn nothing_parked(state: &Path) -> String {
+    format!(
+        "{} does not exist: nothing was parked; give the file mirror.json in the daemon's data folder with --state",
+        state.display()
+    )
 }
 
 /// Result of `park`, for programs.
@@ -107,7 +128,7 @@ pub(super) fn check(report: &CheckReport) -> String {
             },
         ),
         ("frames", report.frames.to_string()),
-        ("light", format!("at least {}", duration(report.light_s))),
+        ("time", format!("at least {}", duration(report.light_s))),
         ("memory", BinaryBytes(report.memory_bytes).to_string()),
         (
             "disk",
@@ -247,7 +268,7 @@ pub(super) fn sessions(sessions: &[SessionInfo]) -> String {
         let folder = session.session.file_name().unwrap_or_default().to_string_lossy().into_owned();
         [folder, session.state.clone(), points, session.name.clone()]
     };
-    let mut rows = vec![["session", "state", "points", "name"].map(str::to_owned)];
+    let mut rows = vec![["session", "state", "stored", "name"].map(str::to_owned)];
     rows.extend(sessions.iter().map(row));
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths = [width(0), width(1), width(2)];
@@ -293,7 +314,7 @@ impl Ending<'_> {
     /// Text for the end of a run.
     pub(super) fn text(&self) -> String {
         let Self { session, state, report, stored, missing, final_s, light_s } = *self;
-        let mut lines = vec![format!("{state}: {stored} points stored, {missing} missing")];
+        let mut lines = vec![format!("{state}: {stored} of {} stored, {missing} missing", stored + missing)];
         lines.push(format!("session: {}", session.display()));
         lines.extend(
             light_s.map(|seconds| format!("{seconds:.2} s from the first to the last frame with light")),
@@ -332,7 +353,7 @@ pub(super) fn film(film: &FilmSummary) -> String {
 /// Text of `process`.
 pub(super) fn processed(made: &Processed) -> String {
     let mut lines: Vec<_> = made.problems.iter().map(|problem| format!("not made: {problem}")).collect();
-    lines.push(format!("made from {} of {} points", made.stored, made.points));
+    lines.push(format!("made from what is stored: {} of {}", made.stored, made.points));
     lines.push(format!("report: {}", made.report.display()));
     lines.join("\n")
 }

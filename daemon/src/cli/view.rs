@@ -11,7 +11,7 @@ use super::show::{self, Ending};
 /// Interval between progress lines where no bar can be drawn.
 const PACE: Duration = Duration::from_secs(5);
 
-const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} points  {msg}";
+const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} stored  {msg}";
 
 /// Displays a run's events.
 pub(super) struct EventView {
@@ -130,7 +130,7 @@ impl EventView {
             }
             Place::Lines { told } if told.is_none_or(|told| told.elapsed() >= PACE) => {
                 *told = Some(Instant::now());
-                eprintln!("{}/{} points  {details}", progress.points_stored, progress.points_planned);
+                eprintln!("{}/{} stored  {details}", progress.points_stored, progress.points_planned);
             }
             Place::Lines { .. } | Place::Json => {}
         }

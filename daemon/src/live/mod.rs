@@ -10,6 +10,8 @@ mod reader;
 use std::io;
 use std::path::PathBuf;
 
+use raysweep_core::io_text;
+
 pub(crate) use estimate::{LiveEstimate, Outlet};
 pub use file::LiveFile;
 pub use reader::{LiveImage, LiveReader};
@@ -28,7 +30,7 @@ pub const FLOODLIT: &str = "floodlit";
 #[derive(Debug, thiserror::Error)]
 pub enum LiveError {
     /// The file cannot be created.
-    #[error("cannot create {}: {source}; its folder must exist and be writable, or choose another --live", path.display())]
+    #[error("cannot create {}: {}; its folder must exist and be writable, or choose another --live", path.display(), io_text(source))]
     Make {
         /// Path of the file.
         path: PathBuf,
@@ -36,7 +38,7 @@ pub enum LiveError {
         source: io::Error,
     },
     /// An operation on the file failed.
-    #[error("cannot {what} {}: {source}", path.display())]
+    #[error("cannot {what} {}: {}", path.display(), io_text(source))]
     Io {
         /// The operation.
         what: &'static str,

@@ -56,6 +56,13 @@ impl Model {
                 "condition number {condition:.1e}: raise alpha or take delays that overlap more"
             ));
         }
+        let (blind, (first_us, last_us)) = task.without_light();
+        if blind > 0 {
+            warnings.push(format!(
+                "{blind} of {} settings see no row of the projector: give delays from {first_us:.0} to {last_us:.0} us",
+                task.settings().count()
+            ));
+        }
         let brightest_rows = task
             .schedule
             .points

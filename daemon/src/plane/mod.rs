@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use raysweep_core::{
     Camera, CameraCapabilities, CameraSettings, Clock, Counts, DeviceError, Pattern, Projector, SettingsId,
-    SettingsLatency, Shown, Vsync,
+    SettingsLatency, Shown, Subject, Vsync,
 };
 use raysweep_pipeline::{AssemblerConfig, Pipeline, PipelineConfig, Point, PointRole, Policy, Sink, Stages};
 use raysweep_processing::plane::{PlaneTask, place};
@@ -22,9 +22,9 @@ pub use self::sink::{PointSink, Verdict};
 use crate::devices::camera::{
     Attempt, CameraThread, Drive, Exposures, FilmPass, FilmSetting, Gone, Pass, TriggerLine, Work,
 };
-use crate::devices::operator::Operator;
+use crate::devices::operator::{self, Operator};
 use crate::devices::vsync::VsyncThread;
-use crate::rig::{Devices, Pace, Rig};
+use crate::rig::{Devices, Pace, Rig, Stand};
 use crate::run::board::StatusBoard;
 use crate::run::error::RunError;
 use crate::run::life::Run;
@@ -79,6 +79,7 @@ pub struct Opened {
     camera: Box<dyn Camera>,
     vsync: Box<dyn Vsync>,
     projector: Lit,
+    stand: Stand,
     clock: Clock,
     assembler: AssemblerConfig,
     orders: Arc<Orders>,
@@ -105,7 +106,7 @@ impl Opened {
     /// # Errors
     /// The first device that cannot be opened; a camera whose size differs from the task's.
     pub fn open(rig: &Rig, task: &Arc<PlaneTask>, run: &Run) -> Result<Self, RunError> {
-        let Devices { camera, vsync, projector, questions, clock, pace, .. } = rig.open()?;
+        let Devices { camera, vsync, projector, questions, stand, clock, pace } = rig.open()?;
         let operator = questions
             .map(|questions| Operator::start(questions, run.orders.clone(), run.board.clone()))
             .transpose()?;
@@ -124,7 +125,7 @@ impl Opened {
             edge_gate_us: rig.file.vsync.gate_us,
         };
         let (task, orders, board) = (task.clone(), run.orders.clone(), run.board.clone());
-        Ok(Self { task, camera, vsync, projector, clock, assembler, orders, board, pace })
+        Ok(Self { task, camera, vsync, projector, stand, clock, assembler, orders, board, pace })
     }
 
     /// Capabilities of the camera.
@@ -145,7 +146,7 @@ impl Opened {
         results: &Receiver<Verdict>,
         points: impl FnOnce(&mut Passes<'_>) -> Result<(), RunError>,
     ) -> Result<Taken<S>, RunError> {
-        let Self { task, camera, vsync, projector, clock, assembler, orders, board, pace } = self;
+        let Self { task, camera, vsync, projector, stand, clock, assembler, orders, board, pace } = self;
         let config = PipelineConfig {
             queue_events: QUEUE_EVENTS,
             policy: match pace {
@@ -168,8 +169,10 @@ impl Opened {
             camera: &camera,
             vsync: &vsync,
             projector,
+            stand: &stand,
             results,
             orders: &orders,
+            board: &board,
             pace,
             trigger_latency_us,
         };
@@ -225,8 +228,10 @@ pub struct Passes<'a> {
     camera: &'a CameraThread,
     vsync: &'a VsyncThread,
     projector: Lit,
+    stand: &'a Stand,
     results: &'a Receiver<Verdict>,
     orders: &'a Orders,
+    board: &'a StatusBoard,
     pace: Pace,
     trigger_latency_us: f64,
 }
@@ -244,28 +249,60 @@ impl Passes<'_> {
         Ok(probed?)
     }
 
-    /// Acquires points until none is missing or the run is told to end.
+    /// Acquires points until none is missing or the run is told to end: dark ones without light, then the others under
+    /// white.
     ///
     /// # Errors
     /// When a device fails, or points fail repeatedly.
     pub fn acquire(&mut self, missing: Vec<SettingsId>) -> Result<(), RunError> {
-        let mut todo: Vec<Attempt> = missing.into_iter().map(|id| self.attempt(id)).collect();
+        let todo = missing.into_iter().map(|id| self.attempt(id)).collect();
+        self.until_none_is_missing(todo, |passes, todo, counts| {
+            let (dark, lit): (Vec<_>, Vec<_>) =
+                todo.into_iter().partition(|attempt| matches!(attempt.point.role, PointRole::Dark(_)));
+            let mut again = Vec::new();
+            for (attempts, pattern) in [(dark, None), (lit, Some(&Pattern::White))] {
+                if !attempts.is_empty() && passes.orders.go_on() {
+                    let Some(failed) = passes.pass(attempts, pattern, counts)? else { return Ok(None) };
+                    again.extend(failed);
+                }
+            }
+            Ok(Some(again))
+        })
+    }
+
+    /// Acquires points with one picture (`None`: no light) until none is missing or the run is told to end.
+    ///
+    /// # Errors
+    /// When a device fails, or points fail repeatedly.
+    pub fn acquire_under(
+        &mut self,
+        pattern: Option<&Pattern>,
+        attempts: Vec<Attempt>,
+    ) -> Result<(), RunError> {
+        self.until_none_is_missing(attempts, |passes, todo, counts| passes.pass(todo, pattern, counts))
+    }
+
+    /// Places a subject in front of the camera; waits for the operator if needed.
+    ///
+    /// # Errors
+    /// When the rig does not have the subject.
+    pub fn place(&self, subject: Subject) -> Result<(), RunError> {
+        Ok(operator::place(self.stand, subject, 0, self.orders, self.board)?)
+    }
+
+    /// Makes `round`s of the attempts that are still to be made, until none is left or the run is told to end. A round
+    /// returns those to be made again, or `None` if the run was ended.
+    fn until_none_is_missing(
+        &mut self,
+        mut todo: Vec<Attempt>,
+        mut round: impl FnMut(&mut Self, Vec<Attempt>, &mut Counts) -> Result<Option<Vec<Attempt>>, RunError>,
+    ) -> Result<(), RunError> {
         let mut fruitless = 0;
         loop {
             let before = todo.len();
             let mut counts = Counts::default();
-            let (dark, lit): (Vec<_>, Vec<_>) =
-                todo.into_iter().partition(|attempt| matches!(attempt.point.role, PointRole::Dark(_)));
-            todo = Vec::new();
-            if !dark.is_empty() {
-                let Some(shown) = self.projector.show(None, self.orders)? else { return Ok(()) };
-                todo.extend(self.pass(dark, shown, &mut counts)?);
-            }
-            if !lit.is_empty() && self.orders.go_on() {
-                let white = self.projector.show(Some(&Pattern::White), self.orders)?;
-                let Some(shown) = white else { return Ok(()) };
-                todo.extend(self.pass(lit, shown, &mut counts)?);
-            }
+            let Some(again) = round(self, todo, &mut counts)? else { return Ok(()) };
+            todo = again;
             if todo.is_empty() || !self.orders.go_on() {
                 return Ok(());
             }
@@ -283,10 +320,14 @@ impl Passes<'_> {
         }
     }
 
-    fn attempt(&self, id: SettingsId) -> Attempt {
-        let point = self.task.schedule.points[id.point as usize];
+    /// An attempt at a point of the schedule, or at one that takes its place.
+    pub fn attempt_at(&self, id: SettingsId, point: Point) -> Attempt {
         let shot = self.task.geometry.shot(&point, self.trigger_latency_us);
         Attempt { id, point, shot, interruptions: 0 }
+    }
+
+    fn attempt(&self, id: SettingsId) -> Attempt {
+        self.attempt_at(id, self.task.schedule.points[id.point as usize])
     }
 
     /// Takes a film with the camera, under white light.
@@ -307,13 +348,15 @@ impl Passes<'_> {
         self.orders.go_on()
     }
 
-    /// Makes attempts with one projected image; returns the next attempts, and adds up the frame counts.
+    /// Makes attempts with one picture (`None`: no light); returns the next attempts, or `None` if the run was ended
+    /// while waiting for the operator. Adds up the frame counts.
     fn pass(
-        &self,
+        &mut self,
         attempts: Vec<Attempt>,
-        shown: Shown,
+        pattern: Option<&Pattern>,
         counts: &mut Counts,
-    ) -> Result<Vec<Attempt>, RunError> {
+    ) -> Result<Option<Vec<Attempt>>, RunError> {
+        let Some(shown) = self.projector.show(pattern, self.orders)? else { return Ok(None) };
         let pass = Pass { attempts: attempts.clone(), not_before_ns: shown.not_before_ns };
         let acquired = self.camera.acquire(Work::Pass(pass)).map_err(|Gone| RunError::Interrupted)?;
         let mut again = Vec::new();
@@ -329,6 +372,6 @@ impl Passes<'_> {
             }
         }
         acquired?;
-        Ok(again)
+        Ok(Some(again))
     }
 }

@@ -112,8 +112,7 @@ impl PointSink {
     }
 
     fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
-        let point = self.task.schedule.points[unit.id.point as usize];
-        let (array, index) = place(point.role);
+        let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
         let crc32 = self.stack.write(array, index, unit.sum.view())?;
         self.run.ledger.append(&Entry::Point(PointEntry {
             array,
@@ -121,7 +120,7 @@ impl PointSink {
             attempt: unit.id.attempt,
             frames: unit.frames,
             exposure_us: unit.exposure_us,
-            delay_us: point.delay_us,
+            delay_us: unit.delay_us,
             delays_us: unit.delays_us.clone(),
             counts: unit.counts.clone(),
             crc32,

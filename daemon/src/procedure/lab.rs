@@ -3,10 +3,14 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use raysweep_core::CameraCapabilities;
+use raysweep_config::ConfigError;
+use raysweep_core::{CameraCapabilities, Size};
+use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::available_bytes;
-use raysweep_proto::CheckReport;
-use raysweep_session::durable;
+use raysweep_processing::plane::KnownRig;
+use raysweep_proto::{CheckReport, ErrorCode, RpcError};
+use raysweep_session::ledger::SessionEntry;
+use raysweep_session::{Session, durable};
 
 use crate::probes::Probes;
 use crate::rig::{DotRig, Rig};
@@ -74,6 +78,66 @@ impl Lab<'_> {
     }
 }
 
+/// A plane rig on which a plan is to run.
+pub struct RigOfRun<'a> {
+    /// The rig.
+    pub rig: &'a Arc<Rig>,
+    /// Projector row that camera row 0 sees, according to the rig file.
+    pub first_row: usize,
+    /// Rows and columns of the frames.
+    pub size: (usize, usize),
+    /// The calibration that the run uses.
+    pub calibration: Option<KeptCalibration>,
+}
+
+impl<'a> RigOfRun<'a> {
+    /// The rig of a new session, without a calibration.
+    pub fn of_new(lab: &Lab<'_>, rig: &'a Arc<Rig>) -> Self {
+        Self { rig, first_row: rig.first_row(lab.camera), size: lab.size(), calibration: None }
+    }
+
+    /// The rig of a session that was begun earlier, without a calibration.
+    pub fn of_begun(rig: &'a Arc<Rig>, begun: &SessionEntry) -> Self {
+        let size = (begun.shape.rows, begun.shape.columns);
+        Self { rig, first_row: begun.first_row, size, calibration: None }
+    }
+
+    /// The same rig with the calibration in a folder, if it has one.
+    ///
+    /// # Errors
+    /// When the calibration cannot be read, or is of other devices.
+    pub fn calibrated(self, lab: &Lab<'_>, folder: &Path) -> Result<Self, ConfigError> {
+        let calibration = KeptCalibration::of(&self.rig.file, folder, Some(lab.camera))?;
+        Ok(Self { calibration, ..self })
+    }
+
+    /// What is known of it for the model.
+    ///
+    /// # Errors
+    /// When the calibration is unusable.
+    pub fn known(&self) -> Result<KnownRig<'a>, ConfigError> {
+        let calibration = self.calibration.as_ref().map(KeptCalibration::known).transpose()?;
+        Ok(KnownRig { file: &self.rig.file, first_row: self.first_row, size: self.size, calibration })
+    }
+
+    /// A prediction, with what may not be true any more of the calibration.
+    pub fn warned(&self, mut report: CheckReport) -> CheckReport {
+        if let Some(kept) = &self.calibration {
+            report.warnings.extend(kept.warnings(&self.rig.text, jiff::Timestamp::now()));
+        }
+        report
+    }
+}
+
+/// Stores the calibration that a run uses in its session.
+///
+/// # Errors
+/// When the session cannot be written.
+pub fn keep_calibration(calibration: Option<&KeptCalibration>, session: &Session) -> Result<(), RpcError> {
+    let kept = calibration.map_or(Ok(()), |kept| kept.write(session.dir()));
+    kept.map_err(|error| RpcError::new(ErrorCode::Storage, error.to_string()))
+}
+
 /// Disk space and memory that a session and its results need, and what is available.
 pub struct Room {
     memory_bytes: u64,
@@ -91,8 +155,8 @@ impl Room {
         ];
         let short = needs.into_iter().filter(|(_, needed, free)| needed > free);
         let warning = |(what, needed, free)| {
-            let (needed, free) = (needed / 1_000_000, free / 1_000_000);
-            format!("{needed} MB of {what} are needed and {free} MB are free: the run would be refused")
+            let (needed, free) = (Size(needed), Size(free));
+            format!("{needed} of {what} are needed and {free} are free: the run would be refused")
         };
         short.map(warning).collect()
     }

@@ -2,16 +2,20 @@
 //! which chooses the plan's.
 
 mod batches;
+mod calibration;
 mod darks;
 mod film;
 pub mod lab;
 mod response;
 mod sweep;
 
+use std::path::Path;
+
 use raysweep_config::{ConfigError, Plan, Procedure};
+use raysweep_processing::calibration::current_in;
 use raysweep_session::ledger::SessionEntry;
 
-use self::lab::{Lab, LabRig};
+use self::lab::{Lab, LabRig, RigOfRun};
 use crate::run::life::Foreseen;
 
 /// Predicts a plan's run on the lab's rig.
@@ -20,22 +24,30 @@ use crate::run::life::Foreseen;
 /// For a plan that cannot be run on it, with the positions in the text.
 pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse(text)?;
+    let in_use = current_in(lab.data);
     match (lab.rig, plan.procedure.clone()) {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
-            sweep::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+            sweep::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
         }
         (LabRig::Plane(rig), Procedure::Darks(own)) => {
-            darks::foresee(lab, rig, &plan, own, rig.first_row(lab.camera), lab.size())
+            darks::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
         }
-        (LabRig::Plane(rig), Procedure::Film(own)) => film::foresee(lab, rig, &plan, own),
+        (LabRig::Plane(rig), Procedure::Calibration(own)) => {
+            calibration::foresee(lab, RigOfRun::of_new(lab, rig), &plan, own)
+        }
+        (LabRig::Plane(rig), Procedure::Film(own)) => {
+            film::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
+        }
         (LabRig::Dots(rig), Procedure::Batches(own)) => batches::foresee(lab, rig, &plan, own),
         (LabRig::Dots(rig), Procedure::Response(own)) => response::foresee(lab, rig, &plan, own),
-        (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => {
-            Err(of_another_rig(&plan, "a plane rig runs plans of kind \"sweep\", \"film\" and \"darks\""))
-        }
-        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_)) => {
-            Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\""))
-        }
+        (LabRig::Plane(_), Procedure::Batches(_) | Procedure::Response(_)) => Err(of_another_rig(
+            &plan,
+            "a plane rig runs plans of kind \"sweep\", \"film\", \"darks\" and \"calibration\"",
+        )),
+        (
+            LabRig::Dots(_),
+            Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_) | Procedure::Calibration(_),
+        ) => Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"")),
     }
 }
 
@@ -43,33 +55,49 @@ fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {
     plan.places.error(&["kind"], format!("kind = \"{}\": {what}", plan.procedure.kind()))
 }
 
-/// Predicts the rest of a session that was begun with this plan.
+/// Predicts the rest of a session, given by its folder, that was begun with this plan.
 ///
 /// # Errors
 /// If nothing can be resumed, or the plan cannot be run on this rig.
-pub fn foresee_rest(lab: &Lab<'_>, text: &str, begun: &SessionEntry) -> Result<Foreseen, Unresumable> {
+pub fn foresee_rest(
+    lab: &Lab<'_>,
+    text: &str,
+    session: &Path,
+    begun: &SessionEntry,
+) -> Result<Foreseen, Unresumable> {
     let plan = Plan::parse(text)?;
     match (lab.rig, plan.procedure.clone()) {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
-            let size = (begun.shape.rows, begun.shape.columns);
-            Ok(sweep::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+            // As it was when the session began.
+            let rig = RigOfRun::of_begun(rig, begun).calibrated(lab, session)?;
+            Ok(sweep::foresee(lab, rig, &plan, own)?)
         }
         (LabRig::Plane(rig), Procedure::Darks(own)) => {
-            let size = (begun.shape.rows, begun.shape.columns);
-            Ok(darks::foresee(lab, rig, &plan, own, begun.first_row, size)?)
+            Ok(darks::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
-        (_, Procedure::Film(_)) => Err(Unresumable::Past(
-            "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film",
-        )),
-        (_, Procedure::Batches(_)) => Err(Unresumable::Past(
-            "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more",
-        )),
-        (_, Procedure::Response(_)) => {
-            Err(Unresumable::Past("a run of kind \"response\" cannot be resumed: run the plan again"))
+        (LabRig::Plane(rig), Procedure::Calibration(own)) => {
+            Ok(calibration::foresee(lab, RigOfRun::of_begun(rig, begun), &plan, own)?)
         }
-        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_)) => {
+        (_, Procedure::Film(_)) => Err(Unresumable::Past(FILM_IS_PAST)),
+        (_, Procedure::Batches(_)) => Err(Unresumable::Past(BATCHES_ARE_PAST)),
+        (_, Procedure::Response(_)) => Err(Unresumable::Past(RESPONSE_IS_PAST)),
+        (LabRig::Dots(_), Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_)) => {
             Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"").into())
         }
+    }
+}
+
+const FILM_IS_PAST: &str = "a film cannot be resumed, because it records one moment: `raysweep process` makes the transports of its stored cycles; run the plan again for another film";
+const BATCHES_ARE_PAST: &str = "batches cannot be resumed, because they record one moment: `raysweep process` makes the products of the stored ones; run the plan again for more";
+const RESPONSE_IS_PAST: &str = "a run of kind \"response\" cannot be resumed: run the plan again";
+
+/// Why no session of this plan can be resumed on any rig.
+pub fn past(text: &str) -> Option<&'static str> {
+    match Plan::parse(text).ok()?.procedure {
+        Procedure::Film(_) => Some(FILM_IS_PAST),
+        Procedure::Batches(_) => Some(BATCHES_ARE_PAST),
+        Procedure::Response(_) => Some(RESPONSE_IS_PAST),
+        Procedure::Sweep(_) | Procedure::Darks(_) | Procedure::Calibration(_) => None,
     }
 }
 

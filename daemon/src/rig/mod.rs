@@ -13,7 +13,7 @@ use std::time::Duration;
 use raysweep_config::rig::plane::{CameraDriver, DrmSection, ProjectorDriver};
 use raysweep_config::rig::vsync::VsyncDriver;
 use raysweep_config::{AnyRigFile, ConfigError, RigFile};
-use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync};
+use raysweep_core::{Camera, CameraCapabilities, Clock, DeviceError, Projector, Vsync, io_text};
 use raysweep_drivers::camera::v4l2::{self, V4l2Setup};
 use raysweep_drivers::projector::drm::{DrmConfig, DrmProjector, Timing};
 use raysweep_drivers::projector::external::{External, ShowRequest};
@@ -28,7 +28,7 @@ pub use self::stand::Stand;
 #[derive(Debug, thiserror::Error)]
 pub enum RigError {
     /// The file cannot be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {}", path.display(), io_text(source))]
     Read {
         /// Path of the file.
         path: PathBuf,

@@ -22,6 +22,7 @@ pub(super) fn simulate(file: &RigFile, folder: &Path) -> Result<PlaneRig, SimErr
         format: file.camera.pixel_format,
         first_row: file.camera.first_projector_row,
     };
+    tracing::info!("building the scene {}", file.sim.scene.display());
     PlaneRig::new(file.sim.clone(), setup, folder)
 }
 

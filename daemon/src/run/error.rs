@@ -39,6 +39,11 @@ pub enum RunError {
     /// The mirror's response could not be identified.
     #[error(transparent)]
     Response(#[from] ResponseError),
+    /// The images of a calibration are of no use.
+    #[error(
+        "the rig is not calibrated: {0}. The images are kept in the session; the calibration in use before stays in use"
+    )]
+    Calibration(#[from] raysweep_processing::calibration::CalibrationError),
     /// A frame cannot be read.
     #[error("{0}")]
     Frame(String),

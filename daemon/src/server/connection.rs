@@ -4,6 +4,7 @@ use std::io;
 use std::sync::Arc;
 use std::time::Duration;
 
+use raysweep_core::io_text;
 use raysweep_proto::{ErrorCode, Event, EventNotice, Id, Method, Request, Response, Role, RpcError};
 use serde::Serialize;
 use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
@@ -35,7 +36,11 @@ pub(super) async fn attend(stream: UnixStream, desk: Arc<Desk>, stop: Cancellati
     let mut connection = Connection { lines, writer, desk, peer, role, events: None };
     match connection.converse(&stop).await {
         Ok(()) => tracing::debug!(uid = peer.uid, "a client has gone"),
-        Err(error) => tracing::info!(%error, uid = peer.uid, "a client is dropped"),
+        // Clients end in this way whenever they exit before they have read everything.
+        Err(error) if is_gone(&error) => tracing::debug!(uid = peer.uid, "a client has disconnected"),
+        Err(error) => {
+            tracing::info!(error = io_text(&error), uid = peer.uid, "a client was disconnected");
+        }
     }
 }
 
@@ -137,6 +142,11 @@ impl Connection {
     async fn send(&mut self, message: &impl Serialize) -> io::Result<()> {
         send(&mut self.writer, message, self.desk.limits.write_timeout).await
     }
+}
+
+/// Whether the client itself has closed the connection.
+fn is_gone(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::ConnectionReset | io::ErrorKind::BrokenPipe)
 }
 
 /// The next event; never returns for a client that has not subscribed.

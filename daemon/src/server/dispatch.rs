@@ -1,8 +1,8 @@
 //! Maps a method's name and parameters to a call of the daemon.
 
 use raysweep_proto::{
-    CheckParams, DesignParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams, describe,
-    params,
+    CheckParams, DesignParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams,
+    UseCalibrationParams, describe, params,
 };
 use serde::Serialize;
 use serde_json::{Map, Value};
@@ -32,6 +32,11 @@ pub(super) fn carry_out(
         Method::Describe => none(given).and_then(|()| value(describe(env!("CARGO_PKG_VERSION")))),
         Method::Status => none(given).and_then(|()| value(control.status())),
         Method::Sessions => none(given).and_then(|()| control.sessions()).and_then(value),
+        Method::Calibrations => none(given).and_then(|()| control.calibrations()).and_then(value),
+        Method::UseCalibration => {
+            let params = params::<UseCalibrationParams>(given)?;
+            control.use_calibration(&params.session).and_then(done)
+        }
         Method::Pause => none(given).and_then(|()| control.pause()).and_then(done),
         Method::Continue => none(given).and_then(|()| control.go_on()).and_then(done),
         Method::Cancel => none(given).and_then(|()| control.cancel()).and_then(done),

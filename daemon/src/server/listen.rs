@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use nix::sys::socket::{getsockopt, sockopt::AcceptConn};
+use raysweep_core::io_text;
 use tokio::net::UnixListener;
 
 /// Owner and group may connect; [`super::Access`] decides which of them may operate the rig.
@@ -24,7 +25,7 @@ pub enum ListenError {
     #[error("{} exists and is not a socket: remove it, or choose another --socket", .0.display())]
     NotASocket(PathBuf),
     /// The socket cannot be created.
-    #[error("cannot listen on {}: {source}; its folder must exist and be writable", path.display())]
+    #[error("cannot listen on {}: {}; its folder must exist and be writable", path.display(), io_text(source))]
     Bind {
         /// Path of the socket.
         path: PathBuf,

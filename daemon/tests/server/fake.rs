@@ -8,9 +8,9 @@ use raysweep::control::Control;
 use raysweep::server::{Access, Limits, Listening, serve_within};
 use raysweep_core::{Counts, LossCause, VsyncStats};
 use raysweep_proto::{
-    BetterPlan, CheckReport, Client, DesignParams, DesignReport, ErrorCode, ErrorRange, Event, ExpectedError,
-    MirrorStatus, NoiseEstimate, NoiseSource, PlanAdvice, Progress, ResumeParams, RpcError, RunParams,
-    RunState, SessionInfo, Started, Status,
+    BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, ErrorCode, ErrorRange,
+    Event, ExpectedError, MirrorStatus, NoiseEstimate, NoiseSource, PlanAdvice, Progress, ResumeParams,
+    RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -254,6 +254,23 @@ impl Control for Fake {
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
         Ok(vec![listed()])
+    }
+
+    fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError> {
+        Ok(vec![CalibrationInfo {
+            session: session(),
+            made: "2026-01-01T00:00:00Z".into(),
+            camera: "fake".into(),
+            in_use: true,
+            problem: None,
+        }])
+    }
+
+    fn use_calibration(&self, session: &Path) -> Result<(), RpcError> {
+        if session == Path::new("none") {
+            return Err(RpcError::new(ErrorCode::NoSession, "there is no session `none`"));
+        }
+        Ok(())
     }
 
     fn events(&self) -> broadcast::Receiver<Event> {

@@ -23,7 +23,7 @@ pub enum DotsRigError {
     #[error("sim.dots.scene: {0}")]
     Scene(#[from] DotSceneError),
     /// A key of `[sim.dots]` outside its range.
-    #[error("sim.dots.{key} = {value}: allowed is {allowed}")]
+    #[error("sim.dots.{key} = {value}: must be {allowed}")]
     Range {
         /// Key below `[sim.dots]`.
         key: &'static str,

@@ -4,14 +4,17 @@ use raysweep_core::{MirrorLimits, MirrorPath, MirrorPoint, PathError, RasterScan
 use serde::Deserialize;
 
 use crate::document::Document;
+use crate::whole::whole;
 
 /// `[batches]`: the mirror completes its path once per batch, and the camera takes one frame per dot.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BatchesPlan {
     /// Number of batches of the scene.
+    #[serde(deserialize_with = "whole::<_, 1, 129_600>")]
     pub count: u32,
     /// Number of frames per batch.
+    #[serde(deserialize_with = "whole::<_, 8, 65_536>")]
     pub dots: u32,
     /// Frames per second; default: the rate that gives `dots` frames in the duration of the mirror's path.
     pub camera_rate_hz: Option<f64>,
@@ -24,8 +27,10 @@ pub struct BatchesPlan {
     /// Indices of the frames whose light goes into the beam dump.
     pub background_indices: Vec<u32>,
     /// Frames without light before the first batch, to calibrate the sensor.
+    #[serde(deserialize_with = "whole::<_, 16, 1_048_576>")]
     pub dark_frames: u32,
     /// Evenly lit frames after the dark frames, for the flat field; 0: none.
+    #[serde(deserialize_with = "whole::<_, 0, 1_048_576>")]
     pub flat_frames: u32,
     /// Whether to store the raw frames, with 16 bits per pixel.
     pub keep_raw: bool,
@@ -78,6 +83,7 @@ pub enum Shape {
 #[serde(deny_unknown_fields)]
 pub struct PlanePlan {
     /// Number of batches.
+    #[serde(deserialize_with = "whole::<_, 1, 129_600>")]
     pub batches: u32,
     /// Distance of the plane from the mirror; for the report.
     pub depth_mm: Option<f64>,

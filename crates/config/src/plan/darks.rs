@@ -3,7 +3,8 @@
 use serde::Deserialize;
 
 use super::Axis;
-use crate::document::Document;
+use crate::document::{Document, counted};
+use crate::whole::whole;
 
 /// `[darks]`: two images at each exposure; the noise is computed from their difference.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -12,6 +13,7 @@ pub struct DarksPlan {
     /// Exposure times.
     pub exposure_us: Axis,
     /// Frames averaged per image.
+    #[serde(deserialize_with = "whole::<_, 1, 65_536>")]
     pub frames: u32,
     /// Pixels whose dark level lies more than this many standard deviations above the others' are hot.
     pub hot_sigmas: f64,
@@ -30,7 +32,8 @@ impl DarksPlan {
     pub(super) fn check(&self, document: &mut Document<'_>) {
         let exposures = self.exposure_us.len();
         if !(1..=MAX_EXPOSURES).contains(&exposures) {
-            let message = format!("darks.exposure_us has {exposures} values: give 1 to {MAX_EXPOSURES}");
+            let message =
+                format!("darks.exposure_us has {}: give 1 to {MAX_EXPOSURES}", counted(exposures, "value"));
             document.refuse(&["darks", "exposure_us"], message);
         } else if let Some(value) =
             self.exposure_us.values().into_iter().find(|us| !(us.is_finite() && *us > 0.0))

@@ -3,7 +3,8 @@
 use serde::Deserialize;
 
 use super::Axis;
-use crate::document::Document;
+use crate::document::{Document, counted};
+use crate::whole::whole;
 
 /// `[film]`: one frame at each delay, cycle after cycle without a pause. The order of the delays within a cycle
 /// depends on the camera, not on the plan.
@@ -15,6 +16,7 @@ pub struct FilmPlan {
     /// Exposure t_e, the same for all frames: cameras may take long to change it.
     pub exposure_us: f64,
     /// Number of cycles.
+    #[serde(deserialize_with = "whole::<_, 1, 86_400>")]
     pub cycles: u32,
     /// Frames whose measured delay deviates by more than this are dropped; their cycle is incomplete.
     pub max_jitter_us: f64,
@@ -71,7 +73,8 @@ impl FilmPlan {
                 document.refuse(&["film", "delay_us"], message);
             }
         } else {
-            let message = format!("film.delay_us has {settings} values: give 2 to {MAX_SETTINGS}");
+            let message =
+                format!("film.delay_us has {}: give 2 to {MAX_SETTINGS}", counted(settings, "value"));
             document.refuse(&["film", "delay_us"], message);
         }
         document.check_positive(&["film", "exposure_us"], self.exposure_us, "microseconds");

@@ -1,6 +1,7 @@
 //! `plan.toml`: what to acquire, and which products to make.
 
 mod batches;
+mod calibration;
 mod darks;
 mod film;
 mod response;
@@ -11,6 +12,7 @@ use serde::Deserialize;
 use serde_json::Map;
 
 pub use self::batches::{BatchesPlan, PathPlan, PlanePlan, Shape};
+pub use self::calibration::CalibrationPlan;
 pub use self::darks::DarksPlan;
 pub use self::film::FilmPlan;
 pub use self::response::ResponsePlan;
@@ -47,6 +49,8 @@ pub enum Procedure {
     Response(ResponsePlan),
     /// Dark images.
     Darks(DarksPlan),
+    /// Images of a white board, from which a plane rig is calibrated.
+    Calibration(CalibrationPlan),
 }
 
 /// The procedures, by their names in plans.
@@ -58,10 +62,12 @@ enum Kind {
     Batches,
     Response,
     Darks,
+    Calibration,
 }
 
 impl Kind {
-    const ALL: [Self; 5] = [Self::Sweep, Self::Film, Self::Batches, Self::Response, Self::Darks];
+    const ALL: [Self; 6] =
+        [Self::Sweep, Self::Film, Self::Batches, Self::Response, Self::Darks, Self::Calibration];
 
     /// Its name in plans, which is also the name of its table.
     fn name(self) -> &'static str {
@@ -71,6 +77,7 @@ impl Kind {
             Self::Batches => "batches",
             Self::Response => "response",
             Self::Darks => "darks",
+            Self::Calibration => "calibration",
         }
     }
 
@@ -83,6 +90,7 @@ impl Kind {
             Self::Batches => read(document, table, BatchesPlan::check, Procedure::Batches),
             Self::Response => read(document, table, ResponsePlan::check, Procedure::Response),
             Self::Darks => read(document, table, DarksPlan::check, Procedure::Darks),
+            Self::Calibration => read(document, table, CalibrationPlan::check, Procedure::Calibration),
         }
     }
 
@@ -91,9 +99,14 @@ impl Kind {
         match self {
             Self::Sweep | Self::Film => Some("demux"),
             Self::Batches => Some("denoise"),
-            Self::Response | Self::Darks => None,
+            Self::Response | Self::Darks | Self::Calibration => None,
         }
     }
+}
+
+/// Whether plans have this kind.
+pub(crate) fn is_kind(name: &str) -> bool {
+    Kind::ALL.iter().any(|kind| kind.name() == name)
 }
 
 fn read<'a, T: Deserialize<'a> + Default>(
@@ -116,6 +129,7 @@ impl Procedure {
             Self::Batches(_) => Kind::Batches,
             Self::Response(_) => Kind::Response,
             Self::Darks(_) => Kind::Darks,
+            Self::Calibration(_) => Kind::Calibration,
         };
         kind.name()
     }
@@ -128,6 +142,12 @@ impl Plan {
     /// Everything that makes the plan invalid, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
+        if let Some(rig @ ("plane" | "dots")) = document.string("kind") {
+            let message =
+                format!("kind = {rig:?}: this is a rig file; give a plan, such as one with kind = \"sweep\"");
+            document.refuse(&["kind"], message);
+            return document.finish(None);
+        }
         let Some(kind) = document.require::<Kind>("kind", "kind = \"sweep\", for example") else {
             return document.finish(None);
         };

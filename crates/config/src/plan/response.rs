@@ -3,6 +3,7 @@
 use serde::Deserialize;
 
 use crate::document::Document;
+use crate::whole::whole;
 
 /// `[response]`: each axis in turn plays a chirp about the origin while the camera tracks the dot on a plane.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -25,6 +26,7 @@ pub struct ResponsePlan {
     /// Exposure of each frame.
     pub exposure_us: f64,
     /// Frames without light before the first chirp.
+    #[serde(deserialize_with = "whole::<_, 16, 65_536>")]
     pub dark_frames: u32,
     /// Region to search for the dot: first row, row after the last, first column, column after the last; default:
     /// everywhere.

@@ -3,8 +3,11 @@
 use std::fmt;
 
 use serde::Deserialize;
+use serde::de::value::{MapAccessDeserializer, SeqAccessDeserializer};
+use serde::de::{Deserializer, MapAccess, SeqAccess, Visitor};
 
-use crate::document::Document;
+use crate::document::{Document, counted};
+use crate::whole::whole;
 
 /// `[sweep]`: the grid of delays and exposures; the defaults are the paper's.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -15,6 +18,7 @@ pub struct SweepPlan {
     /// Exposures t_e.
     pub exposure_us: Axis,
     /// Frames averaged per point.
+    #[serde(deserialize_with = "whole::<_, 1, 65_536>")]
     pub average: u32,
     /// Frames whose measured delay deviates by more than this are dropped and taken again.
     pub max_jitter_us: f64,
@@ -45,12 +49,7 @@ impl Default for SweepPlan {
 }
 
 /// Values along one axis of the sweep.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
-#[serde(
-    untagged,
-    expecting = "expected a list of numbers, or { start = .., stop = .., count = .. }",
-    deny_unknown_fields
-)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Axis {
     /// A list of values, in this order.
     List(Vec<f64>),
@@ -65,7 +64,48 @@ pub enum Axis {
     },
 }
 
+/// The keys of a range.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RangeKeys {
+    start: f64,
+    stop: f64,
+    count: usize,
+}
+
+struct AxisVisitor;
+
+impl<'de> Visitor<'de> for AxisVisitor {
+    type Value = Axis;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a list of numbers or { start = .., stop = .., count = .. }")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, values: A) -> Result<Axis, A::Error> {
+        Deserialize::deserialize(SeqAccessDeserializer::new(values)).map(Axis::List)
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, keys: A) -> Result<Axis, A::Error> {
+        let RangeKeys { start, stop, count } = Deserialize::deserialize(MapAccessDeserializer::new(keys))?;
+        Ok(Axis::Range { start, stop, count })
+    }
+}
+
+impl<'de> Deserialize<'de> for Axis {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(AxisVisitor)
+    }
+}
+
 impl Axis {
+    /// The first value that occurs more than once.
+    pub(crate) fn repeated(&self) -> Option<f64> {
+        let mut values = self.values();
+        values.sort_by(f64::total_cmp);
+        values.windows(2).find(|pair| pair[0] == pair[1]).map(|pair| pair[0])
+    }
+
     /// The values in order.
     pub fn values(&self) -> Vec<f64> {
         match *self {
@@ -205,7 +245,7 @@ impl GridPlan {
                 document.refuse(&path.iter().map(String::as_str).collect::<Vec<_>>(), message);
             };
             if !(1..=MAX_AXIS).contains(&(axis.len() as u64)) {
-                let message = format!("{name} has {} values: give 1 to {MAX_AXIS}", axis.len());
+                let message = format!("{name} has {}: give 1 to {MAX_AXIS}", counted(axis.len(), "value"));
                 refuse(at(&["count"]), message);
                 is_grid = false;
                 continue;
@@ -213,6 +253,8 @@ impl GridPlan {
             let values = axis.values();
             if let Some(value) = values.iter().find(|value| !value.is_finite()) {
                 refuse(at(&[]), format!("{name} contains {value}: must be finite"));
+            } else if let Some(value) = axis.repeated() {
+                refuse(at(&[]), format!("{name} contains {value} more than once: give each value once"));
             }
             if let Some(value) = values.iter().find(|&&value| key == "exposure_us" && value <= 0.0) {
                 refuse(at(&[]), format!("{name} contains {value}: must be more than 0 microseconds"));

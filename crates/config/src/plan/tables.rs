@@ -4,7 +4,7 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::document::Document;
-use crate::{ConfigError, Places};
+use crate::{ConfigError, ConfigMistake, Places};
 
 /// One `[[stage]]`: its name and the options that the stage itself reads.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -63,6 +63,12 @@ pub fn products_of_argument(
     argument: &str,
 ) -> Result<(Vec<ProductTable>, Places, String), (ConfigError, String)> {
     let text = format!("product = [{{ {argument} }}]");
+    if !argument.contains('=') {
+        let message =
+            format!("{argument:?} has no keys: write some, such as 'kind = \"epipolar\", width_rows = 5'");
+        let span = text.find(argument).map(|start| start..start + argument.len());
+        return Err((ConfigMistake { message, field: None, span }.into(), text));
+    }
     let read = || {
         let mut document = Document::parse(&text)?;
         let products: Option<Vec<ProductTable>> = document.require("product", "the keys of a [[product]]");

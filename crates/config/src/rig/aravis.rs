@@ -124,7 +124,7 @@ impl AravisConfig {
         let mut faults: Vec<Fault> = out_of_range(rules).collect();
         let mut refuse = |key, message| faults.push(Fault { key, message });
         if self.device().is_none() {
-            let what = " or camera.aravis.name: give exactly one of them; `raysweep devices` lists both";
+            let what = " or camera.aravis.name: give exactly one of them; `raysweep devices` lists the cameras with both";
             refuse("address", what.into());
         }
         if let Some(text) = self.features.iter().find(|text| !text.contains('=')) {

@@ -14,6 +14,7 @@ pub use self::dots::DotRigFile;
 pub use self::plane::RigFile;
 use crate::ConfigError;
 use crate::document::Document;
+use crate::plan::is_kind;
 
 /// The kinds of rigs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -40,6 +41,13 @@ impl AnyRigFile {
     /// All mistakes, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
         let mut document = Document::parse(text)?;
+        if let Some(plan) = document.string("kind").filter(|kind| is_kind(kind)) {
+            let message = format!(
+                "kind = {plan:?}: this is a plan; give a rig file, with kind = \"plane\" or kind = \"dots\""
+            );
+            document.refuse(&["kind"], message);
+            return document.finish(None);
+        }
         match document.require("kind", "kind = \"plane\" or kind = \"dots\"") {
             Some(RigKind::Plane) => RigFile::read(document).map(|rig| Self::Plane(Box::new(rig))),
             Some(RigKind::Dots) => DotRigFile::read(document).map(|rig| Self::Dots(Box::new(rig))),

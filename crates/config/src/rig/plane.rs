@@ -24,10 +24,21 @@ pub struct RigFile {
     pub vsync: VsyncSection,
     /// `[projector]`
     pub projector: ProjectorSection,
+    /// `[calibration]`: how calibrations are used.
+    pub calibration: CalibrationUse,
     /// `[sim]`, for the driver `sim`.
     pub sim: SimConfig,
     /// Positions of the values in the text.
     pub places: Places,
+}
+
+/// `[calibration]`: whether the rig's runs use the calibration in the daemon's data folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CalibrationUse {
+    /// Whether the numbers in the rig file are used instead.
+    #[serde(rename = "override")]
+    pub is_overridden: bool,
 }
 
 /// Camera drivers, by their names in rig files.
@@ -250,7 +261,8 @@ impl RigFile {
         let projector: Option<ProjectorSection> =
             document.require("projector", "a table [projector] with a driver");
         let sim: Option<SimConfig> = document.take_or_default("sim");
-        document.refuse_others(&["kind", "camera", "vsync", "projector", "sim"]);
+        let calibration: Option<CalibrationUse> = document.take_or_default("calibration");
+        document.refuse_others(&["kind", "camera", "vsync", "projector", "calibration", "sim"]);
         if let Some(camera) = &camera {
             camera.check(&mut document);
         }
@@ -260,10 +272,11 @@ impl RigFile {
         if let Some(projector) = &projector {
             projector.check(&mut document);
         }
-        let (Some(camera), Some(vsync), Some(projector), Some(sim)) = (camera, vsync, projector, sim) else {
+        let (Some(camera), Some(vsync), Some(projector)) = (camera, vsync, projector) else {
             return document.finish(None);
         };
-        let rig = Self { camera, vsync, projector, sim, places: document.places().clone() };
+        let (Some(calibration), Some(sim)) = (calibration, sim) else { return document.finish(None) };
+        let rig = Self { camera, vsync, projector, calibration, sim, places: document.places().clone() };
         rig.check(&mut document);
         document.finish(Some(rig))
     }
@@ -361,12 +374,12 @@ impl RigFile {
             document.refuse(&["camera", "row_time_us"], message);
         }
         if self.sim.projector.spot != SimSpot::Uniform && camera.row_pitch != 1.0 {
-            let message = "sim.projector.spot: flying spots are simulated for camera.row_pitch = 1 only; use \"uniform\"";
+            let message = "sim.projector.spot: flying spots are simulated only with camera.row_pitch = 1: set that, or use \"uniform\"";
             document.refuse(&["sim", "projector", "spot"], message);
         }
         if projector.spot == SpotKind::Flying && camera.row_pitch.fract() != 0.0 {
             let message = format!(
-                "projector.spot = \"flying\" with camera.row_pitch = {}: must be a whole number, because a flying spot is modelled only for camera rows that look at the middle of projector rows",
+                "camera.row_pitch = {}: must be a whole number with projector.spot = \"flying\", because a flying spot is modelled only for camera rows that look at the middle of projector rows; use projector.spot = \"uniform\", or a whole pitch",
                 camera.row_pitch
             );
             document.refuse(&["projector", "spot"], message);

@@ -28,13 +28,14 @@ impl DemuxFold {
         let InStrips { images, strip_rows, take } = strips;
         let not_kept = self.not_kept.take().unwrap_or_default();
         let height = self.geometry.height;
-        let choices = self.choose(self.stack(self.read_to_choose_by(&not_kept, images, go_on)?)?)?;
+        let sampled = self.read_to_choose_by(&not_kept, images, go_on)?;
+        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?)?;
         let mut tally = Tally::default();
         for first_row in (0..height).step_by(strip_rows) {
             let rows = first_row..height.min(first_row + strip_rows);
             let halo_rows = choices.halo_rows();
             let around = first_row.saturating_sub(halo_rows)..height.min(rows.end + halo_rows);
-            let held = self.hold(around.start, read_rows(&not_kept, images, &around)?)?;
+            let held = self.hold(around.clone(), read_rows(&not_kept, images, &around)?)?;
             take(&choices.findings, self.strip(&choices, rows, held, &mut tally, go_on)?)?;
         }
         Ok(tally.summary(choices.findings))
@@ -84,6 +85,8 @@ fn not_read(what: String) -> NotSolved {
 mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
+    use raysweep_transport::plane::board::{BoardCalibration, Estimate};
+    use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS};
 
     use super::*;
     use crate::demux::{DemuxOptions, Solved};
@@ -110,6 +113,7 @@ mod tests {
             width: WIDTH,
             white_dn: 1000.0,
             saturation_dn: 3900.0,
+            calibration: None,
         }
     }
 
@@ -158,6 +162,7 @@ mod tests {
             let unit = Unit {
                 id: SettingsId { point: ordinal, attempt: 0 },
                 frames: 1,
+                delay_us: point.delay_us,
                 exposure_us: point.exposure_us,
                 delays_us: vec![point.delay_us],
                 last_exposure_ns: None,
@@ -168,11 +173,41 @@ mod tests {
         }
     }
 
+    /// The same rig, calibrated: its white level falls off to one side, and a corner is not lit.
+    fn calibrated() -> SweepGeometry {
+        let stated = geometry();
+        let timing = stated.timing().unwrap();
+        let places = Array2::from_shape_fn((HEIGHT, WIDTH), |(t, s)| (5 + t) as f32 + 0.03 * s as f32);
+        let mut shares = [0.0; RESPONSE_ROWS];
+        shares[7] = 1.0;
+        let mut white_dn = Array2::from_shape_fn((HEIGHT, WIDTH), |(t, s)| 1000.0 - (t + 10 * s) as f32);
+        white_dn[[HEIGHT - 1, WIDTH - 1]] = f32::NAN;
+        stated.calibrated(Arc::new(BoardCalibration {
+            row_starts_us: timing.row_starts_us().to_vec(),
+            camera_row_time_us: Estimate { value: 20.0, sd: 0.0 },
+            exposure_offset_us: Estimate { value: 0.5, sd: 0.0 },
+            latency_sd_us: 0.0,
+            response: PixelResponse::with_beam(places, &shares).unwrap(),
+            place_sd_rows: 0.0,
+            white_dn,
+            white_relative_sd: 0.0,
+        }))
+    }
+
     #[test]
     fn strips_that_do_not_divide_the_image_have_the_bits_of_the_whole() {
+        has_the_bits_of_the_whole(&geometry());
+    }
+
+    #[test]
+    fn so_have_strips_of_a_calibrated_rig() {
+        has_the_bits_of_the_whole(&calibrated());
+    }
+
+    fn has_the_bits_of_the_whole(geometry: &SweepGeometry) {
         let points = schedule().points;
         let images = Kept(points.iter().enumerate().map(|(ordinal, point)| image(ordinal, point)).collect());
-        let fold = || DemuxFold::new(DemuxOptions::default(), &schedule(), &geometry()).unwrap();
+        let fold = || DemuxFold::new(DemuxOptions::default(), &schedule(), geometry).unwrap();
 
         let mut whole = fold();
         push_all(&mut whole, &images);

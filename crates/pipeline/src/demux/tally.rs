@@ -29,7 +29,9 @@ const SATURATED_SHARE: f64 = 0.01;
 #[derive(Default)]
 pub(super) struct Tally {
     images: usize,
+    /// Pixels whose white level is known.
     pixels: usize,
+    unmeasured: usize,
     saturated: usize,
     /// `None` if the regular image was not taken.
     regular: Option<Regular>,
@@ -45,17 +47,25 @@ struct Regular {
 }
 
 impl Tally {
-    /// Adds rows whose transport was computed from `images` images.
-    pub(super) fn add_sweep(&mut self, images: usize, transport: &Transport) {
+    /// Adds rows whose transport was computed from `images` images; `measured` is where the white level is known.
+    pub(super) fn add_sweep(&mut self, images: usize, measured: &Array2<bool>, transport: &Transport) {
         self.images = images;
-        self.pixels += transport.saturated.len();
-        self.saturated += transport.saturated.iter().filter(|&&saturated| saturated).count();
+        self.pixels += count(measured);
+        self.unmeasured += measured.len() - count(measured);
+        self.saturated += count(&(&transport.saturated & measured));
     }
 
     /// Adds the light of the regular image in these rows.
-    pub(super) fn add_regular(&mut self, valid: &Array2<bool>, light: &Array2<f32>, transport: &Transport) {
+    pub(super) fn add_regular(
+        &mut self,
+        unsaturated: &Array2<bool>,
+        measured: &Array2<bool>,
+        light: &Array2<f32>,
+        transport: &Transport,
+    ) {
         let regular = self.regular.get_or_insert_default();
-        regular.saturated += valid.iter().filter(|valid| !**valid).count();
+        let valid = &(unsaturated & measured);
+        regular.saturated += count(measured) - count(valid);
         let add = |sum: &mut f64, image: &Array2<f32>| {
             let pixels = image.iter().zip(valid).filter(|&(_, &valid)| valid);
             pixels.for_each(|(&light, _)| *sum += f64::from(light));
@@ -68,6 +78,9 @@ impl Tally {
     pub(super) fn summary(self, findings: Findings) -> SweepSummary {
         let mut figures =
             vec![("images demultiplexed", self.images as f64), ("saturated pixels", self.saturated as f64)];
+        if self.unmeasured > 0 {
+            figures.push(("pixels that the calibration did not measure", self.unmeasured as f64));
+        }
         let mut warnings: Vec<String> =
             too_many_saturated("the sweep", self.saturated, self.pixels).into_iter().collect();
         if let Some(regular) = self.regular {
@@ -95,6 +108,10 @@ impl Regular {
             }
         }
     }
+}
+
+fn count(pixels: &Array2<bool>) -> usize {
+    pixels.iter().filter(|&&pixel| pixel).count()
 }
 
 fn too_many_saturated(what: &str, saturated: usize, pixels: usize) -> Option<String> {

@@ -45,6 +45,18 @@ impl Width {
         }
     }
 
+    /// Why a sweep of this reach does not see the rows.
+    pub(super) fn beyond(self, first: i32, last: i32) -> Option<String> {
+        let reach = first.unsigned_abs().max(last.unsigned_abs());
+        (self.half() > reach).then(|| {
+            format!(
+                "width_rows = {} is beyond the reach of {reach} rows to either side: give at most {}, or delays further from 0",
+                self.width_rows,
+                2 * reach + 1
+            )
+        })
+    }
+
     /// The name of a product of this width if the plan gives none.
     pub(super) fn named(self, name: &str) -> String {
         match self.width_rows {
@@ -133,6 +145,22 @@ impl Band {
             }
             _ => self,
         }
+    }
+
+    /// Why a sweep of this reach sees none of the rows.
+    pub(super) fn beyond(self, first: i32, last: i32) -> Option<String> {
+        let (above, below) = (first.min(0).unsigned_abs(), last.max(0).unsigned_abs());
+        let (reach, side) = match self.side {
+            Some(Side::Above) => (above, " above"),
+            Some(Side::Below) => (below, " below"),
+            None => (above.max(below), ""),
+        };
+        (self.from_rows > reach).then(|| {
+            format!(
+                "from_rows = {} is beyond the reach of {reach} rows{side}, so the image is 0 everywhere: give at most {reach}, or delays further from 0",
+                self.from_rows
+            )
+        })
     }
 
     pub(super) fn default_name(self) -> String {

@@ -8,7 +8,7 @@ use super::band::{Band, Width};
 use super::profile::{ProfileOptions, ProfileTable};
 use super::relight::{BeamName, Relight, RowPattern};
 use crate::schedule::{Schedule, SweepGeometry};
-use raysweep_core::decoding_message;
+use raysweep_core::decoding_message_beside;
 
 /// Why a product is invalid.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -130,6 +130,16 @@ impl ProductSpec {
         &self.name
     }
 
+    /// Why it would be 0 everywhere: it asks only for rows that a sweep of this reach (first and last u) does not see.
+    pub fn beyond(&self, (first, last): (i32, i32)) -> Option<String> {
+        let what = match &self.kind {
+            ProductKind::Epipolar(width) | ProductKind::NonEpipolar(width) => width.beyond(first, last),
+            ProductKind::Band(band) | ProductKind::Uncertainty(band) => band.beyond(first, last),
+            ProductKind::Regular | ProductKind::Relight(_) | ProductKind::DelayProfile(_) => None,
+        }?;
+        Some(format!("product {}: {what}", self.name))
+    }
+
     /// The number of its images on this rig.
     pub fn images(&self, geometry: &SweepGeometry) -> usize {
         match &self.kind {
@@ -167,7 +177,7 @@ fn parse<T: DeserializeOwned>(kind: &str, options: &Map<String, Value>) -> Resul
             Segment::Enum { .. } | Segment::Unknown => None,
         };
         let path: Vec<String> = error.path().iter().filter_map(key).collect();
-        let what = decoding_message(&error.inner().to_string(), "table");
+        let what = decoding_message_beside(&error.inner().to_string(), "table", "name");
         let what = if path.is_empty() { what } else { format!("{}: {what}", path.join(".")) };
         ProductError { kind: kind.into(), path, what }
     })

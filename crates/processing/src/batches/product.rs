@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use ndarray::{Array3, Array4, ArrayView3, Axis};
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{BatchesPlan, ConfigError, Plan, ProductTable};
-use raysweep_core::decoding_message;
+use raysweep_core::decoding_message_beside;
 use raysweep_session::pattern;
 use raysweep_transport::dots::Batch;
 use raysweep_transport::dots::product::{
@@ -152,10 +152,11 @@ impl DotSpec {
             let spec = Self::new(table).map_err(|message| refused("kind", message))?;
             if specs.iter().any(|other| other.name == spec.name) {
                 let message = format!(
-                    "product {}: two products are named {:?} and would overwrite each other: give one another name",
+                    "product {}: two products are named {:?} and would overwrite each other: give one of them another `name`",
                     table.kind, spec.name
                 );
-                return Err(refused("name", message));
+                // A name that is not in the file follows from the kind.
+                return Err(refused(if table.name.is_some() { "name" } else { "kind" }, message));
             }
             specs.push(spec);
         }
@@ -188,7 +189,8 @@ impl DotSpec {
     fn new(table: &ProductTable) -> Result<Self, String> {
         let ProductTable { kind: kind_name, name, options } = table;
         fn read<T: for<'a> Deserialize<'a>>(kind: &str, options: Value) -> Result<T, String> {
-            let plain = |error: serde_json::Error| decoding_message(&error.to_string(), "table");
+            let plain =
+                |error: serde_json::Error| decoding_message_beside(&error.to_string(), "table", "name");
             serde_json::from_value(options).map_err(|error| format!("product {kind}: {}", plain(error)))
         }
         let options = Value::Object(options.clone());
@@ -260,7 +262,8 @@ impl DotSpec {
             }
             Kind::DirectGlobal(Separation { method, compensate, .. }) => {
                 let even = if *compensate { ", over the dots' coverage" } else { "" };
-                let about = |what: &str| format!("{what} light by {}; camera counts", method.name());
+                let about =
+                    |what: &str| format!("{what} light, by the method {}; camera counts", method.name());
                 vec![
                     (format!("{name}-direct"), about("direct") + even),
                     (format!("{name}-global"), about("global")),

@@ -154,8 +154,10 @@ impl DotTask {
     /// For an unknown stage, or options that it does not take.
     pub fn stage(&self, correction: &Correction) -> Result<Arc<dyn ColumnStage>, ConfigError> {
         let StageTable { name, options } = &self.denoise;
-        column_stage(name, Value::Object(options.clone()), correction)
-            .map_err(|error| self.refuse_stage(name, "name", error.to_string()))
+        column_stage(name, Value::Object(options.clone()), correction).map_err(|error| {
+            let is_in_plan = |key: &&str| self.stages.iter().any(|stage| stage.options.contains_key(*key));
+            self.refuse_stage(name, error.key().filter(is_in_plan).unwrap_or("name"), error.to_string())
+        })
     }
 }
 
@@ -184,32 +186,36 @@ pub fn sampling(format: PixelFormat) -> Sampling {
 fn stages(plan: &Plan, batches: &BatchesPlan) -> Result<(CorrectOptions, StageTable), ConfigError> {
     let (mut correct, mut denoise) = (CorrectOptions::default(), None);
     for (index, stage) in plan.stages.iter().enumerate() {
-        let refused = |message: String| plan.places.error(&["stage", &index.to_string(), "name"], message);
+        let refused =
+            |key: &str, message: String| plan.places.error(&["stage", &index.to_string(), key], message);
         if stage.name == "correct" {
             correct = serde_json::from_value(Value::Object(stage.options.clone()))
                 .map_err(|error| decoding_message(&error.to_string(), "table"))
-                .map_err(|what| refused(format!("stage correct: {what}")))?;
+                .map_err(|what| refused("name", format!("stage correct: {what}")))?;
             let CorrectOptions { hot_sigmas, background_batches, .. } = correct;
             if !(hot_sigmas > 0.0 && hot_sigmas.is_finite()) {
-                return Err(refused(format!(
-                    "stage correct: hot_sigmas = {hot_sigmas}: must be more than 0; 8 is usual"
-                )));
+                return Err(refused(
+                    "hot_sigmas",
+                    format!("stage correct: hot_sigmas = {hot_sigmas}: must be more than 0; 8 is usual"),
+                ));
             }
             if background_batches == 0 {
                 return Err(refused(
+                    "background_batches",
                     "stage correct: background_batches = 0: must be at least 1; 64 is usual".into(),
                 ));
             }
             if correct.flat_field.is_some() && batches.flat_frames > 0 {
                 return Err(refused(
+                    "flat_field",
                     "stage correct: flat_field and batches.flat_frames exclude each other: use an earlier session's flat field, or acquire one".into(),
                 ));
             }
         } else if denoise.replace(stage.clone()).is_some() {
-            return Err(refused(format!(
-                "{} is the second stage that turns frames into columns: keep one",
-                stage.name
-            )));
+            return Err(refused(
+                "name",
+                format!("{} is the second stage that turns frames into columns: keep one", stage.name),
+            ));
         }
     }
     let default = || StageTable { name: "denoise".into(), options: serde_json::Map::new() };

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ndarray::{Array2, Axis};
 use raysweep_config::FilmPlan;
 use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Stages, Unit, run_stages};
+use raysweep_pipeline::{Point, Stages, Unit, run_stages};
 use raysweep_session::Session;
 use raysweep_session::film::{CycleEntry, crc32};
 use raysweep_session::ledger::State;
@@ -25,7 +25,7 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let task = FilmTask::new(plan, film, &rig, state.session.first_row, (shape.rows, shape.columns));
+    let task = FilmTask::new(plan, film, &stored.known(&rig)?);
     stored.check_contents(task.contents())?;
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {
@@ -50,7 +50,7 @@ fn make_transports(
     state: &State,
     stages: &Stages,
 ) -> raysweep_session::Result<Vec<String>> {
-    let solver = match task.solver() {
+    let mut solver = match task.solver() {
         Ok(solver) => solver,
         Err(error) => return Ok(vec![error.to_string()]),
     };
@@ -76,28 +76,39 @@ fn make_transports(
             }
         };
         let images = frames.axis_iter(Axis(0)).zip(task.task.settings()).zip(&entry.delays_us).map(
-            |((frame, (ordinal, _)), &delay_us)| {
-                let unit = frame_unit(ordinal, entry, delay_us, frame.mapv(u32::from));
+            |((frame, (ordinal, point)), &delay_us)| {
+                let unit = frame_unit((ordinal, point), entry, delay_us, frame.mapv(u32::from));
                 let setting = Setting::new(delay_us, entry.exposure_us);
                 run_stages(stages, &unit).map(|image| (setting, Arc::new(image)))
             },
         );
-        let solved = images
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(|error| error.to_string())
-            .and_then(|images| solver.solve(&images, &dark, &|| true).map_err(|error| error.to_string()));
+        let solved =
+            images.collect::<Result<Vec<_>, _>>().map_err(|error| error.to_string()).and_then(|images| {
+                match solver.solve(&images, &dark, &|| true) {
+                    Ok(transport) => Ok((transport, images)),
+                    Err(error) => Err(error.to_string()),
+                }
+            });
         match solved {
-            Ok(transport) => transports.write(entry.cycle, transport.t.view())?,
+            Ok((transport, images)) => {
+                transports.write(entry.cycle, transport.t.view())?;
+                let drift = solver.learn(&images, &dark);
+                // Otherwise the ledger says what the film itself found.
+                problems.extend(
+                    drift.filter(|_| state.film.is_none()).into_iter().flat_map(|drift| drift.warnings),
+                );
+            }
             Err(error) => problems.push(format!("cycle {}: {error}", entry.cycle)),
         }
     }
     Ok(problems)
 }
 
-fn frame_unit(ordinal: u32, entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
+fn frame_unit((ordinal, point): (u32, &Point), entry: &CycleEntry, delay_us: f64, sum: Array2<u32>) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.cycle as u32 },
         frames: 1,
+        delay_us: point.delay_us,
         exposure_us: entry.exposure_us,
         delays_us: vec![delay_us],
         last_exposure_ns: None,

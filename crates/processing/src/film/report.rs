@@ -62,6 +62,7 @@ pub fn shortcomings(state: &State) -> Vec<String> {
             film.transports_missing
         ));
     }
+    texts.extend(film.calibration_warnings.iter().cloned());
     texts
 }
 
@@ -139,6 +140,9 @@ fn pace(state: &State) -> Section {
         ("transports made during the film", film.transports.to_string()),
         ("sliding estimates", film.sliding_estimates.to_string()),
     ];
+    if let Some(late_us) = film.late_us {
+        entries.push(("light later than calibrated", format!("{late_us:.2} µs, from the first cycles")));
+    }
     match film.latency_ms {
         Some(Percentiles { p50, p95, p99, max }) => {
             let text = format!("{p50:.0} / {p95:.0} / {p99:.0} / {max:.0} ms");

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use raysweep_config::{ConfigError, FilmPlan, Plan, RigFile};
+use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_pipeline::{FilmSolver, Point, PointRole, Schedule, Stages};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
 use serde_json::json;
 
-use crate::plane::PlaneTask;
+use crate::plane::{KnownRig, PlaneTask};
 
 /// Frames of the dark image: its noise enters every cycle, so it averages many.
 const DARK_FRAMES: u32 = 32;
@@ -25,8 +25,8 @@ pub struct FilmTask {
 
 impl FilmTask {
     /// A film on a rig; see [`PlaneTask::new`].
-    pub fn new(plan: &Plan, film: FilmPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
-        let task = PlaneTask::new(plan, schedule(&film), film.max_jitter_us, rig, first_row, size);
+    pub fn new(plan: &Plan, film: FilmPlan, rig: &KnownRig<'_>) -> Self {
+        let task = PlaneTask::new(plan, schedule(&film), film.max_jitter_us, rig);
         Self { film, task: Arc::new(task) }
     }
 

@@ -34,6 +34,9 @@ pub fn write(session: &Session, state: &State, task: &PlaneTask, rig: &RigFile) 
             "camera_row_time_us": rig.camera_row_time_us(),
         }),
     );
+    if let Some(made) = &task.calibration_made {
+        settings.insert("calibration".into(), json!({ "made": made }));
+    }
     settings.insert("exposures_us".into(), json!(taken_exposures(state, &task.schedule)));
     settings.insert("latency".into(), json!(state.end.as_ref().and_then(|end| end.settings_latency)));
     manifest::write(session, state, software, settings)?;

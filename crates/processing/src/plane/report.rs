@@ -51,10 +51,9 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
             format!("{} ({})", stage.name, options.join(", "))
         }
     });
-    let entries = [
+    let mut entries = vec![
         ("stages", stages.collect::<Vec<_>>().join(", ")),
         ("row time", row_times(geometry)),
-        ("beam", beam(geometry)),
         ("first row after VSYNC", format!("{} µs", geometry.raster.first_row_us)),
         (
             "projector rows",
@@ -63,19 +62,31 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
                 geometry.raster.rows, geometry.first_row, geometry.row_pitch
             ),
         ),
-        ("white", format!("{} counts above black", geometry.white_dn)),
+        ("white", white(geometry)),
         ("software", state.session.software.clone()),
     ];
-    Block::Facts(entries.map(|(key, value)| (key.to_owned(), value)).to_vec())
+    entries.push(match &task.calibration_made {
+        Some(made) => {
+            ("calibration", format!("made {made}: row times, responses and white level of each pixel"))
+        }
+        None => ("beam", beam(geometry)),
+    });
+    Block::Facts(entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect())
 }
 
 /// When rows are lit and exposed, according to the model.
 fn row_times(geometry: &SweepGeometry) -> String {
-    let table = if geometry.row_table_us.is_some() { ", by the measured table" } else { "" };
+    let is_measured = geometry.row_table_us.is_some() || geometry.calibration.is_some();
+    let table = if is_measured { ", by the measured table" } else { "" };
     format!(
         "projector {} µs{table}, camera {:.4} µs",
         geometry.raster.row_time_us, geometry.camera_row_time_us
     )
+}
+
+fn white(geometry: &SweepGeometry) -> String {
+    let median = if geometry.calibration.is_some() { ", the median of the pixels" } else { "" };
+    format!("{} counts above black{median}", geometry.white_dn)
 }
 
 /// How a row's light spreads in space and time, according to the model.

@@ -5,13 +5,14 @@ use std::sync::Arc;
 use ndarray::Array2;
 use raysweep_config::rig::plane::{ScanKind, SpotKind};
 use raysweep_config::{ConfigError, Places, Plan, RigFile, StageTable};
-use raysweep_core::{SettingsId, decoding_message};
+use raysweep_core::{PixelFormat, SettingsId, decoding_message};
 use raysweep_pipeline::{
-    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, Stages,
-    SweepGeometry, Unit,
+    DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, StageRefused,
+    Stages, SweepGeometry, Unit,
 };
 use raysweep_session::ledger::PointEntry;
 use raysweep_session::stack::ArrayName;
+use raysweep_transport::plane::board::BoardCalibration;
 use serde_json::{Map, Value, json};
 
 use crate::saturation::saturation_dn;
@@ -30,21 +31,41 @@ pub struct PlaneTask {
     pub schedule: Schedule,
     /// The model that turns counts into light transport.
     pub geometry: SweepGeometry,
+    /// When the calibration was made that the model uses, as its file says it; `None` without one.
+    pub calibration_made: Option<String>,
+    /// The kind of the plan, which is also the name of its table.
+    table: &'static str,
+    format: PixelFormat,
     places: Places,
 }
 
+/// A plane rig, as far as it is known before a plan runs on it.
+#[derive(Debug, Clone)]
+pub struct KnownRig<'a> {
+    /// Its file.
+    pub file: &'a RigFile,
+    /// The projector row that camera row 0 sees, according to the file.
+    pub first_row: usize,
+    /// Rows and columns of the camera's images.
+    pub size: (usize, usize),
+    /// What a calibration of this rig says of it, if there is one.
+    pub calibration: Option<KnownCalibration>,
+}
+
+/// A calibration, and when it was made.
+#[derive(Debug, Clone)]
+pub struct KnownCalibration {
+    /// Date and time, as reports and metadata should give it.
+    pub made: String,
+    /// What it measured.
+    pub board: Arc<BoardCalibration>,
+}
+
 impl PlaneTask {
-    /// The points of `plan` on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
-    /// `first_row`.
-    pub fn new(
-        plan: &Plan,
-        schedule: Schedule,
-        max_jitter_us: f64,
-        rig: &RigFile,
-        first_row: usize,
-        size: (usize, usize),
-    ) -> Self {
-        let geometry = SweepGeometry {
+    /// The points of `plan` on a rig.
+    pub fn new(plan: &Plan, schedule: Schedule, max_jitter_us: f64, rig: &KnownRig<'_>) -> Self {
+        let &KnownRig { file: rig, first_row, size, ref calibration } = rig;
+        let stated = SweepGeometry {
             raster: rig.raster(),
             row_table_us: rig.projector.row_table.as_deref().map(Into::into),
             beam_sigma_rows: rig.projector.beam_sigma_rows,
@@ -57,9 +78,15 @@ impl PlaneTask {
             width: size.1,
             white_dn: rig.camera.white_dn(),
             saturation_dn: saturation_dn(rig.camera.pixel_format),
+            calibration: None,
+        };
+        let (geometry, calibration_made) = match calibration {
+            Some(KnownCalibration { made, board }) => (stated.calibrated(board.clone()), Some(made.clone())),
+            None => (stated, None),
         };
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
-        Self { name, stages, max_jitter_us, schedule, geometry, places }
+        let (table, format) = (plan.procedure.kind(), rig.camera.pixel_format);
+        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, table, format, places }
     }
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
@@ -99,11 +126,24 @@ impl PlaneTask {
             let place = index.to_string();
             let refuse = |message: String| self.refuse(&["stage", &place, "name"], message);
             let made = PlaneStage::new(&table.name, Value::Object(table.options.clone()));
-            match made.map_err(|error| refuse(error.to_string()))? {
+            match made.map_err(|error| self.refuse_stage(&place, &error))? {
+                PlaneStage::Image(_) if demux.is_some() => {
+                    return Err(refuse(format!(
+                        "stage {} comes after {DEMUX}, which takes the images that stages have processed: put {DEMUX} last",
+                        table.name
+                    )));
+                }
+                PlaneStage::Image(_) if self.format.mosaic.red().is_none() && is_for_mosaics(table) => {
+                    let message = format!(
+                        "stage {}: step_px = 2: must be 1, because camera.pixel_format = \"{}\" has no Bayer mosaic",
+                        table.name, self.format
+                    );
+                    return Err(self.refuse(&["stage", &place, "step_px"], message));
+                }
                 PlaneStage::Image(stage) => stages.push(stage),
                 PlaneStage::Demux(options) => {
                     let fold = DemuxFold::new(options, &self.schedule, &self.geometry)
-                        .map_err(|error| refuse(error.to_string()))?;
+                        .map_err(|error| self.no_model(&place, &error))?;
                     if demux.replace(fold).is_some() {
                         return Err(refuse(format!(
                             "{DEMUX} is named twice, and its products would overwrite each other: keep one"
@@ -115,24 +155,88 @@ impl PlaneTask {
         Ok((stages.into(), demux))
     }
 
+    /// An error about an option of the stage at an index of the plan.
+    fn refuse_stage(&self, index: &str, error: &StageRefused) -> ConfigError {
+        let key = error.key().filter(|key| self.places.has(&["stage", index, key])).unwrap_or("name");
+        self.refuse(&["stage", index, key], error.to_string())
+    }
+
+    /// An error of `demux`: about one of its options, or about settings that give no model.
+    fn no_model(&self, index: &str, error: &StageRefused) -> ConfigError {
+        if error.key().is_some_and(|key| self.places.has(&["stage", index, key])) {
+            return self.refuse_stage(index, error);
+        }
+        let (first_us, last_us) = self.delays_with_light();
+        let message = format!(
+            "{}.delay_us{}: {}; exposures see the projector's rows at delays from {first_us:.0} to {last_us:.0} us",
+            self.table,
+            self.delays_text(),
+            error.what()
+        );
+        self.refuse(&[self.table, "delay_us"], message)
+    }
+
+    /// The smallest and the largest delay at which the shortest exposure sees a row of the projector from some camera
+    /// row.
+    fn delays_with_light(&self) -> (f64, f64) {
+        let shortest = self.settings().map(|(_, point)| point.exposure_us).fold(f64::INFINITY, f64::min);
+        self.delays_with_light_at(if shortest.is_finite() { shortest } else { 0.0 })
+    }
+
+    fn delays_with_light_at(&self, exposure_us: f64) -> (f64, f64) {
+        let geometry = &self.geometry;
+        let row_us = geometry.raster.row_time_us;
+        let last = geometry.height.saturating_sub(1) as f64;
+        let seen = geometry.first_row as f64 + geometry.row_pitch * last;
+        let below = geometry.raster.rows as f64 - geometry.first_row as f64 - 0.5;
+        let half_us = exposure_us / 2.0;
+        (-(seen + 0.5) * row_us - half_us, below * row_us + half_us)
+    }
+
+    /// The number of settings whose exposures see no row of the projector, and the delays between which they would.
+    pub fn without_light(&self) -> (usize, (f64, f64)) {
+        let blind = self.settings().filter(|(_, point)| {
+            let (first_us, last_us) = self.delays_with_light_at(point.exposure_us);
+            !(first_us < point.delay_us && point.delay_us < last_us)
+        });
+        (blind.count(), self.delays_with_light())
+    }
+
+    fn delays_text(&self) -> String {
+        let delays = || self.settings().map(|(_, point)| point.delay_us);
+        let (low, high) =
+            (delays().fold(f64::INFINITY, f64::min), delays().fold(f64::NEG_INFINITY, f64::max));
+        if low == high { format!(" = {low}") } else { format!(" from {low} to {high}") }
+    }
+
     /// Metadata that all products share.
     pub(crate) fn metadata(&self) -> Map<String, Value> {
         let geometry = &self.geometry;
-        let entries = [
+        let mut entries = vec![
             ("units", json!("1 = a white pixel lit by its own projector row")),
             ("plan", json!(self.name)),
             (DEMUX, json!(self.demux_table().map(|stage| &stage.options))),
             ("row_time_us", json!(geometry.raster.row_time_us)),
-            ("row_table", json!(geometry.row_table_us.is_some())),
-            ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
             ("first_row", json!(geometry.first_row)),
             ("row_pitch", json!(geometry.row_pitch)),
             ("camera_row_time_us", json!(geometry.camera_row_time_us)),
-            ("white_dn", json!(geometry.white_dn)),
             ("software", json!(SOFTWARE)),
         ];
+        match &self.calibration_made {
+            Some(made) => entries.push(("calibration", json!({ "made": made }))),
+            None => entries.extend([
+                ("row_table", json!(geometry.row_table_us.is_some())),
+                ("beam_sigma_rows", json!(geometry.beam_sigma_rows)),
+                ("white_dn", json!(geometry.white_dn)),
+            ]),
+        }
         entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
     }
+}
+
+/// Whether a stage compares pixels that are two apart.
+fn is_for_mosaics(stage: &StageTable) -> bool {
+    stage.options.get("step_px").and_then(Value::as_u64) == Some(2)
 }
 
 /// Distribution over time of a pixel's direct light within its row.
@@ -159,6 +263,7 @@ pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Uni
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.attempt },
         frames: entry.frames,
+        delay_us: entry.delay_us,
         exposure_us: entry.exposure_us,
         delays_us: entry.delays_us.clone(),
         last_exposure_ns: None,

@@ -37,7 +37,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let sweep = SweepTask::new(plan, sweep, &rig, state.session.first_row, (shape.rows, shape.columns));
+    let sweep = SweepTask::new(plan, sweep, &stored.known(&rig)?);
     stored.check_contents(sweep.contents())?;
     let task = &*sweep.task;
     let mut processing = sweep.processing().map_err(|error| stored.in_plan(&error))?;
@@ -45,7 +45,15 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
         processing.products.clear();
     }
     for argument in &asked.products {
+        let planned = processing.products.len();
         append_argument(&mut processing.products, argument, task).map_err(ProcessError::Product)?;
+        let reach = processing.demux.as_ref().and_then(|fold| fold.demux().ok()).map(|demux| demux.reach());
+        let mut asked = processing.products[planned..].iter();
+        if let Some(what) =
+            reach.and_then(|reach| asked.find_map(|spec| spec.beyond((*reach.start(), *reach.end()))))
+        {
+            return Err(ProcessError::Product(format!("--product {argument}: {what}")));
+        }
     }
     let memory = MemoryNeed::of_sweep(task, &processing.products)
         .map_err(|error| ProcessError::Config(error.to_string()))?;

@@ -214,15 +214,16 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
 fn model(found: &Findings) -> Map<String, Value> {
     let remarks: Map<String, Value> =
         found.remarks.iter().map(|(key, said)| ((*key).to_owned(), json!(said))).collect();
-    let entries = [
+    let mut entries = vec![
         (
             "prior",
             json!({ "name": found.prior.name(), "alpha": found.prior.alpha(), "beta": found.prior.beta() }),
         ),
-        ("beam_sigma_rows", json!(found.beam_sigma_rows)),
         ("u0_rows", json!(found.u0_rows)),
         ("left_out_us", json!(found.left_out_us)),
         ("findings", json!(remarks)),
     ];
+    entries.extend(found.beam_sigma_rows.map(|sigma_rows| ("beam_sigma_rows", json!(sigma_rows))));
+    entries.extend(found.late_us.map(|late_us| ("late_us", json!(late_us))));
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }

@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use raysweep_config::{ConfigError, Plan, ProductTable, RigFile, SweepPlan};
+use raysweep_config::{ConfigError, Plan, ProductTable, SweepPlan};
 use raysweep_pipeline::{Point, PointRole, ProductSpec, Schedule};
 use raysweep_session::stack::Contents;
 
-use crate::plane::{PlaneTask, Processing};
+use crate::plane::{KnownRig, PlaneTask, Processing};
 
 /// Minimum number of frames of a dark image: its noise enters all images of its exposure, so it must be small.
 const MIN_DARK_AVERAGE: u32 = 8;
@@ -23,9 +23,9 @@ pub struct SweepTask {
 
 impl SweepTask {
     /// A sweep on a rig; see [`PlaneTask::new`].
-    pub fn new(plan: &Plan, sweep: SweepPlan, rig: &RigFile, first_row: usize, size: (usize, usize)) -> Self {
-        let schedule = schedule(&sweep, rig.vsync.period_us);
-        let task = PlaneTask::new(plan, schedule, sweep.max_jitter_us, rig, first_row, size);
+    pub fn new(plan: &Plan, sweep: SweepPlan, rig: &KnownRig<'_>) -> Self {
+        let schedule = schedule(&sweep, rig.file.vsync.period_us);
+        let task = PlaneTask::new(plan, schedule, sweep.max_jitter_us, rig);
         Self { sweep, task: Arc::new(task), products: plan.products.clone() }
     }
 
@@ -118,10 +118,12 @@ pub(super) fn append_product(
         .map_err(|error| refused(&error.path, error.to_string()))?;
     if specs.iter().any(|other| other.name() == spec.name()) {
         let message = format!(
-            "product {kind}: two products are named {:?} and would overwrite each other: give one another name",
+            "product {kind}: two products are named {:?} and would overwrite each other: give one of them another `name`",
             spec.name()
         );
-        return Err(refused(&["name".into()], message));
+        // A name that is not in the file follows from the kind.
+        let path: &[String] = if name.is_some() { &["name".into()] } else { &[] };
+        return Err(refused(path, message));
     }
     specs.push(spec);
     Ok(())

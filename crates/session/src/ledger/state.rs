@@ -79,7 +79,7 @@ impl State {
     /// Number of stored points of the plan, which are what [`Contents`] says.
     pub fn stored_points(&self) -> usize {
         match self.session.shape.contents {
-            Contents::Sweep { .. } => self.stored(ArrayName::Sum).count(),
+            Contents::Sweep { .. } | Contents::Board { .. } => self.stored(ArrayName::Sum).count(),
             Contents::Film { .. } => self.cycles.len(),
             Contents::Batches { .. } => self.batches.len(),
             Contents::Axes { .. } => self.axes.len(),

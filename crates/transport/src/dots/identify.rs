@@ -84,7 +84,7 @@ pub enum IdentifyError {
         measured: usize,
     },
     /// The band is invalid.
-    #[error("band = {low_hz} to {high_hz} Hz: allowed is from above 0 to half the rate, low before high")]
+    #[error("band = {low_hz} to {high_hz} Hz: must be above 0, at most half the rate, and low before high")]
     Band {
         /// Its lower end.
         low_hz: f64,

@@ -41,7 +41,18 @@ impl Acquisition {
         if let Some(latency) = latency {
             self.ahead.set_latency(latency);
         }
-        tracing::info!(?latency, changes_seen = late_frames.len(), "how late the camera's settings act");
+        match latency {
+            Some(SettingsLatency { min_frames, max_frames }) => tracing::info!(
+                min_frames,
+                max_frames,
+                changes_seen = late_frames.len(),
+                "measured how late the camera's settings take effect"
+            ),
+            None => tracing::info!(
+                changes_seen = late_frames.len(),
+                "the probe could not measure how late the camera's settings take effect"
+            ),
+        }
         Ok(latency)
     }
 

@@ -13,7 +13,7 @@ use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::{ArrayName, StackShape};
 
 use crate::plane::{Opened, PointSink, Taken, missing};
-use crate::procedure::lab::Lab;
+use crate::procedure::lab::{Lab, RigOfRun};
 use crate::rig::Rig;
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
@@ -28,28 +28,25 @@ struct DarksRun {
     darks: DarksTask,
 }
 
-/// Predicts a run of dark images on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row
-/// `first_row`.
+/// Predicts a run of dark images.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
 pub fn foresee(
     lab: &Lab<'_>,
-    rig: &Arc<Rig>,
+    rig: RigOfRun<'_>,
     plan: &Plan,
     own: DarksPlan,
-    first_row: usize,
-    size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
-    let darks = DarksTask::new(plan, own, &rig.file, first_row, size);
+    let darks = DarksTask::new(plan, own, &rig.known()?);
     Ok(Foreseen {
         report: check::check(&darks, lab)?,
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
-        shape: StackShape { contents: darks.contents(), rows: size.0, columns: size.1 },
-        first_row,
+        shape: StackShape { contents: darks.contents(), rows: rig.size.0, columns: rig.size.1 },
+        first_row: rig.first_row,
         instead: "take fewer exposures",
-        procedure: Box::new(DarksRun { rig: rig.clone(), darks }),
+        procedure: Box::new(DarksRun { rig: rig.rig.clone(), darks }),
     })
 }
 

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
 use raysweep_pipeline::{CycleOrder, Point, PointRole, Stages};
+use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_proto::{CheckReport, DesignParams, DesignReport, RpcError};
@@ -24,7 +25,7 @@ use self::worker::{Account, Solving, Worker};
 use crate::devices::camera::{Exposures, FilmSetting};
 use crate::plane::advice::{advise, design};
 use crate::plane::{Opened, PointSink, Taken, missing};
-use crate::procedure::lab::Lab;
+use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::{Pace, Rig};
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
@@ -38,6 +39,7 @@ const CYCLES_UNDER_WAY: usize = 4;
 struct FilmRun {
     rig: Arc<Rig>,
     camera: CameraCapabilities,
+    calibration: Option<KeptCalibration>,
     film: FilmTask,
     stages: Stages,
 }
@@ -46,23 +48,33 @@ struct FilmRun {
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
-pub fn foresee(lab: &Lab<'_>, rig: &Arc<Rig>, plan: &Plan, own: FilmPlan) -> Result<Foreseen, ConfigError> {
+pub fn foresee(
+    lab: &Lab<'_>,
+    rig: RigOfRun<'_>,
+    plan: &Plan,
+    own: FilmPlan,
+) -> Result<Foreseen, ConfigError> {
     if plan.products.is_some() {
         let message = "kind = \"film\" takes no [[product]], because its result is a transport for each cycle: leave it out";
         return Err(plan.places.error(&["product"], message));
     }
-    let first_row = rig.first_row(lab.camera);
-    let film = FilmTask::new(plan, own, &rig.file, first_row, lab.size());
+    let film = FilmTask::new(plan, own, &rig.known()?);
     let stages = lab.probes.after(&film.stages()?);
     let shape = StackShape { contents: film.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {
-        report: check::check(&film, lab)?,
+        report: rig.warned(check::check(&film, lab)?),
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
         shape,
-        first_row,
+        first_row: rig.first_row,
         instead: "take fewer settings",
-        procedure: Box::new(FilmRun { rig: rig.clone(), camera: lab.camera.clone(), film, stages }),
+        procedure: Box::new(FilmRun {
+            rig: rig.rig.clone(),
+            camera: lab.camera.clone(),
+            calibration: rig.calibration,
+            film,
+            stages,
+        }),
     })
 }
 
@@ -76,6 +88,10 @@ impl Measurement for FilmRun {
 
     fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
         Ok(design(&self.film, &self.rig.file, &self.camera, params)?)
+    }
+
+    fn keep(&self, session: &Session) -> Result<(), RpcError> {
+        keep_calibration(self.calibration.as_ref(), session)
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {

@@ -228,7 +228,7 @@ impl Drop for Worker {
 }
 
 impl Solving {
-    fn run(self, inbox: &Inbox, workers: &rayon::ThreadPool) -> raysweep_session::Result<()> {
+    fn run(mut self, inbox: &Inbox, workers: &rayon::ThreadPool) -> raysweep_session::Result<()> {
         let mut solve_time = Duration::ZERO;
         while let Some((exposed, is_sliding)) = inbox.next(solve_time) {
             let began = Instant::now();
@@ -254,6 +254,13 @@ impl Solving {
                 tracing::error!(%error, cycle, "transport not stored");
                 self.orders.give(Order::Fault);
                 return Err(error);
+            }
+            if !is_sliding && let Some(drift) = workers.install(|| self.solver.learn(frames, dark)) {
+                drift.warnings.iter().for_each(|warning| tracing::warn!("{warning}"));
+                self.account.note(|film| {
+                    film.late_us = Some(drift.late_us);
+                    film.calibration_warnings = drift.warnings;
+                });
             }
         }
         Ok(())

@@ -43,6 +43,7 @@ impl Searched for SweepTask {
 mod tests {
     use raysweep_config::{Plan, Procedure, RigFile};
     use raysweep_core::{CameraCapabilities, PixelFormat, Readout};
+    use raysweep_processing::plane::KnownRig;
     use raysweep_proto::{DesignParams, PlanAdvice};
 
     use super::*;
@@ -69,7 +70,8 @@ mod tests {
     fn task(rig: &RigFile, plan: &str) -> SweepTask {
         let plan = Plan::parse(plan).unwrap();
         let Procedure::Sweep(sweep) = plan.procedure.clone() else { panic!("{plan:?}") };
-        SweepTask::new(&plan, sweep, rig, 0, (720, 16))
+        let rig = KnownRig { file: rig, first_row: 0, size: (720, 16), calibration: None };
+        SweepTask::new(&plan, sweep, &rig)
     }
 
     fn advised(rig: &str, plan: &str, camera: &CameraCapabilities) -> Result<PlanAdvice, NoAdvice> {

@@ -1,6 +1,7 @@
 //! Predicts a sweep, before anything moves.
 
 use raysweep_config::ConfigError;
+use raysweep_core::Size;
 use raysweep_pipeline::ProductSpec;
 use raysweep_processing::memory::MemoryNeed;
 use raysweep_processing::sweep::SweepTask;
@@ -45,12 +46,13 @@ pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Resu
             model.reach()
         ));
     }
+    warnings.extend(products.iter().filter_map(|spec| spec.beyond(model.reach_rows)));
     warnings.extend(model.warnings(task));
     if memory.in_strips(memory_free_bytes) {
         warnings.push(format!(
-            "{} MB of memory would be needed to solve the sweep in one piece and {} MB may be used: it is solved {STRIP_ROWS} camera rows at a time, after its end, without live estimates; the results are the same",
-            memory.whole_bytes / 1_000_000,
-            memory_free_bytes / 1_000_000
+            "{} of memory would be needed to solve the sweep in one piece and {} may be used: it is solved {STRIP_ROWS} camera rows at a time, after its end, without live estimates; the results are the same",
+            Size(memory.whole_bytes),
+            Size(memory_free_bytes)
         ));
     }
     warnings.extend(room.warnings());

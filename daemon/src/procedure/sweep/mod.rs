@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 
 use raysweep_config::{ConfigError, Plan, SweepPlan};
 use raysweep_core::{CameraCapabilities, SettingsLatency, VsyncStats};
+use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_processing::sweep::{Overview, Results, SweepTask, write_products, write_report};
@@ -20,7 +21,7 @@ use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
 use crate::plane::advice::{advise, design};
 use crate::plane::{Opened, PointSink, Taken, missing};
-use crate::procedure::lab::Lab;
+use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
 use crate::run::life::{Ended, Foreseen, Measurement, Run, end_entry, end_state};
@@ -33,6 +34,7 @@ const UNITS_UNDER_WAY: usize = 8;
 /// A sweep on a rig.
 struct SweepRun {
     rig: Arc<Rig>,
+    calibration: Option<KeptCalibration>,
     camera: CameraCapabilities,
     sweep: SweepTask,
     processing: Processing,
@@ -40,38 +42,37 @@ struct SweepRun {
     in_strips: bool,
 }
 
-/// Predicts a sweep on a rig whose camera has `size` (rows, columns); camera row 0 sees projector row `first_row`.
+/// Predicts a sweep.
 ///
 /// # Errors
 /// For a plan that cannot be run on this rig.
 pub fn foresee(
     lab: &Lab<'_>,
-    rig: &Arc<Rig>,
+    rig: RigOfRun<'_>,
     plan: &Plan,
     own: SweepPlan,
-    first_row: usize,
-    size: (usize, usize),
 ) -> Result<Foreseen, ConfigError> {
-    let sweep = SweepTask::new(plan, own, &rig.file, first_row, size);
+    let sweep = SweepTask::new(plan, own, &rig.known()?);
     let mut processing = sweep.processing()?;
     processing.stages = lab.probes.after(&processing.stages);
-    let report = check::check(&sweep, &processing.products, lab)?;
+    let report = rig.warned(check::check(&sweep, &processing.products, lab)?);
     let memory = MemoryNeed::of_sweep(&sweep.task, &processing.products)
         .map_err(|error| sweep.task.refuse(&["sweep"], error.to_string()))?;
     let in_strips = memory.in_strips(available_bytes(lab.memory_limit_bytes));
     if in_strips {
         processing.keep_no_images();
     }
-    let shape = StackShape { contents: sweep.contents(), rows: size.0, columns: size.1 };
+    let shape = StackShape { contents: sweep.contents(), rows: rig.size.0, columns: rig.size.1 };
     Ok(Foreseen {
         report,
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
         shape,
-        first_row,
+        first_row: rig.first_row,
         instead: "solving in strips of camera rows does not suffice, so make shorter sequences",
         procedure: Box::new(SweepRun {
-            rig: rig.clone(),
+            rig: rig.rig.clone(),
+            calibration: rig.calibration,
             camera: lab.camera.clone(),
             sweep,
             processing,
@@ -90,6 +91,10 @@ impl Measurement for SweepRun {
 
     fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
         Ok(design(&self.sweep, &self.rig.file, &self.camera, params)?)
+    }
+
+    fn keep(&self, session: &Session) -> Result<(), RpcError> {
+        keep_calibration(self.calibration.as_ref(), session)
     }
 
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {

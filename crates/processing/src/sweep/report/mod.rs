@@ -183,7 +183,9 @@ impl SweepImages<'_> {
             .transpose()?
             .flatten();
         let Some((image, dark)) = self.mean(role)?.zip(dark) else { return Ok(None) };
-        Ok(Some((image - dark) / self.task.task.geometry.white_dn as f32))
+        let geometry = &self.task.task.geometry;
+        let white = geometry.white_of(&(0..geometry.height).collect::<Vec<_>>());
+        Ok(Some((image - dark) / white.mapv(|dn| dn as f32)))
     }
 
     fn mean(&self, role: PointRole) -> Result<Option<Array2<f32>>> {

@@ -1,13 +1,15 @@
-use ndarray::Array2;
+use ndarray::{Array2, s};
 
-use super::super::{CameraRows, PixelResponse, PlaneError, RowTiming};
+use super::super::error::check_shape;
+use super::super::{CameraRows, FIRST_RESPONSE_ROW, PixelResponse, PlaneError, RowTiming};
 use super::Estimate;
 
 /// What images of a board have shown of a rig, in the form in which sweeps and films use it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BoardCalibration {
     /// Start of each projector row and end of the last, after the trigger edge, for a rolling exposure that opens the
-    /// camera's row 0 at its trigger delay: the projector's latency less the camera's.
+    /// camera's row 0 at its trigger delay and stated latency: the projector's latency less what the camera's is more
+    /// than stated.
     pub row_starts_us: Vec<f64>,
     /// Time from one row of the camera to the next.
     pub camera_row_time_us: Estimate,
@@ -27,13 +29,38 @@ pub struct BoardCalibration {
 }
 
 impl BoardCalibration {
+    /// Mean time, over the columns of camera row `t`, at which direct light reaches a pixel: from the trigger edge to
+    /// the middle of the rows that light it, each weighted with its share.
+    ///
+    /// # Panics
+    /// If the calibration has no camera row `t`, or no projector row.
+    pub fn direct_light_us(&self, t: usize) -> f64 {
+        let (_, columns) = self.response.size();
+        let last_row = self.row_starts_us.len().saturating_sub(2) as i64;
+        let centre_us = |row: i64| {
+            let row = row.clamp(0, last_row) as usize;
+            (self.row_starts_us[row] + self.row_starts_us[row + 1]) / 2.0
+        };
+        let shares = self.response.shares();
+        let of_column = |(s, own_row): (usize, i64)| -> f64 {
+            (i64::from(FIRST_RESPONSE_ROW)..)
+                .zip(shares.slice(s![.., t, s]))
+                .map(|(d, &share)| f64::from(share) * centre_us(own_row + d))
+                .sum()
+        };
+        self.response.own_rows(t, columns).enumerate().map(of_column).sum::<f64>() / columns as f64
+    }
+
     /// The timing of a sweep on the calibrated rig. `nominal` is that of the rig file, without a beam; `first_row_us`
     /// is its time from the trigger edge to the start of row 0, to which delays refer.
     ///
     /// # Errors
-    /// [`PlaneError::Shape`] if the calibration is of a camera with other rows; [`PlaneError::OutOfRange`] for a
-    /// table of row starts that does not have the projector's rows or does not increase.
+    /// [`PlaneError::Shape`] if the calibration is of a camera with other rows, or its white level of another size;
+    /// [`PlaneError::OutOfRange`] for a table of row starts that does not have the projector's rows or does not
+    /// increase.
     pub fn timing(&self, nominal: RowTiming, first_row_us: f64) -> Result<RowTiming, PlaneError> {
+        let (rows, columns) = self.response.size();
+        check_shape("white_dn", "[camera rows, columns]", self.white_dn.shape(), &[rows, columns])?;
         let camera = CameraRows { row_time_us: self.camera_row_time_us.value, ..nominal.camera() };
         let starts_us: Vec<f64> = self.row_starts_us.iter().map(|start_us| start_us - first_row_us).collect();
         nominal.with_camera(camera)?.with_row_table(&starts_us)?.with_response(self.response.clone())

@@ -3,7 +3,7 @@ use std::ops::RangeInclusive;
 use ndarray::{Array2, ArrayView3, Axis, concatenate, s};
 use rayon::prelude::*;
 
-use super::super::model::{ResponseClass, WIDEST_RESPONSE_SIGMA_ROWS, collected, drawn};
+use super::super::model::{ResponseClass, WIDEST_RESPONSE_SIGMA_ROWS, collected_rows, drawn};
 use super::super::{Beam, PlaneError, Prior, RowModel, RowTiming, Setting, Shares, Slot, reach};
 use super::problem::RowProblem;
 use super::{CalibrateError, SpikeMap};
@@ -249,9 +249,13 @@ impl SampledClass {
     /// A measured response takes the place of the beam.
     pub fn weights(&self, beam_sigma_rows: f64) -> Array2<f64> {
         if let Some(shares) = &self.shares {
-            return Array2::from_shape_fn((self.ideal.nrows(), self.slots.len()), |(n, slot)| {
-                collected(self.ideal.row(n), shares, self.own_row + i64::from(self.slots[slot].u))
-            });
+            let mut weights = Array2::zeros((self.ideal.nrows(), self.slots.len()));
+            for (mut weights, drawn) in weights.rows_mut().into_iter().zip(self.ideal.rows()) {
+                let light = collected_rows(drawn, shares, 0, drawn.len());
+                let lit = |slot: &Slot| (self.own_row + i64::from(slot.u)) as usize;
+                weights.iter_mut().zip(&self.slots).for_each(|(to, slot)| *to = light[lit(slot)]);
+            }
+            return weights;
         }
         let is_wide = beam_sigma_rows > WIDEST_RESPONSE_SIGMA_ROWS;
         let beam = between_rows(beam_shares(beam_sigma_rows), if is_wide { 0.0 } else { self.fraction });

@@ -4,7 +4,7 @@ use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
 use rayon::prelude::*;
 
 use super::super::PlaneError;
-use super::response::{PLACE_STEPS, ResponseClass, collected};
+use super::response::{PLACE_STEPS, ResponseClass, collected_rows};
 use super::{RowTiming, Setting};
 
 /// A row is an unknown if some setting collects at least this share of its dwell.
@@ -124,11 +124,14 @@ impl RowModel {
         class: &ResponseClass,
     ) -> Self {
         let (settings, projector_rows) = drawn.dim();
-        let weight = |n: usize, lit: i64| collected(drawn.row(n), &class.shares, lit);
+        let mut light = Array2::zeros((settings, projector_rows));
+        for (mut light, drawn) in light.rows_mut().into_iter().zip(drawn.rows()) {
+            light.assign(&collected_rows(drawn, &class.shares, 0, projector_rows));
+        }
         let kind = |lit: i64| match i32::try_from(lit - class.own_row) {
             Ok(u) if reach.contains(&u) => Some((u, SlotKind::Own)),
             Ok(u) => {
-                let is_seen = (0..settings).any(|n| weight(n, lit) >= MIN_WEIGHT);
+                let is_seen = light.column(lit as usize).iter().any(|&weight| weight >= MIN_WEIGHT);
                 is_seen.then_some((u, SlotKind::Wrapped))
             }
             Err(_) => None,
@@ -137,7 +140,7 @@ impl RowModel {
         let (own, wrapped): (Vec<_>, Vec<_>) = slots.partition(|(_, kind)| *kind == SlotKind::Own);
         let slots: Vec<Slot> = own.into_iter().chain(wrapped).map(|(u, kind)| Slot { u, kind }).collect();
         let weights = Array2::from_shape_fn((settings, slots.len()), |(n, slot)| {
-            weight(n, class.own_row + i64::from(slots[slot].u))
+            light[[n, (class.own_row + i64::from(slots[slot].u)) as usize]]
         });
         Self { slots, weights }
     }

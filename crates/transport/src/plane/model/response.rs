@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use ndarray::{Array2, Array3, ArrayView1, ArrayView2, ArrayView3};
+use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, s};
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
@@ -157,12 +157,35 @@ impl PixelResponse {
 
 /// `A'` of a pixel with this response for one projector row: light of the row `lit`, collected while the rows around it
 /// are drawn. `drawn` is the share of each projector row's dwell inside the exposure.
+#[cfg(test)]
 pub(in super::super) fn collected(drawn: ArrayView1<f64>, shares: &Shares, lit: i64) -> f64 {
     let of_row = |(d, share): (usize, &f64)| {
         let row = usize::try_from(lit + d as i64 + i64::from(FIRST_RESPONSE_ROW)).ok()?;
         drawn.get(row).map(|drawn| share * drawn)
     };
     shares.iter().enumerate().filter_map(of_row).sum()
+}
+
+/// [`collected`] for the `len` rows that begin with `first`: `[len]`, with the same sums in the same order, but row by
+/// row of the response instead of lit row by lit row, which takes a tenth of the time.
+pub(in super::super) fn collected_rows(
+    drawn: ArrayView1<f64>,
+    shares: &Shares,
+    first: i64,
+    len: usize,
+) -> Array1<f64> {
+    let mut light = Array1::zeros(len);
+    for (d, &share) in shares.iter().enumerate() {
+        // Lit row `first + n` collects from drawn row `n - before`.
+        let before = -(first + d as i64 + i64::from(FIRST_RESPONSE_ROW));
+        let from = before.clamp(0, len as i64) as usize;
+        let end = (before + drawn.len() as i64).clamp(from as i64, len as i64) as usize;
+        if from < end {
+            let drawn = drawn.slice(s![(from as i64 - before) as usize..(end as i64 - before) as usize]);
+            light.slice_mut(s![from..end]).scaled_add(share, &drawn);
+        }
+    }
+    light
 }
 
 #[cfg(test)]
@@ -201,6 +224,20 @@ mod tests {
         let drawn = ndarray::array![0.0, 1.0, 0.0, 1.0];
         let light = |lit: i64| collected(drawn.view(), &shares, lit);
         assert_eq!([-1, 0, 1, 2, 3].map(light), [0.2, 0.3, 0.7, 0.3, 0.5]);
+    }
+
+    #[test]
+    fn rows_together_collect_what_each_does_alone() {
+        let shares: Shares = std::array::from_fn(|d| 0.01 * (d as f64 + 1.0).sqrt());
+        for rows in [1, 5, 16, 40] {
+            let drawn = Array1::from_shape_fn(rows, |v| ((v * 7 + 3) % 11) as f64 / 11.0);
+            for (first, len) in [(-12, 60), (0, rows), (3, 2), (rows as i64 + 20, 4), (-40, 10)] {
+                let expected: Vec<f64> =
+                    (first..first + len as i64).map(|lit| collected(drawn.view(), &shares, lit)).collect();
+                let found = collected_rows(drawn.view(), &shares, first, len);
+                assert_eq!(found.to_vec(), expected, "{rows} rows, from {first}");
+            }
+        }
     }
 
     #[test]

@@ -13,6 +13,11 @@ impl Setting {
     pub fn new(delay_us: f64, exposure_us: f64) -> Self {
         Self { delays_us: vec![delay_us], exposure_us }
     }
+
+    /// The same setting with its delays reduced by `by_us`: that of light which comes so much later than assumed.
+    pub fn earlier(&self, by_us: f64) -> Self {
+        Self { delays_us: self.delays_us.iter().map(|delay_us| delay_us - by_us).collect(), ..*self }
+    }
 }
 
 /// Delay `t_d` from the offset `t'_o` between the start of a row's exposure and the start of its illumination.

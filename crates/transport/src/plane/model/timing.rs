@@ -5,7 +5,7 @@ use ndarray::{Array1, Array2, ArrayView2};
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
-use super::response::{PLACE_STEPS, ResponseClass, collected};
+use super::response::{PLACE_STEPS, ResponseClass, collected_rows};
 use super::{Beam, PixelResponse, Setting};
 
 /// When each projector row is lit, how its light spreads, and which projector rows the camera's rows see.
@@ -266,8 +266,7 @@ impl RowTiming {
         };
         let drawn = Array1::from(self.drawn(t, setting));
         let weights = |class: ResponseClass| {
-            let of_row = |v: usize| collected(drawn.view(), &class.shares, v as i64);
-            ((0..drawn.len()).map(of_row).collect(), class.columns)
+            (collected_rows(drawn.view(), &class.shares, 0, drawn.len()).to_vec(), class.columns)
         };
         response.classes(t, 0..columns, PLACE_STEPS).into_iter().map(weights).collect()
     }

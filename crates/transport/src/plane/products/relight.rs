@@ -3,7 +3,7 @@ use rayon::prelude::*;
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
-use super::super::model::{PLACE_STEPS, RowTiming, Transport, collected};
+use super::super::model::{PLACE_STEPS, RowTiming, Transport, collected_rows};
 
 /// How a projector's rows spread in a relit image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -70,9 +70,8 @@ pub fn relight_rows(
             return;
         };
         for class in response.classes(first_row + at, 0..columns, PLACE_STEPS) {
-            let lit = |v: usize| collected(spread.view(), &class.shares, v as i64);
             let weights = match beam {
-                RelitBeam::AsLit => Array1::from_shape_fn(spread.len(), lit),
+                RelitBeam::AsLit => collected_rows(spread.view(), &class.shares, 0, spread.len()),
                 RelitBeam::Ideal => spread.clone(),
             };
             let mut relit = Array1::zeros(class.columns.len());

@@ -1,0 +1,95 @@
+//! What images tell about the calibration that they are demultiplexed with: whether light still comes when and where
+//! it was measured.
+
+use ndarray::ArrayView3;
+use raysweep_transport::plane::calibrate::{Sample, latency, spike_offset};
+use raysweep_transport::plane::{RowTiming, Setting};
+
+/// A latency found further from the calibration's causes a warning.
+const NEAR_US: f64 = 2.0;
+/// One still further is not adopted: the rig, or something before it, has moved.
+const ADOPTED_US: f64 = 5.0;
+/// Direct light further from its place causes a warning.
+const NEAR_ROWS: f64 = 0.1;
+
+/// How a rig has changed since its calibration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CalibrationDrift {
+    /// By how much later than calibrated light arrives; 0 if it was not found, or is not to be believed.
+    pub late_us: f64,
+    /// Median distance of direct light from its place, in projector rows; `None` if it was not found.
+    pub u0_rows: Option<f64>,
+    /// What was found, each as a key and a sentence.
+    pub remarks: Vec<(&'static str, String)>,
+    /// What is wrong with it.
+    pub warnings: Vec<String>,
+}
+
+/// Images of some camera rows.
+#[derive(Clone, Copy)]
+pub(crate) struct Images<'a> {
+    /// The camera rows, ascending.
+    pub rows: &'a [usize],
+    /// `[settings, rows, s]`; 1 = a white pixel lit by its own projector row.
+    pub images: ArrayView3<'a, f32>,
+    /// Which samples may be used, of the same shape; `None` if all.
+    pub valid: Option<ArrayView3<'a, bool>>,
+}
+
+impl CalibrationDrift {
+    /// Finds it from images with these settings.
+    pub(crate) fn of(timing: &RowTiming, settings: &[Setting], images: &Images<'_>) -> Self {
+        let mut drift = Self { late_us: 0.0, u0_rows: None, remarks: Vec::new(), warnings: Vec::new() };
+        drift.find_latency(timing, settings, images);
+        drift.find_place(timing, settings, images);
+        drift
+    }
+
+    fn find_latency(&mut self, timing: &RowTiming, settings: &[Setting], images: &Images<'_>) {
+        let &Images { rows, images, valid } = images;
+        let said = match latency(timing, settings, rows, images, valid) {
+            Err(error) => format!("as calibrated: {error}"),
+            Ok(found) => {
+                let late_us = found.late_us;
+                let than = if late_us < 0.0 { "earlier" } else { "later" };
+                let comes = format!("light comes {:.2} us {than} than calibrated", late_us.abs());
+                if late_us.abs() > ADOPTED_US {
+                    self.warnings.push(format!(
+                        "{comes}, too much to be corrected: the times of the calibration are kept, but the rig has moved: calibrate again"
+                    ));
+                } else {
+                    self.late_us = late_us;
+                    if late_us.abs() > NEAR_US {
+                        self.warnings.push(format!("{comes}: calibrate again soon"));
+                    }
+                }
+                format!("{comes} (± {:.2} us), from {} pixels", found.standard_error_us, found.pixels)
+            }
+        };
+        self.remarks.push(("latency", said));
+    }
+
+    /// After the latency, which cannot be told from the same error of all places.
+    fn find_place(&mut self, timing: &RowTiming, settings: &[Setting], images: &Images<'_>) {
+        let &Images { rows, images, valid } = images;
+        let settings = settings.iter().map(|setting| setting.earlier(self.late_us)).collect();
+        let sample = Sample::of_rows(timing.clone(), settings, rows, images, valid);
+        let said = match sample.and_then(|sample| spike_offset(&sample, 0.0)) {
+            Err(error) => format!("taken to lie where it was calibrated: {error}"),
+            Ok(map) => {
+                let mut places: Vec<f32> = map.u0.iter().copied().collect();
+                places.sort_by(f32::total_cmp);
+                let median = f64::from(places[places.len() / 2]);
+                if median.abs() > NEAR_ROWS {
+                    self.warnings.push(format!(
+                        "direct light lies {:.2} row from its place: the rig has moved; calibrate again",
+                        median.abs()
+                    ));
+                }
+                self.u0_rows = Some(median);
+                format!("{median:.3} rows from where it was calibrated (median), from {} pixels", map.pixels)
+            }
+        };
+        self.remarks.push(("direct light", said));
+    }
+}

@@ -1,0 +1,428 @@
+//! `calibration.toml` and `calibration.npz`: a calibration as sessions and the data folder keep it.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Cursor, Read};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use ndarray::{Array1, Array2, Array3};
+use ndarray_npy::{NpzReader, NpzWriter};
+use raysweep_config::{ConfigError, RigFile};
+use raysweep_core::{CameraCapabilities, PixelFormat};
+use raysweep_session::durable;
+use raysweep_transport::plane::board::{BoardCalibration, Estimate};
+use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use crate::plane::KnownCalibration;
+
+/// Version of the files' format.
+pub(super) const SCHEMA: u32 = 1;
+/// Older calibrations cause a warning.
+const MOST_DAYS: i64 = 30;
+/// Largest header that is read.
+const MAX_HEADER_BYTES: u64 = 1 << 20;
+/// Room in `calibration.npz` for everything but maps and tables: names, headers, modes.
+const OTHER_BYTES: u64 = 4 << 20;
+/// Most modes of the covariance of the row starts.
+const MAX_MODES: u64 = 256;
+/// 4-byte numbers per pixel: place, its deviation, responses, white, its deviation, dark offset, slope and covariance.
+const NUMBERS_PER_PX: u64 = 2 + RESPONSE_ROWS as u64 + 2 + 2 + 3;
+
+/// Folder of the calibration in use, within the daemon's data folder.
+pub fn current_in(data: &Path) -> PathBuf {
+    data.join("calibration")
+}
+
+/// A number and its standard deviation, as the file has them.
+pub type Pair = [f64; 2];
+
+/// `calibration.toml`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CalibrationHeader {
+    /// Version of the format.
+    pub schema: u32,
+    /// Start of the session that measured it.
+    pub made: Timestamp,
+    /// Name of that session's folder.
+    pub session: String,
+    /// SHA-256 of `calibration.npz`.
+    pub arrays_sha256: String,
+    /// The devices that it belongs to.
+    pub valid_for: ValidFor,
+    /// Times.
+    pub timing: Timing,
+    /// Light and sensor.
+    pub light: Light,
+    /// Figures of the calibration's own checks, each with its limit.
+    pub checks: BTreeMap<String, Pair>,
+}
+
+/// The devices that a calibration belongs to.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValidFor {
+    /// Maker, model and serial number of the camera.
+    pub camera: String,
+    /// Camera rows and columns.
+    pub size: [usize; 2],
+    /// Pixel format.
+    pub pixel_format: PixelFormat,
+    /// Projector rows.
+    pub projector_rows: usize,
+    /// Time from one VSYNC edge to the next, as the rig file has it.
+    pub period_us: f64,
+    /// SHA-256 of the rig file.
+    pub rig_sha256: String,
+}
+
+/// Times, each with its standard deviation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Timing {
+    /// Mean time from one projector row to the next.
+    pub row_time_us: Pair,
+    /// Time from one camera row to the next.
+    pub camera_row_time_us: Pair,
+    /// What exposures have more than their nominal length.
+    pub exposure_offset_us: Pair,
+    /// Standard deviation of the time of all rows together.
+    pub latency_sd_us: f64,
+    /// Jitter of the light of a frame against the measured VSYNC edge.
+    pub jitter_us: Pair,
+    /// First projector row that the image sees, and the row after the last.
+    pub seen_rows: [usize; 2],
+}
+
+/// Light and sensor.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Light {
+    /// Median white, in counts above black.
+    pub white_dn: Pair,
+    /// Gain.
+    pub electrons_per_dn: Pair,
+    /// Noise of a reading.
+    pub read_noise_e: Pair,
+    /// Non-uniformity of the pixels' sensitivities.
+    pub prnu: Pair,
+    /// Number of pixels with unusual dark current or noise.
+    pub hot_pixels: usize,
+}
+
+/// `calibration.npz`. `[t, s]` are camera rows and columns.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CalibrationArrays {
+    /// Start of each projector row and end of the last, `[rows + 1]`.
+    pub row_starts_us: Array1<f64>,
+    /// Modes `[r, rows + 1]` whose outer products sum to the covariance of the row starts.
+    pub row_starts_modes: Array2<f64>,
+    /// Place of each pixel in projector rows, `[t, s]`.
+    pub place: Array2<f32>,
+    /// Its standard deviation; NaN where the board was not lit.
+    pub place_sd: Array2<f32>,
+    /// Shares of the drawn rows around the place in the pixel's direct light, `[16, t, s]`.
+    pub response: Array3<f32>,
+    /// White above black, `[t, s]`; NaN where the board was not lit.
+    pub white_dn: Array2<f32>,
+    /// Its standard deviation.
+    pub white_sd: Array2<f32>,
+    /// Dark level at exposure 0, `[t, s]`.
+    pub dark_offset_dn: Array2<f32>,
+    /// Dark current, `[t, s]`.
+    pub dark_slope_dn_per_us: Array2<f32>,
+    /// Variance of the offset, covariance, variance of the slope, `[3, t, s]`.
+    pub dark_covariance: Array3<f32>,
+}
+
+/// A calibration.
+#[derive(Debug, Clone, PartialEq)]
+pub struct KeptCalibration {
+    /// `calibration.toml`.
+    pub header: CalibrationHeader,
+    /// `calibration.npz`.
+    pub arrays: CalibrationArrays,
+}
+
+impl CalibrationArrays {
+    fn to_bytes(&self) -> Result<Vec<u8>, String> {
+        let mut npz = NpzWriter::new(Cursor::new(Vec::new()));
+        let mut write = || {
+            npz.add_array("row_starts_us", &self.row_starts_us)?;
+            npz.add_array("row_starts_modes", &self.row_starts_modes)?;
+            npz.add_array("place", &self.place)?;
+            npz.add_array("place_sd", &self.place_sd)?;
+            npz.add_array("response", &self.response)?;
+            npz.add_array("white_dn", &self.white_dn)?;
+            npz.add_array("white_sd", &self.white_sd)?;
+            npz.add_array("dark_offset_dn", &self.dark_offset_dn)?;
+            npz.add_array("dark_slope_dn_per_us", &self.dark_slope_dn_per_us)?;
+            npz.add_array("dark_covariance", &self.dark_covariance)
+        };
+        write().map_err(|error: ndarray_npy::WriteNpzError| error.to_string())?;
+        Ok(npz.finish().map_err(|error| error.to_string())?.into_inner())
+    }
+
+    fn from_bytes(bytes: &[u8]) -> Result<Self, ndarray_npy::ReadNpzError> {
+        let mut npz = NpzReader::new(Cursor::new(bytes))?;
+        Ok(Self {
+            row_starts_us: npz.by_name("row_starts_us")?,
+            row_starts_modes: npz.by_name("row_starts_modes")?,
+            place: npz.by_name("place")?,
+            place_sd: npz.by_name("place_sd")?,
+            response: npz.by_name("response")?,
+            white_dn: npz.by_name("white_dn")?,
+            white_sd: npz.by_name("white_sd")?,
+            dark_offset_dn: npz.by_name("dark_offset_dn")?,
+            dark_slope_dn_per_us: npz.by_name("dark_slope_dn_per_us")?,
+            dark_covariance: npz.by_name("dark_covariance")?,
+        })
+    }
+
+    /// Checks that all arrays belong to one rig.
+    fn check(&self, of: &ValidFor) -> Result<(), String> {
+        let [rows, columns] = of.size;
+        let image = [rows, columns];
+        let shapes: [(&str, &[usize], &[usize]); 9] = [
+            ("row_starts_us", self.row_starts_us.shape(), &[of.projector_rows + 1]),
+            ("place", self.place.shape(), &image),
+            ("place_sd", self.place_sd.shape(), &image),
+            ("response", self.response.shape(), &[RESPONSE_ROWS, rows, columns]),
+            ("white_dn", self.white_dn.shape(), &image),
+            ("white_sd", self.white_sd.shape(), &image),
+            ("dark_offset_dn", self.dark_offset_dn.shape(), &image),
+            ("dark_slope_dn_per_us", self.dark_slope_dn_per_us.shape(), &image),
+            ("dark_covariance", self.dark_covariance.shape(), &[3, rows, columns]),
+        ];
+        for (name, found, expected) in shapes {
+            if found != expected {
+                return Err(format!("{name} has shape {found:?}, but valid_for says {expected:?}"));
+            }
+        }
+        Ok(())
+    }
+}
+
+impl KeptCalibration {
+    /// Joins header and arrays, and states the arrays' checksum.
+    ///
+    /// # Errors
+    /// When the arrays cannot be encoded.
+    pub fn new(header: CalibrationHeader, arrays: CalibrationArrays) -> raysweep_session::Result<Self> {
+        let arrays_sha256 = sha256(&encoded(&arrays)?);
+        Ok(Self { header: CalibrationHeader { arrays_sha256, ..header }, arrays })
+    }
+
+    /// Writes both files into a folder, the header last.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write(&self, folder: &Path) -> raysweep_session::Result<()> {
+        durable::write(&folder.join("calibration.npz"), &encoded(&self.arrays)?)?;
+        let header = toml::to_string(&self.header).map_err(|error| not_encoded(error.to_string()))?;
+        durable::write(&folder.join("calibration.toml"), header.as_bytes())
+    }
+
+    /// Makes this the calibration in use of a data folder, at once or not at all.
+    ///
+    /// # Errors
+    /// When it cannot be written; the one before then stays in use.
+    pub fn use_in(&self, data: &Path) -> raysweep_session::Result<()> {
+        durable::replace_dir(&current_in(data), |folder| self.write(folder))
+    }
+
+    /// Reads a calibration; `None` if the folder has none.
+    ///
+    /// # Errors
+    /// Says which file is damaged, and how.
+    pub fn read(folder: &Path) -> Result<Option<Self>, String> {
+        let Some(header) = CalibrationHeader::read(folder)? else { return Ok(None) };
+        let path = folder.join("calibration.npz");
+        let in_file = |why: String| format!("{}: {why}", path.display());
+        let file = File::open(&path).map_err(|error| in_file(error.to_string()))?;
+        let bytes = limited(file, header.most_bytes()).map_err(in_file)?;
+        if sha256(&bytes) != header.arrays_sha256 {
+            return Err(in_file(
+                "its SHA-256 is not the arrays_sha256 of calibration.toml: it was changed or damaged".into(),
+            ));
+        }
+        let arrays = CalibrationArrays::from_bytes(&bytes).map_err(|error| in_file(error.to_string()))?;
+        arrays.check(&header.valid_for).map_err(in_file)?;
+        Ok(Some(Self { header, arrays }))
+    }
+
+    /// The calibration that a rig's runs use, from the daemon's data folder or a session's; `None` if there is none, or
+    /// the rig file overrides it.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is of other devices.
+    pub fn of(
+        rig: &RigFile,
+        folder: &Path,
+        camera: Option<&CameraCapabilities>,
+    ) -> Result<Option<Self>, ConfigError> {
+        if rig.calibration.is_overridden {
+            return Ok(None);
+        }
+        let instead = "run `raysweep calibrate` again, or state [calibration] override = true in the rig file to use its own numbers";
+        let refused = |why: String| {
+            ConfigError::of_field("calibration", format!("the calibration cannot be used: {why}; {instead}"))
+        };
+        let Some(kept) = Self::read(folder).map_err(refused)? else { return Ok(None) };
+        kept.header.valid_for.check(rig, camera).map_err(refused)?;
+        Ok(Some(kept))
+    }
+
+    /// Warnings about a calibration that may not be true any more.
+    pub fn warnings(&self, rig_text: &str, now: Timestamp) -> Vec<String> {
+        let days = now.duration_since(self.header.made).as_hours() / 24;
+        let old = (days > MOST_DAYS)
+            .then(|| format!("the calibration is {days} days old: run `raysweep calibrate` again"));
+        let changed = (sha256(rig_text.as_bytes()) != self.header.valid_for.rig_sha256).then(|| {
+            format!(
+                "the rig file was changed after the calibration of {}: if a device, a lens or a distance changed, run `raysweep calibrate` again",
+                self.header.made.strftime("%Y-%m-%d %H:%M UTC")
+            )
+        });
+        old.into_iter().chain(changed).collect()
+    }
+
+    /// The calibration as sweeps and films use it, with its date.
+    ///
+    /// # Errors
+    /// When the arrays hold no usable response.
+    pub fn known(&self) -> Result<KnownCalibration, ConfigError> {
+        let made = self.header.made.strftime("%Y-%m-%d %H:%M UTC").to_string();
+        Ok(KnownCalibration { made, board: self.board()? })
+    }
+
+    /// The calibration as the model uses it.
+    ///
+    /// # Errors
+    /// When the arrays hold no usable response.
+    fn board(&self) -> Result<Arc<BoardCalibration>, ConfigError> {
+        let Timing { camera_row_time_us, exposure_offset_us, latency_sd_us, .. } = self.header.timing;
+        let [white_dn, white_sd] = self.header.light.white_dn;
+        let place_sd: Vec<f32> = self.arrays.place_sd.iter().copied().filter(|sd| sd.is_finite()).collect();
+        let response = PixelResponse::new(self.arrays.place.clone(), self.arrays.response.clone())
+            .map_err(|error| ConfigError::of_field("calibration", error.to_string()))?;
+        Ok(Arc::new(BoardCalibration {
+            row_starts_us: self.arrays.row_starts_us.to_vec(),
+            camera_row_time_us: estimate(camera_row_time_us),
+            exposure_offset_us: estimate(exposure_offset_us),
+            latency_sd_us,
+            response,
+            place_sd_rows: place_sd.iter().map(|&sd| f64::from(sd)).sum::<f64>()
+                / place_sd.len().max(1) as f64,
+            white_dn: self.arrays.white_dn.clone(),
+            white_relative_sd: white_sd / white_dn,
+        }))
+    }
+}
+
+impl CalibrationHeader {
+    /// Reads the header alone; `None` if the folder has none.
+    ///
+    /// # Errors
+    /// Says how the file is damaged.
+    pub fn read(folder: &Path) -> Result<Option<Self>, String> {
+        let path = folder.join("calibration.toml");
+        let in_file = |why: String| format!("{}: {why}", path.display());
+        let text = match File::open(&path) {
+            Ok(file) => limited(file, MAX_HEADER_BYTES).map_err(in_file)?,
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+            Err(error) => return Err(in_file(error.to_string())),
+        };
+        let text = String::from_utf8(text).map_err(|error| in_file(error.to_string()))?;
+        let header: Self = toml::from_str(&text).map_err(|error| in_file(error.to_string()))?;
+        if header.schema != SCHEMA {
+            let schema = header.schema;
+            return Err(in_file(format!("schema = {schema}: this version reads {SCHEMA}; calibrate again")));
+        }
+        Ok(Some(header))
+    }
+
+    /// The largest `calibration.npz` that belongs to this header.
+    fn most_bytes(&self) -> u64 {
+        let [rows, columns] = self.valid_for.size.map(|side| side as u64);
+        let pixels = rows.saturating_mul(columns);
+        let table = (self.valid_for.projector_rows as u64).saturating_add(1);
+        pixels
+            .saturating_mul(4 * NUMBERS_PER_PX)
+            .saturating_add(table.saturating_mul(8 * (1 + MAX_MODES)))
+            .saturating_add(OTHER_BYTES)
+    }
+}
+
+impl ValidFor {
+    /// The devices of a rig.
+    pub fn new(rig: &RigFile, rig_text: &str, camera: &str, size: (usize, usize)) -> Self {
+        Self {
+            camera: camera.to_owned(),
+            size: [size.0, size.1],
+            pixel_format: rig.camera.pixel_format,
+            projector_rows: rig.projector.rows,
+            period_us: rig.vsync.period_us,
+            rig_sha256: sha256(rig_text.as_bytes()),
+        }
+    }
+
+    /// Refuses other devices.
+    fn check(&self, rig: &RigFile, camera: Option<&CameraCapabilities>) -> Result<(), String> {
+        if let Some(camera) = camera {
+            let (of, now) = (self.size, [camera.height, camera.width]);
+            if camera.model != self.camera {
+                return Err(format!("it is of camera {:?}, and this is {:?}", self.camera, camera.model));
+            }
+            if of != now {
+                let ([rows, columns], [now_rows, now_columns]) = (of, now);
+                return Err(format!(
+                    "it is of {columns} x {rows} pixels, and the camera takes {now_columns} x {now_rows}"
+                ));
+            }
+        }
+        if rig.camera.pixel_format != self.pixel_format {
+            let (of, now) = (self.pixel_format, rig.camera.pixel_format);
+            return Err(format!("it is of pixel format {of}, and camera.pixel_format is {now}"));
+        }
+        if rig.projector.rows != self.projector_rows {
+            let (of, now) = (self.projector_rows, rig.projector.rows);
+            return Err(format!("it is of {of} projector rows, and projector.rows is {now}"));
+        }
+        if rig.vsync.period_us != self.period_us {
+            let (of, now) = (self.period_us, rig.vsync.period_us);
+            return Err(format!("it is of a period of {of} us, and vsync.period_us is {now}"));
+        }
+        Ok(())
+    }
+}
+
+fn estimate([value, sd]: Pair) -> Estimate {
+    Estimate { value, sd }
+}
+
+/// Reads a file of at most so many bytes.
+fn limited(file: File, most_bytes: u64) -> Result<Vec<u8>, String> {
+    let mut bytes = Vec::new();
+    file.take(most_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| error.to_string())?;
+    if bytes.len() as u64 > most_bytes {
+        return Err(format!("it is longer than the {most_bytes} bytes of a calibration"));
+    }
+    Ok(bytes)
+}
+
+fn encoded(arrays: &CalibrationArrays) -> raysweep_session::Result<Vec<u8>> {
+    arrays.to_bytes().map_err(not_encoded)
+}
+
+fn not_encoded(why: String) -> raysweep_session::Error {
+    raysweep_session::Error::Codec { action: "encode", what: "the calibration".into(), why }
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}

@@ -1,0 +1,197 @@
+//! Calibrates a plane rig from images of a white board.
+
+mod file;
+mod images;
+mod report;
+mod task;
+
+use std::collections::BTreeMap;
+
+use ndarray::Array1;
+use raysweep_config::RigFile;
+use raysweep_config::plan::CalibrationPlan;
+use raysweep_session::ledger::State;
+use raysweep_session::{Result, Session, durable};
+use raysweep_transport::plane::board::Estimate;
+use raysweep_transport::plane::board::times::RowTimes;
+
+use self::file::{CalibrationArrays, Light, SCHEMA, Timing};
+pub use self::file::{CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in};
+pub use self::images::{BoardPixels, CalibrationError, StoredImages};
+pub use self::task::{CalibrationTask, Purpose, View};
+use crate::plane::{KnownRig, manifest};
+use crate::stored::{Asked, ProcessError, Processed, Stored};
+
+/// Latency that is known no better than this is said to be uncertain.
+const MOST_LATENCY_SD_US: f64 = 0.5;
+
+/// What a session's images say of the rig.
+pub struct BoardFindings {
+    /// Of each pixel.
+    pub pixels: BoardPixels,
+    /// Of the times.
+    pub times: RowTimes,
+}
+
+impl BoardFindings {
+    /// Evaluates all images.
+    ///
+    /// # Errors
+    /// When an image is missing, or the result is not good enough to be used.
+    pub fn new(images: &StoredImages<'_>) -> std::result::Result<Self, CalibrationError> {
+        let pixels = BoardPixels::new(images)?;
+        let times = pixels.times(images)?;
+        Ok(Self { pixels, times })
+    }
+
+    /// What is worth knowing about a result that is good enough.
+    pub fn warnings(&self) -> Vec<String> {
+        let RowTimes { latency_sd_us, useful_frames, .. } = self.times;
+        let latency = (latency_sd_us > MOST_LATENCY_SD_US).then(|| {
+            format!(
+                "{useful_frames} useful frames: the latency is known to {latency_sd_us:.2} us only; sweeps find the rest from their own light, films do not: raise calibration.delays"
+            )
+        });
+        latency.into_iter().collect()
+    }
+
+    /// The calibration, in the form in which it is kept.
+    ///
+    /// # Errors
+    /// When it cannot be encoded.
+    pub fn keep(&self, session: &Session, state: &State, valid_for: ValidFor) -> Result<KeptCalibration> {
+        let Self { pixels, times } = self;
+        let name = session.dir().file_name().unwrap_or(session.dir().as_os_str());
+        let header = CalibrationHeader {
+            schema: SCHEMA,
+            made: state.session.created,
+            session: name.to_string_lossy().into_owned(),
+            arrays_sha256: String::new(),
+            valid_for,
+            timing: Timing {
+                row_time_us: pair(times.row_time_us),
+                camera_row_time_us: pair(times.camera_row_time_us),
+                exposure_offset_us: pair(times.exposure_offset_us),
+                latency_sd_us: times.latency_sd_us,
+                jitter_us: pair(times.jitter_us),
+                seen_rows: [times.seen_rows.start, times.seen_rows.end],
+            },
+            light: Light {
+                white_dn: pair(pixels.white.level_dn),
+                electrons_per_dn: pair(pixels.transfer.electrons_per_dn),
+                read_noise_e: pair(pixels.transfer.read_noise_e),
+                prnu: pair(pixels.prnu),
+                hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
+            },
+            checks: self.checks(),
+        };
+        let unusable = |error: raysweep_transport::plane::PlaneError| raysweep_session::Error::Codec {
+            action: "encode",
+            what: "the calibration".into(),
+            why: error.to_string(),
+        };
+        let response = pixels.responses.pixel_response().map_err(unusable)?;
+        let lit = pixels.white.lit();
+        let where_lit = |image: &ndarray::Array2<f32>| {
+            let mut image = image.clone();
+            image.zip_mut_with(&lit, |value, lit| {
+                if !lit {
+                    *value = f32::NAN;
+                }
+            });
+            image
+        };
+        let arrays = CalibrationArrays {
+            row_starts_us: Array1::from(times.row_starts_us.clone()),
+            row_starts_modes: times.row_starts_modes.clone(),
+            place: response.places().to_owned(),
+            place_sd: pixels.responses.place_sd.clone(),
+            response: response.shares().to_owned(),
+            white_dn: where_lit(&pixels.white.white_dn),
+            white_sd: where_lit(&pixels.white.sd_dn),
+            dark_offset_dn: pixels.dark.offset_dn.clone(),
+            dark_slope_dn_per_us: pixels.dark.slope_dn_per_us.clone(),
+            dark_covariance: pixels.dark.covariance.clone(),
+        };
+        KeptCalibration::new(header, arrays)
+    }
+
+    /// Figures of the calibration's checks, each with its limit.
+    fn checks(&self) -> BTreeMap<String, Pair> {
+        let checks = &self.pixels.responses.checks;
+        let chi2 = self.times.residuals.iter().map(|residual| residual.chi2_per_sample).fold(0.0, f64::max);
+        let figures = [
+            ("coverage", [self.pixels.white.coverage, 0.6]),
+            ("saturated", [self.pixels.white.saturated, 0.001]),
+            ("sum_of_phases", [checks.sum_of_phases, 0.02]),
+            ("two_peaks", [checks.two_peaks, 0.05]),
+            ("far_light", [checks.far_light, 0.01]),
+            ("place_rms_rows", [checks.place_rms_rows, 0.1]),
+            ("misread", [self.pixels.places.misread, 1.0]),
+            ("chi2_per_sample", [chi2, 3.0]),
+        ];
+        figures.map(|(name, figure)| (name.to_owned(), figure)).into()
+    }
+
+    /// Writes calibration, report and manifest into the session's folder.
+    ///
+    /// # Errors
+    /// When the session cannot be written.
+    pub fn write(
+        &self,
+        kept: &KeptCalibration,
+        session: &Session,
+        state: &State,
+        task: &CalibrationTask,
+        rig: &RigFile,
+    ) -> Result<()> {
+        kept.write(session.dir())?;
+        let page = report::make(session, state, task, self, kept).to_html()?;
+        durable::write(&session.report_path(), page.as_bytes())?;
+        manifest::write(session, state, &task.task, rig)
+    }
+}
+
+fn pair(Estimate { value, sd }: Estimate) -> Pair {
+    [value, sd]
+}
+
+/// Evaluates stored images again. The calibration in use is left alone: `raysweep calibration use` changes it.
+///
+/// # Errors
+/// When products are asked for, an image is missing, or the session cannot be written.
+pub fn process(
+    stored: &Stored<'_>,
+    calibration: CalibrationPlan,
+    asked: &Asked,
+) -> std::result::Result<Processed, ProcessError> {
+    let Stored { session, state, plan, .. } = stored;
+    if !asked.products.is_empty() {
+        let message = "a session of kind \"calibration\" has no products: leave --product out";
+        return Err(ProcessError::Product(message.into()));
+    }
+    let rig = stored.plane_rig()?;
+    let shape = state.session.shape;
+    let size = (shape.rows, shape.columns);
+    let first_row = state.session.first_row;
+    let known = KnownRig { file: &rig, first_row, size, calibration: None };
+    let task = CalibrationTask::new(plan, calibration, &known);
+    stored.check_contents(task.contents())?;
+    let before = KeptCalibration::read(session.dir()).map_err(ProcessError::Config)?;
+    let refused = |error: CalibrationError| ProcessError::Config(error.to_string());
+    let stack = session.stack()?;
+    let findings =
+        BoardFindings::new(&StoredImages { task: &task, state, stack: &stack }).map_err(refused)?;
+    let rig_text = crate::stored::read(&session.rig_path())?;
+    // Only a run knows the camera itself.
+    let camera = before.map_or_else(String::new, |before| before.header.valid_for.camera);
+    let kept = findings.keep(session, state, ValidFor::new(&rig, &rig_text, &camera, size))?;
+    findings.write(&kept, session, state, &task, &rig)?;
+    let problems = findings.warnings();
+    Ok(Processed {
+        report: session.report_path(),
+        stored: state.stored_points(),
+        points: shape.points(),
+        problems,
+    })
+}

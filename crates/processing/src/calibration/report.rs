@@ -1,0 +1,211 @@
+//! The report of a calibration.
+
+use ndarray::Array2;
+use raysweep_session::Session;
+use raysweep_session::ledger::State;
+use raysweep_session::report::{
+    Block, Guide, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table, ToneMap,
+};
+use raysweep_transport::plane::RESPONSE_ROWS;
+use raysweep_transport::plane::board::Estimate;
+use raysweep_transport::plane::board::times::ExposureMode;
+
+use super::{BoardFindings, CalibrationTask, KeptCalibration};
+use crate::report::{accounts, subtitle};
+
+/// First row of a response, relative to the pixel's own.
+const FIRST_ROW: i32 = -7;
+
+/// The page.
+pub(super) fn make(
+    session: &Session,
+    state: &State,
+    task: &CalibrationTask,
+    findings: &BoardFindings,
+    kept: &KeptCalibration,
+) -> Report {
+    let mut sections = Vec::new();
+    let warnings = findings.warnings();
+    if !warnings.is_empty() {
+        let notes = warnings.into_iter().map(|warning| Block::Note(NoteLevel::Warning, warning));
+        sections.push(section("Warnings", "", notes.collect()));
+    }
+    sections.push(section("Found", "Each with its standard deviation.", vec![found(findings)]));
+    sections.push(times(task, findings));
+    sections.push(responses(findings));
+    sections.push(pixels(findings));
+    sections.push(section(
+        "Checks",
+        "Each with the limit beyond which a calibration is refused.",
+        vec![checks(kept)],
+    ));
+    sections.push(section("Frames", "", accounts(state)));
+    let shape = state.session.shape;
+    let facts = [
+        ("images stored", format!("{} of {}", state.stored_points(), shape.points())),
+        ("camera", format!("{} × {} px", shape.columns, shape.rows)),
+        ("frames lost", state.counts.lost_total().to_string()),
+    ];
+    Report {
+        title: state.session.name.clone(),
+        subtitle: subtitle(state, session),
+        facts: facts.map(|(key, value)| (key.to_owned(), value)).to_vec(),
+        sections,
+    }
+}
+
+fn section(title: &str, intro: &str, blocks: Vec<Block>) -> Section {
+    Section { title: title.into(), intro: intro.into(), blocks }
+}
+
+fn found(findings: &BoardFindings) -> Block {
+    let (times, pixels) = (&findings.times, &findings.pixels);
+    let latency = Estimate { value: times.row_starts_us[times.seen_rows.start], sd: times.latency_sd_us };
+    let rows = [
+        ("time from row to row of the projector / µs", times.row_time_us, 5),
+        ("time from row to row of the camera / µs", times.camera_row_time_us, 5),
+        ("start of the first row seen, after the trigger edge / µs", latency, 2),
+        ("exposures are longer than nominal by / µs", times.exposure_offset_us, 3),
+        ("jitter of the light against the VSYNC edge / µs", times.jitter_us, 2),
+        ("white / DN", pixels.white.level_dn, 1),
+        ("gain / (e⁻/DN)", pixels.transfer.electrons_per_dn, 3),
+        ("read noise / e⁻", pixels.transfer.read_noise_e, 2),
+        ("non-uniformity of the pixels", pixels.prnu, 5),
+    ];
+    let rows = rows.map(|(name, Estimate { value, sd }, digits)| {
+        vec![name.to_owned(), format!("{value:.digits$}"), format!("{sd:.digits$}")]
+    });
+    Block::Table(Table { headers: ["", "value", "± 1 sd"].map(Into::into).to_vec(), rows: rows.to_vec() })
+}
+
+fn times(task: &CalibrationTask, findings: &BoardFindings) -> Section {
+    let (times, raster) = (&findings.times, &task.task.geometry.raster);
+    let starts = &times.row_starts_us;
+    let seen = times.seen_rows.clone();
+    let nominal = |row: usize| raster.first_row_us + row as f64 * raster.row_time_us;
+    let against_nominal = seen.clone().map(|row| (row as f64, starts[row] - nominal(row))).collect();
+    let (first, last) = (seen.start, seen.end);
+    let slope_us = (starts[last] - starts[first]) / (last - first) as f64;
+    let straight = |row: usize| starts[first] + slope_us * (row - first) as f64;
+    let bend = seen.clone().map(|row| (row as f64, starts[row] - straight(row))).collect();
+    let sd: Vec<(f64, f64)> = seen.map(|row| (row as f64, times.row_starts_sd_us[row])).collect();
+    let jitters = times.jitters.iter().enumerate();
+    let jitters: Vec<(f64, f64)> =
+        jitters.filter_map(|(frame, jitter)| jitter.map(|jitter| (frame as f64, jitter.late_us))).collect();
+    let plots = vec![
+        plot(
+            "Row starts against the rig file",
+            ("projector row", "µs"),
+            vec![line("found", against_nominal)],
+        ),
+        plot(
+            "Row starts against a straight line",
+            ("projector row", "µs"),
+            vec![line("found", bend), line("standard deviation", sd)],
+        ),
+        plot(
+            "Light of each frame against the mean",
+            ("frame", "late / µs"),
+            vec![Series { name: "frames".into(), style: SeriesStyle::Dots, points: jitters }],
+        ),
+    ];
+    let residuals = times.residuals.iter().map(|residual| {
+        let shutter = match residual.shutter {
+            ExposureMode::Global => "global",
+            ExposureMode::Rolling => "rolling",
+        };
+        vec![
+            shutter.to_owned(),
+            format!("{:.1}", residual.exposure_us),
+            residual.frames.to_string(),
+            residual.samples.to_string(),
+            format!("{:.2}", residual.chi2_per_sample),
+        ]
+    });
+    let headers = ["shutter", "exposure / µs", "frames", "samples", "χ² per sample"];
+    let table = Table { headers: headers.map(Into::into).to_vec(), rows: residuals.collect() };
+    section(
+        "When rows are lit",
+        "From frames of the white board with a global shutter, and from short rolling exposures.",
+        vec![Block::Plots(plots), Block::Table(table)],
+    )
+}
+
+fn responses(findings: &BoardFindings) -> Section {
+    let responses = &findings.pixels.responses;
+    let (rows, columns) = responses.place.dim();
+    let mean_of = |part: std::ops::Range<usize>| -> Vec<(f64, f64)> {
+        (0..RESPONSE_ROWS)
+            .map(|d| {
+                let values = part
+                    .clone()
+                    .flat_map(|t| (0..columns).map(move |s| (t, s)))
+                    .map(|(t, s)| f64::from(responses.response[[d, t, s]]))
+                    .filter(|share| share.is_finite());
+                let (sum, n) = values.fold((0.0, 0), |(sum, n), value| (sum + value, n + 1));
+                (f64::from(FIRST_ROW + d as i32), sum / f64::from(n.max(1)))
+            })
+            .collect()
+    };
+    let kernel = Plot {
+        guides: vec![Guide { x: 0.0, label: "own row".into() }],
+        ..plot(
+            "Share of a pixel's direct light by drawn row",
+            ("drawn row - own row", "share"),
+            vec![
+                line("top third of the image", mean_of(0..rows.div_ceil(3))),
+                line("bottom third", mean_of(rows - rows.div_ceil(3)..rows)),
+            ],
+        )
+    };
+    let offset = Array2::from_shape_fn((rows, columns), |(t, s)| {
+        responses.place[[t, s]] - responses.place[[rows / 2, columns / 2]] - (t as f32 - rows as f32 / 2.0)
+    });
+    let scale = ToneMap::percentile(&[offset.view()], 99.5);
+    let picture = Picture::grey(offset.view(), scale)
+        .with_caption("place minus camera row, against the middle of the image, in projector rows");
+    section(
+        "Where pixels look",
+        "From pictures of every 16th row. If the board scatters light inside, the response contains that: a second board of another material shows it.",
+        vec![Block::Plots(vec![kernel]), Block::Pictures(vec![picture])],
+    )
+}
+
+fn pixels(findings: &BoardFindings) -> Section {
+    let pixels = &findings.pixels;
+    let groups = pixels.transfer.groups.iter().map(|&[signal, variance]| (signal, variance)).collect();
+    let transfer = plot(
+        "Photon transfer",
+        ("signal / DN", "variance / DN²"),
+        vec![Series { name: "groups of pixels".into(), style: SeriesStyle::Dots, points: groups }],
+    );
+    let picture = |image: &Array2<f32>, caption: &str| {
+        Picture::grey(image.view(), ToneMap::percentile(&[image.view()], 99.5)).with_caption(caption)
+    };
+    let pictures = vec![
+        picture(&pixels.white.white_dn, "white, above black"),
+        picture(&pixels.dark.offset_dn, "dark level at no exposure"),
+        picture(&pixels.dark.slope_dn_per_us, "dark current"),
+        picture(&pixels.dark.hot.mapv(|hot| f32::from(u8::from(hot))), "unusual dark current or noise"),
+    ];
+    section(
+        "Pixels",
+        "White contains the lens's shading, the board's brightness and the projector's.",
+        vec![Block::Plots(vec![transfer]), Block::Pictures(pictures)],
+    )
+}
+
+fn checks(kept: &KeptCalibration) -> Block {
+    let rows = kept.header.checks.iter().map(|(name, [value, limit])| {
+        vec![name.replace('_', " "), format!("{value:.4}"), format!("{limit}")]
+    });
+    Block::Table(Table { headers: ["", "value", "limit"].map(Into::into).to_vec(), rows: rows.collect() })
+}
+
+fn plot(title: &str, (x_label, y_label): (&str, &str), series: Vec<Series>) -> Plot {
+    Plot { title: title.into(), x_label: x_label.into(), y_label: y_label.into(), series, guides: Vec::new() }
+}
+
+fn line(name: &str, points: Vec<(f64, f64)>) -> Series {
+    Series { name: name.into(), style: SeriesStyle::Line, points }
+}

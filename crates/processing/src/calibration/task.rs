@@ -1,0 +1,271 @@
+//! The images of a calibration: what each is for, and the settings with which it is taken.
+
+use std::sync::Arc;
+
+use raysweep_config::Plan;
+use raysweep_config::plan::CalibrationPlan;
+use raysweep_core::{Pattern, Raster, Shutter, Subject};
+use raysweep_pipeline::{Point, PointRole, Schedule};
+use raysweep_session::ledger::PointEntry;
+use raysweep_session::stack::Contents;
+use raysweep_transport::plane::PlaneError;
+use raysweep_transport::plane::board::times::{
+    BoardSetting, CoarseSweep, Columns, ExposureMode, Nominal, arrival_settings, check_settings,
+    sweep_settings,
+};
+
+use crate::plane::{KnownRig, PlaneTask};
+
+/// What an image shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// The dark image of one of the plan's exposures, with the lens capped.
+    Capped(usize),
+    /// The board under the projector's black.
+    Black,
+    /// The board under white, its light inside the exposure.
+    White,
+    /// The same under one of the [`GREYS`].
+    Grey(usize),
+    /// The board under every 16th row, beginning with this one.
+    Rows(usize),
+    /// The board under a picture of the rows' Gray code: the highest bit first, each followed by its inverse.
+    RowCode(usize),
+    /// The white board with a global shutter: when the rows are lit.
+    SweepTime,
+    /// The white board in exposures of three rows: when each row's light arrives.
+    Arrival,
+    /// The white board in longer exposures: whether they are as long as they should be.
+    ExposureCheck,
+}
+
+/// What stands before the camera, and what the projector shows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// The subject.
+    pub subject: Subject,
+    /// The picture; `None`: no light.
+    pub picture: Option<Pattern>,
+}
+
+/// Levels of grey for the photon transfer.
+const GREYS: [f32; 3] = [0.25, 0.5, 0.75];
+/// Number of pictures of sparse rows, and the distance of their rows.
+const PHASES: usize = 16;
+/// Rows with the same Gray code.
+pub(super) const ROWS_PER_BLOCK: usize = 8;
+/// Exposure that contains all light of a pixel.
+pub(super) const WHOLE_US: f64 = 3600.0;
+/// How long before the light of the middle camera row it begins.
+const BEFORE_LIGHT_US: f64 = 1600.0;
+/// Global exposures that show when the rows are lit.
+const SWEEP_TIMES: usize = 24;
+/// Frames of each arrival's delay.
+const ARRIVAL_FRAMES: usize = 3;
+/// Long exposures that check the short one.
+const EXPOSURE_CHECKS: usize = 24;
+/// Frames of each grey.
+const GREY_FRAMES: usize = 8;
+
+/// A calibration on a plane rig.
+#[derive(Clone)]
+pub struct CalibrationTask {
+    /// The plan's own table.
+    pub calibration: CalibrationPlan,
+    /// Its points, with settings as foreseen from the rig file. Those of the last three purposes follow from images
+    /// taken before them: see [`Self::sweep_times`] and [`Self::arrivals`].
+    pub task: Arc<PlaneTask>,
+    /// The purpose of each point.
+    purposes: Vec<Purpose>,
+}
+
+impl CalibrationTask {
+    /// A calibration on a rig; see [`PlaneTask::new`].
+    pub fn new(plan: &Plan, calibration: CalibrationPlan, known: &KnownRig<'_>) -> Self {
+        let (rig, size) = (known.file, known.size);
+        let purposes = purposes(&calibration, rig.projector.rows);
+        let raster = rig.raster();
+        let lag_us = size.0 as f64 / 2.0
+            * (rig.camera.row_pitch * rig.projector.row_time_us - rig.camera_row_time_us());
+        let mut next = [0_u32; 2];
+        let mut point = |purpose: &Purpose| {
+            let capped = matches!(purpose, Purpose::Capped(_));
+            let index = &mut next[usize::from(capped)];
+            let role = if capped { PointRole::Dark(*index) } else { PointRole::Sweep(*index) };
+            *index += 1;
+            let (exposure_us, frames) = match *purpose {
+                Purpose::Capped(exposure) => (calibration.exposure_us.values()[exposure], 1),
+                Purpose::Rows(_) => (WHOLE_US, calibration.picture_frames),
+                Purpose::SweepTime => (raster.rows as f64 * raster.row_time_us * 0.5, 1),
+                Purpose::Arrival => (3.0 * raster.row_time_us, 1),
+                Purpose::ExposureCheck => (1200.0, 1),
+                Purpose::Black | Purpose::White | Purpose::Grey(_) | Purpose::RowCode(_) => (WHOLE_US, 1),
+            };
+            let delay_us = match purpose {
+                Purpose::SweepTime | Purpose::Arrival | Purpose::ExposureCheck => 0.0,
+                _ => lag_us + WHOLE_US / 2.0 - BEFORE_LIGHT_US,
+            };
+            Point { role, delay_us, exposure_us, frames }
+        };
+        let schedule = Schedule { points: purposes.iter().map(&mut point).collect() };
+        let task = PlaneTask::new(plan, schedule, calibration.max_jitter_us, known);
+        Self { calibration, task: Arc::new(task), purposes }
+    }
+
+    /// What its session stores.
+    pub fn contents(&self) -> Contents {
+        let images = self.points();
+        Contents::Board { images, capped: self.purposes.len() - images }
+    }
+
+    /// Number of images of the board.
+    pub fn points(&self) -> usize {
+        self.task.schedule.sweep_len()
+    }
+
+    /// The purpose of a point, given by its ordinal.
+    pub fn purpose(&self, ordinal: u32) -> Purpose {
+        self.purposes[ordinal as usize]
+    }
+
+    /// The ordinals of all points of a purpose.
+    pub fn ordinals(&self, purpose: Purpose) -> impl Iterator<Item = u32> {
+        (0..).zip(&self.purposes).filter(move |(_, own)| **own == purpose).map(|(ordinal, _)| ordinal)
+    }
+
+    /// What the frames of a purpose show.
+    pub fn view(&self, purpose: Purpose) -> View {
+        let picture = match purpose {
+            Purpose::Capped(_) => return View { subject: Subject::Cap, picture: None },
+            Purpose::Black => Pattern::Black,
+            Purpose::Grey(grey) => Pattern::Grey { level: GREYS[grey] },
+            Purpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
+            Purpose::RowCode(picture) => Pattern::GrayRows {
+                bit: code_bits(self.task.geometry.raster.rows) - 1 - picture as u32 / 2,
+                inverse: picture % 2 == 1,
+                block: ROWS_PER_BLOCK,
+            },
+            Purpose::White | Purpose::SweepTime | Purpose::Arrival | Purpose::ExposureCheck => Pattern::White,
+        };
+        View { subject: Subject::Board, picture: Some(picture) }
+    }
+
+    /// How the rows are exposed for a purpose.
+    pub fn shutter(&self, purpose: Purpose) -> Shutter {
+        if purpose == Purpose::SweepTime { Shutter::Global } else { Shutter::Rolling }
+    }
+
+    /// The levels of grey, and the purposes of their images.
+    pub(super) fn greys() -> impl Iterator<Item = (f64, Purpose)> {
+        GREYS.into_iter().enumerate().map(|(grey, level)| (f64::from(level), Purpose::Grey(grey)))
+    }
+
+    /// The purposes of the pictures of sparse rows.
+    pub(super) fn phases() -> impl Iterator<Item = Purpose> {
+        (0..PHASES).map(Purpose::Rows)
+    }
+
+    /// The purposes of the pictures of the rows' Gray code.
+    pub(super) fn codes(&self) -> impl Iterator<Item = Purpose> + use<> {
+        (0..2 * code_bits(self.task.geometry.raster.rows) as usize).map(Purpose::RowCode)
+    }
+
+    /// What the rig file says of the times.
+    pub(super) fn nominal(&self) -> Nominal {
+        let geometry = &self.task.geometry;
+        Nominal {
+            projector_rows: geometry.raster.rows,
+            first_row_us: geometry.raster.first_row_us,
+            row_time_us: geometry.raster.row_time_us,
+            camera_row_time_us: geometry.camera_row_time_us,
+            period_us: geometry.raster.period_us,
+        }
+    }
+
+    /// The points that show when the rows are lit, once it is known which rows the image sees.
+    ///
+    /// # Errors
+    /// Those of [`sweep_settings`].
+    pub fn sweep_times(&self, columns: &Columns) -> Result<Vec<(u32, Point)>, PlaneError> {
+        let settings = sweep_settings(&self.nominal(), columns.seen_rows())?;
+        Ok(self.points_at(Purpose::SweepTime, settings))
+    }
+
+    /// The points that show when each row's light arrives and how long exposures are, once the sweep is known to
+    /// within 10 us.
+    ///
+    /// # Errors
+    /// Those of [`arrival_settings`].
+    pub fn arrivals(&self, columns: &Columns, coarse: &CoarseSweep) -> Result<Vec<(u32, Point)>, PlaneError> {
+        let nominal = self.nominal();
+        let half_rows = arrival_settings(columns, coarse, &nominal)?;
+        let [first, .., last] = half_rows[..] else { return Ok(Vec::new()) };
+        let delays = self.calibration.delays as usize;
+        let step_us = (last.delay_us - first.delay_us) / (delays - 1) as f64;
+        // Each delay once before any comes again: drift does not look like a delay.
+        let settings = (0..ARRIVAL_FRAMES * delays).map(|index| BoardSetting {
+            delay_us: first.delay_us + step_us * (index % delays) as f64,
+            ..first
+        });
+        let mut points = self.points_at(Purpose::Arrival, settings.collect());
+        points.extend(self.points_at(Purpose::ExposureCheck, check_settings(columns, coarse, &nominal)?));
+        Ok(points)
+    }
+
+    /// The points of a purpose with these settings.
+    fn points_at(&self, purpose: Purpose, settings: Vec<BoardSetting>) -> Vec<(u32, Point)> {
+        let geometry = &self.task.geometry;
+        let point = |(ordinal, setting): (u32, BoardSetting)| {
+            let BoardSetting { delay_us, exposure_us, .. } = setting;
+            let delay_us = geometry.raster.delay_us(geometry.first_row, delay_us, exposure_us);
+            let foreseen = self.task.schedule.points[ordinal as usize];
+            (ordinal, Point { delay_us, exposure_us, ..foreseen })
+        };
+        self.ordinals(purpose).zip(settings).map(point).collect()
+    }
+
+    /// The setting of a stored frame, by its measured delay.
+    pub(super) fn board_setting(&self, purpose: Purpose, entry: &PointEntry) -> BoardSetting {
+        let geometry = &self.task.geometry;
+        let delay_us = entry.delays_us.iter().sum::<f64>() / entry.delays_us.len().max(1) as f64;
+        let shutter = match self.shutter(purpose) {
+            Shutter::Global => ExposureMode::Global,
+            Shutter::Rolling => ExposureMode::Rolling,
+        };
+        BoardSetting {
+            shutter,
+            delay_us: start_us(&geometry.raster, geometry.first_row, delay_us, entry.exposure_us),
+            exposure_us: entry.exposure_us,
+        }
+    }
+}
+
+/// Time from the edge of the light to the start of row 0's exposure: the inverse of [`Raster::delay_us`].
+fn start_us(raster: &Raster, first_row: usize, delay_us: f64, exposure_us: f64) -> f64 {
+    raster.row_centre_us(first_row) + delay_us - exposure_us / 2.0
+}
+
+/// Bits of the Gray code of all blocks of rows.
+fn code_bits(projector_rows: usize) -> u32 {
+    let blocks = projector_rows.div_ceil(ROWS_PER_BLOCK).max(2);
+    usize::BITS - (blocks - 1).leading_zeros()
+}
+
+/// The purposes of all points, in the order of acquisition.
+fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<Purpose> {
+    let frames = plan.frames as usize;
+    let several = |purpose, frames| std::iter::repeat_n(purpose, frames);
+    let capped = (0..plan.exposure_us.len()).flat_map(|exposure| several(Purpose::Capped(exposure), frames));
+    let levels = [several(Purpose::Black, 2 * frames), several(Purpose::White, 2 * frames)];
+    let greys = (0..GREYS.len()).flat_map(|grey| several(Purpose::Grey(grey), GREY_FRAMES));
+    let codes = 2 * code_bits(projector_rows) as usize;
+    capped
+        .chain(levels.into_iter().flatten())
+        .chain(greys)
+        .chain((0..PHASES).map(Purpose::Rows))
+        .chain((0..codes).map(Purpose::RowCode))
+        .chain(several(Purpose::SweepTime, SWEEP_TIMES))
+        .chain(several(Purpose::Arrival, ARRIVAL_FRAMES * plan.delays as usize))
+        .chain(several(Purpose::ExposureCheck, EXPOSURE_CHECKS))
+        .collect()
+}
