@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use raysweep_proto::{
-    CalibrationInfo, CheckReport, Event, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
+    CalibrationInfo, CheckReport, DesignParams, DesignReport, Event, ResumeParams, RpcError, RunParams,
+    SessionInfo, Started, Status,
 };
 use tokio::sync::broadcast;
 
@@ -17,6 +18,12 @@ pub trait Control: Send + Sync + 'static {
     /// # Errors
     /// `InvalidPlan`, with the position in the plan's text.
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError>;
+
+    /// Searches the settings of a plan for a wanted error or a time of light.
+    ///
+    /// # Errors
+    /// `InvalidPlan`, with the position in the plan's text; `BadParams`.
+    fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError>;
 
     /// Starts a run.
     ///

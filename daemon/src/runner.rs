@@ -7,12 +7,13 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 
 use raysweep_config::ConfigError;
+use raysweep_config::plan::with_tables;
 use raysweep_core::{CameraCapabilities, Size, io_text};
 use raysweep_pipeline::message_of;
 use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, current_in};
 use raysweep_proto::{
-    CalibrationInfo, CheckReport, ErrorCode, Event, Mistake, ResumeParams, RpcError, RunParams, RunState,
-    SessionInfo, Started, Status,
+    CalibrationInfo, CheckReport, DesignParams, DesignReport, ErrorCode, Event, Mistake, ResumeParams,
+    RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
 use raysweep_session::ledger::{EndState, Ledger, SessionEntry};
 use raysweep_session::{Session, SessionSummary};
@@ -332,6 +333,12 @@ impl Control for Runner {
         let Foreseen { mut report, procedure, .. } = self.foresee(plan)?;
         procedure.advise(&mut report);
         Ok(report)
+    }
+
+    fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
+        let report = self.foresee(&params.plan)?.procedure.design(params)?;
+        let plan = with_tables(&params.plan, &report.plan).map_err(|error| invalid_plan(&error))?;
+        Ok(DesignReport { plan, ..report })
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {

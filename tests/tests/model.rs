@@ -14,7 +14,9 @@ use raysweep_config::sim::{RowTable, SimBeam, SimProjector};
 use raysweep_core::{PixelFormat, Raster};
 use raysweep_sim::{PlaneRig, PlaneSetup};
 use raysweep_tests::{Bench, corner_rig, data};
-use raysweep_transport::plane::advice::{Noise, SweepGrid, advise};
+use raysweep_transport::plane::advice::{
+    Arrangement, Calibrated, Conditions, Design, Noise, Search, SweepGrid, Usable,
+};
 use raysweep_transport::plane::{Beam, CameraRows, Demux, Prior, RowTiming, Setting};
 use raysweep_transport::quality::{median_profile_error, relative_l2};
 
@@ -254,11 +256,16 @@ fn a_plan_that_is_expected_to_be_better_is() {
     let white_e = 8000.0 * 2500.0 / 4095.0;
     for frames in [1, 8] {
         let noise = Noise { read: 15.0 / white_e, gain: 1.0 / white_e, frames, dark_frames: None };
-        let advice = advise(&timing, &paper_grid(), &Prior::SPLIT, &noise, |grid| Some(grid.settings()));
-        let (grid, expected) = advice.unwrap().better.unwrap();
-        println!("{} x {:?}, {expected:?}", grid.delays_us.len(), grid.exposures_us);
+        let search = Search {
+            conditions: Conditions { timing: &timing, prior: Prior::SPLIT, calibrated: Calibrated::EXACTLY },
+            arrangement: Arrangement::Sweep,
+            plan: Design { grids: vec![paper_grid()], frames },
+            usable: |design: &Design| Some(Usable { settings: design.settings(), noise }),
+        };
+        let proposed = search.advise().unwrap().better.unwrap();
+        println!("{proposed:?}");
         let paper = rig.recover_from(&timing, paper_grid().settings(), frames);
-        let better = rig.recover_from(&timing, grid.settings(), frames);
+        let better = rig.recover_from(&timing, proposed.design.settings(), frames);
         assert!(better.profile <= paper.profile, "{better:?} {paper:?}");
     }
 }

@@ -193,7 +193,7 @@ fn the_sweep_that_check_proposes_errs_less_than_the_papers() {
     let plan = format!("{PAPER}1\n");
     let report = bench.runner.check(&plan).unwrap();
     let better = report.advice.unwrap().better.unwrap();
-    let proposed = plan.replace("[sweep]\naverage = 1\n", &better.sweep);
+    let proposed = plan.replace("[sweep]\naverage = 1\n", &better.table);
     // The prediction for the proposed sweep equals the check of that sweep.
     let again = bench.runner.check(&proposed).unwrap();
     assert_eq!(

@@ -13,7 +13,7 @@ mod whole;
 pub use document::{Fault, Places};
 pub use error::{ConfigError, ConfigMistake};
 pub use plan::{
-    Axis, BatchesPlan, FilmPlan, PathPlan, Plan, PlanePlan, Procedure, ProductTable, ResponsePlan, Shape,
-    StageTable, SweepPlan,
+    Axis, BatchesPlan, FilmPlan, GridPlan, PathPlan, Plan, PlanePlan, Procedure, ProductTable, ResponsePlan,
+    Shape, StageTable, SweepPlan,
 };
 pub use rig::{AnyRigFile, DotRigFile, RigFile};

@@ -166,6 +166,7 @@ impl DemuxFold {
             noise: None,
             variance_ratio: None,
             u0_rows: None,
+            one_band: false,
         })
     }
 

@@ -34,6 +34,8 @@ pub struct Findings {
     pub late_us: Option<f64>,
     /// Median position of direct light in projector rows, 0 if it lies in its own row, or where it was calibrated.
     pub u0_rows: f64,
+    /// Whether the rows `|u| <= 2` are one band, because no setting tells where in it direct light lies.
+    pub one_band: bool,
     /// Delay and exposure of the images that were left out.
     pub left_out_us: Vec<(f64, f64)>,
     /// Findings, each as a key and a sentence.
@@ -89,6 +91,7 @@ pub fn choose(
         },
         late_us: None,
         u0_rows: 0.0,
+        one_band: false,
         left_out_us: Vec::new(),
         remarks: Vec::new(),
         warnings: Vec::new(),
@@ -225,6 +228,7 @@ impl Choices {
         stack.timing = self.demux.timing().clone();
         stack.prior = self.demux.prior();
         stack.noise = self.noise;
+        stack.one_band = self.findings.one_band;
         stack.u0_rows = self.demux.u0_rows().map(|u0_rows| u0_rows.slice(s![rows.clone(), ..]).to_owned());
         let images = coupled.as_ref().unwrap_or(&stack.images);
         let valid = stack.valid.as_ref().map(|valid| valid.view());
@@ -280,6 +284,11 @@ fn calibrate(
     findings.beam_sigma_rows = Some(sigma_rows);
 
     let said = match &spike {
+        // A measured response states the place, and needs no edge.
+        Err(CalibrateError::NoEdge) if timing.measured_response().is_none() => {
+            findings.one_band = true;
+            "given as one band with the rows |u| <= 2, and not as u = 0 alone: no exposure begins or ends within 1.5 rows of the pixel's own row, so nothing tells how the band is divided; add settings with t_d ± t_e/2 there, or calibrate the rig".into()
+        }
         Err(error) => format!("taken to lie in its own row: {error}"),
         Ok(map) => {
             let mut places: Vec<f32> = map.u0.iter().copied().collect();

@@ -16,7 +16,7 @@ pub enum PointRole {
     Dark(u32),
     /// One whole VSYNC period of exposure: every row is lit once.
     Regular,
-    /// A point of the plan's sweep: `exposure_index * delays + delay_index`.
+    /// A point of the plan's sweep: `exposure_index * delays + delay_index` in its grid, then the extra settings.
     Sweep(u32),
 }
 

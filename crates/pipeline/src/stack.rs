@@ -27,6 +27,8 @@ pub struct SweepStack {
     pub variance_ratio: Option<Array2<f32>>,
     /// Assumed position of direct light, in rows from the pixel's own, `[t, s]`; `None` if in its own row.
     pub u0_rows: Option<Array2<f32>>,
+    /// Whether the rows `|u| <= 2` are one band, because the settings do not tell where in it direct light lies.
+    pub one_band: bool,
 }
 
 impl SweepStack {
@@ -43,6 +45,7 @@ impl SweepStack {
             noise: None,
             variance_ratio: None,
             u0_rows: None,
+            one_band: false,
         }
     }
 

@@ -1,24 +1,23 @@
-//! What `check` expects of a sweep's results, and the sweep that it recommends instead.
+//! What `check` and `design` expect of a plan's results, and the settings that they recommend instead.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Expected errors of a sweep, and a better sweep of the same length. Light is in white units: 1 is the light
-/// that a white pixel receives from its own row.
+/// Expected error of a plan, and better settings of the same length.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct SweepAdvice {
+pub struct PlanAdvice {
     /// Noise of the camera.
     pub noise: NoiseEstimate,
     /// The prior, with its weights. If the plan does not choose one, the default.
     pub prior: String,
-    /// Expected errors of the plan's sweep.
+    /// Expected error of the plan's settings.
     pub expected: ExpectedError,
-    /// A sweep with no more frames and no longer duration, whose expected profile error is at least 10 %
-    /// smaller and whose bands are each at most 10 % worse; `None` if none was found.
-    pub better: Option<BetterSweep>,
+    /// Settings with no more frames and no longer duration, whose expected error is at least 10 % smaller; `None` if
+    /// none were found.
+    pub better: Option<BetterPlan>,
 }
 
-/// Noise of one frame, in white units.
+/// Noise of one frame. Light is in white units: 1 is the light that a white pixel receives from its own row.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct NoiseEstimate {
     /// Standard deviation of a dark sample, quantisation included.
@@ -41,29 +40,74 @@ pub enum NoiseSource {
     Assumed,
 }
 
-/// Errors of a white pixel in the middle of the frame, in white units, before spatial coupling: the effect of
-/// noise and smoothing if timing, beam and white level are correct.
+/// Expected relative error of the light transport over a family of scenes: of each scene the median over pixels of
+/// `||estimate - T|| / ||T||`, before spatial coupling.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ExpectedError {
-    /// Standard deviation of the light from the pixel's own row.
-    pub epipolar: f64,
-    /// Standard deviation of the total light from the ten rows on each side.
-    pub short_range: f64,
-    /// Standard deviation of the total light from all rows beyond those.
-    pub long_range: f64,
-    /// Root of the sum of the squared errors of all rows.
-    pub profile: f64,
+    /// All parts together.
+    pub total: ErrorRange,
+    /// Noise of the camera.
+    pub noise: ErrorRange,
+    /// What the settings leave to the prior.
+    pub bias: ErrorRange,
+    /// Errors of latency, exposure, edges and the pixel's place.
+    pub calibration: ErrorRange,
+    /// The total if rows |u| <= 2 count as one.
+    pub band: ErrorRange,
 }
 
-/// A recommended sweep; it covers as many rows as the plan's.
+/// Median and 10 to 90 % range over the family's scenes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct ErrorRange {
+    /// 10 % of the scenes lie below.
+    pub low: f64,
+    /// Half of the scenes lie below.
+    pub median: f64,
+    /// 90 % of the scenes lie below.
+    pub high: f64,
+}
+
+/// Recommended settings; they cover as many rows as the plan's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct BetterSweep {
-    /// Number of points.
+pub struct BetterPlan {
+    /// Number of settings.
     pub points: usize,
-    /// Frames to average over all points, dark and regular images included.
+    /// Frames to average over all points, dark and regular images included; of a film, those of a cycle.
     pub frames: u64,
-    /// Expected errors.
+    /// Expected error.
     pub expected: ExpectedError,
-    /// The `[sweep]` table of its plan, in TOML.
-    pub sweep: String,
+    /// The tables `[sweep]` or `[film]` of its plan, in TOML.
+    pub table: String,
+}
+
+/// Parameters of `design`. Either an error or a time is wanted, not both.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct DesignParams {
+    /// The TOML text of a plan of kind `sweep` or `film`, whose ranges of delays and exposures are kept.
+    pub plan: String,
+    /// Wanted median relative error of the transport.
+    pub error: Option<f64>,
+    /// Wanted time with light, in seconds: that of the sweep's settings, or of one cycle of the film.
+    pub light_s: Option<f64>,
+    /// Standard deviation of the part of a frame's edges in time that nothing measures, in microseconds; 0.5 if
+    /// omitted.
+    pub edge_us: Option<f64>,
+}
+
+/// Result of `design`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct DesignReport {
+    /// Number of settings.
+    pub points: usize,
+    /// Frames of these settings; of a film, those of a cycle.
+    pub frames: u64,
+    /// Time with light that they take, in seconds.
+    pub light_s: f64,
+    /// Expected error.
+    pub expected: ExpectedError,
+    /// The whole plan, in TOML.
+    pub plan: String,
+    /// What was not reached, or how the results are to be read.
+    pub warnings: Vec<String>,
 }

@@ -13,8 +13,9 @@ use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::{
-    CalibrationInfo, CheckParams, CheckReport, Description, Empty, Event, Id, Incoming, Method, Outcome,
-    Request, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status, UseCalibrationParams,
+    CalibrationInfo, CheckParams, CheckReport, Description, DesignParams, DesignReport, Empty, Event, Id,
+    Incoming, Method, Outcome, Request, ResumeParams, RpcError, RunParams, SessionInfo, Started, Status,
+    UseCalibrationParams,
 };
 
 /// Maximum time for an answer. No call waits for a run, so a longer wait means that the daemon hangs.
@@ -133,6 +134,14 @@ impl Client {
     /// As [`Client::describe`].
     pub fn check(&mut self, plan: impl Into<String>) -> Result<CheckReport, ClientError> {
         self.call(Method::Check, &CheckParams { plan: plan.into() })
+    }
+
+    /// Returns a plan with better settings.
+    ///
+    /// # Errors
+    /// As [`Client::describe`].
+    pub fn design(&mut self, params: &DesignParams) -> Result<DesignReport, ClientError> {
+        self.call(Method::Design, params)
     }
 
     /// Starts a run.

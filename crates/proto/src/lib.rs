@@ -10,7 +10,9 @@ mod messages;
 mod methods;
 mod rpc;
 
-pub use advice::{BetterSweep, ExpectedError, NoiseEstimate, NoiseSource, SweepAdvice};
+pub use advice::{
+    BetterPlan, DesignParams, DesignReport, ErrorRange, ExpectedError, NoiseEstimate, NoiseSource, PlanAdvice,
+};
 pub use client::{Client, ClientError, Subscription};
 pub use messages::*;
 pub use methods::{Description, Empty, ErrorInfo, LimitsInfo, Method, MethodInfo, Role, describe};

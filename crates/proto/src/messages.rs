@@ -7,7 +7,7 @@ use raysweep_core::{ClockQuality, Counts, FilmSummary, SettingsLatency, VsyncSta
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::SweepAdvice;
+use crate::PlanAdvice;
 
 /// What the daemon is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -255,9 +255,9 @@ pub struct CheckReport {
     /// Condition number of the demultiplexing of a middle camera row, including its prior; `None` on a dot rig.
     #[serde(default)]
     pub condition: Option<f64>,
-    /// Expected errors of the sweep and a better sweep; `None` for films, or if a warning says why.
+    /// Expected error of a sweep or film and better settings; `None` for other plans, or if a warning says why.
     #[serde(default)]
-    pub advice: Option<SweepAdvice>,
+    pub advice: Option<PlanAdvice>,
     /// Details if the plan is a film.
     #[serde(default)]
     pub film: Option<FilmCheck>,

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::live::{self, LiveLayout};
 use crate::{
-    CalibrationInfo, CheckParams, CheckReport, ErrorCode, Event, MAX_CLIENTS, MAX_MESSAGE_BYTES,
-    ResumeParams, RunParams, SessionInfo, Started, Status, UseCalibrationParams,
+    CalibrationInfo, CheckParams, CheckReport, DesignParams, DesignReport, ErrorCode, Event, MAX_CLIENTS,
+    MAX_MESSAGE_BYTES, ResumeParams, RunParams, SessionInfo, Started, Status, UseCalibrationParams,
 };
 
 /// Role of a caller.
@@ -34,6 +34,8 @@ pub enum Method {
     Status,
     /// Returns what a plan would do.
     Check,
+    /// Returns a better plan.
+    Design,
     /// Starts a run.
     Run,
     /// Acquires what a session lacks.
@@ -79,10 +81,11 @@ fn sent<T: JsonSchema>() -> Schema {
 
 impl Method {
     /// Every method.
-    pub const ALL: [Method; 13] = [
+    pub const ALL: [Method; 14] = [
         Self::Describe,
         Self::Status,
         Self::Check,
+        Self::Design,
         Self::Run,
         Self::Resume,
         Self::Pause,
@@ -108,6 +111,11 @@ impl Method {
                 "check",
                 Observer,
                 "What a plan would do, without moving anything.",
+            ),
+            Self::Design => row::<DesignParams, DesignReport>(
+                "design",
+                Observer,
+                "Searches the settings of a sweep or film for a wanted error, or for a time of light.",
             ),
             Self::Run => row::<RunParams, Started>(
                 "run",

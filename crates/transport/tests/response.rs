@@ -5,8 +5,8 @@
 
 use ndarray::{Array2, Array3, s};
 use raysweep_transport::plane::{
-    CameraRows, Demux, FIRST_RESPONSE_ROW, PixelResponse, Prior, RESPONSE_ROWS, RowTiming, Setting, Shares,
-    Transport, relight,
+    CameraRows, Demux, FIRST_RESPONSE_ROW, PixelResponse, Prior, RESPONSE_ROWS, RelitBeam, RowTiming,
+    Setting, Shares, Transport, relight,
 };
 
 const ROWS: usize = 160;
@@ -183,7 +183,7 @@ fn relighting_counts_from_each_pixels_own_row() {
     // Only the row that pixel (5, 2) looks at is lit: columns of other own rows see it as indirect light.
     let lit = place(5, 2).round();
     let weights = ndarray::Array1::from_shape_fn(ROWS, |v| f64::from(u8::from(v as f64 == lit)));
-    let image = relight(&timing, &transport, weights.view()).unwrap();
+    let image = relight(&timing, &transport, weights.view(), RelitBeam::Ideal).unwrap();
     for s in 0..WIDTH {
         let u = (lit - place(5, s).round()) as i32;
         let expected = transport.t[[(u - transport.u_min) as usize, 5, s]];

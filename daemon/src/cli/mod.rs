@@ -19,7 +19,9 @@ use std::process::ExitCode;
 use bytesize::ByteSize;
 use clap::{Parser, Subcommand};
 use raysweep_drivers::mirror::{self, Parked};
-use raysweep_proto::{Client, ClientError, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started};
+use raysweep_proto::{
+    Client, ClientError, DesignParams, Empty, ErrorCode, Event, RpcError, RunParams, RunState, Started,
+};
 use serde_json::json;
 
 use self::calibration::CalibrationCommand;
@@ -72,6 +74,20 @@ enum Command {
     Check {
         /// The plan, a TOML file
         plan: PathBuf,
+    },
+    /// Print a plan whose settings are the best found for a wanted error or a time of light
+    Design {
+        /// A plan of kind "sweep" or "film", a TOML file: its ranges of delays and exposures are kept
+        plan: PathBuf,
+        /// Wanted median relative error of the light transport, such as 0.03: the shortest plan is sought
+        #[arg(long, value_name = "ERROR", required_unless_present = "light")]
+        error: Option<f64>,
+        /// Time of light for the settings, or for one cycle of a film, such as 2s or 250ms: the best plan is sought
+        #[arg(long, value_name = "TIME", conflicts_with = "error", value_parser = seconds)]
+        light: Option<f64>,
+        /// How well the edges of single frames are known in time, as a standard deviation in microseconds [default: 0.5]
+        #[arg(long, value_name = "US")]
+        edge_us: Option<f64>,
     },
     /// Run a plan and follow the run; Ctrl-C cancels it, a second Ctrl-C exits without waiting for its end
     Run(RunArguments),
@@ -201,6 +217,13 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             let report =
                 connect()?.check(&text).map_err(|error| CommandFailure::of_plan(error, &plan, &text))?;
             printer.print(&report, show::check)?;
+        }
+        Command::Design { plan, error, light, edge_us } => {
+            let text = read_plan(&plan)?;
+            let params = DesignParams { plan: text.clone(), error, light_s: light, edge_us };
+            let report =
+                connect()?.design(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &text))?;
+            printer.print(&report, show::design)?;
         }
         Command::Run(RunArguments { plan, about }) => {
             return run(&socket, printer, &plan, &read_plan(&plan)?, about);
@@ -338,6 +361,16 @@ fn socket_path(argument: Option<PathBuf>, variable: Option<OsString>) -> PathBuf
     argument.or(variable).unwrap_or_else(|| DEFAULT_SOCKET.into())
 }
 
+/// A time with its unit, `s` or `ms`, in seconds.
+fn seconds(text: &str) -> Result<f64, String> {
+    let (number, unit_s) = match (text.strip_suffix("ms"), text.strip_suffix('s')) {
+        (Some(number), _) => (number, 1e-3),
+        (None, Some(number)) => (number, 1.0),
+        (None, None) => return Err("give a number and its unit, s or ms".into()),
+    };
+    number.trim().parse::<f64>().map(|number| number * unit_s).map_err(|error| error.to_string())
+}
+
 fn read_plan(path: &Path) -> Result<String, CommandFailure> {
     fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })
 }
@@ -364,6 +397,12 @@ mod tests {
         {
             assert!(help.contains(&format!("\n  {}  ", exit as u8)), "{exit:?} in\n{help}");
         }
+    }
+
+    #[test]
+    fn times_have_units() {
+        assert_eq!((seconds("2s"), seconds("250 ms")), (Ok(2.0), Ok(0.25)));
+        assert!(seconds("2").is_err() && seconds("s").is_err());
     }
 
     #[test]

@@ -7,8 +7,8 @@ use indicatif::{BinaryBytes, FormattedDuration};
 use raysweep_core::{ClockQuality, FilmSummary, Percentiles, SettingsLatency};
 use raysweep_drivers::mirror::Parked;
 use raysweep_proto::{
-    BetterSweep, CheckReport, Description, ExpectedError, MirrorStatus, NoiseSource, Progress, Role,
-    RunState, SessionInfo, Status, SweepAdvice,
+    BetterPlan, CheckReport, Description, DesignReport, ErrorRange, ExpectedError, MirrorStatus, NoiseSource,
+    PlanAdvice, Progress, Role, RunState, SessionInfo, Status,
 };
 
 use raysweep_processing::Processed;
@@ -196,12 +196,12 @@ pub(super) fn check(report: &CheckReport) -> String {
     }
     rows.extend(report.warnings.iter().map(|warning| ("warning", warning.clone())));
     let better = report.advice.iter().filter_map(|advice| advice.better.as_ref());
-    better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.sweep.trim_end()))
+    better.fold(block(&rows), |text, better| format!("{text}\n\n{}", better.table.trim_end()))
 }
 
-/// Expected errors and advice of `check`; the better sweep's table follows the rows.
-fn advice(advice: &SweepAdvice) -> Vec<(&'static str, String)> {
-    let SweepAdvice { noise, prior, expected, better } = advice;
+/// Expected errors and advice of `check`; the better settings' tables follow the rows.
+fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
+    let PlanAdvice { noise, prior, expected, better } = advice;
     let source = match noise.source {
         NoiseSource::Stated => "as the rig file states it",
         NoiseSource::Simulated => "as simulated",
@@ -210,34 +210,46 @@ fn advice(advice: &SweepAdvice) -> Vec<(&'static str, String)> {
         }
     };
     let (dark, shot) = (short(noise.dark), short(noise.shot));
+    let better = better.as_ref().map_or_else(
+        || "no better settings of this length found".into(),
+        |BetterPlan { points, frames, expected, .. }| {
+            format!("{}, with {points} settings and {frames} frames; see below", range(&expected.total))
+        },
+    );
     vec![
         ("noise", format!("{dark} in the dark, {shot} of a white pixel's row, which is 1; {source}")),
         ("error", format!("{}, expected with the prior {prior}", errors(expected))),
-        (
-            "better",
-            better.as_ref().map_or_else(
-                || "no better sweep of this length found".into(),
-                |better| {
-                    let BetterSweep { points, frames, expected, .. } = better;
-                    format!(
-                        "{}, with {points} points and {frames} frames; see [sweep] below",
-                        errors(expected)
-                    )
-                },
-            ),
-        ),
+        ("better", better),
     ]
 }
 
+/// Text of `design`: a plan file, with what is expected of it as comments.
+pub(super) fn design(report: &DesignReport) -> String {
+    let DesignReport { points, frames, light_s, expected, plan, warnings } = report;
+    let light = duration(*light_s);
+    let head = [
+        format!("{points} settings, {frames} frames, {light} of light"),
+        format!("expected error: {}", errors(expected)),
+    ];
+    let comments = head.into_iter().chain(warnings.iter().map(|warning| format!("warning: {warning}")));
+    let comments: String = comments.map(|comment| format!("# {comment}\n")).collect();
+    format!("{comments}{}", plan.trim_end())
+}
+
 fn errors(expected: &ExpectedError) -> String {
-    let ExpectedError { epipolar, short_range, long_range, profile } = expected;
+    let ExpectedError { total, noise, bias, calibration, .. } = expected;
     format!(
-        "epipolar {}, short range {}, long range {}, profile {}",
-        short(*epipolar),
-        short(*short_range),
-        short(*long_range),
-        short(*profile)
+        "{}; noise {}, bias {}, calibration {}",
+        range(total),
+        range(noise),
+        range(bias),
+        range(calibration)
     )
+}
+
+/// Median and 10 to 90 % range.
+fn range(range: &ErrorRange) -> String {
+    format!("{} ({} to {})", short(range.median), short(range.low), short(range.high))
 }
 
 /// Formats a small number with two significant digits.

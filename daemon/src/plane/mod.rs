@@ -1,6 +1,7 @@
 //! Acquisition of points on the plane rig, which sweeps and films share: opens the devices, makes passes until
 //! nothing is missing, and closes everything again.
 
+pub mod advice;
 pub mod foresight;
 mod sink;
 

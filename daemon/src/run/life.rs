@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use raysweep_pipeline::message_of;
-use raysweep_proto::{CheckReport, Event, RpcError, RunState};
+use raysweep_proto::{CheckReport, DesignParams, DesignReport, ErrorCode, Event, RpcError, RunState};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
 use raysweep_session::stack::StackShape;
@@ -37,6 +37,16 @@ pub struct Foreseen {
 pub trait Measurement: Send {
     /// Adds what is computed only on request: a run must not wait for it.
     fn advise(&self, _report: &mut CheckReport) {}
+
+    /// Searches its settings for a wanted error or a time of light.
+    ///
+    /// # Errors
+    /// If its plan has no settings to search, or nothing that suits is found.
+    fn design(&self, _params: &DesignParams) -> Result<DesignReport, RpcError> {
+        let message =
+            "the settings of this plan cannot be searched: give a plan of kind \"sweep\" or \"film\"";
+        Err(RpcError::new(ErrorCode::InvalidPlan, message))
+    }
 
     /// Stores in a new session what the run's results will need.
     ///

@@ -1,8 +1,8 @@
 //! Maps a method's name and parameters to a call of the daemon.
 
 use raysweep_proto::{
-    CheckParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams, UseCalibrationParams,
-    describe, params,
+    CheckParams, DesignParams, Empty, ErrorCode, Event, Method, ResumeParams, RpcError, RunParams,
+    UseCalibrationParams, describe, params,
 };
 use serde::Serialize;
 use serde_json::{Map, Value};
@@ -26,6 +26,7 @@ pub(super) fn carry_out(
 ) -> Result<CallResult, RpcError> {
     let result = match method {
         Method::Check => control.check(&params::<CheckParams>(given)?.plan).and_then(value),
+        Method::Design => control.design(&params::<DesignParams>(given)?).and_then(value),
         Method::Run => control.run(params::<RunParams>(given)?).and_then(value),
         Method::Resume => control.resume(params::<ResumeParams>(given)?).and_then(value),
         Method::Describe => none(given).and_then(|()| value(describe(env!("CARGO_PKG_VERSION")))),

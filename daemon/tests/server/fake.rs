@@ -8,9 +8,9 @@ use raysweep::control::Control;
 use raysweep::server::{Access, Limits, Listening, serve_within};
 use raysweep_core::{Counts, LossCause, VsyncStats};
 use raysweep_proto::{
-    BetterSweep, CalibrationInfo, CheckReport, Client, ErrorCode, Event, ExpectedError, MirrorStatus,
-    NoiseEstimate, NoiseSource, Progress, ResumeParams, RpcError, RunParams, RunState, SessionInfo, Started,
-    Status, SweepAdvice,
+    BetterPlan, CalibrationInfo, CheckReport, Client, DesignParams, DesignReport, ErrorCode, ErrorRange,
+    Event, ExpectedError, MirrorStatus, NoiseEstimate, NoiseSource, PlanAdvice, Progress, ResumeParams,
+    RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
 use tokio::runtime::Runtime;
 use tokio::sync::{broadcast, oneshot};
@@ -113,9 +113,24 @@ pub fn progress() -> Progress {
     }
 }
 
+fn expected() -> ExpectedError {
+    let total = ErrorRange { low: 0.015, median: 0.023, high: 0.075 };
+    ExpectedError { total, noise: total, bias: total, calibration: total, band: total }
+}
+
+pub fn designed() -> DesignReport {
+    DesignReport {
+        points: 15,
+        frames: 120,
+        light_s: 2.0,
+        expected: expected(),
+        plan: "kind = \"sweep\"\n".into(),
+        warnings: vec!["not reached".into()],
+    }
+}
+
 pub fn report() -> CheckReport {
-    let expected =
-        ExpectedError { epipolar: 0.0106, short_range: 0.011, long_range: 0.0039, profile: 0.0157 };
+    let expected = expected();
     CheckReport {
         points: 75,
         extra_points: 6,
@@ -127,15 +142,15 @@ pub fn report() -> CheckReport {
         disk_free_bytes: 1 << 40,
         reach_rows: Some((-94, 94)),
         condition: Some(1234.5),
-        advice: Some(SweepAdvice {
+        advice: Some(PlanAdvice {
             noise: NoiseEstimate { dark: 0.002, shot: 0.0155, source: NoiseSource::Assumed },
             prior: "split".into(),
             expected,
-            better: Some(BetterSweep {
+            better: Some(BetterPlan {
                 points: 74,
                 frames: 616,
-                expected: ExpectedError { epipolar: 0.0062, ..expected },
-                sweep: "[sweep]\naverage = 8\n".into(),
+                expected,
+                table: "[sweep]\naverage = 8\n".into(),
             }),
         }),
         film: None,
@@ -192,6 +207,10 @@ impl Control for Fake {
             _ => {}
         }
         Ok(report())
+    }
+
+    fn design(&self, _: &DesignParams) -> Result<DesignReport, RpcError> {
+        Ok(designed())
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {

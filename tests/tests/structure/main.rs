@@ -162,10 +162,8 @@ fn files_import_each_other_in_no_large_circle_and_in_none_between_folders() {
 }
 
 /// Names that several types may share, and why.
-const SHARED_NAMES: [(&str, &str); 2] = [
-    ("Error", "what can go wrong in a module; its users write `module::Error`"),
-    ("ExpectedError", "the same thing: transport computes it, and the socket's message carries it"),
-];
+const SHARED_NAMES: [(&str, &str); 1] =
+    [("Error", "what can go wrong in a module; its users write `module::Error`")];
 
 /// Types of the same name that are visible beyond their files, each with those files.
 fn doubles(graphs: &BTreeMap<String, Graph>) -> Vec<String> {

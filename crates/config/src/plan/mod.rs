@@ -16,10 +16,10 @@ pub use self::calibration::CalibrationPlan;
 pub use self::darks::DarksPlan;
 pub use self::film::FilmPlan;
 pub use self::response::ResponsePlan;
-pub use self::sweep::{Axis, SweepPlan};
+pub use self::sweep::{Axis, GridPlan, SweepPlan};
 pub use self::tables::{ProductTable, StageTable, products_of_argument};
 use crate::document::Document;
-use crate::{ConfigError, Places};
+use crate::{ConfigError, ConfigMistake, Places};
 
 /// A plan.
 #[derive(Debug, Clone)]
@@ -186,9 +186,33 @@ impl Plan {
     }
 }
 
+/// A plan's text with other tables, those of the text `tables`, in place of its own. Comments are lost.
+///
+/// # Errors
+/// If one of the texts is not TOML.
+pub fn with_tables(text: &str, tables: &str) -> Result<String, ConfigError> {
+    let read = |text: &str| -> Result<toml::Table, ConfigError> {
+        text.parse().map_err(|error: toml::de::Error| {
+            ConfigMistake { message: error.message().into(), field: None, span: error.span() }.into()
+        })
+    };
+    let mut plan = read(text)?;
+    plan.extend(read(tables)?);
+    Ok(plan.to_string())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn tables_are_replaced_and_the_rest_of_a_plan_stays() {
+        let text = "kind = \"sweep\"\nname = \"a\" # why\n[sweep]\naverage = 2\n[[sweep.extra]]\ndelay_us = [0]\nexposure_us = [1]\n[[stage]]\nname = \"demux\"\nalpha = 0.5\n";
+        let other = Plan::parse(&with_tables(text, "[sweep]\naverage = 3\n").unwrap()).unwrap();
+        let Procedure::Sweep(sweep) = other.procedure else { panic!("{other:?}") };
+        assert_eq!(sweep, SweepPlan { average: 3, ..SweepPlan::default() });
+        assert_eq!((other.name.as_str(), &other.stages), ("a", &Plan::parse(text).unwrap().stages));
+    }
 
     pub(super) fn parse(text: &str) -> Result<Plan, ConfigError> {
         Plan::parse(text)

@@ -1,4 +1,4 @@
-//! `[sweep]`: the grid of delays and exposures.
+//! `[sweep]`: the grid of delays and exposures, and `[[sweep.extra]]`: further ones.
 
 use std::fmt;
 
@@ -22,6 +22,18 @@ pub struct SweepPlan {
     pub average: u32,
     /// Frames whose measured delay deviates by more than this are dropped and taken again.
     pub max_jitter_us: f64,
+    /// `[[sweep.extra]]`: further grids, taken after the first.
+    pub extra: Vec<GridPlan>,
+}
+
+/// `[[sweep.extra]]`: a further grid of delays and exposures.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GridPlan {
+    /// Delays t_d.
+    pub delay_us: Axis,
+    /// Exposures t_e.
+    pub exposure_us: Axis,
 }
 
 impl Default for SweepPlan {
@@ -31,6 +43,7 @@ impl Default for SweepPlan {
             exposure_us: Axis::Range { start: 600.0, stop: 1200.0, count: 5 },
             average: 8,
             max_jitter_us: 50.0,
+            extra: Vec::new(),
         }
     }
 }
@@ -104,12 +117,38 @@ impl Axis {
         }
     }
 
+    /// The values as an evenly spaced range, if they are one, else as a list.
+    pub fn of_values(values: Vec<f64>) -> Self {
+        if let [start, _, .., stop] = *values {
+            let range = Self::Range { start, stop, count: values.len() };
+            if range.values() == values {
+                return range;
+            }
+        }
+        Self::List(values)
+    }
+
     /// Number of values.
     #[allow(clippy::len_without_is_empty, reason = "an axis without values is refused")]
     pub fn len(&self) -> usize {
         match self {
             Self::List(values) => values.len(),
             Self::Range { count, .. } => *count,
+        }
+    }
+}
+
+impl fmt::Display for Axis {
+    /// As a plan states it.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Range { start, stop, count } => {
+                write!(f, "{{ start = {start}, stop = {stop}, count = {count} }}")
+            }
+            Self::List(values) => {
+                let values: Vec<String> = values.iter().map(f64::to_string).collect();
+                write!(f, "[{}]", values.join(", "))
+            }
         }
     }
 }
@@ -129,29 +168,50 @@ impl SweepPlan {
         document.finish(Some(())).is_ok()
     }
 
-    pub(super) fn check(&self, document: &mut Document<'_>) {
-        let mut is_grid = true;
-        for (key, axis) in [("delay_us", &self.delay_us), ("exposure_us", &self.exposure_us)] {
-            if !(1..=MAX_AXIS).contains(&(axis.len() as u64)) {
-                let message =
-                    format!("sweep.{key} has {}: give 1 to {MAX_AXIS}", counted(axis.len(), "value"));
-                document.refuse(&["sweep", key, "count"], message);
-                is_grid = false;
-            } else if let Some(value) = axis.values().into_iter().find(|value| !value.is_finite()) {
-                let message = format!("sweep.{key} contains {value}: must be finite");
-                document.refuse(&["sweep", key], message);
-            } else if let Some(value) = axis.repeated() {
-                let message = format!("sweep.{key} contains {value} more than once: give each value once");
-                document.refuse(&["sweep", key], message);
+    /// The grids in the order of acquisition.
+    pub fn grids(&self) -> impl Iterator<Item = GridPlan> + '_ {
+        let own = GridPlan { delay_us: self.delay_us.clone(), exposure_us: self.exposure_us.clone() };
+        std::iter::once(own).chain(self.extra.iter().cloned())
+    }
+
+    /// Its tables in a plan.
+    pub fn to_toml(&self) -> String {
+        let Self { delay_us, exposure_us, average, max_jitter_us, extra } = self;
+        let own = format!(
+            "[sweep]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\naverage = {average}\nmax_jitter_us = {max_jitter_us}\n"
+        );
+        let extra = extra.iter().map(|GridPlan { delay_us, exposure_us }| {
+            format!("\n[[sweep.extra]]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\n")
+        });
+        std::iter::once(own).chain(extra).collect()
+    }
+
+    /// Delay and exposure of each point: grid after grid, with the exposure in the outer loop, because some cameras
+    /// take long to change it.
+    pub fn settings_us(&self) -> Vec<(f64, f64)> {
+        self.grids().flat_map(|grid| grid.settings_us()).collect()
+    }
+
+    /// The exposures, each once, in the order of acquisition.
+    pub fn exposures_us(&self) -> Vec<f64> {
+        let mut exposures = Vec::new();
+        for exposure_us in self.grids().flat_map(|grid| grid.exposure_us.values()) {
+            if !exposures.contains(&exposure_us) {
+                exposures.push(exposure_us);
             }
         }
-        let exposures = if is_grid { self.exposure_us.values() } else { Vec::new() };
-        if let Some(value) = exposures.into_iter().find(|&exposure_us| exposure_us <= 0.0) {
-            let message = format!("sweep.exposure_us contains {value}: must be more than 0 microseconds");
-            document.refuse(&["sweep", "exposure_us"], message);
+        exposures
+    }
+
+    pub(super) fn check(&self, document: &mut Document<'_>) {
+        let indices: Vec<String> = (0..self.extra.len()).map(|index| index.to_string()).collect();
+        let extra = indices.iter().map(|index| vec!["sweep", "extra", index.as_str()]);
+        let mut are_grids = true;
+        for (grid, path) in self.grids().zip(std::iter::once(vec!["sweep"]).chain(extra)) {
+            are_grids &= grid.check(&path, document);
         }
-        let points = self.delay_us.len() * self.exposure_us.len();
-        if is_grid && points > MAX_POINTS {
+        let points: usize = self.grids().map(|grid| grid.delay_us.len() * grid.exposure_us.len()).sum();
+        if are_grids && points > MAX_POINTS {
             let message =
                 format!("the sweep has {points} points: at most {MAX_POINTS} are allowed; split it");
             document.refuse(&["sweep"], message);
@@ -164,9 +224,50 @@ impl SweepPlan {
     }
 }
 
+impl GridPlan {
+    fn settings_us(&self) -> Vec<(f64, f64)> {
+        let delays = self.delay_us.values();
+        let of_exposure = |exposure_us: f64| {
+            delays.iter().map(move |&delay_us| (delay_us, exposure_us)).collect::<Vec<_>>()
+        };
+        self.exposure_us.values().into_iter().flat_map(of_exposure).collect()
+    }
+
+    /// Whether the axes have usable lengths; refuses wrong lengths and values of the table at `path`.
+    fn check(&self, path: &[&str], document: &mut Document<'_>) -> bool {
+        let mut is_grid = true;
+        for (key, axis) in [("delay_us", &self.delay_us), ("exposure_us", &self.exposure_us)] {
+            let at = |inner: &[&'static str]| -> Vec<String> {
+                path.iter().chain([&key]).chain(inner).map(|&key| key.to_owned()).collect()
+            };
+            let name = at(&[]).join(".");
+            let mut refuse = |path: Vec<String>, message: String| {
+                document.refuse(&path.iter().map(String::as_str).collect::<Vec<_>>(), message);
+            };
+            if !(1..=MAX_AXIS).contains(&(axis.len() as u64)) {
+                let message = format!("{name} has {}: give 1 to {MAX_AXIS}", counted(axis.len(), "value"));
+                refuse(at(&["count"]), message);
+                is_grid = false;
+                continue;
+            }
+            let values = axis.values();
+            if let Some(value) = values.iter().find(|value| !value.is_finite()) {
+                refuse(at(&[]), format!("{name} contains {value}: must be finite"));
+            } else if let Some(value) = axis.repeated() {
+                refuse(at(&[]), format!("{name} contains {value} more than once: give each value once"));
+            }
+            if let Some(value) = values.iter().find(|&&value| key == "exposure_us" && value <= 0.0) {
+                refuse(at(&[]), format!("{name} contains {value}: must be more than 0 microseconds"));
+            }
+        }
+        is_grid
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::plan::Procedure;
     use crate::plan::tests::{documented, parse};
 
     #[test]
@@ -183,5 +284,34 @@ mod tests {
         let (documented, default) = (parse(documented("sweep")).unwrap(), parse("kind = \"sweep\"").unwrap());
         assert_eq!(documented.procedure, default.procedure);
         assert_eq!((&documented.name, &documented.stages[0].name), (&default.name, &default.stages[0].name));
+    }
+
+    #[test]
+    fn a_sweep_is_written_as_it_is_read() {
+        let extra = GridPlan {
+            delay_us: Axis::of_values(vec![-1.5, 0.0, 7.25]),
+            exposure_us: Axis::List(vec![600.0]),
+        };
+        let sweep = SweepPlan { extra: vec![extra], ..SweepPlan::default() };
+        assert_eq!(
+            sweep.to_toml(),
+            "[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\nexposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\nmax_jitter_us = 50\n\n[[sweep.extra]]\ndelay_us = [-1.5, 0, 7.25]\nexposure_us = [600]\n"
+        );
+        let plan = parse(&format!("kind = \"sweep\"\n{}", sweep.to_toml())).unwrap();
+        assert_eq!(plan.procedure, Procedure::Sweep(sweep));
+        let even = Axis::of_values(vec![-1500.0, 0.0, 1500.0]);
+        assert_eq!(even, Axis::Range { start: -1500.0, stop: 1500.0, count: 3 });
+    }
+
+    #[test]
+    fn extra_settings_follow_the_grid_and_are_checked_as_it_is() {
+        let text = "kind = \"sweep\"\n[sweep]\ndelay_us = [0, 1]\nexposure_us = [600]\n[[sweep.extra]]\n";
+        let plan = parse(&format!("{text}delay_us = [5]\nexposure_us = [700, 600]")).unwrap();
+        let Procedure::Sweep(sweep) = plan.procedure else { panic!("{plan:?}") };
+        assert_eq!(sweep.settings_us(), [(0.0, 600.0), (1.0, 600.0), (5.0, 700.0), (5.0, 600.0)]);
+        assert_eq!(sweep.exposures_us(), [600.0, 700.0]);
+        let refused = parse(&format!("{text}delay_us = []\nexposure_us = [0]")).unwrap_err().to_string();
+        assert!(refused.contains("sweep.extra.0.delay_us has 0 values"), "{refused}");
+        assert!(refused.contains("sweep.extra.0.exposure_us contains 0"), "{refused}");
     }
 }

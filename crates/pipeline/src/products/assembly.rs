@@ -76,14 +76,15 @@ impl Assembly {
                     return Err(not_made(what.into()));
                 }
             },
-            ProductKind::Epipolar(width) => width.epipolar(name, transport),
-            ProductKind::NonEpipolar(width) => width.non_epipolar(name, transport),
-            ProductKind::Band(band) => band.make(name, transport),
+            ProductKind::Epipolar(width) => width.of_stack(stack).epipolar(name, transport),
+            ProductKind::NonEpipolar(width) => width.of_stack(stack).non_epipolar(name, transport),
+            ProductKind::Band(band) => band.of_stack(stack).make(name, transport),
             ProductKind::Relight(pattern) => pattern
                 .make(name, &stack.timing, first_row, transport)
                 .map_err(|error| not_made(error.to_string()))?,
             ProductKind::Uncertainty(band) => {
-                uncertainty::make(name, *band, first_row, stack, transport).map_err(not_made)?
+                uncertainty::make(name, band.of_stack(stack), first_row, stack, transport)
+                    .map_err(not_made)?
             }
             ProductKind::DelayProfile(options) => {
                 options.add(&mut self.sums, first_row, stack, transport);

@@ -7,11 +7,15 @@ use raysweep_transport::plane::Transport;
 use serde::Deserialize;
 
 use crate::product::Product;
+use crate::stack::SweepStack;
 
 /// The reach of a transport as text, for products that are limited by it.
 pub(super) fn reach_of(transport: &Transport) -> String {
     format!("the sweep reaches u = {} to {}, beyond nothing is known", transport.u_min, transport.u_max())
 }
+
+/// Rows up to this distance are one band if no setting tells them apart.
+const ONE_BAND_ROWS: u32 = 2;
 
 /// Options of `epipolar` and `non-epipolar`: the rows that count as the pixel's own.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -59,6 +63,12 @@ impl Width {
             1 => name.into(),
             width_rows => format!("{name}_{width_rows}"),
         }
+    }
+
+    /// At least the band whose division the settings do not tell.
+    pub(super) fn of_stack(self, stack: &SweepStack) -> Self {
+        let narrowest_rows = if stack.one_band { 2 * ONE_BAND_ROWS + 1 } else { 1 };
+        Self { width_rows: self.width_rows.max(narrowest_rows) }
     }
 
     fn half(self) -> u32 {
@@ -120,6 +130,20 @@ impl Band {
                 Err(("to_rows", what))
             }
             _ => Ok(self),
+        }
+    }
+
+    /// The band without a part of the rows whose division the settings do not tell: all of them, or none.
+    pub(super) fn of_stack(self, stack: &SweepStack) -> Self {
+        match self {
+            Self { from_rows, to_rows, side } if stack.one_band && from_rows <= ONE_BAND_ROWS => {
+                match to_rows {
+                    Some(to_rows) if to_rows <= ONE_BAND_ROWS => Self::new(0, Some(ONE_BAND_ROWS)),
+                    _ if from_rows == 0 && side.is_none() => self,
+                    _ => Self { from_rows: ONE_BAND_ROWS + 1, ..self },
+                }
+            }
+            _ => self,
         }
     }
 

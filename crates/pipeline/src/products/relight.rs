@@ -1,14 +1,21 @@
 //! Product `relight`: the scene lit by a pattern of projector rows.
 
 use ndarray::{Array1, Array3, Axis};
-use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
+use raysweep_transport::plane::{PlaneError, RelitBeam, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
 use super::band::reach_of;
 use crate::product::Product;
 use crate::schedule::SweepGeometry;
 
-/// Options of `relight`: the brightness of each projector row.
+/// Options of `relight`: the brightness of each projector row, and how rows spread.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Relight {
+    pattern: RowPattern,
+    beam: RelitBeam,
+}
+
+/// The brightness of each projector row.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum RowPattern {
@@ -18,6 +25,15 @@ pub(super) enum RowPattern {
     Stripes(Stripes),
     /// A sequence of images: a line that moves from the first row seen by the camera to the last.
     Line(MovingLine),
+}
+
+/// Names of [`RelitBeam`] in plans.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum BeamName {
+    #[default]
+    AsLit,
+    Ideal,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
@@ -59,7 +75,15 @@ impl MovingLine {
     }
 }
 
-impl RowPattern {
+impl Relight {
+    pub(super) fn new(pattern: RowPattern, beam: BeamName) -> Self {
+        let beam = match beam {
+            BeamName::AsLit => RelitBeam::AsLit,
+            BeamName::Ideal => RelitBeam::Ideal,
+        };
+        Self { pattern, beam }
+    }
+
     /// Checks the options. An error consists of the keys and indices that lead to the invalid value, and the allowed
     /// values.
     pub(super) fn check(&self, geometry: &SweepGeometry) -> Result<(), (Vec<String>, String)> {
@@ -71,8 +95,8 @@ impl RowPattern {
             let message = format!("{} = {value}: must be from {lowest} to {highest}, {what}", path.join("."));
             Err((path.iter().map(|&key| key.to_owned()).collect::<Vec<_>>(), message))
         };
-        match self {
-            Self::Rows(pieces) => {
+        match &self.pattern {
+            RowPattern::Rows(pieces) => {
                 if pieces.is_empty() {
                     return Err((vec!["rows".into()], "rows is empty: give { first, last, weight }".into()));
                 }
@@ -92,13 +116,13 @@ impl RowPattern {
                     }
                 }
             }
-            Self::Stripes(stripes) => {
+            RowPattern::Stripes(stripes) => {
                 let Stripes { period_rows, lit_rows, phase_rows } = *stripes;
                 within(&["stripes", "period_rows"], period_rows, 1, rows, "the projector's rows")?;
                 within(&["stripes", "lit_rows"], lit_rows, 1, period_rows, "the period")?;
                 within(&["stripes", "phase_rows"], phase_rows, 0, period_rows - 1, "less than the period")?;
             }
-            Self::Line(line) => {
+            RowPattern::Line(line) => {
                 within(&["line", "height_rows"], line.height_rows, 1, rows, "the projector's rows")?;
                 within(&["line", "step_rows"], line.step_rows, 1, rows, "the projector's rows")?;
             }
@@ -108,9 +132,9 @@ impl RowPattern {
 
     /// The number of its images.
     pub(super) fn images(&self, geometry: &SweepGeometry) -> usize {
-        match self {
-            Self::Rows(_) | Self::Stripes(_) => 1,
-            Self::Line(line) => geometry.height.div_ceil(line.step_rows),
+        match &self.pattern {
+            RowPattern::Rows(_) | RowPattern::Stripes(_) => 1,
+            RowPattern::Line(line) => geometry.height.div_ceil(line.step_rows),
         }
     }
 
@@ -124,9 +148,10 @@ impl RowPattern {
     ) -> Result<Product, PlaneError> {
         let rows = timing.projector_rows();
         let reach = reach_of(transport);
-        let under = |weights: &Array1<f64>| relight_rows(timing, first_row, transport, weights.view());
-        let (about, weights) = match self {
-            Self::Rows(pieces) => {
+        let under =
+            |weights: &Array1<f64>| relight_rows(timing, first_row, transport, weights.view(), self.beam);
+        let (about, weights) = match &self.pattern {
+            RowPattern::Rows(pieces) => {
                 let mut weights = Array1::zeros(rows);
                 for piece in pieces {
                     weights
@@ -138,13 +163,13 @@ impl RowPattern {
                 let lit = weights.iter().filter(|&&weight| weight > 0.0).count();
                 (format!("relit by {lit} of the projector's {rows} rows"), weights)
             }
-            Self::Stripes(Stripes { period_rows, lit_rows, phase_rows }) => {
+            RowPattern::Stripes(Stripes { period_rows, lit_rows, phase_rows }) => {
                 let lit =
                     |row: usize| (row % period_rows + period_rows - phase_rows) % period_rows < *lit_rows;
                 let about = format!("relit by stripes of {lit_rows} rows, {period_rows} rows apart");
                 (about, Array1::from_shape_fn(rows, |row| if lit(row) { 1.0 } else { 0.0 }))
             }
-            Self::Line(line) => {
+            RowPattern::Line(line) => {
                 let tops = line.first_rows(timing);
                 let (_, height, width) = transport.t.dim();
                 let mut images = Array3::zeros((tops.len(), height, width));

@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 
 use super::band::{Band, Width};
 use super::profile::{ProfileOptions, ProfileTable};
-use super::relight::RowPattern;
+use super::relight::{BeamName, Relight, RowPattern};
 use crate::schedule::{Schedule, SweepGeometry};
 use raysweep_core::decoding_message_beside;
 
@@ -36,7 +36,7 @@ pub(super) enum ProductKind {
     Epipolar(Width),
     NonEpipolar(Width),
     Band(Band),
-    Relight(RowPattern),
+    Relight(Relight),
     DelayProfile(ProfileOptions),
     Uncertainty(Band),
 }
@@ -54,6 +54,13 @@ const MAX_NAME: usize = 64;
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct NoOptions {}
+
+/// The option of `relight` beside its pattern.
+#[derive(Default, Deserialize)]
+#[serde(default)]
+struct BeamOption {
+    beam: BeamName,
+}
 
 impl ProductSpec {
     /// The product described by a plan's table: its kind, its name if it has one, and all other keys.
@@ -79,13 +86,16 @@ impl ProductSpec {
             "band" => ProductKind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
             "uncertainty" => ProductKind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
             "relight" => {
-                if options.len() != 1 {
+                let (beam, pattern): (Map<_, _>, Map<_, _>) =
+                    options.clone().into_iter().partition(|(key, _)| key == "beam");
+                if pattern.len() != 1 {
                     let what = "give exactly one of rows, stripes and line".to_owned();
                     return Err(refused(Vec::new(), what));
                 }
-                let pattern: RowPattern = parse(kind, options)?;
-                pattern.check(geometry).map_err(|(path, what)| refused(path, what))?;
-                ProductKind::Relight(pattern)
+                let BeamOption { beam } = parse(kind, &beam)?;
+                let relight = Relight::new(parse::<RowPattern>(kind, &pattern)?, beam);
+                relight.check(geometry).map_err(|(path, what)| refused(path, what))?;
+                ProductKind::Relight(relight)
             }
             "delay-profile" => {
                 let table: ProfileTable = parse(kind, options)?;

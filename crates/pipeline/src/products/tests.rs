@@ -83,6 +83,7 @@ fn stack() -> SweepStack {
         noise: None,
         variance_ratio: None,
         u0_rows: None,
+        one_band: false,
     }
 }
 
@@ -330,4 +331,29 @@ fn names_tell_products_of_one_kind_apart() {
     );
     assert_eq!(name(json!({ "kind": "delay-profile", "pixel": [1, 2] })), "delay_profile_t1_s2");
     assert_eq!(name(json!({ "kind": "band", "from_rows": 1, "name": "far-1_a" })), "far-1_a");
+}
+
+#[test]
+fn rows_that_nothing_tells_apart_are_one_band() {
+    let stack = SweepStack { one_band: true, ..stack() };
+    let image = |table: Value| {
+        let Product::Image { image, about, .. } = spec(&table).unwrap().make(&stack, &transport()).unwrap()
+        else {
+            panic!("{table} is no image")
+        };
+        (image, about)
+    };
+    let transport = transport();
+    let (epipolar, about) = image(json!({ "kind": "epipolar" }));
+    assert_eq!(epipolar, transport.epipolar(5));
+    assert!(about.contains("|u| <= 2"), "{about}");
+    assert_eq!(image(json!({ "kind": "non-epipolar" })).0, transport.non_epipolar(5));
+    let band = |table: Value| image(table).0;
+    assert_eq!(band(json!({ "kind": "band", "from_rows": 0, "to_rows": 1 })), transport.epipolar(5));
+    assert_eq!(band(json!({ "kind": "band", "from_rows": 1, "to_rows": 2 })), transport.epipolar(5));
+    assert_eq!(
+        band(json!({ "kind": "band", "from_rows": 1, "to_rows": 4 })),
+        transport.band(-4..=-3) + transport.band(3..=4)
+    );
+    assert_eq!(band(json!({ "kind": "band", "from_rows": 0 })), transport.total());
 }

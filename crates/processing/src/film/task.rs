@@ -30,6 +30,14 @@ impl FilmTask {
         Self { film, task: Arc::new(task) }
     }
 
+    /// The same task with another film, if the plan allows it.
+    pub fn with_film(&self, film: FilmPlan) -> Option<Self> {
+        let is_possible = film.is_possible();
+        let mut task = (*self.task).clone();
+        task.schedule = schedule(&film);
+        is_possible.then(|| Self { film, task: Arc::new(task) })
+    }
+
     /// What its session stores.
     pub fn contents(&self) -> Contents {
         let (settings, exposures) = (self.task.settings().count(), self.task.schedule.dark_len());

@@ -76,31 +76,23 @@ impl SweepTask {
     }
 }
 
-/// The points of a sweep: dark images of each exposure, the regular image, then the grid with the exposure in the outer
-/// loop, because some cameras take long to change it.
+/// The points of a sweep: dark images of each exposure, the regular image, then the settings.
 fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
     let frames = sweep.average;
     let point = |role, delay_us, exposure_us| {
         let frames = if matches!(role, PointRole::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
         Point { role, delay_us, exposure_us, frames }
     };
-    let exposures = sweep.exposure_us.values();
-    let delays = sweep.delay_us.values();
-
-    let mut dark_exposures: Vec<f64> = Vec::new();
-    for &exposure_us in exposures.iter().chain([&period_us]) {
-        if !dark_exposures.contains(&exposure_us) {
-            dark_exposures.push(exposure_us);
-        }
+    let mut dark_exposures = sweep.exposures_us();
+    if !dark_exposures.contains(&period_us) {
+        dark_exposures.push(period_us);
     }
     let mut points: Vec<Point> =
         (0..).zip(&dark_exposures).map(|(index, &us)| point(PointRole::Dark(index), 0.0, us)).collect();
     points.push(point(PointRole::Regular, 0.0, period_us));
-    let grid =
-        exposures.iter().flat_map(|&exposure_us| delays.iter().map(move |&delay_us| (delay_us, exposure_us)));
+    let settings = (0..).zip(sweep.settings_us());
     points.extend(
-        (0..)
-            .zip(grid)
+        settings
             .map(|(index, (delay_us, exposure_us))| point(PointRole::Sweep(index), delay_us, exposure_us)),
     );
     Schedule { points }

@@ -36,7 +36,7 @@ pub use model::{
     Setting, Shares, Slot, SlotKind, Transport, delay_us, offset_us, predict, reach, relative_rows,
 };
 pub use noise::{Coupled, Coupling, NoiseModel};
-pub use products::{DelayProfile, Samples, Uncertainty, relight, relight_rows};
+pub use products::{DelayProfile, RelitBeam, Samples, Uncertainty, relight, relight_rows};
 #[doc(hidden)]
 pub use solve::linear;
 pub use solve::{Demux, Prior, SimdLevel, objectives_bytes, reference};

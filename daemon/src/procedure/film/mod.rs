@@ -1,5 +1,6 @@
 //! Films: the settings of a cycle are repeated, and each cycle gives a transport.
 
+mod advice;
 mod check;
 mod cycle;
 mod sink;
@@ -13,7 +14,7 @@ use raysweep_pipeline::{CycleOrder, Point, PointRole, Stages};
 use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
 use raysweep_processing::plane::{Processing, manifest};
-use raysweep_proto::RpcError;
+use raysweep_proto::{CheckReport, DesignParams, DesignReport, RpcError};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
 use raysweep_session::stack::StackShape;
@@ -22,6 +23,7 @@ use self::cycle::CyclePlan;
 use self::sink::{CycleTiming, Cycles, FilmSink};
 use self::worker::{Account, Solving, Worker};
 use crate::devices::camera::{Exposures, FilmSetting};
+use crate::plane::advice::{advise, design};
 use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::{Pace, Rig};
@@ -36,6 +38,7 @@ const CYCLES_UNDER_WAY: usize = 4;
 /// A film on a rig.
 struct FilmRun {
     rig: Arc<Rig>,
+    camera: CameraCapabilities,
     calibration: Option<KeptCalibration>,
     film: FilmTask,
     stages: Stages,
@@ -65,11 +68,28 @@ pub fn foresee(
         shape,
         first_row: rig.first_row,
         instead: "take fewer settings",
-        procedure: Box::new(FilmRun { rig: rig.rig.clone(), calibration: rig.calibration, film, stages }),
+        procedure: Box::new(FilmRun {
+            rig: rig.rig.clone(),
+            camera: lab.camera.clone(),
+            calibration: rig.calibration,
+            film,
+            stages,
+        }),
     })
 }
 
 impl Measurement for FilmRun {
+    fn advise(&self, report: &mut CheckReport) {
+        match advise(&self.film, &self.rig.file, &self.camera) {
+            Ok(advice) => report.advice = Some(advice),
+            Err(none) => report.warnings.push(none.to_string()),
+        }
+    }
+
+    fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
+        Ok(design(&self.film, &self.rig.file, &self.camera, params)?)
+    }
+
     fn keep(&self, session: &Session) -> Result<(), RpcError> {
         keep_calibration(self.calibration.as_ref(), session)
     }

@@ -12,13 +12,14 @@ use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_processing::sweep::{Overview, Results, SweepTask, write_products, write_report};
-use raysweep_proto::{CheckReport, RpcError};
+use raysweep_proto::{CheckReport, DesignParams, DesignReport, RpcError};
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
 use raysweep_session::stack::StackShape;
 
 use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
+use crate::plane::advice::{advise, design};
 use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
@@ -82,10 +83,14 @@ pub fn foresee(
 
 impl Measurement for SweepRun {
     fn advise(&self, report: &mut CheckReport) {
-        match advice::advise(&self.sweep, &self.rig.file, &self.camera) {
+        match advise(&self.sweep, &self.rig.file, &self.camera) {
             Ok(advice) => report.advice = Some(advice),
             Err(none) => report.warnings.push(none.to_string()),
         }
+    }
+
+    fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
+        Ok(design(&self.sweep, &self.rig.file, &self.camera, params)?)
     }
 
     fn keep(&self, session: &Session) -> Result<(), RpcError> {

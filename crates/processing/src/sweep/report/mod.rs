@@ -208,6 +208,8 @@ impl SweepImages<'_> {
                 lights.push((point.delay_us, light.collect()));
             }
         }
+        // Extra settings follow the grid, wherever their delays lie.
+        lights.sort_by(|a: &(f64, Vec<f32>), b| a.0.total_cmp(&b.0));
         Ok(lights)
     }
 
@@ -241,7 +243,7 @@ impl SweepImages<'_> {
         };
         Ok(Section {
             title: "The stack".into(),
-            intro: "Every image of the sweep, dark image subtracted. A camera row collects the light of projector rows that lie delay / row time below its own, over a band as wide as the exposure. The second sheet is exposed for the indirect light.".into(),
+            intro: "Every image of the sweep's grid, dark image subtracted. A camera row collects the light of projector rows that lie delay / row time below its own, over a band as wide as the exposure. The second sheet is exposed for the indirect light.".into(),
             blocks: vec![
                 Block::ContactSheet(sheet(samples.percentile(PERCENTILE))),
                 Block::ContactSheet(sheet(samples.percentile(INDIRECT_PERCENTILE))),

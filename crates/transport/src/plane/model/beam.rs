@@ -69,7 +69,7 @@ impl Beam {
 
     /// Converts the weights of the drawn rows to those of the scene's rows: `A' = A B`, for one row of `A`. Both have
     /// one entry per projector row; there are no drawn rows beyond the borders.
-    pub(super) fn spread(&self, drawn: Vec<f64>) -> Vec<f64> {
+    pub(in super::super) fn spread(&self, drawn: Vec<f64>) -> Vec<f64> {
         let Self::Gaussian { sigma_rows } = *self else { return drawn };
         let reach_rows = (TAIL_SIGMAS * sigma_rows).ceil() as usize;
         let tail: Vec<f64> =

@@ -12,7 +12,7 @@ pub const RESPONSE_ROWS: usize = 16;
 pub const FIRST_RESPONSE_ROW: i32 = -7;
 
 /// Steps of a pixel's place per projector row: pixels within one step share a model.
-pub(super) const PLACE_STEPS: f32 = 32.0;
+pub(in super::super) const PLACE_STEPS: f32 = 32.0;
 
 /// Where each pixel looks, and how its direct light is divided among the rows drawn around that place (its line spread
 /// function over projector rows), as a calibration measured it.

@@ -5,5 +5,5 @@ mod relight;
 mod uncertainty;
 
 pub use profile::DelayProfile;
-pub use relight::{relight, relight_rows};
+pub use relight::{RelitBeam, relight, relight_rows};
 pub use uncertainty::{Samples, Uncertainty};

@@ -1,15 +1,27 @@
-use ndarray::{Array1, Array2, ArrayView1, Axis};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, ArrayViewMut1, Axis};
 use rayon::prelude::*;
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
-use super::super::model::{RowTiming, Transport};
+use super::super::model::{PLACE_STEPS, RowTiming, Transport, collected_rows};
+
+/// How a projector's rows spread in a relit image.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum RelitBeam {
+    /// As those of the rig do: the image that the camera would see.
+    #[default]
+    AsLit,
+    /// Not at all: each row lights only itself, as in the transport.
+    Ideal,
+}
 
 /// The image `[t, s]` for a projector that shows each of its rows with one weight, shape `[projector_rows]`:
-/// `sum over v of weights[v] T(v, t, s)`, 1.0 for a white surface under its own row at weight 1.
+/// `sum over v of weights[v] T(v, t, s)`, 1.0 for a white surface under its own row at weight 1. With
+/// [`RelitBeam::AsLit`], `weights` are first spread by the beam or by the pixels' measured responses: a pixel's light
+/// from row `v` has the weight `sum over d of k(d) weights[v + d]`.
 ///
 /// Rows outside the transport's reach are unknown and contribute nothing, so all rows at weight 1 give
-/// [`Transport::total`].
+/// [`Transport::total`] with an ideal beam.
 ///
 /// # Errors
 /// [`PlaneError::Shape`] if the weights do not fit the projector's rows, or the transport does not fit the camera's.
@@ -17,9 +29,10 @@ pub fn relight(
     timing: &RowTiming,
     transport: &Transport,
     weights: ArrayView1<f64>,
+    beam: RelitBeam,
 ) -> Result<Array2<f32>, PlaneError> {
     check_shape("transport", "its camera rows", &[transport.t.len_of(Axis(1))], &[timing.camera_rows()])?;
-    relight_rows(timing, 0, transport, weights)
+    relight_rows(timing, 0, transport, weights, beam)
 }
 
 /// [`relight`] for a `transport` that contains only the camera rows starting at `first_row`.
@@ -32,6 +45,7 @@ pub fn relight_rows(
     first_row: usize,
     transport: &Transport,
     weights: ArrayView1<f64>,
+    beam: RelitBeam,
 ) -> Result<Array2<f32>, PlaneError> {
     check_shape("weights", "[projector rows]", &[weights.len()], &[timing.projector_rows()])?;
     let (_, rows, columns) = transport.t.dim();
@@ -41,36 +55,62 @@ pub fn relight_rows(
         return Err(PlaneError::Rows { row: end - 1, camera_rows });
     }
 
-    let weight_of = |v: i64| usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
+    let spread = match beam {
+        RelitBeam::AsLit if timing.response().is_none() => {
+            Array1::from(timing.beam().spread(weights.to_vec()))
+        }
+        RelitBeam::AsLit | RelitBeam::Ideal => weights.to_owned(),
+    };
     let mut image = Array2::zeros((rows, columns));
     image.axis_iter_mut(Axis(0)).into_par_iter().enumerate().for_each(|(at, mut image_row)| {
         let profiles = transport.t.index_axis(Axis(1), at);
-        // In f64, because the light of thousands of dim rows adds up next to a bright one.
-        let mut sum = Array1::<f64>::zeros(columns);
-        if let Some(response) = timing.response() {
-            let own_rows = response.own_rows(first_row + at, columns);
-            for ((sum, profile), own_row) in sum.iter_mut().zip(profiles.columns()).zip(own_rows) {
-                let lit = (own_row + i64::from(transport.u_min)..).zip(profile);
-                *sum = lit.map(|(v, &light)| weight_of(v) * f64::from(light)).sum();
-            }
-        } else {
+        let Some(response) = timing.response() else {
             let own_row = timing.camera().own_row(first_row + at) as i64;
-            for (v, light) in (own_row + i64::from(transport.u_min)..).zip(profiles.outer_iter()) {
-                let weight = weight_of(v);
-                if weight != 0.0 {
-                    sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
-                }
-            }
+            relight_row(image_row, profiles, own_row + i64::from(transport.u_min), spread.view());
+            return;
+        };
+        for class in response.classes(first_row + at, 0..columns, PLACE_STEPS) {
+            let weights = match beam {
+                RelitBeam::AsLit => collected_rows(spread.view(), &class.shares, 0, spread.len()),
+                RelitBeam::Ideal => spread.clone(),
+            };
+            let mut relit = Array1::zeros(class.columns.len());
+            let first_v = class.own_row + i64::from(transport.u_min);
+            relight_row(
+                relit.view_mut(),
+                profiles.select(Axis(1), &class.columns).view(),
+                first_v,
+                weights.view(),
+            );
+            class.columns.iter().zip(relit).for_each(|(&column, relit)| image_row[column] = relit);
         }
-        image_row.zip_mut_with(&sum, |pixel, &sum| *pixel = sum as f32);
     });
     Ok(image)
+}
+
+/// Relights pixels whose profiles, `[reach, pixels]`, begin at projector row `first_v`.
+fn relight_row(
+    mut relit: ArrayViewMut1<f32>,
+    profiles: ArrayView2<f32>,
+    first_v: i64,
+    weights: ArrayView1<f64>,
+) {
+    // In f64, because the light of thousands of dim rows adds up next to a bright one.
+    let mut sum = Array1::<f64>::zeros(relit.len());
+    for (v, light) in (first_v..).zip(profiles.outer_iter()) {
+        let weight = usize::try_from(v).ok().and_then(|v| weights.get(v)).copied().unwrap_or(0.0);
+        if weight != 0.0 {
+            sum.zip_mut_with(&light, |sum, &light| *sum += weight * f64::from(light));
+        }
+    }
+    relit.zip_mut_with(&sum, |pixel, &sum| *pixel = sum as f32);
 }
 
 #[cfg(test)]
 mod tests {
     use ndarray::{Array3, s};
 
+    use super::super::super::{Beam, FIRST_RESPONSE_ROW, PixelResponse, Shares};
     use super::*;
 
     /// A projector of 8 rows whose rows 2..6 the camera sees, with `T(v, t, s) = 1 + 100 v + 10 t + s` for |u| <= 2.
@@ -85,7 +125,7 @@ mod tests {
     #[test]
     fn all_rows_give_the_total_to_the_bit() {
         let (timing, transport) = scene();
-        let image = relight(&timing, &transport, Array1::ones(8).view()).unwrap();
+        let image = relight(&timing, &transport, Array1::ones(8).view(), RelitBeam::default()).unwrap();
         assert_eq!(image, transport.total());
     }
 
@@ -94,7 +134,7 @@ mod tests {
         let (timing, transport) = scene();
         for v in 0..8_usize {
             let weights = Array1::from_shape_fn(8, |row| if row == v { 0.5 } else { 0.0 });
-            let image = relight(&timing, &transport, weights.view()).unwrap();
+            let image = relight(&timing, &transport, weights.view(), RelitBeam::default()).unwrap();
             for ((t, s), &light) in image.indexed_iter() {
                 let within_reach = v.abs_diff(2 + t) <= 2;
                 let expected = if within_reach { 0.5 * (1 + 100 * v + 10 * t + s) as f32 } else { 0.0 };
@@ -107,16 +147,16 @@ mod tests {
     fn some_rows_are_relit_as_in_the_whole() {
         let (timing, transport) = scene();
         let weights = Array1::from_shape_fn(8, |row| (row * row) as f64);
-        let whole = relight(&timing, &transport, weights.view()).unwrap();
+        let whole = relight(&timing, &transport, weights.view(), RelitBeam::default()).unwrap();
         let rows = Transport {
             t: transport.t.slice(s![.., 1..3, ..]).to_owned(),
             exists: transport.exists.slice(s![.., 1..3]).to_owned(),
             saturated: transport.saturated.slice(s![1..3, ..]).to_owned(),
             ..transport
         };
-        let part = relight_rows(&timing, 1, &rows, weights.view()).unwrap();
+        let part = relight_rows(&timing, 1, &rows, weights.view(), RelitBeam::default()).unwrap();
         assert_eq!(part, whole.slice(s![1..3, ..]));
-        let beyond = relight_rows(&timing, 3, &rows, weights.view());
+        let beyond = relight_rows(&timing, 3, &rows, weights.view(), RelitBeam::default());
         assert_eq!(beyond.unwrap_err(), PlaneError::Rows { row: 4, camera_rows: 4 });
     }
 
@@ -125,12 +165,31 @@ mod tests {
         let (timing, transport) = scene();
         let other = timing.clone().window(0, 3).unwrap();
         assert!(matches!(
-            relight(&timing, &transport, Array1::ones(4).view()),
+            relight(&timing, &transport, Array1::ones(4).view(), RelitBeam::default()),
             Err(PlaneError::Shape { array: "weights", .. })
         ));
         assert!(matches!(
-            relight(&other, &transport, Array1::ones(8).view()),
+            relight(&other, &transport, Array1::ones(8).view(), RelitBeam::default()),
             Err(PlaneError::Shape { array: "transport", .. })
         ));
+    }
+
+    #[test]
+    fn rows_spread_as_the_rig_spreads_them_or_not_at_all() {
+        let (timing, transport) = scene();
+        let beam = timing.with_beam(Beam::Gaussian { sigma_rows: 0.7 }).unwrap();
+        let places = Array2::from_shape_fn((4, 3), |(t, _)| 2.0 + t as f32);
+        // The whole light of a row goes to the next one.
+        let down: Shares = std::array::from_fn(|d| f64::from(u8::from(d as i32 == 1 - FIRST_RESPONSE_ROW)));
+        let measured = beam.clone().with_response(PixelResponse::with_beam(places, &down).unwrap()).unwrap();
+        let row = |v: usize| Array1::from_shape_fn(8, |row| f64::from(u8::from(row == v)));
+        let relit = |timing: &RowTiming, weights: &Array1<f64>, beam| {
+            relight(timing, &transport, weights.view(), beam).unwrap()
+        };
+        let spread = Array1::from(Beam::Gaussian { sigma_rows: 0.7 }.spread(row(4).to_vec()));
+        let ideal = relit(&beam, &row(4), RelitBeam::Ideal);
+        assert_eq!(relit(&beam, &row(4), RelitBeam::AsLit), relit(&beam, &spread, RelitBeam::Ideal));
+        assert_eq!(relit(&measured, &row(4), RelitBeam::Ideal), ideal);
+        assert_eq!(relit(&measured, &row(5), RelitBeam::AsLit), ideal);
     }
 }
