@@ -157,6 +157,7 @@ impl Studio {
             let unit = Unit {
                 id: SettingsId { point: ordinal, attempt: 0 },
                 frames: 8,
+                delay_us: point.delay_us,
                 exposure_us: point.exposure_us,
                 delays_us: vec![delay_us; 8],
                 last_exposure_ns: None,

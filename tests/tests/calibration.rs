@@ -7,6 +7,7 @@ use std::fs;
 use std::path::Path;
 
 use ndarray::{Array3, Axis, s};
+use raysweep::control::Control;
 use raysweep::rig::Rig;
 use raysweep_processing::calibration::{KeptCalibration, current_in};
 use raysweep_session::stack::ArrayName;
@@ -144,8 +145,8 @@ fn a_cancelled_calibration_leaves_the_one_in_use() {
     let first = bench.run(&quick());
     let mut events = bench.runner.events();
     let params = raysweep_proto::RunParams { plan: PLAN.into(), ..Default::default() };
-    raysweep::control::Control::run(&*bench.runner, params).unwrap();
-    let _ = raysweep::control::Control::cancel(&*bench.runner);
+    Control::run(&*bench.runner, params).unwrap();
+    let _ = Control::cancel(&*bench.runner);
     let cancelled = end_of(&mut events);
     assert_eq!(cancelled.state, "cancelled");
     assert!(!cancelled.session.join("calibration.toml").exists());
@@ -177,7 +178,7 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
     let current = current_in(&bench.folder.path().join("sessions"));
     let npz = fs::read(current.join("calibration.npz")).unwrap();
     let refusal =
-        |bench: &Bench| raysweep::control::Control::check(&*bench.runner, SWEEP).unwrap_err().message;
+        |bench: &Bench| Control::check(&*bench.runner, SWEEP).unwrap_err().message;
     let mut damaged = npz.clone();
     damaged[npz.len() / 2] ^= 1;
     fs::write(current.join("calibration.npz"), damaged).unwrap();
@@ -193,7 +194,7 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
     first.open();
     fs::copy(first.session.join("calibration.toml"), current.join("calibration.toml")).unwrap();
     fs::write(current.join("calibration.npz"), npz).unwrap();
-    raysweep::control::Control::check(&*bench.runner, SWEEP).unwrap();
+    Control::check(&*bench.runner, SWEEP).unwrap();
 
     let rig = bench.folder.path().join("rig.toml");
     fs::write(&rig, rig_text(720, "scene_rows = 96\nscene_columns = 40", "")).unwrap();
@@ -203,19 +204,19 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
     let overridden = rig_text(720, "scene_rows = 96\nscene_columns = 40", "[calibration]\noverride = true\n");
     fs::write(&rig, overridden).unwrap();
     bench.restart_with(raysweep::Probes::default());
-    let report = raysweep::control::Control::check(&*bench.runner, SWEEP).unwrap();
+    let report = Control::check(&*bench.runner, SWEEP).unwrap();
     assert_eq!(report.warnings.len(), 0, "{:?}", report.warnings);
 
     fs::write(&rig, small("# changed\n")).unwrap();
     bench.restart_with(raysweep::Probes::default());
-    let warnings = raysweep::control::Control::check(&*bench.runner, SWEEP).unwrap().warnings;
+    let warnings = Control::check(&*bench.runner, SWEEP).unwrap().warnings;
     assert!(warnings.iter().any(|warning| warning.contains("the rig file was changed")), "{warnings:?}");
 }
 
 #[test]
 fn calibrations_are_listed_and_chosen() {
     let bench = Bench::new(&small(""));
-    let control: &dyn raysweep::control::Control = &*bench.runner;
+    let control: &dyn Control = &*bench.runner;
     assert_eq!(control.calibrations().unwrap(), []);
     let (first, second) = (bench.run(&quick()), bench.run(&quick()));
     let in_use = || -> Vec<bool> { control.calibrations().unwrap().iter().map(|info| info.in_use).collect() };
