@@ -33,11 +33,12 @@ impl PlaneRig {
         let scenes = if config.scene.extension().is_some_and(|extension| extension == "npz") {
             vec![Scene::load(&folder.join(&config.scene))?]
         } else {
+            let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
+            let scenes = Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?;
             if config.scene_rows > setup.raster.rows {
                 return Err(SimError::TooManyRows { rows: config.scene_rows, most: setup.raster.rows });
             }
-            let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
-            Scene::key_positions(&config.scene.to_string_lossy(), size, config.seed)?
+            scenes
         };
         let motion = SceneMotion::new(scenes.len(), config.motion_period_s);
         let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;

@@ -79,7 +79,7 @@ fn a_flat_field_takes_away_the_fixed_pattern_and_keeps_the_energy() {
     let gains = |ended: &Ended| ended.open().0.dots().unwrap().read_flat([128, 128]).unwrap();
     assert_eq!(gains(&later), gains(&corrected));
     let refused = bench.runner.check(&with_flat(plan + &stage)).unwrap_err();
-    assert_eq!(refused.data.unwrap().field.as_deref(), Some("stage.0.name"));
+    assert_eq!(refused.data.unwrap().field.as_deref(), Some("stage.0.flat_field"));
 }
 
 #[test]

@@ -290,7 +290,8 @@ mod tests {
         let unknown = read(json!({"plan": "", "plann": ""}));
         assert_eq!(unknown.data.unwrap().field.as_deref(), Some("plann"));
         let missing = read(json!({}));
-        assert_eq!((missing.name(), missing.data.unwrap().field), (Some(ErrorCode::InvalidParams), None));
+        assert_eq!(missing.name(), Some(ErrorCode::InvalidParams));
+        assert_eq!(missing.data.unwrap().field.as_deref(), Some("plan"));
     }
 
     #[test]

@@ -48,7 +48,7 @@ fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
         let (exit, out, err) = run(&daemon, &["run", &plan(&daemon, text)]);
         assert_eq!(exit, code, "{text}: {out}{err}");
         assert!(out.contains(wanted) && out.contains(session().to_str().unwrap()), "{text}: {out}");
-        assert!(err.contains("37/75 points") && err.contains("4 lost (4 camera gap)"), "{text}: {err}");
+        assert!(err.contains("37/75 stored") && err.contains("4 lost (4 camera gap)"), "{text}: {err}");
         assert_eq!(out.contains("report.html"), text != "fault", "{text}: {out}");
         assert_eq!(err.contains("unplugged"), text == "fault", "{text}: {err}");
     }
@@ -86,7 +86,7 @@ fn every_other_command_prints_for_people_and_for_programs() {
     let daemon = Daemon::start();
     let plan = plan(&daemon, "hang");
     for (arguments, human, json) in [
-        (vec!["status"], "37 of 75 stored", "/progress/points_stored"),
+        (vec!["status"], "stored     37 of 75", "/progress/points_stored"),
         (vec!["status"], "parked, light off; light is armed", "/mirror/parked"),
         (vec!["arm-light"], "until the next boot", ""),
         (vec!["describe"], "operator  Starts a run", "/methods/0/params/type"),
