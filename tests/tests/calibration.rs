@@ -177,8 +177,7 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
     assert_eq!(first.state, "complete", "{:?}", first.error);
     let current = current_in(&bench.folder.path().join("sessions"));
     let npz = fs::read(current.join("calibration.npz")).unwrap();
-    let refusal =
-        |bench: &Bench| Control::check(&*bench.runner, SWEEP).unwrap_err().message;
+    let refusal = |bench: &Bench| Control::check(&*bench.runner, SWEEP).unwrap_err().message;
     let mut damaged = npz.clone();
     damaged[npz.len() / 2] ^= 1;
     fs::write(current.join("calibration.npz"), damaged).unwrap();
