@@ -423,8 +423,8 @@ fn filtered(transport: ArrayView4<'_, f32>, mosaic: Mosaic) -> Array3<f32> {
     seen
 }
 
-/// Projector row of the scene's first row: `given`, or a value that centres the scene in the frame as far as the
-/// camera's rows, `row_pitch` projector rows each, allow.
+/// Projector row of the scene's first row: `given`, or a value that centres the camera's rows, `row_pitch` projector rows
+/// each, in the frame as far as the scene allows.
 ///
 /// # Errors
 /// When the scene or the camera rows do not fit.
@@ -437,7 +437,7 @@ pub fn first_scene_row(
     let (scene_rows, (camera_height, _)) = (scene.rows(), scene.size());
     let camera_rows = ((camera_height - 1) as f64 * row_pitch).round() as usize + 1;
     let spare = |rows: usize| raster.rows.saturating_sub(rows);
-    let first_row = given.unwrap_or_else(|| (spare(scene_rows) / 2).min(spare(camera_rows)));
+    let first_row = given.unwrap_or_else(|| (spare(camera_rows) / 2).min(spare(scene_rows)));
     if first_row + scene_rows > raster.rows {
         return Err(SimError::SceneRows { scene_rows, first_row, projector_rows: raster.rows });
     }

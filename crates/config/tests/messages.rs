@@ -198,6 +198,7 @@ fn dot_rig() {
             &["mirror.response.0.f0_hz"],
         ),
         ("unknown limit", mirror("limits.tilt = 3"), &["mirror.limits.tilt"]),
+        ("a limit without the others", mirror("limits.max_tilt = 3"), &["mirror.limits"]),
         (
             "too large a step",
             mirror(
@@ -214,6 +215,7 @@ fn rig_of_either_kind() {
     let cases: [Case; _] = [
         ("the file is empty", String::new(), &["kind"]),
         ("unknown kind", "kind = \"lines\"\n".into(), &["kind"]),
+        ("a plan", "kind = \"sweep\"\n".into(), &["kind"]),
     ];
     insta::assert_snapshot!(messages("rig.toml", AnyRigFile::parse, &cases));
 }
@@ -226,6 +228,12 @@ fn sweep_plan() {
         ("the file is empty", String::new(), &["kind"]),
         ("a quote is missing", "kind = \"sweep\n".into(), &["-"]),
         ("unknown kind", "kind = \"swep\"\n".into(), &["kind"]),
+        ("a rig file", PLANE.into(), &["kind"]),
+        ("half a frame", sweep("average = 2.5"), &["sweep.average"]),
+        ("too many frames for the type", sweep("average = 5000000000"), &["sweep.average"]),
+        ("a text for a range", sweep("delay_us = \"all\""), &["sweep.delay_us"]),
+        ("a delay twice", sweep("delay_us = [0, 0, 10]"), &["sweep.delay_us"]),
+        ("an exposure twice", sweep("exposure_us = [600, 600]"), &["sweep.exposure_us"]),
         ("no name", plan("name = \"  \""), &["name"]),
         ("a key outside its table", plan("average = 8"), &["average"]),
         ("the table of another kind", plan("[film]\ncycles = 3"), &["film"]),
@@ -355,6 +363,7 @@ fn product_of_the_command_line() {
     let mut shown = String::new();
     for (name, argument, field) in [
         ("a value is missing", "kind =", None),
+        ("no keys", "epipolar", None),
         ("no kind", "width_rows = 5", Some("product.0")),
         ("an edge that is no number", "kind = \"band\", from_rows = nan", Some("product.0.from_rows")),
     ] {

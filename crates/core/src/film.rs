@@ -23,8 +23,8 @@ pub struct FilmSummary {
     pub cycles_per_s: Option<f64>,
     /// Time from the end of a cycle's last exposure to the publication of its transport; `None` on a virtual clock.
     pub latency_ms: Option<Percentiles>,
-    /// By how much later than calibrated light was taken to arrive after the first cycles; `None` without a calibration,
-    /// or for a film of few cycles.
+    /// By how much later than calibrated light was taken to arrive after the first cycles; `None` without a
+    /// calibration, or for a film of few cycles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub late_us: Option<f64>,
     /// What the first cycles showed to be wrong with the calibration.

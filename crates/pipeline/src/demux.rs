@@ -120,8 +120,8 @@ impl DemuxFold {
         taken.get(&self.schedule.dark_of(point.exposure_us)?).cloned()
     }
 
-    /// The sweep in these images of camera rows `rows`, without those whose dark image is missing. Each image is dropped
-    /// as soon as it is in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
+    /// The sweep in these images of camera rows `rows`, without those whose dark image is missing. Each image is
+    /// dropped as soon as it is in the stack: unless a clone of the fold shares it, a sweep is held in memory once, not twice.
     fn stack(
         &self,
         rows: &[usize],

@@ -171,7 +171,8 @@ impl FilmSolver {
     }
 
     /// The transport from one frame of each setting, in the settings' order, with the delays and the exposure that the
-    /// camera states. `dark` is the image `[t, s]` without light. Stops early, with an error, soon after `go_on` returns false.
+    /// camera states. `dark` is the image `[t, s]` without light. Stops early, with an error, soon after `go_on`
+    /// returns false.
     ///
     /// It does not start from the previous cycle's transport: the noise of single frames determines which rows are 0,
     /// so this would save no steps (5.2 per pixel with and without), and the bits would depend on what was solved

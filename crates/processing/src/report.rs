@@ -44,7 +44,14 @@ pub(crate) fn accounts(state: &State) -> Vec<Block> {
     if let Some(end) = &state.end {
         let light = end.light_s.map(|s| ("first to last frame with light", format!("{s:.2} s")));
         let latency = end.settings_latency.map(|SettingsLatency { min_frames, max_frames }| {
-            ("camera settings act", format!("{min_frames} to {max_frames} frames late"))
+            (
+                "camera settings act",
+                match (min_frames, max_frames) {
+                    (0, 0) => "with the next frame".to_owned(),
+                    (min, max) if min == max => format!("{min} frames late"),
+                    (min, max) => format!("{min} to {max} frames late"),
+                },
+            )
         });
         let facts: Vec<_> =
             light.into_iter().chain(latency).map(|(key, value)| (key.to_owned(), value)).collect();

@@ -33,7 +33,7 @@ struct Arguments {
     /// Socket for clients; under systemd's socket activation, the passed socket is used instead.
     #[arg(long, value_name = "PATH", default_value = "/run/raysweep/raysweepd.sock")]
     socket: PathBuf,
-    /// File with the newest live images, which clients map [default: `live` in the socket's folder]
+    /// File with the newest live images, which clients map [default: the socket's path with the extension `live`]
     #[arg(long, value_name = "PATH")]
     live: Option<PathBuf>,
     /// Data folder, in which sessions are stored.
@@ -128,7 +128,7 @@ fn live_file(arguments: &Arguments) -> Result<Option<LiveFile>, LiveError> {
     if let Some(path) = &arguments.live {
         return LiveFile::create(path).map(Some);
     }
-    let made = LiveFile::create(&arguments.socket.with_file_name("live"));
+    let made = LiveFile::create(&arguments.socket.with_extension("live"));
     Ok(made.map_err(|error| tracing::warn!(%error, "there will be no live images")).ok())
 }
 

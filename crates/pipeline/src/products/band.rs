@@ -182,14 +182,14 @@ impl Band {
         }
         let rows = match self.to_rows {
             Some(to_rows) => format!("{} to {to_rows} rows", self.from_rows),
-            None => format!("{} rows and more", self.from_rows),
+            None => format!("{} or more rows", self.from_rows),
         };
         let side = match self.side {
             Some(Side::Above) => "above the pixel's own",
             Some(Side::Below) => "below the pixel's own",
-            None => "away",
+            None => "away from the pixel's own",
         };
-        format!("light from projector rows {rows} {side}")
+        format!("light that left the projector {rows} {side}")
     }
 
     pub(super) fn make(self, name: String, transport: &Transport) -> Product {

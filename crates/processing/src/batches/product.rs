@@ -408,7 +408,7 @@ mod tests {
             ("kind = \"direct-global\"\ndistance_px = -1", "product.0.kind"),
             ("kind = \"floodlit\"\nname = \"a/b\"", "product.0.kind"),
             ("kind = \"floodlit\"\npixels = 3", "product.0.kind"),
-            ("kind = \"dual\"\n[[product]]\nkind = \"dual\"", "product.1.name"),
+            ("kind = \"dual\"\n[[product]]\nkind = \"dual\"", "product.1.kind"),
         ];
         let mut shown = String::new();
         for (product, field) in cases {

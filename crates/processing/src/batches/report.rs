@@ -106,7 +106,7 @@ fn planes(calibration: &Calibration, task: &DotTask) -> Section {
             "neighbours of a dot, itself among them",
             format!("{:.1} in the mean", neighbours as f64 / seen.max(1) as f64),
         ),
-        ("dots that are not one piece", calibration.not_unimodal.to_string()),
+        ("dots that fall into several pieces on the plane", calibration.not_unimodal.to_string()),
     ];
     if let Some(px) = calibration.radius_px {
         entries.push(("radius of a dot", format!("{px:.1} px")));

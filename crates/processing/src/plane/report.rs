@@ -58,7 +58,7 @@ pub(crate) fn settings(state: &State, task: &PlaneTask) -> Block {
         (
             "projector rows",
             format!(
-                "{}, the camera's first sees row {}, each of its rows {} further",
+                "{}; camera row 0 sees projector row {}; each camera row sees {} rows further down than the one before",
                 geometry.raster.rows, geometry.first_row, geometry.row_pitch
             ),
         ),
@@ -79,7 +79,7 @@ fn row_times(geometry: &SweepGeometry) -> String {
     let is_measured = geometry.row_table_us.is_some() || geometry.calibration.is_some();
     let table = if is_measured { ", by the measured table" } else { "" };
     format!(
-        "projector {} µs{table}, camera {:.4} µs",
+        "projector {:.4} µs{table}, camera {:.4} µs",
         geometry.raster.row_time_us, geometry.camera_row_time_us
     )
 }

@@ -29,12 +29,18 @@ pub(super) fn section(findings: &Findings) -> Section {
 fn curve(findings: &Findings) -> Option<Block> {
     let choice = findings.choice.as_ref()?;
     let row = |(index, candidate): (usize, &raysweep_transport::plane::calibrate::Candidate)| {
-        let better = 100.0 * ((candidate.log_ratio / 2.0).exp() - 1.0);
-        let error = 100.0 * candidate.standard_error / 2.0;
+        // Errors are those of the logarithm, so that they agree with the reason above the table.
+        let change = |errors: f64| {
+            100.0 * (((candidate.log_ratio + errors * candidate.standard_error) / 2.0).exp() - 1.0)
+        };
         vec![
             prior_name(candidate.prior),
             format!("{:.5}", candidate.residual),
-            if index == 0 { "—".into() } else { format!("{better:+.1} ± {error:.1} %") },
+            if index == 0 {
+                "—".into()
+            } else {
+                format!("{:+.1} % ({:+.1} to {:+.1})", change(0.0), change(-1.0), change(1.0))
+            },
             if index == choice.chosen { "taken".into() } else { String::new() },
         ]
     };
@@ -42,7 +48,7 @@ fn curve(findings: &Findings) -> Option<Block> {
         headers: vec![
             "prior".into(),
             "held-out residual".into(),
-            "against the default".into(),
+            "against the default (within one standard error)".into(),
             String::new(),
         ],
         rows: choice.curve.iter().enumerate().map(row).collect(),
