@@ -175,7 +175,7 @@ fn predicted_errors_are_measured() {
     }
     let (cases, correlation) = (predicted.len() * scenes.len(), rank_correlation(&predicted, &found));
     println!("{inside} of {cases} inside, rank correlation of {} plans {correlation:.2}", predicted.len());
-    // Measured: 56 of 60, 0.97.
+    // Measured: 48 of 60, 0.94.
     assert!(4 * inside >= 3 * cases && correlation >= 0.8);
 }
 

@@ -158,7 +158,11 @@ mod tests {
     }
 
     fn push_all(fold: &mut DemuxFold, images: &Kept) {
-        for ((ordinal, point), image) in (0..).zip(schedule().points).zip(&images.0) {
+        push_points(fold, &schedule().points, images);
+    }
+
+    fn push_points(fold: &mut DemuxFold, points: &[Point], images: &Kept) {
+        for ((ordinal, point), image) in (0..).zip(points).zip(&images.0) {
             let unit = Unit {
                 id: SettingsId { point: ordinal, attempt: 0 },
                 frames: 1,
@@ -171,6 +175,30 @@ mod tests {
             };
             fold.push(&unit, image.view());
         }
+    }
+
+    #[test]
+    fn direct_light_is_one_band_with_its_neighbours_unless_an_edge_tells_them_apart() {
+        let one_band = |step_us: f64, exposure_us: f64| {
+            let mut schedule = schedule();
+            for point in &mut schedule.points {
+                match point.role {
+                    PointRole::Sweep(index) => {
+                        (point.delay_us, point.exposure_us) =
+                            ((f64::from(index) - 4.0) * step_us, exposure_us);
+                    }
+                    PointRole::Dark(0) => point.exposure_us = exposure_us,
+                    _ => {}
+                }
+            }
+            let images = schedule.points.iter().enumerate().map(|(ordinal, point)| image(ordinal, point));
+            let mut fold = DemuxFold::new(DemuxOptions::default(), &schedule, &geometry()).unwrap();
+            push_points(&mut fold, &schedule.points, &Kept(images.collect()));
+            fold.finish(&|| true).unwrap().stack.one_band
+        };
+        // Edges lie 2.5 rows of 20 us from the direct row and further; with the other delays, a quarter of a row.
+        assert!(one_band(100.0, 100.0));
+        assert!(!one_band(25.0, 60.0));
     }
 
     /// The same rig, calibrated: its white level falls off to one side, and a corner is not lit.

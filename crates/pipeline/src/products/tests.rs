@@ -139,6 +139,10 @@ fn a_band_and_what_lies_on_either_side_of_it_are_all_light() {
 fn relighting_by_all_rows_by_pieces_and_by_complementary_stripes_agree() {
     let all = image(json!({ "kind": "relight", "rows": [{ "first": 0, "last": 9 }] }));
     assert_eq!(all, transport().total());
+    let ideal = json!({ "kind": "relight", "beam": "ideal", "rows": [{ "first": 0, "last": 9 }] });
+    assert_eq!(image(ideal), all, "the rig's beam is ideal");
+    let unknown = json!({ "kind": "relight", "beam": "wide", "rows": [{ "first": 0, "last": 9 }] });
+    assert_eq!(spec(&unknown).unwrap_err().path, ["beam"]);
     let overlapping = json!([{ "first": 0, "last": 9, "weight": 0.5 }, { "first": 0, "last": 6, "weight": 0.5 },
         { "first": 7, "last": 9, "weight": 0.5 }]);
     assert_eq!(image(json!({ "kind": "relight", "rows": overlapping })), all);
