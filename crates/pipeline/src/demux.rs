@@ -26,6 +26,20 @@ struct SweepImage {
     setting: Setting,
     /// Mean counts.
     image: Array2<f32>,
+    /// Where any of its frames saturates; `None` if nowhere, or if it is not known.
+    clipped: Option<Array2<bool>>,
+}
+
+impl SweepImage {
+    /// Where neither the mean nor, as far as it is known, any of its frames reaches `saturation_dn`, `[t, s]`. Noise
+    /// clips single frames of means that stay below.
+    fn valid(&self, saturation_dn: f64) -> Array2<bool> {
+        let mut valid = self.image.mapv(|counts| f64::from(counts) < saturation_dn);
+        if let Some(clipped) = &self.clipped {
+            valid.zip_mut_with(clipped, |valid, &clipped| *valid &= !clipped);
+        }
+        valid
+    }
 }
 
 /// Collects a sweep and demultiplexes it. Clones share the images.
@@ -138,7 +152,8 @@ impl DemuxFold {
         }
         let white = self.geometry.white_of(rows);
         let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
-        let saturates = |taken: &Arc<SweepImage>| self.valid(taken.image.view()).iter().any(|valid| !valid);
+        let valid_of = |taken: &SweepImage| taken.valid(self.geometry.saturation_dn);
+        let saturates = |taken: &Arc<SweepImage>| valid_of(taken).iter().any(|valid| !valid);
         let shape = (taken.len(), rows.len(), self.geometry.width);
         let is_masked = measured.iter().any(|measured| !measured) || taken.values().any(saturates);
         let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
@@ -148,7 +163,7 @@ impl DemuxFold {
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&(self.valid(sample.image.view()) & &measured));
+                valid.index_axis_mut(Axis(0), index).assign(&(valid_of(&sample) & &measured));
             }
             if let Some(dark) = self.dark_of(&darks, role) {
                 images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * &scale));
@@ -207,15 +222,11 @@ impl DemuxFold {
         if let Some((regular, dark)) = regular {
             let [image, dark] = [&regular, &dark].map(|taken| taken.image.slice(s![inner.clone(), ..]));
             let light = (&image - &dark) / white.mapv(|dn| dn as f32);
-            tally.add_regular(&self.valid(image), &measured, &light, &transport);
+            let valid = regular.valid(self.geometry.saturation_dn).slice_move(s![inner, ..]);
+            tally.add_regular(&valid, &measured, &light, &transport);
             stack.regular = Some(light);
         }
         Ok(Strip { first_row, stack, transport })
-    }
-
-    /// Where an image is not saturated.
-    fn valid(&self, image: ArrayView2<'_, f32>) -> Array2<bool> {
-        image.mapv(|counts| f64::from(counts) < self.geometry.saturation_dn)
     }
 }
 
@@ -227,9 +238,9 @@ impl DemuxFold {
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {
-                drop(
-                    self.taken.insert(point.role, Arc::new(SweepImage { setting, image: image.to_owned() })),
-                );
+                let clipped = unit.clipped.as_ref().map(|frames| frames.mapv(|frames| frames > 0));
+                let taken = SweepImage { setting, image: image.to_owned(), clipped };
+                drop(self.taken.insert(point.role, Arc::new(taken)));
             }
         }
     }

@@ -37,5 +37,5 @@ pub use schedule::{Point, PointRole, Schedule, Shot, Spot, SpotScan, SweepGeomet
 pub use stack::SweepStack;
 pub use stage::{HotPixels, PlaneStage, Stage, StageError, Stages, message_of, run_stages};
 pub use stage_refused::StageRefused;
-pub use strips::{ImageRows, InStrips, NotSolved, Strip};
+pub use strips::{ImageRows, InStrips, NotSolved, PointRows, Strip};
 pub use unit::Unit;

@@ -183,7 +183,12 @@ pub fn place(role: PointRole) -> (ArrayName, usize) {
 }
 
 /// A stored point, in the form in which the pipeline delivered it.
-pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
+pub(crate) fn unit_of(
+    ordinal: u32,
+    entry: &PointEntry,
+    sum: Array2<u32>,
+    clipped: Option<Array2<u32>>,
+) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.attempt },
         frames: entry.frames,
@@ -192,6 +197,7 @@ pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Uni
         delays_us: entry.delays_us.clone(),
         last_exposure_ns: None,
         sum: Arc::new(sum),
+        clipped: clipped.map(Arc::new),
         counts: entry.counts.clone(),
     }
 }
