@@ -14,6 +14,7 @@ use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting, Transport
 pub use self::options::{DEMUX, DemuxOptions};
 use self::tally::Tally;
 pub use self::tally::{PREDICTED_SHARE, SweepSummary};
+use crate::bracket::BracketImage;
 use crate::findings::{Choices, choose, rows_to_choose_by};
 use crate::schedule::{PointRole, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
@@ -196,11 +197,28 @@ impl DemuxFold {
     }
 
     /// Chooses how to demultiplex, from a stack that contains only the rows of [`rows_to_choose_by`].
-    fn choose(&self, stack: SweepStack) -> Result<Choices, NotSolved> {
+    fn choose(&self, stack: SweepStack, bracket: Option<BracketImage>) -> Result<Choices, NotSolved> {
         let rows = rows_to_choose_by(self.geometry.height);
+        let bracket = bracket.map(|image| (image, stack.clone()));
         self.demux()
             .and_then(|planned| choose(&planned, &self.options, &self.geometry, &rows, stack))
+            .and_then(|choices| match bracket {
+                Some((image, stack)) => choices.with_bracket(image, &rows, stack),
+                None => Ok(choices),
+            })
             .map_err(refused)
+    }
+
+    /// The image under less light among these images of all camera rows, if it and its dark image were taken.
+    fn bracket(&self, taken: &BTreeMap<PointRole, Arc<SweepImage>>) -> Option<BracketImage> {
+        let role = self.schedule.bracket()?.role;
+        let (bracket, dark) = taken.get(&role).zip(self.dark_of(taken, role))?;
+        let white = self.geometry.white_of(&(0..self.geometry.height).collect::<Vec<_>>());
+        Some(BracketImage {
+            setting: bracket.setting.clone(),
+            image: (&bracket.image - &dark.image) / white.mapv(|dn| dn as f32),
+            valid: bracket.valid(self.geometry.saturation_dn) & white.mapv(f64::is_finite),
+        })
     }
 
     /// Stack and transport of some camera rows; adds their figures and warnings to `tally`.
@@ -259,8 +277,9 @@ impl DemuxFold {
         let taken = std::mem::take(&mut self.taken);
         let mut tally = Tally::default();
         let height = self.geometry.height;
+        let bracket = self.bracket(&taken);
         let held = self.hold(0..height, taken)?;
-        let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)))?;
+        let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)), bracket)?;
         let Strip { stack, transport, .. } = self.strip(&choices, 0..height, held, &mut tally, go_on)?;
         Ok(Solved { stack, transport, summary: tally.summary(choices.findings) })
     }

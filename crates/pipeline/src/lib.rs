@@ -4,6 +4,7 @@
 //! This crate accesses no devices, files or sockets. Threads are named `std` threads, workers are rayon's.
 
 mod assembler;
+mod bracket;
 mod calibrated;
 mod demux;
 pub mod dots;

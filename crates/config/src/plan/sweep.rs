@@ -16,6 +16,16 @@ pub struct SweepPlan {
     pub average: u32,
     /// Frames whose measured delay deviates by more than this are dropped and taken again.
     pub max_jitter_us: f64,
+    /// One more image under less light, for pixels that saturate; `None`: not taken.
+    pub bracket: Option<BracketPlan>,
+}
+
+/// `sweep.bracket`: the image under less light.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BracketPlan {
+    /// Level of the grey picture that the projector shows, as a share of white.
+    pub light: f64,
 }
 
 impl Default for SweepPlan {
@@ -25,6 +35,7 @@ impl Default for SweepPlan {
             exposure_us: Axis::Range { start: 600.0, stop: 1200.0, count: 5 },
             average: 8,
             max_jitter_us: 50.0,
+            bracket: None,
         }
     }
 }
@@ -115,6 +126,14 @@ impl SweepPlan {
             document.refuse(&["sweep", "average"], message);
         }
         document.check_positive(&["sweep", "max_jitter_us"], self.max_jitter_us, "microseconds");
+        if let Some(BracketPlan { light }) = self.bracket
+            && !(light > 0.0 && light < 1.0)
+        {
+            let message = format!(
+                "sweep.bracket.light = {light}: must be more than 0 and less than 1, a share of white; 0.125 suits highlights of up to 8 times the limit"
+            );
+            document.refuse(&["sweep", "bracket", "light"], message);
+        }
     }
 }
 
@@ -130,6 +149,17 @@ mod tests {
         assert_eq!((sweep.delay_us.values()[0], sweep.delay_us.values()[14]), (-1500.0, 1500.0));
         assert_eq!(sweep.exposure_us.values(), [600.0, 750.0, 900.0, 1050.0, 1200.0]);
         assert_eq!(parse("kind = \"sweep\"").unwrap().stages[0].name, "demux");
+    }
+
+    #[test]
+    fn a_bracket_is_a_share_of_white() {
+        let sweep = |light: &str| parse(&format!("kind = \"sweep\"\n[sweep]\nbracket = {{ light = {light} }}"));
+        assert!(sweep("0.125").is_ok());
+        for light in ["0.0", "1.0", "-0.5", "nan"] {
+            let error = sweep(light).unwrap_err().to_string();
+            assert!(error.contains("sweep.bracket.light"), "{error}");
+        }
+        assert!(parse("kind = \"sweep\"\n[sweep]\nbracket = { level = 0.1 }").is_err());
     }
 
     #[test]

@@ -29,7 +29,16 @@ impl DemuxFold {
         let not_kept = self.not_kept.take().unwrap_or_default();
         let height = self.geometry.height;
         let sampled = self.read_to_choose_by(&not_kept, images, go_on)?;
-        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?)?;
+        let bracket = match self.schedule.bracket() {
+            Some(point) => {
+                let roles = [Some(point.role), self.schedule.dark_of(point.exposure_us)];
+                let mut taken = not_kept.clone();
+                taken.retain(|role, _| roles.contains(&Some(*role)));
+                self.bracket(&read_rows(&taken, images, &(0..height))?)
+            }
+            None => None,
+        };
+        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?, bracket)?;
         let mut tally = Tally::default();
         for first_row in (0..height).step_by(strip_rows) {
             let rows = first_row..height.min(first_row + strip_rows);

@@ -176,7 +176,7 @@ fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
 /// Position of a point in the stack.
 pub fn place(role: PointRole) -> (ArrayName, usize) {
     match role {
-        PointRole::Sweep(index) => (ArrayName::Sum, index as usize),
+        PointRole::Sweep(index) | PointRole::Bracket(index) => (ArrayName::Sum, index as usize),
         PointRole::Dark(index) => (ArrayName::Dark, index as usize),
         PointRole::Regular => (ArrayName::Regular, 0),
     }
