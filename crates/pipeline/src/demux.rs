@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{Array2, Array3, ArrayView2, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, Axis, Zip, s};
 use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting, Transport};
 
 pub use self::options::{DEMUX, DemuxOptions};
@@ -53,6 +53,8 @@ pub struct DemuxFold {
     taken: BTreeMap<PointRole, Arc<SweepImage>>,
     /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
     not_kept: Option<BTreeMap<PointRole, (u32, Setting)>>,
+    /// Pixels that a stage replaced in some image, `[t, s]`; `None` if none.
+    filled: Option<Arc<Array2<bool>>>,
 }
 
 /// The camera rows of a sweep to be solved, and the neighbouring rows on which they depend.
@@ -109,7 +111,7 @@ impl DemuxFold {
         options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new(), not_kept: None };
+        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new(), not_kept: None, filled: None };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -179,6 +181,8 @@ impl DemuxFold {
             images,
             valid,
             regular: None,
+            regular_valid: None,
+            filled: None,
             noise: None,
             variance_ratio: None,
             u0_rows: None,
@@ -235,6 +239,7 @@ impl DemuxFold {
         let inner = rows.start - held_from..rows.end - held_from;
         let white = self.geometry.white_of(&rows.clone().collect::<Vec<_>>());
         let measured = white.mapv(f64::is_finite);
+        let solved = rows.clone();
         let transport = choices.solve(rows, held_from, &mut stack, go_on).map_err(refused)?;
         tally.add_sweep(stack.settings.len(), &measured, &transport);
         if let Some((regular, dark)) = regular {
@@ -243,7 +248,9 @@ impl DemuxFold {
             let valid = regular.valid(self.geometry.saturation_dn).slice_move(s![inner, ..]);
             tally.add_regular(&valid, &measured, &light, &transport);
             stack.regular = Some(light);
+            stack.regular_valid = Some(valid);
         }
+        stack.filled = self.filled.as_ref().map(|filled| filled.slice(s![solved, ..]).to_owned());
         Ok(Strip { first_row, stack, transport })
     }
 }
@@ -260,6 +267,16 @@ impl DemuxFold {
                 let taken = SweepImage { setting, image: image.to_owned(), clipped };
                 drop(self.taken.insert(point.role, Arc::new(taken)));
             }
+        }
+    }
+
+    /// Notes which pixels of a unit's image its stages replaced.
+    pub fn note_filled(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
+        let raw = unit.mean();
+        if raw != image {
+            let none = || Arc::new(Array2::from_elem(image.dim(), false));
+            let filled = Arc::make_mut(self.filled.get_or_insert_with(none));
+            Zip::from(filled).and(&raw).and(image).for_each(|filled, raw, image| *filled |= raw != image);
         }
     }
 

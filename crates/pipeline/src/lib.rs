@@ -32,6 +32,7 @@ pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};
 pub use product::{Product, Profile};
+pub use products::mask;
 pub use products::{Assembly, NotMade, ProductError, ProductSpec};
 pub use queue::{Input, Policy, QueueError, Receiver};
 pub use schedule::{Point, PointRole, Schedule, Shot, Spot, SpotScan, SweepGeometry};

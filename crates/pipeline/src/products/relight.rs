@@ -1,6 +1,6 @@
 //! Product `relight`: the scene lit by a pattern of projector rows.
 
-use ndarray::{Array1, Array3, Axis};
+use ndarray::{Array1, Array2, Array3, Axis};
 use raysweep_transport::plane::{PlaneError, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
@@ -121,6 +121,7 @@ impl RowPattern {
         timing: &RowTiming,
         first_row: usize,
         transport: &Transport,
+        mask: Array2<u8>,
     ) -> Result<Product, PlaneError> {
         let rows = timing.projector_rows();
         let reach = reach_of(transport);
@@ -163,9 +164,10 @@ impl RowPattern {
                     axis: "first lit projector row".into(),
                     at: tops.into_iter().map(|top| top as f64).collect(),
                     images,
+                    mask,
                 });
             }
         };
-        Ok(Product::Image { name, about: format!("{about}; {reach}"), image: under(&weights)? })
+        Ok(Product::Image { name, about: format!("{about}; {reach}"), image: under(&weights)?, mask })
     }
 }

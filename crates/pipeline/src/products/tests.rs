@@ -80,6 +80,8 @@ fn stack() -> SweepStack {
         images: ndarray::stack(Axis(0), &views).unwrap(),
         valid: None,
         regular: None,
+        regular_valid: None,
+        filled: None,
         noise: None,
         variance_ratio: None,
         u0_rows: None,

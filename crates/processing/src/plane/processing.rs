@@ -82,7 +82,14 @@ impl Processing {
     /// Gives the demultiplexer a unit's image. If it panics, it is dropped, with its products.
     pub fn push(&mut self, unit: &Unit, image: &Array2<f32>) {
         let Some(demux) = &mut self.demux else { return };
-        if let Err(panic) = catch_unwind(AssertUnwindSafe(|| demux.push(unit, image.view()))) {
+        let has_stages = !self.stages.is_empty();
+        let push = || {
+            demux.push(unit, image.view());
+            if has_stages {
+                demux.note_filled(unit, image.view());
+            }
+        };
+        if let Err(panic) = catch_unwind(AssertUnwindSafe(push)) {
             self.problems.push(panicked(DEMUX, &*panic));
             self.demux = None;
         }
