@@ -45,6 +45,7 @@ fn observe(faults: &str) -> (Counts, Truth) {
         raster: rig.raster(),
         first_row: 0,
         max_jitter_us: 50.0,
+        saturation_dn: 4000.0,
         edge_gate_us: 500.0,
     });
     camera.arm().unwrap();

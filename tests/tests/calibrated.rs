@@ -162,6 +162,7 @@ impl Studio {
                 delays_us: vec![delay_us; 8],
                 last_exposure_ns: None,
                 sum: Arc::new(Array2::zeros((0, 0))),
+                clipped: None,
                 counts: Counts::default(),
             };
             fold.push(&unit, image.view());

@@ -103,6 +103,8 @@ pub struct AssemblerConfig {
     pub first_row: usize,
     /// Frames whose measured delay is off by more than this are not used.
     pub max_jitter_us: f64,
+    /// Counts from which a pixel of a frame is saturated.
+    pub saturation_dn: f64,
     /// Largest distance of an edge from its position expected from the last true edge.
     pub edge_gate_us: f64,
 }
@@ -151,6 +153,9 @@ enum Waiting {
 struct AttemptFrames {
     job: Job,
     sum: Array2<u32>,
+    /// In how many of the frames each pixel saturates. It takes no memory before one does.
+    clipped: Array2<u32>,
+    any_clipped: bool,
     averaged: u32,
     delays_us: Vec<f64>,
     counts: Counts,
@@ -283,6 +288,8 @@ impl Assembler {
         self.attempt = Some(AttemptFrames {
             job,
             sum: Array2::zeros((self.config.camera.height, self.config.camera.width)),
+            clipped: Array2::zeros((self.config.camera.height, self.config.camera.width)),
+            any_clipped: false,
             averaged: 0,
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
@@ -382,6 +389,7 @@ impl Assembler {
         else {
             return;
         };
+        let limit_dn = self.config.saturation_dn.ceil() as u16;
         let Some(attempt) = &mut self.attempt else { return };
         let (trigger, sound) = match verdict {
             Judgement::Sound { trigger, delay_us } => (Some(trigger), Ok(delay_us)),
@@ -409,9 +417,13 @@ impl Assembler {
             Ok(delay_us) => {
                 // An array created from zeros is one slice, row by row, like a frame.
                 let sums = attempt.sum.as_slice_mut().unwrap_or_default();
-                if let Err(error) = frame.format.add_to(&frame.data, sums) {
-                    tracing::warn!(%error, seq = frame.stamp.seq, "frame does not match its format");
-                    return attempt.counts.lose(LossCause::SettingsMismatch, 1);
+                let clipped = attempt.clipped.as_slice_mut().unwrap_or_default();
+                match frame.format.add_counting(&frame.data, sums, limit_dn, clipped) {
+                    Ok(any) => attempt.any_clipped |= any,
+                    Err(error) => {
+                        tracing::warn!(%error, seq = frame.stamp.seq, "frame does not match its format");
+                        return attempt.counts.lose(LossCause::SettingsMismatch, 1);
+                    }
                 }
                 attempt.averaged += 1;
                 attempt.delays_us.push(delay_us);
@@ -450,6 +462,7 @@ impl AttemptFrames {
             delays_us: self.delays_us,
             last_exposure_ns: self.last_exposure_ns,
             sum: Arc::new(self.sum),
+            clipped: self.any_clipped.then(|| Arc::new(self.clipped)),
             counts: self.counts,
         })
     }

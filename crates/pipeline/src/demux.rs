@@ -8,12 +8,13 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{Array2, Array3, ArrayView2, Axis, s};
+use ndarray::{Array2, Array3, ArrayView2, Axis, Zip, s};
 use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting, Transport};
 
 pub use self::options::{DEMUX, DemuxOptions};
 use self::tally::Tally;
 pub use self::tally::{PREDICTED_SHARE, SweepSummary};
+use crate::bracket::BracketImage;
 use crate::findings::{Choices, choose, rows_to_choose_by};
 use crate::schedule::{PointRole, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
@@ -26,6 +27,20 @@ struct SweepImage {
     setting: Setting,
     /// Mean counts.
     image: Array2<f32>,
+    /// Where any of its frames saturates; `None` if nowhere, or if it is not known.
+    clipped: Option<Array2<bool>>,
+}
+
+impl SweepImage {
+    /// Where neither the mean nor, as far as it is known, any of its frames reaches `saturation_dn`, `[t, s]`. Noise
+    /// clips single frames of means that stay below.
+    fn valid(&self, saturation_dn: f64) -> Array2<bool> {
+        let mut valid = self.image.mapv(|counts| f64::from(counts) < saturation_dn);
+        if let Some(clipped) = &self.clipped {
+            valid.zip_mut_with(clipped, |valid, &clipped| *valid &= !clipped);
+        }
+        valid
+    }
 }
 
 /// Collects a sweep and demultiplexes it. Clones share the images.
@@ -38,6 +53,8 @@ pub struct DemuxFold {
     taken: BTreeMap<PointRole, Arc<SweepImage>>,
     /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
     not_kept: Option<BTreeMap<PointRole, (u32, Setting)>>,
+    /// Pixels that a stage replaced in some image, `[t, s]`; `None` if none.
+    filled: Option<Arc<Array2<bool>>>,
 }
 
 /// The camera rows of a sweep to be solved, and the neighbouring rows on which they depend.
@@ -94,7 +111,15 @@ impl DemuxFold {
         options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new(), not_kept: None };
+        let fold = Self {
+            options,
+            schedule,
+            geometry,
+            timing,
+            taken: BTreeMap::new(),
+            not_kept: None,
+            filled: None,
+        };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }
@@ -138,7 +163,8 @@ impl DemuxFold {
         }
         let white = self.geometry.white_of(rows);
         let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
-        let saturates = |taken: &Arc<SweepImage>| self.valid(taken.image.view()).iter().any(|valid| !valid);
+        let valid_of = |taken: &SweepImage| taken.valid(self.geometry.saturation_dn);
+        let saturates = |taken: &Arc<SweepImage>| valid_of(taken).iter().any(|valid| !valid);
         let shape = (taken.len(), rows.len(), self.geometry.width);
         let is_masked = measured.iter().any(|measured| !measured) || taken.values().any(saturates);
         let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
@@ -148,7 +174,7 @@ impl DemuxFold {
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
-                valid.index_axis_mut(Axis(0), index).assign(&(self.valid(sample.image.view()) & &measured));
+                valid.index_axis_mut(Axis(0), index).assign(&(valid_of(&sample) & &measured));
             }
             if let Some(dark) = self.dark_of(&darks, role) {
                 images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * &scale));
@@ -163,6 +189,8 @@ impl DemuxFold {
             images,
             valid,
             regular: None,
+            regular_valid: None,
+            filled: None,
             noise: None,
             variance_ratio: None,
             u0_rows: None,
@@ -182,11 +210,28 @@ impl DemuxFold {
     }
 
     /// Chooses how to demultiplex, from a stack that contains only the rows of [`rows_to_choose_by`].
-    fn choose(&self, stack: SweepStack) -> Result<Choices, NotSolved> {
+    fn choose(&self, stack: SweepStack, bracket: Option<BracketImage>) -> Result<Choices, NotSolved> {
         let rows = rows_to_choose_by(self.geometry.height);
+        let bracket = bracket.map(|image| (image, stack.clone()));
         self.demux()
             .and_then(|planned| choose(&planned, &self.options, &self.geometry, &rows, stack))
+            .and_then(|choices| match bracket {
+                Some((image, stack)) => choices.with_bracket(image, &rows, stack),
+                None => Ok(choices),
+            })
             .map_err(refused)
+    }
+
+    /// The image under less light among these images of all camera rows, if it and its dark image were taken.
+    fn bracket(&self, taken: &BTreeMap<PointRole, Arc<SweepImage>>) -> Option<BracketImage> {
+        let role = self.schedule.bracket()?.role;
+        let (bracket, dark) = taken.get(&role).zip(self.dark_of(taken, role))?;
+        let white = self.geometry.white_of(&(0..self.geometry.height).collect::<Vec<_>>());
+        Some(BracketImage {
+            setting: bracket.setting.clone(),
+            image: (&bracket.image - &dark.image) / white.mapv(|dn| dn as f32),
+            valid: bracket.valid(self.geometry.saturation_dn) & white.mapv(f64::is_finite),
+        })
     }
 
     /// Stack and transport of some camera rows; adds their figures and warnings to `tally`.
@@ -203,20 +248,19 @@ impl DemuxFold {
         let inner = rows.start - held_from..rows.end - held_from;
         let white = self.geometry.white_of(&rows.clone().collect::<Vec<_>>());
         let measured = white.mapv(f64::is_finite);
+        let solved = rows.clone();
         let transport = choices.solve(rows, held_from, &mut stack, go_on).map_err(refused)?;
         tally.add_sweep(stack.settings.len(), &measured, &transport);
         if let Some((regular, dark)) = regular {
             let [image, dark] = [&regular, &dark].map(|taken| taken.image.slice(s![inner.clone(), ..]));
             let light = (&image - &dark) / white.mapv(|dn| dn as f32);
-            tally.add_regular(&self.valid(image), &measured, &light, &transport);
+            let valid = regular.valid(self.geometry.saturation_dn).slice_move(s![inner, ..]);
+            tally.add_regular(&valid, &measured, &light, &transport);
             stack.regular = Some(light);
+            stack.regular_valid = Some(valid);
         }
+        stack.filled = self.filled.as_ref().map(|filled| filled.slice(s![solved, ..]).to_owned());
         Ok(Strip { first_row, stack, transport })
-    }
-
-    /// Where an image is not saturated.
-    fn valid(&self, image: ArrayView2<'_, f32>) -> Array2<bool> {
-        image.mapv(|counts| f64::from(counts) < self.geometry.saturation_dn)
     }
 }
 
@@ -228,10 +272,20 @@ impl DemuxFold {
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {
-                drop(
-                    self.taken.insert(point.role, Arc::new(SweepImage { setting, image: image.to_owned() })),
-                );
+                let clipped = unit.clipped.as_ref().map(|frames| frames.mapv(|frames| frames > 0));
+                let taken = SweepImage { setting, image: image.to_owned(), clipped };
+                drop(self.taken.insert(point.role, Arc::new(taken)));
             }
+        }
+    }
+
+    /// Notes which pixels of a unit's image its stages replaced.
+    pub fn note_filled(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
+        let raw = unit.mean();
+        if raw != image {
+            let none = || Arc::new(Array2::from_elem(image.dim(), false));
+            let filled = Arc::make_mut(self.filled.get_or_insert_with(none));
+            Zip::from(filled).and(&raw).and(image).for_each(|filled, raw, image| *filled |= raw != image);
         }
     }
 
@@ -249,8 +303,9 @@ impl DemuxFold {
         let taken = std::mem::take(&mut self.taken);
         let mut tally = Tally::default();
         let height = self.geometry.height;
+        let bracket = self.bracket(&taken);
         let held = self.hold(0..height, taken)?;
-        let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)))?;
+        let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)), bracket)?;
         let Strip { stack, transport, .. } = self.strip(&choices, 0..height, held, &mut tally, go_on)?;
         Ok(Solved { stack, transport, summary: tally.summary(choices.findings) })
     }

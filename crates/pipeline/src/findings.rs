@@ -13,6 +13,7 @@ use raysweep_transport::plane::{
     Beam, Coupled, Coupling, Demux, NoiseModel, PlaneError, Prior, RowTiming, Transport,
 };
 
+use crate::bracket::BracketImage;
 use crate::calibrated;
 use crate::demux::DemuxOptions;
 use crate::schedule::{Spot, SweepGeometry};
@@ -180,6 +181,39 @@ impl Findings {
 }
 
 impl Choices {
+    /// The same with an image under less light for pixels that saturate, whose level is found from the rows of
+    /// [`rows_to_choose_by`]: `stack` contains only the camera rows `rows`.
+    ///
+    /// # Errors
+    /// If the stack does not give a valid model.
+    pub(crate) fn with_bracket(
+        mut self,
+        mut image: BracketImage,
+        rows: &[usize],
+        mut stack: SweepStack,
+    ) -> Result<Self, PlaneError> {
+        stack.keep(|n| self.kept.contains(&n));
+        stack.settings.iter_mut().for_each(|setting| *setting = setting.earlier(self.late_us));
+        image.setting = image.setting.earlier(self.late_us);
+        let said = match image.levelled(&self.demux, rows, &stack)? {
+            Some(bracket) => {
+                let said = format!(
+                    "taken under {:.2} % of the sweep's light, as found from both",
+                    100.0 * bracket.light
+                );
+                self.demux = self.demux.with_bracket(bracket)?;
+                said
+            }
+            None => {
+                let what = "not used: too few pixels are lit in it and do not saturate to find its level";
+                self.findings.warnings.push(format!("the bracket is {what}; raise sweep.bracket.light"));
+                what.into()
+            }
+        };
+        self.findings.remarks.push(("bracket", said));
+        Ok(self)
+    }
+
     /// Number of additional rows that the stack must contain on either side of those solved, where the image has
     /// them.
     pub fn halo_rows(&self) -> usize {

@@ -4,6 +4,7 @@
 //! This crate accesses no devices, files or sockets. Threads are named `std` threads, workers are rayon's.
 
 mod assembler;
+mod bracket;
 mod calibrated;
 mod demux;
 pub mod dots;
@@ -32,11 +33,12 @@ pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};
 pub use product::{Product, Profile};
+pub use products::mask;
 pub use products::{Assembly, NotMade, ProductError, ProductSpec};
 pub use queue::{Input, Policy, QueueError, Receiver};
 pub use schedule::{Point, PointRole, Schedule, Shot, Spot, SpotScan, SweepGeometry};
 pub use stack::SweepStack;
 pub use stage::{HotPixels, PlaneStage, Stage, StageError, Stages, message_of, run_stages};
 pub use stage_refused::StageRefused;
-pub use strips::{ImageRows, InStrips, NotSolved, Strip};
+pub use strips::{ImageRows, InStrips, NotSolved, PointRows, Strip};
 pub use unit::Unit;

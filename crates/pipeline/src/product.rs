@@ -14,6 +14,8 @@ pub enum Product {
         about: String,
         /// The pixels.
         image: Array2<f32>,
+        /// What is known of each pixel, `[t, s]`: the bits of [`crate::mask`].
+        mask: Array2<u8>,
     },
     /// Images `[k, t, s]` in the scene's units.
     Sequence {
@@ -27,6 +29,8 @@ pub enum Product {
         at: Vec<f64>,
         /// The pixels.
         images: Array3<f32>,
+        /// What is known of each pixel in all images, `[t, s]`: the bits of [`crate::mask`].
+        mask: Array2<u8>,
     },
     /// Light as a function of the delay.
     Profile(Profile),

@@ -18,6 +18,8 @@ pub enum PointRole {
     Regular,
     /// A point of the plan's sweep: `exposure_index * delays + delay_index` in its grid, then the extra settings.
     Sweep(u32),
+    /// The image under less light for pixels that saturate; its place among the stored images, after the sweep's.
+    Bracket(u32),
 }
 
 /// One point: frames with the same setting that are averaged.
@@ -36,7 +38,7 @@ pub struct Point {
 /// All points of a run. A point's ordinal is its index in `points`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Schedule {
-    /// In the order of acquisition: dark frames, the regular image, then the sweep.
+    /// In the order of acquisition: dark frames, the regular image, the sweep, then its bracket.
     pub points: Vec<Point>,
 }
 
@@ -44,6 +46,11 @@ impl Schedule {
     /// Number of points in the plan's sweep.
     pub fn sweep_len(&self) -> usize {
         self.points.iter().filter(|point| matches!(point.role, PointRole::Sweep(_))).count()
+    }
+
+    /// The point under less light, if there is one.
+    pub fn bracket(&self) -> Option<&Point> {
+        self.points.iter().find(|point| matches!(point.role, PointRole::Bracket(_)))
     }
 
     /// Number of dark points.

@@ -21,6 +21,10 @@ pub struct SweepStack {
     pub valid: Option<Array3<bool>>,
     /// The image with one whole VSYNC period of exposure, `[t, s]`, if it was taken.
     pub regular: Option<Array2<f32>>,
+    /// Where that image does not saturate, `[t, s]`; `None` if nowhere, or if the image was not taken.
+    pub regular_valid: Option<Array2<bool>>,
+    /// Which pixels a stage replaced in some image, `[t, s]`; `None` if none.
+    pub filled: Option<Array2<bool>>,
     /// The noise of a single frame, if it could be fitted.
     pub noise: Option<NoiseModel>,
     /// Share of the noise variance that remains after spatial coupling, `[t, s]`; `None` if not coupled.
@@ -42,6 +46,8 @@ impl SweepStack {
             images: self.images.select(Axis(1), rows),
             valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
             regular: None,
+            regular_valid: None,
+            filled: None,
             noise: None,
             variance_ratio: None,
             u0_rows: None,

@@ -167,6 +167,7 @@ mod tests {
             delays_us: vec![0.0],
             last_exposure_ns: None,
             sum: Arc::new(Array2::zeros((5, 5))),
+            clipped: None,
             counts: Counts::default(),
         }
     }

@@ -18,13 +18,22 @@ pub struct NotSolved {
     pub what: String,
 }
 
+/// Some rows of the image of a point.
+#[derive(Debug, Clone)]
+pub struct PointRows {
+    /// Mean counts, `[rows, s]`.
+    pub image: Array2<f32>,
+    /// Where any of its frames saturates, `[rows, s]`; `None` if nowhere, or if it is not known.
+    pub clipped: Option<Array2<bool>>,
+}
+
 /// Reads images again that were not kept.
 pub trait ImageRows: Sync {
-    /// Some rows of the image of a point of the schedule, as passed to [`crate::DemuxFold::push`]: counts, `[rows, s]`.
+    /// Some rows of the image of a point of the schedule, as passed to [`crate::DemuxFold::push`].
     ///
     /// # Errors
     /// What cannot be read, why, and what to do.
-    fn read(&self, point: u32, rows: Range<usize>) -> Result<Array2<f32>, String>;
+    fn read(&self, point: u32, rows: Range<usize>) -> Result<PointRows, String>;
 }
 
 /// Consecutive camera rows of a sweep and their results.

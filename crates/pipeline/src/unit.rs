@@ -22,6 +22,8 @@ pub struct Unit {
     pub last_exposure_ns: Option<i64>,
     /// Sum of counts, `[t, s]`.
     pub sum: Arc<Array2<u32>>,
+    /// In how many of the frames each pixel saturates, `[t, s]`; `None` if none does, or if it is not known.
+    pub clipped: Option<Arc<Array2<u32>>>,
     /// What became of the attempt's triggers.
     pub counts: Counts,
 }

@@ -162,6 +162,7 @@ fn store_point(
             ..Counts::default()
         },
         crc32,
+        clipped_crc32: None,
     }))
 }
 

@@ -12,7 +12,7 @@ use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
-use ndarray_npy::WriteNpyExt;
+use ndarray_npy::{WritableElement, WriteNpyExt};
 use serde_json::{Map, Value};
 
 pub use self::video::VideoWriter;
@@ -45,6 +45,24 @@ impl Products {
     /// [`Error::Codec`] for an empty image or a name that is not a plain file name, [`Error::Io`].
     pub fn image(&self, name: &str, values: ArrayView2<f32>, metadata: &Map<String, Value>) -> Result<()> {
         self.write(name, "exr", &exr_file::encode(&[("Y", values)], metadata)?)?;
+        self.write_array(name, &values, metadata)
+    }
+
+    /// [`Products::image`] with a mask `[t, s]`, which is the EXR file's channel `mask` and `name_mask.npy` (uint8);
+    /// `metadata` should name its bits.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if the mask is not as large as the image; otherwise as [`Products::image`].
+    pub fn masked_image(
+        &self,
+        name: &str,
+        values: ArrayView2<f32>,
+        mask: ArrayView2<u8>,
+        metadata: &Map<String, Value>,
+    ) -> Result<()> {
+        let shown = self.write_mask(name, mask, values.shape())?;
+        let channels = [("Y", values), ("mask", shown.view())];
+        self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
         self.write_array(name, &values, metadata)
     }
 
@@ -100,14 +118,42 @@ impl Products {
         layers: &[String],
         metadata: &Map<String, Value>,
     ) -> Result<()> {
+        self.layers(name, values, layers, None, metadata)
+    }
+
+    fn layers(
+        &self,
+        name: &str,
+        values: ArrayView3<f32>,
+        layers: &[String],
+        mask: Option<ArrayView2<f32>>,
+        metadata: &Map<String, Value>,
+    ) -> Result<()> {
         if values.shape()[0] != layers.len() {
             let (found, allowed) = (values.shape().to_vec(), format!("[{}, t, s]", layers.len()));
             return Err(Error::Shape { what: format!("sequence `{name}`"), found, allowed });
         }
         let names: Vec<String> = layers.iter().map(|layer| format!("{layer}.Y")).collect();
-        let channels: Vec<_> = names.iter().map(String::as_str).zip(values.outer_iter()).collect();
+        let mut channels: Vec<_> = names.iter().map(String::as_str).zip(values.outer_iter()).collect();
+        channels.extend(mask.map(|mask| ("mask", mask)));
         self.write(name, "exr", &exr_file::encode(&channels, metadata)?)?;
         self.write_array(name, &values, metadata)
+    }
+
+    /// [`Products::sequence`] with one mask for all images, as in [`Products::masked_image`].
+    ///
+    /// # Errors
+    /// As [`Products::sequence`] and [`Products::masked_image`].
+    pub fn masked_sequence(
+        &self,
+        name: &str,
+        values: ArrayView3<f32>,
+        layers: &[String],
+        mask: ArrayView2<u8>,
+        metadata: &Map<String, Value>,
+    ) -> Result<()> {
+        let shown = self.write_mask(name, mask, &values.shape()[1..])?;
+        self.layers(name, values, layers, Some(shown.view()), metadata)
     }
 
     /// Writes columns of equal length as `name.csv`, `name.npy` (`[row, column]`) and `name.json`. The first
@@ -150,19 +196,37 @@ impl Products {
         ndarray_npy::ReadNpyExt::read_npy(bytes.as_slice()).map_err(Error::codec("read", path.display()))
     }
 
+    /// Writes a product's mask; returns it as a channel.
+    fn write_mask(&self, name: &str, mask: ArrayView2<u8>, size: &[usize]) -> Result<Array2<f32>> {
+        if mask.shape() != size {
+            let (found, allowed) = (mask.shape().to_vec(), format!("{size:?}"));
+            return Err(Error::Shape { what: format!("the mask of `{name}`"), found, allowed });
+        }
+        self.write_npy(&format!("{name}_mask"), &mask)?;
+        Ok(mask.mapv(f32::from))
+    }
+
     fn write_array<D: Dimension>(
         &self,
         name: &str,
         values: &ArrayRef<f32, D>,
         metadata: &Map<String, Value>,
     ) -> Result<()> {
+        self.write_npy(name, values)?;
+        self.write(name, "json", &sidecar(name, metadata)?)
+    }
+
+    fn write_npy<T: WritableElement + Clone, D: Dimension>(
+        &self,
+        name: &str,
+        values: &ArrayRef<T, D>,
+    ) -> Result<()> {
         let path = self.path(name, "npy")?;
         durable::create_dir_all(&self.dir)?;
         durable::write_with(&path, |file| {
             // Without this, an array in Fortran order would be written in that order.
             values.as_standard_layout().write_npy(BufWriter::new(file)).map_err(io::Error::other)
-        })?;
-        self.write(name, "json", &sidecar(name, metadata)?)
+        })
     }
 
     fn write(&self, name: &str, extension: &str, bytes: &[u8]) -> Result<()> {

@@ -5,6 +5,10 @@
 //! | `sum` | uint32 | `[point, t, s]` | the sweep; point = exposure_index * delays + delay_index |
 //! | `dark` | uint32 | `[exposure, t, s]` | projector off, one per exposure |
 //! | `regular` | uint32 | `[1, t, s]` | all rows lit by a long exposure |
+//! | `clipped` | uint32 | `[point, t, s]` | in how many of the frames of a point of `sum` the pixel saturated |
+//!
+//! A point of `clipped` is written only if some pixel saturated; then its ledger line has `clipped_crc32`. Sessions from
+//! before these frames were counted do not have the array.
 //!
 //! The stack of a film has only `dark`: its frames are in `film.zarr`, see [`crate::film`].
 //!
@@ -36,11 +40,13 @@ pub enum ArrayName {
     Dark,
     /// All rows lit by a long exposure.
     Regular,
+    /// In how many frames of the sweep's points a pixel saturated.
+    Clipped,
 }
 
 impl ArrayName {
     /// All arrays.
-    pub const ALL: [ArrayName; 3] = [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular];
+    pub const ALL: [ArrayName; 4] = [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular, ArrayName::Clipped];
 
     /// The name in the Zarr group and in the ledger.
     pub fn as_str(self) -> &'static str {
@@ -48,12 +54,13 @@ impl ArrayName {
             ArrayName::Sum => "sum",
             ArrayName::Dark => "dark",
             ArrayName::Regular => "regular",
+            ArrayName::Clipped => "clipped",
         }
     }
 
     fn first_axis(self) -> &'static str {
         match self {
-            ArrayName::Sum => "point",
+            ArrayName::Sum | ArrayName::Clipped => "point",
             ArrayName::Dark => "exposure",
             ArrayName::Regular => "frame",
         }
@@ -208,6 +215,7 @@ impl StackShape {
             (ArrayName::Sum, Contents::Sweep { points, .. } | Contents::Board { images: points, .. }) => {
                 points
             }
+            (ArrayName::Clipped, Contents::Sweep { points, .. }) => points,
             (ArrayName::Regular, Contents::Sweep { .. }) => 1,
             (ArrayName::Dark, Contents::Sweep { exposures, .. } | Contents::Film { exposures, .. }) => {
                 exposures
@@ -319,6 +327,9 @@ impl Stack {
         let store = DurableStore::new(dir)?;
         let mut arrays = BTreeMap::new();
         for &name in shape.arrays() {
+            if name == ArrayName::Clipped && !dir.join(name.as_str()).exists() {
+                continue;
+            }
             let array = zarr::open_array(&store, name.as_str(), 3)?;
             let expected = [shape.len(name), shape.rows, shape.columns];
             let found = zarr::shape_of(&array);
@@ -339,6 +350,11 @@ impl Stack {
     /// The shapes of the arrays.
     pub fn shape(&self) -> &StackShape {
         &self.shape
+    }
+
+    /// Whether the stack has this array: kinds of sessions differ, and old ones have no `clipped`.
+    pub fn has(&self, array: ArrayName) -> bool {
+        self.arrays.contains_key(&array)
     }
 
     /// Writes one point `[t, s]`, replacing any existing one; when this returns, it is durable. Returns the
@@ -434,12 +450,13 @@ fn create_array(
         Contents::Darks { .. } => "image",
         _ => name.first_axis(),
     };
+    let units = if name == ArrayName::Clipped { "frames" } else { "DN" };
     let mut builder =
         ArrayBuilder::new(to_u64(array_shape), to_u64(shape.shard()), data_type::uint32(), 0u32);
     zarr::with_codecs(&mut builder)
         .subchunk_shape(to_u64(shape.chunk()))
         .dimension_names(Some([first_axis, "t", "s"]))
-        .attributes(into_map(json!({ "units": "DN" })));
+        .attributes(into_map(json!({ "units": units })));
     zarr::create_array(store, name.as_str(), &builder)
 }
 

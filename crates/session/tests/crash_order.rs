@@ -41,6 +41,7 @@ fn point(index: usize) -> Entry {
         delays_us: vec![0.25],
         counts: Counts { expected: 1, averaged: 1, ..Counts::default() },
         crc32: crc32(image(index).view()),
+        clipped_crc32: None,
     })
 }
 

@@ -157,12 +157,9 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
                 }
             }
 
-            let transport = Transport {
-                t: Array3::from_shape_fn((base.len(), 1, 1), |(index, ..)| base[index] as f32),
-                u_min: *reach.start(),
-                exists: Array2::from_elem((base.len(), 1), true),
-                saturated: Array2::from_elem((1, 1), !masked.is_empty()),
-            };
+            let t = Array3::from_shape_fn((base.len(), 1, 1), |(index, ..)| base[index] as f32);
+            let exists = Array2::from_elem((base.len(), 1), true);
+            let transport = Transport::measured(t, *reach.start(), exists);
             let stack = Array3::from_shape_fn((24, 1, 1), |(n, ..)| all_samples[n] as f32);
             let valid = Array3::from_shape_fn((24, 1, 1), |(n, ..)| !masked.contains(&n));
             let samples = Samples {

@@ -196,12 +196,7 @@ mod tests {
     use super::*;
 
     fn transport(value: f32) -> Transport {
-        Transport {
-            t: Array3::from_elem((3, 2, 2), value),
-            u_min: -1,
-            exists: Array2::from_elem((3, 2), true),
-            saturated: Array2::from_elem((2, 2), false),
-        }
+        Transport::measured(Array3::from_elem((3, 2, 2), value), -1, Array2::from_elem((3, 2), true))
     }
 
     /// An estimate that signals its start and waits for permission to end.

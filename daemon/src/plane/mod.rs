@@ -122,6 +122,7 @@ impl Opened {
             raster: geometry.raster,
             first_row: geometry.first_row,
             max_jitter_us: task.max_jitter_us,
+            saturation_dn: geometry.saturation_dn,
             edge_gate_us: rig.file.vsync.gate_us,
         };
         let (task, orders, board) = (task.clone(), run.orders.clone(), run.board.clone());

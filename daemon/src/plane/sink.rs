@@ -8,7 +8,7 @@ use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
 use raysweep_processing::plane::{PlaneTask, Processing, place};
 use raysweep_proto::Event;
 use raysweep_session::ledger::{Entry, PointEntry};
-use raysweep_session::stack::Stack;
+use raysweep_session::stack::{ArrayName, Stack};
 
 use crate::live::LiveEstimate;
 use crate::run::life::Run;
@@ -113,6 +113,10 @@ impl PointSink {
 
     fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
         let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
+        let clipped =
+            unit.clipped.as_ref().filter(|_| array == ArrayName::Sum && self.stack.has(ArrayName::Clipped));
+        let clipped_crc32 =
+            clipped.map(|frames| self.stack.write(ArrayName::Clipped, index, frames.view())).transpose()?;
         let crc32 = self.stack.write(array, index, unit.sum.view())?;
         self.run.ledger.append(&Entry::Point(PointEntry {
             array,
@@ -124,6 +128,7 @@ impl PointSink {
             delays_us: unit.delays_us.clone(),
             counts: unit.counts.clone(),
             crc32,
+            clipped_crc32,
         }))
     }
 

@@ -24,6 +24,8 @@ pub struct SweepPlan {
     pub max_jitter_us: f64,
     /// `[[sweep.extra]]`: further grids, taken after the first.
     pub extra: Vec<GridPlan>,
+    /// One more image under less light, for pixels that saturate; `None`: not taken.
+    pub bracket: Option<BracketPlan>,
 }
 
 /// `[[sweep.extra]]`: a further grid of delays and exposures.
@@ -36,6 +38,14 @@ pub struct GridPlan {
     pub exposure_us: Axis,
 }
 
+/// `sweep.bracket`: the image under less light.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BracketPlan {
+    /// Level of the grey picture that the projector shows, as a share of white.
+    pub light: f64,
+}
+
 impl Default for SweepPlan {
     fn default() -> Self {
         Self {
@@ -44,6 +54,7 @@ impl Default for SweepPlan {
             average: 8,
             max_jitter_us: 50.0,
             extra: Vec::new(),
+            bracket: None,
         }
     }
 }
@@ -176,9 +187,11 @@ impl SweepPlan {
 
     /// Its tables in a plan.
     pub fn to_toml(&self) -> String {
-        let Self { delay_us, exposure_us, average, max_jitter_us, extra } = self;
+        let Self { delay_us, exposure_us, average, max_jitter_us, extra, bracket } = self;
+        let bracket = bracket
+            .map_or_else(String::new, |bracket| format!("bracket = {{ light = {} }}\n", bracket.light));
         let own = format!(
-            "[sweep]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\naverage = {average}\nmax_jitter_us = {max_jitter_us}\n"
+            "[sweep]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\naverage = {average}\nmax_jitter_us = {max_jitter_us}\n{bracket}"
         );
         let extra = extra.iter().map(|GridPlan { delay_us, exposure_us }| {
             format!("\n[[sweep.extra]]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\n")
@@ -221,6 +234,14 @@ impl SweepPlan {
             document.refuse(&["sweep", "average"], message);
         }
         document.check_positive(&["sweep", "max_jitter_us"], self.max_jitter_us, "microseconds");
+        if let Some(BracketPlan { light }) = self.bracket
+            && !(light > 0.0 && light < 1.0)
+        {
+            let message = format!(
+                "sweep.bracket.light = {light}: must be more than 0 and less than 1, a share of white; 0.125 suits highlights of up to 8 times the limit"
+            );
+            document.refuse(&["sweep", "bracket", "light"], message);
+        }
     }
 }
 
@@ -277,6 +298,18 @@ mod tests {
         assert_eq!((sweep.delay_us.values()[0], sweep.delay_us.values()[14]), (-1500.0, 1500.0));
         assert_eq!(sweep.exposure_us.values(), [600.0, 750.0, 900.0, 1050.0, 1200.0]);
         assert_eq!(parse("kind = \"sweep\"").unwrap().stages[0].name, "demux");
+    }
+
+    #[test]
+    fn a_bracket_is_a_share_of_white() {
+        let sweep =
+            |light: &str| parse(&format!("kind = \"sweep\"\n[sweep]\nbracket = {{ light = {light} }}"));
+        assert!(sweep("0.125").is_ok());
+        for light in ["0.0", "1.0", "-0.5", "nan"] {
+            let error = sweep(light).unwrap_err().to_string();
+            assert!(error.contains("sweep.bracket.light"), "{error}");
+        }
+        assert!(parse("kind = \"sweep\"\n[sweep]\nbracket = { level = 0.1 }").is_err());
     }
 
     #[test]

@@ -197,6 +197,23 @@ impl PixelFormat {
         Ok(())
     }
 
+    /// [`Self::add_to`] that also adds 1 to `reached`, as long as `sums`, for each pixel of at least `limit_dn`. Returns
+    /// whether there is such a pixel.
+    ///
+    /// # Errors
+    /// If `bytes` is not exactly a frame of `sums.len()` and `reached.len()` pixels; both are then unchanged.
+    pub fn add_counting(
+        self,
+        bytes: &[u8],
+        sums: &mut [u32],
+        limit_dn: u16,
+        reached: &mut [u32],
+    ) -> Result<bool, PixelError> {
+        self.checked(sums.len(), bytes.len())?;
+        self.checked(reached.len(), bytes.len())?;
+        Ok(unpack::add_counting(UnpackLevel::best(), self.packing, bytes, sums, (limit_dn, reached)))
+    }
+
     /// Packs pixels into a frame, as a camera does; bits beyond [`PixelFormat::bits`] are cut off.
     ///
     /// # Errors

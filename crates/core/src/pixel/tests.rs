@@ -166,5 +166,25 @@ fn a_frame_of_the_wrong_size_is_refused() {
     assert!(error.to_string().contains("6 bytes"), "{error}");
     let mut sums = [7; 4];
     PixelFormat::Mono12p.add_to(&[0xFF; 7], &mut sums).unwrap_err();
+    let mut reached = sums;
+    PixelFormat::Mono12p.add_counting(&[0xFF; 7], &mut sums, 1, &mut reached).unwrap_err();
     assert_eq!(sums, [7; 4]);
+}
+
+#[test]
+fn pixels_at_the_limit_are_counted_while_they_are_added() {
+    let pixels: Vec<u16> = (0..5000).map(|n| (n * 37 % 4096) as u16).collect();
+    for format in [PixelFormat::Mono12p, PixelFormat::Mono16] {
+        let mut bytes = vec![0; format.frame_bytes(pixels.len())];
+        format.pack_into(&pixels, &mut bytes).unwrap();
+        let [mut sums, mut plain, mut reached] = [(); 3].map(|()| vec![0; pixels.len()]);
+        for _ in 0..3 {
+            format.add_to(&bytes, &mut plain).unwrap();
+            assert!(format.add_counting(&bytes, &mut sums, 4000, &mut reached).unwrap());
+        }
+        assert_eq!(sums, plain);
+        let expected: Vec<u32> = pixels.iter().map(|&pixel| if pixel >= 4000 { 3 } else { 0 }).collect();
+        assert_eq!(reached, expected);
+        assert!(!format.add_counting(&bytes, &mut sums, 4096, &mut reached).unwrap());
+    }
 }

@@ -81,7 +81,30 @@ pub(super) fn unpack(level: UnpackLevel, packing: Packing, bytes: &[u8], pixels:
 
 /// Adds the pixels of `bytes`, which must hold exactly one pixel per sum.
 pub(super) fn add(level: UnpackLevel, packing: Packing, bytes: &[u8], sums: &mut [u32]) {
-    run(level, Add { packing, bytes, sums });
+    run(level, Add { packing, bytes, sums, on_block: |_: usize, _: &[u16]| {} });
+}
+
+/// [`add`] that also counts, in the second part of `reached`, the pixels of at least its first part. Returns whether
+/// there are any.
+pub(super) fn add_counting(
+    level: UnpackLevel,
+    packing: Packing,
+    bytes: &[u8],
+    sums: &mut [u32],
+    reached: (u16, &mut [u32]),
+) -> bool {
+    let (limit_dn, counts) = reached;
+    let mut any = false;
+    // Most blocks have no such pixel, so that their counts need not be fetched.
+    let on_block = |first: usize, pixels: &[u16]| {
+        if pixels.iter().fold(0, |most, &pixel| pixel.max(most)) >= limit_dn {
+            any = true;
+            let counts = counts[first..].iter_mut().zip(pixels);
+            counts.for_each(|(count, &pixel)| *count += u32::from(pixel >= limit_dn));
+        }
+    };
+    run(level, Add { packing, bytes, sums, on_block });
+    any
 }
 
 /// A computation that every level can run.
@@ -147,13 +170,15 @@ impl Task for Unpack<'_> {
     }
 }
 
-struct Add<'a> {
+struct Add<'a, F> {
     packing: Packing,
     bytes: &'a [u8],
     sums: &'a mut [u32],
+    /// Called for the pixels of each block, with the index of the first.
+    on_block: F,
 }
 
-impl Task for Add<'_> {
+impl<F: FnMut(usize, &[u16])> Task for Add<'_, F> {
     #[inline(always)]
     fn run<K: Kernel>(self, kernel: K) {
         // A block of pixels fits in the L1 cache. It is a multiple of the group, so that each block begins at a whole
@@ -161,9 +186,11 @@ impl Task for Add<'_> {
         const BLOCK: usize = 1024;
         let mut block = [0; BLOCK];
         let blocks = self.bytes.chunks(self.packing.bytes(BLOCK)).zip(self.sums.chunks_mut(BLOCK));
-        for (bytes, sums) in blocks {
+        let mut on_block = self.on_block;
+        for (index, (bytes, sums)) in blocks.enumerate() {
             let pixels = &mut block[..sums.len()];
             Unpack { packing: self.packing, bytes, pixels }.run(kernel);
+            on_block(index * BLOCK, pixels);
             sums.iter_mut().zip(pixels).for_each(|(sum, pixel)| *sum += u32::from(*pixel));
         }
     }

@@ -24,6 +24,7 @@ fn config() -> AssemblerConfig {
         raster: Raster { rows: 2, row_time_us: 20.0, first_row_us: 990.0, period_us: 16_666.667 },
         first_row: 0,
         max_jitter_us: 50.0,
+        saturation_dn: 4000.0,
         edge_gate_us: 500.0,
     }
 }

@@ -13,7 +13,7 @@ use super::tally::{SweepSummary, Tally};
 use super::{DEMUX, DemuxFold, SweepImage, refused};
 use crate::findings::rows_to_choose_by;
 use crate::schedule::PointRole;
-use crate::strips::{ImageRows, InStrips, NotSolved};
+use crate::strips::{ImageRows, InStrips, NotSolved, PointRows};
 
 impl DemuxFold {
     /// [`Self::finish`] after [`Self::keep_no_images`]: stack and transport are handed over strip by strip.
@@ -29,7 +29,16 @@ impl DemuxFold {
         let not_kept = self.not_kept.take().unwrap_or_default();
         let height = self.geometry.height;
         let sampled = self.read_to_choose_by(&not_kept, images, go_on)?;
-        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?)?;
+        let bracket = match self.schedule.bracket() {
+            Some(point) => {
+                let roles = [Some(point.role), self.schedule.dark_of(point.exposure_us)];
+                let mut taken = not_kept.clone();
+                taken.retain(|role, _| roles.contains(&Some(*role)));
+                self.bracket(&read_rows(&taken, images, &(0..height))?)
+            }
+            None => None,
+        };
+        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?, bracket)?;
         let mut tally = Tally::default();
         for first_row in (0..height).step_by(strip_rows) {
             let rows = first_row..height.min(first_row + strip_rows);
@@ -55,8 +64,10 @@ impl DemuxFold {
             if !go_on() {
                 return Err(refused(PlaneError::Stopped));
             }
-            let image = images.read(*point, 0..height).map_err(not_read)?.select(Axis(0), &rows);
-            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image })))
+            let PointRows { image, clipped } = images.read(*point, 0..height).map_err(not_read)?;
+            let image = image.select(Axis(0), &rows);
+            let clipped = clipped.map(|clipped| clipped.select(Axis(0), &rows));
+            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image, clipped })))
         };
         not_kept.iter().map(of_rows).collect()
     }
@@ -71,8 +82,8 @@ fn read_rows(
     not_kept
         .par_iter()
         .map(|(role, (point, setting))| {
-            let image = images.read(*point, rows.clone()).map_err(not_read)?;
-            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image })))
+            let PointRows { image, clipped } = images.read(*point, rows.clone()).map_err(not_read)?;
+            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image, clipped })))
         })
         .collect()
 }
@@ -152,8 +163,8 @@ mod tests {
     struct Kept(Vec<Array2<f32>>);
 
     impl ImageRows for Kept {
-        fn read(&self, point: u32, rows: Range<usize>) -> Result<Array2<f32>, String> {
-            Ok(self.0[point as usize].slice(s![rows, ..]).to_owned())
+        fn read(&self, point: u32, rows: Range<usize>) -> Result<PointRows, String> {
+            Ok(PointRows { image: self.0[point as usize].slice(s![rows, ..]).to_owned(), clipped: None })
         }
     }
 
@@ -171,6 +182,7 @@ mod tests {
                 delays_us: vec![point.delay_us],
                 last_exposure_ns: None,
                 sum: Arc::new(Array2::zeros((0, 0))),
+                clipped: None,
                 counts: Counts::default(),
             };
             fold.push(&unit, image.view());

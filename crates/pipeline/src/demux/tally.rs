@@ -33,6 +33,8 @@ pub(super) struct Tally {
     pixels: usize,
     unmeasured: usize,
     saturated: usize,
+    /// Pixels that are known only as lower bounds.
+    bounds: usize,
     /// `None` if the regular image was not taken.
     regular: Option<Regular>,
 }
@@ -53,6 +55,7 @@ impl Tally {
         self.pixels += count(measured);
         self.unmeasured += measured.len() - count(measured);
         self.saturated += count(&(&transport.saturated & measured));
+        self.bounds += transport.lower_bounds.keys().filter(|pixel| measured[**pixel]).count();
     }
 
     /// Adds the light of the regular image in these rows.
@@ -64,8 +67,11 @@ impl Tally {
         transport: &Transport,
     ) {
         let regular = self.regular.get_or_insert_default();
-        let valid = &(unsaturated & measured);
-        regular.saturated += count(measured) - count(valid);
+        let mut valid = unsaturated & measured;
+        regular.saturated += count(measured) - count(&valid);
+        // A bound is not what is there.
+        transport.lower_bounds.keys().for_each(|pixel| valid[*pixel] = false);
+        let valid = &valid;
         let add = |sum: &mut f64, image: &Array2<f32>| {
             let pixels = image.iter().zip(valid).filter(|&(_, &valid)| valid);
             pixels.for_each(|(&light, _)| *sum += f64::from(light));
@@ -78,6 +84,9 @@ impl Tally {
     pub(super) fn summary(self, findings: Findings) -> SweepSummary {
         let mut figures =
             vec![("images demultiplexed", self.images as f64), ("saturated pixels", self.saturated as f64)];
+        if self.saturated > 0 {
+            figures.push(("pixels known only as lower bounds", self.bounds as f64));
+        }
         if self.unmeasured > 0 {
             figures.push(("pixels that the calibration did not measure", self.unmeasured as f64));
         }

@@ -1,8 +1,9 @@
 //! Assembles products from the strips of a sweep.
 
-use ndarray::{Array3, Axis, s};
+use ndarray::{Array2, Array3, Axis, s};
 use raysweep_transport::plane::Transport;
 
+use super::mask;
 use super::profile::ProfileSums;
 use super::spec::{ProductKind, ProductSpec};
 use super::uncertainty;
@@ -64,26 +65,28 @@ impl Assembly {
     ) -> Result<(), NotMade> {
         let name = self.spec.name.clone();
         let not_made = |what: String| NotMade { name: self.spec.name.clone(), what };
+        let mask = mask::of(&self.spec.kind, first_row, stack, transport);
         let part = match &self.spec.kind {
             ProductKind::Regular => match &stack.regular {
                 Some(image) => Product::Image {
                     name,
                     about: "a captured exposure of one whole VSYNC period: every row lit once".into(),
                     image: image.clone(),
+                    mask,
                 },
                 None => {
                     let what = "the regular image or its dark image is not stored: resume the run";
                     return Err(not_made(what.into()));
                 }
             },
-            ProductKind::Epipolar(width) => width.of_stack(stack).epipolar(name, transport),
-            ProductKind::NonEpipolar(width) => width.of_stack(stack).non_epipolar(name, transport),
-            ProductKind::Band(band) => band.of_stack(stack).make(name, transport),
+            ProductKind::Epipolar(width) => width.of_stack(stack).epipolar(name, transport, mask),
+            ProductKind::NonEpipolar(width) => width.of_stack(stack).non_epipolar(name, transport, mask),
+            ProductKind::Band(band) => band.of_stack(stack).make(name, transport, mask),
             ProductKind::Relight(pattern) => pattern
-                .make(name, &stack.timing, first_row, transport)
+                .make(name, &stack.timing, first_row, transport, mask)
                 .map_err(|error| not_made(error.to_string()))?,
             ProductKind::Uncertainty(band) => {
-                uncertainty::make(name, band.of_stack(stack), first_row, stack, transport)
+                uncertainty::make(name, band.of_stack(stack), first_row, stack, transport, mask)
                     .map_err(not_made)?
             }
             ProductKind::DelayProfile(options) => {
@@ -111,33 +114,43 @@ impl Assembly {
             return Ok(first);
         }
         Ok(match first {
-            Product::Image { name, about, image } => {
+            Product::Image { name, about, image, mask } => {
                 let rest = parts.filter_map(|part| match part {
-                    Product::Image { image, .. } => Some(image.insert_axis(Axis(0))),
+                    Product::Image { image, mask, .. } => Some((image.insert_axis(Axis(0)), mask)),
                     _ => None,
                 });
-                let image = one_below_the_other(image.insert_axis(Axis(0)), rest).index_axis_move(Axis(0), 0);
-                Product::Image { name, about, image }
+                let (images, masks) = rest.unzip();
+                let image =
+                    one_below_the_other(image.insert_axis(Axis(0)), images).index_axis_move(Axis(0), 0);
+                Product::Image { name, about, image, mask: one_mask_below_the_other(mask, masks) }
             }
-            Product::Sequence { name, about, axis, at, images } => {
+            Product::Sequence { name, about, axis, at, images, mask } => {
                 let rest = parts.filter_map(|part| match part {
-                    Product::Sequence { images, .. } => Some(images),
+                    Product::Sequence { images, mask, .. } => Some((images, mask)),
                     _ => None,
                 });
-                Product::Sequence { name, about, axis, at, images: one_below_the_other(images, rest) }
+                let (rest, masks) = rest.unzip();
+                let (images, mask) =
+                    (one_below_the_other(images, rest), one_mask_below_the_other(mask, masks));
+                Product::Sequence { name, about, axis, at, images, mask }
             }
             other => other,
         })
     }
 }
 
+fn one_mask_below_the_other(first: Array2<u8>, rest: Vec<Array2<u8>>) -> Array2<u8> {
+    let rest = rest.into_iter().map(|mask| mask.insert_axis(Axis(0))).collect();
+    one_below_the_other(first.insert_axis(Axis(0)), rest).index_axis_move(Axis(0), 0)
+}
+
 /// Concatenates images `[k, t, s]` along their rows. The result is in C order, as if it had been computed as a whole:
 /// sums over it depend, to the bit, on the memory layout.
-fn one_below_the_other(first: Array3<f32>, rest: impl Iterator<Item = Array3<f32>>) -> Array3<f32> {
-    let parts: Vec<Array3<f32>> = std::iter::once(first).chain(rest).collect();
+fn one_below_the_other<T: Copy + Default>(first: Array3<T>, rest: Vec<Array3<T>>) -> Array3<T> {
+    let parts: Vec<Array3<T>> = std::iter::once(first).chain(rest).collect();
     let (count, _, columns) = parts[0].dim();
     let rows = parts.iter().map(|part| part.len_of(Axis(1))).sum();
-    let mut whole = Array3::zeros((count, rows, columns));
+    let mut whole = Array3::from_elem((count, rows, columns), T::default());
     let mut first_row = 0;
     for part in parts {
         let end = first_row + part.len_of(Axis(1));

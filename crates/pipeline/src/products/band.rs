@@ -75,24 +75,30 @@ impl Width {
         self.width_rows / 2
     }
 
-    pub(super) fn epipolar(self, name: String, transport: &Transport) -> Product {
+    /// The relative rows.
+    pub(super) fn range(self) -> RangeInclusive<i32> {
+        let half = i32::try_from(self.half()).unwrap_or(i32::MAX);
+        -half..=half
+    }
+
+    pub(super) fn epipolar(self, name: String, transport: &Transport, mask: Array2<u8>) -> Product {
         let about = match self.half() {
             0 => "light from the pixel's own projector row (u = 0)".into(),
             half => {
                 format!("light from the pixel's own projector row and {half} to either side (|u| <= {half})")
             }
         };
-        Product::Image { name, about, image: transport.epipolar(self.width_rows) }
+        Product::Image { name, about, image: transport.epipolar(self.width_rows), mask }
     }
 
-    pub(super) fn non_epipolar(self, name: String, transport: &Transport) -> Product {
+    pub(super) fn non_epipolar(self, name: String, transport: &Transport, mask: Array2<u8>) -> Product {
         let about = match self.half() {
             0 => "light from all other rows within the sweep's reach".into(),
             half => {
                 format!("light from all rows more than {half} away within the sweep's reach (|u| > {half})")
             }
         };
-        Product::Image { name, about, image: transport.non_epipolar(self.width_rows) }
+        Product::Image { name, about, image: transport.non_epipolar(self.width_rows), mask }
     }
 }
 
@@ -192,13 +198,13 @@ impl Band {
         format!("light that left the projector {rows} {side}")
     }
 
-    pub(super) fn make(self, name: String, transport: &Transport) -> Product {
+    pub(super) fn make(self, name: String, transport: &Transport, mask: Array2<u8>) -> Product {
         let mut about = self.says();
         let known = transport.u_min.unsigned_abs().min(transport.u_max().unsigned_abs());
         if self.to_rows.is_none_or(|to_rows| to_rows > known) {
             about.push_str(&format!("; {}", reach_of(transport)));
         }
-        Product::Image { name, about, image: self.image(transport) }
+        Product::Image { name, about, image: self.image(transport), mask }
     }
 
     /// The relative rows, without duplicates.
@@ -213,6 +219,12 @@ impl Band {
             None if from == 0 => vec![-to..=to],
             None => vec![-to..=-from, from..=to],
         }
+    }
+
+    /// [`Self::ranges`], where rows as far as the sweep reaches end at `i32::MIN` and `i32::MAX`.
+    pub(super) fn open_ranges(self) -> Vec<RangeInclusive<i32>> {
+        let start = |u: i32| if u == -i32::MAX { i32::MIN } else { u };
+        self.ranges().into_iter().map(|rows| start(*rows.start())..=*rows.end()).collect()
     }
 
     fn image(self, transport: &Transport) -> Array2<f32> {

@@ -3,6 +3,7 @@
 
 mod assembly;
 mod band;
+pub mod mask;
 mod profile;
 mod relight;
 mod spec;

@@ -119,8 +119,9 @@ impl ProfileOptions {
         let [t0, t1, s0, s1] = self.region;
         let end = first_row + stack.images.len_of(Axis(1));
         // A pixel that saturates at some delays would distort the profile at these delays only.
-        let unsaturated = |[t, s]: &[usize; 2]| {
-            stack.valid.as_ref().is_none_or(|valid| taken.iter().all(|&n| valid[[n, *t, *s]]))
+        let unsaturated = |pixel @ [t, s]: &[usize; 2]| {
+            !transport.lower_bounds.contains_key(pixel)
+                && stack.valid.as_ref().is_none_or(|valid| taken.iter().all(|&n| valid[[n, *t, *s]]))
         };
         let rows = t0.max(first_row)..t1.min(end);
         let all = rows.flat_map(|t| (s0..s1).map(move |s| [t - first_row, s]));

@@ -1,6 +1,6 @@
 //! Product `relight`: the scene lit by a pattern of projector rows.
 
-use ndarray::{Array1, Array3, Axis};
+use ndarray::{Array1, Array2, Array3, Axis};
 use raysweep_transport::plane::{PlaneError, RelitBeam, RowTiming, Transport, relight_rows};
 use serde::Deserialize;
 
@@ -145,6 +145,7 @@ impl Relight {
         timing: &RowTiming,
         first_row: usize,
         transport: &Transport,
+        mask: Array2<u8>,
     ) -> Result<Product, PlaneError> {
         let rows = timing.projector_rows();
         let reach = reach_of(transport);
@@ -188,9 +189,10 @@ impl Relight {
                     axis: "first lit projector row".into(),
                     at: tops.into_iter().map(|top| top as f64).collect(),
                     images,
+                    mask,
                 });
             }
         };
-        Ok(Product::Image { name, about: format!("{about}; {reach}"), image: under(&weights)? })
+        Ok(Product::Image { name, about: format!("{about}; {reach}"), image: under(&weights)?, mask })
     }
 }

@@ -1,5 +1,7 @@
 //! Products by their names in plans: a `[[product]]` table is validated before anything moves.
 
+use std::ops::RangeInclusive;
+
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
@@ -39,6 +41,22 @@ pub(super) enum ProductKind {
     Relight(Relight),
     DelayProfile(ProfileOptions),
     Uncertainty(Band),
+}
+
+impl ProductKind {
+    /// The relative rows whose light it tells apart; `i32::MIN` and `i32::MAX`: as far as the sweep reaches.
+    pub(super) fn rows(&self) -> Vec<RangeInclusive<i32>> {
+        match self {
+            Self::Regular | Self::DelayProfile(_) => Vec::new(),
+            Self::Epipolar(width) => vec![width.range()],
+            Self::NonEpipolar(width) => {
+                let own = width.range();
+                vec![i32::MIN..=*own.start() - 1, *own.end() + 1..=i32::MAX]
+            }
+            Self::Band(band) | Self::Uncertainty(band) => band.open_ranges(),
+            Self::Relight(_) => vec![i32::MIN..=i32::MAX],
+        }
+    }
 }
 
 /// The kinds by their names in plans.

@@ -55,7 +55,7 @@ fn transport() -> Transport {
         false => 0.0,
     });
     let exists = Array2::from_shape_fn((9, 6), |(index, t)| row(index, t));
-    Transport { t, u_min: -4, exists, saturated: Array2::from_elem((6, 3), false) }
+    Transport::measured(t, -4, exists)
 }
 
 /// The camera's images of the transport, without noise.
@@ -80,6 +80,8 @@ fn stack() -> SweepStack {
         images: ndarray::stack(Axis(0), &views).unwrap(),
         valid: None,
         regular: None,
+        regular_valid: None,
+        filled: None,
         noise: None,
         variance_ratio: None,
         u0_rows: None,
@@ -214,12 +216,9 @@ fn strip(stack: &SweepStack, rows: std::ops::Range<usize>) -> (SweepStack, Trans
         variance_ratio: stack.variance_ratio.map(|ratio| ratio.slice(s![rows.clone(), ..]).to_owned()),
         ..stack
     };
-    let transport = Transport {
-        t: transport.t.slice(s![.., rows.clone(), ..]).to_owned(),
-        exists: transport.exists.slice(s![.., rows.clone()]).to_owned(),
-        saturated: transport.saturated.slice(s![rows, ..]).to_owned(),
-        ..transport
-    };
+    let t = transport.t.slice(s![.., rows.clone(), ..]).to_owned();
+    let exists = transport.exists.slice(s![.., rows]).to_owned();
+    let transport = Transport::measured(t, transport.u_min, exists);
     (cut, transport)
 }
 

@@ -1,6 +1,6 @@
 //! `uncertainty`: the standard deviation of a band's light due to noise.
 
-use ndarray::Axis;
+use ndarray::{Array2, Axis};
 use raysweep_transport::plane::{Samples, Transport, Uncertainty};
 
 use super::band::Band;
@@ -14,6 +14,7 @@ pub(super) fn make(
     first_row: usize,
     stack: &SweepStack,
     transport: &Transport,
+    mask: Array2<u8>,
 ) -> Result<Product, String> {
     let noise = stack.noise.ok_or("the stack's noise could not be fitted; the report says why")?;
     let frames: Vec<usize> = stack.settings.iter().map(|setting| setting.delays_us.len()).collect();
@@ -35,5 +36,5 @@ pub(super) fn make(
         .map_err(|error| error.to_string())?;
     let about =
         format!("standard deviation, through noise alone, of {}; the prior's bias is not in it", band.says());
-    Ok(Product::Image { name, about, image: sd.index_axis_move(Axis(0), 0) })
+    Ok(Product::Image { name, about, image: sd.index_axis_move(Axis(0), 0), mask })
 }

@@ -113,6 +113,7 @@ fn frame_unit((ordinal, point): (u32, &Point), entry: &CycleEntry, delay_us: f64
         delays_us: vec![delay_us],
         last_exposure_ns: None,
         sum: Arc::new(sum),
+        clipped: None,
         counts: Counts::default(),
     }
 }
@@ -128,5 +129,5 @@ fn dark_image(
     if raysweep_session::stack::crc32(sum.view()) != entry.crc32 {
         return Ok(None);
     }
-    Ok(run_stages(stages, &unit_of(0, entry, sum)).ok())
+    Ok(run_stages(stages, &unit_of(0, entry, sum, None)).ok())
 }

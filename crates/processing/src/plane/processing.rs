@@ -12,7 +12,7 @@ use raysweep_pipeline::{
 };
 use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
-use raysweep_session::stack::{Stack, crc32};
+use raysweep_session::stack::{ArrayName, Stack, crc32};
 use raysweep_transport::plane::Transport;
 
 use super::task::{PlaneTask, place, unit_of};
@@ -49,9 +49,16 @@ impl Processing {
         for (ordinal, point) in (0..).zip(&task.schedule.points) {
             let (array, index) = place(point.role);
             let Some(entry) = state.point(array, index).filter(|_| go_on()) else { continue };
-            let sum = match stack.read_point(array, index) {
-                Ok(sum) if crc32(sum.view()) == entry.crc32 => sum,
-                read => {
+            let clipped = entry.clipped_crc32.map(|crc| (ArrayName::Clipped, crc));
+            let read = |(array, crc)| match stack.read_point(array, index) {
+                Ok(image) if crc32(image.view()) == crc => Ok(image),
+                read => Err(read),
+            };
+            let sum_and_clipped = read((array, entry.crc32))
+                .and_then(|sum| clipped.map(read).transpose().map(|clipped| (sum, clipped)));
+            let (sum, clipped) = match sum_and_clipped {
+                Ok(read) => read,
+                Err(read) => {
                     let why = read
                         .err()
                         .map_or("its checksum differs from the ledger's".into(), |error| error.to_string());
@@ -63,7 +70,7 @@ impl Processing {
                     continue;
                 }
             };
-            let unit = unit_of(ordinal, entry, sum);
+            let unit = unit_of(ordinal, entry, sum, clipped);
             match run_stages(&self.stages, &unit) {
                 Ok(image) => self.push(&unit, &image),
                 Err(error) => self.problems.push(error.to_string()),
@@ -75,7 +82,14 @@ impl Processing {
     /// Gives the demultiplexer a unit's image. If it panics, it is dropped, with its products.
     pub fn push(&mut self, unit: &Unit, image: &Array2<f32>) {
         let Some(demux) = &mut self.demux else { return };
-        if let Err(panic) = catch_unwind(AssertUnwindSafe(|| demux.push(unit, image.view()))) {
+        let has_stages = !self.stages.is_empty();
+        let push = || {
+            demux.push(unit, image.view());
+            if has_stages {
+                demux.note_filled(unit, image.view());
+            }
+        };
+        if let Err(panic) = catch_unwind(AssertUnwindSafe(push)) {
             self.problems.push(panicked(DEMUX, &*panic));
             self.demux = None;
         }

@@ -252,14 +252,19 @@ fn spot(kind: SpotKind, scan: Option<ScanKind>) -> Spot {
 /// Position of a point in the stack.
 pub fn place(role: PointRole) -> (ArrayName, usize) {
     match role {
-        PointRole::Sweep(index) => (ArrayName::Sum, index as usize),
+        PointRole::Sweep(index) | PointRole::Bracket(index) => (ArrayName::Sum, index as usize),
         PointRole::Dark(index) => (ArrayName::Dark, index as usize),
         PointRole::Regular => (ArrayName::Regular, 0),
     }
 }
 
 /// A stored point, in the form in which the pipeline delivered it.
-pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Unit {
+pub(crate) fn unit_of(
+    ordinal: u32,
+    entry: &PointEntry,
+    sum: Array2<u32>,
+    clipped: Option<Array2<u32>>,
+) -> Unit {
     Unit {
         id: SettingsId { point: ordinal, attempt: entry.attempt },
         frames: entry.frames,
@@ -268,6 +273,7 @@ pub(crate) fn unit_of(ordinal: u32, entry: &PointEntry, sum: Array2<u32>) -> Uni
         delays_us: entry.delays_us.clone(),
         last_exposure_ns: None,
         sum: Arc::new(sum),
+        clipped: clipped.map(Arc::new),
         counts: entry.counts.clone(),
     }
 }

@@ -1,6 +1,6 @@
 //! Writes the products to files.
 
-use raysweep_pipeline::{Findings, Product, Solved, Strip, SweepSummary};
+use raysweep_pipeline::{Findings, Product, Solved, Strip, SweepSummary, mask};
 use raysweep_session::ledger::State;
 use raysweep_session::products::VolumeWriter;
 use raysweep_session::{Result, Session, transport};
@@ -178,20 +178,22 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
     let files = session.products();
     for product in products {
         match product {
-            Product::Image { name, about, image } => {
+            Product::Image { name, about, image, mask } => {
                 let mut metadata = task.metadata();
                 metadata.insert("axes".into(), json!(["t", "s"]));
                 metadata.insert("about".into(), json!(about));
-                files.image(name, image.view(), &metadata)?;
+                metadata.insert("mask".into(), mask_bits());
+                files.masked_image(name, image.view(), mask.view(), &metadata)?;
             }
-            Product::Sequence { name, about, axis, at, images } => {
+            Product::Sequence { name, about, axis, at, images, mask } => {
                 let layers: Vec<String> = (0..at.len()).map(|k| format!("k{k:04}")).collect();
                 let mut metadata = task.metadata();
                 metadata.insert("axes".into(), json!(["k", "t", "s"]));
                 metadata.insert("about".into(), json!(about));
                 metadata.insert("k".into(), json!({ "is": axis, "at": at }));
                 metadata.insert("layers".into(), json!(layers));
-                files.sequence(name, images.view(), &layers, &metadata)?;
+                metadata.insert("mask".into(), mask_bits());
+                files.masked_sequence(name, images.view(), &layers, mask.view(), &metadata)?;
             }
             Product::Profile(profile) => {
                 let columns = profile.columns();
@@ -208,6 +210,17 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
         }
     }
     Ok(())
+}
+
+/// The bits of masks, as metadata say them.
+fn mask_bits() -> Value {
+    json!({
+        "measured": mask::MEASURED,
+        "bound only": mask::BOUND_ONLY,
+        "hot pixel filled": mask::HOT_PIXEL_FILLED,
+        "outside reach": mask::OUTSIDE_REACH,
+        "no edge": mask::NO_EDGE,
+    })
 }
 
 /// The model and settings that the transport was estimated with.

@@ -4,9 +4,9 @@
 use std::ops::Range;
 
 use ndarray::{Array2, s};
-use raysweep_pipeline::{ImageRows, Stages, run_stages};
+use raysweep_pipeline::{ImageRows, PointRows, Stages, run_stages};
 use raysweep_session::ledger::State;
-use raysweep_session::stack::Stack;
+use raysweep_session::stack::{ArrayName, Stack};
 use raysweep_transport::plane::Transport;
 
 use crate::plane::{PlaneTask, place, unit_of};
@@ -24,7 +24,7 @@ pub struct StoredImages<'a> {
 }
 
 impl ImageRows for StoredImages<'_> {
-    fn read(&self, point: u32, rows: Range<usize>) -> Result<Array2<f32>, String> {
+    fn read(&self, point: u32, rows: Range<usize>) -> Result<PointRows, String> {
         let height = self.task.geometry.height;
         let planned = self.task.schedule.points.get(point as usize);
         let (array, index) = place(planned.ok_or_else(|| format!("the plan has no point {point}"))?.role);
@@ -35,10 +35,14 @@ impl ImageRows for StoredImages<'_> {
         let around = halo_rows.map_or(0..height, |halo_rows| {
             rows.start.saturating_sub(halo_rows)..height.min(rows.end + halo_rows)
         });
-        let sum = self.stack.read_rows(array, index, around.clone()).map_err(|error| error.to_string())?;
-        let image =
-            run_stages(self.stages, &unit_of(point, entry, sum)).map_err(|error| error.to_string())?;
-        Ok(image.slice(s![rows.start - around.start..rows.end - around.start, ..]).to_owned())
+        let read =
+            |array| self.stack.read_rows(array, index, around.clone()).map_err(|error| error.to_string());
+        let clipped = entry.clipped_crc32.map(|_| read(ArrayName::Clipped)).transpose()?;
+        let unit = unit_of(point, entry, read(array)?, clipped);
+        let image = run_stages(self.stages, &unit).map_err(|error| error.to_string())?;
+        let inner = s![rows.start - around.start..rows.end - around.start, ..];
+        let clipped = unit.clipped.map(|frames| frames.slice(inner).mapv(|frames| frames > 0));
+        Ok(PointRows { image: image.slice(inner).to_owned(), clipped })
     }
 }
 

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use raysweep_config::{ConfigError, Plan, ProductTable, SweepPlan};
+use raysweep_core::Pattern;
 use raysweep_pipeline::{Point, PointRole, ProductSpec, Schedule};
 use raysweep_session::stack::Contents;
 
@@ -10,6 +11,8 @@ use crate::plane::{KnownRig, PlaneTask, Processing};
 
 /// Minimum number of frames of a dark image: its noise enters all images of its exposure, so it must be small.
 const MIN_DARK_AVERAGE: u32 = 8;
+/// Minimum number of frames of the image under less light, whose noise is that of the highlights.
+const MIN_BRACKET_AVERAGE: u32 = 8;
 
 /// A sweep on a plane rig.
 #[derive(Clone)]
@@ -45,7 +48,12 @@ impl SweepTask {
 
     /// Number of images to store, without dark and regular ones.
     pub fn points(&self) -> usize {
-        self.task.schedule.sweep_len()
+        self.task.schedule.sweep_len() + usize::from(self.sweep.bracket.is_some())
+    }
+
+    /// The picture under which the image for pixels that saturate is taken, if the plan asks for it.
+    pub fn bracket_picture(&self) -> Option<Pattern> {
+        self.sweep.bracket.map(|bracket| Pattern::Grey { level: bracket.light as f32 })
     }
 
     /// The stages and products that the plan names.
@@ -76,11 +84,16 @@ impl SweepTask {
     }
 }
 
-/// The points of a sweep: dark images of each exposure, the regular image, then the settings.
+/// The points of a sweep: dark images of each exposure, the regular image, then the settings, and last the bracket: the
+/// shortest exposure about direct light.
 fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
     let frames = sweep.average;
     let point = |role, delay_us, exposure_us| {
-        let frames = if matches!(role, PointRole::Dark(_)) { frames.max(MIN_DARK_AVERAGE) } else { frames };
+        let frames = match role {
+            PointRole::Dark(_) => frames.max(MIN_DARK_AVERAGE),
+            PointRole::Bracket(_) => frames.max(MIN_BRACKET_AVERAGE),
+            PointRole::Regular | PointRole::Sweep(_) => frames,
+        };
         Point { role, delay_us, exposure_us, frames }
     };
     let mut dark_exposures = sweep.exposures_us();
@@ -95,6 +108,9 @@ fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
         settings
             .map(|(index, (delay_us, exposure_us))| point(PointRole::Sweep(index), delay_us, exposure_us)),
     );
+    let shortest_us = sweep.exposures_us().into_iter().fold(f64::INFINITY, f64::min);
+    let index = sweep.settings_us().len() as u32;
+    points.extend(sweep.bracket.map(|_| point(PointRole::Bracket(index), 0.0, shortest_us)));
     Schedule { points }
 }
 

@@ -147,6 +147,10 @@ pub struct PointEntry {
     pub counts: Counts,
     /// CRC-32 of the stored data, see [`crate::stack::crc32`].
     pub crc32: u32,
+    /// CRC-32 of the point's counts of clipped frames in the array `clipped`; `None` if no pixel of any frame
+    /// saturated, and in sessions from before they were counted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub clipped_crc32: Option<u32>,
 }
 
 impl PointEntry {

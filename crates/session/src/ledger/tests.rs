@@ -38,6 +38,7 @@ fn point(index: usize, attempt: u32) -> Entry {
         delays_us: vec![0.1 + 0.2, -1e-7 / 3.0, 1_234_567.891_234_567_9, f64::MIN_POSITIVE],
         counts: counts(),
         crc32: 0xdead_beef,
+        clipped_crc32: None,
     })
 }
 

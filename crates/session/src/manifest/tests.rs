@@ -32,6 +32,7 @@ fn session() -> (tempfile::TempDir, Session) {
             delays_us: vec![0.0],
             counts: Counts { expected: 1, averaged: 1, ..Counts::default() },
             crc32,
+            clipped_crc32: None,
         }))
         .unwrap();
     write(&session, ledger.state(), BTreeMap::new(), json!({ "a": 1 }).as_object().cloned().unwrap())

@@ -3,7 +3,7 @@
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use maud::{Markup, html};
-use ndarray::{Array2, Array3, ArrayView2, ArrayView3, Axis, s};
+use ndarray::{Array2, Array3, ArrayView1, ArrayView2, ArrayView3, Axis, s};
 
 use super::style::{PALETTE, short};
 use crate::{Error, Result};
@@ -101,6 +101,8 @@ pub struct Picture {
     tone_map: ToneMap,
     caption: String,
     markers: Vec<Marker>,
+    /// Pixels of the image that are hatched, as runs along rows: row, first column, length.
+    hatched: Vec<[usize; 3]>,
     /// The remaining pictures of an animation.
     next: Vec<Picture>,
 }
@@ -148,6 +150,21 @@ impl Picture {
         Picture { markers, ..self }
     }
 
+    /// Hatches the pixels of the image `[t, s]` that are true.
+    pub fn with_hatching(self, hatched: Array2<bool>) -> Picture {
+        let runs_of = |(row, pixels): (usize, ArrayView1<bool>)| {
+            let mut runs: Vec<[usize; 3]> = Vec::new();
+            for (column, _) in pixels.iter().enumerate().filter(|(_, is_hatched)| **is_hatched) {
+                match runs.last_mut() {
+                    Some([_, first, length]) if *first + *length == column => *length += 1,
+                    _ => runs.push([row, column, 1]),
+                }
+            }
+            runs
+        };
+        Picture { hatched: hatched.outer_iter().enumerate().flat_map(runs_of).collect(), ..self }
+    }
+
     fn new(image: ArrayView3<f32>, tone_map: ToneMap, max_px: usize) -> Picture {
         let (rows, columns, channels) = image.dim();
         let reduction = reduction_of((rows, columns), max_px);
@@ -163,6 +180,7 @@ impl Picture {
             tone_map,
             caption: String::new(),
             markers: Vec::new(),
+            hatched: Vec::new(),
             next: Vec::new(),
         }
     }
@@ -204,7 +222,24 @@ impl Picture {
     fn overlay(&self) -> Markup {
         let (rows, columns) = self.size;
         let arm = 0.028 * columns as f64;
+        let hatching: String = self
+            .hatched
+            .iter()
+            .map(|[row, column, length]| format!("M{column} {row}h{length}v1h-{length}z"))
+            .collect();
+        let step = columns as f64 / 200.0;
         html! {
+            @if !self.hatched.is_empty() {
+                svg.hatching viewBox=(format!("0 0 {columns} {rows}")) aria-label="hatched: at least the value" {
+                    defs {
+                        pattern id="hatching" width=(short(step)) height=(short(step))
+                            patternUnits="userSpaceOnUse" patternTransform="rotate(45)" {
+                            path d=(format!("M0 0V{}", short(step))) stroke=(PALETTE[0]) stroke-width=(short(step)) {}
+                        }
+                    }
+                    path d=(hatching) style="fill:url(#hatching)" {}
+                }
+            }
             @if !self.markers.is_empty() {
                 svg.markers viewBox=(format!("0 0 {columns} {rows}")) aria-hidden="true" {
                     @for (marker, colour) in self.markers.iter().zip(PALETTE.iter().cycle()) {

@@ -6,6 +6,7 @@
 //! interpreter on the same stacks. `--large PRIOR` is internal: the 1280x720 case runs in its own process, so that
 //! the peak memory is that of this case alone.
 
+mod censored;
 mod check;
 #[allow(clippy::unwrap_used, reason = "shared with the tests, where a helper that cannot go on may panic")]
 #[path = "../../tests/common/mod.rs"]
@@ -122,7 +123,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
     match options.json {
         true => print::json_lines(&measured, &compared, &peak),
-        false => print::tables(&measured, &compared, &peak),
+        false => {
+            print::tables(&measured, &compared, &peak);
+            censored::print()?;
+        }
     }
     Ok(())
 }

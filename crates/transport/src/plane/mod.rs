@@ -39,4 +39,4 @@ pub use noise::{Coupled, Coupling, NoiseModel};
 pub use products::{DelayProfile, RelitBeam, Samples, Uncertainty, relight, relight_rows};
 #[doc(hidden)]
 pub use solve::linear;
-pub use solve::{Demux, Prior, SimdLevel, objectives_bytes, reference};
+pub use solve::{Bracket, Demux, Prior, SimdLevel, objectives_bytes, reference};

@@ -31,7 +31,14 @@ impl Searched for SweepTask {
         let GridPlan { delay_us, exposure_us } = grid(own);
         let extra = extra.iter().map(grid).collect();
         let max_jitter_us = self.sweep.max_jitter_us;
-        self.with_sweep(SweepPlan { delay_us, exposure_us, average: design.frames, max_jitter_us, extra })
+        self.with_sweep(SweepPlan {
+            delay_us,
+            exposure_us,
+            average: design.frames,
+            max_jitter_us,
+            extra,
+            bracket: self.sweep.bracket,
+        })
     }
 
     fn to_toml(&self) -> String {

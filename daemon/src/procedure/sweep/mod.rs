@@ -7,7 +7,8 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use raysweep_config::{ConfigError, Plan, SweepPlan};
-use raysweep_core::{CameraCapabilities, SettingsLatency, VsyncStats};
+use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats};
+use raysweep_pipeline::PointRole;
 use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
 use raysweep_processing::plane::{Processing, manifest};
@@ -20,7 +21,7 @@ use raysweep_session::stack::StackShape;
 use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
 use crate::plane::advice::{advise, design};
-use crate::plane::{Opened, PointSink, Taken, missing};
+use crate::plane::{Opened, Passes, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun, keep_calibration};
 use crate::rig::Rig;
 use crate::run::error::RunError;
@@ -144,7 +145,8 @@ fn acquire(
     let live = run.live.clone().and_then(start_live);
     let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
     sink.live = live;
-    let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
+    let taken = opened
+        .acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| acquire_points(passes, sweep, missing))?;
     let Taken { sink, exposures, latency, fault } = taken;
     Ok(Acquired {
         session: sink.run.session,
@@ -155,6 +157,25 @@ fn acquire(
         latency,
         fault: sink.write_error.map(RunError::from).or(fault),
     })
+}
+
+/// Acquires the points of the sweep under white, then its bracket under less light.
+fn acquire_points(
+    passes: &mut Passes<'_>,
+    sweep: &SweepTask,
+    missing: Vec<SettingsId>,
+) -> Result<(), RunError> {
+    let point_of = |id: SettingsId| sweep.task.schedule.points[id.point as usize];
+    let (bracket, others): (Vec<_>, Vec<_>) =
+        missing.into_iter().partition(|&id| matches!(point_of(id).role, PointRole::Bracket(_)));
+    passes.acquire(others)?;
+    let attempts: Vec<_> = bracket.into_iter().map(|id| passes.attempt_at(id, point_of(id))).collect();
+    match sweep.bracket_picture() {
+        Some(picture) if !attempts.is_empty() && passes.go_on() => {
+            passes.acquire_under(Some(&picture), attempts)
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Starts the running estimate; the run works without it too.

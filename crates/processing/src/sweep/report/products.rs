@@ -1,7 +1,7 @@
 //! The products that a plan names, as pictures and plots.
 
 use ndarray::{Array2, Array3, ArrayView2};
-use raysweep_pipeline::{Product, Profile};
+use raysweep_pipeline::{Product, Profile, mask};
 use raysweep_session::report::{Block, ContactSheet, Marker, Picture, Plot, Section, Series, ToneMap};
 
 /// Percentile of the pixels that maps to white in a picture.
@@ -16,15 +16,17 @@ pub(super) fn images(products: &[Product], markers: &[Marker]) -> Option<Section
     let pictures: Vec<Picture> = products
         .iter()
         .filter_map(|product| match product {
-            Product::Image { name, about, image } => {
-                Some(picture(image, &format!("{name}: {about}")).with_markers(markers.to_vec()))
+            Product::Image { name, about, image, mask } => {
+                let bounds = mask.mapv(|bits| bits & mask::BOUND_ONLY != 0);
+                let shown = picture(image, &format!("{name}: {about}"));
+                Some(shown.with_markers(markers.to_vec()).with_hatching(bounds))
             }
             _ => None,
         })
         .collect();
     (!pictures.is_empty()).then(|| Section {
         title: "Light by where it came from".into(),
-        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below.".into(),
+        intro: "Each picture has its own scale; 1 is a white surface lit by its own projector row. The crosses are the pixels of the profiles below. Where pixels are hatched, the light is only known to be at least what is shown: they saturate.".into(),
         blocks: vec![Block::Pictures(pictures)],
     })
 }
@@ -36,7 +38,9 @@ fn picture(image: &Array2<f32>, caption: &str) -> Picture {
 /// A section for each sequence: a contact sheet and an animation.
 pub(super) fn sequences(products: &[Product]) -> impl Iterator<Item = Section> {
     products.iter().filter_map(|product| match product {
-        Product::Sequence { name, about, axis, at, images } => Some(sequence(name, about, axis, at, images)),
+        Product::Sequence { name, about, axis, at, images, .. } => {
+            Some(sequence(name, about, axis, at, images))
+        }
         _ => None,
     })
 }

@@ -1,3 +1,4 @@
+use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
@@ -12,14 +13,33 @@ pub struct Transport {
     pub u_min: i32,
     /// Whether the projector has the row, shape `[U, camera_rows]`.
     pub exists: Array2<bool>,
-    /// Pixels `[t, s]` that were estimated without some of the settings, because samples were masked.
+    /// Pixels `[t, s]` some of whose samples saturate.
     pub saturated: Array2<bool>,
+    /// Rows whose light is only known to be at least what `t` says, because each sample that sees them saturates: for
+    /// each pixel `[t, s]` that has some, `[U]`.
+    pub lower_bounds: BTreeMap<[usize; 2], Vec<bool>>,
+    /// Pixels `[t, s]` in which no exposure begins or ends near the pixel's own row, so that nothing but the prior
+    /// tells the rows `|u| <= 2` apart.
+    pub no_edge: Array2<bool>,
 }
 
 impl Transport {
+    /// A transport no part of which is only a bound or only the prior's word.
+    pub fn measured(t: Array3<f32>, u_min: i32, exists: Array2<bool>) -> Self {
+        let (_, rows, columns) = t.dim();
+        let none = Array2::from_elem((rows, columns), false);
+        Self { t, u_min, exists, saturated: none.clone(), lower_bounds: BTreeMap::new(), no_edge: none }
+    }
+
     /// Relative row of the last index of `t`.
     pub fn u_max(&self) -> i32 {
         self.u_min + self.t.len_of(Axis(0)) as i32 - 1
+    }
+
+    /// Whether some light of a pixel from these relative rows is only a lower bound.
+    pub fn is_bound(&self, pixel: [usize; 2], rows: RangeInclusive<i32>) -> bool {
+        let mut known = *rows.start().max(&self.u_min)..=*rows.end().min(&self.u_max());
+        self.lower_bounds.get(&pixel).is_some_and(|bounds| known.any(|u| bounds[(u - self.u_min) as usize]))
     }
 
     /// Light from the relative rows `u` in `rows`, `[t, s]`; rows outside the reach contribute nothing.
@@ -67,12 +87,8 @@ mod tests {
     #[test]
     fn bands_split_the_total() {
         // u = -2..=3 have the values 1, 10, 100, ...
-        let transport = Transport {
-            t: Array3::from_shape_fn((6, 1, 2), |(u, _, s)| (s + 1) as f32 * 10_f32.powi(u as i32)),
-            u_min: -2,
-            exists: Array2::from_elem((6, 1), true),
-            saturated: Array2::from_elem((1, 2), false),
-        };
+        let t = Array3::from_shape_fn((6, 1, 2), |(u, _, s)| (s + 1) as f32 * 10_f32.powi(u as i32));
+        let transport = Transport::measured(t, -2, Array2::from_elem((6, 1), true));
         let first = |image: Array2<f32>| image[[0, 0]];
         assert_eq!(transport.u_max(), 3);
         assert_eq!(first(transport.total()), 111_111.0);

@@ -127,12 +127,8 @@ mod tests {
         assert_eq!(measured.light, [1, 2, 3, 0].map(|index: usize| at(&images[index])));
 
         let reach = -11..=11;
-        let transport = Transport {
-            t: relative_rows(truth.view(), &reach),
-            u_min: -11,
-            exists: Array2::from_elem((23, 12), true),
-            saturated: Array2::from_elem((12, 2), false),
-        };
+        let t = relative_rows(truth.view(), &reach);
+        let transport = Transport::measured(t, -11, Array2::from_elem((23, 12), true));
         let predicted = DelayProfile::predicted(&timing, &transport, &settings(), &PIXELS);
         assert_eq!(predicted.delays_us, measured.delays_us);
         for (predicted, measured) in predicted.light.iter().zip(&measured.light) {

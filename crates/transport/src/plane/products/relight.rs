@@ -118,8 +118,7 @@ mod tests {
         let timing = RowTiming::new(8, 20.0, 200.0).unwrap().window(2, 4).unwrap();
         let light = |(index, t, s): (usize, usize, usize)| (1 + 100 * (index + t) + 10 * t + s) as f32;
         let t = Array3::from_shape_fn((5, 4, 3), light);
-        let (exists, saturated) = (Array2::from_elem((5, 4), true), Array2::from_elem((4, 3), false));
-        (timing, Transport { t, u_min: -2, exists, saturated })
+        (timing, Transport::measured(t, -2, Array2::from_elem((5, 4), true)))
     }
 
     #[test]
@@ -148,12 +147,9 @@ mod tests {
         let (timing, transport) = scene();
         let weights = Array1::from_shape_fn(8, |row| (row * row) as f64);
         let whole = relight(&timing, &transport, weights.view(), RelitBeam::default()).unwrap();
-        let rows = Transport {
-            t: transport.t.slice(s![.., 1..3, ..]).to_owned(),
-            exists: transport.exists.slice(s![.., 1..3]).to_owned(),
-            saturated: transport.saturated.slice(s![1..3, ..]).to_owned(),
-            ..transport
-        };
+        let t = transport.t.slice(s![.., 1..3, ..]).to_owned();
+        let exists = transport.exists.slice(s![.., 1..3]).to_owned();
+        let rows = Transport::measured(t, transport.u_min, exists);
         let part = relight_rows(&timing, 1, &rows, weights.view(), RelitBeam::default()).unwrap();
         assert_eq!(part, whole.slice(s![1..3, ..]));
         let beyond = relight_rows(&timing, 3, &rows, weights.view(), RelitBeam::default());

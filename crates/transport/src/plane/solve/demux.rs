@@ -1,12 +1,14 @@
+use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-use ndarray::{Array1, Array2, Array3, ArrayView2, ArrayView3, ArrayViewMut2, Axis, s};
+use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, Axis, s};
 use rayon::prelude::*;
 
 use super::super::PlaneError;
 use super::super::error::check_shape;
 use super::super::model::{FlyingSpot, RowModel, RowTiming, Setting, SlotKind, Transport, reach};
+use super::censored::minimise_censored;
 use super::pivot::{Start, minimise};
 use super::quadratic::Quadratic;
 use super::tiles::{Objectives, Problem, Row, Spike, Tile};
@@ -28,7 +30,21 @@ pub struct Demux {
     reach: RangeInclusive<i32>,
     u0_rows: Option<Arc<Array2<f32>>>,
     spot: Option<Arc<FlyingSpot>>,
+    bracket: Option<Arc<Bracket>>,
     simd: SimdLevel,
+}
+
+/// An image under less light than those of the stack, taken for the pixels that saturate there.
+#[derive(Debug, Clone)]
+pub struct Bracket {
+    /// Delays and exposure.
+    pub setting: Setting,
+    /// The level of its light as a share of the stack's, in `0..=1`.
+    pub light: f64,
+    /// `[t, s]` of all camera rows, in the units of the stack: divided by `light`, dark image subtracted.
+    pub image: Array2<f32>,
+    /// Which of its pixels are not saturated, `[t, s]`; the others are lower bounds.
+    pub valid: Array2<bool>,
 }
 
 impl Demux {
@@ -39,7 +55,16 @@ impl Demux {
     pub fn new(timing: RowTiming, settings: Vec<Setting>, prior: Prior) -> Result<Self, PlaneError> {
         prior.check()?;
         let reach = reach(&timing, &settings)?;
-        Ok(Self { timing, settings, prior, reach, u0_rows: None, spot: None, simd: SimdLevel::best() })
+        Ok(Self {
+            timing,
+            settings,
+            prior,
+            reach,
+            u0_rows: None,
+            spot: None,
+            bracket: None,
+            simd: SimdLevel::best(),
+        })
     }
 
     /// The same unknowns and prior with other settings: those of the points captured so far, or the planned ones with
@@ -114,6 +139,24 @@ impl Demux {
         Ok(Self { spot: Some(Arc::new(spot)), ..self.clone() })
     }
 
+    /// Adds an image under less light, which is used for pixels with saturated samples only: its squared error joins
+    /// their objective with the weight `light`.
+    ///
+    /// # Errors
+    /// Those of [`RowTiming::check`]; [`PlaneError::OutOfRange`] for a level outside 0..=1; [`PlaneError::Shape`].
+    pub fn with_bracket(&self, bracket: Bracket) -> Result<Self, PlaneError> {
+        self.timing.check(std::slice::from_ref(&bracket.setting))?;
+        if !(bracket.light > 0.0 && bracket.light <= 1.0) {
+            let allowed = "above 0 and at most 1: take the bracket under less light than the sweep";
+            return Err(PlaneError::OutOfRange { field: "light", value: bracket.light, allowed });
+        }
+        let (rows, columns) = bracket.image.dim();
+        let expected = [self.timing.camera_rows(), columns];
+        check_shape("image of the bracket", "[camera rows, columns]", &[rows, columns], &expected)?;
+        check_shape("valid of the bracket", "[camera rows, columns]", bracket.valid.shape(), &expected)?;
+        Ok(Self { bracket: Some(Arc::new(bracket)), ..self.clone() })
+    }
+
     /// The same, solved with the given instructions instead of the fastest.
     pub fn with_simd(&self, simd: SimdLevel) -> Self {
         Self { simd, ..self.clone() }
@@ -157,9 +200,10 @@ impl Demux {
     /// Estimates the transport from `stack`, shape `[settings, camera_rows, columns]`, in units of the light that a
     /// white pixel collects per row dwell. Black level and ambient light must already be subtracted.
     ///
-    /// `valid`, of the same shape, tells which samples may be used; saturated ones may not. A pixel with masked
-    /// samples is estimated from the others and flagged in [`Transport::saturated`]. It takes many times longer,
-    /// because its model differs from its row's.
+    /// `valid`, of the same shape, tells which samples are exact. The others are saturated: their light is at least what
+    /// they show, and only what the prediction lacks is squared; 0 or less says nothing. A pixel with such samples is
+    /// flagged in [`Transport::saturated`], and the rows that no exact sample sees in [`Transport::lower_bounds`]. It
+    /// takes many times longer, because its model differs from its row's.
     ///
     /// # Errors
     /// [`PlaneError::Shape`] if an array does not fit the timing and the settings; [`PlaneError::NotFinite`] for a
@@ -295,6 +339,9 @@ impl Demux {
         if let Some(spot) = &self.spot {
             check_shape("columns of the spot", "[columns]", &[spot.columns.len()], &[columns])?;
         }
+        if let Some(bracket) = &self.bracket {
+            check_shape("image of the bracket", "[columns]", &[bracket.image.ncols()], &[columns])?;
+        }
         if let Some(((setting, row, column), _)) =
             stack.indexed_iter().find(|(_, sample)| !sample.is_finite())
         {
@@ -311,12 +358,18 @@ impl Demux {
                 let valid = valid.map(|valid| valid.index_axis_move(Axis(1), at));
                 let u0_rows = self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(row));
                 let estimate = estimate.map(|estimate| estimate.t.index_axis(Axis(1), at));
-                Row::new(row, columns, valid, u0_rows, Data { stack, estimate, profiles })
+                let bracket = self.bracket.as_ref().map(|of| (of.image.row(row), of.valid.row(row)));
+                let data =
+                    Data { stack, bracket, estimate, profiles, bounds: Vec::new(), no_edge: Vec::new() };
+                Row::new(row, columns, valid, u0_rows, data)
             })
             .collect();
+        let bracket_setting = self.bracket.iter().map(|bracket| &bracket.setting);
+        let settings: Vec<Setting> = self.settings.iter().chain(bracket_setting).cloned().collect();
         let objectives = Objectives {
             timing: &self.timing,
-            settings: &self.settings,
+            settings: &settings,
+            bracket_light: self.bracket.as_ref().map(|bracket| bracket.light),
             prior: self.prior,
             reach: &self.reach,
             spot: self.spot.as_deref(),
@@ -324,31 +377,63 @@ impl Demux {
         objectives.for_each_tile(
             &mut solved,
             go_on,
-            &|problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
-                self.solve_tile(problem, tile, rows);
-                Ok(())
-            },
+            &|problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| self.solve_tile(problem, tile, rows),
         )?;
+        let mut lower_bounds = BTreeMap::new();
+        let mut no_edge = Array2::from_elem((rows.len(), columns), false);
+        for (at, row) in solved.into_iter().enumerate() {
+            lower_bounds.extend(row.data.bounds.into_iter().map(|(column, bounds)| ([at, column], bounds)));
+            row.data.no_edge.into_iter().for_each(|column| no_edge[[at, column]] = true);
+        }
         let exists = Array2::from_shape_fn((shape[0], rows.len()), |(index, at)| {
             self.timing.row_exists(u_min + index as i32, rows[at])
         });
         let saturated = Array2::from_shape_fn((rows.len(), columns), |(at, column)| {
             valid.is_some_and(|valid| valid.slice(s![.., at, column]).iter().any(|valid| !valid))
         });
-        Ok(Transport { t, u_min, exists, saturated })
+        Ok(Transport { t, u_min, exists, saturated, lower_bounds, no_edge })
     }
 
-    fn solve_tile(&self, problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]) {
-        let Problem { settings, weights, quadratic, .. } = problem;
-        let Tile { pixels, runs } = tile;
-        let mut samples = Array2::zeros((pixels.len(), settings.len()));
-        for (samples, &setting) in samples.columns_mut().into_iter().zip(settings) {
-            for (sample, &(at, column)) in samples.into_iter().zip(pixels) {
-                *sample = f64::from(rows[at].data.stack[[setting, column]]);
+    fn solve_tile(&self, problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]) -> Result<(), PlaneError> {
+        let places: Vec<(usize, usize)> = problem.places(*self.reach.start()).collect();
+        let minima = match &tile.valid {
+            None => self.minima(problem, tile, &places, rows),
+            Some(valid) => self.censored_minima(problem, tile, valid.view(), rows)?,
+        };
+        if !problem.has_edge() {
+            tile.pixels.iter().for_each(|&(at, column)| rows[at].data.no_edge.push(column));
+        }
+
+        let place_of = |slot: usize| places.iter().find(|(own, _)| *own == slot).map(|(_, place)| *place);
+        for &(slot, place) in &places {
+            for (&x, &(at, column)) in minima.column(slot).iter().zip(&tile.pixels) {
+                rows[at].data.profiles[[place, column]] = x as f32;
             }
         }
-        let linear = quadratic.linear(weights.view(), samples.view());
-        let places: Vec<(usize, usize)> = problem.places(*self.reach.start()).collect();
+        if let Some(Spike { own, neighbour, share }) = problem.spike {
+            let [own_place, neighbour] = [Some(own), neighbour].map(|slot| place_of(slot?));
+            for (&direct, &(at, column)) in minima.column(own).iter().zip(&tile.pixels) {
+                let profiles = &mut rows[at].data.profiles;
+                own_place
+                    .into_iter()
+                    .for_each(|own| profiles[[own, column]] = (direct * (1.0 - share)) as f32);
+                neighbour.into_iter().for_each(|place| profiles[[place, column]] += (direct * share) as f32);
+            }
+        }
+        Ok(())
+    }
+
+    /// The minima of pixels all of whose samples are exact, `[pixels, slots]`.
+    fn minima(
+        &self,
+        problem: &Problem,
+        tile: &Tile,
+        places: &[(usize, usize)],
+        rows: &[Row<Data>],
+    ) -> Array2<f64> {
+        let Tile { pixels, runs, .. } = tile;
+        let samples = samples_of(problem, tile, rows);
+        let linear = problem.quadratic.linear(problem.weights.view(), samples.view());
         let estimated = rows.iter().all(|row| row.data.estimate.is_some());
         let free = estimated.then(|| {
             let mut free = Array2::from_elem(linear.dim(), true);
@@ -359,35 +444,73 @@ impl Demux {
             free
         });
         let start = free.as_ref().map_or(Start::Runs(runs), |free| Start::Free(free.view()));
-        let minima = minimise(self.simd, quadratic, linear, &start);
+        minimise(self.simd, &problem.quadratic, linear, &start)
+    }
 
-        let place_of = |slot: usize| places.iter().find(|(own, _)| *own == slot).map(|(_, place)| *place);
-        for &(slot, place) in &places {
-            for (&x, &(at, column)) in minima.column(slot).iter().zip(pixels) {
-                rows[at].data.profiles[[place, column]] = x as f32;
+    /// The minima of pixels with censored samples, `[pixels, slots]`; notes what is only a lower bound.
+    fn censored_minima(
+        &self,
+        problem: &Problem,
+        tile: &Tile,
+        valid: ArrayView1<bool>,
+        rows: &mut [Row<Data>],
+    ) -> Result<Array2<f64>, PlaneError> {
+        let samples = samples_of(problem, tile, rows);
+        let mut minima = Array2::zeros((samples.nrows(), problem.model.slots.len()));
+        for (k, &(at, column)) in tile.pixels.iter().enumerate() {
+            let (mut own, mut exact) = (samples.row(k).to_vec(), valid.to_vec());
+            if let Some((image, valid)) = rows[at].data.bracket {
+                own.push(f64::from(image[column]) * problem.bracket_scale());
+                exact.push(valid[column]);
+            }
+            let (own, exact) = (Array1::from(own), Array1::from(exact));
+            let solved = minimise_censored(self.simd, problem, &self.prior, own.view(), exact.view())?;
+            minima.row_mut(k).assign(&solved);
+            if let Some(bounds) = self.lower_bounds(problem, exact.view()) {
+                rows[at].data.bounds.push((column, bounds));
             }
         }
-        if let Some(Spike { own, neighbour, share }) = problem.spike {
-            let [own_place, neighbour] = [Some(own), neighbour].map(|slot| place_of(slot?));
-            for (&direct, &(at, column)) in minima.column(own).iter().zip(pixels) {
-                let profiles = &mut rows[at].data.profiles;
-                own_place
-                    .into_iter()
-                    .for_each(|own| profiles[[own, column]] = (direct * (1.0 - share)) as f32);
-                neighbour.into_iter().for_each(|place| profiles[[place, column]] += (direct * share) as f32);
-            }
+        Ok(minima)
+    }
+
+    /// Which rows of the profile, `[reach]`, are only lower bounds, if any.
+    fn lower_bounds(&self, problem: &Problem, exact: ArrayView1<bool>) -> Option<Vec<bool>> {
+        let of_slots = problem.lower_bounds(exact);
+        let mut bounds = vec![false; self.reach.clone().count()];
+        for (slot, place) in problem.places(*self.reach.start()) {
+            // Direct light between two rows is one unknown, in the slot of row 0.
+            let is_neighbour = |spike: &Spike| spike.neighbour == Some(slot) && of_slots[spike.own];
+            bounds[place] = of_slots[slot] || problem.spike.as_ref().is_some_and(is_neighbour);
+        }
+        bounds.contains(&true).then_some(bounds)
+    }
+}
+
+/// The samples of a tile's pixels, `[pixels, settings]`.
+fn samples_of(problem: &Problem, tile: &Tile, rows: &[Row<Data>]) -> Array2<f64> {
+    let mut samples = Array2::zeros((tile.pixels.len(), problem.settings.len()));
+    for (samples, &setting) in samples.columns_mut().into_iter().zip(&problem.settings) {
+        for (sample, &(at, column)) in samples.into_iter().zip(&tile.pixels) {
+            *sample = f64::from(rows[at].data.stack[[setting, column]]);
         }
     }
+    samples
 }
 
 /// A camera row to be solved.
 struct Data<'a> {
     /// `[settings, columns]`
     stack: ArrayView2<'a, f32>,
+    /// Image and validity of the bracket, `[columns]`.
+    bracket: Option<(ArrayView1<'a, f32>, ArrayView1<'a, bool>)>,
     /// Starting point of the solver, `[reach, columns]`.
     estimate: Option<ArrayView2<'a, f32>>,
     /// The row's part of the transport, `[reach, columns]`.
     profiles: ArrayViewMut2<'a, f32>,
+    /// Columns with rows that are only lower bounds, and which of them, `[reach]`.
+    bounds: Vec<(usize, Vec<bool>)>,
+    /// Columns in which no exposure tells rows near `u = 0` apart.
+    no_edge: Vec<usize>,
 }
 
 /// Largest eigenvalue of a symmetric positive definite matrix, by power iteration to about 1 %.

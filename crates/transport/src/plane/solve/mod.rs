@@ -1,5 +1,6 @@
 //! Inverts the forward model: from a stack to its transport, the exact minimum of each pixel's objective.
 
+mod censored;
 pub(super) mod cholesky;
 mod demux;
 mod dense;
@@ -11,7 +12,7 @@ pub mod reference;
 mod simd;
 pub(super) mod tiles;
 
-pub use demux::Demux;
+pub use demux::{Bracket, Demux};
 pub use prior::Prior;
 pub use simd::SimdLevel;
 pub use tiles::objectives_bytes;

@@ -1,8 +1,9 @@
 //! The simple solver that the fast one must equal: one pixel at a time, one row freed at a time.
 
-use ndarray::ArrayView2;
+use ndarray::{Array2, ArrayView2};
 
 use super::cholesky;
+use super::quadratic::RIDGE;
 
 /// Minimises `x'Hx - 2 c'x` over `x >= 0` by the active-set method of Lawson and Hanson ("Solving Least Squares
 /// Problems", 1974, algorithm NNLS) on the normal equations.
@@ -43,6 +44,32 @@ pub fn minimise(h: ArrayView2<f64>, c: &[f64]) -> Vec<f64> {
     }
 }
 
+/// Minimises `x'Hx - 2 c'x` over `x >= 0` for a pixel in which some samples are only lower bounds: of these, only what
+/// the prediction lacks is squared, `max(0, bound - weights x)^2`. Each gets an unknown of its own, its light beyond
+/// the bound, with which it is an exact sample: a problem for [`minimise`].
+///
+/// `h`, shape `[n, n]`, and `c`, `n` elements, are those of all samples, as if the bounds were exact; `weights`, shape
+/// `[bounds, n]`, and `bounds` are those of the censored samples.
+pub fn minimise_censored(
+    h: ArrayView2<f64>,
+    c: &[f64],
+    weights: ArrayView2<f64>,
+    bounds: &[f64],
+) -> Vec<f64> {
+    let (k, n) = weights.dim();
+    let augmented =
+        Array2::from_shape_fn((n + k, n + k), |(i, j)| match (i.checked_sub(n), j.checked_sub(n)) {
+            (None, None) => h[[i, j]],
+            (Some(beyond), None) => -weights[[beyond, j]],
+            (None, Some(beyond)) => -weights[[beyond, i]],
+            (Some(a), Some(b)) => f64::from(u8::from(a == b)) * (1.0 + RIDGE),
+        });
+    let c: Vec<f64> = c.iter().copied().chain(bounds.iter().map(|bound| -bound)).collect();
+    let mut x = minimise(augmented.view(), &c);
+    x.truncate(n);
+    x
+}
+
 /// The minimum over the free rows, with 0 in all other rows.
 fn stationary_point(h: ArrayView2<f64>, c: &[f64], free: &[bool]) -> Vec<f64> {
     let rows: Vec<usize> = (0..c.len()).filter(|&i| free[i]).collect();
@@ -67,7 +94,7 @@ fn dot_row(h: ArrayView2<f64>, i: usize, x: &[f64]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use ndarray::{Array2, array};
+    use ndarray::array;
     use proptest::prelude::*;
 
     use super::*;

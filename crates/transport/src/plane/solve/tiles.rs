@@ -3,12 +3,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
+use std::sync::OnceLock;
 
-use ndarray::{Array2, ArrayView1, ArrayView2, Axis};
+use ndarray::{Array1, Array2, ArrayView1, ArrayView2, Axis, s};
 use rayon::prelude::*;
 
 use super::super::PlaneError;
-use super::super::model::{FlyingSpot, RowModel, RowTiming, Setting, Slot, SlotKind};
+use super::super::model::{FlyingSpot, MIN_WEIGHT, RowModel, RowTiming, Setting, Slot, SlotKind};
 use super::Prior;
 use super::pivot::RUN_PX;
 use super::quadratic::Quadratic;
@@ -22,6 +23,9 @@ const PROBLEMS: usize = 16;
 /// Steps of the position of direct light per projector row: pixels within one step share an objective.
 const SPIKE_STEPS: f32 = 64.0;
 
+/// Rows as near as this to the pixel's own are told apart only by exposures that begin or end there.
+const NEAR_ROWS: i32 = 2;
+
 /// Memory in bytes for the objectives held at a time when solving on `threads` threads, for pixels that see
 /// `reach_rows` projector rows: for each its matrix, the inverse, and the settings' weights or their inputs.
 pub fn objectives_bytes(reach_rows: u64, threads: u64) -> u64 {
@@ -33,7 +37,10 @@ pub fn objectives_bytes(reach_rows: u64, threads: u64) -> u64 {
 #[derive(Clone, Copy)]
 pub struct Objectives<'a> {
     pub timing: &'a RowTiming,
+    /// The settings of the stack; the bracket's follows them if there is one.
     pub settings: &'a [Setting],
+    /// The level of the bracket's light, as a share of white.
+    pub bracket_light: Option<f64>,
     pub prior: Prior,
     pub reach: &'a RangeInclusive<i32>,
     pub spot: Option<&'a FlyingSpot>,
@@ -60,15 +67,27 @@ struct Direct {
     weights: Option<Vec<u64>>,
 }
 
-/// The objective of pixels with the same direct light and the same valid samples.
+/// The objective of pixels with the same direct light and the same samples.
 pub struct Problem<'a> {
     pub model: &'a RowModel,
-    /// The indices of the settings in use.
+    /// The indices of the samples in use: settings of the stack, and possibly the bracket after them.
     pub settings: Vec<usize>,
-    /// `[settings, slots]`
+    /// Of these samples, `[samples, slots]`.
     pub weights: Array2<f64>,
     pub quadratic: Quadratic,
     pub spike: Option<Spike>,
+    bracket: Option<BracketRow>,
+}
+
+/// The part of a bracket in a [`Problem`].
+struct BracketRow {
+    /// Weight of its squared error; 1 for an image of the stack. It is the level of its light, because the variance of
+    /// shot noise, in units of white, is that much larger.
+    light: f64,
+    /// `[slots]`
+    weights: Array1<f64>,
+    /// The objective of all samples and the bracket, once a pixel has needed it.
+    quadratic: OnceLock<Result<Quadratic, PlaneError>>,
 }
 
 /// Direct light between two rows: one unknown, in the slot of row 0, that represents light in both rows.
@@ -89,6 +108,9 @@ pub struct Tile {
     /// Lengths of the runs of pixels: neighbours in one row, so that an image solved in parts gives the same result
     /// as one solved as a whole.
     pub runs: Vec<usize>,
+    /// Which samples of the stack are exact, `[settings]`, the same in all pixels; `None` if all are. The others are
+    /// lower bounds.
+    pub valid: Option<Array1<bool>>,
 }
 
 /// The processing of a tile, whose pixels lie in these rows.
@@ -143,7 +165,7 @@ impl Objectives<'_> {
             if !go_on() {
                 return Err(PlaneError::Stopped);
             }
-            let problem = Problem::new(&model, &self.prior, &direct)?;
+            let problem = self.problem(&model, &direct)?;
             row.groups.insert(direct.clone(), columns);
             self.for_group(&problem, &direct, std::slice::from_mut(row), work)?;
         }
@@ -167,10 +189,8 @@ impl Objectives<'_> {
         let columns = rows.first().map_or(1, |row| row.columns.max(1));
         let tile_rows = (TILE_PX / columns).max(1);
         for directs in directs.chunks(PROBLEMS) {
-            let problems: Vec<Problem> = directs
-                .par_iter()
-                .map(|direct| Problem::new(model, &self.prior, direct))
-                .collect::<Result<_, _>>()?;
+            let problems: Vec<Problem> =
+                directs.par_iter().map(|direct| self.problem(model, direct)).collect::<Result<_, _>>()?;
             rows.par_chunks_mut(tile_rows).try_for_each(|rows| {
                 directs.iter().zip(&problems).try_for_each(|(direct, problem)| match go_on() {
                     true => self.for_group(problem, direct, rows, work),
@@ -206,12 +226,40 @@ impl Objectives<'_> {
             let Some(valid) = valid else { continue };
             // Neighbouring pixels of a highlight mostly lack the same samples.
             for alike in masked.chunk_by(|&a, &b| valid.column(a) == valid.column(b)) {
-                let mut tile = Tile::default();
+                let mut tile = Tile { valid: Some(valid.column(alike[0]).to_owned()), ..Tile::default() };
                 tile.add(at, alike);
-                work(&problem.masked(valid.column(alike[0]), &self.prior)?, &tile, rows)?;
+                work(problem, &tile, rows)?;
             }
         }
         work(problem, &tile, rows)
+    }
+
+    /// The objective of pixels of this model with this direct light.
+    fn problem<'a>(&self, model: &'a RowModel, direct: &Direct) -> Result<Problem<'a>, PlaneError> {
+        let mut weights = model.weights.clone();
+        let own = slot_of(model, 0);
+        if let Some((own, direct)) = own.zip(direct.weights.as_ref()) {
+            weights.column_mut(own).iter_mut().zip(direct).for_each(|(to, &bits)| *to = f64::from_bits(bits));
+        }
+        let spike = own.filter(|_| direct.step != 0).map(|own| Spike {
+            own,
+            neighbour: slot_of(model, direct.step.signum()),
+            share: f64::from(direct.step.unsigned_abs()) / f64::from(SPIKE_STEPS),
+        });
+        if let Some(Spike { own, neighbour, share }) = spike {
+            let other = neighbour.map(|neighbour| weights.column(neighbour).to_owned());
+            let mut column = weights.column_mut(own);
+            column *= 1.0 - share;
+            other.into_iter().for_each(|other| column.scaled_add(share, &other));
+        }
+        let last = weights.nrows() - 1;
+        let bracket = self.bracket_light.map(|light| {
+            let of_bracket = weights.row(last).to_owned();
+            weights.remove_index(Axis(0), last);
+            BracketRow { light, weights: of_bracket, quadratic: OnceLock::new() }
+        });
+        let quadratic = Quadratic::new(weights.view(), &model.slots, &self.prior)?;
+        Ok(Problem { model, settings: (0..weights.nrows()).collect(), weights, quadratic, spike, bracket })
     }
 
     /// Groups the columns of a row by position and time of their direct light.
@@ -264,37 +312,69 @@ impl Tile {
 }
 
 impl<'a> Problem<'a> {
-    fn new(model: &'a RowModel, prior: &Prior, direct: &Direct) -> Result<Self, PlaneError> {
-        let mut weights = model.weights.clone();
-        let own = slot_of(model, 0);
-        if let Some((own, direct)) = own.zip(direct.weights.as_ref()) {
-            weights.column_mut(own).iter_mut().zip(direct).for_each(|(to, &bits)| *to = f64::from_bits(bits));
-        }
-        let spike = own.filter(|_| direct.step != 0).map(|own| Spike {
-            own,
-            neighbour: slot_of(model, direct.step.signum()),
-            share: f64::from(direct.step.unsigned_abs()) / f64::from(SPIKE_STEPS),
-        });
-        if let Some(Spike { own, neighbour, share }) = spike {
-            let other = neighbour.map(|neighbour| weights.column(neighbour).to_owned());
-            let mut column = weights.column_mut(own);
-            column *= 1.0 - share;
-            other.into_iter().for_each(|other| column.scaled_add(share, &other));
-        }
-        let quadratic = Quadratic::new(weights.view(), &model.slots, prior)?;
-        Ok(Self { model, settings: (0..weights.nrows()).collect(), weights, quadratic, spike })
+    /// The same problem for pixels with only some of the samples: `used`, `[settings]` or one more for the bracket.
+    pub fn of_samples(&self, used: ArrayView1<bool>, prior: &Prior) -> Result<Self, PlaneError> {
+        let bracket =
+            self.bracket.as_ref().filter(|_| used.len() > self.settings.len() && used[used.len() - 1]);
+        let rows = self.rows();
+        let rows = if bracket.is_some() { rows.view() } else { rows.slice(s![..self.settings.len(), ..]) };
+        let whole = match bracket {
+            None => &self.quadratic,
+            Some(bracket) => bracket
+                .quadratic
+                .get_or_init(|| Quadratic::new(rows, &self.model.slots, prior))
+                .as_ref()
+                .map_err(Clone::clone)?,
+        };
+        let (settings, dropped): (Vec<usize>, Vec<usize>) = (0..rows.nrows()).partition(|&n| used[n]);
+        let weights = rows.select(Axis(0), &settings);
+        let quadratic = if dropped.is_empty() {
+            whole.clone()
+        } else {
+            match whole.without(rows.select(Axis(0), &dropped).view()) {
+                Some(quadratic) => quadratic,
+                None => Quadratic::new(weights.view(), &self.model.slots, prior)?,
+            }
+        };
+        Ok(Self { model: self.model, settings, weights, quadratic, spike: self.spike, bracket: None })
     }
 
-    /// The same problem for pixels with only some valid samples.
-    fn masked(&self, valid: ArrayView1<bool>, prior: &Prior) -> Result<Self, PlaneError> {
-        let (settings, dropped): (Vec<usize>, Vec<usize>) = self.settings.iter().partition(|&&n| valid[n]);
-        let weights = self.weights.select(Axis(0), &settings);
-        let downdated = self.quadratic.without(self.weights.select(Axis(0), &dropped).view());
-        let quadratic = match downdated {
-            Some(quadratic) => quadratic,
-            None => Quadratic::new(weights.view(), &self.model.slots, prior)?,
-        };
-        Ok(Self { model: self.model, settings, weights, quadratic, spike: self.spike })
+    /// The weights of all samples as they enter the objective, `[samples, slots]`: those of the stack, then the
+    /// bracket's, scaled by [`Self::bracket_scale`].
+    pub fn rows(&self) -> Array2<f64> {
+        let mut rows = self.weights.clone();
+        if let Some(BracketRow { weights, .. }) = &self.bracket {
+            let scaled = weights * self.bracket_scale();
+            rows.append(Axis(0), scaled.insert_axis(Axis(0)).view()).unwrap_or_default();
+        }
+        rows
+    }
+
+    /// Factor of the bracket's sample and weights in the objective.
+    pub fn bracket_scale(&self) -> f64 {
+        self.bracket.as_ref().map_or(1.0, |bracket| bracket.light.sqrt())
+    }
+
+    /// Which slots a pixel knows only as lower bounds: some sample sees them, but no exact one does. `valid` tells
+    /// which samples are exact, `[settings]`, or one more for the bracket.
+    pub fn lower_bounds(&self, valid: ArrayView1<bool>) -> Vec<bool> {
+        let rows = self.rows();
+        let scale = |n: usize| if n < self.settings.len() { 1.0 } else { self.bracket_scale() };
+        let sees = |n: usize, slot: usize| rows[[n, slot]] >= MIN_WEIGHT * scale(n);
+        let seen = |slot: usize, exact: bool| (0..valid.len()).any(|n| valid[n] == exact && sees(n, slot));
+        (0..rows.ncols()).map(|slot| !seen(slot, true) && seen(slot, false)).collect()
+    }
+
+    /// Whether some exposure begins or ends so near the pixel's own row that it tells the rows `|u| <= 2` apart.
+    pub fn has_edge(&self) -> bool {
+        let own = |slot: &Slot| slot.kind == SlotKind::Own && slot.u.abs() <= NEAR_ROWS;
+        let near: Vec<usize> = (0..self.weights.ncols()).filter(|&n| own(&self.model.slots[n])).collect();
+        self.weights.rows().into_iter().any(|weights| {
+            let of_near = near.iter().map(|&slot| weights[slot]);
+            let (least, most) =
+                of_near.fold((f64::INFINITY, 0.0_f64), |(least, most), w| (least.min(w), most.max(w)));
+            most - least >= MIN_WEIGHT
+        })
     }
 
     /// The slots that are part of the profile, `[slot, relative row - u_min]`.

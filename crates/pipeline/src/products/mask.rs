@@ -1,0 +1,63 @@
+//! The mask beside each product: what is known of each of its pixels.
+
+use std::ops::RangeInclusive;
+
+use ndarray::{Array2, Axis};
+use raysweep_transport::plane::Transport;
+
+use super::spec::ProductKind;
+use crate::stack::SweepStack;
+
+/// The light is measured.
+pub const MEASURED: u8 = 1;
+/// The light is only known to be at least the value: samples that see it saturate.
+pub const BOUND_ONLY: u8 = 2;
+/// A stage replaced the pixel in some image.
+pub const HOT_PIXEL_FILLED: u8 = 4;
+/// Rows that the product asks for lie outside of the sweep's reach, and their light is missing.
+pub const OUTSIDE_REACH: u8 = 8;
+/// No exposure tells the rows `|u| <= 2` apart, which the product separates: the prior alone does.
+pub const NO_EDGE: u8 = 16;
+
+/// Rows as near as this to the pixel's own are told apart only by edges of exposures.
+const NEAR_ROWS: RangeInclusive<i32> = -2..=2;
+
+/// Bits of a product's pixels, `[t, s]`, for the camera rows starting at `first_row`, to which stack and transport
+/// belong.
+pub(super) fn of(
+    kind: &ProductKind,
+    first_row: usize,
+    stack: &SweepStack,
+    transport: &Transport,
+) -> Array2<u8> {
+    let (_, height, width) = transport.t.dim();
+    let rows = kind.rows();
+    let is_lit = |u: i32| rows.iter().any(|rows| rows.contains(&u));
+    let near = NEAR_ROWS.filter(|&u| is_lit(u)).count();
+    let separates = near > 0 && near < NEAR_ROWS.count();
+    // Rows without end mean those within the reach.
+    let asked = |u: i32| {
+        rows.iter().any(|rows| *rows.start() > i32::MIN && *rows.end() < i32::MAX && rows.contains(&u))
+    };
+    let measured =
+        stack.valid.as_ref().map(|valid| valid.map_axis(Axis(0), |valid| valid.iter().any(|v| *v)));
+    let at = |map: &Option<Array2<bool>>, pixel, absent| map.as_ref().map_or(absent, |map| map[pixel]);
+    Array2::from_shape_fn((height, width), |pixel| {
+        let (t, s) = pixel;
+        let is_bound = match kind {
+            ProductKind::Regular => !at(&stack.regular_valid, pixel, true),
+            _ => rows.iter().any(|rows| transport.is_bound([t, s], rows.clone())),
+        };
+        let beyond = [transport.u_min - 1, transport.u_max() + 1];
+        let is_outside = beyond.iter().any(|&u| asked(u) && stack.timing.row_exists(u, first_row + t));
+        [
+            (at(&measured, pixel, true) && !is_bound, MEASURED),
+            (is_bound, BOUND_ONLY),
+            (at(&stack.filled, pixel, false), HOT_PIXEL_FILLED),
+            (is_outside, OUTSIDE_REACH),
+            (separates && transport.no_edge[pixel], NO_EDGE),
+        ]
+        .into_iter()
+        .fold(0, |mask, (is_set, bit)| if is_set { mask | bit } else { mask })
+    })
+}
