@@ -226,9 +226,8 @@ fn advice(advice: &PlanAdvice) -> Vec<(&'static str, String)> {
 /// Text of `design`: a plan file, with what is expected of it as comments.
 pub(super) fn design(report: &DesignReport) -> String {
     let DesignReport { points, frames, light_s, expected, plan, warnings } = report;
-    let light = duration(*light_s);
     let head = [
-        format!("{points} settings, {frames} frames, {light} of light"),
+        format!("{points} settings, {frames} frames, {light_s:.2} s of light"),
         format!("expected error: {}", errors(expected)),
     ];
     let comments = head.into_iter().chain(warnings.iter().map(|warning| format!("warning: {warning}")));
