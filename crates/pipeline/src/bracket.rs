@@ -34,9 +34,12 @@ impl BracketImage {
     ) -> Result<Option<Bracket>, PlaneError> {
         let Self { setting, image, valid } = self;
         let exact = stack.valid.as_ref().map(|valid| valid.view());
-        let transport = demux
-            .with_settings(stack.settings.clone())?
-            .solve_rows(rows, stack.images.view(), exact, &|| true)?;
+        let transport = demux.with_settings(stack.settings.clone())?.solve_rows(
+            rows,
+            stack.images.view(),
+            exact,
+            &|| true,
+        )?;
         let predicted = demux.with_settings(vec![setting.clone()])?.predict_rows(rows, &transport)?;
         let predicted = predicted.index_axis_move(Axis(0), 0);
         let (found, usable) = (image.select(Axis(0), rows), valid.select(Axis(0), rows));
@@ -52,6 +55,11 @@ impl BracketImage {
         if pixels < MIN_PIXELS || !(light > 0.0 && light <= 1.0) {
             return Ok(None);
         }
-        Ok(Some(Bracket { setting, light, image: image.mapv(|counts| (f64::from(counts) / light) as f32), valid }))
+        Ok(Some(Bracket {
+            setting,
+            light,
+            image: image.mapv(|counts| (f64::from(counts) / light) as f32),
+            valid,
+        }))
     }
 }

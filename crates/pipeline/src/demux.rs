@@ -111,7 +111,15 @@ impl DemuxFold {
         options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
-        let fold = Self { options, schedule, geometry, timing, taken: BTreeMap::new(), not_kept: None, filled: None };
+        let fold = Self {
+            options,
+            schedule,
+            geometry,
+            timing,
+            taken: BTreeMap::new(),
+            not_kept: None,
+            filled: None,
+        };
         fold.demux().map_err(invalid)?;
         Ok(fold)
     }

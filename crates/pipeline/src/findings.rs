@@ -194,7 +194,10 @@ impl Choices {
         image.setting = image.setting.earlier(self.late_us);
         let said = match image.levelled(&self.demux, rows, &stack)? {
             Some(bracket) => {
-                let said = format!("taken under {:.2} % of the sweep's light, as found from both", 100.0 * bracket.light);
+                let said = format!(
+                    "taken under {:.2} % of the sweep's light, as found from both",
+                    100.0 * bracket.light
+                );
                 self.demux = self.demux.with_bracket(bracket)?;
                 said
             }

@@ -46,8 +46,7 @@ pub enum ArrayName {
 
 impl ArrayName {
     /// All arrays.
-    pub const ALL: [ArrayName; 4] =
-        [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular, ArrayName::Clipped];
+    pub const ALL: [ArrayName; 4] = [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular, ArrayName::Clipped];
 
     /// The name in the Zarr group and in the ledger.
     pub fn as_str(self) -> &'static str {

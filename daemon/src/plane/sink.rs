@@ -113,10 +113,8 @@ impl PointSink {
 
     fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
         let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
-        let clipped = unit
-            .clipped
-            .as_ref()
-            .filter(|_| array == ArrayName::Sum && self.stack.has(ArrayName::Clipped));
+        let clipped =
+            unit.clipped.as_ref().filter(|_| array == ArrayName::Sum && self.stack.has(ArrayName::Clipped));
         let clipped_crc32 =
             clipped.map(|frames| self.stack.write(ArrayName::Clipped, index, frames.view())).transpose()?;
         let crc32 = self.stack.write(array, index, unit.sum.view())?;

@@ -153,7 +153,8 @@ mod tests {
 
     #[test]
     fn a_bracket_is_a_share_of_white() {
-        let sweep = |light: &str| parse(&format!("kind = \"sweep\"\n[sweep]\nbracket = {{ light = {light} }}"));
+        let sweep =
+            |light: &str| parse(&format!("kind = \"sweep\"\n[sweep]\nbracket = {{ light = {light} }}"));
         assert!(sweep("0.125").is_ok());
         for light in ["0.0", "1.0", "-0.5", "nan"] {
             let error = sweep(light).unwrap_err().to_string();

@@ -119,7 +119,8 @@ impl Assembly {
                     _ => None,
                 });
                 let (images, masks) = rest.unzip();
-                let image = one_below_the_other(image.insert_axis(Axis(0)), images).index_axis_move(Axis(0), 0);
+                let image =
+                    one_below_the_other(image.insert_axis(Axis(0)), images).index_axis_move(Axis(0), 0);
                 Product::Image { name, about, image, mask: one_mask_below_the_other(mask, masks) }
             }
             Product::Sequence { name, about, axis, at, images, mask } => {
@@ -128,7 +129,8 @@ impl Assembly {
                     _ => None,
                 });
                 let (rest, masks) = rest.unzip();
-                let (images, mask) = (one_below_the_other(images, rest), one_mask_below_the_other(mask, masks));
+                let (images, mask) =
+                    (one_below_the_other(images, rest), one_mask_below_the_other(mask, masks));
                 Product::Sequence { name, about, axis, at, images, mask }
             }
             other => other,

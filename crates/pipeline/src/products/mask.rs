@@ -24,7 +24,12 @@ const NEAR_ROWS: RangeInclusive<i32> = -2..=2;
 
 /// Bits of a product's pixels, `[t, s]`, for the camera rows starting at `first_row`, to which stack and transport
 /// belong.
-pub(super) fn of(kind: &ProductKind, first_row: usize, stack: &SweepStack, transport: &Transport) -> Array2<u8> {
+pub(super) fn of(
+    kind: &ProductKind,
+    first_row: usize,
+    stack: &SweepStack,
+    transport: &Transport,
+) -> Array2<u8> {
     let (_, height, width) = transport.t.dim();
     let rows = kind.rows();
     let is_lit = |u: i32| rows.iter().any(|rows| rows.contains(&u));
@@ -34,7 +39,8 @@ pub(super) fn of(kind: &ProductKind, first_row: usize, stack: &SweepStack, trans
     let asked = |u: i32| {
         rows.iter().any(|rows| *rows.start() > i32::MIN && *rows.end() < i32::MAX && rows.contains(&u))
     };
-    let measured = stack.valid.as_ref().map(|valid| valid.map_axis(Axis(0), |valid| valid.iter().any(|v| *v)));
+    let measured =
+        stack.valid.as_ref().map(|valid| valid.map_axis(Axis(0), |valid| valid.iter().any(|v| *v)));
     let at = |map: &Option<Array2<bool>>, pixel, absent| map.as_ref().map_or(absent, |map| map[pixel]);
     Array2::from_shape_fn((height, width), |pixel| {
         let (t, s) = pixel;

@@ -35,9 +35,8 @@ impl ImageRows for StoredImages<'_> {
         let around = halo_rows.map_or(0..height, |halo_rows| {
             rows.start.saturating_sub(halo_rows)..height.min(rows.end + halo_rows)
         });
-        let read = |array| {
-            self.stack.read_rows(array, index, around.clone()).map_err(|error| error.to_string())
-        };
+        let read =
+            |array| self.stack.read_rows(array, index, around.clone()).map_err(|error| error.to_string());
         let clipped = entry.clipped_crc32.map(|_| read(ArrayName::Clipped)).transpose()?;
         let unit = unit_of(point, entry, read(array)?, clipped);
         let image = run_stages(self.stages, &unit).map_err(|error| error.to_string())?;

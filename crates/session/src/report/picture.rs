@@ -222,8 +222,11 @@ impl Picture {
     fn overlay(&self) -> Markup {
         let (rows, columns) = self.size;
         let arm = 0.028 * columns as f64;
-        let hatching: String =
-            self.hatched.iter().map(|[row, column, length]| format!("M{column} {row}h{length}v1h-{length}z")).collect();
+        let hatching: String = self
+            .hatched
+            .iter()
+            .map(|[row, column, length]| format!("M{column} {row}h{length}v1h-{length}z"))
+            .collect();
         let step = columns as f64 / 200.0;
         html! {
             @if !self.hatched.is_empty() {

@@ -43,6 +43,8 @@ pub fn print() -> Result<(), Box<dyn Error>> {
     let valid = stack.mapv(|light| light < LIMIT);
     let with = seconds(&stack, Some(&valid))?;
     let each_us = (with - without) / f64::from(pixels) * 1e6;
-    println!("\nsaturated samples: {pixels} pixels of 128x128, V=189: {without:.3} s without, {with:.3} s with, {each_us:.0} us each");
+    println!(
+        "\nsaturated samples: {pixels} pixels of 128x128, V=189: {without:.3} s without, {with:.3} s with, {each_us:.0} us each"
+    );
     Ok(())
 }

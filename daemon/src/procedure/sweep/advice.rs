@@ -212,7 +212,8 @@ fn told(expected: advice::ExpectedError) -> ExpectedError {
 fn written(sweep: &SweepPlan) -> String {
     let SweepPlan { delay_us, exposure_us, average, max_jitter_us, bracket } = sweep;
     let (delay_us, exposure_us) = (axis(&delay_us.values()), axis(&exposure_us.values()));
-    let bracket = bracket.map_or_else(String::new, |bracket| format!("bracket = {{ light = {} }}\n", bracket.light));
+    let bracket =
+        bracket.map_or_else(String::new, |bracket| format!("bracket = {{ light = {} }}\n", bracket.light));
     format!(
         "[sweep]\ndelay_us = {delay_us}\nexposure_us = {exposure_us}\naverage = {average}\nmax_jitter_us = {max_jitter_us}\n{bracket}"
     )

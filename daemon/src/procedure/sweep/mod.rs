@@ -140,9 +140,8 @@ fn acquire(
     let live = run.live.clone().and_then(start_live);
     let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
     sink.live = live;
-    let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| {
-        acquire_points(passes, sweep, missing)
-    })?;
+    let taken = opened
+        .acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| acquire_points(passes, sweep, missing))?;
     let Taken { sink, exposures, latency, fault } = taken;
     Ok(Acquired {
         session: sink.run.session,
@@ -167,7 +166,9 @@ fn acquire_points(
     passes.acquire(others)?;
     let attempts: Vec<_> = bracket.into_iter().map(|id| passes.attempt_at(id, point_of(id))).collect();
     match sweep.bracket_picture() {
-        Some(picture) if !attempts.is_empty() && passes.go_on() => passes.acquire_under(Some(&picture), attempts),
+        Some(picture) if !attempts.is_empty() && passes.go_on() => {
+            passes.acquire_under(Some(&picture), attempts)
+        }
         _ => Ok(()),
     }
 }

@@ -38,7 +38,9 @@ fn picture(image: &Array2<f32>, caption: &str) -> Picture {
 /// A section for each sequence: a contact sheet and an animation.
 pub(super) fn sequences(products: &[Product]) -> impl Iterator<Item = Section> {
     products.iter().filter_map(|product| match product {
-        Product::Sequence { name, about, axis, at, images, .. } => Some(sequence(name, about, axis, at, images)),
+        Product::Sequence { name, about, axis, at, images, .. } => {
+            Some(sequence(name, about, axis, at, images))
+        }
         _ => None,
     })
 }

@@ -39,9 +39,7 @@ impl Transport {
     /// Whether some light of a pixel from these relative rows is only a lower bound.
     pub fn is_bound(&self, pixel: [usize; 2], rows: RangeInclusive<i32>) -> bool {
         let mut known = *rows.start().max(&self.u_min)..=*rows.end().min(&self.u_max());
-        self.lower_bounds
-            .get(&pixel)
-            .is_some_and(|bounds| known.any(|u| bounds[(u - self.u_min) as usize]))
+        self.lower_bounds.get(&pixel).is_some_and(|bounds| known.any(|u| bounds[(u - self.u_min) as usize]))
     }
 
     /// Light from the relative rows `u` in `rows`, `[t, s]`; rows outside the reach contribute nothing.

@@ -102,7 +102,8 @@ impl Uncertainty<'_> {
         let objectives =
             Objectives { timing, settings, bracket_light: None, prior, reach: &reach, spot: None };
         let work = |problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
-            let masked = tile.valid.as_ref().map(|valid| problem.of_samples(valid.view(), &prior)).transpose()?;
+            let masked =
+                tile.valid.as_ref().map(|valid| problem.of_samples(valid.view(), &prior)).transpose()?;
             let problem = masked.as_ref().unwrap_or(problem);
             let gains = problem.gains(bands, transport.u_min, tile, rows)?;
             for (gains, &(at, column)) in gains.axis_chunks_iter(Axis(0), bands.len()).zip(&tile.pixels) {

@@ -24,7 +24,8 @@ pub fn minimise_censored(
     valid: ArrayView1<bool>,
 ) -> Result<Array1<f64>, PlaneError> {
     let rows = problem.rows();
-    let informative: Array1<bool> = samples.iter().zip(valid).map(|(&sample, valid)| *valid || sample > 0.0).collect();
+    let informative: Array1<bool> =
+        samples.iter().zip(valid).map(|(&sample, valid)| *valid || sample > 0.0).collect();
     let linear = |of: &Problem| {
         let samples = samples.select(Axis(0), &of.settings).insert_axis(Axis(0));
         of.quadratic.linear(of.weights.view(), samples.view())

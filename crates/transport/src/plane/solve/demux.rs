@@ -359,7 +359,8 @@ impl Demux {
                 let u0_rows = self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(row));
                 let estimate = estimate.map(|estimate| estimate.t.index_axis(Axis(1), at));
                 let bracket = self.bracket.as_ref().map(|of| (of.image.row(row), of.valid.row(row)));
-                let data = Data { stack, bracket, estimate, profiles, bounds: Vec::new(), no_edge: Vec::new() };
+                let data =
+                    Data { stack, bracket, estimate, profiles, bounds: Vec::new(), no_edge: Vec::new() };
                 Row::new(row, columns, valid, u0_rows, data)
             })
             .collect();
@@ -376,9 +377,7 @@ impl Demux {
         objectives.for_each_tile(
             &mut solved,
             go_on,
-            &|problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
-                self.solve_tile(problem, tile, rows)
-            },
+            &|problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| self.solve_tile(problem, tile, rows),
         )?;
         let mut lower_bounds = BTreeMap::new();
         let mut no_edge = Array2::from_elem((rows.len(), columns), false);

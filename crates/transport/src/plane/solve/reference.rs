@@ -50,14 +50,20 @@ pub fn minimise(h: ArrayView2<f64>, c: &[f64]) -> Vec<f64> {
 ///
 /// `h`, shape `[n, n]`, and `c`, `n` elements, are those of all samples, as if the bounds were exact; `weights`, shape
 /// `[bounds, n]`, and `bounds` are those of the censored samples.
-pub fn minimise_censored(h: ArrayView2<f64>, c: &[f64], weights: ArrayView2<f64>, bounds: &[f64]) -> Vec<f64> {
+pub fn minimise_censored(
+    h: ArrayView2<f64>,
+    c: &[f64],
+    weights: ArrayView2<f64>,
+    bounds: &[f64],
+) -> Vec<f64> {
     let (k, n) = weights.dim();
-    let augmented = Array2::from_shape_fn((n + k, n + k), |(i, j)| match (i.checked_sub(n), j.checked_sub(n)) {
-        (None, None) => h[[i, j]],
-        (Some(beyond), None) => -weights[[beyond, j]],
-        (None, Some(beyond)) => -weights[[beyond, i]],
-        (Some(a), Some(b)) => f64::from(u8::from(a == b)) * (1.0 + RIDGE),
-    });
+    let augmented =
+        Array2::from_shape_fn((n + k, n + k), |(i, j)| match (i.checked_sub(n), j.checked_sub(n)) {
+            (None, None) => h[[i, j]],
+            (Some(beyond), None) => -weights[[beyond, j]],
+            (None, Some(beyond)) => -weights[[beyond, i]],
+            (Some(a), Some(b)) => f64::from(u8::from(a == b)) * (1.0 + RIDGE),
+        });
     let c: Vec<f64> = c.iter().copied().chain(bounds.iter().map(|bound| -bound)).collect();
     let mut x = minimise(augmented.view(), &c);
     x.truncate(n);

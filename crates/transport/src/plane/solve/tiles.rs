@@ -189,10 +189,8 @@ impl Objectives<'_> {
         let columns = rows.first().map_or(1, |row| row.columns.max(1));
         let tile_rows = (TILE_PX / columns).max(1);
         for directs in directs.chunks(PROBLEMS) {
-            let problems: Vec<Problem> = directs
-                .par_iter()
-                .map(|direct| self.problem(model, direct))
-                .collect::<Result<_, _>>()?;
+            let problems: Vec<Problem> =
+                directs.par_iter().map(|direct| self.problem(model, direct)).collect::<Result<_, _>>()?;
             rows.par_chunks_mut(tile_rows).try_for_each(|rows| {
                 directs.iter().zip(&problems).try_for_each(|(direct, problem)| match go_on() {
                     true => self.for_group(problem, direct, rows, work),
@@ -316,7 +314,8 @@ impl Tile {
 impl<'a> Problem<'a> {
     /// The same problem for pixels with only some of the samples: `used`, `[settings]` or one more for the bracket.
     pub fn of_samples(&self, used: ArrayView1<bool>, prior: &Prior) -> Result<Self, PlaneError> {
-        let bracket = self.bracket.as_ref().filter(|_| used.len() > self.settings.len() && used[used.len() - 1]);
+        let bracket =
+            self.bracket.as_ref().filter(|_| used.len() > self.settings.len() && used[used.len() - 1]);
         let rows = self.rows();
         let rows = if bracket.is_some() { rows.view() } else { rows.slice(s![..self.settings.len(), ..]) };
         let whole = match bracket {
@@ -372,7 +371,8 @@ impl<'a> Problem<'a> {
         let near: Vec<usize> = (0..self.weights.ncols()).filter(|&n| own(&self.model.slots[n])).collect();
         self.weights.rows().into_iter().any(|weights| {
             let of_near = near.iter().map(|&slot| weights[slot]);
-            let (least, most) = of_near.fold((f64::INFINITY, 0.0_f64), |(least, most), w| (least.min(w), most.max(w)));
+            let (least, most) =
+                of_near.fold((f64::INFINITY, 0.0_f64), |(least, most), w| (least.min(w), most.max(w)));
             most - least >= MIN_WEIGHT
         })
     }
