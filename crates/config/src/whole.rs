@@ -24,10 +24,10 @@ impl<const LOW: u32, const HIGH: u32> Visitor<'_> for Whole<LOW, HIGH> {
     }
 
     fn visit_i64<E: Error>(self, value: i64) -> Result<u32, E> {
-        u32::try_from(value).map_err(|_| E::invalid_value(Unexpected::Signed(value), &self))
+        u32::try_from(value).map_err(|_out_of_range| E::invalid_value(Unexpected::Signed(value), &self))
     }
 
     fn visit_u64<E: Error>(self, value: u64) -> Result<u32, E> {
-        u32::try_from(value).map_err(|_| E::invalid_value(Unexpected::Unsigned(value), &self))
+        u32::try_from(value).map_err(|_out_of_range| E::invalid_value(Unexpected::Unsigned(value), &self))
     }
 }

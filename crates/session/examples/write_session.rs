@@ -145,7 +145,7 @@ fn store_point(
     let crc32 = stack.write(array, index, counts.view())?;
     let delays_us = match array {
         ArrayName::Sum => (0..FRAMES).map(|frame| delay_us + f64::from(frame) * 0.1 - 0.35).collect(),
-        ArrayName::Dark | ArrayName::Regular => Vec::new(),
+        ArrayName::Dark | ArrayName::Regular | ArrayName::Clipped => Vec::new(),
     };
     ledger.append(&Entry::Point(PointEntry {
         array,

@@ -3,20 +3,23 @@
 //! float32 `[u, t, s]`: u = v - t is the projector row relative to the camera row t, s the camera column. The
 //! first plane is u = `u_min` of the array's attributes. Values are in the scene's units (1 is a white
 //! Lambertian surface at the reference distance). Rows that the projector does not have are 0. Chunks contain
-//! all of u for 64 x 64 pixels.
+//! all of u for 64 x 64 pixels. The array `mask`, uint8 of the same shape, tells what is known of each value; its
+//! attribute `bits` names the bits.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use ndarray::{Array1, Array3, ArrayView3, Axis, s};
 use rayon::prelude::*;
 use serde_json::{Map, Value};
-use zarrs::array::{Array, ArrayBuilder, data_type};
+use zarrs::array::{Array, ArrayBuilder, Element, data_type};
 
 use crate::durable::DraftDir;
 use crate::zarr::{self, CHUNK_PX, DurableStore};
 use crate::{Error, Result};
 
 const NAME: &str = "transport";
+const MASK: &str = "mask";
 
 /// Writes `transport [u, t, s]` to the group at `dir`, replacing any existing one atomically. `attributes`
 /// become those of the array: `u_min`, `u_max`, `row_time_us`, the prior and how it was computed.
@@ -34,7 +37,10 @@ pub fn write(dir: &Path, transport: ArrayView3<f32>, attributes: &Map<String, Va
 /// not fit in memory. Nothing is visible before [`Writer::commit`], and nothing is kept without it.
 pub struct Writer {
     draft: DraftDir,
+    store: Arc<DurableStore>,
     array: Array<DurableStore>,
+    /// The mask and its next row, once it has been begun.
+    mask: Option<(Array<DurableStore>, usize)>,
     /// Shape, `[u, t, s]`.
     shape: (usize, usize, usize),
     next_row: usize,
@@ -70,7 +76,7 @@ impl Writer {
         let store = DurableStore::new(draft.path())?;
         zarr::create_group(&store, Map::new())?;
         let array = zarr::create_array(&store, NAME, &builder)?;
-        Ok(Writer { draft, array, shape, next_row: 0 })
+        Ok(Writer { draft, store, array, mask: None, shape, next_row: 0 })
     }
 
     /// Writes the next camera rows, durably: a multiple of [`STRIP_ROWS`](crate::STRIP_ROWS), or all
@@ -79,32 +85,30 @@ impl Writer {
     /// # Errors
     /// [`Error::Shape`] for other rows; [`Error::Zarr`] if the file system refuses.
     pub fn append(&mut self, strip: ArrayView3<f32>) -> Result<()> {
-        let (depth, all_rows, columns) = self.shape;
-        let (first_row, rows) = (self.next_row, strip.len_of(Axis(1)));
-        let chunk = chunk_of(self.shape);
-        let end = first_row + rows;
-        let whole_chunks = end == all_rows || (end < all_rows && rows.is_multiple_of(chunk[1]));
-        if rows == 0 || !whole_chunks || strip.dim() != (depth, rows, columns) {
-            return Err(Error::Shape {
-                what: format!("a strip of the transport from row {first_row} on"),
-                found: strip.shape().to_vec(),
-                allowed: format!(
-                    "[{depth}, a multiple of {} or the last {}, {columns}]",
-                    chunk[1],
-                    all_rows - first_row
-                ),
-            });
-        }
-        let chunks_across = columns.div_ceil(chunk[2]);
-        // While one chunk waits for the disk, others are compressed.
-        (0..rows.div_ceil(chunk[1]) * chunks_across).into_par_iter().try_for_each(|index| {
-            let (chunk_row, chunk_column) = (index / chunks_across, index % chunks_across);
-            let (t, s) = (chunk_row * chunk[1], chunk_column * chunk[2]);
-            let part = strip.slice(s![.., t..rows.min(t + chunk[1]), s..columns.min(s + chunk[2])]);
-            let chunk_row = first_row / chunk[1] + chunk_row;
-            zarr::write_chunk(&self.array, [0, chunk_row as u64, chunk_column as u64], chunk, part)
-        })?;
-        self.next_row = end;
+        self.next_row = append_to(&self.array, self.shape, self.next_row, strip)?;
+        Ok(())
+    }
+
+    /// Writes the next camera rows of the mask, durably, in strips like those of [`Writer::append`]. `bits` names the
+    /// bits. A transport without a mask has none of its rows.
+    ///
+    /// # Errors
+    /// As [`Writer::append`].
+    pub fn append_mask(&mut self, strip: ArrayView3<u8>, bits: &Value) -> Result<()> {
+        let (array, next_row) = match self.mask.take() {
+            Some(begun) => begun,
+            None => {
+                let to_u64 = |axes: [usize; 3]| axes.map(|len| len as u64).to_vec();
+                let (depth, rows, columns) = self.shape;
+                let (shape, chunk) = (to_u64([depth, rows, columns]), to_u64(chunk_of(self.shape)));
+                let mut builder = ArrayBuilder::new(shape, chunk, data_type::uint8(), 0u8);
+                let attributes = Map::from_iter([("bits".to_owned(), bits.clone())]);
+                zarr::with_codecs(&mut builder).dimension_names(Some(["u", "t", "s"])).attributes(attributes);
+                (zarr::create_array(&self.store, MASK, &builder)?, 0)
+            }
+        };
+        let next_row = append_to(&array, self.shape, next_row, strip)?;
+        self.mask = Some((array, next_row));
         Ok(())
     }
 
@@ -114,15 +118,51 @@ impl Writer {
     /// [`Error::Shape`] if rows are missing; [`Error::Io`] if the file system refuses.
     pub fn commit(self) -> Result<()> {
         let (depth, rows, columns) = self.shape;
-        if self.next_row < rows {
+        let written = self.mask.map_or(self.next_row, |(_, next_row)| next_row.min(self.next_row));
+        if written < rows {
             return Err(Error::Shape {
                 what: "the transport that is to be put in place".into(),
-                found: vec![depth, self.next_row, columns],
+                found: vec![depth, written, columns],
                 allowed: format!("{:?}", [depth, rows, columns]),
             });
         }
         self.draft.commit()
     }
+}
+
+/// Writes the next rows of an array; returns the row after them.
+fn append_to<T: Element + Clone + Default + Sync>(
+    array: &Array<DurableStore>,
+    shape: (usize, usize, usize),
+    first_row: usize,
+    strip: ArrayView3<T>,
+) -> Result<usize> {
+    let (depth, all_rows, columns) = shape;
+    let rows = strip.len_of(Axis(1));
+    let chunk = chunk_of(shape);
+    let end = first_row + rows;
+    let whole_chunks = end == all_rows || (end < all_rows && rows.is_multiple_of(chunk[1]));
+    if rows == 0 || !whole_chunks || strip.dim() != (depth, rows, columns) {
+        return Err(Error::Shape {
+            what: format!("a strip of the transport from row {first_row} on"),
+            found: strip.shape().to_vec(),
+            allowed: format!(
+                "[{depth}, a multiple of {} or the last {}, {columns}]",
+                chunk[1],
+                all_rows - first_row
+            ),
+        });
+    }
+    let chunks_across = columns.div_ceil(chunk[2]);
+    // While one chunk waits for the disk, others are compressed.
+    (0..rows.div_ceil(chunk[1]) * chunks_across).into_par_iter().try_for_each(|index| {
+        let (chunk_row, chunk_column) = (index / chunks_across, index % chunks_across);
+        let (t, s) = (chunk_row * chunk[1], chunk_column * chunk[2]);
+        let part = strip.slice(s![.., t..rows.min(t + chunk[1]), s..columns.min(s + chunk[2])]);
+        let chunk_row = first_row / chunk[1] + chunk_row;
+        zarr::write_chunk(array, [0, chunk_row as u64, chunk_column as u64], chunk, part)
+    })?;
+    Ok(end)
 }
 
 fn chunk_of((depth, rows, columns): (usize, usize, usize)) -> [usize; 3] {

@@ -136,6 +136,28 @@ fn frames_are_summed_once_their_edges_are_known() {
 }
 
 #[test]
+fn clipped_frames_are_counted_even_where_the_mean_is_not_clipped() {
+    let mut feed = Feed::new();
+    feed.edges(0, 3);
+    feed.begin(2, 700.0, 0);
+    feed.frame(2, 4000);
+    feed.edge(3 * PERIOD_NS);
+    feed.frame(3, 3999);
+    feed.push(DeviceEvent::End);
+    feed.edge(4 * PERIOD_NS);
+    let clipped = feed.unit().clipped.as_ref().unwrap();
+    assert_eq!(clipped.iter().copied().collect::<Vec<_>>(), [1, 1]);
+
+    let mut feed = Feed::new();
+    feed.edges(0, 3);
+    feed.begin(1, 700.0, 0);
+    feed.frame(2, 3999);
+    feed.push(DeviceEvent::End);
+    feed.edge(3 * PERIOD_NS);
+    assert!(feed.unit().clipped.is_none());
+}
+
+#[test]
 fn the_delay_is_measured_against_the_edge_of_the_light_not_of_the_trigger() {
     let mut feed = Feed::new();
     feed.edges(0, 3);

@@ -109,6 +109,10 @@ mod tests {
     const HEIGHT: usize = 130;
     const WIDTH: usize = 12;
     const STRIP_ROWS: usize = 50;
+    /// A pixel whose direct light saturates, and that light.
+    const HIGHLIGHT: ([usize; 2], f64) = ([20, 5], 6.0);
+    /// Level of the light of the bracket.
+    const DIM: f64 = 0.25;
 
     fn geometry() -> SweepGeometry {
         SweepGeometry {
@@ -128,6 +132,7 @@ mod tests {
         }
     }
 
+    /// With a bracket as the last point.
     fn schedule() -> Schedule {
         let point = |role, delay_us, exposure_us| Point { role, delay_us, exposure_us, frames: 1 };
         let regular = [
@@ -138,7 +143,8 @@ mod tests {
         let delays_us = (-4..=4).map(|step| f64::from(step) * 25.0);
         let sweep =
             (0..).zip(delays_us).map(|(index, delay_us)| point(PointRole::Sweep(index), delay_us, 60.0));
-        Schedule { points: regular.into_iter().chain(sweep).collect() }
+        let bracket = point(PointRole::Bracket(9), 0.0, 60.0);
+        Schedule { points: regular.into_iter().chain(sweep).chain([bracket]).collect() }
     }
 
     /// Direct light with equally bright light on either side of it, and noise.
@@ -147,16 +153,21 @@ mod tests {
         let setting = Setting::new(point.delay_us, point.exposure_us);
         Array2::from_shape_fn((HEIGHT, WIDTH), |(t, s)| {
             let light = |v: usize| match timing.relative_row(v, t) {
+                0 if [t, s] == HIGHLIGHT.0 => HIGHLIGHT.1,
                 0 => 0.4 + 0.01 * s as f64,
                 u => 0.1 * (-f64::from(u.abs()) / 2.0).exp(),
             };
             let weights = timing.weights(t, &setting);
             let lit: f64 = weights.iter().enumerate().map(|(v, weight)| weight * light(v)).sum();
-            let lit = if matches!(point.role, PointRole::Dark(_)) { 0.0 } else { lit };
+            let lit = match point.role {
+                PointRole::Dark(_) => 0.0,
+                PointRole::Bracket(_) => DIM * lit,
+                PointRole::Regular | PointRole::Sweep(_) => lit,
+            };
             let seed = ((ordinal * HEIGHT + t) * WIDTH + s) as f64;
             let noise = (seed * 12.9898).sin() * 43_758.545_3;
             let highlight = if (t, s, ordinal) == (HEIGHT - 2, 3, 6) { 4000.0 } else { 0.0 };
-            (100.0 + 1000.0 * lit + 10.0 * (noise - noise.floor()) + highlight) as f32
+            (100.0 + 1000.0 * lit + 10.0 * (noise - noise.floor()) + highlight).min(4000.0) as f32
         })
     }
 
@@ -272,7 +283,7 @@ mod tests {
         assert_eq!(strips.iter().map(|strip| strip.first_row).collect::<Vec<_>>(), [0, 50, 100]);
         assert_eq!(
             strips.iter().map(|strip| strip.stack.valid.is_some()).collect::<Vec<_>>(),
-            [false, false, true]
+            [true, false, true]
         );
         let rows = |of: &dyn Fn(&Strip) -> Array2<f32>| {
             let parts: Vec<Array2<f32>> = strips.iter().map(of).collect();
@@ -285,5 +296,48 @@ mod tests {
         assert!(concatenate(Axis(1), &transports).unwrap() == transport.t);
         let images: Vec<_> = strips.iter().map(|strip| strip.stack.images.view()).collect();
         assert!(concatenate(Axis(1), &images).unwrap() == stack.images);
+
+        let bracket = findings.remarks.iter().find(|(key, _)| *key == "bracket");
+        assert!(
+            bracket.is_some_and(|(_, said)| said.contains("under 25.0") || said.contains("under 24.9")),
+            "{bracket:?}"
+        );
+        let (pixel, light) = HIGHLIGHT;
+        let direct = f64::from(transport.epipolar(1)[pixel]);
+        assert!((direct / light - 1.0).abs() < 0.02, "{direct}");
+        assert!(!transport.is_bound(pixel, 0..=0));
+    }
+
+    #[test]
+    fn without_its_bracket_a_highlight_is_a_bound_and_counted() {
+        let points = schedule().points;
+        let images = Kept(points.iter().enumerate().map(|(ordinal, point)| image(ordinal, point)).collect());
+        let mut fold = DemuxFold::new(DemuxOptions::default(), &schedule(), &geometry()).unwrap();
+        push_all(&mut fold, &images);
+        fold.taken.retain(|role, _| !matches!(role, PointRole::Bracket(_)));
+        let Solved { stack, transport, summary } = fold.finish(&|| true).unwrap();
+        let (pixel, light) = HIGHLIGHT;
+        assert!(transport.is_bound(pixel, 0..=0));
+        let direct = f64::from(transport.epipolar(1)[pixel]);
+        assert!((3.0..light).contains(&direct), "{direct}");
+        let bounds = summary.figures.iter().find(|(name, _)| *name == "pixels known only as lower bounds");
+        assert_eq!(bounds, Some(&("pixels known only as lower bounds", 1.0)));
+        let options = serde_json::Map::new();
+        let spec = crate::ProductSpec::new("epipolar", None, &options, &schedule(), &geometry()).unwrap();
+        let crate::Product::Image { mask, .. } = spec.make(&stack, &transport).unwrap() else { panic!() };
+        assert_eq!(mask[pixel] & !crate::mask::NO_EDGE, crate::mask::BOUND_ONLY);
+        assert_eq!(mask[[0, 0]] & !crate::mask::NO_EDGE, crate::mask::MEASURED);
+    }
+
+    #[test]
+    fn a_frame_that_clips_makes_its_mean_a_bound() {
+        let image = SweepImage {
+            setting: Setting::new(0.0, 60.0),
+            image: Array2::from_elem((1, 3), 3800.0),
+            clipped: Some(Array2::from_shape_vec((1, 3), vec![false, true, false]).unwrap()),
+        };
+        assert_eq!(image.valid(3900.0).into_raw_vec_and_offset().0, [true, false, true]);
+        let unknown = SweepImage { clipped: None, ..image };
+        assert!(unknown.valid(3900.0).iter().all(|valid| *valid));
     }
 }

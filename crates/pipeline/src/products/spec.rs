@@ -212,5 +212,10 @@ fn checked_name(name: &str) -> Result<String, String> {
     if name == TAKEN_NAME {
         return Err(format!("name = {name:?}: reserved for the light transport; choose another name"));
     }
+    if name.ends_with("_mask") {
+        return Err(format!(
+            "name = {name:?}: names that end in _mask are those of masks; choose another name"
+        ));
+    }
     Ok(name.into())
 }

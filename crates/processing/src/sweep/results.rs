@@ -1,6 +1,10 @@
 //! Writes the products to files.
 
+use std::ops::Range;
+
+use ndarray::{Array3, s};
 use raysweep_pipeline::{Findings, Product, Solved, Strip, SweepSummary, mask};
+use raysweep_session::STRIP_ROWS;
 use raysweep_session::ledger::State;
 use raysweep_session::products::VolumeWriter;
 use raysweep_session::{Result, Session, transport};
@@ -154,7 +158,15 @@ impl TransportWriter {
 
     fn append(&mut self, rows: &Transport) -> Result<()> {
         let (npy, zarr) = (&mut self.npy, &mut self.zarr);
-        let (npy, zarr) = rayon::join(|| npy.append(rows.t.view()), || zarr.append(rows.t.view()));
+        let write_zarr = || {
+            zarr.append(rows.t.view())?;
+            let height = rows.exists.ncols();
+            (0..height).step_by(STRIP_ROWS).try_for_each(|first_row| {
+                let mask = mask_of(rows, first_row..height.min(first_row + STRIP_ROWS));
+                zarr.append_mask(mask.view(), &mask_bits())
+            })
+        };
+        let (npy, zarr) = rayon::join(|| npy.append(rows.t.view()), write_zarr);
         npy.and(zarr)?;
         self.rows_left = self.rows_left.saturating_sub(rows.exists.ncols());
         Ok(())
@@ -210,6 +222,22 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
         }
     }
     Ok(())
+}
+
+/// What is known of each value of some camera rows of a transport, `[u, t, s]`.
+fn mask_of(transport: &Transport, rows: Range<usize>) -> Array3<u8> {
+    let (depth, _, columns) = transport.t.dim();
+    let mut bits = Array3::from_shape_fn((depth, rows.len(), columns), |(u, t, _)| {
+        if transport.exists[[u, rows.start + t]] { mask::MEASURED } else { mask::OUTSIDE_REACH }
+    });
+    for (&[t, s], bounds) in transport.lower_bounds.range([rows.start, 0]..[rows.end, 0]) {
+        for (bits, _) in
+            bits.slice_mut(s![.., t - rows.start, s]).iter_mut().zip(bounds).filter(|(_, bound)| **bound)
+        {
+            *bits = mask::BOUND_ONLY;
+        }
+    }
+    bits
 }
 
 /// The bits of masks, as metadata say them.

@@ -51,6 +51,7 @@ fn it_names_every_file_and_adds_up() {
             "ledger.jsonl",
             "plan.toml",
             "rig.toml",
+            "stack.zarr/clipped/zarr.json",
             "stack.zarr/dark/zarr.json",
             "stack.zarr/regular/zarr.json",
             "stack.zarr/sum/c.1.0.0",
