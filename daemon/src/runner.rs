@@ -397,6 +397,9 @@ impl Control for Runner {
     }
 
     fn calibrations(&self) -> Result<Vec<CalibrationInfo>, RpcError> {
+        if !self.data.exists() {
+            return Ok(Vec::new());
+        }
         let listing = raysweep_session::list(&self.data).map_err(|error| storage(&error))?;
         let in_use = CalibrationHeader::read(&current_in(&self.data)).ok().flatten();
         let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);

@@ -20,6 +20,9 @@ use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::ArrayName;
 use tempfile::TempDir;
 
+/// With delays that frames' timestamps tell apart, because the camera does not say when its settings act.
+const FILM: &str =
+    "kind = \"film\"\n[film]\ncycles = 80000\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n";
 /// 8 x 8 pixels, 9 points, and all faults whose effects could differ after a crash.
 const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
                    [projector]\ndriver = \"sim\"\nrows = 8\n\
@@ -434,7 +437,7 @@ fn a_socket_passed_by_the_service_manager_is_served() {
 fn a_film_that_is_killed_keeps_its_cycles_and_is_processed_not_resumed() {
     let folder = folder(RIG);
     let mut daemon = Daemon::start(folder.path());
-    let started = daemon.client().run(&plan("kind = \"film\"\n[film]\ncycles = 80000\n")).unwrap();
+    let started = daemon.client().run(&plan(FILM)).unwrap();
     wait_for_line(&started.session, 30);
     daemon.kill();
 

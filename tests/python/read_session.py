@@ -115,6 +115,9 @@ def check_exr(faults, path, values, metadata):
             expected = {f"{layer}.Y": image for layer, image in zip(layers, values, strict=True)}
         elif values.ndim == 2:
             expected = {"Y": values}
+            mask = path.with_name(f"{path.stem}_mask.npy")
+            if mask.exists():
+                expected["mask"] = np.load(mask)
         else:
             expected = {name: values[:, :, index] for index, name in enumerate("RGB")}
         faults.equal(set(channels), set(expected), f"channels of {path.name}")
@@ -140,6 +143,9 @@ def check_csv(faults, path, values, metadata):
 def check_products(faults, session):
     products = {}
     for path in sorted((session / "products").glob("*.npy")):
+        if path.stem.endswith("_mask"):
+            faults.equal(np.load(path).dtype, np.dtype("u1"), f"type of {path.name}")
+            continue
         values, metadata = check_npy(faults, path)
         products[path.stem] = values, metadata
         exr = path.with_suffix(".exr")

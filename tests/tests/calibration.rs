@@ -204,7 +204,7 @@ fn a_calibration_of_other_devices_or_a_damaged_one_is_refused_unless_overridden(
     fs::write(&rig, overridden).unwrap();
     bench.restart_with(raysweep::Probes::default());
     let report = Control::check(&*bench.runner, SWEEP).unwrap();
-    assert_eq!(report.warnings.len(), 0, "{:?}", report.warnings);
+    assert!(!report.warnings.iter().any(|warning| warning.contains("calibration")), "{:?}", report.warnings);
 
     fs::write(&rig, small("# changed\n")).unwrap();
     bench.restart_with(raysweep::Probes::default());

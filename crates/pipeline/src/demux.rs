@@ -272,7 +272,9 @@ impl DemuxFold {
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {
-                let clipped = unit.clipped.as_ref().map(|frames| frames.mapv(|frames| frames > 0));
+                // Sessions store the clipped frames of the sweep and its bracket alone.
+                let clipped = unit.clipped.as_ref().filter(|_| is_of_sweep(point.role));
+                let clipped = clipped.map(|frames| frames.mapv(|frames| frames > 0));
                 let taken = SweepImage { setting, image: image.to_owned(), clipped };
                 drop(self.taken.insert(point.role, Arc::new(taken)));
             }
@@ -339,6 +341,14 @@ impl Snapshot for DemuxFold {
                 None => demux.solve_while(images.view(), valid, go_on),
             })
             .map_err(refused)
+    }
+}
+
+/// Whether a point is one of the sweep's own images.
+fn is_of_sweep(role: PointRole) -> bool {
+    match role {
+        PointRole::Sweep(_) | PointRole::Bracket(_) => true,
+        PointRole::Dark(_) | PointRole::Regular => false,
     }
 }
 

@@ -274,7 +274,10 @@ mod tests {
     fn who_only_observes_cannot_move_the_rig() {
         let drives =
             Method::ALL.into_iter().filter(|method| method.role() == Role::Operator).map(Method::name);
-        assert_eq!(drives.collect::<Vec<_>>(), ["run", "resume", "pause", "continue", "cancel", "arm_light"]);
+        assert_eq!(
+            drives.collect::<Vec<_>>(),
+            ["run", "resume", "pause", "continue", "cancel", "arm_light", "use_calibration"]
+        );
     }
 
     #[test]

@@ -316,7 +316,7 @@ fn run(
 /// # Errors
 /// What to give instead.
 pub fn memory_size(text: &str) -> Result<ByteSize, String> {
-    text.parse().map_err(|_| "give a size, such as 2GB or 512MiB".to_owned())
+    text.parse().map_err(|_not_a_size| "give a size, such as 2GB or 512MiB".to_owned())
 }
 
 /// Begins a run and follows it, unless it is to be left alone.

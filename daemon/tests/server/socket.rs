@@ -186,6 +186,7 @@ fn who_only_observes_is_forbidden_to_drive() {
         client.go_on(),
         client.cancel(),
         client.arm_light(),
+        client.use_calibration("old"),
     ];
     assert_eq!(driving.len(), Method::ALL.iter().filter(|method| method.role() == Role::Operator).count());
     for result in driving {

@@ -55,9 +55,9 @@ pub struct CalibrationHeader {
     /// The devices that it belongs to.
     pub valid_for: ValidFor,
     /// Times.
-    pub timing: Timing,
-    /// Light and sensor.
-    pub light: Light,
+    pub timing: CalibratedTiming,
+    /// CalibratedLight and sensor.
+    pub light: CalibratedLight,
     /// Figures of the calibration's own checks, each with its limit.
     pub checks: BTreeMap<String, Pair>,
 }
@@ -83,7 +83,7 @@ pub struct ValidFor {
 /// Times, each with its standard deviation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Timing {
+pub struct CalibratedTiming {
     /// Mean time from one projector row to the next.
     pub row_time_us: Pair,
     /// Time from one camera row to the next.
@@ -98,10 +98,10 @@ pub struct Timing {
     pub seen_rows: [usize; 2],
 }
 
-/// Light and sensor.
+/// CalibratedLight and sensor.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Light {
+pub struct CalibratedLight {
     /// Median white, in counts above black.
     pub white_dn: Pair,
     /// Gain.
@@ -305,7 +305,8 @@ impl KeptCalibration {
     /// # Errors
     /// When the arrays hold no usable response.
     fn board(&self) -> Result<Arc<BoardCalibration>, ConfigError> {
-        let Timing { camera_row_time_us, exposure_offset_us, latency_sd_us, .. } = self.header.timing;
+        let CalibratedTiming { camera_row_time_us, exposure_offset_us, latency_sd_us, .. } =
+            self.header.timing;
         let [white_dn, white_sd] = self.header.light.white_dn;
         let place_sd: Vec<f32> = self.arrays.place_sd.iter().copied().filter(|sd| sd.is_finite()).collect();
         let response = PixelResponse::new(self.arrays.place.clone(), self.arrays.response.clone())

@@ -11,7 +11,7 @@ use raysweep_transport::plane::board::images::{
 use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
 use raysweep_transport::plane::{NoiseModel, PlaneError};
 
-use super::task::{CalibrationTask, Purpose, ROWS_PER_BLOCK, WHOLE_US};
+use super::task::{BoardPurpose, CalibrationTask, ROWS_PER_BLOCK, WHOLE_US};
 use crate::plane::place;
 
 /// Why a rig cannot be calibrated from a session's images.
@@ -35,7 +35,7 @@ pub enum CalibrationError {
 }
 
 /// The images of a session.
-pub struct StoredImages<'a> {
+pub struct BoardImages<'a> {
     /// The task that they belong to.
     pub task: &'a CalibrationTask,
     /// State of the session.
@@ -44,7 +44,7 @@ pub struct StoredImages<'a> {
     pub stack: &'a Stack,
 }
 
-impl StoredImages<'_> {
+impl BoardImages<'_> {
     /// The mean image of a point, `[t, s]` in counts, with its line in the ledger.
     fn image(&self, ordinal: u32) -> Result<(Array2<f32>, &PointEntry), CalibrationError> {
         let (array, index) = place(self.task.task.schedule.points[ordinal as usize].role);
@@ -76,7 +76,7 @@ impl StoredImages<'_> {
     }
 
     /// All frames of a purpose, `[n, t, s]` in counts.
-    fn frames(&self, purpose: Purpose) -> Result<Array3<f32>, CalibrationError> {
+    fn frames(&self, purpose: BoardPurpose) -> Result<Array3<f32>, CalibrationError> {
         let (rows, columns) = (self.task.task.geometry.height, self.task.task.geometry.width);
         let ordinals: Vec<u32> = self.task.ordinals(purpose).collect();
         let mut frames = Array3::zeros((ordinals.len(), rows, columns));
@@ -87,7 +87,7 @@ impl StoredImages<'_> {
     }
 
     /// Means of several purposes, `[n, t, s]` in counts.
-    fn means(&self, purposes: impl Iterator<Item = Purpose>) -> Result<Array3<f32>, CalibrationError> {
+    fn means(&self, purposes: impl Iterator<Item = BoardPurpose>) -> Result<Array3<f32>, CalibrationError> {
         let images: Vec<Array2<f32>> = purposes
             .map(|purpose| Ok(self.frames(purpose)?.mean_axis(Axis(0)).unwrap_or_default()))
             .collect::<Result<_, CalibrationError>>()?;
@@ -119,11 +119,11 @@ impl BoardPixels {
     ///
     /// # Errors
     /// When an image is missing, or board, light or pictures are of no use.
-    pub fn new(images: &StoredImages<'_>) -> Result<Self, CalibrationError> {
+    pub fn new(images: &BoardImages<'_>) -> Result<Self, CalibrationError> {
         let task = images.task;
         let full_scale_dn = task.task.geometry.saturation_dn as f32;
         let dark = dark(images)?;
-        let (black, white) = (images.frames(Purpose::Black)?, images.frames(Purpose::White)?);
+        let (black, white) = (images.frames(BoardPurpose::Black)?, images.frames(BoardPurpose::White)?);
         let dark_dn = dark.image(WHOLE_US);
         let greys: Vec<(f64, Array3<f32>)> = CalibrationTask::greys()
             .map(|(light, purpose)| Ok((light, images.frames(purpose)?)))
@@ -158,8 +158,8 @@ impl BoardPixels {
     /// Frames of the white board, as shares of white averaged over columns.
     fn board_frames(
         &self,
-        images: &StoredImages<'_>,
-        purpose: Purpose,
+        images: &BoardImages<'_>,
+        purpose: BoardPurpose,
     ) -> Result<Vec<BoardFrame>, CalibrationError> {
         let frame = |ordinal| {
             let (image, entry) = images.image(ordinal)?;
@@ -174,8 +174,8 @@ impl BoardPixels {
     ///
     /// # Errors
     /// When an image is missing, or the sweep cannot be seen in them.
-    pub fn coarse(&self, images: &StoredImages<'_>) -> Result<CoarseSweep, CalibrationError> {
-        let frames = self.board_frames(images, Purpose::SweepTime)?;
+    pub fn coarse(&self, images: &BoardImages<'_>) -> Result<CoarseSweep, CalibrationError> {
+        let frames = self.board_frames(images, BoardPurpose::SweepTime)?;
         Ok(CoarseSweep::from_borders(&self.columns, &frames, &images.task.nominal())?)
     }
 
@@ -183,9 +183,9 @@ impl BoardPixels {
     ///
     /// # Errors
     /// When an image is missing, or the times cannot be found.
-    pub fn times(&self, images: &StoredImages<'_>) -> Result<RowTimes, CalibrationError> {
+    pub fn times(&self, images: &BoardImages<'_>) -> Result<RowTimes, CalibrationError> {
         let mut frames = Vec::new();
-        for purpose in [Purpose::SweepTime, Purpose::Arrival, Purpose::ExposureCheck] {
+        for purpose in [BoardPurpose::SweepTime, BoardPurpose::Arrival, BoardPurpose::ExposureCheck] {
             frames.extend(self.board_frames(images, purpose)?);
         }
         let (noise, white_dn) = (self.transfer.noise(), self.white.level_dn.value);
@@ -197,12 +197,12 @@ impl BoardPixels {
     }
 }
 
-fn dark(images: &StoredImages<'_>) -> Result<DarkFit, CalibrationError> {
+fn dark(images: &BoardImages<'_>) -> Result<DarkFit, CalibrationError> {
     let exposures_us = images.task.calibration.exposure_us.values();
     let runs: Vec<(f64, Array3<f32>)> = exposures_us
         .into_iter()
         .enumerate()
-        .map(|(index, exposure_us)| Ok((exposure_us, images.frames(Purpose::Capped(index))?)))
+        .map(|(index, exposure_us)| Ok((exposure_us, images.frames(BoardPurpose::Capped(index))?)))
         .collect::<Result<_, CalibrationError>>()?;
     let runs: Vec<CappedFrames<'_>> = runs
         .iter()

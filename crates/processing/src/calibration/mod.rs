@@ -15,10 +15,10 @@ use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::RowTimes;
 
-use self::file::{CalibrationArrays, Light, SCHEMA, Timing};
+use self::file::{CalibratedLight, CalibratedTiming, CalibrationArrays, SCHEMA};
 pub use self::file::{CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in};
-pub use self::images::{BoardPixels, CalibrationError, StoredImages};
-pub use self::task::{CalibrationTask, Purpose, View};
+pub use self::images::{BoardImages, BoardPixels, CalibrationError};
+pub use self::task::{BoardPurpose, BoardView, CalibrationTask};
 use crate::plane::{KnownRig, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
@@ -38,7 +38,7 @@ impl BoardFindings {
     ///
     /// # Errors
     /// When an image is missing, or the result is not good enough to be used.
-    pub fn new(images: &StoredImages<'_>) -> std::result::Result<Self, CalibrationError> {
+    pub fn new(images: &BoardImages<'_>) -> std::result::Result<Self, CalibrationError> {
         let pixels = BoardPixels::new(images)?;
         let times = pixels.times(images)?;
         Ok(Self { pixels, times })
@@ -68,7 +68,7 @@ impl BoardFindings {
             session: name.to_string_lossy().into_owned(),
             arrays_sha256: String::new(),
             valid_for,
-            timing: Timing {
+            timing: CalibratedTiming {
                 row_time_us: pair(times.row_time_us),
                 camera_row_time_us: pair(times.camera_row_time_us),
                 exposure_offset_us: pair(times.exposure_offset_us),
@@ -76,7 +76,7 @@ impl BoardFindings {
                 jitter_us: pair(times.jitter_us),
                 seen_rows: [times.seen_rows.start, times.seen_rows.end],
             },
-            light: Light {
+            light: CalibratedLight {
                 white_dn: pair(pixels.white.level_dn),
                 electrons_per_dn: pair(pixels.transfer.electrons_per_dn),
                 read_noise_e: pair(pixels.transfer.read_noise_e),
@@ -180,8 +180,7 @@ pub fn process(
     let before = KeptCalibration::read(session.dir()).map_err(ProcessError::Config)?;
     let refused = |error: CalibrationError| ProcessError::Config(error.to_string());
     let stack = session.stack()?;
-    let findings =
-        BoardFindings::new(&StoredImages { task: &task, state, stack: &stack }).map_err(refused)?;
+    let findings = BoardFindings::new(&BoardImages { task: &task, state, stack: &stack }).map_err(refused)?;
     let rig_text = crate::stored::read(&session.rig_path())?;
     // Only a run knows the camera itself.
     let camera = before.map_or_else(String::new, |before| before.header.valid_for.camera);

@@ -18,7 +18,7 @@ use crate::plane::{KnownRig, PlaneTask};
 
 /// What an image shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Purpose {
+pub enum BoardPurpose {
     /// The dark image of one of the plan's exposures, with the lens capped.
     Capped(usize),
     /// The board under the projector's black.
@@ -41,7 +41,7 @@ pub enum Purpose {
 
 /// What stands before the camera, and what the projector shows.
 #[derive(Debug, Clone, PartialEq)]
-pub struct View {
+pub struct BoardView {
     /// The subject.
     pub subject: Subject,
     /// The picture; `None`: no light.
@@ -76,7 +76,7 @@ pub struct CalibrationTask {
     /// taken before them: see [`Self::sweep_times`] and [`Self::arrivals`].
     pub task: Arc<PlaneTask>,
     /// The purpose of each point.
-    purposes: Vec<Purpose>,
+    purposes: Vec<BoardPurpose>,
 }
 
 impl CalibrationTask {
@@ -88,21 +88,24 @@ impl CalibrationTask {
         let lag_us = size.0 as f64 / 2.0
             * (rig.camera.row_pitch * rig.projector.row_time_us - rig.camera_row_time_us());
         let mut next = [0_u32; 2];
-        let mut point = |purpose: &Purpose| {
-            let capped = matches!(purpose, Purpose::Capped(_));
+        let mut point = |purpose: &BoardPurpose| {
+            let capped = matches!(purpose, BoardPurpose::Capped(_));
             let index = &mut next[usize::from(capped)];
             let role = if capped { PointRole::Dark(*index) } else { PointRole::Sweep(*index) };
             *index += 1;
             let (exposure_us, frames) = match *purpose {
-                Purpose::Capped(exposure) => (calibration.exposure_us.values()[exposure], 1),
-                Purpose::Rows(_) => (WHOLE_US, calibration.picture_frames),
-                Purpose::SweepTime => (raster.rows as f64 * raster.row_time_us * 0.5, 1),
-                Purpose::Arrival => (3.0 * raster.row_time_us, 1),
-                Purpose::ExposureCheck => (1200.0, 1),
-                Purpose::Black | Purpose::White | Purpose::Grey(_) | Purpose::RowCode(_) => (WHOLE_US, 1),
+                BoardPurpose::Capped(exposure) => (calibration.exposure_us.values()[exposure], 1),
+                BoardPurpose::Rows(_) => (WHOLE_US, calibration.picture_frames),
+                BoardPurpose::SweepTime => (raster.rows as f64 * raster.row_time_us * 0.5, 1),
+                BoardPurpose::Arrival => (3.0 * raster.row_time_us, 1),
+                BoardPurpose::ExposureCheck => (1200.0, 1),
+                BoardPurpose::Black
+                | BoardPurpose::White
+                | BoardPurpose::Grey(_)
+                | BoardPurpose::RowCode(_) => (WHOLE_US, 1),
             };
             let delay_us = match purpose {
-                Purpose::SweepTime | Purpose::Arrival | Purpose::ExposureCheck => 0.0,
+                BoardPurpose::SweepTime | BoardPurpose::Arrival | BoardPurpose::ExposureCheck => 0.0,
                 _ => lag_us + WHOLE_US / 2.0 - BEFORE_LIGHT_US,
             };
             Point { role, delay_us, exposure_us, frames }
@@ -124,50 +127,53 @@ impl CalibrationTask {
     }
 
     /// The purpose of a point, given by its ordinal.
-    pub fn purpose(&self, ordinal: u32) -> Purpose {
+    pub fn purpose(&self, ordinal: u32) -> BoardPurpose {
         self.purposes[ordinal as usize]
     }
 
     /// The ordinals of all points of a purpose.
-    pub fn ordinals(&self, purpose: Purpose) -> impl Iterator<Item = u32> {
+    pub fn ordinals(&self, purpose: BoardPurpose) -> impl Iterator<Item = u32> {
         (0..).zip(&self.purposes).filter(move |(_, own)| **own == purpose).map(|(ordinal, _)| ordinal)
     }
 
     /// What the frames of a purpose show.
-    pub fn view(&self, purpose: Purpose) -> View {
+    pub fn view(&self, purpose: BoardPurpose) -> BoardView {
         let picture = match purpose {
-            Purpose::Capped(_) => return View { subject: Subject::Cap, picture: None },
-            Purpose::Black => Pattern::Black,
-            Purpose::Grey(grey) => Pattern::Grey { level: GREYS[grey] },
-            Purpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
-            Purpose::RowCode(picture) => Pattern::GrayRows {
+            BoardPurpose::Capped(_) => return BoardView { subject: Subject::Cap, picture: None },
+            BoardPurpose::Black => Pattern::Black,
+            BoardPurpose::Grey(grey) => Pattern::Grey { level: GREYS[grey] },
+            BoardPurpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
+            BoardPurpose::RowCode(picture) => Pattern::GrayRows {
                 bit: code_bits(self.task.geometry.raster.rows) - 1 - picture as u32 / 2,
                 inverse: picture % 2 == 1,
                 block: ROWS_PER_BLOCK,
             },
-            Purpose::White | Purpose::SweepTime | Purpose::Arrival | Purpose::ExposureCheck => Pattern::White,
+            BoardPurpose::White
+            | BoardPurpose::SweepTime
+            | BoardPurpose::Arrival
+            | BoardPurpose::ExposureCheck => Pattern::White,
         };
-        View { subject: Subject::Board, picture: Some(picture) }
+        BoardView { subject: Subject::Board, picture: Some(picture) }
     }
 
     /// How the rows are exposed for a purpose.
-    pub fn shutter(&self, purpose: Purpose) -> Shutter {
-        if purpose == Purpose::SweepTime { Shutter::Global } else { Shutter::Rolling }
+    pub fn shutter(&self, purpose: BoardPurpose) -> Shutter {
+        if purpose == BoardPurpose::SweepTime { Shutter::Global } else { Shutter::Rolling }
     }
 
     /// The levels of grey, and the purposes of their images.
-    pub(super) fn greys() -> impl Iterator<Item = (f64, Purpose)> {
-        GREYS.into_iter().enumerate().map(|(grey, level)| (f64::from(level), Purpose::Grey(grey)))
+    pub(super) fn greys() -> impl Iterator<Item = (f64, BoardPurpose)> {
+        GREYS.into_iter().enumerate().map(|(grey, level)| (f64::from(level), BoardPurpose::Grey(grey)))
     }
 
     /// The purposes of the pictures of sparse rows.
-    pub(super) fn phases() -> impl Iterator<Item = Purpose> {
-        (0..PHASES).map(Purpose::Rows)
+    pub(super) fn phases() -> impl Iterator<Item = BoardPurpose> {
+        (0..PHASES).map(BoardPurpose::Rows)
     }
 
     /// The purposes of the pictures of the rows' Gray code.
-    pub(super) fn codes(&self) -> impl Iterator<Item = Purpose> + use<> {
-        (0..2 * code_bits(self.task.geometry.raster.rows) as usize).map(Purpose::RowCode)
+    pub(super) fn codes(&self) -> impl Iterator<Item = BoardPurpose> + use<> {
+        (0..2 * code_bits(self.task.geometry.raster.rows) as usize).map(BoardPurpose::RowCode)
     }
 
     /// What the rig file says of the times.
@@ -188,7 +194,7 @@ impl CalibrationTask {
     /// Those of [`sweep_settings`].
     pub fn sweep_times(&self, columns: &Columns) -> Result<Vec<(u32, Point)>, PlaneError> {
         let settings = sweep_settings(&self.nominal(), columns.seen_rows())?;
-        Ok(self.points_at(Purpose::SweepTime, settings))
+        Ok(self.points_at(BoardPurpose::SweepTime, settings))
     }
 
     /// The points that show when each row's light arrives and how long exposures are, once the sweep is known to
@@ -207,13 +213,14 @@ impl CalibrationTask {
             delay_us: first.delay_us + step_us * (index % delays) as f64,
             ..first
         });
-        let mut points = self.points_at(Purpose::Arrival, settings.collect());
-        points.extend(self.points_at(Purpose::ExposureCheck, check_settings(columns, coarse, &nominal)?));
+        let mut points = self.points_at(BoardPurpose::Arrival, settings.collect());
+        points
+            .extend(self.points_at(BoardPurpose::ExposureCheck, check_settings(columns, coarse, &nominal)?));
         Ok(points)
     }
 
     /// The points of a purpose with these settings.
-    fn points_at(&self, purpose: Purpose, settings: Vec<BoardSetting>) -> Vec<(u32, Point)> {
+    fn points_at(&self, purpose: BoardPurpose, settings: Vec<BoardSetting>) -> Vec<(u32, Point)> {
         let geometry = &self.task.geometry;
         let point = |(ordinal, setting): (u32, BoardSetting)| {
             let BoardSetting { delay_us, exposure_us, .. } = setting;
@@ -225,7 +232,7 @@ impl CalibrationTask {
     }
 
     /// The setting of a stored frame, by its measured delay.
-    pub(super) fn board_setting(&self, purpose: Purpose, entry: &PointEntry) -> BoardSetting {
+    pub(super) fn board_setting(&self, purpose: BoardPurpose, entry: &PointEntry) -> BoardSetting {
         let geometry = &self.task.geometry;
         let delay_us = entry.delays_us.iter().sum::<f64>() / entry.delays_us.len().max(1) as f64;
         let shutter = match self.shutter(purpose) {
@@ -252,20 +259,21 @@ fn code_bits(projector_rows: usize) -> u32 {
 }
 
 /// The purposes of all points, in the order of acquisition.
-fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<Purpose> {
+fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> {
     let frames = plan.frames as usize;
     let several = |purpose, frames| std::iter::repeat_n(purpose, frames);
-    let capped = (0..plan.exposure_us.len()).flat_map(|exposure| several(Purpose::Capped(exposure), frames));
-    let levels = [several(Purpose::Black, 2 * frames), several(Purpose::White, 2 * frames)];
-    let greys = (0..GREYS.len()).flat_map(|grey| several(Purpose::Grey(grey), GREY_FRAMES));
+    let capped =
+        (0..plan.exposure_us.len()).flat_map(|exposure| several(BoardPurpose::Capped(exposure), frames));
+    let levels = [several(BoardPurpose::Black, 2 * frames), several(BoardPurpose::White, 2 * frames)];
+    let greys = (0..GREYS.len()).flat_map(|grey| several(BoardPurpose::Grey(grey), GREY_FRAMES));
     let codes = 2 * code_bits(projector_rows) as usize;
     capped
         .chain(levels.into_iter().flatten())
         .chain(greys)
-        .chain((0..PHASES).map(Purpose::Rows))
-        .chain((0..codes).map(Purpose::RowCode))
-        .chain(several(Purpose::SweepTime, SWEEP_TIMES))
-        .chain(several(Purpose::Arrival, ARRIVAL_FRAMES * plan.delays as usize))
-        .chain(several(Purpose::ExposureCheck, EXPOSURE_CHECKS))
+        .chain((0..PHASES).map(BoardPurpose::Rows))
+        .chain((0..codes).map(BoardPurpose::RowCode))
+        .chain(several(BoardPurpose::SweepTime, SWEEP_TIMES))
+        .chain(several(BoardPurpose::Arrival, ARRIVAL_FRAMES * plan.delays as usize))
+        .chain(several(BoardPurpose::ExposureCheck, EXPOSURE_CHECKS))
         .collect()
 }

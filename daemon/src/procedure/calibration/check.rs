@@ -1,7 +1,7 @@
 //! Predicts a calibration, before anything moves.
 
 use raysweep_config::ConfigError;
-use raysweep_processing::calibration::{CalibrationTask, Purpose};
+use raysweep_processing::calibration::{BoardPurpose, CalibrationTask};
 use raysweep_proto::CheckReport;
 
 use crate::plane::foresight::periods;
@@ -25,7 +25,7 @@ pub fn check(calibration: &CalibrationTask, lab: &Lab<'_>) -> Result<CheckReport
         let shot = task.geometry.shot(point, lab.camera.trigger_latency_us);
         lab.camera.allows(&shot.settings).map_err(|message| task.refuse(&["calibration"], message))?;
         frames += u64::from(point.frames);
-        if !matches!(calibration.purpose(ordinal), Purpose::Capped(_)) {
+        if !matches!(calibration.purpose(ordinal), BoardPurpose::Capped(_)) {
             light_periods += u64::from(point.frames) * periods(task, lab.camera, point);
         }
     }

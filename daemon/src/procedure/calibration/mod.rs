@@ -10,7 +10,8 @@ use raysweep_config::{ConfigError, Plan};
 use raysweep_core::SettingsId;
 use raysweep_pipeline::Point;
 use raysweep_processing::calibration::{
-    BoardFindings, BoardPixels, CalibrationError, CalibrationTask, Purpose, StoredImages, ValidFor, View,
+    BoardFindings, BoardImages, BoardPixels, BoardPurpose, BoardView, CalibrationError, CalibrationTask,
+    ValidFor,
 };
 use raysweep_processing::plane::{Processing, place};
 use raysweep_session::Session;
@@ -102,7 +103,7 @@ impl BoardAcquisition<'_, '_> {
             .collect();
         let view = |(id, _): &(SettingsId, Point)| self.calibration.view(self.calibration.purpose(id.point));
         for group in wanted.chunk_by(|a, b| view(a) == view(b)) {
-            let View { subject, picture } = view(&group[0]);
+            let BoardView { subject, picture } = view(&group[0]);
             self.passes.place(subject)?;
             if !self.passes.go_on() {
                 return Ok(());
@@ -121,17 +122,17 @@ impl BoardAcquisition<'_, '_> {
     /// Evaluates the images stored so far.
     fn with_images<T>(
         &self,
-        evaluate: impl FnOnce(&StoredImages<'_>) -> Result<T, CalibrationError>,
+        evaluate: impl FnOnce(&BoardImages<'_>) -> Result<T, CalibrationError>,
     ) -> Result<T, RunError> {
         let (state, stack) = (self.session.state()?, self.session.stack()?);
-        let images = StoredImages { task: self.calibration, state: &state, stack: &stack };
+        let images = BoardImages { task: self.calibration, state: &state, stack: &stack };
         Ok(evaluate(&images)?)
     }
 }
 
 /// Whether the settings of a purpose depend on earlier images.
-fn is_adapted(purpose: Purpose) -> bool {
-    matches!(purpose, Purpose::SweepTime | Purpose::Arrival | Purpose::ExposureCheck)
+fn is_adapted(purpose: BoardPurpose) -> bool {
+    matches!(purpose, BoardPurpose::SweepTime | BoardPurpose::Arrival | BoardPurpose::ExposureCheck)
 }
 
 impl Measurement for CalibrationRun {
@@ -143,7 +144,7 @@ impl Measurement for CalibrationRun {
         let stack = run.session.stack()?;
         let mut missing = missing(task, run.ledger.state());
         if run.is_resumed {
-            let images = StoredImages { task: &calibration, state: run.ledger.state(), stack: &stack };
+            let images = BoardImages { task: &calibration, state: run.ledger.state(), stack: &stack };
             missing.extend(images.damaged().map(|ordinal| {
                 let (array, index) = place(task.schedule.points[ordinal as usize].role);
                 let attempt = run.ledger.state().next_attempt(array, index);
@@ -170,7 +171,7 @@ impl Measurement for CalibrationRun {
         let mut found = None;
         if let (None, Some(pixels)) = (&fault, pixels) {
             let stack = session.stack()?;
-            let images = StoredImages { task: &calibration, state: ledger.state(), stack: &stack };
+            let images = BoardImages { task: &calibration, state: ledger.state(), stack: &stack };
             match pixels.times(&images) {
                 Ok(times) => found = Some(BoardFindings { pixels, times }),
                 Err(error) => fault = Some(error.into()),
