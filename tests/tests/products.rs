@@ -152,8 +152,8 @@ fn what_cannot_be_had_is_refused_before_anything_moves() {
     let cases: [(&[&str], &str); 5] = [
         (&[r#"kind = "epipolar", width_rows = 4"#], "product.0.width_rows"),
         (&[r#"kind = "regular", name = "../../escape""#], "product.0.name"),
-        (&[r#"kind = "regular""#, r#"kind = "epipolar", name = "regular""#], "product.1"),
-        (&[r#"kind = "epipolar""#, r#"kind = "epipolar", width_rows = 1"#], "product.1.name"),
+        (&[r#"kind = "regular""#, r#"kind = "epipolar", name = "regular""#], "product.1.name"),
+        (&[r#"kind = "epipolar""#, r#"kind = "epipolar", width_rows = 1"#], "product.1"),
         (&[r#"kind = "delay-profile", pixel = [24, 0]"#], "product.0.pixel"),
     ];
     for (products, field) in cases {
