@@ -115,11 +115,11 @@ def check_exr(faults, path, values, metadata):
             expected = {f"{layer}.Y": image for layer, image in zip(layers, values, strict=True)}
         elif values.ndim == 2:
             expected = {"Y": values}
-            mask = path.with_name(f"{path.stem}_mask.npy")
-            if mask.exists():
-                expected["mask"] = np.load(mask)
         else:
             expected = {name: values[:, :, index] for index, name in enumerate("RGB")}
+        mask = path.with_name(f"{path.stem}_mask.npy")
+        if mask.exists():
+            expected["mask"] = np.load(mask)
         faults.equal(set(channels), set(expected), f"channels of {path.name}")
         faults.equal(header["compression"], OpenEXR.ZIP_COMPRESSION, f"compression of {path.name}")
         faults.equal(header["type"], OpenEXR.scanlineimage, f"storage of {path.name}")
