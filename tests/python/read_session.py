@@ -74,6 +74,7 @@ def check_stack(faults, session, header, entries):
     expected = {
         "sum": ((shape["points"], *frame), ("point", "t", "s")),
         "dark": ((shape["exposures"], *frame), ("exposure", "t", "s")),
+        "clipped": ((shape["points"], *frame), ("point", "t", "s")),
         "regular": ((1, *frame), ("frame", "t", "s")),
     }
     if header["kind"] == "film":
@@ -119,7 +120,7 @@ def check_exr(faults, path, values, metadata):
             expected = {name: values[:, :, index] for index, name in enumerate("RGB")}
         mask = path.with_name(f"{path.stem}_mask.npy")
         if mask.exists():
-            expected["mask"] = np.load(mask)
+            expected["mask"] = np.load(mask).astype(np.float32)
         faults.equal(set(channels), set(expected), f"channels of {path.name}")
         faults.equal(header["compression"], OpenEXR.ZIP_COMPRESSION, f"compression of {path.name}")
         faults.equal(header["type"], OpenEXR.scanlineimage, f"storage of {path.name}")
