@@ -183,12 +183,20 @@ impl CalibrationArrays {
         })
     }
 
-    /// Checks that all arrays belong to one rig.
-    fn check(&self, of: &ValidFor) -> Result<(), String> {
+    /// Checks that all arrays belong to one rig, and that the rows seen exist.
+    fn check(&self, header: &CalibrationHeader) -> Result<(), String> {
+        let of = &header.valid_for;
+        let [first, end] = header.timing.seen_rows;
+        if first >= end || end > of.projector_rows {
+            return Err(format!(
+                "seen_rows = [{first}, {end}]: must be [first row, row after the last] of the {} projector rows",
+                of.projector_rows
+            ));
+        }
         let [rows, columns] = of.size;
         let image = [rows, columns];
         let shapes: [(&str, &[usize], &[usize]); 9] = [
-            ("row_starts_us", self.row_starts_us.shape(), &[of.projector_rows + 1]),
+            ("row_starts_us", self.row_starts_us.shape(), &[of.projector_rows.saturating_add(1)]),
             ("place", self.place.shape(), &image),
             ("place_sd", self.place_sd.shape(), &image),
             ("response", self.response.shape(), &[RESPONSE_ROWS, rows, columns]),
@@ -251,7 +259,7 @@ impl KeptCalibration {
             ));
         }
         let arrays = CalibrationArrays::from_bytes(&bytes).map_err(|error| in_file(error.to_string()))?;
-        arrays.check(&header.valid_for).map_err(in_file)?;
+        arrays.check(&header).map_err(in_file)?;
         Ok(Some(Self { header, arrays }))
     }
 

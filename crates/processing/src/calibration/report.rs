@@ -1,20 +1,24 @@
 //! The report of a calibration.
 
+use std::ops::Range;
+
 use ndarray::Array2;
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{
     Block, Guide, NoteLevel, Picture, Plot, Report, Section, Series, SeriesStyle, Table, ToneMap,
 };
-use raysweep_transport::plane::RESPONSE_ROWS;
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::ExposureMode;
+use raysweep_transport::plane::{FIRST_RESPONSE_ROW, RESPONSE_ROWS};
 
 use super::{BoardFindings, CalibrationTask, KeptCalibration};
 use crate::report::{accounts, subtitle};
 
-/// First row of a response, relative to the pixel's own.
-const FIRST_ROW: i32 = -7;
+/// Number of pixels whose responses are shown of each part of the image.
+const SHOWN_PIXELS: usize = 60;
+/// Rows on either side of the place that are shown.
+const SHOWN_ROWS: f64 = 4.0;
 
 /// The page.
 pub(super) fn make(
@@ -134,36 +138,39 @@ fn times(task: &CalibrationTask, findings: &BoardFindings) -> Section {
 fn responses(findings: &BoardFindings) -> Section {
     let responses = &findings.pixels.responses;
     let (rows, columns) = responses.place.dim();
-    let mean_of = |part: std::ops::Range<usize>| -> Vec<(f64, f64)> {
-        (0..RESPONSE_ROWS)
-            .map(|d| {
-                let values = part
-                    .clone()
-                    .flat_map(|t| (0..columns).map(move |s| (t, s)))
-                    .map(|(t, s)| f64::from(responses.response[[d, t, s]]))
-                    .filter(|share| share.is_finite());
-                let (sum, n) = values.fold((0.0, 0), |(sum, n), value| (sum + value, n + 1));
-                (f64::from(FIRST_ROW + d as i32), sum / f64::from(n.max(1)))
-            })
-            .collect()
+    // Pixels look at different fractions of a row, and together they show the beam between the rows.
+    let sampled = |part: Range<usize>| -> Vec<(f64, f64)> {
+        let pixels = part.len() * columns;
+        let some = (0..pixels).step_by((pixels / SHOWN_PIXELS).max(1));
+        let places = some.map(|n| (part.start + n / columns, n % columns));
+        let lit = places.filter(|&pixel| responses.place[pixel].is_finite());
+        lit.flat_map(|(t, s)| {
+            let place = f64::from(responses.place[[t, s]]);
+            let from_place = place.round() - place + f64::from(FIRST_RESPONSE_ROW);
+            (0..RESPONSE_ROWS).map(move |d| (from_place + d as f64, f64::from(responses.response[[d, t, s]])))
+        })
+        .filter(|(distance, _)| distance.abs() <= SHOWN_ROWS)
+        .collect()
     };
+    let dots =
+        |name: &str, part| Series { name: name.into(), style: SeriesStyle::Dots, points: sampled(part) };
     let kernel = Plot {
-        guides: vec![Guide { x: 0.0, label: "own row".into() }],
+        guides: vec![Guide { x: 0.0, label: "place".into() }],
         ..plot(
             "Share of a pixel's direct light by drawn row",
-            ("drawn row - own row", "share"),
+            ("drawn row - place", "share"),
             vec![
-                line("top third of the image", mean_of(0..rows.div_ceil(3))),
-                line("bottom third", mean_of(rows - rows.div_ceil(3)..rows)),
+                dots("top third of the image", 0..rows.div_ceil(3)),
+                dots("bottom third", rows - rows.div_ceil(3)..rows),
             ],
         )
     };
-    let offset = Array2::from_shape_fn((rows, columns), |(t, s)| {
-        responses.place[[t, s]] - responses.place[[rows / 2, columns / 2]] - (t as f32 - rows as f32 / 2.0)
-    });
+    let mut offset = Array2::from_shape_fn((rows, columns), |(t, s)| responses.place[[t, s]] - t as f32);
+    let least = offset.iter().copied().fold(f32::INFINITY, f32::min);
+    offset -= least;
     let scale = ToneMap::percentile(&[offset.view()], 99.5);
-    let picture = Picture::grey(offset.view(), scale)
-        .with_caption("place minus camera row, against the middle of the image, in projector rows");
+    let caption = format!("place minus camera row, beyond its smallest value of {least:.2} rows");
+    let picture = Picture::grey(offset.view(), scale).with_caption(caption);
     section(
         "Where pixels look",
         "From pictures of every 16th row. If the board scatters light inside, the response contains that: a second board of another material shows it.",

@@ -3,11 +3,8 @@
 //! [`images`] turns images of the board under dark, white, grey and coded pictures into properties of each pixel: dark
 //! image, gain and noise, linearity, white level, the projector row that it sees, and its response to the rows drawn
 //! around that row. [`times`] turns images of the white board with different delays and exposures into the time at
-//! which each projector row is lit. All functions are pure; no device takes part.
-
-//!
-//! `tests/tests/calibration.rs` shows the order of all steps on the simulated rig. No procedure of the daemon runs them
-//! yet.
+//! which each projector row is lit. All functions are pure; no device takes part. The procedure `calibration` calls them
+//! in order (`crates/processing/src/calibration/images.rs`).
 
 mod calibration;
 mod estimate;
