@@ -450,16 +450,15 @@ pub fn first_scene_row(
 /// Start of each projector row's light after the VSYNC edge, and the last row's end: `[rows + 1]`.
 pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64>, SimError> {
     let sweep_us = raster.rows as f64 * raster.row_time_us;
-    let linear = |row: usize| raster.first_row_us + row as f64 * raster.row_time_us;
+    let bent = |row: usize, percent: f64| {
+        let x = row as f64 / raster.rows as f64;
+        let linear_us = raster.first_row_us + row as f64 * raster.row_time_us;
+        linear_us - percent / 100.0 * sweep_us * 4.0 * x * (1.0 - x)
+    };
     let starts: Vec<f64> = match *table {
-        RowTable::Linear => (0..=raster.rows).map(linear).collect(),
-        RowTable::Quadratic { percent } => (0..=raster.rows)
-            .map(|row| {
-                let x = row as f64 / raster.rows as f64;
-                linear(row) - percent / 100.0 * sweep_us * 4.0 * x * (1.0 - x)
-            })
-            .collect(),
-        RowTable::Kinked { pieces, amplitude_us } => {
+        RowTable::Linear => (0..=raster.rows).map(|row| bent(row, 0.0)).collect(),
+        RowTable::Quadratic { percent } => (0..=raster.rows).map(|row| bent(row, percent)).collect(),
+        RowTable::Kinked { pieces, amplitude_us, percent } => {
             let pieces = pieces.clamp(1, raster.rows);
             let mut random = keyed(seed, Purpose::RowTable, &[]);
             let mut knots: Vec<f64> =
@@ -471,7 +470,7 @@ pub fn row_table(raster: &Raster, table: &RowTable, seed: u64) -> Result<Vec<f64
                     let x = row as f64 / raster.rows as f64 * pieces as f64;
                     let piece = (x as usize).min(pieces - 1);
                     let share = x - piece as f64;
-                    linear(row) + knots[piece] * (1.0 - share) + knots[piece + 1] * share
+                    bent(row, percent) + knots[piece] * (1.0 - share) + knots[piece + 1] * share
                 })
                 .collect()
         }

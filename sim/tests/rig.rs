@@ -230,7 +230,10 @@ fn a_flying_spot_lights_each_column_at_its_own_moment() {
 
 #[test]
 fn row_tables_bend_the_sweep_and_keep_its_ends() {
-    for table in [RowTable::Quadratic { percent: 5.0 }, RowTable::Kinked { pieces: 3, amplitude_us: 12.0 }] {
+    for table in [
+        RowTable::Quadratic { percent: 5.0 },
+        RowTable::Kinked { pieces: 3, amplitude_us: 12.0, percent: 0.0 },
+    ] {
         let rig = rig(|config| config.projector.row_table = table.clone());
         let mut bench = Bench::lit(&rig, Some(&Pattern::White));
         let global = |start_us, exposure_us| CameraSettings {
@@ -245,7 +248,7 @@ fn row_tables_bend_the_sweep_and_keep_its_ends() {
     }
     assert!(
         std::panic::catch_unwind(|| rig(|config| {
-            config.projector.row_table = RowTable::Kinked { pieces: 8, amplitude_us: 500.0 };
+            config.projector.row_table = RowTable::Kinked { pieces: 8, amplitude_us: 500.0, percent: 0.0 };
         }))
         .is_err()
     );

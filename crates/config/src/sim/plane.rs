@@ -107,6 +107,9 @@ pub enum RowTable {
         pieces: usize,
         /// Largest deviation of a knot, in either direction.
         amplitude_us: f64,
+        /// The quadratic deviation on which the kinks lie, in percent of the sweep; within -20..=20.
+        #[serde(default)]
+        percent: f64,
     },
 }
 
