@@ -86,6 +86,18 @@ pub enum SimError {
         /// Projector rows.
         projector_rows: usize,
     },
+    /// The board's strip is not within the image.
+    #[error(
+        "sim.board.strip_columns = [{first}, {end}]: must be [first column, column after the last] of the {columns} columns, with at least one between them"
+    )]
+    Strip {
+        /// First column.
+        first: usize,
+        /// Column after the last.
+        end: usize,
+        /// Columns of the image.
+        columns: usize,
+    },
     /// The pattern varies along rows, which the scene's row transport cannot represent.
     #[error(
         "a scene is simulated under patterns that are the same along rows, and a built-in one under columns too: for other patterns put the board before the camera"
@@ -119,6 +131,7 @@ impl SimError {
             Self::TooManyRows { .. } => "scene_rows",
             Self::RowTable => "projector.row_table",
             Self::Beam | Self::Kernel => "projector.beam",
+            Self::Strip { .. } => "board.strip_columns",
             Self::TruthPeriod { key, .. } | Self::TruthRows { key, .. } | Self::Range { key, .. } => key,
         }
     }

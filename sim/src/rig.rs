@@ -30,7 +30,7 @@ impl PlaneRig {
     /// When the scene cannot be read or a key is out of range; the message names the key.
     pub fn new(config: SimConfig, setup: PlaneSetup, folder: &Path) -> Result<Self, SimError> {
         check_ranges(&config)?;
-        let scenes = if config.scene.extension().is_some_and(|extension| extension == "npz") {
+        let mut scenes = if config.scene.extension().is_some_and(|extension| extension == "npz") {
             vec![Scene::load(&folder.join(&config.scene))?]
         } else {
             let size = SceneSize { rows: config.scene_rows, columns: config.scene_columns };
@@ -40,6 +40,13 @@ impl PlaneRig {
             }
             scenes
         };
+        if let Some([first, end]) = config.board.strip_columns {
+            let (_, columns) = scenes[0].size();
+            if first >= end || end > columns {
+                return Err(SimError::Strip { first, end, columns });
+            }
+            scenes.iter_mut().for_each(|scene| scene.cover_with_board(first..end));
+        }
         let motion = SceneMotion::new(scenes.len(), config.motion_period_s);
         let first_row = optics::first_scene_row(&setup.raster, &scenes[0], setup.row_pitch, setup.first_row)?;
         let size = scenes[0].size();

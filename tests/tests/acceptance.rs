@@ -19,6 +19,7 @@ const ROW_TIME_US: f64 = 22.22;
 const STATED_LATENCY_US: f64 = 8.0;
 const SWEEP: &str = "kind = \"sweep\"\n[sweep]\ndelay_us = { start = -1500, stop = 1500, count = 15 }\n\
                      exposure_us = { start = 600, stop = 1200, count = 5 }\naverage = 8\n";
+const EDGES: &str = include_str!("../../deploy/plans/edges.toml");
 const FILM: &str = "kind = \"film\"\n[film]\ncycles = 8\nexposure_us = 600\ndelay_us = [-1500, -1000, -640, -420, \
                     -333, -311, -289, 0, 289, 311, 333, 420, 640, 1000, 1500]\n";
 
@@ -29,6 +30,9 @@ const UNKNOWN: &str = "[sim.projector]\nbeam = { kind = \"flat-top\", up_rows = 
                        [sim.sensor]\nvignetting_percent = 20.0\nprnu_percent = 1.0\n\
                        [sim.truth]\ncamera_row_time_us = 22.89\nrow_offset_rows = 0.4\nrotation_deg = 0.2\n\
                        trigger_latency_us = 30.0\n";
+
+/// The board stays in view in the leftmost columns.
+const STRIP: &str = "[calibration]\nstrip_columns = [0, 8]\n[sim.board]\nstrip_columns = [0, 8]\n";
 
 fn scenes() -> Vec<PathBuf> {
     let folder = std::env::var_os("RAYSWEEP_SCENES").expect("RAYSWEEP_SCENES: a folder with rendered scenes");
@@ -105,26 +109,34 @@ fn an_unknown_rig_against_the_same_rig_known() {
     // A row that the beam spreads downwards by a row is seen there while the row above is drawn.
     let mut beam = [0.0; RESPONSE_ROWS];
     (beam[7], beam[6]) = (1.0 / 1.7, 0.7 / 1.7);
-    println!("scene | jitter in us | sweep: uncalibrated | calibrated | known | film: calibrated | known");
+    println!(
+        "scene | light | sweep: uncalibrated | calibrated | known | edges: calibrated | known | film: calibrated | known"
+    );
     for scene in scenes() {
-        for jitter_us in ["5.0", "0.5"] {
-            let (bench, rig) = bench(&scene, &UNKNOWN.replace("JITTER", jitter_us));
+        for (jitter_us, strip) in [("5.0", ""), ("5.0", STRIP), ("0.5", "")] {
+            let (bench, rig) = bench(&scene, &(UNKNOWN.replace("JITTER", jitter_us) + strip));
             let sim = rig.simulated().unwrap();
             let uncalibrated = error_of_sweep(&bench.run(SWEEP), sim);
             let calibration = bench.run("kind = \"calibration\"\n");
             assert_eq!(calibration.state, "complete", "{:?}", calibration.error);
             let found = KeptCalibration::read(&calibration.session).unwrap().unwrap();
-            let errors = || (error_of_sweep(&bench.run(SWEEP), sim), error_of_film(&bench.run(FILM), sim));
+            let errors = || {
+                let [sweep, edges] = [SWEEP, EDGES].map(|plan| error_of_sweep(&bench.run(plan), sim));
+                [sweep, edges, error_of_film(&bench.run(FILM), sim)]
+            };
             let calibrated = errors();
             known(&found, sim, &beam).use_in(&data_folder(&bench)).unwrap();
             let known = errors();
+            let pairs: Vec<String> = calibrated
+                .iter()
+                .zip(known)
+                .map(|(found, known)| format!("{found:.4} | {known:.4}"))
+                .collect();
             println!(
-                "{} | {jitter_us} | {uncalibrated:.4} | {:.4} | {:.4} | {:.4} | {:.4}",
+                "{} | {jitter_us} us{} | {uncalibrated:.4} | {}",
                 scene.file_stem().unwrap().to_string_lossy(),
-                calibrated.0,
-                known.0,
-                calibrated.1,
-                known.1,
+                if strip.is_empty() { "" } else { ", strip" },
+                pairs.join(" | "),
             );
         }
     }

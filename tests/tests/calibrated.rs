@@ -3,6 +3,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -17,8 +18,11 @@ use raysweep_pipeline::{
 };
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{data, rig_text};
+use raysweep_transport::plane::board::times::{BoardStrip, JitterGauge};
 use raysweep_transport::plane::board::{BoardCalibration, Estimate};
-use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS, Setting, Transport, relative_rows};
+use raysweep_transport::plane::{
+    NoiseModel, PixelResponse, RESPONSE_ROWS, Setting, Transport, relative_rows,
+};
 use raysweep_transport::quality::median_profile_error;
 
 const BLACK_DN: f64 = 64.0;
@@ -40,6 +44,7 @@ impl Studio {
             &format!("scene = {:?}", data("p2r_corner.npz")),
             "[sim.projector]\nbeam = { kind = \"flat-top\", up_rows = 0.5, down_rows = 1.2 }\n\
              row_table = { kind = \"quadratic\", percent = 1.0 }\n\
+             [sim.board]\nstrip_columns = [0, 8]\n\
              [sim.truth]\nrow_offset_rows = 0.4\ntrigger_latency_us = 22.0\n",
         );
         let path = folder.path().join("rig.toml");
@@ -94,6 +99,7 @@ impl Studio {
             place_sd_rows: 0.0,
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
             white_relative_sd: 0.0,
+            strip: None,
         }
     }
 
@@ -277,6 +283,45 @@ fn pixels_that_the_board_did_not_light_have_no_light_and_harm_no_others() {
     let error = studio.error(&transport);
     println!("{error:.4}");
     assert!(error < 0.02, "{error}");
+}
+
+#[test]
+fn a_strip_of_the_board_shows_how_late_each_image_is() {
+    let studio = Studio::new();
+    let (calibration, geometry) = (studio.calibration(0.0), studio.calibrated(0.0));
+    let noise = NoiseModel { read_variance: 6e-5, gain: 2.4e-4 };
+    let gauge_of = |columns: Range<usize>| {
+        let strip = BoardStrip { columns, noise, jitter_us: 5.0 };
+        let centre_us = geometry.raster.row_centre_us(geometry.first_row);
+        JitterGauge::new(&calibration, &strip, geometry.raster.period_us, centre_us)
+    };
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(3);
+    let mut lateness = |gauge: &JitterGauge, delay_us: f64, exposure_us: f64, late_us: f64| {
+        let point = Point { role: PointRole::Sweep(0), delay_us: delay_us - late_us, exposure_us, frames: 1 };
+        let (measured_us, counts) = studio.take(&geometry, &point, 1, &mut random);
+        // The camera's stamps know nothing of light that is late.
+        let setting = geometry.setting(&[measured_us + late_us], exposure_us);
+        let light =
+            ((&counts - &studio.dark()) / &calibration.white_dn.clone()).slice_move(s![.., gauge.columns()]);
+        gauge.lateness(&setting, light.view()).unwrap()
+    };
+    let strip = gauge_of(0..8).unwrap();
+    for late_us in [-6.0, -1.3, 0.0, 0.4, 7.5] {
+        for delay_us in [-310.0, -295.0, 290.0, 311.0] {
+            let found = lateness(&strip, delay_us, 600.0, late_us);
+            assert!((found.late_us.value - late_us).abs() < 0.3, "{late_us}, {delay_us}: {found:?}");
+            assert!(
+                found.late_us.sd < 0.1 && found.chi2_per_sample < 2.0,
+                "{late_us}, {delay_us}: {found:?}"
+            );
+        }
+    }
+    // Far from both edges nothing is shown, and the scene is not the board.
+    let blind = lateness(&strip, 0.0, 600.0, 4.0);
+    assert!(blind.late_us.value.abs() < 0.1 && blind.late_us.sd > 4.9, "{blind:?}");
+    let scene = lateness(&gauge_of(60..68).unwrap(), 300.0, 600.0, 0.0);
+    assert!(scene.chi2_per_sample > 9.0, "{scene:?}");
+    assert!(gauge_of(120..130).is_err() && gauge_of(5..5).is_err());
 }
 
 #[test]

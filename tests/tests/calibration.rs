@@ -10,6 +10,7 @@ use ndarray::{Array3, Axis, s};
 use raysweep::control::Control;
 use raysweep::rig::Rig;
 use raysweep_processing::calibration::{KeptCalibration, current_in};
+use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::ArrayName;
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{Bench, Ended, data, end_of, rig_text};
@@ -122,6 +123,35 @@ fn a_rig_that_nobody_knows_is_calibrated_and_swept() {
     for section in ["When rows are lit", "Where pixels look", "Photon transfer", "Checks"] {
         assert!(page.contains(section), "{section}");
     }
+}
+
+#[test]
+fn a_strip_of_the_board_cancels_jitter_that_no_device_measures() {
+    let film = "kind = \"film\"\n[film]\ncycles = 6\nexposure_us = 600\ndelay_us = [-1500, -1000, -640, -420, \
+                -333, -311, -289, 0, 289, 311, 333, 420, 640, 1000, 1500]\n";
+    let columns = "strip_columns = [0, 8]\n";
+    let rig = |of_rig: &str, of_sim: &str| {
+        corner(&UNKNOWN.replace("[sim.truth]", &format!("{of_rig}[sim.board]\n{of_sim}[sim.truth]")))
+    };
+    let in_rig = format!("[calibration]\n{columns}");
+    let error = |rig: &str| {
+        let bench = Bench::new(rig);
+        assert_eq!(bench.run(PLAN).state, "complete");
+        let ended = bench.run(film);
+        assert_eq!(ended.state, "complete", "{:?}", ended.error);
+        let rig = Rig::load(&bench.folder.path().join("rig.toml")).unwrap();
+        let transports = TransportFilm::open(&ended.session.join("transport_film.zarr")).unwrap();
+        let u_min = transports.attributes()["u_min"].as_i64().unwrap() as i32;
+        let found = transports.read(5).unwrap().unwrap();
+        let scene = rig.simulated().unwrap().scene().transport.index_axis(Axis(3), 0).to_owned();
+        let found = found.slice(s![(-80 - u_min) as usize..=(80 - u_min) as usize, .., ..]);
+        median_profile_error(found, relative_rows(scene.view(), &(-80..=80)).view())
+    };
+    // Columns of the scene, which the rig file takes for the board, are not used.
+    let [with, without, wrong] =
+        [rig(&in_rig, columns), rig("", columns), rig(&in_rig, "")].map(|rig| error(&rig));
+    println!("{with:.4} with a strip, {without:.4} without, {wrong:.4} with a scene in its place");
+    assert!(with < 0.045 && without > 0.08 && wrong < 1.3 * without);
 }
 
 #[test]

@@ -16,6 +16,7 @@ use self::tally::Tally;
 pub use self::tally::{PREDICTED_SHARE, SweepSummary};
 use crate::bracket::BracketImage;
 use crate::findings::{Choices, choose, rows_to_choose_by};
+use crate::jitter::{StripFindings, StripGauge, StripLight};
 use crate::schedule::{PointRole, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
 use crate::stage_refused::StageRefused;
@@ -55,6 +56,8 @@ pub struct DemuxFold {
     not_kept: Option<BTreeMap<PointRole, (u32, Setting)>>,
     /// Pixels that a stage replaced in some image, `[t, s]`; `None` if none.
     filled: Option<Arc<Array2<bool>>>,
+    /// The images' light in the strip of the board, if one is in view.
+    strip: Option<StripLight>,
 }
 
 /// The camera rows of a sweep to be solved, and the neighbouring rows on which they depend.
@@ -110,6 +113,7 @@ impl DemuxFold {
             |error: PlaneError| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() };
         options.prior().check().map_err(invalid)?;
         let timing = geometry.timing().map_err(invalid)?;
+        let strip = StripGauge::of(geometry).map_err(invalid)?.map(StripLight::new);
         let (schedule, geometry) = (Arc::new(schedule.clone()), Arc::new(geometry.clone()));
         let fold = Self {
             options,
@@ -119,6 +123,7 @@ impl DemuxFold {
             taken: BTreeMap::new(),
             not_kept: None,
             filled: None,
+            strip,
         };
         fold.demux().map_err(invalid)?;
         Ok(fold)
@@ -171,6 +176,7 @@ impl DemuxFold {
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
+        let StripFindings { late_us, .. } = self.jitter();
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
@@ -179,7 +185,7 @@ impl DemuxFold {
             if let Some(dark) = self.dark_of(&darks, role) {
                 images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * &scale));
             }
-            settings.push(sample.setting.clone());
+            settings.push(sample.setting.earlier(late_us.get(&role).copied().unwrap_or(0.0)));
         }
         Ok(SweepStack {
             timing: self.timing.clone(),
@@ -196,6 +202,15 @@ impl DemuxFold {
             u0_rows: None,
             one_band: false,
         })
+    }
+
+    /// How late the light of each image is, as far as a strip of the board shows it.
+    fn jitter(&self) -> StripFindings {
+        let dark_of = |role: PointRole| {
+            let point = self.schedule.points.iter().find(|point| point.role == role)?;
+            self.schedule.dark_of(point.exposure_us)
+        };
+        self.strip.as_ref().map_or_else(StripFindings::default, |strip| strip.findings(dark_of))
     }
 
     /// Camera rows `rows`, to which the images belong.
@@ -218,6 +233,12 @@ impl DemuxFold {
             .and_then(|choices| match bracket {
                 Some((image, stack)) => choices.with_bracket(image, &rows, stack),
                 None => Ok(choices),
+            })
+            .map(|mut choices| {
+                let StripFindings { remark, warning, .. } = self.jitter();
+                choices.findings.remarks.extend(remark.map(|said| ("jitter", said)));
+                choices.findings.warnings.extend(warning);
+                choices
             })
             .map_err(refused)
     }
@@ -269,6 +290,9 @@ impl DemuxFold {
     pub fn push(&mut self, unit: &Unit, image: ArrayView2<'_, f32>) {
         let Some(point) = self.schedule.points.get(unit.id.point as usize) else { return };
         let setting = self.geometry.setting(&unit.delays_us, unit.exposure_us);
+        if let Some(strip) = &mut self.strip {
+            strip.push(point.role, &setting, image);
+        }
         match &mut self.not_kept {
             Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
             None => {

@@ -8,6 +8,7 @@ use raysweep_transport::plane::{Demux, Setting, Transport};
 
 use crate::calibrated::{CalibrationDrift, Images};
 use crate::demux::{DEMUX, DemuxFold, DemuxOptions};
+use crate::jitter::StripGauge;
 use crate::schedule::{Schedule, SweepGeometry};
 use crate::stage_refused::StageRefused;
 use crate::strips::NotSolved;
@@ -129,6 +130,8 @@ pub struct FilmSolver {
     late_us: f64,
     /// The film's first cycles; `None` without a calibration, or after they have shown the latency.
     first: Option<FirstCycles>,
+    /// The strip of the board that shows each frame's jitter, if it is in view.
+    strip: Option<StripGauge>,
 }
 
 /// The sum of a film's first cycles.
@@ -161,7 +164,9 @@ impl FilmSolver {
         let white = geometry.white_of(&(0..geometry.height).collect::<Vec<_>>());
         let (scale, measured) = (white.mapv(|dn| (1.0 / dn) as f32), white.mapv(f64::is_finite));
         let first = geometry.calibration.as_ref().map(|_| FirstCycles::default());
-        Ok(Self { demux, geometry: geometry.clone(), scale, measured, late_us: 0.0, first })
+        let strip = StripGauge::of(geometry)
+            .map_err(|error| StageRefused::Invalid { name: DEMUX.into(), what: error.to_string() })?;
+        Ok(Self { demux, geometry: geometry.clone(), scale, measured, late_us: 0.0, first, strip })
     }
 
     /// The relative rows that are estimated: first and last.
@@ -235,8 +240,14 @@ impl FilmSolver {
             }
             images.index_axis_mut(Axis(0), index).assign(&((&**image - dark) * &self.scale));
         }
-        let setting =
-            |(setting, _): &(Setting, _)| self.geometry.setting(&setting.delays_us, setting.exposure_us);
+        let setting = |(setting, image): &(Setting, Arc<Array2<f32>>)| {
+            let setting = self.geometry.setting(&setting.delays_us, setting.exposure_us);
+            let late_us = self.strip.as_ref().and_then(|strip| {
+                let [image, dark] = [image.view(), dark.view()];
+                strip.late_us(&setting, strip.of_image(&image), strip.of_image(&dark))
+            });
+            setting.earlier(late_us.unwrap_or(0.0))
+        };
         FilmStack { settings: frames.iter().map(setting).collect(), images, valid }
     }
 }

@@ -119,7 +119,7 @@ impl Stored<'_> {
         let (shape, first_row) = (self.state.session.shape, self.state.session.first_row);
         let refused = |error: ConfigError| ProcessError::Config(error.to_string());
         let kept = KeptCalibration::of(rig, self.session.dir(), None).map_err(refused)?;
-        let calibration = kept.as_ref().map(KeptCalibration::known).transpose().map_err(refused)?;
+        let calibration = kept.map(|kept| kept.known(rig)).transpose().map_err(refused)?;
         Ok(KnownRig { file: rig, first_row, size: (shape.rows, shape.columns), calibration })
     }
 

@@ -116,7 +116,7 @@ impl<'a> RigOfRun<'a> {
     /// # Errors
     /// When the calibration is unusable.
     pub fn known(&self) -> Result<KnownRig<'a>, ConfigError> {
-        let calibration = self.calibration.as_ref().map(KeptCalibration::known).transpose()?;
+        let calibration = self.calibration.as_ref().map(|kept| kept.known(&self.rig.file)).transpose()?;
         Ok(KnownRig { file: &self.rig.file, first_row: self.first_row, size: self.size, calibration })
     }
 

@@ -27,6 +27,7 @@ pub(crate) mod texture;
 mod translucent;
 mod vector;
 
+use std::ops::Range;
 use std::path::Path;
 
 use ndarray::{Array2, Array3, Array4, ArrayView2, Axis, s};
@@ -65,6 +66,13 @@ impl Scene {
     /// `T` holds a negative or non-finite value.
     pub fn load(path: &Path) -> Result<Self, SceneError> {
         npz::load(path)
+    }
+
+    /// Puts a white board without scattering into these columns of the image, in the scene's place.
+    pub fn cover_with_board(&mut self, columns: Range<usize>) {
+        for ((v, t, _, _), light) in self.transport.slice_mut(s![.., .., columns, ..]).indexed_iter_mut() {
+            *light = f32::from(u8::from(v == t));
+        }
     }
 
     /// Writes T (and `proj_uv`, if known) in the format that [`Scene::load`] reads.

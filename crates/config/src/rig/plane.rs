@@ -39,6 +39,8 @@ pub struct CalibrationUse {
     /// Whether the numbers in the rig file are used instead.
     #[serde(rename = "override")]
     pub is_overridden: bool,
+    /// First camera column in which the board stays in view during runs, and the column after the last.
+    pub strip_columns: Option<[usize; 2]>,
 }
 
 /// Camera drivers, by their names in rig files.
@@ -275,6 +277,15 @@ impl RigFile {
         let (Some(camera), Some(vsync), Some(projector)) = (camera, vsync, projector) else {
             return document.finish(None);
         };
+        if let Some([first, end]) = calibration.and_then(|calibration| calibration.strip_columns)
+            && first >= end
+        {
+            let message = format!(
+                "calibration.strip_columns = [{first}, {end}]: must be [first column, column after the last] with at \
+                 least one column between them"
+            );
+            document.refuse(&["calibration", "strip_columns"], message);
+        }
         let (Some(calibration), Some(sim)) = (calibration, sim) else { return document.finish(None) };
         let rig = Self { camera, vsync, projector, calibration, sim, places: document.places().clone() };
         rig.check(&mut document);

@@ -306,11 +306,13 @@ pub struct SimBoard {
     pub scatter_share: f64,
     /// Projector columns, 0 to 1 across its width, that the image's left and right edges see on the board.
     pub projector_columns: [f64; 2],
+    /// First column of the scene's images in which the board stays in view, and the column after the last.
+    pub strip_columns: Option<[usize; 2]>,
 }
 
 impl Default for SimBoard {
     fn default() -> Self {
-        Self { scatter_rows: 0.0, scatter_share: 0.0, projector_columns: [0.0, 1.0] }
+        Self { scatter_rows: 0.0, scatter_share: 0.0, projector_columns: [0.0, 1.0], strip_columns: None }
     }
 }
 

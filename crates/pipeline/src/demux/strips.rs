@@ -242,6 +242,8 @@ mod tests {
             place_sd_rows: 0.0,
             white_dn,
             white_relative_sd: 0.0,
+            strip: None,
+            strip: None,
         }))
     }
 

@@ -12,8 +12,9 @@ use ndarray_npy::{NpzReader, NpzWriter};
 use raysweep_config::{ConfigError, RigFile};
 use raysweep_core::{CameraCapabilities, PixelFormat};
 use raysweep_session::durable;
+use raysweep_transport::plane::board::times::BoardStrip;
 use raysweep_transport::plane::board::{BoardCalibration, Estimate};
-use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS};
+use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -299,20 +300,35 @@ impl KeptCalibration {
         old.into_iter().chain(changed).collect()
     }
 
-    /// The calibration as sweeps and films use it, with its date.
+    /// The calibration as sweeps and films of a rig use it, with its date.
     ///
     /// # Errors
-    /// When the arrays hold no usable response.
-    pub fn known(&self) -> Result<KnownCalibration, ConfigError> {
+    /// When the arrays hold no usable response, or the image does not have the columns in which the board stays.
+    pub fn known(&self, rig: &RigFile) -> Result<KnownCalibration, ConfigError> {
         let made = self.header.made.strftime("%Y-%m-%d %H:%M UTC").to_string();
-        Ok(KnownCalibration { made, board: self.board()? })
+        Ok(KnownCalibration { made, board: self.board(self.strip(rig)?)? })
+    }
+
+    fn strip(&self, rig: &RigFile) -> Result<Option<BoardStrip>, ConfigError> {
+        let Some([first, end]) = rig.calibration.strip_columns else { return Ok(None) };
+        let [_, columns] = self.header.valid_for.size;
+        if end > columns {
+            let message =
+                format!("calibration.strip_columns = [{first}, {end}]: the camera has {columns} columns");
+            return Err(rig.places.error(&["calibration", "strip_columns"], message));
+        }
+        let CalibratedLight { white_dn: [white_dn, _], electrons_per_dn: [gain, _], read_noise_e, .. } =
+            self.header.light;
+        let white_e = white_dn * gain;
+        let noise = NoiseModel { read_variance: (read_noise_e[0] / white_e).powi(2), gain: white_e.recip() };
+        Ok(Some(BoardStrip { columns: first..end, noise, jitter_us: self.header.timing.jitter_us[0] }))
     }
 
     /// The calibration as the model uses it.
     ///
     /// # Errors
     /// When the arrays hold no usable response.
-    fn board(&self) -> Result<Arc<BoardCalibration>, ConfigError> {
+    fn board(&self, strip: Option<BoardStrip>) -> Result<Arc<BoardCalibration>, ConfigError> {
         let CalibratedTiming { camera_row_time_us, exposure_offset_us, latency_sd_us, .. } =
             self.header.timing;
         let [white_dn, white_sd] = self.header.light.white_dn;
@@ -329,6 +345,7 @@ impl KeptCalibration {
                 / place_sd.len().max(1) as f64,
             white_dn: self.arrays.white_dn.clone(),
             white_relative_sd: white_sd / white_dn,
+            strip,
         }))
     }
 }

@@ -3,6 +3,7 @@ use ndarray::{Array2, s};
 use super::super::error::check_shape;
 use super::super::{CameraRows, FIRST_RESPONSE_ROW, PixelResponse, PlaneError, RowTiming};
 use super::Estimate;
+use super::times::BoardStrip;
 
 /// What images of a board have shown of a rig, in the form in which sweeps and films use it.
 #[derive(Debug, Clone, PartialEq)]
@@ -26,6 +27,8 @@ pub struct BoardCalibration {
     pub white_dn: Array2<f32>,
     /// Standard deviation of the white level relative to itself.
     pub white_relative_sd: f64,
+    /// Where the board stays in view during runs, if it does.
+    pub strip: Option<BoardStrip>,
 }
 
 impl BoardCalibration {

@@ -22,11 +22,6 @@ const STEP_US: f64 = 8.0;
 /// Steps below this end the fit.
 const CONVERGED_US: f64 = 0.02;
 const MAX_STEPS: usize = 20;
-/// First range of the search for a frame's jitter, the one used if the best value lies at its end, and its step.
-const SCAN_US: [f64; 2] = [40.0, 160.0];
-const SCAN_STEP_US: f64 = 4.0;
-/// Only every fourth camera row is compared in the search.
-const SCAN_ROWS: usize = 4;
 /// Frames whose jitter is farther from the median, in robust standard deviations, are dropped.
 const OUTLIER_SDS: f64 = 4.5;
 /// Frames whose chi^2 per sample exceeds both this value and this multiple of the median are dropped.
@@ -218,52 +213,12 @@ impl<'a> Fit<'a> {
     fn scan_jitters(&mut self) {
         let sweep = self.sweep();
         let comparison = self.comparison(&sweep);
-        let late_us: Vec<(usize, f64)> =
-            self.used().map(|frame| (frame, self.scan_jitter(&comparison, frame))).collect();
-        late_us.into_iter().for_each(|(frame, late_us)| self.late_us[frame] = late_us);
-    }
-
-    fn scan_jitter(&self, comparison: &FrameComparison, frame: usize) -> f64 {
-        let longer_us = self.longer_us(frame);
-        let prior = self.jitter_prior_us.powi(-2);
-        let objective = |late_us: f64| {
-            let mut chi2 = late_us * late_us * prior;
-            comparison.visit(
-                &self.frames[frame],
-                (late_us, longer_us),
-                BoardSamples::EveryRow(SCAN_ROWS),
-                |_, _, _, sums| {
-                    chi2 += sums.chi2;
-                },
-            );
-            chi2
+        let alone = |frame: usize| {
+            let longer_us = self.longer_us(frame);
+            comparison.lateness_us(&self.frames[frame], longer_us, self.jitter_prior_us).value
         };
-        let mut best_us = 0.0;
-        for range_us in SCAN_US {
-            let steps = (range_us / SCAN_STEP_US) as i32;
-            let values = (-steps..=steps).map(|step| f64::from(step) * SCAN_STEP_US);
-            let best = values
-                .map(|late_us| (late_us, objective(late_us)))
-                .fold((0.0, f64::MAX), |best, value| if value.1 < best.1 { value } else { best });
-            best_us = best.0;
-            if best_us.abs() < range_us - SCAN_STEP_US / 2.0 {
-                break;
-            }
-        }
-        for _ in 0..4 {
-            let (mut weight, mut right) = (prior, -best_us * prior);
-            comparison.visit(
-                &self.frames[frame],
-                (best_us, longer_us),
-                BoardSamples::OnEdges,
-                |_, _, _, sums| {
-                    weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
-                    right += sums.opening_residual - sums.closing_residual;
-                },
-            );
-            best_us += (right / weight).clamp(-STEP_US, STEP_US);
-        }
-        best_us
+        let late_us: Vec<(usize, f64)> = self.used().map(|frame| (frame, alone(frame))).collect();
+        late_us.into_iter().for_each(|(frame, late_us)| self.late_us[frame] = late_us);
     }
 
     /// Derivatives of the times of a frame's opening and closing edge.

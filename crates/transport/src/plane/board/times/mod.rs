@@ -10,6 +10,9 @@
 //! reduced by [`Columns::average`]; [`CoarseSweep::from_borders`]; frames of [`arrival_settings`] and [`check_settings`];
 //! [`RowTimes::fit`], which takes all of these frames; and, with pictures of even and of odd rows, [`spot_slopes`],
 //! which tells a flying spot from rows that are lit evenly.
+//!
+//! While a scene is measured, [`JitterGauge`] finds how late the light of each image is from a strip of the board that
+//! stays in view.
 
 mod coarse;
 mod columns;
@@ -19,6 +22,7 @@ mod model;
 mod result;
 mod settings;
 mod spot;
+mod strip;
 mod table;
 
 pub use coarse::CoarseSweep;
@@ -29,3 +33,4 @@ pub use settings::{
     BoardFrame, BoardSetting, ExposureMode, Nominal, arrival_settings, check_settings, sweep_settings,
 };
 pub use spot::{SpotSlopes, spot_slopes};
+pub use strip::{BoardStrip, JitterGauge, Lateness};

@@ -1,6 +1,7 @@
 use std::ops::Range;
 
 use super::super::super::NoiseModel;
+use super::super::Estimate;
 use super::columns::Columns;
 use super::settings::{BoardFrame, ExposureMode};
 
@@ -11,6 +12,14 @@ const ROBUST_SDS: f64 = 4.0;
 /// Shortest dwell of a row in a table that folds back while it is being fitted, as a share of the mean.
 const LEAST_DWELL: f64 = 0.02;
 
+/// First range of the search for a frame's jitter, the one used if the best value lies at its end, and its step.
+const SCAN_US: [f64; 2] = [40.0, 160.0];
+const SCAN_STEP_US: f64 = 4.0;
+/// Only every fourth camera row is compared in the search.
+const SCAN_ROWS: usize = 4;
+/// Largest step towards the best value.
+const LATENESS_STEP_US: f64 = 8.0;
+
 /// Times that all frames share, besides the table.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clocks {
@@ -20,6 +29,7 @@ pub(super) struct Clocks {
 }
 
 /// A table of row starts, repeated every period, in which edges are looked up.
+#[derive(Debug, Clone)]
 pub(super) struct Sweep {
     starts_us: Vec<f64>,
     period_us: f64,
@@ -107,6 +117,45 @@ pub(super) struct FrameComparison<'a> {
 }
 
 impl FrameComparison<'_> {
+    /// How late the light of a frame is whose exposure is `longer_us` longer than that of other frames: the best of
+    /// equally spaced values, then a few steps. Before it is measured, it is 0 with the standard deviation `prior_us`.
+    pub fn lateness_us(&self, frame: &BoardFrame, longer_us: f64, prior_us: f64) -> Estimate {
+        let prior = prior_us.powi(-2);
+        let objective = |late_us: f64| {
+            let mut chi2 = late_us * late_us * prior;
+            self.visit(frame, (late_us, longer_us), BoardSamples::EveryRow(SCAN_ROWS), |_, _, _, sums| {
+                chi2 += sums.chi2;
+            });
+            chi2
+        };
+        let mut best_us = 0.0;
+        for range_us in SCAN_US {
+            let steps = (range_us / SCAN_STEP_US) as i32;
+            let values = (-steps..=steps).map(|step| f64::from(step) * SCAN_STEP_US);
+            let best = values
+                .map(|late_us| (late_us, objective(late_us)))
+                .fold((0.0, f64::MAX), |best, value| if value.1 < best.1 { value } else { best });
+            best_us = best.0;
+            if best_us.abs() < range_us - SCAN_STEP_US / 2.0 {
+                break;
+            }
+        }
+        let step = |late_us: f64| {
+            let (mut weight, mut right) = (prior, -late_us * prior);
+            self.visit(frame, (late_us, longer_us), BoardSamples::OnEdges, |_, _, _, sums| {
+                weight += sums.opening_square - 2.0 * sums.mixed + sums.closing_square;
+                right += sums.opening_residual - sums.closing_residual;
+            });
+            (weight, right)
+        };
+        for _ in 0..4 {
+            let (weight, right) = step(best_us);
+            best_us += (right / weight).clamp(-LATENESS_STEP_US, LATENESS_STEP_US);
+        }
+        let (weight, _) = step(best_us);
+        Estimate { value: best_us, sd: weight.sqrt().recip() }
+    }
+
     /// Visits the camera rows of a frame whose light is late by `late_us` and whose exposure is `longer_us`
     /// longer than that of other frames.
     pub fn visit(
