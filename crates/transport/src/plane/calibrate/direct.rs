@@ -56,8 +56,9 @@ fn of_class(class: &SampledClass, beam_sigma_rows: f64) -> Result<Vec<DirectLigh
     // The light at u = 0 is direct light plus indirect light, which is about that of the neighbours.
     let amount =
         combination(slots + 2, &[(slots, 1.0), (own, 1.0), (slots + 1, 1.0), (above, -0.5), (below, -0.5)]);
-    let plan_variance = moment.dot(&problem.inverse().dot(&moment));
-    let amount_variance = amount.dot(&problem.inverse().dot(&amount));
+    let inverse = problem.inverse()?;
+    let plan_variance = moment.dot(&inverse.dot(&moment));
+    let amount_variance = amount.dot(&inverse.dot(&amount));
     let residual = x.dot(&problem.weights.t()) - &class.intensities;
     let minima = problem.minima(x.view(), class.intensities.view());
     let pixels = x.rows().into_iter().zip(residual.rows()).zip(minima).zip(&class.pixels);

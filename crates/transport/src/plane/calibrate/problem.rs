@@ -34,7 +34,10 @@ impl RowProblem {
     }
 
     /// `H^-1`, shape `[slots, slots]`.
-    pub fn inverse(&self) -> ArrayView2<'_, f64> {
+    ///
+    /// # Errors
+    /// Those of [`Self::new`].
+    pub fn inverse(&self) -> Result<ArrayView2<'_, f64>, PlaneError> {
         self.quadratic.inverse()
     }
 

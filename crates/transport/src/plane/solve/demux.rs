@@ -194,7 +194,7 @@ impl Demux {
     pub fn condition(&self, row: usize) -> Result<f64, PlaneError> {
         let model = RowModel::typical(&self.timing, &self.settings, &self.reach, row);
         let quadratic = Quadratic::new(model.weights.view(), &model.slots, &self.prior)?;
-        Ok(largest_eigenvalue(quadratic.h()) * largest_eigenvalue(quadratic.inverse()))
+        Ok(largest_eigenvalue(quadratic.h()) * largest_eigenvalue(quadratic.inverse()?))
     }
 
     /// Estimates the transport from `stack`, shape `[settings, camera_rows, columns]`, in units of the light that a
@@ -359,8 +359,8 @@ impl Demux {
                 let u0_rows = self.u0_rows.as_ref().map(|u0_rows| u0_rows.row(row));
                 let estimate = estimate.map(|estimate| estimate.t.index_axis(Axis(1), at));
                 let bracket = self.bracket.as_ref().map(|of| (of.image.row(row), of.valid.row(row)));
-                let data =
-                    Data { stack, bracket, estimate, profiles, bounds: Vec::new(), no_edge: Vec::new() };
+                let (bounds, no_edge, lit) = (Vec::new(), Vec::new(), None);
+                let data = Data { stack, bracket, estimate, profiles, bounds, no_edge, lit };
                 Row::new(row, columns, valid, u0_rows, data)
             })
             .collect();
@@ -397,7 +397,14 @@ impl Demux {
     fn solve_tile(&self, problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]) -> Result<(), PlaneError> {
         let places: Vec<(usize, usize)> = problem.places(*self.reach.start()).collect();
         let minima = match &tile.valid {
-            None => self.minima(problem, tile, &places, rows),
+            None => {
+                let minima = self.minima(problem, tile, &places, rows);
+                if let ([row], Some(_), false) = (&mut *rows, self.timing.response(), tile.pixels.is_empty())
+                {
+                    row.data.lit = Some(self.lit_by_most(&places, &minima));
+                }
+                minima
+            }
             Some(valid) => self.censored_minima(problem, tile, valid.view(), rows)?,
         };
         if !problem.has_edge() {
@@ -435,7 +442,7 @@ impl Demux {
         let samples = samples_of(problem, tile, rows);
         let linear = problem.quadratic.linear(problem.weights.view(), samples.view());
         let estimated = rows.iter().all(|row| row.data.estimate.is_some());
-        let free = estimated.then(|| {
+        let mut free = estimated.then(|| {
             let mut free = Array2::from_elem(linear.dim(), true);
             for (mut free, &(at, column)) in free.rows_mut().into_iter().zip(pixels) {
                 let Some(estimate) = rows[at].data.estimate else { continue };
@@ -443,8 +450,23 @@ impl Demux {
             }
             free
         });
+        if let ([Row { data: Data { lit: Some(lit), .. }, .. }], None) = (rows, &free) {
+            let mut marks = Array2::from_elem(linear.dim(), true);
+            places.iter().for_each(|&(slot, place)| marks.column_mut(slot).fill(lit[place]));
+            free = Some(marks);
+        }
         let start = free.as_ref().map_or(Start::Runs(runs), |free| Start::Free(free.view()));
         minimise(self.simd, &problem.quadratic, linear, &start)
+    }
+
+    /// The places, `[reach]`, that send light to most pixels.
+    fn lit_by_most(&self, places: &[(usize, usize)], minima: &Array2<f64>) -> Vec<bool> {
+        let mut lit = vec![true; self.reach.clone().count()];
+        for &(slot, place) in places {
+            lit[place] =
+                2 * minima.column(slot).iter().filter(|&&light| light > 0.0).count() > minima.nrows();
+        }
+        lit
     }
 
     /// The minima of pixels with censored samples, `[pixels, slots]`; notes what is only a lower bound.
@@ -511,6 +533,9 @@ struct Data<'a> {
     bounds: Vec<(usize, Vec<bool>)>,
     /// Columns in which no exposure tells rows near `u = 0` apart.
     no_edge: Vec<usize>,
+    /// Where pixels have measured responses: the places, `[reach]`, that send light to most of those solved last. The
+    /// next few, which have an objective of their own, start from there.
+    lit: Option<Vec<bool>>,
 }
 
 /// Largest eigenvalue of a symmetric positive definite matrix, by power iteration to about 1 %.

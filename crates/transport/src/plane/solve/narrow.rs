@@ -49,10 +49,11 @@ struct Border {
 
 impl Narrow {
     /// The parts, or `None` unless `D` links the slots into chains and there are so few settings that this solver is
-    /// the faster one. `diagonal` is that of `H` without its ridge.
-    pub fn new(
+    /// the faster one. `links` are the entries of each row of `D` other than 0; `diagonal` is that of `H` without its
+    /// ridge.
+    pub fn new<L: AsRef<[(usize, f64)]>>(
         weights: ArrayView2<f64>,
-        differences: ArrayView2<f64>,
+        links: &[L],
         alpha: f64,
         diagonal: &[f64],
     ) -> Option<Self> {
@@ -60,13 +61,9 @@ impl Narrow {
         let mut before = vec![0.0; slots];
         let mut after: Vec<Option<(usize, f64)>> = vec![None; slots];
         let mut has_before = vec![false; slots];
-        for difference in differences.rows() {
-            let mut touched = difference.indexed_iter().filter(|(_, weight)| **weight != 0.0);
-            let (Some((low, a)), Some((high, b)), None) = (touched.next(), touched.next(), touched.next())
-            else {
-                return None;
-            };
-            if *a != -*b || after[low].is_some() || has_before[high] {
+        for link in links {
+            let &[(low, a), (high, b)] = link.as_ref() else { return None };
+            if a != -b || after[low].is_some() || has_before[high] {
                 return None;
             }
             let joint = alpha * a * a;

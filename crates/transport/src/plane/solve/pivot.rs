@@ -42,7 +42,7 @@ pub fn minimise(simd: SimdLevel, quadratic: &Quadratic, linear: Array2<f64>, sta
     if linear.is_empty() {
         return linear;
     }
-    let unconstrained = linear.dot(&quadratic.inverse());
+    let unconstrained = unconstrained(quadratic, &linear);
     let mut slope = linear;
     slope.mapv_inplace(|c| -c);
     let mut free = Free::all(slope.nrows(), quadratic);
@@ -77,13 +77,20 @@ pub fn minimise_free(
     if linear.is_empty() {
         return linear;
     }
-    let unconstrained = linear.dot(&quadratic.inverse());
+    let unconstrained = unconstrained(quadratic, &linear);
     let mut slope = linear;
     slope.mapv_inplace(|c| -c);
     let mut marks = Free::all(slope.nrows(), quadratic);
     marks.set(free);
     simd.run(Pivoting { aim: Aim::Free, ..Pivoting::new(quadratic, &unconstrained, &mut slope, &mut marks) });
     slope
+}
+
+/// The minima without constraints, `[pixels, slots]`. The chain solver does without them.
+fn unconstrained(quadratic: &Quadratic, linear: &Array2<f64>) -> Array2<f64> {
+    quadratic
+        .dense()
+        .map_or_else(|| Array2::zeros(linear.dim()), |inverse| linear.dot(&inverse.padded.view()))
 }
 
 fn means_of_runs(pixels: ArrayView2<f64>, lengths: &[usize]) -> Array2<f64> {
@@ -206,7 +213,7 @@ impl<'a> Pivoting<'a> {
             let free = self.free.count(pixel.number);
             let zero = self.slots - free;
             let inverted =
-                zero <= free && self.quadratic.well_conditioned() && self.quadratic.narrow().is_none();
+                zero <= free && self.quadratic.dense().is_some_and(|inverse| inverse.is_well_conditioned);
             (pixel.side, pixel.size) = if inverted { (Side::Zero, zero) } else { (Side::Free, free) };
         }
         pixels.sort_unstable_by_key(|pixel| (pixel.side, pixel.size, pixel.number));
@@ -215,9 +222,9 @@ impl<'a> Pivoting<'a> {
     /// The matrix of a side's systems, the mark of the slots solved for, and the pixel's initial values in all slots.
     fn system(&self, side: Side, pixel: usize) -> (&Padded, f64, &[f64]) {
         let own = pixel * self.slots..(pixel + 1) * self.slots;
-        match side {
-            Side::Free => (self.quadratic.padded_h(), 1.0, &self.slope[own]),
-            Side::Zero => (self.quadratic.padded_inverse(), 0.0, &self.unconstrained[own]),
+        match (side, self.quadratic.dense()) {
+            (Side::Zero, Some(inverse)) => (&inverse.padded, 0.0, &self.unconstrained[own]),
+            _ => (self.quadratic.padded_h(), 1.0, &self.slope[own]),
         }
     }
 }

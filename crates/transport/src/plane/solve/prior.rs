@@ -73,8 +73,17 @@ impl Prior {
     /// `D`, one row per difference between neighbouring existing slots, shape `[differences, slots]`. Wrapped slots
     /// form separate chains, because no measured row links them to the others.
     pub fn differences(&self, slots: &[Slot]) -> Array2<f64> {
-        let index_of = |wanted: Slot| slots.iter().position(|&slot| slot == wanted);
-        let mut pairs = Vec::new();
+        let links = self.links(slots);
+        let mut differences = Array2::zeros((links.len(), slots.len()));
+        for (row, link) in links.into_iter().enumerate() {
+            link.into_iter().for_each(|(slot, weight)| differences[[row, slot]] = weight);
+        }
+        differences
+    }
+
+    /// The entries of each row of [`Self::differences`] other than 0, each with its slot.
+    pub(super) fn links(&self, slots: &[Slot]) -> Vec<[(usize, f64); 2]> {
+        let mut links = Vec::with_capacity(slots.len());
         for (lower, &slot) in slots.iter().enumerate() {
             let (step_rows, weight) = match self {
                 Self::Split { .. } if slot.u == 0 => continue,
@@ -82,16 +91,16 @@ impl Prior {
                 Self::Split { .. } => (1, (f64::from(slot.u) + 0.5).abs()),
                 Self::Paper { .. } => (1, 1.0),
             };
-            if let Some(upper) = index_of(Slot { u: slot.u + step_rows, ..slot }) {
-                pairs.push((lower, upper, weight));
-            }
+            let wanted = Slot { u: slot.u + step_rows, ..slot };
+            // Rows in order, mostly without a gap.
+            let near = lower + step_rows as usize;
+            let upper = match slots.get(near) {
+                Some(found) if *found == wanted => Some(near),
+                _ => slots.iter().position(|&slot| slot == wanted),
+            };
+            links.extend(upper.map(|upper| [(lower, -weight), (upper, weight)]));
         }
-        let mut differences = Array2::zeros((pairs.len(), slots.len()));
-        for (row, (lower, upper, weight)) in pairs.into_iter().enumerate() {
-            differences[[row, lower]] = -weight;
-            differences[[row, upper]] = weight;
-        }
-        differences
+        links
     }
 }
 

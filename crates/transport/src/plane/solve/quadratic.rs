@@ -1,5 +1,7 @@
+use std::sync::OnceLock;
+
 use aligned_vec::{AVec, avec};
-use ndarray::{Array2, ArrayView2, Axis, ShapeBuilder, aview2};
+use ndarray::{Array2, ArrayView1, ArrayView2, Axis, ShapeBuilder, aview2};
 
 use super::super::PlaneError;
 use super::super::model::Slot;
@@ -20,14 +22,42 @@ const WELL_CONDITIONED: f64 = 1e7;
 #[derive(Debug, Clone)]
 pub struct Quadratic {
     h: Padded,
-    /// The inverse of `H`.
-    inverse: Padded,
-    /// Whether solutions may be computed from the inverse. If settings leave rows undetermined, its entries are so
-    /// large that only rounding errors would remain.
-    well_conditioned: bool,
     half_beta: f64,
-    /// The parts of `H` for the chain solver; `None` unless there are few settings for many rows.
-    narrow: Option<Narrow>,
+    solver: Solver,
+}
+
+/// How the systems of pivoting are solved.
+#[derive(Debug, Clone)]
+enum Solver {
+    /// By the parts of `H` for the chain solver, if there are few settings for many rows. Its inverse is computed only
+    /// when something else asks for it.
+    Narrow(Narrow, OnceLock<Result<Inverse, PlaneError>>),
+    /// By `H` or its inverse.
+    Dense(Inverse),
+}
+
+/// The inverse of `H`.
+#[derive(Debug, Clone)]
+pub(super) struct Inverse {
+    /// Padded as `H` is.
+    pub padded: Padded,
+    /// Whether solutions may be computed from it. If settings leave rows undetermined, its entries are so large that
+    /// only rounding errors would remain.
+    pub is_well_conditioned: bool,
+}
+
+impl Inverse {
+    fn of(h: ArrayView2<f64>) -> Result<Self, PlaneError> {
+        let inverse = invert(h)?;
+        Ok(Self::new(h, inverse.view()))
+    }
+
+    fn new(h: ArrayView2<f64>, inverse: ArrayView2<f64>) -> Self {
+        // From the diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
+        let condition =
+            h.diag().iter().zip(inverse.diag()).fold(1.0_f64, |most, (h, inverse)| most.max(h * inverse));
+        Self { padded: Padded::new(inverse), is_well_conditioned: condition < WELL_CONDITIONED }
+    }
 }
 
 impl Quadratic {
@@ -36,7 +66,7 @@ impl Quadratic {
     /// # Errors
     /// [`PlaneError::NotConvex`] if values exceed the range of floating point.
     pub fn new(weights: ArrayView2<f64>, slots: &[Slot], prior: &Prior) -> Result<Self, PlaneError> {
-        Self::with_differences(weights, prior.differences(slots).view(), prior)
+        Self::with_links(weights, &prior.links(slots), prior)
     }
 
     /// The objective with the given `D`, shape `[differences, slots]`.
@@ -48,32 +78,36 @@ impl Quadratic {
         differences: ArrayView2<f64>,
         prior: &Prior,
     ) -> Result<Self, PlaneError> {
+        let entries = |row: ArrayView1<f64>| -> Vec<(usize, f64)> {
+            row.indexed_iter().filter(|(_, weight)| **weight != 0.0).map(|(i, w)| (i, *w)).collect()
+        };
+        let links: Vec<_> = differences.rows().into_iter().map(entries).collect();
+        Self::with_links(weights, &links, prior)
+    }
+
+    /// The objective with a `D` given by the entries of each row other than 0.
+    fn with_links<L: AsRef<[(usize, f64)]>>(
+        weights: ArrayView2<f64>,
+        links: &[L],
+        prior: &Prior,
+    ) -> Result<Self, PlaneError> {
         let mut h = weights.t().dot(&weights);
-        for difference in differences.rows() {
-            let touched: Vec<(usize, f64)> = difference
-                .indexed_iter()
-                .filter(|(_, weight)| **weight != 0.0)
-                .map(|(i, w)| (i, *w))
-                .collect();
-            for &(i, a) in &touched {
-                touched.iter().for_each(|&(j, b)| h[[i, j]] += prior.alpha() * a * b);
+        for link in links {
+            for &(i, a) in link.as_ref() {
+                link.as_ref().iter().for_each(|&(j, b)| h[[i, j]] += prior.alpha() * a * b);
             }
         }
-        let narrow = Narrow::new(weights, differences, prior.alpha(), &h.diag().to_vec());
+        let narrow = Narrow::new(weights, links, prior.alpha(), &h.diag().to_vec());
         for diagonal in h.diag_mut() {
             // A slot without any setting or difference must not make H singular; its T is 0 in any case.
             *diagonal = if *diagonal > 0.0 { *diagonal * (1.0 + RIDGE) } else { 1.0 };
         }
-        let inverse = invert(h.view())?;
-        Ok(Self { narrow, ..Self::from_parts(h, inverse, prior.beta() / 2.0) })
-    }
-
-    fn from_parts(h: Array2<f64>, inverse: Array2<f64>, half_beta: f64) -> Self {
-        // From the diagonal of the inverse of H scaled to a unit diagonal: a lower bound of its condition number.
-        let condition =
-            h.diag().iter().zip(inverse.diag()).fold(1.0_f64, |most, (h, inverse)| most.max(h * inverse));
-        let [h, inverse] = [h, inverse].map(|matrix| Padded::new(matrix.view()));
-        Self { h, inverse, well_conditioned: condition < WELL_CONDITIONED, half_beta, narrow: None }
+        let solver = match narrow {
+            Some(_) if h.iter().any(|entry| !entry.is_finite()) => return Err(PlaneError::NotConvex),
+            Some(narrow) => Solver::Narrow(narrow, OnceLock::new()),
+            None => Solver::Dense(Inverse::of(h.view())?),
+        };
+        Ok(Self { h: Padded::new(h.view()), half_beta: prior.beta() / 2.0, solver })
     }
 
     /// The same objective without some of its settings, whose weights are `dropped`, shape `[dropped settings,
@@ -84,10 +118,12 @@ impl Quadratic {
         let h = &self.h() - &dropped.t().dot(&dropped);
         // Only the ridge and rounding remain of rows that only the dropped settings saw.
         let lost = h.diag().iter().zip(self.h().diag()).any(|(left, had)| *left <= 1e-9 * had);
-        let seen = dropped.dot(&self.inverse());
+        let whole = self.inverted().ok()?;
+        let seen = dropped.dot(&whole.padded.view());
         let mut core = (Array2::<f64>::eye(settings) - seen.dot(&dropped.t())).into_raw_vec_and_offset().0;
         let well_posed = (0..settings).all(|k| core[k * settings + k] > 1e-6);
-        if lost || !well_posed || !self.well_conditioned || cholesky::factor(&mut core, settings).is_err() {
+        if lost || !well_posed || !whole.is_well_conditioned || cholesky::factor(&mut core, settings).is_err()
+        {
             return None;
         }
         // L^-1 of the core times `seen`, whose own product is the update.
@@ -100,13 +136,38 @@ impl Quadratic {
             }
             update.row_mut(i).mapv_inplace(|value| value / core[i * settings + i]);
         }
-        let inverse = &self.inverse() + &update.t().dot(&update);
-        Some(Self::from_parts(h, inverse, self.half_beta)).filter(|downdated| downdated.well_conditioned)
+        let inverse = &whole.padded.view() + &update.t().dot(&update);
+        let inverse = Inverse::new(h.view(), inverse.view());
+        inverse.is_well_conditioned.then(|| Self {
+            h: Padded::new(h.view()),
+            half_beta: self.half_beta,
+            solver: Solver::Dense(inverse),
+        })
     }
 
     /// The parts of `H` for the chain solver, if there are few settings for many rows.
     pub(super) fn narrow(&self) -> Option<&Narrow> {
-        self.narrow.as_ref()
+        match &self.solver {
+            Solver::Narrow(narrow, _) => Some(narrow),
+            Solver::Dense(_) => None,
+        }
+    }
+
+    /// The inverse for pivoting; `None` with the chain solver.
+    pub(super) fn dense(&self) -> Option<&Inverse> {
+        match &self.solver {
+            Solver::Narrow(..) => None,
+            Solver::Dense(inverse) => Some(inverse),
+        }
+    }
+
+    fn inverted(&self) -> Result<&Inverse, PlaneError> {
+        match &self.solver {
+            Solver::Narrow(_, inverse) => {
+                inverse.get_or_init(|| Inverse::of(self.h())).as_ref().map_err(Clone::clone)
+            }
+            Solver::Dense(inverse) => Ok(inverse),
+        }
     }
 
     /// Number of unknowns.
@@ -120,23 +181,16 @@ impl Quadratic {
     }
 
     /// The inverse of `H`.
-    pub fn inverse(&self) -> ArrayView2<'_, f64> {
-        self.inverse.view()
+    ///
+    /// # Errors
+    /// [`PlaneError::NotConvex`] if values exceed the range of floating point.
+    pub fn inverse(&self) -> Result<ArrayView2<'_, f64>, PlaneError> {
+        Ok(self.inverted()?.padded.view())
     }
 
     /// `H`, padded for gathering systems.
     pub(super) fn padded_h(&self) -> &Padded {
         &self.h
-    }
-
-    /// The inverse, padded as [`Self::padded_h`].
-    pub(super) fn padded_inverse(&self) -> &Padded {
-        &self.inverse
-    }
-
-    /// Whether solutions may be computed from the inverse.
-    pub fn well_conditioned(&self) -> bool {
-        self.well_conditioned
     }
 
     /// `c` of each pixel, shape `[pixels, slots]`, from intensities of shape `[pixels, settings]`.
@@ -172,7 +226,8 @@ impl Padded {
         &self.values[slot * self.stride..(slot + 1) * self.stride]
     }
 
-    fn view(&self) -> ArrayView2<'_, f64> {
+    /// Without the padding.
+    pub fn view(&self) -> ArrayView2<'_, f64> {
         let shape = (self.slots, self.slots).strides((self.stride, 1));
         ArrayView2::from_shape(shape, &self.values).unwrap_or(aview2::<f64, 0>(&[]))
     }
@@ -217,7 +272,7 @@ mod tests {
     fn the_inverse_undoes_h() {
         let weights = array![[1.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.3, 0.0, 0.0]];
         let quadratic = Quadratic::new(weights.view(), &slots(), &Prior::PAPER).unwrap();
-        let product = quadratic.h().dot(&quadratic.inverse()) - Array2::<f64>::eye(3);
+        let product = quadratic.h().dot(&quadratic.inverse().unwrap()) - Array2::<f64>::eye(3);
         assert!(product.iter().all(|entry| entry.abs() < 1e-12), "{product}");
     }
 
@@ -233,7 +288,10 @@ mod tests {
                 Quadratic::new(weights.select(Axis(0), &kept).view(), &slots(), &Prior::PAPER).unwrap();
             let close =
                 |a: ArrayView2<f64>, b: ArrayView2<f64>| (&a - &b).iter().all(|error| error.abs() < 1e-8);
-            assert!(close(downdated.h(), expected.h()) && close(downdated.inverse(), expected.inverse()));
+            assert!(
+                close(downdated.h(), expected.h())
+                    && close(downdated.inverse().unwrap(), expected.inverse().unwrap())
+            );
         }
         assert!(whole.without(weights.view()).is_none(), "nothing is left");
     }
