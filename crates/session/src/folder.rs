@@ -1,5 +1,6 @@
 //! The folder of a session, and listing the sessions of a data folder.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -9,7 +10,9 @@ use jiff::tz::TimeZone;
 
 use crate::dots::Dots;
 use crate::film::Film;
-use crate::ledger::{self, EndState, Ledger, SessionEntry, State};
+use crate::integrity::Audit;
+use crate::ledger::{self, EndState, Ledger, LedgerText, SessionEntry, State};
+use crate::manifest::{self, FileRecord};
 use crate::products::Products;
 use crate::stack::{Contents, Stack};
 use crate::{Error, Result, durable};
@@ -37,27 +40,58 @@ impl Session {
     /// # Errors
     /// [`Error::Io`] if the file system refuses, [`Error::Shape`] for an empty stack.
     pub fn create(root: &Path, session: SessionEntry, plan: &str, rig: &str) -> Result<(Session, Ledger)> {
+        Session::create_with(root, session, [plan, rig], |_| Ok(()))
+    }
+
+    /// As [`Session::create`], from the texts of plan and rig file and with further files that `keep` writes. The ledger
+    /// binds all of them by their SHA-256. After an error nothing is left.
+    ///
+    /// # Errors
+    /// As [`Session::create`], and the error of `keep`.
+    pub fn create_with<E: From<Error>>(
+        root: &Path,
+        session: SessionEntry,
+        texts: [&str; 2],
+        keep: impl FnOnce(&Session) -> std::result::Result<(), E>,
+    ) -> std::result::Result<(Session, Ledger), E> {
         session.shape.check()?;
         durable::create_dir_all(root)?;
         let stamp = session.created.to_zoned(TimeZone::UTC).strftime("%Y%m%d-%H%M%S").to_string();
         let session_dir = create_unused(root, &format!("{stamp}_{}", folder_name(&session.name)))?;
         let created = Session { dir: session_dir };
-        durable::write(&created.plan_path(), plan.as_bytes())?;
-        durable::write(&created.rig_path(), rig.as_bytes())?;
-        durable::create_dir(&created.products_path())?;
+        let filled = created.fill(&session, texts).map_err(E::from).and_then(|()| keep(&created));
+        let begun = filled.and_then(|()| {
+            let files = manifest::files_of(&created)?.into_iter();
+            let files = files.map(|(file, record)| (file, record.sha256)).collect();
+            Ok(Ledger::create(&created.ledger_path(), session, files)?)
+        });
+        match begun {
+            Ok(ledger) => Ok((created, ledger)),
+            Err(error) => {
+                // Without a ledger there is no session; what cannot be removed is not listed as one.
+                let _ = fs::remove_dir_all(&created.dir);
+                Err(error)
+            }
+        }
+    }
+
+    /// Writes what a new session has before its ledger.
+    fn fill(&self, session: &SessionEntry, [plan, rig]: [&str; 2]) -> Result<()> {
+        durable::write(&self.plan_path(), plan.as_bytes())?;
+        durable::write(&self.rig_path(), rig.as_bytes())?;
+        durable::create_dir(&self.products_path())?;
         if !session.shape.arrays().is_empty() {
-            Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
+            Stack::create(&self.stack_path(), &session.shape, &session.kind)?;
         }
         match session.shape.contents {
-            Contents::Batches { .. } => drop(Dots::create(&created.dots_path(), &session.shape)?),
-            Contents::Film { .. } => drop(Film::create(&created.film_path(), &session.shape)?),
+            Contents::Batches { .. } => drop(Dots::create(&self.dots_path(), &session.shape)?),
+            Contents::Film { .. } => drop(Film::create(&self.film_path(), &session.shape)?),
             Contents::Sweep { .. }
             | Contents::Axes { .. }
             | Contents::Darks { .. }
             | Contents::Board { .. } => {}
         }
-        let ledger = Ledger::create(&created.ledger_path(), session)?;
-        Ok((created, ledger))
+        Ok(())
     }
 
     /// Opens an existing session, to read it or to continue it ([`Session::resume`]).
@@ -88,6 +122,36 @@ impl Session {
         let ledger = Ledger::open(&self.ledger_path())?;
         durable::remove_leftovers(&self.dir)?;
         Ok(ledger)
+    }
+
+    /// As [`Session::resume`], of a session whose ledger may be damaged, with what the ledger says.
+    ///
+    /// # Errors
+    /// As [`Ledger::open_damaged`], [`Error::Io`] if a leftover cannot be removed.
+    pub fn open_damaged(&self) -> Result<(Ledger, LedgerText)> {
+        let opened = Ledger::open_damaged(&self.ledger_path())?;
+        durable::remove_leftovers(&self.dir)?;
+        Ok(opened)
+    }
+
+    /// Checks all checksums, without locking the session; also returns what the ledger says of it.
+    ///
+    /// # Errors
+    /// As [`LedgerText::read`], [`LedgerText::replay`] and [`Audit::new`].
+    pub fn audit(&self) -> Result<(State, Audit)> {
+        let text = LedgerText::read(&self.ledger_path())?;
+        let state = text.replay(&self.ledger_path())?;
+        let audit = Audit::new(self, &text, &state)?;
+        Ok((state, audit))
+    }
+
+    /// SHA-256 of files of the session, by their paths with `/` separators, for the ledger's `files`.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if one cannot be read.
+    pub fn sums_of(&self, files: &[&str]) -> Result<BTreeMap<String, String>> {
+        let sum = |file: &&str| Ok(((*file).to_owned(), FileRecord::read(&self.dir.join(file))?.sha256));
+        files.iter().map(sum).collect()
     }
 
     /// The state according to the ledger, read without locking it.

@@ -10,7 +10,7 @@ use raysweep_pipeline::{
     DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, StageRefused,
     Stages, SweepGeometry, Unit,
 };
-use raysweep_session::ledger::PointEntry;
+use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::board::BoardCalibration;
 use serde_json::{Map, Value, json};
@@ -33,6 +33,8 @@ pub struct PlaneTask {
     pub geometry: SweepGeometry,
     /// When the calibration was made that the model uses, as its file says it; `None` without one.
     pub calibration_made: Option<String>,
+    /// What is damaged and is left out of the results.
+    pub left_out: Vec<String>,
     /// The kind of the plan, which is also the name of its table.
     table: &'static str,
     format: PixelFormat,
@@ -86,12 +88,35 @@ impl PlaneTask {
         };
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
         let (table, format) = (plan.procedure.kind(), rig.camera.pixel_format);
-        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, table, format, places }
+        let left_out = Vec::new();
+        Self {
+            name,
+            stages,
+            max_jitter_us,
+            schedule,
+            geometry,
+            calibration_made,
+            left_out,
+            table,
+            format,
+            places,
+        }
     }
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
     pub fn settings(&self) -> impl Iterator<Item = (u32, &Point)> {
         (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, PointRole::Sweep(_)))
+    }
+
+    /// What of a session's ledger was not acquired with these settings, if anything.
+    pub fn unlike(&self, state: &State) -> Option<String> {
+        self.schedule.points.iter().find_map(|point| {
+            let (array, index) = place(point.role);
+            let stored = state.point(array, index).filter(|stored| stored.delay_us != point.delay_us)?;
+            let (planned_us, stored_us) = (point.delay_us, stored.delay_us);
+            let name = array.as_str();
+            Some(format!("{name} {index} was acquired at a delay of {stored_us} us, and the plan says {planned_us}"))
+        })
     }
 
     /// An error about a value of the plan.
@@ -222,6 +247,9 @@ impl PlaneTask {
             ("camera_row_time_us", json!(geometry.camera_row_time_us)),
             ("software", json!(SOFTWARE)),
         ];
+        if !self.left_out.is_empty() {
+            entries.push(("left_out", json!(self.left_out)));
+        }
         match &self.calibration_made {
             Some(made) => entries.push(("calibration", json!({ "made": made }))),
             None => entries.extend([

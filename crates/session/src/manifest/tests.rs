@@ -101,8 +101,8 @@ fn files_that_came_or_went_are_named() {
 fn a_missing_damaged_or_newer_manifest_is_an_error() {
     let (_root, session) = session();
     let text = fs::read_to_string(session.manifest_path()).unwrap();
-    fs::write(session.manifest_path(), text.replacen("\"format\": 1", "\"format\": 2", 1)).unwrap();
-    assert!(matches!(verify(&session), Err(Error::NewerFormat { found: 2, .. })));
+    fs::write(session.manifest_path(), text.replacen("\"format\": 2", "\"format\": 3", 1)).unwrap();
+    assert!(matches!(verify(&session), Err(Error::NewerFormat { found: 3, .. })));
     fs::write(session.manifest_path(), "{}").unwrap();
     assert!(matches!(verify(&session), Err(Error::Codec { .. })));
     fs::remove_file(session.manifest_path()).unwrap();
