@@ -23,7 +23,7 @@ use std::path::Path;
 
 use raysweep_config::{Plan, Procedure};
 use raysweep_session::integrity::{Audit, Damage, DamagedPart};
-use raysweep_session::ledger::{Entry, State};
+use raysweep_session::ledger::State;
 use raysweep_session::manifest::FileRecord;
 use raysweep_session::{Session, manifest};
 
@@ -69,7 +69,7 @@ pub fn process_asked(dir: &Path, asked: &Asked) -> Result<Processed, ProcessErro
     }
     keep_damaged(&session, before)?;
     if asked.accept_edits && !edited.is_empty() {
-        ledger.append(&Entry::Files { sha256: session.sums_of(&edited)? })?;
+        ledger.append(&session.bind(|file| edited.contains(&file))?)?;
     }
     Ok(processed)
 }
@@ -119,7 +119,7 @@ fn keep_damaged(session: &Session, before: Vec<(String, [FileRecord; 2])>) -> Re
 fn process_sound(session: &Session, state: &State, asked: &Asked) -> Result<Processed, ProcessError> {
     let path = session.plan_path();
     let plan_text = read(&path)?;
-    let plan = Plan::parse(&plan_text)
+    let plan = Plan::parse_stored(&plan_text)
         .map_err(|error| ProcessError::Config(error.render(&path.display().to_string(), &plan_text)))?;
     let stored = Stored { session, state, plan: &plan, plan_text: &plan_text };
     match plan.procedure.clone() {

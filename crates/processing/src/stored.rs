@@ -71,11 +71,13 @@ pub enum ProcessError {
 
 /// Most damaged parts that an error names.
 const MOST_NAMED: usize = 10;
-const EDITED: &str = "If you edited plan.toml or rig.toml, --accept-edits takes them as they are now. Otherwise, ";
+const EDITED: &str =
+    "If you edited plan.toml or rig.toml, --accept-edits takes them as they are now. Otherwise, ";
 
 /// Damaged parts as lines, the first ones by name.
 fn listed(damage: &[String]) -> String {
-    let mut lines: Vec<String> = damage.iter().take(MOST_NAMED).map(|damage| format!("\n  {damage}")).collect();
+    let mut lines: Vec<String> =
+        damage.iter().take(MOST_NAMED).map(|damage| format!("\n  {damage}")).collect();
     if let Some(more @ 1..) = damage.len().checked_sub(MOST_NAMED) {
         lines.push(format!("\n  and {more} more, which `raysweep verify` lists"));
     }

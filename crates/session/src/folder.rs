@@ -1,6 +1,5 @@
 //! The folder of a session, and listing the sessions of a data folder.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
@@ -11,7 +10,7 @@ use jiff::tz::TimeZone;
 use crate::dots::Dots;
 use crate::film::Film;
 use crate::integrity::Audit;
-use crate::ledger::{self, EndState, Ledger, LedgerText, SessionEntry, State};
+use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, SessionEntry, State};
 use crate::manifest::{self, FileRecord};
 use crate::products::Products;
 use crate::stack::{Contents, Stack};
@@ -145,13 +144,14 @@ impl Session {
         Ok((state, audit))
     }
 
-    /// SHA-256 of files of the session, by their paths with `/` separators, for the ledger's `files`.
+    /// An entry that binds files of the session, which are chosen by their paths with `/` separators.
     ///
     /// # Errors
     /// [`Error::Io`] if one cannot be read.
-    pub fn sums_of(&self, files: &[&str]) -> Result<BTreeMap<String, String>> {
-        let sum = |file: &&str| Ok(((*file).to_owned(), FileRecord::read(&self.dir.join(file))?.sha256));
-        files.iter().map(sum).collect()
+    pub fn bind(&self, is_bound: impl Fn(&str) -> bool) -> Result<Entry> {
+        let bound = manifest::paths_of(self)?.into_iter().filter(|(file, _)| is_bound(file));
+        let sum = |(file, path): (String, PathBuf)| Ok((file, FileRecord::read(&path)?.sha256));
+        Ok(Entry::Files { sha256: bound.map(sum).collect::<Result<_>>()? })
     }
 
     /// The state according to the ledger, read without locking it.

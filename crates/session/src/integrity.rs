@@ -222,21 +222,24 @@ pub fn changed_inputs(session: &Session, state: &State) -> Result<Vec<Damage>> {
 /// Returns early, soon after `go_on` returns false.
 pub fn damaged_data(session: &Session, state: &State, go_on: &(dyn Fn() -> bool + Sync)) -> Vec<Damage> {
     let mut damage = Vec::new();
-    let points: Vec<&PointEntry> =
-        [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular].iter().flat_map(|&array| state.stored(array)).collect();
+    let points: Vec<&PointEntry> = [ArrayName::Sum, ArrayName::Dark, ArrayName::Regular]
+        .iter()
+        .flat_map(|&array| state.stored(array))
+        .collect();
     let stack = session.stack().map_err(|error| error.to_string());
     let of_point = |point: &&PointEntry| {
         let PointEntry { array, index, crc32: sum, clipped_crc32, .. } = **point;
         let images = [(array, Some(sum)), (ArrayName::Clipped, clipped_crc32)];
-        let why = images.into_iter().filter_map(|(array, crc)| Some((array, crc?))).find_map(|(array, crc)| {
-            match &stack {
-                Err(why) => Some(why.clone()),
-                Ok(stack) => match stack.read_point(array, index) {
-                    Ok(image) => (crc32(image.view()) != crc).then(|| OTHER_CRC.into()),
-                    Err(error) => Some(error.to_string()),
-                },
-            }
-        });
+        let why =
+            images.into_iter().filter_map(|(array, crc)| Some((array, crc?))).find_map(|(array, crc)| {
+                match &stack {
+                    Err(why) => Some(why.clone()),
+                    Ok(stack) => match stack.read_point(array, index) {
+                        Ok(image) => (crc32(image.view()) != crc).then(|| OTHER_CRC.into()),
+                        Err(error) => Some(error.to_string()),
+                    },
+                }
+            });
         why.map(|why| Damage { part: DamagedPart::Point { array, index }, why })
     };
     damage.par_extend(points.par_iter().filter(|_| go_on()).filter_map(of_point));

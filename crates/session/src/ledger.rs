@@ -16,8 +16,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, PointEntry, SessionEntry};
 use self::chain::{Chain, Fit};
+pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, PointEntry, SessionEntry};
 pub use self::state::{Replay, State};
 use crate::durable::DraftFile;
 use crate::integrity::Damage;
@@ -89,11 +89,7 @@ impl Ledger {
     /// # Errors
     /// [`Error::Io`] if a ledger exists or the file system refuses; [`Error::Entry`] as for
     /// [`Ledger::append`].
-    pub fn create(
-        path: &Path,
-        session: SessionEntry,
-        files: BTreeMap<String, String>,
-    ) -> Result<Ledger> {
+    pub fn create(path: &Path, session: SessionEntry, files: BTreeMap<String, String>) -> Result<Ledger> {
         if path.exists() {
             return Err(Error::io("create ledger", path)(io::ErrorKind::AlreadyExists.into()));
         }

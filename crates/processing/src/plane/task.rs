@@ -37,7 +37,6 @@ pub struct PlaneTask {
     pub left_out: Vec<String>,
     /// The kind of the plan, which is also the name of its table.
     table: &'static str,
-    format: PixelFormat,
     places: Places,
 }
 
@@ -87,20 +86,9 @@ impl PlaneTask {
             None => (stated, None),
         };
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
-        let (table, format) = (plan.procedure.kind(), rig.camera.pixel_format);
+        let table = plan.procedure.kind();
         let left_out = Vec::new();
-        Self {
-            name,
-            stages,
-            max_jitter_us,
-            schedule,
-            geometry,
-            calibration_made,
-            left_out,
-            table,
-            format,
-            places,
-        }
+        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, left_out, table, places }
     }
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
@@ -115,7 +103,9 @@ impl PlaneTask {
             let stored = state.point(array, index).filter(|stored| stored.delay_us != point.delay_us)?;
             let (planned_us, stored_us) = (point.delay_us, stored.delay_us);
             let name = array.as_str();
-            Some(format!("{name} {index} was acquired at a delay of {stored_us} us, and the plan says {planned_us}"))
+            Some(format!(
+                "{name} {index} was acquired at a delay of {stored_us} us, and the plan says {planned_us}"
+            ))
         })
     }
 
@@ -152,19 +142,6 @@ impl PlaneTask {
             let refuse = |message: String| self.refuse(&["stage", &place, "name"], message);
             let made = PlaneStage::new(&table.name, Value::Object(table.options.clone()));
             match made.map_err(|error| self.refuse_stage(&place, &error))? {
-                PlaneStage::Image(_) if demux.is_some() => {
-                    return Err(refuse(format!(
-                        "stage {} comes after {DEMUX}, which takes the images that stages have processed: put {DEMUX} last",
-                        table.name
-                    )));
-                }
-                PlaneStage::Image(_) if self.format.mosaic.red().is_none() && is_for_mosaics(table) => {
-                    let message = format!(
-                        "stage {}: step_px = 2: must be 1, because camera.pixel_format = \"{}\" has no Bayer mosaic",
-                        table.name, self.format
-                    );
-                    return Err(self.refuse(&["stage", &place, "step_px"], message));
-                }
                 PlaneStage::Image(stage) => stages.push(stage),
                 PlaneStage::Demux(options) => {
                     let fold = DemuxFold::new(options, &self.schedule, &self.geometry)
@@ -262,9 +239,23 @@ impl PlaneTask {
     }
 }
 
-/// Whether a stage compares pixels that are two apart.
-fn is_for_mosaics(stage: &StageTable) -> bool {
-    stage.options.get("step_px").and_then(Value::as_u64) == Some(2)
+/// Checks that no stage of a plan for a new run compares pixels that are two apart, unless the camera's pixels have a
+/// mosaic.
+///
+/// # Errors
+/// With the position of the option in the plan.
+pub fn check_mosaic(plan: &Plan, format: PixelFormat) -> Result<(), ConfigError> {
+    let is_for_mosaics = |stage: &StageTable| stage.options.get("step_px").and_then(Value::as_u64) == Some(2);
+    match plan.stages.iter().position(is_for_mosaics).filter(|_| format.mosaic.red().is_none()) {
+        None => Ok(()),
+        Some(index) => {
+            let message = format!(
+                "stage {}: step_px = 2: must be 1, because camera.pixel_format = \"{format}\" has no Bayer mosaic",
+                plan.stages[index].name
+            );
+            Err(plan.places.error(&["stage", &index.to_string(), "step_px"], message))
+        }
+    }
 }
 
 /// Distribution over time of a pixel's direct light within its row.

@@ -200,7 +200,11 @@ impl State {
                     Err(format!("axis {axis} is outside of the plan, which has {axes} axes"))
                 }
             }
-            Entry::Files { .. } | Entry::Run { .. } | Entry::Film(_) | Entry::Outside { .. } | Entry::End(_) => Ok(()),
+            Entry::Files { .. }
+            | Entry::Run { .. }
+            | Entry::Film(_)
+            | Entry::Outside { .. }
+            | Entry::End(_) => Ok(()),
         }
     }
 
