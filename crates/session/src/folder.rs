@@ -9,7 +9,6 @@ use jiff::tz::TimeZone;
 
 use crate::dots::Dots;
 use crate::film::Film;
-use crate::integrity::Audit;
 use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, SessionEntry, State};
 use crate::manifest::{self, FileRecord};
 use crate::products::Products;
@@ -131,17 +130,6 @@ impl Session {
         let opened = Ledger::open_damaged(&self.ledger_path())?;
         durable::remove_leftovers(&self.dir)?;
         Ok(opened)
-    }
-
-    /// Checks all checksums, without locking the session; also returns what the ledger says of it.
-    ///
-    /// # Errors
-    /// As [`LedgerText::read`], [`LedgerText::replay`] and [`Audit::new`].
-    pub fn audit(&self) -> Result<(State, Audit)> {
-        let text = LedgerText::read(&self.ledger_path())?;
-        let state = text.replay(&self.ledger_path())?;
-        let audit = Audit::new(self, &text, &state)?;
-        Ok((state, audit))
     }
 
     /// An entry that binds files of the session, which are chosen by their paths with `/` separators.
@@ -430,6 +418,40 @@ mod tests {
         empty.shape.rows = 0;
         assert!(matches!(Session::create(root.path(), empty, "", ""), Err(Error::Shape { .. })));
         assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_session_that_is_refused_while_it_is_made_leaves_nothing() {
+        let root = tempfile::tempdir().unwrap();
+        let refuse = |session: &Session| {
+            fs::write(session.pattern_path("x").with_file_name("kept"), "").unwrap_err();
+            Err(Error::NotASession { path: session.dir().to_owned(), why: "no pattern".into() })
+        };
+        assert!(Session::create_with(root.path(), session("cup"), ["plan", "rig"], refuse).is_err());
+        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn the_ledger_binds_what_a_session_begins_with() {
+        let root = tempfile::tempdir().unwrap();
+        let keep = |session: &Session| durable::write(&session.dir().join("calibration.toml"), b"kept");
+        let (session, ledger) =
+            Session::create_with(root.path(), session("cup"), ["plan", "rig"], keep).unwrap();
+        let files = ledger.state().files();
+        // SHA-256 of the three letters "rig", computed by another program.
+        assert_eq!(files["rig.toml"], "c00ae0a63348054ecc8343f23278fe13bfa5c44255e208ff6102ffc2d7910a53");
+        assert!(files.contains_key("calibration.toml") && files.contains_key("stack.zarr/sum/zarr.json"));
+        fs::write(session.dir().join("calibration.toml"), "kepd").unwrap();
+        fs::remove_file(session.rig_path()).unwrap();
+        let (_, audit) = crate::integrity::Audit::of(&session).unwrap();
+        let damaged: Vec<String> = audit.damage.iter().map(ToString::to_string).collect();
+        assert_eq!(
+            damaged,
+            [
+                "calibration.toml is damaged (its SHA-256 is not the one in the ledger)",
+                "rig.toml is damaged (it is missing)"
+            ]
+        );
     }
 
     #[test]

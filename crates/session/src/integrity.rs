@@ -7,7 +7,6 @@
 //! | plan, rig, calibration and other inputs | the ledger's `files`; in sessions of format 1, the manifest |
 //! | results, and the ledger as it was when they were made | the manifest, which has a checksum of its own |
 
-use std::fmt;
 use std::fs::File;
 use std::io::Read;
 use std::path::Path;
@@ -15,82 +14,12 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde::Serialize;
 
+pub use crate::damage::{Damage, DamagedPart};
 use crate::folder::Session;
 use crate::ledger::{LedgerText, PointEntry, State};
 use crate::manifest::{self, FileRecord, Manifest};
 use crate::stack::{ArrayName, crc32};
 use crate::{Result, film};
-
-/// A part of a session that can be damaged by itself.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(tag = "part", rename_all = "snake_case")]
-pub enum DamagedPart {
-    /// A line of the ledger, counted from 1.
-    Line {
-        /// Its number.
-        line: usize,
-    },
-    /// A point of the stack.
-    Point {
-        /// Its array.
-        array: ArrayName,
-        /// Its index in that array.
-        index: usize,
-    },
-    /// A cycle of a film.
-    Cycle {
-        /// Counted from 0.
-        cycle: usize,
-    },
-    /// A batch of a flying dot.
-    Batch {
-        /// Counted from 0.
-        batch: usize,
-    },
-    /// A file that results depend on.
-    Input {
-        /// Its path in the session, with `/` separators.
-        file: String,
-    },
-    /// A file that can be made again from the others.
-    Result {
-        /// Its path in the session, with `/` separators.
-        file: String,
-    },
-    /// The manifest: it does not say what the results should be.
-    Manifest,
-}
-
-/// A damaged part.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Damage {
-    /// The part.
-    #[serde(flatten)]
-    pub part: DamagedPart,
-    /// What is wrong with it.
-    pub why: String,
-}
-
-impl fmt::Display for Damage {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.part {
-            DamagedPart::Line { line } => write!(f, "line {line} of ledger.jsonl")?,
-            DamagedPart::Point { array, index } => write!(f, "{} {index}", array.as_str())?,
-            DamagedPart::Cycle { cycle } => write!(f, "cycle {cycle}")?,
-            DamagedPart::Batch { batch } => write!(f, "batch {batch}")?,
-            DamagedPart::Input { file } | DamagedPart::Result { file } => f.write_str(file)?,
-            DamagedPart::Manifest => f.write_str("manifest.json")?,
-        }
-        write!(f, " is damaged ({})", self.why)
-    }
-}
-
-impl Damage {
-    /// Whether results that are made now would lack something, or could be wrong.
-    pub fn is_of_results_only(&self) -> bool {
-        matches!(self.part, DamagedPart::Result { .. })
-    }
-}
 
 /// The result of checking all checksums of a session.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -106,6 +35,17 @@ pub struct Audit {
 }
 
 impl Audit {
+    /// Checks a session without locking it; also returns what its ledger says of it.
+    ///
+    /// # Errors
+    /// As [`LedgerText::read`], [`LedgerText::replay`] and [`Audit::new`].
+    pub fn of(session: &Session) -> Result<(State, Self)> {
+        let text = LedgerText::read(&session.ledger_path())?;
+        let state = text.replay(&session.ledger_path())?;
+        let audit = Self::new(session, &text, &state)?;
+        Ok((state, audit))
+    }
+
     /// Checks a session, given what its ledger says and the state that results from it.
     ///
     /// # Errors
@@ -160,8 +100,10 @@ impl Audit {
                 None => Some(MISSING),
             };
             let file = file.clone();
-            let part =
-                if is_result(&file) { DamagedPart::Result { file } } else { DamagedPart::Input { file } };
+            let part = match is_result(&file, &state.session.kind) {
+                true => DamagedPart::Result { file },
+                false => DamagedPart::Input { file },
+            };
             Ok(why.map(|why| Damage { part, why: why.into() }))
         };
         let compared: Vec<Option<Damage>> = recorded.par_iter().map(compare).collect::<Result<_>>()?;
@@ -183,11 +125,13 @@ fn is_data(file: &str) -> bool {
     is_chunk && ["stack.zarr/", "film.zarr/", "dots.zarr/b"].iter().any(|data| file.starts_with(data))
 }
 
-/// Whether a file can be made again from the others.
-fn is_result(file: &str) -> bool {
+/// Whether a file can be made again from the others of a session of this kind.
+fn is_result(file: &str, kind: &str) -> bool {
     let results = ["products/", "report.html", "transport.zarr/", "transport_film.zarr/"];
-    // The records of a mirror's axes are among the products.
-    results.iter().any(|result| file.starts_with(result)) && !file.starts_with("products/chirp_")
+    // The records of a mirror's axes are among the products, and its response is made from them.
+    let is_of_mirror = kind == "response" && file == "mirror-response.json";
+    let is_record = file.starts_with("products/chirp_");
+    is_of_mirror || (results.iter().any(|result| file.starts_with(result)) && !is_record)
 }
 
 /// Whether a file begins with the bytes of a record.

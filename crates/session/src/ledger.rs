@@ -19,8 +19,8 @@ use serde::Deserialize;
 use self::chain::{Chain, Fit};
 pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, PointEntry, SessionEntry};
 pub use self::state::{Replay, State};
+use crate::damage::Damage;
 use crate::durable::DraftFile;
-use crate::integrity::Damage;
 use crate::{Error, Result};
 
 /// A ledger opened for appending. The file is locked, so only one process can do so at a time.

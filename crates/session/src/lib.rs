@@ -15,6 +15,7 @@
 //! The ledger is the source of truth: data without a line in the ledger do not count. So the order of a write
 //! is data, fsync, rename, fsync of the folder ([`durable`]), then the ledger's line, fsync.
 
+mod damage;
 pub mod dots;
 pub mod durable;
 mod error;

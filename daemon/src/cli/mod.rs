@@ -33,6 +33,7 @@ use self::printer::Printer;
 use self::view::EventView;
 use raysweep_processing::{Asked, ProcessError, export, process_asked};
 use raysweep_session::Session;
+use raysweep_session::integrity::Audit;
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -316,7 +317,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
 /// Checks a session.
 fn verify(session: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
     let (state, audit) =
-        Session::open(session).and_then(|session| session.audit()).map_err(ProcessError::from)?;
+        Session::open(session).and_then(|session| Audit::of(&session)).map_err(ProcessError::from)?;
     let (stored, points) = (state.stored_points(), state.session.shape.points());
     let value = json!({ "session": session, "stored": stored, "points": points, "audit": audit });
     printer.print(&value, |_| show::audit(&audit, stored, points))?;

@@ -18,7 +18,7 @@ pub use self::film::FilmPlan;
 pub use self::response::ResponsePlan;
 pub use self::sweep::{Axis, GridPlan, SweepPlan};
 pub use self::tables::{ProductTable, StageTable, products_of_argument};
-use crate::document::{Document, Purpose};
+use crate::document::{Document, ReadingPurpose};
 use crate::{ConfigError, ConfigMistake, Places};
 
 /// A plan.
@@ -150,7 +150,7 @@ impl Plan {
     /// # Errors
     /// Everything that keeps the session from being processed, with positions in the text.
     pub fn parse_stored(text: &str) -> Result<Self, ConfigError> {
-        Self::read(Document::parse(text)?.read_for(Purpose::StoredSession))
+        Self::read(Document::parse(text)?.read_for(ReadingPurpose::StoredSession))
     }
 
     fn read(mut document: Document<'_>) -> Result<Self, ConfigError> {

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use raysweep_core::{Counts, FilmSummary};
 
 use super::entry::{AxisEntry, EndEntry, Entry, PointEntry, SessionEntry};
+use crate::damage::{Damage, DamagedPart};
 use crate::dots::BatchEntry;
 use crate::film::CycleEntry;
-use crate::integrity::{Damage, DamagedPart};
 use crate::stack::{ArrayName, Contents};
 
 /// The state that results from the lines of a ledger.

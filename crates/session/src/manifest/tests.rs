@@ -108,3 +108,15 @@ fn a_missing_damaged_or_newer_manifest_is_an_error() {
     fs::remove_file(session.manifest_path()).unwrap();
     assert!(matches!(verify(&session), Err(Error::Io { .. })));
 }
+
+#[test]
+fn a_flipped_bit_in_the_manifest_itself_is_found() {
+    let (_root, session) = session();
+    let whole = fs::read(session.manifest_path()).unwrap();
+    for at in 0..whole.len() {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 1 << (at % 7);
+        fs::write(session.manifest_path(), damaged).unwrap();
+        assert!(read(&session).is_err(), "byte {at}");
+    }
+}
