@@ -15,7 +15,8 @@ use raysweep_proto::{
     CalibrationInfo, CheckReport, DesignParams, DesignReport, ErrorCode, Event, Mistake, ResumeParams,
     RpcError, RunParams, RunState, SessionInfo, Started, Status,
 };
-use raysweep_session::ledger::{EndState, Ledger, SessionEntry};
+use raysweep_session::integrity::{Audit, Damage, DamagedPart, changed_inputs};
+use raysweep_session::ledger::{EndState, Ledger, LedgerText, SessionEntry};
 use raysweep_session::{Session, SessionSummary};
 use tokio::sync::broadcast;
 
@@ -271,10 +272,15 @@ impl Runner {
             shape: foreseen.shape,
             first_row: foreseen.first_row,
         };
-        let (session, ledger) = Session::create(&self.data, entry, &params.plan, self.rig.text())
-            .map_err(|error| storage(&error))?;
-        foreseen.procedure.keep(&session)?;
-        self.spawn(foreseen, session, ledger, false)
+        let texts = [params.plan.as_str(), self.rig.text()];
+        let keep = |session: &Session| foreseen.procedure.keep(session).map_err(NotBegun);
+        let (session, ledger) =
+            Session::create_with(&self.data, entry, texts, keep).map_err(|NotBegun(error)| error)?;
+        let dir = session.dir().to_owned();
+        self.spawn(foreseen, session, ledger, false).inspect_err(|_| {
+            // Nothing was acquired, so there is nothing to resume.
+            let _ = std::fs::remove_dir_all(&dir);
+        })
     }
 
     fn resume_session(&self, params: &ResumeParams) -> Result<(Started, Current), RpcError> {
@@ -298,6 +304,15 @@ impl Runner {
             )));
         }
         let ledger = session.resume().map_err(|error| storage(&error))?;
+        let changed = changed_inputs(&session, ledger.state()).map_err(|error| storage(&error))?;
+        if !changed.is_empty() {
+            let changed: Vec<String> = changed.iter().map(ToString::to_string).collect();
+            return Err(no_session(format!(
+                "{} was changed after it was begun: {}; restore the original",
+                session.dir().display(),
+                changed.join("; ")
+            )));
+        }
         let foreseen =
             foresee_rest(&self.lab(), &plan, session.dir(), &ledger.state().session).map_err(|error| {
                 match error {
@@ -424,6 +439,13 @@ impl Control for Runner {
     fn use_calibration(&self, session: &Path) -> Result<(), RpcError> {
         let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
         let folder = self.data.join(session);
+        if let Ok(session) = Session::open(&folder) {
+            let damage = damaged_calibration(&session).map_err(|error| storage(&error))?;
+            if let Some(damage) = damage {
+                let advice = "`raysweep process` with --accept-damage makes it again";
+                return Err(no_session(format!("{}: {damage}; {advice}", folder.display())));
+            }
+        }
         let kept = KeptCalibration::read(&folder).map_err(no_session)?.ok_or_else(|| {
             no_session(format!(
                 "{} has no calibration.toml: give a session of kind \"calibration\" whose run succeeded; `raysweep calibration list` lists them",
@@ -436,6 +458,17 @@ impl Control for Runner {
     fn events(&self) -> broadcast::Receiver<Event> {
         self.board.subscribe()
     }
+}
+
+/// What of a session's calibration is damaged, if anything.
+fn damaged_calibration(session: &Session) -> raysweep_session::Result<Option<Damage>> {
+    let text = LedgerText::read(&session.ledger_path())?;
+    let state = text.replay(&session.ledger_path())?;
+    let is_of_calibration = |damage: &Damage| match &damage.part {
+        DamagedPart::Input { file } => file.starts_with("calibration."),
+        part => matches!(part, DamagedPart::Manifest),
+    };
+    Ok(Audit::without_data(session, &text, &state)?.damage.into_iter().find(is_of_calibration))
 }
 
 fn invalid_plan(error: &ConfigError) -> RpcError {
@@ -456,6 +489,15 @@ fn invalid_plan(error: &ConfigError) -> RpcError {
             .collect();
     }
     rpc
+}
+
+/// Why a session was not made.
+struct NotBegun(RpcError);
+
+impl From<raysweep_session::Error> for NotBegun {
+    fn from(error: raysweep_session::Error) -> Self {
+        Self(storage(&error))
+    }
 }
 
 fn storage(error: &raysweep_session::Error) -> RpcError {

@@ -412,6 +412,35 @@ fn sigterm_ends_a_run_in_order_and_keeps_what_was_acquired() {
     assert!(raysweep_session::manifest::verify(&Session::open(&resumed).unwrap()).unwrap().is_empty());
 }
 
+/// The exit code and output of a command that needs no daemon.
+fn raysweep(arguments: &[&str], session: &Path) -> (i32, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_raysweep")).args(arguments).arg(session).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn a_damaged_session_fails_verify_and_process_until_the_damage_is_accepted() {
+    let folder = folder(RIG);
+    let mut daemon = Daemon::start(folder.path());
+    let (session, _) = end(&mut daemon, |client| drop(client.run(&plan(PLAN)).unwrap()));
+    daemon.kill();
+    let (exit, out, _) = raysweep(&["verify"], &session);
+    assert_eq!((exit, out.as_str()), (0, "nothing is damaged; 9 of 9 points are stored\n"));
+    std::fs::remove_file(session.join("stack.zarr/sum/c.4.0.0")).unwrap();
+    let before = outcome(&session).files;
+    let (exit, out, _) = raysweep(&["verify"], &session);
+    assert!(exit == 1 && out.contains("sum 4 is damaged") && out.contains("1 damaged"), "{exit} {out}");
+    let (exit, out, _) = raysweep(&["verify", "--json"], &session);
+    let json: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((exit, &json["audit"]["damage"][0]["index"]), (1, &serde_json::json!(4)), "{json}");
+    let (exit, _, err) = raysweep(&["process"], &session);
+    assert!(exit == 1 && err.contains("sum 4 is damaged") && err.contains("--accept-damage"), "{exit} {err}");
+    assert!(outcome(&session).files == before, "the products are kept");
+    let (exit, out, _) = raysweep(&["process", "--accept-damage"], &session);
+    assert!(exit == 0 && out.contains("made from what is stored: 8 of 9"), "{exit} {out}");
+}
+
 #[test]
 fn a_socket_passed_by_the_service_manager_is_served() {
     let folder = folder(RIG);

@@ -47,8 +47,15 @@ class Faults:
         self.check(same, f"{what}: {found.dtype}{found.shape} differs from {expected.dtype}{expected.shape}")
 
 
-def read_ledger(session):
-    lines = (session / "ledger.jsonl").read_text().splitlines()
+def read_ledger(faults, session):
+    """All lines; each has a checksum of itself and of the checksum before it."""
+    lines = (session / "ledger.jsonl").read_bytes().splitlines()
+    before = b""
+    for number, line in enumerate(lines, start=1):
+        entry, _, found = line.removesuffix(b'"}').rpartition(b',"chain":"')
+        digits = hashlib.sha256(before + entry).hexdigest()[:16].encode()
+        faults.equal(found, digits, f"chain of line {number} of the ledger")
+        before = found
     return [json.loads(line) for line in lines]
 
 
@@ -56,7 +63,7 @@ def check_ledger(faults, entries):
     """The first line, and that every trigger is accounted for."""
     header = entries[0]
     faults.equal(header["event"], "session", "first line of the ledger")
-    faults.equal(header["format"], 1, "format of the ledger")
+    faults.equal(header["format"], 2, "format of the ledger")
     faults.check(all(entry["event"] != "session" for entry in entries[1:]), "a second `session` line")
     for number, entry in enumerate(entries, start=1):
         if counts := entry.get("counts"):
@@ -245,7 +252,7 @@ def check_session(session):
     faults = Faults()
     for name in ("plan.toml", "rig.toml"):
         faults.check("kind" in tomllib.loads((session / name).read_text()), f"{name} names no kind")
-    entries = read_ledger(session)
+    entries = read_ledger(faults, session)
     header = check_ledger(faults, entries)
     check_stack(faults, session, header, entries)
     if header["kind"] == "film":

@@ -72,8 +72,9 @@ fn what_is_missing_is_acquired_again() {
 
     // What is damaged is named, and acquired again too.
     fs::write(whole.session.join("stack.zarr/dark/c.3.0.0"), b"nothing of this kind").unwrap();
-    let problems = raysweep_processing::process(&whole.session).unwrap().problems;
-    assert!(problems.len() == 1 && problems[0].contains("dark 3 is damaged"), "{problems:?}");
+    let refused = raysweep_processing::process(&whole.session).unwrap_err().to_string();
+    assert!(refused.contains("dark 3 is damaged"), "{refused}");
+    assert_eq!(fs::read(whole.session.join("products/dark.npy")).unwrap(), dark);
     assert_eq!(bench.resume(&whole.session).state, "complete");
     assert_eq!(raysweep_processing::process(&whole.session).unwrap().problems, [""; 0]);
 }

@@ -275,7 +275,11 @@ fn processing_a_film_again_gives_the_same_bits_and_names_what_is_damaged() {
     let middle = bytes.len() / 2;
     bytes[middle] ^= 0x10;
     std::fs::write(&shard, bytes).unwrap();
-    let processed = process::process(&ended.session).unwrap();
+    let refused = process::process(&ended.session).unwrap_err().to_string();
+    assert!(refused.contains("cycle 2 is damaged") && files(&folder) == before, "{refused}");
+    let accepting = process::Asked { accept_damage: true, ..process::Asked::default() };
+    let processed = process::process_asked(&ended.session, &accepting).unwrap();
+    assert_eq!((processed.stored, processed.points), (3, 4));
     assert!(
         processed.problems.iter().any(|what| what.contains("cycle 2 is damaged")),
         "{:?}",

@@ -139,27 +139,29 @@ fn a_disk_that_refuses_ends_the_run_at_once_with_its_cause_and_the_rest_can_be_r
     bench.restart_with(Probes::default());
     let resumed = bench.resume(&ended.session);
     assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
+    let bits = lasting_files(&ended.session);
+    let undisturbed = lasting_files(&bench.run(PLAN).session);
+    let differing: Vec<_> =
+        bits.iter().filter(|(name, bytes)| undisturbed.get(*name) != Some(bytes)).collect();
+    assert!(differing.is_empty(), "{:?}", differing.iter().map(|(name, _)| name).collect::<Vec<_>>());
 }
 
 #[test]
 fn damaged_data_are_noticed_and_acquired_again() {
     let bench = Bench::new(&small_rig(""));
     let ended = bench.run(PLAN);
+    let before = lasting_files(&ended.session);
     let chunk = ended.session.join("stack.zarr/sum/c.3.0.0");
     let mut bytes = std::fs::read(&chunk).unwrap();
     let middle = bytes.len() / 2;
     bytes[middle] ^= 0x10;
     std::fs::write(&chunk, bytes).unwrap();
-    let processed = process::process(&ended.session).unwrap();
-    assert!(
-        processed.problems.iter().any(|problem| problem.contains("sum 3 is damaged")),
-        "{:?}",
-        processed.problems
-    );
+    let refused = process::process(&ended.session).unwrap_err().to_string();
+    assert!(refused.contains("sum 3 is damaged") && refused.contains("--accept-damage"), "{refused}");
     let resumed = bench.resume(&ended.session);
     assert_eq!(resumed.state, "complete", "{:?}", resumed.error);
-    let (_, state) = resumed.open();
-    assert_eq!(state.point(ArrayName::Sum, 3).unwrap().attempt, 1);
+    assert_eq!(resumed.open().1.point(ArrayName::Sum, 3).unwrap().attempt, 0, "its attempt had not failed");
+    assert!(lasting_files(&ended.session) == before, "the same attempt gives the same bits");
     assert!(process::process(&ended.session).unwrap().problems.is_empty());
 }
 

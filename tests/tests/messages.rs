@@ -158,7 +158,10 @@ fn sessions_that_cannot_be_processed() {
     let film = bench.run("kind = \"film\"\n[film]\ndelay_us = [-60, 0, 60]\nexposure_us = 50\ncycles = 1\n");
     let darks = bench.run("kind = \"darks\"\n[darks]\nexposure_us = [50]\nframes = 1\n");
     let ask = |session, product: &str, memory_limit_bytes| {
-        process_asked(session, &Asked { products: vec![product.into()], only: false, memory_limit_bytes })
+        process_asked(
+            session,
+            &Asked { products: vec![product.into()], memory_limit_bytes, ..Asked::default() },
+        )
     };
     let mut shown = String::new();
     let mut tell = |name: &str, error: raysweep_processing::ProcessError| {

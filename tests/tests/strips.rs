@@ -133,10 +133,12 @@ fn damaged_data_are_noticed_in_strips_too_and_left_out() {
     bytes[cut] ^= 0x10;
     std::fs::write(&chunk, bytes).unwrap();
     let limit_bytes = whole_bytes(&bench, &plan) - 1;
-    let in_strips = process::process_asked(&ended.session, &limited(limit_bytes)).unwrap();
+    let accepting = |asked: Asked| Asked { accept_damage: true, ..asked };
+    let asked = accepting(limited(limit_bytes));
+    let in_strips = process::process_asked(&ended.session, &asked).unwrap();
     assert!(in_strips.problems.iter().any(|problem| problem.contains("sum 3 is damaged")));
     let found = checksums(&ended.session);
-    let whole = process::process(&ended.session).unwrap();
+    let whole = process::process_asked(&ended.session, &accepting(Asked::default())).unwrap();
     assert_eq!(whole.problems, in_strips.problems);
     assert!(checksums(&ended.session) == found);
 }

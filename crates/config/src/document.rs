@@ -56,6 +56,17 @@ pub(crate) struct Document<'a> {
     tables: DeTable<'a>,
     places: Places,
     mistakes: Vec<ConfigMistake>,
+    purpose: ReadingPurpose,
+}
+
+/// What a text is read for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum ReadingPurpose {
+    /// For a run that is still to be made.
+    NewRun,
+    /// For what a session already has: mistakes that earlier versions allowed, and that do not keep it from being
+    /// processed, are none.
+    StoredSession,
 }
 
 impl<'a> Document<'a> {
@@ -72,7 +83,19 @@ impl<'a> Document<'a> {
             })
         })?;
         let places = Places::of(&table);
-        Ok(Self { tables: table.into_inner(), places, mistakes: Vec::new() })
+        Ok(Self { tables: table.into_inner(), places, mistakes: Vec::new(), purpose: ReadingPurpose::NewRun })
+    }
+
+    /// The same text, read for this purpose.
+    pub fn read_for(self, purpose: ReadingPurpose) -> Self {
+        Self { purpose, ..self }
+    }
+
+    /// As [`Self::refuse`], but only in a text for a new run.
+    pub fn refuse_new(&mut self, path: &[&str], message: impl Into<String>) {
+        if self.purpose == ReadingPurpose::NewRun {
+            self.refuse(path, message);
+        }
     }
 
     /// Positions of its values.

@@ -100,7 +100,7 @@ fn median(values: &mut [f32]) -> f32 {
 /// # Errors
 /// When the session cannot be written.
 pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -> Result<Vec<String>> {
-    let (stack, mut problems) = (session.stack()?, Vec::new());
+    let (stack, mut problems) = (session.stack()?, state.left_out());
     let DarksPlan { exposure_us, hot_sigmas, .. } = &task.darks;
     let mut levels = Vec::new();
     for (index, exposure_us) in exposure_us.values().into_iter().enumerate() {
@@ -117,12 +117,6 @@ pub fn make(session: &Session, state: &State, task: &DarksTask, rig: &RigFile) -
     )?;
     manifest::write(session, state, &task.task, rig)?;
     Ok(problems)
-}
-
-/// The stored images that are damaged and must be taken again.
-pub fn damaged(stack: &Stack, state: &State, task: &DarksTask) -> Vec<usize> {
-    let stored = (0..task.points()).filter(|&image| state.point(ArrayName::Dark, image).is_some());
-    stored.filter(|&image| read(stack, state, image).is_err()).collect()
 }
 
 /// The mean of an image's frames, or why it cannot be used.
@@ -250,7 +244,8 @@ pub fn process(
     }
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let task = DarksTask::new(plan, darks, &stored.known(&rig)?);
+    let mut task = DarksTask::new(plan, darks, &stored.known(&rig)?);
+    Arc::make_mut(&mut task.task).left_out = state.left_out();
     stored.check_contents(task.contents())?;
     let problems = make(session, state, &task, &rig)?;
     let (report, points) = (session.report_path(), shape.points());

@@ -3,15 +3,26 @@
 use std::path::Path;
 
 use raysweep_session::Session;
+use raysweep_session::integrity::Audit;
+use raysweep_session::ledger::LedgerText;
 
 use crate::stored::ProcessError;
 
 /// Copies a session's products, report and manifest into the new folder `to`, which must not exist.
 ///
 /// # Errors
-/// When the session cannot be read or `to` cannot be written.
-pub fn export(dir: &Path, to: &Path) -> Result<usize, ProcessError> {
+/// When the session cannot be read, its results are damaged (unless `accept_damage`), or `to` cannot be written.
+pub fn export(dir: &Path, to: &Path, accept_damage: bool) -> Result<usize, ProcessError> {
     let session = Session::open(dir)?;
+    if !accept_damage {
+        let text = LedgerText::read(&session.ledger_path())?;
+        let state = text.replay(&session.ledger_path())?;
+        let Audit { damage, .. } = Audit::without_data(&session, &text, &state)?;
+        if !damage.is_empty() {
+            let damage = damage.iter().map(ToString::to_string).collect();
+            return Err(ProcessError::DamagedResults { dir: dir.to_owned(), damage });
+        }
+    }
     if to.exists() {
         return Err(ProcessError::Config(format!("{} already exists: give a new folder", to.display())));
     }

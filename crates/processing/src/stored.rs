@@ -9,7 +9,7 @@ use raysweep_session::ledger::State;
 use raysweep_session::stack::Contents;
 
 use crate::calibration::KeptCalibration;
-use crate::plane::KnownRig;
+use crate::plane::{KnownRig, PlaneTask};
 
 /// Why a session cannot be processed.
 #[derive(Debug, thiserror::Error)]
@@ -17,6 +17,30 @@ pub enum ProcessError {
     /// The session cannot be read or written.
     #[error(transparent)]
     Session(#[from] raysweep_session::Error),
+    /// Something of it is damaged.
+    #[error(
+        "{} is damaged, so nothing was made, and its results are as they were:{}\n{}`raysweep resume` acquires damaged points again, a backup may have the files, and --accept-damage goes on without what is damaged",
+        dir.display(), listed(damage), if *is_edited { EDITED } else { "" }
+    )]
+    Damaged {
+        /// The session.
+        dir: PathBuf,
+        /// What is damaged.
+        damage: Vec<String>,
+        /// Whether the user may have edited what looks damaged.
+        is_edited: bool,
+    },
+    /// Results to be copied are damaged.
+    #[error(
+        "{} is damaged, so nothing was copied:{}\n`raysweep process` makes results again; --accept-damage copies the files as they are",
+        dir.display(), listed(damage)
+    )]
+    DamagedResults {
+        /// The session.
+        dir: PathBuf,
+        /// What is damaged.
+        damage: Vec<String>,
+    },
     /// Its plan or rig file cannot be read.
     #[error("{0}")]
     Config(String),
@@ -45,6 +69,21 @@ pub enum ProcessError {
     },
 }
 
+/// Most damaged parts that an error names.
+const MOST_NAMED: usize = 10;
+const EDITED: &str =
+    "If you edited plan.toml or rig.toml, --accept-edits takes them as they are now. Otherwise, ";
+
+/// Damaged parts as lines, the first ones by name.
+fn listed(damage: &[String]) -> String {
+    let mut lines: Vec<String> =
+        damage.iter().take(MOST_NAMED).map(|damage| format!("\n  {damage}")).collect();
+    if let Some(more @ 1..) = damage.len().checked_sub(MOST_NAMED) {
+        lines.push(format!("\n  and {more} more, which `raysweep verify` lists"));
+    }
+    lines.concat()
+}
+
 /// Results of processing.
 #[derive(Debug, Clone)]
 pub struct Processed {
@@ -68,6 +107,10 @@ pub struct Asked {
     /// Memory limit; results that need more are made in strips of camera rows, with the same values. `None`: the
     /// memory that is free.
     pub memory_limit_bytes: Option<u64>,
+    /// Go on if something is damaged: without it, which the results then say.
+    pub accept_damage: bool,
+    /// Take plan and rig file as they are, even if they are not the ones that the session was begun with.
+    pub accept_edits: bool,
 }
 
 /// A session that is being processed.
@@ -101,6 +144,21 @@ impl Stored<'_> {
             "{} was changed after the session was begun: its points are not those of the ledger; restore the original",
             self.session.plan_path().display()
         )))
+    }
+
+    /// As [`Self::check_contents`], and checks that the stored points were acquired with the plan's settings.
+    ///
+    /// # Errors
+    /// When `plan.toml` is not the one that the session was begun with.
+    pub(crate) fn check_points(&self, planned: Contents, task: &PlaneTask) -> Result<(), ProcessError> {
+        self.check_contents(planned)?;
+        match task.unlike(self.state) {
+            None => Ok(()),
+            Some(what) => Err(ProcessError::Config(format!(
+                "{} was changed after the session was begun: {what}; restore the original",
+                self.session.plan_path().display()
+            ))),
+        }
     }
 
     /// The rig file of a session of the plane rig.

@@ -46,6 +46,16 @@ pub fn write_with(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<()>) -
     draft.commit()
 }
 
+/// As [`write()`], with the content that another program writes to the path given to `fill`, which returns whether there
+/// is any.
+///
+/// # Errors
+/// [`Error::Io`]; the file at `path` is then unchanged.
+pub fn write_by(path: &Path, fill: impl FnOnce(&Path) -> bool) -> Result<()> {
+    let draft = DraftFile::create(path)?;
+    if fill(&draft.path) { draft.commit() } else { Ok(()) }
+}
+
 /// Creates a new folder, durably. It can serve as a lock: this fails if the name exists.
 ///
 /// # Errors
@@ -70,6 +80,15 @@ pub fn create_dir_all(path: &Path) -> Result<()> {
         }
         done => done,
     }
+}
+
+/// Creates a folder within an existing one, durably, if it is missing. Unlike [`create_dir_all`], this never brings back
+/// a session's folder that was removed.
+///
+/// # Errors
+/// [`Error::Io`] if the file system refuses.
+pub(crate) fn create_dir_within(path: &Path) -> Result<()> {
+    if path.is_dir() { Ok(()) } else { create_dir(path) }
 }
 
 /// Replaces the folder at `path` with one that `fill` writes, durably. `fill` gets the temporary folder and
@@ -146,6 +165,11 @@ impl DraftFile {
         let path = temporary_path(target);
         let file = File::create(&path).map_err(Error::io("write", &path))?;
         Ok(DraftFile { target: target.to_owned(), path, file })
+    }
+
+    /// Its path.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
     }
 
     /// The temporary file.

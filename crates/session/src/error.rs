@@ -48,6 +48,12 @@ pub enum Error {
         /// What is wrong with it.
         why: String,
     },
+    /// A crash tore the first line of a ledger: the session had not begun.
+    #[error("{} has no whole line: a crash cut the session off before it had begun, and nothing was acquired; move its folder to the trash", path.display())]
+    Torn {
+        /// The ledger.
+        path: PathBuf,
+    },
     /// An entry would not read back unchanged, so it was not written.
     #[error("{}: an entry was not written: {why}", path.display())]
     Entry {
@@ -152,6 +158,7 @@ mod tests {
             Error::NotASession { path: "s".into(), why: "there is no ledger.jsonl".into() },
             Error::InUse { path: "s/ledger.jsonl".into() },
             Error::Ledger { path: "s/ledger.jsonl".into(), line: 3, why: "its checksum is wrong".into() },
+            Error::Torn { path: "s/ledger.jsonl".into() },
             Error::Entry { path: "s/ledger.jsonl".into(), why: "delays_us[0] = NaN".into() },
             Error::NewerFormat { path: "s/ledger.jsonl".into(), found: 9, known: 2 },
             Error::Shape { what: "a sum".into(), found: vec![2, 3], allowed: "[4, 5]".into() },

@@ -9,7 +9,8 @@ use jiff::tz::TimeZone;
 
 use crate::dots::Dots;
 use crate::film::Film;
-use crate::ledger::{self, EndState, Ledger, SessionEntry, State};
+use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, SessionEntry, State};
+use crate::manifest::{self, FileRecord};
 use crate::products::Products;
 use crate::stack::{Contents, Stack};
 use crate::{Error, Result, durable};
@@ -37,27 +38,58 @@ impl Session {
     /// # Errors
     /// [`Error::Io`] if the file system refuses, [`Error::Shape`] for an empty stack.
     pub fn create(root: &Path, session: SessionEntry, plan: &str, rig: &str) -> Result<(Session, Ledger)> {
+        Session::create_with(root, session, [plan, rig], |_| Ok(()))
+    }
+
+    /// As [`Session::create`], from the texts of plan and rig file and with further files that `keep` writes. The ledger
+    /// binds all of them by their SHA-256. After an error nothing is left.
+    ///
+    /// # Errors
+    /// As [`Session::create`], and the error of `keep`.
+    pub fn create_with<E: From<Error>>(
+        root: &Path,
+        session: SessionEntry,
+        texts: [&str; 2],
+        keep: impl FnOnce(&Session) -> std::result::Result<(), E>,
+    ) -> std::result::Result<(Session, Ledger), E> {
         session.shape.check()?;
         durable::create_dir_all(root)?;
         let stamp = session.created.to_zoned(TimeZone::UTC).strftime("%Y%m%d-%H%M%S").to_string();
         let session_dir = create_unused(root, &format!("{stamp}_{}", folder_name(&session.name)))?;
         let created = Session { dir: session_dir };
-        durable::write(&created.plan_path(), plan.as_bytes())?;
-        durable::write(&created.rig_path(), rig.as_bytes())?;
-        durable::create_dir(&created.products_path())?;
+        let filled = created.fill(&session, texts).map_err(E::from).and_then(|()| keep(&created));
+        let begun = filled.and_then(|()| {
+            let files = manifest::files_of(&created)?.into_iter();
+            let files = files.map(|(file, record)| (file, record.sha256)).collect();
+            Ok(Ledger::create(&created.ledger_path(), session, files)?)
+        });
+        match begun {
+            Ok(ledger) => Ok((created, ledger)),
+            Err(error) => {
+                // Without a ledger there is no session; what cannot be removed is not listed as one.
+                let _ = fs::remove_dir_all(&created.dir);
+                Err(error)
+            }
+        }
+    }
+
+    /// Writes what a new session has before its ledger.
+    fn fill(&self, session: &SessionEntry, [plan, rig]: [&str; 2]) -> Result<()> {
+        durable::write(&self.plan_path(), plan.as_bytes())?;
+        durable::write(&self.rig_path(), rig.as_bytes())?;
+        durable::create_dir(&self.products_path())?;
         if !session.shape.arrays().is_empty() {
-            Stack::create(&created.stack_path(), &session.shape, &session.kind)?;
+            Stack::create(&self.stack_path(), &session.shape, &session.kind)?;
         }
         match session.shape.contents {
-            Contents::Batches { .. } => drop(Dots::create(&created.dots_path(), &session.shape)?),
-            Contents::Film { .. } => drop(Film::create(&created.film_path(), &session.shape)?),
+            Contents::Batches { .. } => drop(Dots::create(&self.dots_path(), &session.shape)?),
+            Contents::Film { .. } => drop(Film::create(&self.film_path(), &session.shape)?),
             Contents::Sweep { .. }
             | Contents::Axes { .. }
             | Contents::Darks { .. }
             | Contents::Board { .. } => {}
         }
-        let ledger = Ledger::create(&created.ledger_path(), session)?;
-        Ok((created, ledger))
+        Ok(())
     }
 
     /// Opens an existing session, to read it or to continue it ([`Session::resume`]).
@@ -88,6 +120,26 @@ impl Session {
         let ledger = Ledger::open(&self.ledger_path())?;
         durable::remove_leftovers(&self.dir)?;
         Ok(ledger)
+    }
+
+    /// As [`Session::resume`], of a session whose ledger may be damaged, with what the ledger says.
+    ///
+    /// # Errors
+    /// As [`Ledger::open_damaged`], [`Error::Io`] if a leftover cannot be removed.
+    pub fn open_damaged(&self) -> Result<(Ledger, LedgerText)> {
+        let opened = Ledger::open_damaged(&self.ledger_path())?;
+        durable::remove_leftovers(&self.dir)?;
+        Ok(opened)
+    }
+
+    /// An entry that binds files of the session, which are chosen by their paths with `/` separators.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if one cannot be read.
+    pub fn bind(&self, is_bound: impl Fn(&str) -> bool) -> Result<Entry> {
+        let bound = manifest::paths_of(self)?.into_iter().filter(|(file, _)| is_bound(file));
+        let sum = |(file, path): (String, PathBuf)| Ok((file, FileRecord::read(&path)?.sha256));
+        Ok(Entry::Files { sha256: bound.map(sum).collect::<Result<_>>()? })
     }
 
     /// The state according to the ledger, read without locking it.
@@ -366,6 +418,40 @@ mod tests {
         empty.shape.rows = 0;
         assert!(matches!(Session::create(root.path(), empty, "", ""), Err(Error::Shape { .. })));
         assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn a_session_that_is_refused_while_it_is_made_leaves_nothing() {
+        let root = tempfile::tempdir().unwrap();
+        let refuse = |session: &Session| {
+            fs::write(session.pattern_path("x").with_file_name("kept"), "").unwrap_err();
+            Err(Error::NotASession { path: session.dir().to_owned(), why: "no pattern".into() })
+        };
+        assert!(Session::create_with(root.path(), session("cup"), ["plan", "rig"], refuse).is_err());
+        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn the_ledger_binds_what_a_session_begins_with() {
+        let root = tempfile::tempdir().unwrap();
+        let keep = |session: &Session| durable::write(&session.dir().join("calibration.toml"), b"kept");
+        let (session, ledger) =
+            Session::create_with(root.path(), session("cup"), ["plan", "rig"], keep).unwrap();
+        let files = ledger.state().files();
+        // SHA-256 of the three letters "rig", computed by another program.
+        assert_eq!(files["rig.toml"], "c00ae0a63348054ecc8343f23278fe13bfa5c44255e208ff6102ffc2d7910a53");
+        assert!(files.contains_key("calibration.toml") && files.contains_key("stack.zarr/sum/zarr.json"));
+        fs::write(session.dir().join("calibration.toml"), "kepd").unwrap();
+        fs::remove_file(session.rig_path()).unwrap();
+        let (_, audit) = crate::integrity::Audit::of(&session).unwrap();
+        let damaged: Vec<String> = audit.damage.iter().map(ToString::to_string).collect();
+        assert_eq!(
+            damaged,
+            [
+                "calibration.toml is damaged (its SHA-256 is not the one in the ledger)",
+                "rig.toml is damaged (it is missing)"
+            ]
+        );
     }
 
     #[test]

@@ -15,12 +15,14 @@
 //! The ledger is the source of truth: data without a line in the ledger do not count. So the order of a write
 //! is data, fsync, rename, fsync of the folder ([`durable`]), then the ledger's line, fsync.
 
+mod damage;
 pub mod dots;
 pub mod durable;
 mod error;
 mod exr_file;
 pub mod film;
 mod folder;
+pub mod integrity;
 pub mod ledger;
 pub mod manifest;
 pub mod pattern;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, Read};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
@@ -28,6 +28,9 @@ pub struct Manifest {
     pub points: PointCounts,
     /// Counts of frames.
     pub counts: Counts,
+    /// What was damaged and is left out of the results.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub left_out: Vec<String>,
     /// All files of the session except the manifest, by path with `/` separators.
     pub files: BTreeMap<String, FileRecord>,
 }
@@ -82,19 +85,52 @@ pub fn write(
 ) -> Result<Manifest> {
     let stored = state.stored_points();
     let planned = state.session.shape.points();
+    let missing = state.missing_points();
     let manifest = Manifest {
         format: FORMAT,
         software,
         settings,
-        points: PointCounts { planned, stored, missing: planned - stored },
+        points: PointCounts { planned, stored, missing },
         counts: state.counts.clone(),
-        files: scan(session)?,
+        left_out: state.left_out(),
+        files: files_of(session)?,
     };
-    let path = session.manifest_path();
-    let mut text = serde_json::to_vec_pretty(&manifest).map_err(Error::codec("encode", path.display()))?;
-    text.push(b'\n');
-    durable::write(&path, &text)?;
+    store(session, &manifest)?;
     Ok(manifest)
+}
+
+/// Puts files that differ from their records back under these, so that their damage is not taken for what they should
+/// be.
+///
+/// # Errors
+/// As [`read`] and [`write`].
+pub fn keep_records(session: &Session, damaged: &BTreeMap<String, FileRecord>) -> Result<()> {
+    let mut manifest = read(session)?;
+    manifest.files.extend(damaged.clone());
+    store(session, &manifest)
+}
+
+/// Between the manifest and its checksum, its last key.
+const KEY: &str = ",\n  \"sha256\": \"";
+/// After the checksum.
+const END: &str = "\"\n}\n";
+
+fn store(session: &Session, manifest: &Manifest) -> Result<()> {
+    let path = session.manifest_path();
+    let text = serde_json::to_string_pretty(manifest).map_err(Error::codec("encode", path.display()))?;
+    // The closing brace follows the checksum.
+    let text = text.strip_suffix("\n}").unwrap_or(&text);
+    let FileRecord { sha256, .. } = FileRecord::of(text.as_bytes());
+    durable::write(&path, format!("{text}{KEY}{sha256}{END}").as_bytes())
+}
+
+/// Whether a manifest's text has its own checksum; those of format 1 have none.
+fn is_sound(text: &[u8], format: u32) -> bool {
+    let sealed = str::from_utf8(text).ok().and_then(|text| text.strip_suffix(END)?.rsplit_once(KEY));
+    match sealed {
+        Some((text, sha256)) => FileRecord::of(text.as_bytes()).sha256 == sha256,
+        None => format < FORMAT,
+    }
 }
 
 /// Reads the manifest of a session.
@@ -108,6 +144,9 @@ pub fn read(session: &Session) -> Result<Manifest> {
     if manifest.format > FORMAT {
         return Err(Error::NewerFormat { path, found: manifest.format, known: FORMAT });
     }
+    if !is_sound(&text, manifest.format) {
+        return Err(Error::codec("read", path.display())("its own checksum is wrong, so it was damaged"));
+    }
     Ok(manifest)
 }
 
@@ -117,7 +156,7 @@ pub fn read(session: &Session) -> Result<Manifest> {
 /// As [`read`], and [`Error::Io`] if a file cannot be read.
 pub fn verify(session: &Session) -> Result<Differences> {
     let expected = read(session)?.files;
-    let found = scan(session)?;
+    let found = files_of(session)?;
     let mut differences = Differences::default();
     for (path, record) in &expected {
         match found.get(path) {
@@ -130,15 +169,17 @@ pub fn verify(session: &Session) -> Result<Differences> {
     Ok(differences)
 }
 
-fn scan(session: &Session) -> Result<BTreeMap<String, FileRecord>> {
+/// All files of a session but the manifest and those that a crash left behind.
+pub(crate) fn files_of(session: &Session) -> Result<BTreeMap<String, FileRecord>> {
+    let record = |(name, path): (String, PathBuf)| Ok((name, FileRecord::read(&path)?));
+    paths_of(session)?.into_par_iter().map(record).collect()
+}
+
+/// The paths of these files, by their names in the manifest.
+pub(crate) fn paths_of(session: &Session) -> Result<BTreeMap<String, PathBuf>> {
     let mut paths = Vec::new();
     list_files(session.dir(), "", &mut paths)?;
-    let record = |(name, path): (String, PathBuf)| {
-        checksum(&path).map(|record| (name, record)).map_err(Error::io("read", &path))
-    };
-    let mut files = paths.into_par_iter().map(record).collect::<Result<BTreeMap<_, _>>>()?;
-    files.remove("manifest.json");
-    Ok(files)
+    Ok(paths.into_iter().filter(|(name, _)| name != "manifest.json").collect())
 }
 
 fn list_files(dir: &Path, prefix: &str, files: &mut Vec<(String, PathBuf)>) -> Result<()> {
@@ -158,20 +199,34 @@ fn list_files(dir: &Path, prefix: &str, files: &mut Vec<(String, PathBuf)>) -> R
     Ok(())
 }
 
-fn checksum(path: &Path) -> io::Result<FileRecord> {
-    let mut file = File::open(path)?;
-    let mut digest = Sha256::new();
-    let mut bytes = 0;
-    let mut buffer = vec![0; 1 << 16];
-    loop {
-        let count = file.read(&mut buffer)?;
-        if count == 0 {
-            let sha256 = digest.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-            return Ok(FileRecord { bytes, sha256 });
+impl FileRecord {
+    /// Of a file.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if it cannot be read.
+    pub fn read(path: &Path) -> Result<Self> {
+        let mut file = File::open(path).map_err(Error::io("read", path))?;
+        let mut digest = Sha256::new();
+        let mut bytes = 0;
+        let mut buffer = vec![0; 1 << 16];
+        loop {
+            let count = file.read(&mut buffer).map_err(Error::io("read", path))?;
+            if count == 0 {
+                return Ok(Self { bytes, sha256: hex(&digest.finalize()) });
+            }
+            digest.update(&buffer[..count]);
+            bytes += count as u64;
         }
-        digest.update(&buffer[..count]);
-        bytes += count as u64;
     }
+
+    /// Of the content of a file.
+    pub(crate) fn of(content: &[u8]) -> Self {
+        Self { bytes: content.len() as u64, sha256: hex(&Sha256::digest(content)) }
+    }
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

@@ -102,7 +102,7 @@ impl Products {
         metadata: &Map<String, Value>,
     ) -> Result<VolumeWriter> {
         let path = self.path(name, "npy")?;
-        durable::create_dir_all(&self.dir)?;
+        durable::create_dir_within(&self.dir)?;
         VolumeWriter::create(&path, shape, (self.path(name, "json")?, sidecar(name, metadata)?))
     }
 
@@ -222,7 +222,7 @@ impl Products {
         values: &ArrayRef<T, D>,
     ) -> Result<()> {
         let path = self.path(name, "npy")?;
-        durable::create_dir_all(&self.dir)?;
+        durable::create_dir_within(&self.dir)?;
         durable::write_with(&path, |file| {
             // Without this, an array in Fortran order would be written in that order.
             values.as_standard_layout().write_npy(BufWriter::new(file)).map_err(io::Error::other)
@@ -231,7 +231,7 @@ impl Products {
 
     fn write(&self, name: &str, extension: &str, bytes: &[u8]) -> Result<()> {
         let path = self.path(name, extension)?;
-        durable::create_dir_all(&self.dir)?;
+        durable::create_dir_within(&self.dir)?;
         durable::write(&path, bytes)
     }
 

@@ -81,7 +81,7 @@ impl WritableStorageTraits for DurableStore {
                 .and_then(|mut file| durable::write_in_pieces(&mut file, &value));
             return written.map_err(StorageError::from);
         }
-        durable::create_dir_all(parent)
+        durable::create_dir_within(parent)
             .and_then(|()| durable::write(&path, &value))
             .map_err(|error| StorageError::Other(error.to_string()))
     }
@@ -109,6 +109,7 @@ impl WritableStorageTraits for DurableStore {
 
 /// Writes the metadata of the root group.
 pub(crate) fn create_group(store: &Arc<DurableStore>, attributes: Map<String, Value>) -> Result<()> {
+    durable::create_dir_within(store.root())?;
     GroupBuilder::new()
         .attributes(attributes)
         .build(store.clone(), "/")

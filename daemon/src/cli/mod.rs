@@ -31,7 +31,9 @@ use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::printer::Printer;
 use self::view::EventView;
-use raysweep_processing::{Asked, export, process_asked};
+use raysweep_processing::{Asked, ProcessError, export, process_asked};
+use raysweep_session::Session;
+use raysweep_session::integrity::Audit;
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -154,6 +156,17 @@ enum Command {
         /// memory]
         #[arg(long, value_name = "SIZE", value_parser = memory_size)]
         memory: Option<ByteSize>,
+        /// Go on if something of the session is damaged: without it, which report, products and manifest then say
+        #[arg(long)]
+        accept_damage: bool,
+        /// Take plan.toml and rig.toml as they are now, although they are not as the session was begun with
+        #[arg(long)]
+        accept_edits: bool,
+    },
+    /// Check all checksums of a session, and list what is damaged; needs no daemon
+    Verify {
+        /// The session's folder
+        session: PathBuf,
     },
     /// Copy a session's products, report and manifest; needs no daemon
     Export {
@@ -162,6 +175,9 @@ enum Command {
         /// The folder to create [default: the session's name with `-export`, in the current folder]
         #[arg(long, value_name = "DIR")]
         to: Option<PathBuf>,
+        /// Copy the files even if some are damaged
+        #[arg(long)]
+        accept_damage: bool,
     },
 }
 
@@ -278,22 +294,34 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             }
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
-        Command::Process { session, products, only, memory } => {
+        Command::Process { session, products, only, memory, accept_damage, accept_edits } => {
             let memory_limit_bytes = memory.map(|size| size.as_u64());
-            let made = process_asked(&session, &Asked { products, only, memory_limit_bytes })?;
+            let asked = Asked { products, only, memory_limit_bytes, accept_damage, accept_edits };
+            let made = process_asked(&session, &asked)?;
             let value = json!({
                 "report": made.report, "stored": made.stored, "points": made.points, "problems": made.problems,
             });
             printer.print(&value, |_| show::processed(&made))?;
         }
-        Command::Export { session, to } => {
+        Command::Verify { session } => return verify(&session, printer),
+        Command::Export { session, to, accept_damage } => {
             let to = to.unwrap_or_else(|| export_folder(&session));
-            let files = export(&session, &to)?;
+            let files = export(&session, &to, accept_damage)?;
             let value = json!({ "folder": to, "files": files });
             printer.print(&value, |_| format!("{files} files copied to {}", to.display()))?;
         }
     }
     Ok(Exit::Done)
+}
+
+/// Checks a session.
+fn verify(session: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
+    let (state, audit) =
+        Session::open(session).and_then(|session| Audit::of(&session)).map_err(ProcessError::from)?;
+    let (stored, points) = (state.stored_points(), state.session.shape.points());
+    let value = json!({ "session": session, "stored": stored, "points": points, "audit": audit });
+    printer.print(&value, |_| show::audit(&audit, stored, points))?;
+    Ok(if audit.damage.is_empty() { Exit::Done } else { Exit::Failed })
 }
 
 /// Runs a plan, given by its path and its text.

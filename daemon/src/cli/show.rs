@@ -12,6 +12,7 @@ use raysweep_proto::{
 };
 
 use raysweep_processing::Processed;
+use raysweep_session::integrity::{Audit, Damage};
 
 /// Text of `status`.
 pub(super) fn status(status: &Status) -> String {
@@ -354,6 +355,34 @@ pub(super) fn processed(made: &Processed) -> String {
     let mut lines: Vec<_> = made.problems.iter().map(|problem| format!("not made: {problem}")).collect();
     lines.push(format!("made from what is stored: {} of {}", made.stored, made.points));
     lines.push(format!("report: {}", made.report.display()));
+    lines.join("\n")
+}
+
+/// The result of checking a session with so many stored points of those planned.
+pub(super) fn audit(audit: &Audit, stored: usize, points: usize) -> String {
+    let Audit { damage, added, torn_bytes, has_manifest } = audit;
+    let mut lines: Vec<String> = damage.iter().map(ToString::to_string).collect();
+    if *torn_bytes > 0 {
+        lines
+            .push("the last line of ledger.jsonl was torn by a crash: what it recorded is not stored".into());
+    }
+    if !has_manifest {
+        lines.push(
+            "there is no manifest, because the session is not complete: its results were not checked".into(),
+        );
+    }
+    lines.extend(added.iter().map(|file| format!("{file} is not in the manifest, so it was not checked")));
+    lines.push(match damage.len() {
+        0 => format!("nothing is damaged; {stored} of {points} points are stored"),
+        count => {
+            let what = if damage.iter().all(Damage::is_of_results_only) {
+                "results alone: `raysweep process` makes them again"
+            } else {
+                "`raysweep resume` acquires damaged points again, a backup may have the files, and `raysweep process --accept-damage` goes on without what is damaged"
+            };
+            format!("{count} damaged: {what}")
+        }
+    });
     lines.join("\n")
 }
 

@@ -13,6 +13,7 @@ use std::path::Path;
 
 use raysweep_config::{ConfigError, Plan, Procedure};
 use raysweep_processing::calibration::current_in;
+use raysweep_processing::plane::check_mosaic;
 use raysweep_session::ledger::SessionEntry;
 
 use self::lab::{Lab, LabRig, RigOfRun};
@@ -25,7 +26,7 @@ use crate::run::life::Foreseen;
 pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
     let plan = Plan::parse(text)?;
     let in_use = current_in(lab.data);
-    match (lab.rig, plan.procedure.clone()) {
+    let foreseen = match (lab.rig, plan.procedure.clone()) {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
             sweep::foresee(lab, RigOfRun::of_new(lab, rig).calibrated(lab, &in_use)?, &plan, own)
         }
@@ -48,7 +49,11 @@ pub fn foresee(lab: &Lab<'_>, text: &str) -> Result<Foreseen, ConfigError> {
             LabRig::Dots(_),
             Procedure::Sweep(_) | Procedure::Film(_) | Procedure::Darks(_) | Procedure::Calibration(_),
         ) => Err(of_another_rig(&plan, "a dot rig runs plans of kind \"batches\" and \"response\"")),
+    }?;
+    if let LabRig::Plane(rig) = lab.rig {
+        check_mosaic(&plan, rig.file.camera.pixel_format)?;
     }
+    Ok(foreseen)
 }
 
 fn of_another_rig(plan: &Plan, what: &str) -> ConfigError {
@@ -65,7 +70,7 @@ pub fn foresee_rest(
     session: &Path,
     begun: &SessionEntry,
 ) -> Result<Foreseen, Unresumable> {
-    let plan = Plan::parse(text)?;
+    let plan = Plan::parse_stored(text)?;
     match (lab.rig, plan.procedure.clone()) {
         (LabRig::Plane(rig), Procedure::Sweep(own)) => {
             // As it was when the session began.
@@ -93,7 +98,7 @@ const RESPONSE_IS_PAST: &str = "a run of kind \"response\" cannot be resumed: ru
 
 /// Why no session of this plan can be resumed on any rig.
 pub fn past(text: &str) -> Option<&'static str> {
-    match Plan::parse(text).ok()?.procedure {
+    match Plan::parse_stored(text).ok()?.procedure {
         Procedure::Film(_) => Some(FILM_IS_PAST),
         Procedure::Batches(_) => Some(BATCHES_ARE_PAST),
         Procedure::Response(_) => Some(RESPONSE_IS_PAST),

@@ -50,6 +50,9 @@ pub enum RunError {
     /// The plan gives no model on this rig.
     #[error("{0}")]
     Plan(#[from] ConfigError),
+    /// The plan is not the one that the session was begun with.
+    #[error("plan.toml was changed after the session was begun: {0}; restore the original")]
+    OtherPlan(String),
     /// Points failed repeatedly.
     #[error(
         "{points} points failed in {passes} passes in a row; frames of the last pass: {}, {interrupted} attempts interrupted. The ledger lists the cause of each failure: fix it and resume the session",

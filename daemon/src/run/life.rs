@@ -7,13 +7,17 @@ use std::sync::Arc;
 use raysweep_pipeline::message_of;
 use raysweep_proto::{CheckReport, DesignParams, DesignReport, ErrorCode, Event, RpcError, RunState};
 use raysweep_session::Session;
+use raysweep_session::integrity::damaged_data;
 use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
-use raysweep_session::stack::StackShape;
+use raysweep_session::stack::{ArrayName, StackShape};
 
 use super::board::StatusBoard;
 use super::error::RunError;
 use super::orders::{Order, Orders};
 use crate::live::Outlet;
+
+/// Most damaged images that a warning names.
+const MOST_NAMED: usize = 10;
 
 /// A plan on the daemon's rig, and the prediction of its run.
 pub struct Foreseen {
@@ -91,6 +95,26 @@ impl Run {
         let started = jiff::Timestamp::now();
         Ok(self.ledger.append(&Entry::Run { started, resumed: self.is_resumed })?)
     }
+
+    /// Checks the data that earlier runs have stored. What is damaged counts as missing, so that this run acquires it
+    /// again; returns what to tell the operator of it.
+    fn leave_out_damage(&mut self) -> Option<String> {
+        let state = self.ledger.state();
+        let damage = damaged_data(&self.session, state, &|| self.orders.go_on());
+        let first = damage.iter().take(MOST_NAMED).map(ToString::to_string).collect::<Vec<_>>().join("; ");
+        if damage.is_empty() {
+            return None;
+        }
+        let (count, stored) = (damage.len(), ArrayName::ALL.map(|array| state.stored(array).count()));
+        let stored = stored.iter().sum::<usize>();
+        let more = if count > MOST_NAMED { "; ..." } else { "" };
+        self.ledger.leave_out(&damage);
+        let text = format!(
+            "{count} of {stored} stored images were damaged, so they are acquired again: {first}{more}"
+        );
+        tracing::warn!("{text}");
+        Some(text)
+    }
 }
 
 /// How a run ended.
@@ -103,22 +127,43 @@ pub struct Ended {
 
 /// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon
 /// stuck.
-pub fn conduct(procedure: Box<dyn Measurement>, run: Run, points: usize) {
+pub fn conduct(procedure: Box<dyn Measurement>, mut run: Run, points: usize) {
     let (board, dir) = (run.board.clone(), run.session.dir().to_owned());
     tracing::info!(session = %dir.display(), resumed = run.is_resumed, "run begins");
-    let ended = catch_unwind(AssertUnwindSafe(|| procedure.measure(run)))
+    let mut damaged = None;
+    let measure = || {
+        damaged = run.leave_out_damage();
+        procedure.measure(run)
+    };
+    let ended = catch_unwind(AssertUnwindSafe(measure))
         .unwrap_or_else(|panic| Err(RunError::Panicked(message_of(&*panic).to_owned())));
-    finish(ended, points, &board, &dir);
+    let ended = ended.unwrap_or_else(|error| failed(&error, points, &dir));
+    let warnings = damaged.into_iter().chain(ended.warnings).collect();
+    finish(Ended { warnings, ..ended }, &board, &dir);
 }
 
-/// Reports the end of a run with this many points.
-fn finish(ended: Result<Ended, RunError>, points: usize, board: &StatusBoard, dir: &Path) {
-    let Ended { end, warnings } = ended.unwrap_or_else(|error| {
+/// The end of a run that could not reach its own: also recorded in the ledger, so that the session does not look as if
+/// it were still under way.
+fn failed(error: &RunError, points: usize, dir: &Path) -> Ended {
+    let faulted = |stored, missing| EndEntry {
+        error: Some(error.to_string()),
+        ..end_entry(EndState::Faulted, stored, missing)
+    };
+    let recorded = Session::open(dir).and_then(|session| session.resume()).and_then(|mut ledger| {
+        let end = faulted(ledger.state().stored_points(), ledger.state().missing_points());
+        ledger.append(&Entry::End(end.clone())).map(|()| end)
+    });
+    let end = recorded.unwrap_or_else(|not_recorded| {
+        tracing::warn!(error = %not_recorded, "the end of the run is not in the ledger");
         let stored = Session::open(dir).and_then(|session| session.state());
         let stored = stored.map_or(0, |state| state.stored_points());
-        let end = end_entry(EndState::Faulted, stored, points.saturating_sub(stored));
-        Ended { end: EndEntry { error: Some(error.to_string()), ..end }, warnings: Vec::new() }
+        faulted(stored, points.saturating_sub(stored))
     });
+    Ended { end, warnings: Vec::new() }
+}
+
+/// Reports the end of a run.
+fn finish(Ended { end, warnings }: Ended, board: &StatusBoard, dir: &Path) {
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
         tracing::error!(%error, session = %dir.display(), "run faulted");

@@ -70,7 +70,7 @@ impl FilmPlan {
                 document.refuse(&["film", "delay_us"], message);
             } else if let Some(pair) = delays.windows(2).find(|pair| pair[0] == pair[1]) {
                 let message = format!("film.delay_us contains {} twice: give each delay once", pair[0]);
-                document.refuse(&["film", "delay_us"], message);
+                document.refuse_new(&["film", "delay_us"], message);
             }
         } else {
             let message =

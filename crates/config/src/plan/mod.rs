@@ -18,7 +18,7 @@ pub use self::film::FilmPlan;
 pub use self::response::ResponsePlan;
 pub use self::sweep::{Axis, GridPlan, SweepPlan};
 pub use self::tables::{ProductTable, StageTable, products_of_argument};
-use crate::document::Document;
+use crate::document::{Document, ReadingPurpose};
 use crate::{ConfigError, ConfigMistake, Places};
 
 /// A plan.
@@ -97,7 +97,7 @@ impl Kind {
     /// The default stage of a plan that names none.
     fn default_stage(self) -> Option<&'static str> {
         match self {
-            Self::Sweep | Self::Film => Some("demux"),
+            Self::Sweep | Self::Film => Some(tables::DEMUX),
             Self::Batches => Some("denoise"),
             Self::Response | Self::Darks | Self::Calibration => None,
         }
@@ -136,12 +136,24 @@ impl Procedure {
 }
 
 impl Plan {
-    /// Reads a plan.
+    /// Reads a plan for a new run.
     ///
     /// # Errors
     /// Everything that makes the plan invalid, with positions in the text.
     pub fn parse(text: &str) -> Result<Self, ConfigError> {
-        let mut document = Document::parse(text)?;
+        Self::read(Document::parse(text)?)
+    }
+
+    /// Reads the plan of a session, which an earlier version may have accepted although new runs may not repeat a delay
+    /// or an exposure, or have a stage after `demux`.
+    ///
+    /// # Errors
+    /// Everything that keeps the session from being processed, with positions in the text.
+    pub fn parse_stored(text: &str) -> Result<Self, ConfigError> {
+        Self::read(Document::parse(text)?.read_for(ReadingPurpose::StoredSession))
+    }
+
+    fn read(mut document: Document<'_>) -> Result<Self, ConfigError> {
         if let Some(rig @ ("plane" | "dots")) = document.string("kind") {
             let message =
                 format!("kind = {rig:?}: this is a rig file; give a plan, such as one with kind = \"sweep\"");

@@ -274,11 +274,14 @@ impl GridPlan {
             let values = axis.values();
             if let Some(value) = values.iter().find(|value| !value.is_finite()) {
                 refuse(at(&[]), format!("{name} contains {value}: must be finite"));
-            } else if let Some(value) = axis.repeated() {
-                refuse(at(&[]), format!("{name} contains {value} more than once: give each value once"));
             }
             if let Some(value) = values.iter().find(|&&value| key == "exposure_us" && value <= 0.0) {
                 refuse(at(&[]), format!("{name} contains {value}: must be more than 0 microseconds"));
+            }
+            if let Some(value) = axis.repeated().filter(|_| values.iter().all(|value| value.is_finite())) {
+                let path: Vec<&str> = path.iter().copied().chain([key]).collect();
+                let message = format!("{name} contains {value} more than once: give each value once");
+                document.refuse_new(&path, message);
             }
         }
         is_grid

@@ -6,6 +6,9 @@ use serde_json::{Map, Value};
 use crate::document::Document;
 use crate::{ConfigError, ConfigMistake, Places};
 
+/// The stage that combines the images of all points.
+pub(super) const DEMUX: &str = "demux";
+
 /// One `[[stage]]`: its name and the options that the stage itself reads.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 pub struct StageTable {
@@ -34,7 +37,15 @@ fn not_finite(options: &Map<String, Value>) -> Option<&str> {
 }
 
 pub(super) fn check_stages<'a>(stages: impl Iterator<Item = &'a StageTable>, document: &mut Document<'_>) {
+    let mut has_demux = false;
     for (index, StageTable { name, options }) in stages.enumerate() {
+        if has_demux && name != DEMUX {
+            let message = format!(
+                "stage {name} comes after {DEMUX}, which takes the images that stages have processed: put {DEMUX} last"
+            );
+            document.refuse_new(&["stage", &index.to_string(), "name"], message);
+        }
+        has_demux |= name == DEMUX;
         if let Some(key) = not_finite(options) {
             let message = format!("stage {name}: {key} is not a finite number");
             document.refuse(&["stage", &index.to_string(), key], message);

@@ -4,16 +4,18 @@ use std::path::Path;
 
 use ndarray::{Array2, Axis};
 use raysweep_session::dots::FlatArrays;
-use raysweep_session::{Result, Session};
+use raysweep_session::integrity::{DamagedPart, changed_inputs};
+use raysweep_session::ledger::Entry;
+use raysweep_session::{Error, Result, Session};
 use raysweep_transport::dots::{Correction, FlatField};
 
 use super::task::DotTask;
 
-/// Stores the gains that are applied to the run's columns.
+/// Stores the gains that are applied to the run's columns; returns the entry that binds them in the ledger.
 ///
 /// # Errors
 /// When the session cannot be written.
-pub fn keep(session: &Session, correction: &Correction) -> Result<()> {
+pub fn keep(session: &Session, correction: &Correction) -> Result<Entry> {
     let size = (correction.shape().height(), correction.shape().width());
     let mut repaired = Array2::from_elem(size, false);
     correction
@@ -21,7 +23,15 @@ pub fn keep(session: &Session, correction: &Correction) -> Result<()> {
         .iter()
         .for_each(|&pixel| repaired[[pixel as usize / size.1, pixel as usize % size.1]] = true);
     let gain = Array2::from_shape_fn(size, |(t, s)| correction.gain()[t * size.1 + s]);
-    session.dots()?.write_flat(&FlatArrays { gain, repaired })
+    session.dots()?.write_flat(&FlatArrays { gain, repaired })?;
+    session.bind(|file| file.starts_with(FOLDER))
+}
+
+/// Where the flat field is in a session.
+const FOLDER: &str = "dots.zarr/flat/";
+
+fn is_flat_field(part: &DamagedPart) -> bool {
+    matches!(part, DamagedPart::Input { file } if file.starts_with(FOLDER))
 }
 
 impl DotTask {
@@ -32,7 +42,13 @@ impl DotTask {
     pub fn earlier_flat_field(&self, data: &Path) -> Result<Option<FlatField>> {
         let Some(dir) = &self.correct.flat_field else { return Ok(None) };
         let size = [self.shape.height(), self.shape.width()];
-        let FlatArrays { gain, repaired } = Session::open(&data.join(dir))?.dots()?.read_flat(size)?;
+        let session = Session::open(&data.join(dir))?;
+        let changed = changed_inputs(&session, &session.state()?)?;
+        if let Some(damage) = changed.iter().find(|damage| is_flat_field(&damage.part)) {
+            let what = session.dir().display().to_string();
+            return Err(Error::Codec { action: "use the flat field of", what, why: damage.to_string() });
+        }
+        let FlatArrays { gain, repaired } = session.dots()?.read_flat(size)?;
         let dead =
             repaired.indexed_iter().filter(|(_, repaired)| **repaired).map(|(pixel, _)| pixel).collect();
         Ok(Some(FlatField { gain: gain.insert_axis(Axis(2)), dead }))

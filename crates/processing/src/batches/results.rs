@@ -11,7 +11,7 @@ use raysweep_session::dots::BatchEntry;
 use raysweep_session::ledger::State;
 use raysweep_session::products::VideoWriter;
 use raysweep_session::report::ToneMap;
-use raysweep_session::{Result, Session, manifest, pattern};
+use raysweep_session::{Result, Session, durable, manifest, pattern};
 use serde_json::{Map, Value, json};
 
 use super::calibration::{Calibration, read_batch};
@@ -37,10 +37,12 @@ pub fn make(
     go_on: &dyn Fn() -> bool,
 ) -> Result<Vec<String>> {
     let dots = session.dots()?;
+    problems.extend(state.left_out());
     let calibration = Calibration::of(&dots, task.shape, state, &mut problems);
     if let Some(calibration) = &calibration {
         calibration.write(session)?;
     }
+    let about_all = common(task, state);
     let mut videos: Vec<Video> = Vec::new();
     for spec in specs {
         match patterns_of(session, spec) {
@@ -77,7 +79,7 @@ pub fn make(
         }
         videos = Vec::new();
         for (mut video, images) in drawn {
-            video.append(session, task, images, (image, sound.len()), entry)?;
+            video.append(session, &about_all, images, (image, sound.len()), entry)?;
             videos.push(video);
         }
     }
@@ -89,7 +91,7 @@ pub fn make(
         }
         for (name, writer) in writers {
             writer.commit()?;
-            encoder.encode(session.products().dir(), &name, 1.0 / task.batches.path.duration_s());
+            encoder.encode(session.products().dir(), &name, 1.0 / task.batches.path.duration_s())?;
         }
         strips.extend(of_video);
     }
@@ -136,7 +138,7 @@ impl Video<'_> {
     fn append(
         &mut self,
         session: &Session,
-        task: &DotTask,
+        about_all: &Map<String, Value>,
         images: Vec<Array3<f32>>,
         (number, count): (usize, usize),
         entry: &BatchEntry,
@@ -144,7 +146,10 @@ impl Video<'_> {
         for (place, (image, (name, about))) in images.into_iter().zip(self.spec.videos()).enumerate() {
             if self.writers.len() <= place {
                 let (rows, columns, channels) = image.dim();
-                let metadata = common(task, &about, channels);
+                let axes: &[&str] = if channels == 1 { &["k", "t", "s"] } else { &["k", "t", "s", "rgb"] };
+                let mut metadata = about_all.clone();
+                metadata.insert("about".into(), json!(about));
+                metadata.insert("axes".into(), json!(axes));
                 let writer = session.products().video(&name, count, [rows, columns, channels], &metadata)?;
                 self.writers.push((name.clone(), writer));
                 self.strips.push(VideoStrip { name, about, images: Vec::new() });
@@ -169,43 +174,55 @@ struct Encoder {
 }
 
 impl Encoder {
-    fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) {
-        const MISSING: &str = "ffmpeg is not installed, so there are only PNG sequences and no video files: install it and run `raysweep process`";
+    fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) -> Result<()> {
         let target = products.join(format!("{name}.mp4"));
-        let ended = Command::new("ffmpeg")
-            .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
-            .arg(products.join(name).join("%04d.png"))
-            // Players need even sides and half-resolution chroma.
-            .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"])
-            .arg(&target)
-            .stdin(Stdio::null())
-            .output();
-        match ended {
-            Ok(output) if output.status.success() => {}
-            Ok(output) => {
-                let said = String::from_utf8_lossy(&output.stderr).trim().to_owned();
-                self.problems.push(format!("ffmpeg could not make {name}.mp4: {said}"));
-            }
-            Err(error) if error.kind() == ErrorKind::NotFound => {
-                if !self.problems.iter().any(|problem| problem == MISSING) {
-                    self.problems.push(MISSING.into());
+        durable::write_by(&target, |draft| match encode_to(draft, &products.join(name), images_per_s) {
+            Ok(()) => true,
+            Err(problem) => {
+                if !self.problems.contains(&problem) {
+                    self.problems.push(problem);
                 }
+                false
             }
-            Err(error) => self.problems.push(format!("ffmpeg could not make {name}.mp4: {error}")),
-        }
+        })
+    }
+}
+
+/// Encodes the images of a folder as one file; the error says why not.
+fn encode_to(target: &Path, images: &Path, images_per_s: f64) -> std::result::Result<(), String> {
+    let failed = |what: String| {
+        let name = images.file_name().unwrap_or_default().to_string_lossy();
+        format!("ffmpeg could not make {name}.mp4: {what}")
+    };
+    let ended = Command::new("ffmpeg")
+        .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
+        .arg(images.join("%04d.png"))
+        // Players need even sides and half-resolution chroma.
+        .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"])
+        // The temporary file's name does not say the format.
+        .args(["-f", "mp4"])
+        .arg(target)
+        .stdin(Stdio::null())
+        .output();
+    match ended {
+        Ok(output) if output.status.success() => Ok(()),
+        Ok(output) => Err(failed(String::from_utf8_lossy(&output.stderr).trim().to_owned())),
+        Err(error) if error.kind() == ErrorKind::NotFound => Err("ffmpeg is not installed, so there are only PNG sequences and no video files: install it and run `raysweep process`".into()),
+        Err(error) => Err(failed(error.to_string())),
     }
 }
 
 /// Metadata that all videos share.
-fn common(task: &DotTask, about: &str, channels: usize) -> Map<String, Value> {
-    let axes: &[&str] = if channels == 1 { &["k", "t", "s"] } else { &["k", "t", "s", "rgb"] };
-    let entries = [
-        ("about", json!(about)),
-        ("axes", json!(axes)),
+fn common(task: &DotTask, state: &State) -> Map<String, Value> {
+    let left_out = state.left_out();
+    let mut entries = vec![
         ("plan", json!(task.name)),
         ("images_per_s", json!(1.0 / task.batches.path.duration_s())),
         ("software", json!(SOFTWARE)),
     ];
+    if !left_out.is_empty() {
+        entries.push(("left_out", json!(left_out)));
+    }
     entries.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 

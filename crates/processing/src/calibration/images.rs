@@ -65,16 +65,6 @@ impl BoardImages<'_> {
         Ok((sum.mapv(|sum| sum as f32 / entry.frames as f32), entry))
     }
 
-    /// The ordinals of stored images that are damaged and must be taken again.
-    pub fn damaged(&self) -> impl Iterator<Item = u32> {
-        let points = (0..).zip(&self.task.task.schedule.points);
-        let stored = points.filter(|(_, point)| {
-            let (array, index) = place(point.role);
-            self.state.point(array, index).is_some()
-        });
-        stored.filter(|&(ordinal, _)| self.image(ordinal).is_err()).map(|(ordinal, _)| ordinal)
-    }
-
     /// All frames of a purpose, `[n, t, s]` in counts.
     fn frames(&self, purpose: BoardPurpose) -> Result<Array3<f32>, CalibrationError> {
         let (rows, columns) = (self.task.task.geometry.height, self.task.task.geometry.width);

@@ -25,7 +25,8 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let task = FilmTask::new(plan, film, &stored.known(&rig)?);
+    let mut task = FilmTask::new(plan, film, &stored.known(&rig)?);
+    Arc::make_mut(&mut task.task).left_out = state.left_out();
     stored.check_contents(task.contents())?;
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
     if !asked.products.is_empty() {
@@ -50,16 +51,20 @@ fn make_transports(
     state: &State,
     stages: &Stages,
 ) -> raysweep_session::Result<Vec<String>> {
+    let mut problems = state.left_out();
     let mut solver = match task.solver() {
         Ok(solver) => solver,
-        Err(error) => return Ok(vec![error.to_string()]),
+        Err(error) => {
+            problems.push(error.to_string());
+            return Ok(problems);
+        }
     };
     let Some(dark) = dark_image(session, state, stages)? else {
-        return Ok(vec!["the dark image is missing or damaged: no transport can be made without it".into()]);
+        problems.push("the dark image is missing or damaged: no transport can be made without it".into());
+        return Ok(problems);
     };
     let film = session.film()?;
     let transports = create_transports(session, task, solver.reach_rows())?;
-    let mut problems = Vec::new();
     for entry in state.cycles() {
         let frames = match film.read(entry.cycle) {
             Ok(Some(frames)) if crc32(frames.view()) == entry.crc32 => frames,

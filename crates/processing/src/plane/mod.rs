@@ -7,4 +7,4 @@ mod task;
 
 pub use self::processing::Processing;
 pub(crate) use self::task::unit_of;
-pub use self::task::{KnownCalibration, KnownRig, PlaneTask, place};
+pub use self::task::{KnownCalibration, KnownRig, PlaneTask, check_mosaic, place};

@@ -5,7 +5,6 @@ use std::fmt::Display;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use ndarray::Array2;
-use raysweep_core::SettingsId;
 use raysweep_pipeline::{
     Assembly, DEMUX, DemuxFold, Findings, ImageRows, InStrips, NotSolved, Product, ProductSpec, Solved,
     Stages, Strip, SweepStack, SweepSummary, Unit, message_of, run_stages,
@@ -36,37 +35,23 @@ impl Processing {
     }
 
     /// Passes stored points through the stages into the demultiplexer, while `go_on` returns true. A point whose stage
-    /// fails is left out and listed among the problems; so are points with damaged data, which are returned because
-    /// they must be acquired again.
-    pub fn feed_stored(
-        &mut self,
-        task: &PlaneTask,
-        state: &State,
-        stack: &Stack,
-        go_on: &dyn Fn() -> bool,
-    ) -> Vec<SettingsId> {
-        let mut damaged = Vec::new();
+    /// fails, or that has been damaged since the session was checked, is left out and listed among the problems.
+    pub fn feed_stored(&mut self, task: &PlaneTask, state: &State, stack: &Stack, go_on: &dyn Fn() -> bool) {
         for (ordinal, point) in (0..).zip(&task.schedule.points) {
             let (array, index) = place(point.role);
             let Some(entry) = state.point(array, index).filter(|_| go_on()) else { continue };
             let clipped = entry.clipped_crc32.map(|crc| (ArrayName::Clipped, crc));
             let read = |(array, crc)| match stack.read_point(array, index) {
                 Ok(image) if crc32(image.view()) == crc => Ok(image),
-                read => Err(read),
+                Ok(_) => Err("its checksum differs from the ledger's".to_owned()),
+                Err(error) => Err(error.to_string()),
             };
             let sum_and_clipped = read((array, entry.crc32))
                 .and_then(|sum| clipped.map(read).transpose().map(|clipped| (sum, clipped)));
             let (sum, clipped) = match sum_and_clipped {
                 Ok(read) => read,
-                Err(read) => {
-                    let why = read
-                        .err()
-                        .map_or("its checksum differs from the ledger's".into(), |error| error.to_string());
-                    self.problems.push(format!(
-                        "{} {index} is damaged ({why}): `raysweep resume` acquires it again",
-                        array.as_str()
-                    ));
-                    damaged.push(SettingsId { point: ordinal, attempt: state.next_attempt(array, index) });
+                Err(why) => {
+                    self.problems.push(format!("{} {index} is damaged ({why})", array.as_str()));
                     continue;
                 }
             };
@@ -76,7 +61,6 @@ impl Processing {
                 Err(error) => self.problems.push(error.to_string()),
             }
         }
-        damaged
     }
 
     /// Gives the demultiplexer a unit's image. If it panics, it is dropped, with its products.

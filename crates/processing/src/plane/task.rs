@@ -10,7 +10,7 @@ use raysweep_pipeline::{
     DEMUX, DemuxFold, DemuxOptions, PlaneStage, Point, PointRole, Schedule, Spot, SpotScan, StageRefused,
     Stages, SweepGeometry, Unit,
 };
-use raysweep_session::ledger::PointEntry;
+use raysweep_session::ledger::{PointEntry, State};
 use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::board::BoardCalibration;
 use serde_json::{Map, Value, json};
@@ -33,9 +33,10 @@ pub struct PlaneTask {
     pub geometry: SweepGeometry,
     /// When the calibration was made that the model uses, as its file says it; `None` without one.
     pub calibration_made: Option<String>,
+    /// What is damaged and is left out of the results.
+    pub left_out: Vec<String>,
     /// The kind of the plan, which is also the name of its table.
     table: &'static str,
-    format: PixelFormat,
     places: Places,
 }
 
@@ -85,13 +86,27 @@ impl PlaneTask {
             None => (stated, None),
         };
         let (name, stages, places) = (plan.name.clone(), plan.stages.clone(), plan.places.clone());
-        let (table, format) = (plan.procedure.kind(), rig.camera.pixel_format);
-        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, table, format, places }
+        let table = plan.procedure.kind();
+        let left_out = Vec::new();
+        Self { name, stages, max_jitter_us, schedule, geometry, calibration_made, left_out, table, places }
     }
 
     /// The points of the sweep, or the settings of the film's cycle, with their ordinals.
     pub fn settings(&self) -> impl Iterator<Item = (u32, &Point)> {
         (0..).zip(&self.schedule.points).filter(|(_, point)| matches!(point.role, PointRole::Sweep(_)))
+    }
+
+    /// What of a session's ledger was not acquired with these settings, if anything.
+    pub fn unlike(&self, state: &State) -> Option<String> {
+        self.schedule.points.iter().find_map(|point| {
+            let (array, index) = place(point.role);
+            let stored = state.point(array, index).filter(|stored| stored.delay_us != point.delay_us)?;
+            let (planned_us, stored_us) = (point.delay_us, stored.delay_us);
+            let name = array.as_str();
+            Some(format!(
+                "{name} {index} was acquired at a delay of {stored_us} us, and the plan says {planned_us}"
+            ))
+        })
     }
 
     /// An error about a value of the plan.
@@ -127,19 +142,6 @@ impl PlaneTask {
             let refuse = |message: String| self.refuse(&["stage", &place, "name"], message);
             let made = PlaneStage::new(&table.name, Value::Object(table.options.clone()));
             match made.map_err(|error| self.refuse_stage(&place, &error))? {
-                PlaneStage::Image(_) if demux.is_some() => {
-                    return Err(refuse(format!(
-                        "stage {} comes after {DEMUX}, which takes the images that stages have processed: put {DEMUX} last",
-                        table.name
-                    )));
-                }
-                PlaneStage::Image(_) if self.format.mosaic.red().is_none() && is_for_mosaics(table) => {
-                    let message = format!(
-                        "stage {}: step_px = 2: must be 1, because camera.pixel_format = \"{}\" has no Bayer mosaic",
-                        table.name, self.format
-                    );
-                    return Err(self.refuse(&["stage", &place, "step_px"], message));
-                }
                 PlaneStage::Image(stage) => stages.push(stage),
                 PlaneStage::Demux(options) => {
                     let fold = DemuxFold::new(options, &self.schedule, &self.geometry)
@@ -222,6 +224,9 @@ impl PlaneTask {
             ("camera_row_time_us", json!(geometry.camera_row_time_us)),
             ("software", json!(SOFTWARE)),
         ];
+        if !self.left_out.is_empty() {
+            entries.push(("left_out", json!(self.left_out)));
+        }
         match &self.calibration_made {
             Some(made) => entries.push(("calibration", json!({ "made": made }))),
             None => entries.extend([
@@ -234,9 +239,23 @@ impl PlaneTask {
     }
 }
 
-/// Whether a stage compares pixels that are two apart.
-fn is_for_mosaics(stage: &StageTable) -> bool {
-    stage.options.get("step_px").and_then(Value::as_u64) == Some(2)
+/// Checks that no stage of a plan for a new run compares pixels that are two apart, unless the camera's pixels have a
+/// mosaic.
+///
+/// # Errors
+/// With the position of the option in the plan.
+pub fn check_mosaic(plan: &Plan, format: PixelFormat) -> Result<(), ConfigError> {
+    let is_for_mosaics = |stage: &StageTable| stage.options.get("step_px").and_then(Value::as_u64) == Some(2);
+    match plan.stages.iter().position(is_for_mosaics).filter(|_| format.mosaic.red().is_none()) {
+        None => Ok(()),
+        Some(index) => {
+            let message = format!(
+                "stage {}: step_px = 2: must be 1, because camera.pixel_format = \"{format}\" has no Bayer mosaic",
+                plan.stages[index].name
+            );
+            Err(plan.places.error(&["stage", &index.to_string(), "step_px"], message))
+        }
+    }
 }
 
 /// Distribution over time of a pixel's direct light within its row.

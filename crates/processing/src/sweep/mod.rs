@@ -5,6 +5,8 @@ mod results;
 mod strips;
 mod task;
 
+use std::sync::Arc;
+
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{ConfigError, Places, SweepPlan};
 use raysweep_pipeline::ProductSpec;
@@ -37,8 +39,9 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
     let shape = state.session.shape;
-    let sweep = SweepTask::new(plan, sweep, &stored.known(&rig)?);
-    stored.check_contents(sweep.contents())?;
+    let mut sweep = SweepTask::new(plan, sweep, &stored.known(&rig)?);
+    stored.check_points(sweep.contents(), &sweep.task)?;
+    Arc::make_mut(&mut sweep.task).left_out = state.left_out();
     let task = &*sweep.task;
     let mut processing = sweep.processing().map_err(|error| stored.in_plan(&error))?;
     if asked.only {
@@ -65,6 +68,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     if in_strips {
         processing.keep_no_images();
     }
+    processing.problems.extend(state.left_out());
     processing.feed_stored(task, state, &session.stack()?, &|| true);
     let mut results = match in_strips {
         true => Results::in_strips(processing, session, state, task, &|| true)?,

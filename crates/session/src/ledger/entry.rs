@@ -1,5 +1,7 @@
 //! The entries of a ledger.
 
+use std::collections::BTreeMap;
+
 use jiff::Timestamp;
 use raysweep_core::{Counts, FilmSummary, SettingsLatency, VsyncStats};
 use serde::{Deserialize, Serialize};
@@ -9,7 +11,8 @@ use crate::film::CycleEntry;
 use crate::stack::{ArrayName, StackShape};
 
 /// The format of the session folder that this version writes.
-pub const FORMAT: u32 = 1;
+/// From 2 on, each line has a checksum.
+pub const FORMAT: u32 = 2;
 
 /// One line of the ledger; the key `event` tells the kinds apart.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -17,6 +20,11 @@ pub const FORMAT: u32 = 1;
 pub enum Entry {
     /// The first line, and only the first: describes the session.
     Session(SessionEntry),
+    /// Files of the session that its results depend on. A later line replaces an earlier one of the same file.
+    Files {
+        /// SHA-256 of each, hexadecimal, by path with `/` separators.
+        sha256: BTreeMap<String, String>,
+    },
     /// An acquisition run begins.
     Run {
         /// Wall-clock time, UTC.

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use raysweep_core::{Counts, FilmSummary};
 
 use super::entry::{AxisEntry, EndEntry, Entry, PointEntry, SessionEntry};
+use crate::damage::{Damage, DamagedPart};
 use crate::dots::BatchEntry;
 use crate::film::CycleEntry;
 use crate::stack::{ArrayName, Contents};
@@ -27,6 +28,8 @@ pub struct State {
     batches: BTreeMap<usize, BatchEntry>,
     axes: BTreeMap<usize, AxisEntry>,
     next_attempts: BTreeMap<(ArrayName, usize), u32>,
+    files: BTreeMap<String, String>,
+    left_out: Vec<Damage>,
 }
 
 impl State {
@@ -34,8 +37,8 @@ impl State {
     ///
     /// # Errors
     /// [`Replay`] names the entry (counted from 0) that contradicts the ones before it.
-    pub fn replay(entries: &[Entry]) -> Result<State, Replay> {
-        let Some((Entry::Session(session), rest)) = entries.split_first() else {
+    pub fn replay<'a>(mut entries: impl Iterator<Item = &'a Entry>) -> Result<State, Replay> {
+        let Some(Entry::Session(session)) = entries.next() else {
             return Err(Replay { entry: 0, why: "the first line is not a `session` entry".into() });
         };
         let mut state = State {
@@ -49,8 +52,10 @@ impl State {
             batches: BTreeMap::new(),
             axes: BTreeMap::new(),
             next_attempts: BTreeMap::new(),
+            files: BTreeMap::new(),
+            left_out: Vec::new(),
         };
-        for (entry, line) in rest.iter().zip(1..) {
+        for (entry, line) in entries.zip(1..) {
             state.apply(entry).map_err(|why| Replay { entry: line, why })?;
         }
         Ok(state)
@@ -84,6 +89,48 @@ impl State {
             Contents::Batches { .. } => self.batches.len(),
             Contents::Axes { .. } => self.axes.len(),
             Contents::Darks { .. } => self.stored(ArrayName::Dark).count(),
+        }
+    }
+
+    /// Number of points of the plan that are not stored.
+    pub fn missing_points(&self) -> usize {
+        // Each stored point is one of those planned, see `check`.
+        self.session.shape.points() - self.stored_points()
+    }
+
+    /// SHA-256, hexadecimal, of the files that the session's results depend on, by path with `/` separators; empty in
+    /// sessions of format 1.
+    pub fn files(&self) -> &BTreeMap<String, String> {
+        &self.files
+    }
+
+    /// What is damaged, was left out of this state, and was not stored again since.
+    pub fn left_out(&self) -> Vec<String> {
+        let is_back = |damage: &&Damage| match damage.part {
+            DamagedPart::Point { array, index } => self.point(array, index).is_some(),
+            _ => false,
+        };
+        self.left_out.iter().filter(|damage| !is_back(damage)).map(ToString::to_string).collect()
+    }
+
+    /// Leaves out damaged data, as if they were not stored. The attempt at a damaged point is made again under the same
+    /// number, because it did not fail.
+    pub fn leave_out(&mut self, damage: &[Damage]) {
+        for damage in damage {
+            match damage.part {
+                DamagedPart::Point { array, index } => {
+                    if let Some(point) = self.stored.remove(&(array, index)) {
+                        self.next_attempts.insert((array, index), point.attempt);
+                    }
+                }
+                DamagedPart::Cycle { cycle } => drop(self.cycles.remove(&cycle)),
+                DamagedPart::Batch { batch } => drop(self.batches.remove(&batch)),
+                DamagedPart::Line { .. }
+                | DamagedPart::Input { .. }
+                | DamagedPart::Result { .. }
+                | DamagedPart::Manifest => {}
+            }
+            self.left_out.push(damage.clone());
         }
     }
 
@@ -153,7 +200,11 @@ impl State {
                     Err(format!("axis {axis} is outside of the plan, which has {axes} axes"))
                 }
             }
-            Entry::Run { .. } | Entry::Film(_) | Entry::Outside { .. } | Entry::End(_) => Ok(()),
+            Entry::Files { .. }
+            | Entry::Run { .. }
+            | Entry::Film(_)
+            | Entry::Outside { .. }
+            | Entry::End(_) => Ok(()),
         }
     }
 
@@ -161,6 +212,7 @@ impl State {
         self.check(entry)?;
         match entry {
             Entry::Session(_) => {}
+            Entry::Files { sha256 } => self.files.extend(sha256.clone()),
             Entry::Run { .. } => {
                 self.runs += 1;
                 self.end = None;

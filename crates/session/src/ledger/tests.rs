@@ -74,7 +74,7 @@ fn all_kinds() -> Vec<Entry> {
 fn ledger_with(entries: &[Entry]) -> (tempfile::TempDir, PathBuf) {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("ledger.jsonl");
-    let mut ledger = Ledger::create(&path, session()).unwrap();
+    let mut ledger = Ledger::create(&path, session(), BTreeMap::new()).unwrap();
     for entry in entries {
         ledger.append(entry).unwrap();
     }
@@ -158,8 +158,6 @@ fn ledgers_that_make_no_sense_are_errors() {
     let first = fs::read_to_string(&path).unwrap();
     let outside = serde_json::to_string(&point(4, 0)).unwrap();
     for (text, line) in [
-        (String::new(), 1),
-        ("garbage".to_owned(), 1),
         ("{\"event\":\"run\",\"started\":\"2026-03-04T05:06:08Z\",\"resumed\":false}\n".to_owned(), 1),
         (format!("{first}{first}"), 2),
         (format!("{first}{outside}\n"), 2),
@@ -176,10 +174,10 @@ fn ledgers_that_make_no_sense_are_errors() {
 fn a_ledger_of_the_future_is_told_apart_from_a_corrupt_one() {
     let (_dir, path) = ledger_with(&[]);
     let first = fs::read_to_string(&path).unwrap();
-    let newer = first.replace("\"format\":1", "\"format\":2");
+    let newer = first.replace("\"format\":2", "\"format\":3");
     for text in [newer.clone(), newer.replace("\"kind\"", "\"sort\"")] {
         fs::write(&path, text).unwrap();
-        assert!(matches!(read(&path), Err(Error::NewerFormat { found: 2, known: FORMAT, .. })));
+        assert!(matches!(read(&path), Err(Error::NewerFormat { found: 3, known: FORMAT, .. })));
     }
 }
 
@@ -202,7 +200,7 @@ fn an_entry_that_would_not_read_back_is_refused_and_leaves_no_trace() {
 #[test]
 fn an_existing_ledger_is_not_created_again() {
     let (_dir, path) = ledger_with(&[point(0, 0)]);
-    assert!(matches!(Ledger::create(&path, session()), Err(Error::Io { .. })));
+    assert!(matches!(Ledger::create(&path, session(), BTreeMap::new()), Err(Error::Io { .. })));
     assert_eq!(read(&path).unwrap().len(), 2);
 }
 
@@ -272,4 +270,67 @@ fn records_of_a_mirrors_axes_are_points_of_their_own() {
     let state = session.state().unwrap();
     assert_eq!(state.axes().map(|axis| axis.axis).collect::<Vec<_>>(), [0, 1]);
     assert_eq!((state.stored_points(), state.counts.expected), (2, 24));
+}
+
+#[test]
+fn a_chained_line_that_is_changed_moved_or_left_out_is_named() {
+    let (_dir, path) = ledger_with(&[point(0, 0), point(1, 0), point(2, 0)]);
+    let text = fs::read_to_string(&path).unwrap();
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    let changed = text.replacen("\"frames\":8", "\"frames\":9", 1);
+    let without_chain = text.replacen(&lines[1][lines[1].find(",\"chain").unwrap()..], "}\n", 1);
+    let left_out = [lines[0], lines[1], lines[3]].concat();
+    let turned = [lines[0], lines[2], lines[1], lines[3]].concat();
+    for (damaged, expected) in [(changed, 2), (without_chain, 2), (left_out, 3), (turned, 2)] {
+        fs::write(&path, &damaged).unwrap();
+        for error in [read(&path).unwrap_err(), Ledger::open(&path).unwrap_err()] {
+            assert!(matches!(error, Error::Ledger { line, .. } if line == expected), "{error}");
+        }
+        // What is sound can still be read, and nothing is appended after damage.
+        let (mut ledger, text) = Ledger::open_damaged(&path).unwrap();
+        assert!(text.damaged.iter().any(|(line, _)| *line == expected), "{text:?}");
+        assert!(ledger.state().point(ArrayName::Sum, 2).is_some() || expected == 3 || text.damaged.len() > 1);
+        assert!(matches!(ledger.append(&point(3, 0)), Err(Error::Entry { .. })));
+        assert_eq!(fs::read_to_string(&path).unwrap(), damaged);
+    }
+}
+
+#[test]
+fn a_ledger_without_a_chain_is_read_and_continued_with_one() {
+    let (_dir, path) = ledger_with(&[point(0, 0), point(1, 0)]);
+    let text = fs::read_to_string(&path).unwrap().replace("\"format\":2", "\"format\":1");
+    let old: String =
+        text.lines().map(|line| line[..line.find(",\"chain").unwrap()].to_owned() + "}\n").collect();
+    fs::write(&path, &old).unwrap();
+    Ledger::open(&path).unwrap().append(&point(2, 0)).unwrap();
+    Ledger::open(&path).unwrap().append(&point(3, 0)).unwrap();
+    assert_eq!(read_state(&path).unwrap().missing(ArrayName::Sum).count(), 0);
+    // The first chained line covers all before it.
+    let continued = fs::read_to_string(&path).unwrap();
+    fs::write(&path, continued.replacen("\"frames\":8", "\"frames\":9", 1)).unwrap();
+    assert!(matches!(read(&path), Err(Error::Ledger { line: 4, .. })));
+}
+
+#[test]
+fn a_last_line_that_was_whole_once_is_damaged_not_torn() {
+    let (_dir, path) = ledger_with(&[point(0, 0), point(1, 0)]);
+    let text = fs::read_to_string(&path).unwrap();
+    let last = text.rfind("\"index\"").unwrap();
+    let mut bytes = text.into_bytes();
+    bytes[last] ^= 1;
+    fs::write(&path, &bytes).unwrap();
+    assert!(matches!(Ledger::open(&path), Err(Error::Ledger { line: 3, .. })));
+    assert_eq!(fs::read(&path).unwrap(), bytes, "nothing is cut off");
+}
+
+#[test]
+fn a_ledger_appears_with_its_first_lines_and_a_torn_first_one_says_what_it_was() {
+    let (dir, path) = ledger_with(&[]);
+    let whole = fs::read(&path).unwrap();
+    assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "no draft is left");
+    for cut in 0..whole.len() {
+        fs::write(&path, &whole[..cut]).unwrap();
+        let error = read(&path).unwrap_err();
+        assert!(matches!(error, Error::Torn { .. }) && error.to_string().contains("trash"), "{error}");
+    }
 }

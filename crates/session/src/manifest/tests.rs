@@ -101,10 +101,22 @@ fn files_that_came_or_went_are_named() {
 fn a_missing_damaged_or_newer_manifest_is_an_error() {
     let (_root, session) = session();
     let text = fs::read_to_string(session.manifest_path()).unwrap();
-    fs::write(session.manifest_path(), text.replacen("\"format\": 1", "\"format\": 2", 1)).unwrap();
-    assert!(matches!(verify(&session), Err(Error::NewerFormat { found: 2, .. })));
+    fs::write(session.manifest_path(), text.replacen("\"format\": 2", "\"format\": 3", 1)).unwrap();
+    assert!(matches!(verify(&session), Err(Error::NewerFormat { found: 3, .. })));
     fs::write(session.manifest_path(), "{}").unwrap();
     assert!(matches!(verify(&session), Err(Error::Codec { .. })));
     fs::remove_file(session.manifest_path()).unwrap();
     assert!(matches!(verify(&session), Err(Error::Io { .. })));
+}
+
+#[test]
+fn a_flipped_bit_in_the_manifest_itself_is_found() {
+    let (_root, session) = session();
+    let whole = fs::read(session.manifest_path()).unwrap();
+    for at in 0..whole.len() {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 1 << (at % 7);
+        fs::write(session.manifest_path(), damaged).unwrap();
+        assert!(read(&session).is_err(), "byte {at}");
+    }
 }

@@ -54,7 +54,7 @@ impl Products {
             });
         }
         let (path, sidecar) = (self.path(name, "npy")?, self.path(name, "json")?);
-        durable::create_dir_all(self.dir())?;
+        durable::create_dir_within(self.dir())?;
         let npy = DraftFile::create(&path)?;
         let zeroed = match channels {
             1 => write_zeroed_npy::<f32, _>(npy.file(), (images, rows, columns)),

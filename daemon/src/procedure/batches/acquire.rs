@@ -169,7 +169,7 @@ impl DotPasses<'_> {
         };
         let sensor = dark.finish(hot_sigmas, field.as_ref(), task.sampling())?;
         if field.is_some() {
-            flat::keep(self.session, &sensor.correction)?;
+            self.storage.note(flat::keep(self.session, &sensor.correction)?);
         }
         Ok(Some(sensor))
     }

@@ -73,7 +73,7 @@ impl Measurement for BatchesRun {
         let state = end_state(fault.as_ref(), &orders);
         let end = EndEntry {
             error: fault.map(|fault| fault.to_string()),
-            ..end_entry(state, stored, task.batches.total() - stored)
+            ..end_entry(state, stored, ledger.state().missing_points())
         };
         ledger.append(&Entry::End(end.clone()))?;
         if state == EndState::Complete {

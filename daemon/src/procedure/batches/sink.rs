@@ -30,6 +30,8 @@ enum Item {
     Batch(Box<Cut>, usize, Option<usize>),
     /// Frames outside any batch.
     Outside(Counts),
+    /// An entry for the ledger.
+    Note(Entry),
 }
 
 /// Handle of the writer's thread.
@@ -97,6 +99,11 @@ impl BatchSink {
     /// Records frames that belong to no batch.
     pub fn outside(&self, counts: Counts) {
         let _ = self.items.send(Item::Outside(counts));
+    }
+
+    /// Records an entry that no batch depends on.
+    pub fn note(&self, entry: Entry) {
+        let _ = self.items.send(Item::Note(entry));
     }
 
     /// Waits until everything is written.
@@ -210,6 +217,7 @@ impl BatchWriter {
                     self.progress.counts.add(&counts);
                     self.append(&Entry::Outside { counts });
                 }
+                Item::Note(entry) => self.append(&entry),
             }
             self.writing.board.publish(Event::Progress(self.progress.shown()));
         }

@@ -13,7 +13,7 @@ use raysweep_processing::calibration::{
     BoardFindings, BoardImages, BoardPixels, BoardPurpose, BoardView, CalibrationError, CalibrationTask,
     ValidFor,
 };
-use raysweep_processing::plane::{Processing, place};
+use raysweep_processing::plane::Processing;
 use raysweep_session::Session;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
 use raysweep_session::stack::StackShape;
@@ -142,16 +142,7 @@ impl Measurement for CalibrationRun {
         let task = &calibration.task;
         let opened = Opened::open(&rig, task, &run)?;
         let stack = run.session.stack()?;
-        let mut missing = missing(task, run.ledger.state());
-        if run.is_resumed {
-            let images = BoardImages { task: &calibration, state: run.ledger.state(), stack: &stack };
-            missing.extend(images.damaged().map(|ordinal| {
-                let (array, index) = place(task.schedule.points[ordinal as usize].role);
-                let attempt = run.ledger.state().next_attempt(array, index);
-                SettingsId { point: ordinal, attempt }
-            }));
-            missing.sort_by_key(|id| id.point);
-        }
+        let missing = missing(task, run.ledger.state());
         let stages: Arc<[_]> = Arc::new([]);
         let processing = Processing::without_demux(stages.clone());
         let planned = task.schedule.points.len();
@@ -187,7 +178,7 @@ impl Measurement for CalibrationRun {
             vsync,
             light_s: exposures.light_s(),
             settings_latency: latency,
-            ..end_entry(state, stored, calibration.points() - stored)
+            ..end_entry(state, stored, ledger.state().missing_points())
         };
         ledger.append(&Entry::End(end.clone()))?;
         let mut warnings = Vec::new();

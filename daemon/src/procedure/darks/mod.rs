@@ -6,11 +6,10 @@ use std::sync::Arc;
 
 use raysweep_config::plan::DarksPlan;
 use raysweep_config::{ConfigError, Plan};
-use raysweep_core::SettingsId;
-use raysweep_processing::darks::{DarksTask, damaged, make};
+use raysweep_processing::darks::{DarksTask, make};
 use raysweep_processing::plane::Processing;
 use raysweep_session::ledger::{EndEntry, EndState, Entry};
-use raysweep_session::stack::{ArrayName, StackShape};
+use raysweep_session::stack::StackShape;
 
 use crate::plane::{Opened, PointSink, Taken, missing};
 use crate::procedure::lab::{Lab, RigOfRun};
@@ -56,15 +55,7 @@ impl Measurement for DarksRun {
         let Self { rig, darks } = *self;
         let opened = Opened::open(&rig, &darks.task, &run)?;
         let (stack, state) = (run.session.stack()?, run.ledger.state());
-        let mut missing = missing(&darks.task, state);
-        if run.is_resumed {
-            let again = damaged(&stack, state, &darks);
-            missing.extend(again.into_iter().map(|image| SettingsId {
-                point: image as u32,
-                attempt: state.next_attempt(ArrayName::Dark, image),
-            }));
-            missing.sort_by_key(|id| id.point);
-        }
+        let missing = missing(&darks.task, state);
         let stages: Arc<[_]> = Arc::new([]);
         let processing = Processing::without_demux(stages.clone());
         let progress = ProgressMeter::new(darks.points() - missing.len(), darks.points());
@@ -81,7 +72,7 @@ impl Measurement for DarksRun {
             error,
             vsync,
             settings_latency: latency,
-            ..end_entry(state, stored, darks.points() - stored)
+            ..end_entry(state, stored, ledger.state().missing_points())
         };
         ledger.append(&Entry::End(end.clone()))?;
         let warnings = match state {

@@ -220,7 +220,7 @@ fn conclude(acquired: Acquired, film: &FilmTask, rig: &Rig, orders: &Orders) -> 
         final_s: exposures.until.map(|until| until.elapsed().as_secs_f64()),
         light_s: exposures.light_s(),
         settings_latency: latency,
-        ..end_entry(state, stored, film.points() - stored)
+        ..end_entry(state, stored, ledger.state().missing_points())
     };
     ledger.append(&Entry::End(end.clone()))?;
     if state != EndState::Faulted {

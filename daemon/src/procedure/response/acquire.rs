@@ -166,6 +166,8 @@ impl Recorder {
             return self.append(&Entry::Outside { counts: counts.clone() }, counts, progress);
         }
         record.write(&self.run.session, axis, &task)?;
+        let of_axis = format!("products/chirp_{}.", AXES[axis]);
+        self.run.ledger.append(&self.run.session.bind(|file| file.starts_with(&of_axis))?)?;
         progress.stored += 1;
         let empty = came - shown as usize;
         let entry = AxisEntry { axis, frames, lost: frames - came, empty, counts: counts.clone() };

@@ -64,7 +64,7 @@ impl Measurement for ResponseRun {
             (None, false) => EndState::Cancelled,
         };
         let error = fault.map(|fault| fault.to_string());
-        let end = EndEntry { error, ..end_entry(state, stored, AXES.len() - stored) };
+        let end = EndEntry { error, ..end_entry(state, stored, ledger.state().missing_points()) };
         ledger.append(&Entry::End(end.clone()))?;
         if let Some(findings) = &findings {
             findings.write(&session, ledger.state(), &task, &rig.file)?;

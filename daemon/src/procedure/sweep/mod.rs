@@ -132,13 +132,11 @@ fn acquire(
     let opened = Opened::open(rig, task, &run)?;
     let stack = run.session.stack()?;
     let state = run.ledger.state().clone();
-    let mut missing = missing(task, &state);
-    if run.is_resumed {
-        missing.extend(processing.feed_stored(task, &state, &stack, &|| run.orders.go_on()));
-        missing.sort_by_key(|id| id.point);
-        // Damaged points are about to be acquired again.
-        processing.problems.clear();
+    if let Some(what) = task.unlike(&state) {
+        return Err(RunError::OtherPlan(what));
     }
+    let missing = missing(task, &state);
+    processing.feed_stored(task, &state, &stack, &|| run.orders.go_on());
     let planned = task.schedule.points.len();
     let stages = processing.stages.clone();
     let progress = ProgressMeter::new(planned - missing.len(), planned);
@@ -213,7 +211,7 @@ fn conclude(
         vsync,
         light_s: exposures.light_s(),
         settings_latency: latency,
-        ..end_entry(state, stored, sweep.points() - stored)
+        ..end_entry(state, stored, ledger.state().missing_points())
     };
     if let (EndState::Complete, Some(results)) = (state, &mut results) {
         results.write_transport()?;
