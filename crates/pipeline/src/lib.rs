@@ -11,6 +11,7 @@ pub mod dots;
 mod edges;
 mod film;
 mod findings;
+mod flicker;
 mod pipeline;
 mod product;
 mod products;

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, PointEntry, SessionEntry};
+pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, FrameStarts, PointEntry, SessionEntry};
 pub use self::state::{Replay, State};
 use crate::{Error, Result};
 

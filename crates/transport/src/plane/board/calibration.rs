@@ -26,6 +26,17 @@ pub struct BoardCalibration {
     pub white_dn: Array2<f32>,
     /// Standard deviation of the white level relative to itself.
     pub white_relative_sd: f64,
+    /// A lamp that flickered in the room; `None` if none did, or it was not measured.
+    pub lamp: Option<FlickeringLamp>,
+}
+
+/// A lamp that flickers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FlickeringLamp {
+    /// Frequency.
+    pub frequency_hz: f64,
+    /// Amplitude, of white in the time of one projector row.
+    pub amplitude: f64,
 }
 
 impl BoardCalibration {
