@@ -8,7 +8,6 @@ use std::path::Path;
 use ndarray::{Array3, Axis, s};
 use raysweep::rig::Rig;
 use raysweep_processing::calibration::{CalibratedFlicker, KeptCalibration};
-use raysweep_proto::CheckParams;
 use raysweep_session::ledger::FrameStarts;
 use raysweep_session::stack::ArrayName;
 use raysweep_tests::{Bench, Ended, corner_rig, rig_text};
@@ -91,7 +90,7 @@ fn a_calibration_finds_the_lamp_and_plans_are_checked_by_it() {
 
     let warnings = |frames: u32| {
         let plan = SWEEP.replace("average = 8", &format!("average = {frames}"));
-        bench.runner.check(&CheckParams { plan }).unwrap().warnings.join("\n")
+        bench.runner.check(&plan).unwrap().warnings.join("\n")
     };
     assert!(warnings(8).contains("sweep.average = 9 cancels it"), "{}", warnings(8));
     assert!(!warnings(9).contains("lamp"), "{}", warnings(9));

@@ -25,6 +25,8 @@ pub(crate) struct FrameStamps {
 const DARK_ROOM: f64 = 2e-5;
 /// Largest amplitude that may remain, of white in a row's time.
 const MOST_FLICKER: f64 = 0.0005;
+/// Light is not negative, so an amplitude cannot much exceed the level.
+const MOST_SHARE: f64 = 1.2;
 /// A dark image with a larger share of saturated pixels is not used.
 const MOST_SATURATED: f64 = 0.01;
 /// Time between the end of a run and the start of the next, on their common clock. What it is does not matter as long
@@ -153,12 +155,16 @@ impl<'a> RoomImages<'a> {
         self.geometry.camera_row_time_us * 1e-6
     }
 
+    /// The room's light, of white in a row's time.
+    fn level(&self, lamp: Option<&LampFlicker>) -> Option<f64> {
+        let levels = levels_dn_per_us(&self.darks, &self.times, lamp, self.rows)?;
+        Some(levels.mean()? * self.geometry.raster.row_time_us / self.geometry.white_dn)
+    }
+
     /// The flicker in the dark images. Without at least three exposures they cannot show one, and that of the
     /// calibration is assumed.
     pub(crate) fn seen(&self) -> Option<SeenFlicker> {
-        let levels = levels_dn_per_us(&self.darks, &self.times, None, self.rows)?;
-        let of_white = self.geometry.raster.row_time_us / self.geometry.white_dn;
-        let level = levels.mean()? * of_white;
+        let level = self.level(None)?;
         if level < DARK_ROOM {
             return None;
         }
@@ -205,7 +211,11 @@ impl<'a> RoomImages<'a> {
             return (None, RoomFindings { remark: None, warning });
         }
         match self.fitted(seen, stack, roles) {
-            Some(lamp) if lamp.is_steady(share.unwrap_or_else(|| lamp.share())) && lamp.share() < 1.2 => {
+            Some(lamp)
+                if lamp.is_steady(share.unwrap_or_else(|| lamp.share())) && lamp.share() < MOST_SHARE =>
+            {
+                // Flicker in the dark images changes what they seem to show of the level.
+                let level = self.level(Some(&lamp)).unwrap_or(level);
                 let darks = self.darks.keys().copied().collect();
                 let room = RoomFlicker { lamp, darks, times: self.times };
                 let said = room.say(level, self.rows, roles, (frames, rate_hz));
