@@ -29,7 +29,7 @@ const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver
                    [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\nseed = 11\n\
                    [sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\n\
                    [sim.camera]\nlate_frames_max = 3\ndropped = 0.02\n\
-                   [sim.ambient]\nlevel = 0.001\nflicker = 0.5\n\
+                   [sim.ambient]\nlevel = 0.001\nflicker = 0.5\nphase = \"drawn\"\n\
                    [sim.projector]\nphase_jitter_us = 5\n";
 const PLAN: &str = "kind = \"sweep\"\nname = \"crash\"\n[sweep]\naverage = 2\n\
                     delay_us = [-60, 0, 60]\nexposure_us = [50, 100, 150]\n";
@@ -121,7 +121,7 @@ fn outcome(session: &Path) -> Outcome {
     assert!(state.counts.balanced(), "{:?}", state.counts);
     let points =
         ArrayName::ALL.into_iter().flat_map(|array| state.stored(array).cloned().collect::<Vec<_>>());
-    let points = points.map(|point| PointEntry { counts: Counts::default(), ..point });
+    let points = points.map(|point| PointEntry { counts: Counts::default(), exposed: None, ..point });
     let points = points.map(|point| serde_json::to_string(&point).unwrap()).collect();
     let mut files: Vec<_> = std::fs::read_dir(session.join("products"))
         .unwrap()

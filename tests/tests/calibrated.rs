@@ -100,6 +100,7 @@ impl Studio {
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
             white_relative_sd: 0.0,
             strip: None,
+            lamp: None,
         }
     }
 
@@ -166,7 +167,8 @@ impl Studio {
                 delay_us: point.delay_us,
                 exposure_us: point.exposure_us,
                 delays_us: vec![delay_us; 8],
-                last_exposure_ns: None,
+                run: 1,
+                starts_ns: Vec::new(),
                 sum: Arc::new(Array2::zeros((0, 0))),
                 clipped: None,
                 counts: Counts::default(),

@@ -159,7 +159,7 @@ struct AttemptFrames {
     averaged: u32,
     delays_us: Vec<f64>,
     counts: Counts,
-    last_exposure_ns: Option<i64>,
+    starts_ns: Vec<i64>,
     /// Whether one of its frames may have been exposed with the previous settings; later frames are then not used.
     is_doubtful: bool,
     chain: Chain,
@@ -293,7 +293,7 @@ impl Assembler {
             averaged: 0,
             delays_us: Vec::with_capacity(job.frames as usize),
             counts: Counts::default(),
-            last_exposure_ns: None,
+            starts_ns: Vec::with_capacity(job.frames as usize),
             is_doubtful: false,
             chain,
         });
@@ -427,7 +427,7 @@ impl Assembler {
                 }
                 attempt.averaged += 1;
                 attempt.delays_us.push(delay_us);
-                attempt.last_exposure_ns = Some(frame.stamp.exposure_start_ns);
+                attempt.starts_ns.push(frame.stamp.exposure_start_ns);
             }
             Err(cause) => attempt.counts.lose(cause, 1),
         }
@@ -460,7 +460,8 @@ impl AttemptFrames {
             delay_us: self.job.delay_us,
             exposure_us: self.job.applied.actual.exposure_us,
             delays_us: self.delays_us,
-            last_exposure_ns: self.last_exposure_ns,
+            run: 0,
+            starts_ns: self.starts_ns,
             sum: Arc::new(self.sum),
             clipped: self.any_clipped.then(|| Arc::new(self.clipped)),
             counts: self.counts,

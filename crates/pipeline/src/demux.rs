@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{Array2, Array3, ArrayView2, Axis, Zip, s};
+use ndarray::{Array2, Array3, ArrayView2, ArrayViewMut2, Axis, Zip, s};
 use raysweep_transport::plane::{Demux, PlaneError, RowTiming, Setting, Transport};
 
 pub use self::options::{DEMUX, DemuxOptions};
@@ -17,6 +17,7 @@ pub use self::tally::{PREDICTED_SHARE, SweepSummary};
 use crate::bracket::BracketImage;
 use crate::findings::{Choices, choose, rows_to_choose_by};
 use crate::jitter::{StripFindings, StripGauge, StripLight};
+use crate::flicker::{FrameStamps, RoomFindings, RoomFlicker, RoomImages, on_one_clock, stamps};
 use crate::schedule::{PointRole, Schedule, SweepGeometry};
 use crate::stack::SweepStack;
 use crate::stage_refused::StageRefused;
@@ -30,6 +31,17 @@ struct SweepImage {
     image: Array2<f32>,
     /// Where any of its frames saturates; `None` if nowhere, or if it is not known.
     clipped: Option<Array2<bool>>,
+    /// When its frames were exposed, if it is known.
+    stamps: Option<FrameStamps>,
+}
+
+/// How an image was taken that is not kept.
+#[derive(Clone)]
+struct NotKept {
+    /// The point's ordinal.
+    point: u32,
+    setting: Setting,
+    stamps: Option<FrameStamps>,
 }
 
 impl SweepImage {
@@ -52,12 +64,14 @@ pub struct DemuxFold {
     geometry: Arc<SweepGeometry>,
     timing: RowTiming,
     taken: BTreeMap<PointRole, Arc<SweepImage>>,
-    /// The point's ordinal and the setting of images that are not kept; `None` if images are kept.
-    not_kept: Option<BTreeMap<PointRole, (u32, Setting)>>,
+    /// The images that are not kept; `None` if images are kept.
+    not_kept: Option<BTreeMap<PointRole, NotKept>>,
     /// Pixels that a stage replaced in some image, `[t, s]`; `None` if none.
     filled: Option<Arc<Array2<bool>>>,
     /// The images' light in the strip of the board, if one is in view.
     strip: Option<StripLight>,
+    /// A lamp whose flicker the images contain; `None` until it is found in them.
+    room: Option<Arc<RoomFlicker>>,
 }
 
 /// The camera rows of a sweep to be solved, and the neighbouring rows on which they depend.
@@ -67,6 +81,8 @@ struct Held {
     stack: SweepStack,
     /// The regular image and its dark image, if both were taken.
     regular: Option<(Arc<SweepImage>, Arc<SweepImage>)>,
+    /// The dark images, if a lamp flickers.
+    darks: BTreeMap<PointRole, Arc<SweepImage>>,
 }
 
 /// A sweep that was solved in one piece.
@@ -124,6 +140,7 @@ impl DemuxFold {
             not_kept: None,
             filled: None,
             strip,
+            room: None,
         };
         fold.demux().map_err(invalid)?;
         Ok(fold)
@@ -178,12 +195,17 @@ impl DemuxFold {
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let StripFindings { late_us, .. } = self.jitter();
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
+        let flicker = self.flicker(&darks, rows);
         for (index, (role, sample)) in taken.into_iter().enumerate() {
             if let Some(valid) = &mut valid {
                 valid.index_axis_mut(Axis(0), index).assign(&(valid_of(&sample) & &measured));
             }
             if let Some(dark) = self.dark_of(&darks, role) {
-                images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * &scale));
+                let mut image = images.index_axis_mut(Axis(0), index);
+                image.assign(&((&sample.image - &dark.image) * &scale));
+                if let Some(flicker) = &flicker {
+                    flicker.subtract(role, self.schedule_dark(role), image);
+                }
             }
             settings.push(sample.setting.earlier(late_us.get(&role).copied().unwrap_or(0.0)));
         }
@@ -206,11 +228,58 @@ impl DemuxFold {
 
     /// How late the light of each image is, as far as a strip of the board shows it.
     fn jitter(&self) -> StripFindings {
-        let dark_of = |role: PointRole| {
-            let point = self.schedule.points.iter().find(|point| point.role == role)?;
-            self.schedule.dark_of(point.exposure_us)
-        };
+        let dark_of = |role: PointRole| self.schedule_dark(role);
         self.strip.as_ref().map_or_else(StripFindings::default, |strip| strip.findings(dark_of))
+    }
+
+    /// Searches the images of the camera rows `rows` for a lamp that flickers, and follows it; `sampled` gives the dark
+    /// images of these rows, or all of them.
+    fn watch_room(
+        &mut self,
+        rows: &[usize],
+        sampled: impl Fn(&dyn Fn(PointRole) -> bool) -> BTreeMap<PointRole, Arc<SweepImage>>,
+    ) -> Result<RoomFindings, NotSolved> {
+        let darks = sampled(&|role| matches!(role, PointRole::Dark(_)));
+        let room = |images: &BTreeMap<PointRole, Arc<SweepImage>>| {
+            let stamped = images
+                .iter()
+                .map(|(role, image)| Some((*role, image.setting.exposure_us, image.stamps.as_ref()?)));
+            let stamped: Vec<_> = stamped.collect::<Option<_>>()?;
+            let times = on_one_clock(stamped.into_iter())?;
+            Some(RoomImages::new(&self.geometry, rows, counts_of(&darks), times))
+        };
+        let Some(seen) = room(&darks).and_then(|room| room.seen()) else {
+            return Ok(RoomFindings::default());
+        };
+        let all = sampled(&|_| true);
+        let Some(room) = room(&all) else { return Ok(RoomFindings::default()) };
+        let stack = self.stack(rows, all.clone())?;
+        let roles = all.keys().filter(|role| matches!(role, PointRole::Sweep(_)));
+        let roles: Vec<(PointRole, PointRole)> = roles
+            .filter_map(|&role| Some((role, self.schedule_dark(role)?)))
+            .filter(|(_, dark)| all.contains_key(dark))
+            .collect();
+        let frames = self.schedule.points.iter().find(|point| is_of_sweep(point.role));
+        let (found, said) = room.follow(&seen, &stack, &roles, frames.map_or(1, |point| point.frames));
+        self.room = found.map(Arc::new);
+        Ok(said)
+    }
+
+    /// The dark point of a point of the plan.
+    fn schedule_dark(&self, role: PointRole) -> Option<PointRole> {
+        let point = self.schedule.points.iter().find(|point| point.role == role)?;
+        self.schedule.dark_of(point.exposure_us)
+    }
+
+    /// The flicker to be subtracted from images of camera rows `rows`, to which the dark images belong.
+    fn flicker<'a>(
+        &'a self,
+        darks: &BTreeMap<PointRole, Arc<SweepImage>>,
+        rows: &'a [usize],
+    ) -> Option<RowFlicker<'a>> {
+        let room = self.room.as_deref()?;
+        let levels = room.levels_dn_per_us(&counts_of(darks), rows)? / self.geometry.white_of(rows);
+        Some(RowFlicker { room, rows, levels })
     }
 
     /// Camera rows `rows`, to which the images belong.
@@ -221,7 +290,8 @@ impl DemuxFold {
     ) -> Result<Held, NotSolved> {
         let regular = taken.get(&PointRole::Regular).cloned().zip(self.dark_of(&taken, PointRole::Regular));
         let first_row = rows.start;
-        Ok(Held { first_row, stack: self.stack(&rows.collect::<Vec<_>>(), taken)?, regular })
+        let darks = self.room.as_ref().map_or_else(BTreeMap::new, |_| darks_of(&taken));
+        Ok(Held { first_row, stack: self.stack(&rows.collect::<Vec<_>>(), taken)?, regular, darks })
     }
 
     /// Chooses how to demultiplex, from a stack that contains only the rows of [`rows_to_choose_by`].
@@ -247,10 +317,15 @@ impl DemuxFold {
     fn bracket(&self, taken: &BTreeMap<PointRole, Arc<SweepImage>>) -> Option<BracketImage> {
         let role = self.schedule.bracket()?.role;
         let (bracket, dark) = taken.get(&role).zip(self.dark_of(taken, role))?;
-        let white = self.geometry.white_of(&(0..self.geometry.height).collect::<Vec<_>>());
+        let rows: Vec<usize> = (0..self.geometry.height).collect();
+        let white = self.geometry.white_of(&rows);
+        let mut image = (&bracket.image - &dark.image) / white.mapv(|dn| dn as f32);
+        if let Some(flicker) = self.flicker(&darks_of(taken), &rows) {
+            flicker.subtract(role, self.schedule_dark(role), image.view_mut());
+        }
         Some(BracketImage {
             setting: bracket.setting.clone(),
-            image: (&bracket.image - &dark.image) / white.mapv(|dn| dn as f32),
+            image,
             valid: bracket.valid(self.geometry.saturation_dn) & white.mapv(f64::is_finite),
         })
     }
@@ -264,7 +339,7 @@ impl DemuxFold {
         tally: &mut Tally,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Strip, NotSolved> {
-        let Held { first_row: held_from, mut stack, regular } = held;
+        let Held { first_row: held_from, mut stack, regular, darks } = held;
         let first_row = rows.start;
         let inner = rows.start - held_from..rows.end - held_from;
         let white = self.geometry.white_of(&rows.clone().collect::<Vec<_>>());
@@ -274,7 +349,13 @@ impl DemuxFold {
         tally.add_sweep(stack.settings.len(), &measured, &transport);
         if let Some((regular, dark)) = regular {
             let [image, dark] = [&regular, &dark].map(|taken| taken.image.slice(s![inner.clone(), ..]));
-            let light = (&image - &dark) / white.mapv(|dn| dn as f32);
+            let mut light = (&image - &dark) / white.mapv(|dn| dn as f32);
+            let role = PointRole::Regular;
+            let rows: Vec<usize> = solved.clone().collect();
+            let darks = darks.iter().map(|(role, taken)| (*role, taken.rows(inner.clone()))).collect();
+            if let Some(flicker) = self.flicker(&darks, &rows) {
+                flicker.subtract(role, self.schedule_dark(role), light.view_mut());
+            }
             let valid = regular.valid(self.geometry.saturation_dn).slice_move(s![inner, ..]);
             tally.add_regular(&valid, &measured, &light, &transport);
             stack.regular = Some(light);
@@ -293,13 +374,16 @@ impl DemuxFold {
         if let Some(strip) = &mut self.strip {
             strip.push(point.role, &setting, image);
         }
+        let stamps = stamps(unit.run, &unit.starts_ns);
         match &mut self.not_kept {
-            Some(not_kept) => drop(not_kept.insert(point.role, (unit.id.point, setting))),
+            Some(not_kept) => {
+                drop(not_kept.insert(point.role, NotKept { point: unit.id.point, setting, stamps }));
+            }
             None => {
                 // Sessions store the clipped frames of the sweep and its bracket alone.
                 let clipped = unit.clipped.as_ref().filter(|_| is_of_sweep(point.role));
                 let clipped = clipped.map(|frames| frames.mapv(|frames| frames > 0));
-                let taken = SweepImage { setting, image: image.to_owned(), clipped };
+                let taken = SweepImage { setting, image: image.to_owned(), clipped, stamps };
                 drop(self.taken.insert(point.role, Arc::new(taken)));
             }
         }
@@ -329,9 +413,12 @@ impl DemuxFold {
         let taken = std::mem::take(&mut self.taken);
         let mut tally = Tally::default();
         let height = self.geometry.height;
+        let rows = rows_to_choose_by(height);
+        let said = self.watch_room(&rows, |is_wanted| of_rows(&taken, &rows, is_wanted))?;
         let bracket = self.bracket(&taken);
         let held = self.hold(0..height, taken)?;
-        let choices = self.choose(held.stack.of_rows(&rows_to_choose_by(height)), bracket)?;
+        let mut choices = self.choose(held.stack.of_rows(&rows), bracket)?;
+        choices.findings.add_room(said);
         let Strip { stack, transport, .. } = self.strip(&choices, 0..height, held, &mut tally, go_on)?;
         Ok(Solved { stack, transport, summary: tally.summary(choices.findings) })
     }
@@ -356,7 +443,10 @@ impl Snapshot for DemuxFold {
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<Transport, NotSolved> {
         let rows: Vec<usize> = (0..self.geometry.height).collect();
-        let SweepStack { settings, images, valid, .. } = self.stack(&rows, self.taken.clone())?;
+        let mut fold = self.clone();
+        let sampled = rows_to_choose_by(self.geometry.height);
+        fold.watch_room(&sampled, |is_wanted| of_rows(&self.taken, &sampled, is_wanted))?;
+        let SweepStack { settings, images, valid, .. } = fold.stack(&rows, fold.taken.clone())?;
         let valid = valid.as_ref().map(|valid| valid.view());
         self.demux()
             .and_then(|demux| demux.with_settings(settings))
@@ -366,6 +456,58 @@ impl Snapshot for DemuxFold {
             })
             .map_err(refused)
     }
+}
+
+/// A lamp's flicker in images of some camera rows.
+struct RowFlicker<'a> {
+    room: &'a RoomFlicker,
+    rows: &'a [usize],
+    /// The room's light at their pixels, of white per us.
+    levels: Array2<f64>,
+}
+
+impl RowFlicker<'_> {
+    /// Subtracts it from the light of an image and its dark image.
+    fn subtract(&self, light: PointRole, dark: Option<PointRole>, image: ArrayViewMut2<'_, f32>) {
+        if let Some(dark) = dark {
+            self.room.subtract((light, dark), self.rows, &self.levels, image);
+        }
+    }
+}
+
+impl SweepImage {
+    /// Some of its rows.
+    fn rows(&self, rows: Range<usize>) -> Arc<Self> {
+        self.select(&rows.collect::<Vec<_>>())
+    }
+
+    fn select(&self, rows: &[usize]) -> Arc<Self> {
+        Arc::new(Self {
+            setting: self.setting.clone(),
+            image: self.image.select(Axis(0), rows),
+            clipped: self.clipped.as_ref().map(|clipped| clipped.select(Axis(0), rows)),
+            stamps: self.stamps.clone(),
+        })
+    }
+}
+
+/// Some camera rows of some of the images.
+fn of_rows(
+    taken: &BTreeMap<PointRole, Arc<SweepImage>>,
+    rows: &[usize],
+    is_wanted: &dyn Fn(PointRole) -> bool,
+) -> BTreeMap<PointRole, Arc<SweepImage>> {
+    let wanted = taken.iter().filter(|(role, _)| is_wanted(**role));
+    wanted.map(|(role, image)| (*role, image.select(rows))).collect()
+}
+
+fn darks_of(taken: &BTreeMap<PointRole, Arc<SweepImage>>) -> BTreeMap<PointRole, Arc<SweepImage>> {
+    let darks = taken.iter().filter(|(role, _)| matches!(role, PointRole::Dark(_)));
+    darks.map(|(role, image)| (*role, image.clone())).collect()
+}
+
+fn counts_of(images: &BTreeMap<PointRole, Arc<SweepImage>>) -> BTreeMap<PointRole, &Array2<f32>> {
+    images.iter().map(|(role, image)| (*role, &image.image)).collect()
 }
 
 /// Whether a point is one of the sweep's own images.

@@ -78,7 +78,7 @@ impl FilmFrame {
     /// The only frame of a film's unit, with its image after all stages.
     pub fn of(unit: &Unit, image: Option<Arc<Array2<f32>>>) -> Option<Self> {
         let setting = Setting { delays_us: unit.delays_us.clone(), exposure_us: unit.exposure_us };
-        let exposure_start_ns = unit.last_exposure_ns?;
+        let exposure_start_ns = *unit.starts_ns.last()?;
         Some(Self { setting, exposure_start_ns, raw: unit.sum.clone(), image })
     }
 }

@@ -16,6 +16,7 @@ use raysweep_transport::plane::{
 use crate::bracket::BracketImage;
 use crate::calibrated;
 use crate::demux::DemuxOptions;
+use crate::flicker::RoomFindings;
 use crate::schedule::{Spot, SweepGeometry};
 use crate::stack::SweepStack;
 
@@ -166,6 +167,12 @@ pub fn choose(
 }
 
 impl Findings {
+    /// Adds what was found of the room's light.
+    pub(crate) fn add_room(&mut self, RoomFindings { remark, warning }: RoomFindings) {
+        self.remarks.extend(remark);
+        self.warnings.extend(warning);
+    }
+
     /// Checks the calibration by a stack that contains only the camera rows `rows`, and corrects the delays of its
     /// images for the latency found.
     fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize]) {

@@ -12,6 +12,7 @@ mod edges;
 mod film;
 mod findings;
 mod jitter;
+mod flicker;
 mod pipeline;
 mod product;
 mod products;

@@ -18,8 +18,10 @@ pub struct Unit {
     pub exposure_us: f64,
     /// True delay t_d of each frame, relative to the VSYNC edge of its light.
     pub delays_us: Vec<f64>,
-    /// Start of the exposure of row 0 in the last frame, on the host's clock; `None` for a unit read from disk.
-    pub last_exposure_ns: Option<i64>,
+    /// Which run of the session took it, counted from 1; 0 until the unit reaches its sink. Each run has its own clock.
+    pub run: u32,
+    /// Start of the exposure of row 0 in each frame, on the host's clock; empty if it was not stored.
+    pub starts_ns: Vec<i64>,
     /// Sum of counts, `[t, s]`.
     pub sum: Arc<Array2<u32>>,
     /// In how many of the frames each pixel saturates, `[t, s]`; `None` if none does, or if it is not known.

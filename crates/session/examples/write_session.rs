@@ -163,6 +163,7 @@ fn store_point(
         },
         crc32,
         clipped_crc32: None,
+        exposed: None,
     }))
 }
 

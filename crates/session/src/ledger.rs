@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use self::chain::{Chain, Fit};
-pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, PointEntry, SessionEntry};
+pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, FrameStarts, PointEntry, SessionEntry};
 pub use self::state::{Replay, State};
 use crate::damage::Damage;
 use crate::durable::DraftFile;

@@ -42,6 +42,7 @@ fn point(index: usize) -> Entry {
         counts: Counts { expected: 1, averaged: 1, ..Counts::default() },
         crc32: crc32(image(index).view()),
         clipped_crc32: None,
+        exposed: None,
     })
 }
 

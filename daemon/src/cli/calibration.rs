@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use clap::Subcommand;
-use raysweep_processing::calibration::{CalibrationHeader, KeptCalibration, Pair};
+use raysweep_processing::calibration::{CalibratedAmbient, CalibrationHeader, KeptCalibration, Pair};
 use raysweep_proto::{CalibrationInfo, Client, Empty};
 use serde_json::json;
 
@@ -130,6 +130,9 @@ fn header(header: &CalibrationHeader) -> String {
         let _ = writeln!(text, "{name:24} {value:12.5} +- {sd:.5}");
     }
     let _ = write!(text, "{:24} {:12} +- {:.3}", "latency / us", "", header.timing.latency_sd_us);
+    for (name, said) in header.ambient.iter().flat_map(CalibratedAmbient::lines) {
+        let _ = write!(text, "\n{name:24} {said}");
+    }
     text
 }
 

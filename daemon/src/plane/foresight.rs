@@ -2,11 +2,16 @@
 
 use raysweep_config::ConfigError;
 use raysweep_core::CameraCapabilities;
-use raysweep_pipeline::{DemuxFold, Point};
+use raysweep_pipeline::{DemuxFold, Point, PointRole};
 use raysweep_processing::plane::PlaneTask;
+use raysweep_transport::plane::board::FlickeringLamp;
+use raysweep_transport::plane::calibrate::{averaged_share, can_be_followed, cancelling_frames};
 
 /// Condition number from which on noise is amplified more than the prior can compensate.
 const ILL_CONDITIONED: f64 = 1e9;
+
+/// Flicker with a smaller amplitude does no harm, of white in a row's time.
+const MOST_FLICKER: f64 = 0.0005;
 
 /// The model that a task's points give on its rig.
 pub struct Model {
@@ -45,6 +50,45 @@ impl Model {
     pub fn reach(&self) -> u64 {
         let (first, last) = self.reach_rows;
         (first..=last).count() as u64
+    }
+
+    /// What the lamp that the calibration found does to a plan whose images are means of frames; `key` sets their
+    /// number, and without one nothing removes the flicker.
+    pub fn lamp_warning(&self, task: &PlaneTask, key: Option<&str>) -> Option<String> {
+        let FlickeringLamp { frequency_hz, amplitude } = task.geometry.calibration.as_ref()?.lamp?;
+        if amplitude <= MOST_FLICKER {
+            return None;
+        }
+        let lit = task.schedule.points.iter().zip(&self.periods);
+        let lit = lit.filter(|(point, _)| matches!(point.role, PointRole::Sweep(_)));
+        let frames = lit.clone().map(|(point, _)| point.frames).max()?;
+        let mut periods: Vec<u64> = lit.map(|(_, &periods)| periods).collect();
+        periods.sort_unstable();
+        periods.dedup();
+        let rate_hz = |&periods: &u64| 1e6 / (task.geometry.raster.period_us * periods as f64);
+        let rates_hz: Vec<f64> = periods.iter().map(rate_hz).collect();
+        let lamp = format!(
+            "the calibration found a lamp that flickers at {frequency_hz:.1} Hz by {amplitude:.4} of white in a row's time"
+        );
+        if let Some(rate_hz) = rates_hz.iter().find(|&&rate_hz| !can_be_followed(frequency_hz, rate_hz)) {
+            return Some(format!(
+                "{lamp}: that is the same in all frames at {rate_hz:.1} frames/s, and no number of frames cancels it: switch the lamp off"
+            ));
+        }
+        let share = |&rate_hz: &f64| averaged_share(frequency_hz, rate_hz, frames);
+        let percent = 100.0 * rates_hz.iter().map(share).fold(0.0, f64::max);
+        let Some(key) = key else {
+            return Some(format!("{lamp}, which nothing removes from a film: switch the lamp off"));
+        };
+        match cancelling_frames(frequency_hz, &rates_hz, frames) {
+            Some(enough) if enough == frames => None,
+            Some(enough) => Some(format!(
+                "{lamp}: the mean of {frames} frames leaves {percent:.0} % of that, which the times of the frames should remove; {key} = {enough} cancels it"
+            )),
+            None => Some(format!(
+                "{lamp}: the mean of {frames} frames leaves {percent:.0} % of that, which the times of the frames should remove; no {key} up to 64 cancels it"
+            )),
+        }
     }
 
     /// Warnings for the operator.

@@ -7,7 +7,7 @@ use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
 use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
 use raysweep_processing::plane::{PlaneTask, Processing, place};
 use raysweep_proto::Event;
-use raysweep_session::ledger::{Entry, PointEntry};
+use raysweep_session::ledger::{Entry, FrameStarts, PointEntry};
 use raysweep_session::stack::{ArrayName, Stack};
 
 use crate::live::LiveEstimate;
@@ -44,6 +44,7 @@ impl Sink for PointSink {
     fn take(&mut self, item: Ordered) {
         match item {
             Ordered::Unit(unit, image) => {
+                let unit = Unit { run: self.run.ledger.state().runs, ..unit };
                 if let Err(error) = self.store(&unit) {
                     tracing::error!(%error, point = unit.id.point, "point not stored");
                     self.note_write_error(error);
@@ -129,6 +130,7 @@ impl PointSink {
             counts: unit.counts.clone(),
             crc32,
             clipped_crc32,
+            exposed: Some(FrameStarts { run: unit.run, starts_ns: unit.starts_ns.clone() }),
         }))
     }
 

@@ -292,7 +292,7 @@ pub enum FlickerPhase {
 
 impl Default for SimAmbient {
     fn default() -> Self {
-        Self { level: 0.0, flicker: 0.0, flicker_hz: 100.0, phase: FlickerPhase::Drawn }
+        Self { level: 0.0, flicker: 0.0, flicker_hz: 100.0, phase: FlickerPhase::Continuous }
     }
 }
 

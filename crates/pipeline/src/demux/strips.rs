@@ -7,10 +7,10 @@ use std::sync::Arc;
 
 use ndarray::Axis;
 use rayon::prelude::*;
-use raysweep_transport::plane::{PlaneError, Setting};
+use raysweep_transport::plane::PlaneError;
 
 use super::tally::{SweepSummary, Tally};
-use super::{DEMUX, DemuxFold, SweepImage, refused};
+use super::{DEMUX, DemuxFold, NotKept, SweepImage, refused};
 use crate::findings::rows_to_choose_by;
 use crate::schedule::PointRole;
 use crate::strips::{ImageRows, InStrips, NotSolved, PointRows};
@@ -28,17 +28,24 @@ impl DemuxFold {
         let InStrips { images, strip_rows, take } = strips;
         let not_kept = self.not_kept.take().unwrap_or_default();
         let height = self.geometry.height;
+        let rows = rows_to_choose_by(height);
         let sampled = self.read_to_choose_by(&not_kept, images, go_on)?;
+        let said = self.watch_room(&rows, |is_wanted| {
+            let wanted = sampled.iter().filter(|(role, _)| is_wanted(**role));
+            wanted.map(|(role, image)| (*role, image.clone())).collect()
+        })?;
         let bracket = match self.schedule.bracket() {
             Some(point) => {
                 let roles = [Some(point.role), self.schedule.dark_of(point.exposure_us)];
+                let is_for_room = |role| self.room.is_some() && matches!(role, PointRole::Dark(_));
                 let mut taken = not_kept.clone();
-                taken.retain(|role, _| roles.contains(&Some(*role)));
+                taken.retain(|role, _| roles.contains(&Some(*role)) || is_for_room(*role));
                 self.bracket(&read_rows(&taken, images, &(0..height))?)
             }
             None => None,
         };
-        let choices = self.choose(self.stack(&rows_to_choose_by(height), sampled)?, bracket)?;
+        let mut choices = self.choose(self.stack(&rows, sampled)?, bracket)?;
+        choices.findings.add_room(said);
         let mut tally = Tally::default();
         for first_row in (0..height).step_by(strip_rows) {
             let rows = first_row..height.min(first_row + strip_rows);
@@ -54,20 +61,21 @@ impl DemuxFold {
     /// completely: one at a time, because several together may be larger than the memory.
     fn read_to_choose_by(
         &self,
-        not_kept: &BTreeMap<PointRole, (u32, Setting)>,
+        not_kept: &BTreeMap<PointRole, NotKept>,
         images: &dyn ImageRows,
         go_on: &(dyn Fn() -> bool + Sync),
     ) -> Result<BTreeMap<PointRole, Arc<SweepImage>>, NotSolved> {
         let height = self.geometry.height;
         let rows = rows_to_choose_by(height);
-        let of_rows = |(role, (point, setting)): (&PointRole, &(u32, Setting))| {
+        let of_rows = |(role, NotKept { point, setting, stamps }): (&PointRole, &NotKept)| {
             if !go_on() {
                 return Err(refused(PlaneError::Stopped));
             }
             let PointRows { image, clipped } = images.read(*point, 0..height).map_err(not_read)?;
             let image = image.select(Axis(0), &rows);
             let clipped = clipped.map(|clipped| clipped.select(Axis(0), &rows));
-            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image, clipped })))
+            let (setting, stamps) = (setting.clone(), stamps.clone());
+            Ok((*role, Arc::new(SweepImage { setting, image, clipped, stamps })))
         };
         not_kept.iter().map(of_rows).collect()
     }
@@ -75,15 +83,16 @@ impl DemuxFold {
 
 /// Reads some camera rows of the images.
 fn read_rows(
-    not_kept: &BTreeMap<PointRole, (u32, Setting)>,
+    not_kept: &BTreeMap<PointRole, NotKept>,
     images: &dyn ImageRows,
     rows: &Range<usize>,
 ) -> Result<BTreeMap<PointRole, Arc<SweepImage>>, NotSolved> {
     not_kept
         .par_iter()
-        .map(|(role, (point, setting))| {
+        .map(|(role, NotKept { point, setting, stamps })| {
             let PointRows { image, clipped } = images.read(*point, rows.clone()).map_err(not_read)?;
-            Ok((*role, Arc::new(SweepImage { setting: setting.clone(), image, clipped })))
+            let (setting, stamps) = (setting.clone(), stamps.clone());
+            Ok((*role, Arc::new(SweepImage { setting, image, clipped, stamps })))
         })
         .collect()
 }
@@ -97,7 +106,7 @@ mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
     use raysweep_transport::plane::board::{BoardCalibration, Estimate};
-    use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS};
+    use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS, Setting};
 
     use super::*;
     use crate::demux::{DemuxOptions, Solved};
@@ -191,7 +200,8 @@ mod tests {
                 delay_us: point.delay_us,
                 exposure_us: point.exposure_us,
                 delays_us: vec![point.delay_us],
-                last_exposure_ns: None,
+                run: 1,
+                starts_ns: Vec::new(),
                 sum: Arc::new(Array2::zeros((0, 0))),
                 clipped: None,
                 counts: Counts::default(),
@@ -243,7 +253,7 @@ mod tests {
             white_dn,
             white_relative_sd: 0.0,
             strip: None,
-            strip: None,
+            lamp: None,
         }))
     }
 
@@ -337,10 +347,11 @@ mod tests {
         let image = SweepImage {
             setting: Setting::new(0.0, 60.0),
             image: Array2::from_elem((1, 3), 3800.0),
+            stamps: None,
             clipped: Some(Array2::from_shape_vec((1, 3), vec![false, true, false]).unwrap()),
         };
         assert_eq!(image.valid(3900.0).into_raw_vec_and_offset().0, [true, false, true]);
-        let unknown = SweepImage { clipped: None, ..image };
+        let unknown = SweepImage { stamps: None, clipped: None, ..image };
         assert!(unknown.valid(3900.0).iter().all(|valid| *valid));
     }
 }

@@ -13,7 +13,7 @@ use raysweep_config::{ConfigError, RigFile};
 use raysweep_core::{CameraCapabilities, PixelFormat};
 use raysweep_session::durable;
 use raysweep_transport::plane::board::times::BoardStrip;
-use raysweep_transport::plane::board::{BoardCalibration, Estimate};
+use raysweep_transport::plane::board::{BoardCalibration, Estimate, FlickeringLamp};
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -30,8 +30,11 @@ const MAX_HEADER_BYTES: u64 = 1 << 20;
 const OTHER_BYTES: u64 = 4 << 20;
 /// Most modes of the covariance of the row starts.
 const MAX_MODES: u64 = 256;
-/// 4-byte numbers per pixel: place, its deviation, responses, white, its deviation, dark offset, slope and covariance.
-const NUMBERS_PER_PX: u64 = 2 + RESPONSE_ROWS as u64 + 2 + 2 + 3;
+/// 4-byte numbers per pixel: place, its deviation, responses, white, its deviation, dark offset, slope and covariance,
+/// the room's light.
+const NUMBERS_PER_PX: u64 = 2 + RESPONSE_ROWS as u64 + 2 + 2 + 3 + 1;
+/// Name of the only array that older files lack.
+const AMBIENT: &str = "ambient_dn_per_us";
 
 /// Folder of the calibration in use, within the daemon's data folder.
 pub fn current_in(data: &Path) -> PathBuf {
@@ -59,6 +62,9 @@ pub struct CalibrationHeader {
     pub timing: CalibratedTiming,
     /// CalibratedLight and sensor.
     pub light: CalibratedLight,
+    /// The room's light; `None` if it was not measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ambient: Option<CalibratedAmbient>,
     /// Figures of the calibration's own checks, each with its limit.
     pub checks: BTreeMap<String, Pair>,
 }
@@ -115,6 +121,29 @@ pub struct CalibratedLight {
     pub hot_pixels: usize,
 }
 
+/// The room's light.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CalibratedAmbient {
+    /// Its median level, of white in the time of one projector row.
+    pub level: f64,
+    /// Median light of the projector's black, of white.
+    pub projector_black: f64,
+    /// Its flicker, if it has any.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub flicker: Option<CalibratedFlicker>,
+}
+
+/// The flicker of the room's light, with standard deviations.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CalibratedFlicker {
+    /// Frequency.
+    pub frequency_hz: Pair,
+    /// Amplitude as a share of the level.
+    pub share: Pair,
+}
+
 /// `calibration.npz`. `[t, s]` are camera rows and columns.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CalibrationArrays {
@@ -138,6 +167,8 @@ pub struct CalibrationArrays {
     pub dark_slope_dn_per_us: Array2<f32>,
     /// Variance of the offset, covariance, variance of the slope, `[3, t, s]`.
     pub dark_covariance: Array3<f32>,
+    /// Light of the room, `[t, s]`; `None` if it was not measured.
+    pub ambient_dn_per_us: Option<Array2<f32>>,
 }
 
 /// A calibration.
@@ -162,7 +193,8 @@ impl CalibrationArrays {
             npz.add_array("white_sd", &self.white_sd)?;
             npz.add_array("dark_offset_dn", &self.dark_offset_dn)?;
             npz.add_array("dark_slope_dn_per_us", &self.dark_slope_dn_per_us)?;
-            npz.add_array("dark_covariance", &self.dark_covariance)
+            npz.add_array("dark_covariance", &self.dark_covariance)?;
+            self.ambient_dn_per_us.as_ref().map_or(Ok(()), |level| npz.add_array(AMBIENT, level))
         };
         write().map_err(|error: ndarray_npy::WriteNpzError| error.to_string())?;
         Ok(npz.finish().map_err(|error| error.to_string())?.into_inner())
@@ -170,6 +202,7 @@ impl CalibrationArrays {
 
     fn from_bytes(bytes: &[u8]) -> Result<Self, ndarray_npy::ReadNpzError> {
         let mut npz = NpzReader::new(Cursor::new(bytes))?;
+        let has_ambient = npz.names()?.iter().any(|name| name == AMBIENT);
         Ok(Self {
             row_starts_us: npz.by_name("row_starts_us")?,
             row_starts_modes: npz.by_name("row_starts_modes")?,
@@ -181,6 +214,7 @@ impl CalibrationArrays {
             dark_offset_dn: npz.by_name("dark_offset_dn")?,
             dark_slope_dn_per_us: npz.by_name("dark_slope_dn_per_us")?,
             dark_covariance: npz.by_name("dark_covariance")?,
+            ambient_dn_per_us: has_ambient.then(|| npz.by_name(AMBIENT)).transpose()?,
         })
     }
 
@@ -207,7 +241,8 @@ impl CalibrationArrays {
             ("dark_slope_dn_per_us", self.dark_slope_dn_per_us.shape(), &image),
             ("dark_covariance", self.dark_covariance.shape(), &[3, rows, columns]),
         ];
-        for (name, found, expected) in shapes {
+        let ambient = self.ambient_dn_per_us.iter().map(|level| (AMBIENT, level.shape(), &image[..]));
+        for (name, found, expected) in shapes.into_iter().chain(ambient) {
             if found != expected {
                 return Err(format!("{name} has shape {found:?}, but valid_for says {expected:?}"));
             }
@@ -346,7 +381,36 @@ impl KeptCalibration {
             white_dn: self.arrays.white_dn.clone(),
             white_relative_sd: white_sd / white_dn,
             strip,
+            lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),
         }))
+    }
+}
+
+impl CalibratedAmbient {
+    /// What was found, each as a name and a text.
+    pub fn lines(&self) -> Vec<(&'static str, String)> {
+        let flicker = match &self.flicker {
+            Some(CalibratedFlicker { frequency_hz: [frequency_hz, hz_sd], share: [share, share_sd] }) => {
+                format!(
+                    "{frequency_hz:.2} +- {hz_sd:.2} Hz, {:.1} +- {:.1} % of the light",
+                    100.0 * share,
+                    100.0 * share_sd
+                )
+            }
+            None => "none".into(),
+        };
+        vec![
+            ("ambient light", format!("{:.6} of white in the time of a row", self.level)),
+            ("flicker", flicker),
+            ("projector's black", format!("{:.5} of white", self.projector_black)),
+        ]
+    }
+
+    /// The lamp that flickers, if one does.
+    fn lamp(&self) -> Option<FlickeringLamp> {
+        let CalibratedFlicker { frequency_hz: [frequency_hz, _], share: [share, _] } =
+            self.flicker.as_ref()?;
+        Some(FlickeringLamp { frequency_hz: *frequency_hz, amplitude: self.level * share })
     }
 }
 

@@ -1,18 +1,23 @@
 //! The stored images of a calibration, and what they say.
 
+use std::collections::BTreeMap;
+
 use ndarray::{Array2, Array3, Axis};
-use raysweep_session::ledger::{PointEntry, State};
+use raysweep_session::ledger::{FrameStarts, PointEntry, State};
 use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::images::{
-    CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Phases, PhotonTransfer, Responses,
-    RowPlaces, WhiteMap, locate_rows, photon_transfer, prnu,
+    Ambient, BlackFrames, CappedFrames, CodedPictures, DarkFit, ImagesError, LightLevel, Phases,
+    PhotonTransfer, Responses, RowPlaces, SensorNoise, WhiteMap, ambient, locate_rows, photon_transfer, prnu,
 };
 use raysweep_transport::plane::board::times::{BoardFrame, CoarseSweep, Columns, RowTimes, TimesError};
 use raysweep_transport::plane::{NoiseModel, PlaneError};
 
-use super::task::{BoardPurpose, CalibrationTask, ROWS_PER_BLOCK, WHOLE_US};
+use super::task::{AMBIENT_US, BoardPurpose, CalibrationTask, ROWS_PER_BLOCK, WHOLE_US};
 use crate::plane::place;
+
+/// Fewer frames of an exposure do not show the room's light.
+const LEAST_AMBIENT_FRAMES: usize = 8;
 
 /// Why a rig cannot be calibrated from a session's images.
 #[derive(Debug, thiserror::Error)]
@@ -76,6 +81,38 @@ impl BoardImages<'_> {
         Ok(frames)
     }
 
+    /// The frames of a purpose that one run took, with the start of each exposure in s; none if it was not stored.
+    fn timed_frames(
+        &self,
+        purpose: BoardPurpose,
+        run: u32,
+    ) -> Result<(Array3<f32>, Vec<f64>), CalibrationError> {
+        let (rows, columns) = (self.task.task.geometry.height, self.task.task.geometry.width);
+        let (mut frames, mut opened_s) = (Array3::zeros((0, rows, columns)), Vec::new());
+        for ordinal in self.task.ordinals(purpose) {
+            let (image, entry) = self.image(ordinal)?;
+            if let Some(FrameStarts { starts_ns, .. }) = entry.exposed.as_ref().filter(|of| of.run == run)
+                && let [start_ns] = starts_ns[..]
+            {
+                let shaped = |error: ndarray::ShapeError| CalibrationError::Image(error.to_string());
+                frames.push(Axis(0), image.view()).map_err(shaped)?;
+                opened_s.push(start_ns as f64 * 1e-9);
+            }
+        }
+        Ok((frames, opened_s))
+    }
+
+    /// The run that took most of the frames of the room's light: each run has its own clock.
+    fn run_of_ambient(&self) -> Option<u32> {
+        let mut frames = BTreeMap::<u32, usize>::new();
+        for ordinal in self.task.ordinals(BoardPurpose::Ambient) {
+            let (array, index) = place(self.task.task.schedule.points[ordinal as usize].role);
+            let run = self.state.point(array, index)?.exposed.as_ref()?.run;
+            *frames.entry(run).or_default() += 1;
+        }
+        frames.into_iter().max_by_key(|(run, count)| (*count, *run)).map(|(run, _)| run)
+    }
+
     /// Means of several purposes, `[n, t, s]` in counts.
     fn means(&self, purposes: impl Iterator<Item = BoardPurpose>) -> Result<Array3<f32>, CalibrationError> {
         let images: Vec<Array2<f32>> = purposes
@@ -96,6 +133,8 @@ pub struct BoardPixels {
     pub prnu: Estimate,
     /// White.
     pub white: WhiteMap,
+    /// The room's light; `None` if too few of its frames have time stamps of one run.
+    pub ambient: Option<Ambient>,
     /// The places of single pixels against a smooth map.
     pub places: RowPlaces,
     /// Place and response.
@@ -130,6 +169,10 @@ impl BoardPixels {
         let frames = white.len_of(Axis(0));
         let white = WhiteMap::new(white.view(), black.view(), full_scale_dn, noise)?;
         white.check(full_scale_dn)?;
+        let ambient = room(images, &dark, noise)?;
+        if let Some(ambient) = &ambient {
+            ambient.check(white.level_dn.value, task.task.geometry.raster.row_time_us)?;
+        }
         let lit = white.lit();
         let prnu = prnu(white.white_dn.view(), Some(lit.view()), frames, noise)?;
         let black_dn = black.mean_axis(Axis(0)).unwrap_or_default();
@@ -142,7 +185,7 @@ impl BoardPixels {
         let responses = Responses::new(&phases, &white, &places, projector_rows)?;
         responses.checks.check()?;
         let columns = Columns::new(responses.place.view(), responses.response.view())?;
-        Ok(Self { dark, transfer, prnu, white, places, responses, columns })
+        Ok(Self { dark, transfer, prnu, white, ambient, places, responses, columns })
     }
 
     /// Frames of the white board, as shares of white averaged over columns.
@@ -185,6 +228,33 @@ impl BoardPixels {
         };
         Ok(RowTimes::fit(&self.columns, &frames, &images.task.nominal(), share)?)
     }
+}
+
+/// The room's light, from the black pictures of both exposures.
+fn room(
+    images: &BoardImages<'_>,
+    dark: &DarkFit,
+    noise: SensorNoise,
+) -> Result<Option<Ambient>, CalibrationError> {
+    let Some(run) = images.run_of_ambient() else { return Ok(None) };
+    let exposures = [(BoardPurpose::Black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
+    let [black, short] = exposures.map(|(purpose, exposure_us)| {
+        Ok::<_, CalibrationError>((images.timed_frames(purpose, run)?, exposure_us, dark.image(exposure_us)))
+    });
+    let taken = [black?, short?];
+    if taken.iter().any(|((_, opened_s), ..)| opened_s.len() < LEAST_AMBIENT_FRAMES) {
+        return Ok(None);
+    }
+    let runs = taken.each_ref().map(|((frames, opened_s), exposure_us, dark_dn)| BlackFrames {
+        exposure_us: *exposure_us,
+        frames: frames.view(),
+        dark_dn: dark_dn.view(),
+        opened_s,
+    });
+    let usable = dark.hot.mapv(|hot| !hot);
+    let geometry = &images.task.task.geometry;
+    let rate_hz = 1e6 / geometry.raster.period_us;
+    Ok(Some(ambient(&runs, geometry.camera_row_time_us, rate_hz, noise, Some(usable.view()))?))
 }
 
 fn dark(images: &BoardImages<'_>) -> Result<DarkFit, CalibrationError> {

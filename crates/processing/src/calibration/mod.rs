@@ -15,8 +15,8 @@ use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::RowTimes;
 
-use self::file::{CalibratedLight, CalibratedTiming, CalibrationArrays, SCHEMA};
-pub use self::file::{CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in};
+pub use self::file::{CalibratedAmbient, CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in};
+use self::file::{CalibratedFlicker, CalibratedLight, CalibratedTiming, CalibrationArrays, SCHEMA};
 pub use self::images::{BoardImages, BoardPixels, CalibrationError};
 pub use self::task::{BoardPurpose, BoardView, CalibrationTask};
 use crate::plane::{KnownRig, manifest};
@@ -83,6 +83,7 @@ impl BoardFindings {
                 prnu: pair(pixels.prnu),
                 hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
             },
+            ambient: self.ambient(),
             checks: self.checks(),
         };
         let unusable = |error: raysweep_transport::plane::PlaneError| raysweep_session::Error::Codec {
@@ -112,8 +113,29 @@ impl BoardFindings {
             dark_offset_dn: pixels.dark.offset_dn.clone(),
             dark_slope_dn_per_us: pixels.dark.slope_dn_per_us.clone(),
             dark_covariance: pixels.dark.covariance.clone(),
+            ambient_dn_per_us: pixels.ambient.as_ref().map(|ambient| ambient.level_dn_per_us.clone()),
         };
         KeptCalibration::new(header, arrays)
+    }
+
+    /// The room's light, in the form in which it is kept.
+    fn ambient(&self) -> Option<CalibratedAmbient> {
+        let Self { pixels, times } = self;
+        let ambient = pixels.ambient.as_ref()?;
+        let white_dn = pixels.white.level_dn.value;
+        let flicker = ambient.flicker.as_ref().map(|flicker| CalibratedFlicker {
+            frequency_hz: pair(flicker.frequency_hz),
+            share: pair(flicker.share),
+        });
+        let mut black: Vec<f32> =
+            ambient.projector_black_dn.iter().copied().filter(|dn| dn.is_finite()).collect();
+        black.sort_by(f32::total_cmp);
+        let black_dn = black.get(black.len() / 2).map_or(0.0, |&dn| f64::from(dn));
+        Some(CalibratedAmbient {
+            level: ambient.level_of_white(white_dn, times.row_time_us.value),
+            projector_black: black_dn / white_dn,
+            flicker,
+        })
     }
 
     /// Figures of the calibration's checks, each with its limit.
@@ -175,7 +197,7 @@ pub fn process(
     let size = (shape.rows, shape.columns);
     let first_row = state.session.first_row;
     let known = KnownRig { file: &rig, first_row, size, calibration: None };
-    let task = CalibrationTask::new(plan, calibration, &known);
+    let task = CalibrationTask::stored(plan, calibration, &known, shape.contents);
     stored.check_contents(task.contents())?;
     let before = KeptCalibration::read(session.dir()).map_err(ProcessError::Config)?;
     let refused = |error: CalibrationError| ProcessError::Config(error.to_string());

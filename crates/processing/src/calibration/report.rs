@@ -38,6 +38,7 @@ pub(super) fn make(
     sections.push(times(task, findings));
     sections.push(responses(findings));
     sections.push(pixels(findings));
+    sections.extend(ambient(kept));
     sections.push(section(
         "Checks",
         "Each with the limit beyond which a calibration is refused.",
@@ -80,6 +81,17 @@ fn found(findings: &BoardFindings) -> Block {
         vec![name.to_owned(), format!("{value:.digits$}"), format!("{sd:.digits$}")]
     });
     Block::Table(Table { headers: ["", "value", "± 1 sd"].map(Into::into).to_vec(), rows: rows.to_vec() })
+}
+
+/// The room's light, if it was measured.
+fn ambient(kept: &KeptCalibration) -> Option<Section> {
+    let (found, level) = (kept.header.ambient.as_ref()?, kept.arrays.ambient_dn_per_us.as_ref()?);
+    let picture = Picture::grey(level.view(), ToneMap::percentile(&[level.view()], 99.5))
+        .with_caption("light of the room, in counts per µs");
+    let notes =
+        found.lines().into_iter().map(|(name, said)| Block::Note(NoteLevel::Info, format!("{name}: {said}")));
+    let intro = "From black pictures of two exposures, by the times of their frames.";
+    Some(section("Light of the room", intro, notes.chain([Block::Pictures(vec![picture])]).collect()))
 }
 
 fn times(task: &CalibrationTask, findings: &BoardFindings) -> Section {

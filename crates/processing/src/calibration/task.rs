@@ -23,6 +23,8 @@ pub enum BoardPurpose {
     Capped(usize),
     /// The board under the projector's black.
     Black,
+    /// The same in a shorter exposure, which tells the room's light from the projector's black.
+    Ambient,
     /// The board under white, its light inside the exposure.
     White,
     /// The same under one of the [`GREYS`].
@@ -56,6 +58,8 @@ const PHASES: usize = 16;
 pub(super) const ROWS_PER_BLOCK: usize = 8;
 /// Exposure that contains all light of a pixel.
 pub(super) const WHOLE_US: f64 = 3600.0;
+/// Exposure of the shorter images of the room's light.
+pub(super) const AMBIENT_US: f64 = 1200.0;
 /// How long before the light of the middle camera row it begins.
 const BEFORE_LIGHT_US: f64 = 1600.0;
 /// Global exposures that show when the rows are lit.
@@ -82,8 +86,34 @@ pub struct CalibrationTask {
 impl CalibrationTask {
     /// A calibration on a rig; see [`PlaneTask::new`].
     pub fn new(plan: &Plan, calibration: CalibrationPlan, known: &KnownRig<'_>) -> Self {
+        let purposes = purposes(&calibration, known.file.projector.rows);
+        Self::with_purposes(plan, calibration, known, purposes)
+    }
+
+    /// The calibration of a session with these contents, which may be from before the room's light was measured.
+    pub fn stored(
+        plan: &Plan,
+        calibration: CalibrationPlan,
+        known: &KnownRig<'_>,
+        contents: Contents,
+    ) -> Self {
+        let task = Self::new(plan, calibration.clone(), known);
+        if task.contents() == contents {
+            return task;
+        }
+        let mut purposes = task.purposes.clone();
+        purposes.retain(|purpose| *purpose != BoardPurpose::Ambient);
+        let before = Self::with_purposes(plan, calibration, known, purposes);
+        if before.contents() == contents { before } else { task }
+    }
+
+    fn with_purposes(
+        plan: &Plan,
+        calibration: CalibrationPlan,
+        known: &KnownRig<'_>,
+        purposes: Vec<BoardPurpose>,
+    ) -> Self {
         let (rig, size) = (known.file, known.size);
-        let purposes = purposes(&calibration, rig.projector.rows);
         let raster = rig.raster();
         let lag_us = size.0 as f64 / 2.0
             * (rig.camera.row_pitch * rig.projector.row_time_us - rig.camera_row_time_us());
@@ -99,6 +129,7 @@ impl CalibrationTask {
                 BoardPurpose::SweepTime => (raster.rows as f64 * raster.row_time_us * 0.5, 1),
                 BoardPurpose::Arrival => (3.0 * raster.row_time_us, 1),
                 BoardPurpose::ExposureCheck => (1200.0, 1),
+                BoardPurpose::Ambient => (AMBIENT_US, 1),
                 BoardPurpose::Black
                 | BoardPurpose::White
                 | BoardPurpose::Grey(_)
@@ -140,7 +171,7 @@ impl CalibrationTask {
     pub fn view(&self, purpose: BoardPurpose) -> BoardView {
         let picture = match purpose {
             BoardPurpose::Capped(_) => return BoardView { subject: Subject::Cap, picture: None },
-            BoardPurpose::Black => Pattern::Black,
+            BoardPurpose::Black | BoardPurpose::Ambient => Pattern::Black,
             BoardPurpose::Grey(grey) => Pattern::Grey { level: GREYS[grey] },
             BoardPurpose::Rows(phase) => Pattern::SparseRows { phase, period: PHASES },
             BoardPurpose::RowCode(picture) => Pattern::GrayRows {
@@ -264,7 +295,8 @@ fn purposes(plan: &CalibrationPlan, projector_rows: usize) -> Vec<BoardPurpose> 
     let several = |purpose, frames| std::iter::repeat_n(purpose, frames);
     let capped =
         (0..plan.exposure_us.len()).flat_map(|exposure| several(BoardPurpose::Capped(exposure), frames));
-    let levels = [several(BoardPurpose::Black, 2 * frames), several(BoardPurpose::White, 2 * frames)];
+    let levels = [BoardPurpose::Black, BoardPurpose::Ambient, BoardPurpose::White]
+        .map(|purpose| several(purpose, 2 * frames));
     let greys = (0..GREYS.len()).flat_map(|grey| several(BoardPurpose::Grey(grey), GREY_FRAMES));
     let codes = 2 * code_bits(projector_rows) as usize;
     capped

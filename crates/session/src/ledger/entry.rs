@@ -159,6 +159,18 @@ pub struct PointEntry {
     /// saturated, and in sessions from before they were counted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub clipped_crc32: Option<u32>,
+    /// When the summed frames were exposed; `None` in sessions from before it was stored.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposed: Option<FrameStarts>,
+}
+
+/// When the frames of a point were exposed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameStarts {
+    /// The session's run that took them, counted from 1: each run has its own clock.
+    pub run: u32,
+    /// Start of the exposure of camera row 0 in each frame, in ns on the clock of frames and edges.
+    pub starts_ns: Vec<i64>,
 }
 
 impl PointEntry {

@@ -39,6 +39,7 @@ fn point(index: usize, attempt: u32) -> Entry {
         counts: counts(),
         crc32: 0xdead_beef,
         clipped_crc32: None,
+        exposed: None,
     })
 }
 

@@ -33,6 +33,7 @@ fn session() -> (tempfile::TempDir, Session) {
             counts: Counts { expected: 1, averaged: 1, ..Counts::default() },
             crc32,
             clipped_crc32: None,
+            exposed: None,
         }))
         .unwrap();
     write(&session, ledger.state(), BTreeMap::new(), json!({ "a": 1 }).as_object().cloned().unwrap())

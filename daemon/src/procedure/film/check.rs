@@ -36,6 +36,7 @@ pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError>
     let settings = task.settings().count();
     let light_periods = dark_periods + cycles.cycles as u64 * u64::from(cycles.periods_per_cycle);
     let mut warnings = model.warnings(task);
+    warnings.extend(model.lamp_warning(task, None));
     warnings.extend(room.warnings());
     Ok(CheckReport {
         points: film.points(),

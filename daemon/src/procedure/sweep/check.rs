@@ -48,6 +48,7 @@ pub fn check(sweep: &SweepTask, products: &[ProductSpec], lab: &Lab<'_>) -> Resu
     }
     warnings.extend(products.iter().filter_map(|spec| spec.beyond(model.reach_rows)));
     warnings.extend(model.warnings(task));
+    warnings.extend(model.lamp_warning(task, Some("sweep.average")));
     if memory.in_strips(memory_free_bytes) {
         warnings.push(format!(
             "{} of memory would be needed to solve the sweep in one piece and {} may be used: it is solved {STRIP_ROWS} camera rows at a time, after its end, without live estimates; the results are the same",

@@ -29,6 +29,17 @@ pub struct BoardCalibration {
     pub white_relative_sd: f64,
     /// Where the board stays in view during runs, if it does.
     pub strip: Option<BoardStrip>,
+    /// A lamp that flickered in the room; `None` if none did, or it was not measured.
+    pub lamp: Option<FlickeringLamp>,
+}
+
+/// A lamp that flickers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FlickeringLamp {
+    /// Frequency.
+    pub frequency_hz: f64,
+    /// Amplitude, of white in the time of one projector row.
+    pub amplitude: f64,
 }
 
 impl BoardCalibration {

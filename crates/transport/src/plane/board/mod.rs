@@ -11,5 +11,5 @@ mod estimate;
 pub mod images;
 pub mod times;
 
-pub use calibration::BoardCalibration;
+pub use calibration::{BoardCalibration, FlickeringLamp};
 pub use estimate::Estimate;

@@ -7,11 +7,14 @@
 //! pixel as logarithms, so that no model of the camera's noise is needed. If a stack does not determine a quantity, a
 //! [`CalibrateError`] explains why.
 //!
+//! [`DarkFlicker`] and [`LampFlicker`] are for rooms with a lamp that flickers.
+//!
 //! [`settings_on_direct_row`] and [`spike_weights`] are for projectors that draw their rows with a flying spot.
 
 mod beam;
 mod direct;
 mod error;
+mod flicker;
 mod holdout;
 mod latency;
 mod problem;
@@ -21,6 +24,10 @@ mod spike;
 pub use super::model::{FlyingSpot, Scan, settings_on_direct_row, spike_weights};
 pub use beam::{BeamEstimate, OpticsEstimate, beam_sigma, estimate_optics};
 pub use error::CalibrateError;
+pub use flicker::{
+    DarkFlicker, DarkRows, FrameExposures, LampFlicker, TimedImage, averaged_share, can_be_followed,
+    cancelling_frames,
+};
 pub use holdout::{Candidate, Choice, candidates, choose_prior};
 pub use latency::{LatencyEstimate, latency};
 pub use sample::{Optics, Sample};
