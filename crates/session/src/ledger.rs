@@ -8,14 +8,23 @@ mod entry;
 mod state;
 
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{Read, Write};
+use std::io::Write;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+
+use nix::fcntl::OFlag;
 
 use serde::Deserialize;
 
 pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, PointEntry, SessionEntry};
 pub use self::state::{Replay, State};
-use crate::{Error, Result};
+use crate::{Error, Result, input};
+
+/// Length at which a ledger is full: twice that of the longest run, 388,800 batches.
+const MOST_BYTES: u64 = 256 << 20;
+
+/// Neither follows a link nor waits for the other end of a pipe.
+const NEVER_ELSEWHERE: OFlag = OFlag::O_NOFOLLOW.union(OFlag::O_NONBLOCK);
 
 /// A ledger opened for appending. The file is locked, so only one process can do so at a time.
 #[derive(Debug)]
@@ -55,8 +64,8 @@ impl Ledger {
     /// # Errors
     /// [`Error::InUse`] if another process has it open for appending; otherwise as [`read`].
     pub fn open(path: &Path) -> Result<Ledger> {
-        let file =
-            OpenOptions::new().read(true).append(true).open(path).map_err(Error::io("open ledger", path))?;
+        let to_append = OpenOptions::new().read(true).append(true).custom_flags(NEVER_ELSEWHERE.bits()).open(path);
+        let file = to_append.map_err(Error::io("open ledger", path))?;
         lock(&file, path)?;
         let text = read_bytes(&file, path)?;
         let (entries, len) = parse(&text, path)?;
@@ -97,6 +106,9 @@ impl Ledger {
             ));
         }
         line.push(b'\n');
+        if self.len + line.len() as u64 > MOST_BYTES {
+            return Err(refused(&self.path)("the ledger is full: begin another session"));
+        }
         if let Err(error) = self.file.write_all(&line).and_then(|()| self.file.sync_data()) {
             // Half a line followed by another line would damage the ledger permanently.
             self.broken = self.file.set_len(self.len).is_err();
@@ -113,7 +125,7 @@ impl Ledger {
 /// [`Error::Io`] if it cannot be read, [`Error::Ledger`] for a corrupt line, [`Error::NewerFormat`] for a
 /// newer format.
 pub fn read(path: &Path) -> Result<Vec<Entry>> {
-    let file = File::open(path).map_err(Error::io("open ledger", path))?;
+    let file = input::open(path, MOST_BYTES).map_err(Error::io("open ledger", path))?;
     let text = read_bytes(&file, path)?;
     Ok(parse(&text, path)?.0)
 }
@@ -134,10 +146,8 @@ fn replay(entries: &[Entry], path: &Path) -> Result<State> {
     })
 }
 
-fn read_bytes(mut file: &File, path: &Path) -> Result<Vec<u8>> {
-    let mut text = Vec::new();
-    file.read_to_end(&mut text).map_err(Error::io("read ledger", path))?;
-    Ok(text)
+fn read_bytes(file: &File, path: &Path) -> Result<Vec<u8>> {
+    input::read_open(file, MOST_BYTES).map_err(Error::io("read ledger", path))
 }
 
 /// The complete entries, and their total length in bytes.

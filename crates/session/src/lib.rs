@@ -21,6 +21,7 @@ mod error;
 mod exr_file;
 pub mod film;
 mod folder;
+pub mod input;
 pub mod ledger;
 pub mod manifest;
 pub mod pattern;
