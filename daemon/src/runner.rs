@@ -35,6 +35,9 @@ use crate::run::orders::{Order, Orders};
 /// Frame rate at which a dot rig's camera is opened to check that it is present; each run opens it at its own rate.
 const LEAST_FRAME_RATE_HZ: f64 = 100.0;
 
+/// The longest run that is begun, in hours of light: a week.
+const MOST_HOURS: f64 = 168.0;
+
 /// How long a daemon that shuts down waits for a run that is being prepared.
 const MOST_PREPARING: Duration = Duration::from_millis(500);
 
@@ -279,8 +282,16 @@ impl Runner {
         self.live.as_ref().map(outlet)
     }
 
-    /// Checks that disk and memory suffice; `instead` advises the user if memory does not.
-    fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
+    /// Checks that disk and memory suffice, and that the run ends some day; `instead` advises the user if memory does
+    /// not suffice.
+    fn check_needs(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
+        if report.light_s > MOST_HOURS * 3600.0 {
+            let what = format!(
+                "the run would take {:.0} hours of light, and at most {MOST_HOURS} are allowed: take fewer points or frames",
+                report.light_s / 3600.0
+            );
+            return Err(RpcError::new(ErrorCode::InvalidPlan, what));
+        }
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
                 "the session needs {}, but {} has only {} free: free some space or give the daemon another --data",
@@ -303,7 +314,7 @@ impl Runner {
 
     fn begin(&self, params: &RunParams, orders: &Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError> {
         let foreseen = self.foresee(&params.plan)?;
-        self.check_room(&foreseen.report, foreseen.instead)?;
+        self.check_needs(&foreseen.report, foreseen.instead)?;
         self.go_on_preparing(orders)?;
         let entry = SessionEntry {
             format: raysweep_session::ledger::FORMAT,
