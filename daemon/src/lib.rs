@@ -1,6 +1,7 @@
 //! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
 
 pub mod cli;
+mod computing;
 pub mod control;
 mod devices;
 pub mod live;

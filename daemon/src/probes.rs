@@ -13,6 +13,8 @@ type Around = Arc<dyn Fn(Arc<dyn ColumnStage>) -> Arc<dyn ColumnStage> + Send + 
 pub struct Probes {
     /// On the plane rig: stages after those of the plan.
     pub stages: Vec<Arc<dyn Stage>>,
+    /// Called while a run is prepared, before its session is made.
+    pub preparing: Option<Arc<dyn Fn() + Send + Sync>>,
     /// On the dot rig: what takes the place of the plan's stage, given that one.
     pub column_stage: Option<Around>,
 }

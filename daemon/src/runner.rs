@@ -3,8 +3,9 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use raysweep_config::ConfigError;
 use raysweep_config::plan::with_tables;
@@ -17,9 +18,10 @@ use raysweep_proto::{
 };
 use raysweep_session::integrity::{Audit, Damage, DamagedPart, changed_inputs};
 use raysweep_session::ledger::{EndState, Ledger, LedgerText, SessionEntry};
-use raysweep_session::{Session, SessionSummary};
+use raysweep_session::{Session, SessionSummary, input};
 use tokio::sync::broadcast;
 
+use crate::computing::Computing;
 use crate::control::Control;
 use crate::live::{LiveFile, Outlet};
 use crate::mirror;
@@ -34,6 +36,15 @@ use crate::run::orders::{Order, Orders};
 /// Frame rate at which a dot rig's camera is opened to check that it is present; each run opens it at its own rate.
 const LEAST_FRAME_RATE_HZ: f64 = 100.0;
 
+/// The longest run that is begun, in hours of light: a week.
+const MOST_HOURS: f64 = 168.0;
+
+/// How long a daemon that shuts down waits for a run that is being prepared.
+const MOST_PREPARING: Duration = Duration::from_millis(500);
+
+/// Longest plan or rig file of a session.
+const MOST_TEXT_BYTES: u64 = 4 << 20;
+
 /// The procedure whose sessions hold calibrations.
 const CALIBRATION: &str = "calibration";
 
@@ -47,15 +58,25 @@ pub struct Runner {
     live: Option<Arc<LiveFile>>,
     memory_limit_bytes: Option<u64>,
     probes: Probes,
+    computing: Computing,
     current: Mutex<Option<Current>>,
+    /// Notified when a run's preparation has ended.
+    prepared: Condvar,
     /// Set once, when no more runs may begin.
     closed: AtomicBool,
+}
+
+/// How a run starts.
+struct Start<'a> {
+    orders: &'a Arc<Orders>,
+    is_resumed: bool,
 }
 
 /// The run in progress, or the last one.
 struct Current {
     orders: Arc<Orders>,
-    thread: JoinHandle<()>,
+    /// `None` while the run is being prepared.
+    thread: Option<JoinHandle<()>>,
 }
 
 impl Runner {
@@ -83,7 +104,9 @@ impl Runner {
             live: None,
             memory_limit_bytes: None,
             probes: Probes::default(),
+            computing: Computing::new().map_err(|error| RigError::Config(error.to_string()))?,
             current: Mutex::default(),
+            prepared: Condvar::new(),
             closed: AtomicBool::new(false),
         })
     }
@@ -130,20 +153,33 @@ impl Runner {
         foresee(&self.lab(), plan).map_err(|error| invalid_plan(&error))
     }
 
-    /// Ends the run in progress, if any, waits for it, and allows no more runs.
+    fn lock(&self) -> MutexGuard<'_, Option<Current>> {
+        self.current.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Ends the run in progress, if any, waits for it, and allows no more runs. A run that is still being prepared has
+    /// moved and stored nothing: it is waited for only shortly.
     pub fn shut_down(&self) {
+        let mut current = self.lock();
         self.closed.store(true, Ordering::Relaxed);
-        let current = self.current.lock().unwrap_or_else(PoisonError::into_inner).take();
-        if let Some(Current { orders, thread }) = current {
+        if let Some(Current { orders, .. }) = &*current {
             orders.give(Order::Cancel);
-            if thread.join().is_err() {
-                tracing::error!("the run's thread panicked");
-            }
+        }
+        let in_preparation =
+            |current: &mut Option<Current>| matches!(current, Some(Current { thread: None, .. }));
+        (current, _) = self
+            .prepared
+            .wait_timeout_while(current, MOST_PREPARING, in_preparation)
+            .unwrap_or_else(PoisonError::into_inner);
+        let thread = current.take().and_then(|current| current.thread);
+        drop(current);
+        if thread.is_some_and(|thread| thread.join().is_err()) {
+            tracing::error!("the run's thread panicked");
         }
     }
 
     fn order(&self, order: Order, from: &[RunState], to: Option<RunState>) -> Result<(), RpcError> {
-        let current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
+        let current = self.lock();
         let state = self.board.status().state;
         let Some(current) = current.as_ref().filter(|_| from.contains(&state)) else {
             let what = match (state, order) {
@@ -168,34 +204,48 @@ impl Runner {
     }
 
     /// Reserves the daemon for a run, prepares it and starts its thread; after an error, the daemon is free again.
+    /// Meanwhile, orders can be given.
     fn start(
         &self,
-        begin: impl FnOnce() -> Result<(Started, Current), RpcError>,
+        begin: impl FnOnce(&Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError>,
     ) -> Result<Started, RpcError> {
-        let mut current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
-        if self.closed.load(Ordering::Relaxed) {
-            return Err(RpcError::new(ErrorCode::Busy, "the daemon is shutting down: start it again first"));
-        }
-        self.board.go(RunState::Preparing).map_err(wrong_state)?;
-        if let Some(last) = current.take() {
+        let orders = Arc::new(Orders::default());
+        let last = {
+            let mut current = self.lock();
+            if self.closed.load(Ordering::Relaxed) {
+                return Err(RpcError::new(
+                    ErrorCode::Busy,
+                    "the daemon is shutting down: start it again first",
+                ));
+            }
+            self.board.go(RunState::Preparing).map_err(wrong_state)?;
+            current.replace(Current { orders: orders.clone(), thread: None })
+        };
+        if let Some(thread) = last.and_then(|last| last.thread) {
             // The thread of the last run had nothing left to do once the state allowed a new run.
-            let _ = last.thread.join();
+            let _ = thread.join();
         }
-        let begun = catch_unwind(AssertUnwindSafe(begin)).unwrap_or_else(|panic| {
+        let begun = catch_unwind(AssertUnwindSafe(|| begin(&orders))).unwrap_or_else(|panic| {
             let what = format!("preparing the run failed because of a bug: {}", message_of(&*panic));
             Err(RpcError::new(ErrorCode::Internal, what))
         });
-        match begun {
-            Ok((started, run)) => {
-                *current = Some(run);
-                Ok(started)
-            }
+        let mut current = self.lock();
+        let (started, thread) = match begun {
+            Ok((started, thread)) => (Ok(started), Some(thread)),
             Err(error) => {
                 // The run has not begun, so it has not failed.
                 let _ = self.board.go(RunState::Idle);
-                Err(error)
+                (Err(error), None)
             }
+        };
+        // There is no current run if the daemon did not wait for the preparation before it shut down.
+        match (&mut *current, thread) {
+            (Some(current), Some(thread)) => current.thread = Some(thread),
+            (_, None) => *current = None,
+            (None, Some(_cancelled)) => {}
         }
+        self.prepared.notify_all();
+        started
     }
 
     /// Starts the thread of a run.
@@ -204,11 +254,11 @@ impl Runner {
         foreseen: Foreseen,
         session: Session,
         ledger: Ledger,
-        is_resumed: bool,
-    ) -> Result<(Started, Current), RpcError> {
+        start: Start<'_>,
+    ) -> Result<(Started, JoinHandle<()>), RpcError> {
+        let Start { orders, is_resumed } = start;
         let dir = session.dir().to_owned();
         self.board.set_session(dir.clone());
-        let orders = Arc::new(Orders::default());
         let run = Run {
             session,
             ledger,
@@ -225,7 +275,7 @@ impl Runner {
             .map_err(|error| {
                 RpcError::new(ErrorCode::Internal, format!("cannot start the run's thread: {error}"))
             })?;
-        Ok((Started { session: dir }, Current { orders, thread }))
+        Ok((Started { session: dir }, thread))
     }
 
     fn outlet(&self, dir: &Path) -> Option<Outlet> {
@@ -234,8 +284,16 @@ impl Runner {
         self.live.as_ref().map(outlet)
     }
 
-    /// Checks that disk and memory suffice; `instead` advises the user if memory does not.
-    fn check_room(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
+    /// Checks that disk and memory suffice, and that the run ends some day; `instead` advises the user if memory does
+    /// not suffice.
+    fn check_needs(&self, report: &CheckReport, instead: &str) -> Result<(), RpcError> {
+        if report.light_s > MOST_HOURS * 3600.0 {
+            let what = format!(
+                "the run would take {:.0} hours of light, and at most {MOST_HOURS} are allowed: take fewer points or frames",
+                report.light_s / 3600.0
+            );
+            return Err(RpcError::new(ErrorCode::InvalidPlan, what));
+        }
         if report.disk_bytes > report.disk_free_bytes {
             let what = format!(
                 "the session needs {}, but {} has only {} free: free some space or give the daemon another --data",
@@ -256,9 +314,10 @@ impl Runner {
         Ok(())
     }
 
-    fn begin(&self, params: &RunParams) -> Result<(Started, Current), RpcError> {
+    fn begin(&self, params: &RunParams, orders: &Arc<Orders>) -> Result<(Started, JoinHandle<()>), RpcError> {
         let foreseen = self.foresee(&params.plan)?;
-        self.check_room(&foreseen.report, foreseen.instead)?;
+        self.check_needs(&foreseen.report, foreseen.instead)?;
+        self.go_on_preparing(orders)?;
         let entry = SessionEntry {
             format: raysweep_session::ledger::FORMAT,
             name: foreseen.name.clone(),
@@ -277,18 +336,43 @@ impl Runner {
         let (session, ledger) =
             Session::create_with(&self.data, entry, texts, keep).map_err(|NotBegun(error)| error)?;
         let dir = session.dir().to_owned();
-        self.spawn(foreseen, session, ledger, false).inspect_err(|_| {
+        self.spawn(foreseen, session, ledger, Start { orders, is_resumed: false }).inspect_err(|_| {
             // Nothing was acquired, so there is nothing to resume.
             let _ = std::fs::remove_dir_all(&dir);
         })
     }
 
-    fn resume_session(&self, params: &ResumeParams) -> Result<(Started, Current), RpcError> {
-        let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
-        let session =
-            Session::open(&self.data.join(&params.session)).map_err(|error| no_session(error.to_string()))?;
+    /// Whether a run is still wanted that is being prepared.
+    fn go_on_preparing(&self, orders: &Orders) -> Result<(), RpcError> {
+        if let Some(preparing) = &self.probes.preparing {
+            preparing();
+        }
+        match orders.go_on() {
+            true => Ok(()),
+            false => {
+                let what = "the run was cancelled while it was being prepared: nothing was moved or stored";
+                Err(RpcError::new(ErrorCode::NotRunning, what))
+            }
+        }
+    }
+
+    /// A session of the data folder, given by its folder or its name.
+    fn session(&self, given: &Path) -> Result<Session, RpcError> {
+        Session::open_below(std::slice::from_ref(&self.data), given)
+            .map_err(|error| no_session(error.to_string()))
+    }
+
+    fn resume_session(
+        &self,
+        params: &ResumeParams,
+        orders: &Arc<Orders>,
+    ) -> Result<(Started, JoinHandle<()>), RpcError> {
+        let session = self.session(&params.session)?;
         let read = |path: PathBuf| {
-            std::fs::read_to_string(&path)
+            let folders = std::slice::from_ref(&self.data);
+            input::open_below(folders, &path, MOST_TEXT_BYTES)
+                .and_then(|file| input::read_open(&file, MOST_TEXT_BYTES))
+                .map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
                 .map_err(|error| no_session(format!("cannot read {}: {}", path.display(), io_text(&error))))
         };
         let plan = read(session.plan_path())?;
@@ -331,7 +415,8 @@ impl Runner {
             );
             return Err(no_session(what));
         }
-        self.spawn(foreseen, session, ledger, true)
+        self.go_on_preparing(orders)?;
+        self.spawn(foreseen, session, ledger, Start { orders, is_resumed: true })
     }
 }
 
@@ -345,23 +430,34 @@ impl Control for Runner {
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
-        let Foreseen { mut report, procedure, .. } = self.foresee(plan)?;
-        procedure.advise(&mut report);
-        Ok(report)
+        self.computing.check(
+            plan,
+            || self.board.status().state,
+            || {
+                let Foreseen { mut report, procedure, .. } = self.foresee(plan)?;
+                procedure.advise(&mut report);
+                Ok(report)
+            },
+        )
     }
 
     fn design(&self, params: &DesignParams) -> Result<DesignReport, RpcError> {
-        let report = self.foresee(&params.plan)?.procedure.design(params)?;
-        let plan = with_tables(&params.plan, &report.plan).map_err(|error| invalid_plan(&error))?;
-        Ok(DesignReport { plan, ..report })
+        self.computing.between_runs(
+            || self.board.status().state,
+            || {
+                let report = self.foresee(&params.plan)?.procedure.design(params)?;
+                let plan = with_tables(&params.plan, &report.plan).map_err(|error| invalid_plan(&error))?;
+                Ok(DesignReport { plan, ..report })
+            },
+        )
     }
 
     fn run(&self, params: RunParams) -> Result<Started, RpcError> {
-        self.start(|| self.begin(&params))
+        self.start(|orders| self.begin(&params, orders))
     }
 
     fn resume(&self, params: ResumeParams) -> Result<Started, RpcError> {
-        self.start(|| self.resume_session(&params))
+        self.start(|orders| self.resume_session(&params, orders))
     }
 
     fn pause(&self) -> Result<(), RpcError> {
@@ -391,7 +487,8 @@ impl Control for Runner {
     }
 
     fn sessions(&self) -> Result<Vec<SessionInfo>, RpcError> {
-        let listing = raysweep_session::list(&self.data).map_err(|error| storage(&error))?;
+        let listing =
+            self.computing.now(|| raysweep_session::list(&self.data)).map_err(|error| storage(&error))?;
         let readable = listing.sessions.into_iter().map(|session| SessionInfo {
             session: session.dir,
             name: session.name,
@@ -415,7 +512,8 @@ impl Control for Runner {
         if !self.data.exists() {
             return Ok(Vec::new());
         }
-        let listing = raysweep_session::list(&self.data).map_err(|error| storage(&error))?;
+        let listing =
+            self.computing.now(|| raysweep_session::list(&self.data)).map_err(|error| storage(&error))?;
         let in_use = CalibrationHeader::read(&current_in(&self.data)).ok().flatten();
         let measured = listing.sessions.into_iter().filter(|session| session.kind == CALIBRATION);
         let info = |session: SessionSummary| {
@@ -437,14 +535,11 @@ impl Control for Runner {
     }
 
     fn use_calibration(&self, session: &Path) -> Result<(), RpcError> {
-        let no_session = |what: String| RpcError::new(ErrorCode::NoSession, what);
-        let folder = self.data.join(session);
-        if let Ok(session) = Session::open(&folder) {
-            let damage = damaged_calibration(&session).map_err(|error| storage(&error))?;
-            if let Some(damage) = damage {
-                let advice = "`raysweep process` with --accept-damage makes it again";
-                return Err(no_session(format!("{}: {damage}; {advice}", folder.display())));
-            }
+        let session = self.session(session)?;
+        let folder = session.dir().to_owned();
+        if let Some(damage) = damaged_calibration(&session).map_err(|error| storage(&error))? {
+            let advice = "`raysweep process` with --accept-damage makes it again";
+            return Err(no_session(format!("{}: {damage}; {advice}", folder.display())));
         }
         let kept = KeptCalibration::read(&folder).map_err(no_session)?.ok_or_else(|| {
             no_session(format!(
@@ -452,6 +547,7 @@ impl Control for Runner {
                 folder.display()
             ))
         })?;
+        self.computing.forget();
         kept.use_in(&self.data).map_err(|error| storage(&error))
     }
 
@@ -469,6 +565,10 @@ fn damaged_calibration(session: &Session) -> raysweep_session::Result<Option<Dam
         part => matches!(part, DamagedPart::Manifest),
     };
     Ok(Audit::without_data(session, &text, &state)?.damage.into_iter().find(is_of_calibration))
+}
+
+fn no_session(what: String) -> RpcError {
+    RpcError::new(ErrorCode::NoSession, what)
 }
 
 fn invalid_plan(error: &ConfigError) -> RpcError {

@@ -169,8 +169,8 @@ fn raw_frames_are_kept_with_the_place_of_each() {
 
 #[test]
 fn lighting_patterns_come_from_images_and_sequences() {
-    let bench = Bench::dots(&rig(""));
     let folder = tempfile::tempdir().unwrap();
+    let bench = Bench::dots(&format!("plan_folders = [{:?}]\n{}", folder.path(), rig("")));
     let file = |name: &str| folder.path().join(name);
     let half = |at: usize, columns: usize| if at < columns / 2 { 1.0_f32 } else { 0.0 };
     let left = Array2::from_shape_fn((4, 8), |(_, column)| half(column, 8));

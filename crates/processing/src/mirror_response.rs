@@ -5,12 +5,15 @@ use std::path::{Path, PathBuf};
 use jiff::Timestamp;
 use raysweep_config::rig::dots::ResponseKey;
 use raysweep_config::{ConfigError, DotRigFile};
-use raysweep_core::SecondOrder;
+use raysweep_core::{SecondOrder, io_text};
 use raysweep_session::ledger::State;
-use raysweep_session::{Error, Result, Session, durable};
+use raysweep_session::{Error, Result, Session, durable, input};
 use raysweep_transport::dots::identify::{Identified, Resonance};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
+
+/// Most bytes of the file.
+const MOST_BYTES: u64 = 1 << 20;
 
 /// Path of the file in the daemon's data folder or a session's folder.
 pub fn path_in(folder: &Path) -> PathBuf {
@@ -81,7 +84,7 @@ impl KeptResponse {
     }
 
     fn read(path: &Path) -> std::result::Result<Self, String> {
-        let text = std::fs::read(path).map_err(|error| error.to_string())?;
+        let text = input::read(path, MOST_BYTES).map_err(|error| io_text(&error))?;
         let kept: Self = serde_json::from_slice(&text).map_err(|error| error.to_string())?;
         Ok(kept)
     }

@@ -22,4 +22,10 @@ pub use rpc::{EventNotice, Id, Incoming, Outcome, Request, Response, params};
 pub const MAX_MESSAGE_BYTES: usize = 1 << 20;
 
 /// Maximum number of connected clients.
-pub const MAX_CLIENTS: usize = 32;
+pub const MAX_CLIENTS: usize = 64;
+
+/// Maximum number of connections of one user.
+pub const MAX_CLIENTS_PER_USER: usize = 16;
+
+/// Number of connections that only operators may take.
+pub const CLIENTS_OF_OPERATORS: usize = 16;

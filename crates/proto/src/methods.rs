@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::live::{self, LiveLayout};
 use crate::{
-    CalibrationInfo, CheckParams, CheckReport, DesignParams, DesignReport, ErrorCode, Event, MAX_CLIENTS,
-    MAX_MESSAGE_BYTES, ResumeParams, RunParams, SessionInfo, Started, Status, UseCalibrationParams,
+    CLIENTS_OF_OPERATORS, CalibrationInfo, CheckParams, CheckReport, DesignParams, DesignReport, ErrorCode,
+    Event, MAX_CLIENTS, MAX_CLIENTS_PER_USER, MAX_MESSAGE_BYTES, ResumeParams, RunParams, SessionInfo,
+    Started, Status, UseCalibrationParams,
 };
 
 /// Role of a caller.
@@ -226,6 +227,12 @@ pub struct LimitsInfo {
     pub message_bytes: usize,
     /// Maximum number of connected clients.
     pub clients: usize,
+    /// Maximum number of connections of one user; 0: the daemon is older and has no such limit.
+    #[serde(default)]
+    pub clients_per_user: usize,
+    /// Number of connections that only operators may take.
+    #[serde(default)]
+    pub clients_of_operators: usize,
 }
 
 /// The result of `describe` for a daemon of this version.
@@ -239,7 +246,12 @@ pub fn describe(version: &str) -> Description {
         methods: methods.into(),
         event: sent::<Event>(),
         errors: error_codes(),
-        limits: LimitsInfo { message_bytes: MAX_MESSAGE_BYTES, clients: MAX_CLIENTS },
+        limits: LimitsInfo {
+            message_bytes: MAX_MESSAGE_BYTES,
+            clients: MAX_CLIENTS,
+            clients_per_user: MAX_CLIENTS_PER_USER,
+            clients_of_operators: CLIENTS_OF_OPERATORS,
+        },
         live: live::layout(),
     }
 }

@@ -115,10 +115,12 @@ impl DraftDir {
     /// Creates the temporary folder, replacing one that a crash left behind.
     pub(crate) fn create(target: &Path) -> Result<DraftDir> {
         let path = temporary_path(target);
-        if path.exists() {
-            fs::remove_dir_all(&path).map_err(Error::io("remove", &path))?;
+        match fs::remove_dir_all(&path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                return Err(Error::io("remove", &path)(error));
+            }
+            _ => create_dir(&path)?,
         }
-        create_dir(&path)?;
         Ok(DraftDir { target: target.to_owned(), path })
     }
 
@@ -160,10 +162,17 @@ pub(crate) struct DraftFile {
 }
 
 impl DraftFile {
-    /// Creates the temporary file; overwrites a stale one.
+    /// Creates the temporary file; replaces a stale one, or a link that somebody has put in its place.
     pub(crate) fn create(target: &Path) -> Result<DraftFile> {
         let path = temporary_path(target);
-        let file = File::create(&path).map_err(Error::io("write", &path))?;
+        match fs::remove_file(&path) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                return Err(Error::io("remove", &path)(error));
+            }
+            _ => {}
+        }
+        // Fails if anything has the name, even a dangling link.
+        let file = File::create_new(&path).map_err(Error::io("write", &path))?;
         Ok(DraftFile { target: target.to_owned(), path, file })
     }
 
@@ -198,16 +207,21 @@ impl Drop for DraftFile {
 }
 
 /// Removes the temporary files and folders that crashes left anywhere below `dir`; returns how many. Only the
-/// single process that writes there may call it.
+/// single process that writes there may call it, before it writes.
 ///
 /// # Errors
-/// [`Error::Io`] if the file system refuses.
+/// [`Error::Io`] if the file system refuses, and for a symbolic link: what is written there would land elsewhere.
 pub fn remove_leftovers(dir: &Path) -> Result<usize> {
     let mut removed = 0;
     for entry in fs::read_dir(dir).map_err(Error::io("list", dir))? {
         let entry = entry.map_err(Error::io("list", dir))?;
         let path = entry.path();
-        let is_dir = entry.file_type().map_err(Error::io("examine", &path))?.is_dir();
+        let kind = entry.file_type().map_err(Error::io("examine", &path))?;
+        let is_dir = kind.is_dir();
+        if kind.is_symlink() && !is_temporary(&path) {
+            let why = "it is a symbolic link, and a session contains none: put the file itself in its place";
+            return Err(Error::io("write to", &path)(io::Error::other(why)));
+        }
         if is_temporary(&path) {
             if is_dir { fs::remove_dir_all(&path) } else { fs::remove_file(&path) }
                 .map_err(Error::io("remove", &path))?;
@@ -288,6 +302,29 @@ mod tests {
         let error = write(&path, b"new").unwrap_err();
         assert!(matches!(&error, Error::Io { path: named, .. } if named.starts_with(dir.path())), "{error}");
         assert_eq!(fs::read(&path).unwrap(), b"old");
+    }
+
+    #[test]
+    fn nothing_is_written_through_a_link() {
+        use std::os::unix::fs::symlink;
+        let dir = tempfile::tempdir().unwrap();
+        let (precious, session) = (dir.path().join("precious"), dir.path().join("session"));
+        fs::write(&precious, "mine").unwrap();
+        create_dir_all(&session).unwrap();
+        let (file, folder) = (session.join("manifest.json"), session.join("transport.zarr"));
+        symlink(&precious, temporary_path(&file)).unwrap();
+        symlink(dir.path(), temporary_path(&folder)).unwrap();
+        write(&file, b"ours").unwrap();
+        assert!(
+            replace_dir(&folder, |fresh| write(&fresh.join("x"), b"1")).is_err() || folder.join("x").exists()
+        );
+        assert_eq!(fs::read(&precious).unwrap(), b"mine");
+        assert!(!dir.path().join("x").exists());
+        assert!(fs::symlink_metadata(&file).unwrap().is_file());
+        symlink(dir.path(), session.join("products")).unwrap();
+        fs::write(dir.path().join("kept.raysweep-tmp"), "mine").unwrap();
+        assert!(remove_leftovers(&session).unwrap_err().to_string().contains("symbolic link"));
+        assert!(dir.path().join("kept.raysweep-tmp").exists());
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use jiff::tz::TimeZone;
+use raysweep_core::io_text;
 
 use crate::dots::Dots;
 use crate::film::Film;
@@ -13,7 +14,7 @@ use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, SessionEntry, Sta
 use crate::manifest::{self, FileRecord};
 use crate::products::Products;
 use crate::stack::{Contents, Stack};
-use crate::{Error, Result, durable};
+use crate::{Error, Result, durable, input};
 
 /// Maximum bytes of a session's name that are used in its folder's name.
 const NAME_MAX_BYTES: usize = 64;
@@ -92,13 +93,23 @@ impl Session {
         Ok(())
     }
 
+    /// Opens a session below one of these folders, given by its full path or by its name in one of them. Symbolic links
+    /// and other ways out of the folders are refused.
+    ///
+    /// # Errors
+    /// [`Error::NotASession`].
+    pub fn open_below(folders: &[PathBuf], given: &Path) -> Result<Session> {
+        let refused = |error: io::Error| Error::NotASession { path: given.to_owned(), why: io_text(&error) };
+        Session::open(&input::folder_below(folders, given).map_err(refused)?)
+    }
+
     /// Opens an existing session, to read it or to continue it ([`Session::resume`]).
     ///
     /// # Errors
     /// [`Error::NotASession`] if there is no ledger.
     pub fn open(dir: &Path) -> Result<Session> {
         let session = Session { dir: dir.to_owned() };
-        match fs::metadata(session.ledger_path()) {
+        match fs::symlink_metadata(session.ledger_path()) {
             Ok(ledger) if ledger.is_file() => Ok(session),
             Ok(_) => {
                 Err(Error::NotASession { path: dir.to_owned(), why: "its ledger.jsonl is not a file".into() })
@@ -492,5 +503,38 @@ mod tests {
         drop(ledger);
         let _ledger = session.resume().unwrap();
         assert!(!leftover.exists());
+    }
+
+    #[test]
+    fn a_session_is_opened_below_its_folder_or_not_at_all() {
+        let top = tempfile::tempdir().unwrap();
+        let data = top.path().join("data");
+        let (inside, _) = Session::create(&data, session("in"), "", "").unwrap();
+        let (outside, _) = Session::create(&top.path().join("other"), session("out"), "", "").unwrap();
+        std::os::unix::fs::symlink(outside.dir(), data.join("link")).unwrap();
+        let name = inside.dir().file_name().unwrap();
+        let open = |given: &Path| Session::open_below(std::slice::from_ref(&data), given);
+        assert_eq!(open(Path::new(name)).unwrap(), inside);
+        assert_eq!(open(inside.dir()).unwrap(), inside);
+        let other = Path::new("../other").join(outside.dir().file_name().unwrap());
+        for given in [Path::new("link"), outside.dir(), &other, Path::new("."), Path::new("missing")] {
+            let error = open(given).unwrap_err();
+            assert!(matches!(error, Error::NotASession { .. }), "{}: {error}", given.display());
+        }
+        // A ledger that lies elsewhere would be continued there.
+        fs::rename(inside.ledger_path(), top.path().join("ledger")).unwrap();
+        std::os::unix::fs::symlink(top.path().join("ledger"), inside.ledger_path()).unwrap();
+        assert!(open(inside.dir()).is_err());
+        assert!(Ledger::open(&inside.ledger_path()).is_err());
+    }
+
+    #[test]
+    fn a_ledger_too_long_for_memory_is_not_read() {
+        let root = tempfile::tempdir().unwrap();
+        let (session, _) = Session::create(root.path(), session("a"), "", "").unwrap();
+        fs::File::options().write(true).open(session.ledger_path()).unwrap().set_len(20 << 30).unwrap();
+        for error in [session.state().map(drop).unwrap_err(), session.resume().map(drop).unwrap_err()] {
+            assert!(error.to_string().contains("limit"), "{error}");
+        }
     }
 }

@@ -11,8 +11,11 @@ mod state;
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+
+use nix::fcntl::OFlag;
 
 use serde::Deserialize;
 
@@ -21,7 +24,13 @@ pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, FrameStarts,
 pub use self::state::{Replay, State};
 use crate::damage::Damage;
 use crate::durable::DraftFile;
-use crate::{Error, Result};
+use crate::{Error, Result, input};
+
+/// Length at which a ledger is full: twice that of the longest run, 388,800 batches.
+const MOST_BYTES: u64 = 256 << 20;
+
+/// Neither follows a link nor waits for the other end of a pipe.
+const NEVER_ELSEWHERE: OFlag = OFlag::O_NOFOLLOW.union(OFlag::O_NONBLOCK);
 
 /// A ledger opened for appending. The file is locked, so only one process can do so at a time.
 #[derive(Debug)]
@@ -51,7 +60,7 @@ impl LedgerText {
     /// # Errors
     /// [`Error::Io`] if it cannot be read, [`Error::NewerFormat`] for a newer format.
     pub fn read(path: &Path) -> Result<Self> {
-        let file = File::open(path).map_err(Error::io("open ledger", path))?;
+        let file = input::open(path, MOST_BYTES).map_err(Error::io("open ledger", path))?;
         Ok(parse(&read_bytes(&file, path)?, path)?.0)
     }
 
@@ -126,8 +135,9 @@ impl Ledger {
     /// [`Error::InUse`] if another process has it open for appending; otherwise as [`LedgerText::read`] and
     /// [`LedgerText::replay`].
     pub fn open_damaged(path: &Path) -> Result<(Ledger, LedgerText)> {
-        let file =
-            OpenOptions::new().read(true).append(true).open(path).map_err(Error::io("open ledger", path))?;
+        let to_append =
+            OpenOptions::new().read(true).append(true).custom_flags(NEVER_ELSEWHERE.bits()).open(path);
+        let file = to_append.map_err(Error::io("open ledger", path))?;
         lock(&file, path)?;
         let bytes = read_bytes(&file, path)?;
         let (text, chain) = parse(&bytes, path)?;
@@ -178,6 +188,9 @@ impl Ledger {
         // The closing brace follows the checksum.
         line.pop();
         let line = self.chain.seal(line);
+        if self.len + line.len() as u64 > MOST_BYTES {
+            return Err(refused(&self.path)("the ledger is full: begin another session"));
+        }
         if let Err(error) = self.file.write_all(&line).and_then(|()| self.file.sync_data()) {
             // Half a line followed by another line would damage the ledger permanently.
             self.broken = self.file.set_len(self.len).is_err();
@@ -206,10 +219,8 @@ pub fn read_state(path: &Path) -> Result<State> {
     Ok(LedgerText::read(path)?.whole(path)?.1)
 }
 
-fn read_bytes(mut file: &File, path: &Path) -> Result<Vec<u8>> {
-    let mut text = Vec::new();
-    file.read_to_end(&mut text).map_err(Error::io("read ledger", path))?;
-    Ok(text)
+fn read_bytes(file: &File, path: &Path) -> Result<Vec<u8>> {
+    input::read_open(file, MOST_BYTES).map_err(Error::io("read ledger", path))
 }
 
 /// What a ledger's bytes say, and the chain that its next line continues.

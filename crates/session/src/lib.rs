@@ -22,6 +22,7 @@ mod error;
 mod exr_file;
 pub mod film;
 mod folder;
+pub mod input;
 pub mod integrity;
 pub mod ledger;
 pub mod manifest;

@@ -20,8 +20,9 @@ use zarrs::storage::{
     Bytes, MaybeBytesIterator, OffsetBytesIterator, ReadableStorageTraits, StorageError, StoreKey,
     StorePrefix, WritableStorageTraits,
 };
+use zstd::zstd_safe;
 
-use crate::{Error, Result, durable};
+use crate::{Error, Result, durable, input};
 
 /// Maximum rows and columns of a chunk.
 pub(crate) const CHUNK_PX: usize = 64;
@@ -153,6 +154,41 @@ pub(crate) fn open_array(store: &Arc<DurableStore>, name: &str, axes: usize) -> 
         return Err(Error::Shape { what, found, allowed: format!("{axes} axes") });
     }
     Ok(array.with_codec_specific_options(&in_fixed_order()))
+}
+
+/// Longest `zarr.json` of an array that a client names.
+const MOST_METADATA_BYTES: u64 = 1 << 20;
+
+/// Refuses an array, given by its folder, whose metadata are no regular file of a usual length.
+pub(crate) fn check_metadata_file(array: &Path) -> Result<()> {
+    let path = array.join("zarr.json");
+    input::open(&path, MOST_METADATA_BYTES).map(drop).map_err(Error::io("read", &path))
+}
+
+/// Refuses an array unless it has a single chunk, packed as ours are, that says truly how long it becomes: the decoder
+/// allocates what a chunk claims.
+pub(crate) fn check_only_chunk(array: &Array<DurableStore>, element_bytes: usize) -> Result<()> {
+    let path = path_of(array);
+    let damaged = |why: &str| Error::codec("read", path.display())(why);
+    let metadata = serde_json::to_value(array.metadata()).map_err(Error::codec("read", path.display()))?;
+    let codecs = metadata["codecs"].as_array().map(Vec::as_slice).unwrap_or_default();
+    if !codecs.iter().map(|codec| &codec["name"]).eq(["bytes", "zstd"]) {
+        return Err(damaged("its codecs are not those of a session, bytes and zstd"));
+    }
+    let first = vec![0; array.shape().len()];
+    let chunk = array.chunk_shape(&first).map_err(Error::zarr("read", &path))?;
+    if chunk.iter().map(|side| side.get()).ne(array.shape().iter().copied()) {
+        return Err(damaged("it is not stored as a single chunk"));
+    }
+    let bytes = array.shape().iter().product::<u64>() * element_bytes as u64;
+    let file = array.storage().files.key_to_fspath(&array.chunk_key(&first));
+    // Zstandard stores what it cannot pack as it is, with 3 bytes for each block of at least 1 KB and less than 32 around.
+    let packed = input::read(&file, bytes + bytes / 256 + 64).map_err(Error::io("read", &file))?;
+    let is_whole = zstd_safe::find_frame_compressed_size(&packed) == Ok(packed.len());
+    if !is_whole || zstd_safe::get_frame_content_size(&packed).ok().flatten() != Some(bytes) {
+        return Err(damaged("its chunk is damaged, or does not unpack to the array's size"));
+    }
+    Ok(())
 }
 
 fn path_of(array: &Array<DurableStore>) -> PathBuf {

@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use bytesize::ByteSize;
 use clap::Parser;
+use nix::sys::stat::{Mode, umask};
+use nix::unistd::{AccessFlags, access};
 use raysweep::Runner;
 use raysweep::control::Control;
 use raysweep::live::{LiveError, LiveFile};
@@ -54,6 +56,8 @@ struct Arguments {
 fn main() -> ExitCode {
     let colours = std::io::stderr().is_terminal();
     tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).with_ansi(colours).init();
+    // The group may read sessions and process them; nobody else may write them.
+    umask(Mode::S_IWGRP | Mode::S_IRWXO);
     let mut arguments = Arguments::parse();
     // Clients print the paths of sessions, in other working directories.
     if let Ok(data) = std::path::absolute(&arguments.data) {
@@ -145,9 +149,7 @@ fn park_left_behind(data: &Path) {
 /// Creates the data folder if it is missing, and checks that sessions can be stored in it.
 fn prepare_data(folder: &Path) -> std::io::Result<()> {
     std::fs::create_dir_all(folder)?;
-    let probe = folder.join(format!(".raysweepd-{}", std::process::id()));
-    std::fs::create_dir(&probe)?;
-    std::fs::remove_dir(&probe)
+    Ok(access(folder, AccessFlags::W_OK | AccessFlags::X_OK)?)
 }
 
 async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn std::error::Error>> {
@@ -158,6 +160,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
     tracing::info!("listening on {}", listening_on(&listener, &arguments.socket).display());
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut hangup = signal(SignalKind::hangup())?;
     let watchdog = tokio::spawn(feed_watchdog(runner.clone()));
     let _ = sd_notify::notify(&[NotifyState::Ready]);
     let ended = {
@@ -166,6 +169,8 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
             tokio::select! {
                 _ = terminate.recv() => {}
                 _ = interrupt.recv() => {}
+                // The terminal was closed.
+                _ = hangup.recv() => {}
             }
             tracing::info!("shutting down");
             let _ = sd_notify::notify(&[NotifyState::Stopping]);

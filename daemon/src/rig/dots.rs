@@ -55,8 +55,9 @@ impl DotRig {
         Self::of(file, source)
     }
 
-    pub(super) fn of(file: DotRigFile, source: Source<'_>) -> Result<Self, RigError> {
+    pub(super) fn of(mut file: DotRigFile, source: Source<'_>) -> Result<Self, RigError> {
         let folder = source.folder().to_owned();
+        file.plan_folders.iter_mut().for_each(|allowed| *allowed = folder.join(&*allowed));
         let setup = DotsSetup {
             format: file.camera.pixel_format,
             white_dn: file.camera.white_dn(),

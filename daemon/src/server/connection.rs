@@ -15,26 +15,25 @@ use tokio_util::bytes::BytesMut;
 use tokio_util::codec::{Decoder, LinesCodec, LinesCodecError};
 use tokio_util::sync::CancellationToken;
 
-use super::access::Peer;
+use super::seats::Seat;
 use super::{Desk, dispatch};
 
 /// Serves a client until it hangs up, violates the line protocol, stops reading, or `stop` is set.
-pub(super) async fn attend(stream: UnixStream, desk: Arc<Desk>, stop: CancellationToken) {
-    let peer = match desk.access.peer(&stream) {
-        Ok(peer) => peer,
-        Err(error) => {
-            tracing::warn!(%error, "a client without credentials is dropped");
-            return;
-        }
-    };
+pub(super) async fn attend(stream: UnixStream, mut seat: Seat, desk: Arc<Desk>, stop: CancellationToken) {
+    let peer = seat.peer;
     let asked = desk.clone();
     // Looking up groups may query a server over the network.
     let role = tokio::task::spawn_blocking(move || asked.access.role(peer)).await.unwrap_or(Role::Observer);
     tracing::debug!(uid = peer.uid, ?role, "a client has connected");
+    if role == Role::Observer
+        && let Err(error) = seat.observe()
+    {
+        return super::turn_away(stream, error, desk.limits).await;
+    }
     let (reader, writer) = stream.into_split();
     let lines = Lines::new(reader, desk.limits.message_bytes);
-    let mut connection = Connection { lines, writer, desk, peer, role, events: None };
-    match connection.converse(&stop).await {
+    let mut connection = Connection { lines, writer, desk, seat, role, stop, events: None };
+    match connection.converse().await {
         Ok(()) => tracing::debug!(uid = peer.uid, "a client has gone"),
         // Clients end in this way whenever they exit before they have read everything.
         Err(error) if is_gone(&error) => tracing::debug!(uid = peer.uid, "a client has disconnected"),
@@ -48,16 +47,17 @@ struct Connection {
     lines: Lines,
     writer: OwnedWriteHalf,
     desk: Arc<Desk>,
-    peer: Peer,
+    seat: Seat,
     role: Role,
+    stop: CancellationToken,
     events: Option<broadcast::Receiver<Event>>,
 }
 
 impl Connection {
-    async fn converse(&mut self, stop: &CancellationToken) -> io::Result<()> {
+    async fn converse(&mut self) -> io::Result<()> {
         loop {
             tokio::select! {
-                () = stop.cancelled() => return self.farewell().await,
+                () = self.stop.cancelled() => return self.farewell().await,
                 line = self.lines.next() => match line? {
                     Line::Text(text) => self.answer(&text).await?,
                     Line::NotUtf8 => {
@@ -95,8 +95,15 @@ impl Connection {
             return Err(RpcError::new(ErrorCode::MethodNotFound, message).of_field("method"));
         };
         if method.role() == Role::Operator && self.role != Role::Operator {
-            return Err(self.desk.access.forbidden(method, self.peer));
+            return Err(self.desk.access.forbidden(method, self.seat.peer));
         }
+        let _turn = match dispatch::computes(method) {
+            true => tokio::select! {
+                turn = self.seat.turn() => turn,
+                () = self.stop.cancelled() => return Err(RpcError::new(ErrorCode::Busy, "the daemon is shutting down")),
+            },
+            false => None,
+        };
         let control = self.desk.control.clone();
         let call = move || dispatch::carry_out(&*control, method, request.params);
         let reply = tokio::task::spawn_blocking(call).await.map_err(|error| {

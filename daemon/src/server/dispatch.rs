@@ -18,6 +18,11 @@ pub(super) struct CallResult {
     pub events: Option<broadcast::Receiver<Event>>,
 }
 
+/// Whether a call may take long, or reads many files.
+pub(super) fn computes(method: Method) -> bool {
+    matches!(method, Method::Check | Method::Design | Method::Sessions | Method::Calibrations)
+}
+
 /// Executes a call; may block.
 pub(super) fn carry_out(
     control: &dyn Control,

@@ -1,19 +1,20 @@
 //! The listening socket: our own, or one passed by the service manager.
 
-use std::fs;
+use std::fs::{self, File, TryLockError};
 use std::io::{self, ErrorKind};
 use std::os::fd::{FromRawFd, OwnedFd};
-use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt, PermissionsExt};
 use std::os::unix::net::{UnixListener as StdListener, UnixStream as StdStream};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use nix::fcntl::OFlag;
 use nix::sys::socket::{getsockopt, sockopt::AcceptConn};
 use raysweep_core::io_text;
 use tokio::net::UnixListener;
 
-/// Owner and group may connect; [`super::Access`] decides which of them may operate the rig.
-const SOCKET_MODE: u32 = 0o660;
+/// Everybody may connect; [`super::Access`] decides who may operate the rig and who only observes.
+const SOCKET_MODE: u32 = 0o666;
 
 /// Why the daemon cannot listen.
 #[derive(Debug, thiserror::Error)]
@@ -48,26 +49,43 @@ pub struct Listening {
 
 /// The file of a socket that we created; it is removed when this is dropped.
 #[derive(Debug)]
-pub struct SocketFile(PathBuf);
+pub struct SocketFile {
+    path: PathBuf,
+    /// Locked until the socket is removed. It stays: if it were removed, two daemons could lock two files.
+    _lock: File,
+}
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        if let Err(error) = fs::remove_file(&self.0) {
-            tracing::warn!(%error, path = %self.0.display(), "cannot remove the socket");
+        if let Err(error) = fs::remove_file(&self.path) {
+            tracing::warn!(%error, path = %self.path.display(), "cannot remove the socket");
         }
     }
 }
 
 impl Listening {
-    /// Creates a socket with mode 0660. A socket left by a dead daemon is replaced.
+    /// Creates a socket with mode 0666. A socket left by a dead daemon is replaced. A lock beside it, its name with
+    /// `.lock` at the end, decides between daemons that start at once.
     ///
     /// # Errors
     /// [`ListenError::Taken`], [`ListenError::NotASocket`], [`ListenError::Bind`].
     pub fn bind(path: &Path) -> Result<Self, ListenError> {
-        remove_stale(path)?;
         let failed = |source| ListenError::Bind { path: path.to_owned(), source };
+        let lock = File::options()
+            .write(true)
+            .create(true)
+            .truncate(false)
+            .custom_flags(OFlag::O_NOFOLLOW.bits())
+            .mode(0o600)
+            .open(lock_of(path))
+            .map_err(failed)?;
+        lock.try_lock().map_err(|error| match error {
+            TryLockError::WouldBlock => ListenError::Taken(path.to_owned()),
+            TryLockError::Error(source) => failed(source),
+        })?;
+        remove_stale(path)?;
         let listener = UnixListener::bind(path).map_err(failed)?;
-        let file = SocketFile(path.to_owned());
+        let file = SocketFile { path: path.to_owned(), _lock: lock };
         fs::set_permissions(path, fs::Permissions::from_mode(SOCKET_MODE)).map_err(failed)?;
         Ok(Self { listener, file: Some(file) })
     }
@@ -115,6 +133,12 @@ impl Listening {
     }
 }
 
+fn lock_of(socket: &Path) -> PathBuf {
+    let mut name = socket.as_os_str().to_owned();
+    name.push(".lock");
+    name.into()
+}
+
 /// Removes a socket that nobody listens on.
 fn remove_stale(path: &Path) -> Result<(), ListenError> {
     let Ok(metadata) = fs::symlink_metadata(path) else { return Ok(()) };
@@ -139,20 +163,49 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("raysweepd.sock");
         let first = Listening::bind(&path).unwrap();
-        assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o660);
+        assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o666);
         let taken = Listening::bind(&path).unwrap_err();
         assert!(matches!(taken, ListenError::Taken(_)), "{taken}");
         StdStream::connect(&path).expect("the first is still there");
 
-        // A killed daemon removes nothing.
+        // A killed daemon removes nothing, and its locks end with it.
         let Listening { listener, file } = first;
-        std::mem::forget(file);
-        drop(listener);
+        drop((listener, file));
+        drop(StdListener::bind(&path).unwrap());
         assert!(path.exists());
         let second = Listening::bind(&path).unwrap();
         StdStream::connect(&path).unwrap();
         drop(second);
         assert!(!path.exists(), "a daemon that ends in order leaves nothing");
+    }
+
+    #[tokio::test]
+    async fn of_daemons_that_start_at_once_one_listens() {
+        let folder = tempfile::tempdir().unwrap();
+        for round in 0..50 {
+            let path = folder.path().join(format!("{round}.sock"));
+            drop(StdListener::bind(&path).unwrap());
+            let handle = tokio::runtime::Handle::current();
+            let listening: Vec<_> = std::thread::scope(|scope| {
+                let bind = || {
+                    let _within = handle.enter();
+                    Listening::bind(&path).ok()
+                };
+                let daemons: Vec<_> = (0..4).map(|_| scope.spawn(bind)).collect();
+                daemons.into_iter().filter_map(|daemon| daemon.join().unwrap()).collect()
+            });
+            assert_eq!(listening.len(), 1, "round {round}");
+            StdStream::connect(&path).expect("nobody has removed its socket");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_daemon_whose_socket_was_made_by_an_earlier_version_is_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("raysweepd.sock");
+        let _without_lock = StdListener::bind(&path).unwrap();
+        assert!(matches!(Listening::bind(&path), Err(ListenError::Taken(_))));
+        StdStream::connect(&path).unwrap();
     }
 
     #[tokio::test]

@@ -1,6 +1,7 @@
 //! The socket: JSON-RPC 2.0, one message per line, for several clients at once.
 //!
 //! One task serves one client, one request after another, so that at most [`Limits::clients`] calls are in progress.
+//! Of each user, one call at a time computes.
 //! Calls run on tokio's blocking threads; events arrive over a broadcast channel that never waits for a reader, so
 //! that no client slows down the run.
 
@@ -8,6 +9,7 @@ mod access;
 mod connection;
 mod dispatch;
 mod listen;
+mod seats;
 
 use std::future::Future;
 use std::io;
@@ -15,13 +17,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use nix::errno::Errno;
-use raysweep_proto::{ErrorCode, Id, MAX_CLIENTS, MAX_MESSAGE_BYTES, Response, RpcError};
+use raysweep_proto::{
+    CLIENTS_OF_OPERATORS, Id, MAX_CLIENTS, MAX_CLIENTS_PER_USER, MAX_MESSAGE_BYTES, Response, RpcError,
+};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
 pub use self::access::{Access, Peer};
 pub use self::listen::{ListenError, Listening, SocketFile};
+use self::seats::Seats;
 use crate::control::Control;
 
 /// How long clients may take, after shutdown, to read what is left for them.
@@ -34,6 +39,10 @@ pub struct Limits {
     pub message_bytes: usize,
     /// How many clients may be connected at once.
     pub clients: usize,
+    /// How many connections one user may have.
+    pub clients_per_user: usize,
+    /// How many of the connections only operators may take.
+    pub clients_of_operators: usize,
     /// How long a client may take to make room for a message before it is dropped.
     pub write_timeout: Duration,
 }
@@ -43,6 +52,8 @@ impl Default for Limits {
         Self {
             message_bytes: MAX_MESSAGE_BYTES,
             clients: MAX_CLIENTS,
+            clients_per_user: MAX_CLIENTS_PER_USER,
+            clients_of_operators: CLIENTS_OF_OPERATORS,
             write_timeout: Duration::from_secs(10),
         }
     }
@@ -81,6 +92,7 @@ pub async fn serve_within(
     shutdown: impl Future<Output = ()>,
 ) -> io::Result<()> {
     let desk = Arc::new(Desk { control, access, limits });
+    let seats = Seats::new(limits);
     let stop = CancellationToken::new();
     let mut clients = JoinSet::new();
     tokio::pin!(shutdown);
@@ -93,10 +105,13 @@ pub async fn serve_within(
                 }
             }
             accepted = listener.accept() => match accepted {
-                Ok((stream, _)) if clients.len() < limits.clients => {
-                    clients.spawn(connection::attend(stream, desk.clone(), stop.clone()));
-                }
-                Ok((stream, _)) => turn_away(stream, limits).await,
+                Ok((stream, _)) => match desk.access.peer(&stream).map(|peer| seats.take(peer)) {
+                    Ok(Ok(seat)) => {
+                        clients.spawn(connection::attend(stream, seat, desk.clone(), stop.clone()));
+                    }
+                    Ok(Err(error)) => turn_away(stream, error, limits).await,
+                    Err(error) => tracing::warn!(%error, "a client without credentials is dropped"),
+                },
                 Err(error) if passes(&error) => {
                     tracing::warn!(%error, "cannot accept a client now");
                     tokio::time::sleep(Duration::from_millis(100)).await;
@@ -129,11 +144,9 @@ fn passes(error: &io::Error) -> bool {
     )
 }
 
-/// Tells a client that the server is full. A new socket's buffer is empty, so this does not wait.
-async fn turn_away(mut stream: UnixStream, limits: Limits) {
-    let message =
-        format!("{} clients are already connected; close one of them, or try again later", limits.clients);
-    let response = Response::error(Id::Null, RpcError::new(ErrorCode::TooManyClients, message));
+/// Tells a client that there is no place for it. A new socket's buffer is empty, so this does not wait.
+async fn turn_away(mut stream: UnixStream, error: RpcError, limits: Limits) {
+    let response = Response::error(Id::Null, error);
     if let Err(error) = connection::send(&mut stream, &response, limits.write_timeout).await {
         tracing::debug!(%error, "a client that was turned away did not listen");
     }

@@ -1,6 +1,7 @@
 //! A daemon without a rig; the first word of the plan determines what it does.
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -25,6 +26,8 @@ pub struct Fake {
     pub resumed: Mutex<Vec<PathBuf>>,
     /// Held by a test to block a call of `check` with the plan `wait`.
     pub gate: Mutex<()>,
+    /// Number of calls of `check`.
+    pub checks: AtomicUsize,
     /// Path of the file with live images; the file need not exist.
     pub live: PathBuf,
     events: broadcast::Sender<Event>,
@@ -37,6 +40,7 @@ impl Fake {
             runs: Mutex::default(),
             resumed: Mutex::default(),
             gate: Mutex::default(),
+            checks: AtomicUsize::new(0),
             live,
             events: broadcast::Sender::new(KEPT_EVENTS),
         }
@@ -200,6 +204,7 @@ impl Control for Fake {
     }
 
     fn check(&self, plan: &str) -> Result<CheckReport, RpcError> {
+        self.checks.fetch_add(1, Ordering::SeqCst);
         match plan.split_whitespace().next() {
             Some("bad") => return Err(bad_plan()),
             Some("panic") => panic!("a defect, on purpose"),

@@ -22,6 +22,8 @@ pub struct DotRigFile {
     pub mirror: Option<MirrorSection>,
     /// `[sim]`, for the driver `sim`.
     pub sim: DotSimSection,
+    /// Folders, relative to the rig file, whose files plans may name beside the sessions in the daemon's data folder.
+    pub plan_folders: Vec<PathBuf>,
     /// Positions of the values in the text.
     pub places: Places,
 }
@@ -238,17 +240,20 @@ impl DotRigFile {
         let has_mirror = document.places().has(&["mirror"]);
         let mirror: Option<MirrorSection> = document.take("mirror");
         let sim: Option<DotSimSection> = document.take_or_default("sim");
-        document.refuse_others(&["kind", "camera", "mirror", "sim"]);
+        let plan_folders: Option<Vec<PathBuf>> = document.take_or_default("plan_folders");
+        document.refuse_others(&["kind", "camera", "mirror", "sim", "plan_folders"]);
         if let Some(camera) = &camera {
             camera.check(&mut document);
         }
         if let Some(mirror) = &mirror {
             mirror.check(&mut document);
         }
-        let (Some(camera), Some(sim), true) = (camera, sim, mirror.is_some() == has_mirror) else {
+        let (Some(camera), Some(sim), Some(plan_folders), true) =
+            (camera, sim, plan_folders, mirror.is_some() == has_mirror)
+        else {
             return document.finish(None);
         };
-        let rig = Self { camera, mirror, sim, places: document.places().clone() };
+        let rig = Self { camera, mirror, sim, plan_folders, places: document.places().clone() };
         rig.check(&mut document);
         document.finish(Some(rig))
     }

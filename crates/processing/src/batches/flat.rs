@@ -1,6 +1,6 @@
 //! Passes the flat field between a run, its session, and later runs.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ndarray::{Array2, Axis};
 use raysweep_session::dots::FlatArrays;
@@ -35,20 +35,22 @@ fn is_flat_field(part: &DamagedPart) -> bool {
 }
 
 impl DotTask {
-    /// Loads the flat field of the earlier session that the plan names, if any; sessions are in `data`.
+    /// Loads the flat field of the earlier session that the plan names, if any: one in `data`, or in a folder that the
+    /// rig file allows.
     ///
     /// # Errors
-    /// When that session has no flat field, or one of another size.
+    /// When that session is elsewhere, or has no flat field, or one of another size.
     pub fn earlier_flat_field(&self, data: &Path) -> Result<Option<FlatField>> {
         let Some(dir) = &self.correct.flat_field else { return Ok(None) };
         let size = [self.shape.height(), self.shape.width()];
-        let session = Session::open(&data.join(dir))?;
+        let folders: Vec<PathBuf> = [data.to_owned()].into_iter().chain(self.folders.clone()).collect();
+        let session = Session::open_below(&folders, dir)?;
         let changed = changed_inputs(&session, &session.state()?)?;
         if let Some(damage) = changed.iter().find(|damage| is_flat_field(&damage.part)) {
             let what = session.dir().display().to_string();
             return Err(Error::Codec { action: "use the flat field of", what, why: damage.to_string() });
         }
-        let FlatArrays { gain, repaired } = session.dots()?.read_flat(size)?;
+        let FlatArrays { gain, repaired } = FlatArrays::read(&session.dots_path(), size)?;
         let dead =
             repaired.indexed_iter().filter(|(_, repaired)| **repaired).map(|(pixel, _)| pixel).collect();
         Ok(Some(FlatField { gain: gain.insert_axis(Axis(2)), dead }))

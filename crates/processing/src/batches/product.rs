@@ -6,16 +6,16 @@ use ndarray::{Array3, Array4, ArrayView3, Axis};
 use raysweep_config::plan::products_of_argument;
 use raysweep_config::{BatchesPlan, ConfigError, Plan, ProductTable};
 use raysweep_core::decoding_message_beside;
-use raysweep_session::pattern;
-use raysweep_transport::dots::Batch;
 use raysweep_transport::dots::product::{
     EpipolarMask, MaskRule, REFERENCE_WIDTH_PX, compensate, dual, epipolar, floodlit, pattern_weights,
     relight, shadow_dot, shadow_neighbours,
 };
+use raysweep_transport::dots::{Batch, FrameShape};
 use serde::Deserialize;
 use serde_json::Value;
 
 use super::calibration::Calibration;
+use super::task::DotTask;
 
 /// A `[[product]]` of a plan of batches.
 #[derive(Debug, Clone, PartialEq)]
@@ -249,6 +249,25 @@ impl DotSpec {
         }
     }
 
+    /// Number of values in one image of each of its videos.
+    pub(super) fn values(&self, task: &DotTask) -> u64 {
+        let pixels = task.shape.pixels() as u64;
+        match &self.kind {
+            Kind::Floodlit => pixels,
+            // A pattern may have colours.
+            Kind::Relight(_) => 3 * pixels,
+            Kind::DirectGlobal(_) => 2 * pixels,
+            Kind::Dual(DualSize { size_px }) => {
+                let dots = task.batches.dots as usize;
+                size_px
+                    .unwrap_or_else(|| size_of_dots(task.shape, dots))
+                    .iter()
+                    .map(|&side| side as u64)
+                    .product()
+            }
+        }
+    }
+
     /// Names and descriptions of its videos.
     pub fn videos(&self) -> Vec<(String, String)> {
         let name = &self.name;
@@ -339,17 +358,18 @@ impl DotSpec {
                 // A lost dot is as dark as a dot that hit nothing: interpolate it instead of showing it.
                 let lost = centroids.xy.iter_mut().zip(scene.seen).filter(|(_, seen)| !**seen);
                 lost.for_each(|(xy, _)| *xy = None);
-                let shape = batch.shape();
-                let [height, width] = size_px.unwrap_or_else(|| {
-                    let pitch = (shape.pixels() as f64 / batch.dots() as f64).sqrt().max(1.0);
-                    [shape.height(), shape.width()]
-                        .map(|side| ((side as f64 / pitch).round() as usize).max(1))
-                });
+                let [height, width] = size_px.unwrap_or_else(|| size_of_dots(batch.shape(), batch.dots()));
                 let made = dual(batch, &centroids, &calibration.energies, (height, width)).map_err(told)?;
                 Ok(vec![made.image])
             }
         }
     }
+}
+
+/// Height and width of an image with about one pixel per dot.
+fn size_of_dots(shape: FrameShape, dots: usize) -> [usize; 2] {
+    let pitch = (shape.pixels() as f64 / dots as f64).sqrt().max(1.0);
+    [shape.height(), shape.width()].map(|side| ((side as f64 / pitch).round() as usize).max(1))
 }
 
 impl Pattern {
@@ -372,11 +392,6 @@ impl Pattern {
             }
         }
     }
-}
-
-/// Reads the pattern of a product.
-pub(super) fn read_pattern(spec: &DotSpec, path: &std::path::Path) -> Result<Array4<f32>, String> {
-    pattern::read(path).map_err(|error| format!("product {}: {error}", spec.name))
 }
 
 /// Sum of all light in a batch.

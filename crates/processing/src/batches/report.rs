@@ -1,6 +1,6 @@
 //! The report of a dot rig's session.
 
-use ndarray::{Array3, Axis};
+use ndarray::Axis;
 use raysweep_session::dots::FlatArrays;
 use raysweep_session::ledger::State;
 use raysweep_session::report::{
@@ -12,11 +12,11 @@ use super::calibration::Calibration;
 use super::task::DotTask;
 use crate::report::{accounts, subtitle};
 
-/// Selected images of a video, each with its label and scale.
+/// Pictures of selected images of a video.
 pub(super) struct VideoStrip {
     pub name: String,
     pub about: String,
-    pub images: Vec<(String, Array3<f32>, ToneMap)>,
+    pub pictures: Vec<Picture>,
 }
 
 /// Percentile of the pixels that maps to white in a picture.
@@ -79,20 +79,13 @@ fn flat_field(session: &Session, task: &DotTask) -> Result<Option<(String, Strin
 }
 
 fn video(strip: &VideoStrip) -> Section {
-    let picture = |(label, image, scale): &(String, Array3<f32>, ToneMap)| {
-        let picture = match image.len_of(Axis(2)) {
-            1 => Picture::grey(image.index_axis(Axis(2), 0), *scale),
-            _ => Picture::rgb(image.view(), *scale),
-        };
-        picture.with_caption(format!("batch {label}"))
-    };
     Section {
         title: strip.name.clone(),
         intro: format!(
             "Some of the batches, evenly spread: {}. All are in products/{}.",
             strip.about, strip.name
         ),
-        blocks: vec![Block::Pictures(strip.images.iter().map(picture).collect())],
+        blocks: vec![Block::Pictures(strip.pictures.clone())],
     }
 }
 

@@ -5,17 +5,18 @@ use std::io::ErrorKind;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use ndarray::{Array3, Array4};
+use ndarray::{Array3, Array4, Axis};
 use raysweep_config::DotRigFile;
 use raysweep_session::dots::BatchEntry;
 use raysweep_session::ledger::State;
+use raysweep_session::pattern::PatternFile;
 use raysweep_session::products::VideoWriter;
-use raysweep_session::report::ToneMap;
+use raysweep_session::report::Picture;
 use raysweep_session::{Result, Session, durable, manifest, pattern};
 use serde_json::{Map, Value, json};
 
 use super::calibration::{Calibration, read_batch};
-use super::product::{DotSpec, SceneBatches, light_of, read_pattern};
+use super::product::{DotSpec, SceneBatches, light_of};
 use super::report::{self, VideoStrip};
 use super::task::DotTask;
 use crate::mirror_response::Predistortion;
@@ -70,18 +71,20 @@ pub fn make(
             seen: &seen,
             light: &light,
         };
-        let mut drawn = Vec::new();
-        for video in videos {
+        let mut continued = Vec::new();
+        for mut video in videos {
+            if !go_on() {
+                break;
+            }
             match video.spec.draw(&batch, &scene, video.patterns.as_ref()) {
-                Ok(images) => drawn.push((video, images)),
+                Ok(images) => {
+                    video.append(session, &about_all, images, (image, sound.len()), entry)?;
+                    continued.push(video);
+                }
                 Err(problem) => problems.push(format!("product {}: {problem}", video.spec.name)),
             }
         }
-        videos = Vec::new();
-        for (mut video, images) in drawn {
-            video.append(session, &about_all, images, (image, sound.len()), entry)?;
-            videos.push(video);
-        }
+        videos = continued;
     }
     let mut strips = Vec::new();
     let mut encoder = Encoder { problems: Vec::new() };
@@ -108,8 +111,8 @@ pub fn make(
 /// What is wrong with a pattern.
 pub fn keep_patterns(session: &Session, task: &DotTask) -> std::result::Result<(), String> {
     for spec in &task.specs {
-        let Some(path) = spec.pattern_file() else { continue };
-        let patterns = read_pattern(spec, path)?;
+        let Some(file) = task.open_pattern(spec)? else { continue };
+        let patterns = file.read().map_err(|error| format!("product {}: {error}", spec.name))?;
         let kept = session.pattern_path(&spec.name);
         kept.parent()
             .map_or(Ok(()), raysweep_session::durable::create_dir_all)
@@ -123,7 +126,8 @@ pub fn keep_patterns(session: &Session, task: &DotTask) -> std::result::Result<(
 fn patterns_of(session: &Session, spec: &DotSpec) -> std::result::Result<Option<Array4<f32>>, String> {
     let Some(file) = spec.pattern_file() else { return Ok(None) };
     let kept = session.pattern_path(&spec.name);
-    read_pattern(spec, if kept.exists() { &kept } else { file }).map(Some)
+    let read = PatternFile::open(if kept.exists() { &kept } else { file }).and_then(PatternFile::read);
+    read.map(Some).map_err(|error| format!("product {}: {error}", spec.name))
 }
 
 /// A video that is being written.
@@ -152,16 +156,16 @@ impl Video<'_> {
                 metadata.insert("axes".into(), json!(axes));
                 let writer = session.products().video(&name, count, [rows, columns, channels], &metadata)?;
                 self.writers.push((name.clone(), writer));
-                self.strips.push(VideoStrip { name, about, images: Vec::new() });
+                self.strips.push(VideoStrip { name, about, pictures: Vec::new() });
             }
-            let scale: ToneMap = self.writers[place].1.append(image.view())?;
-            let step = count.div_ceil(SHOWN);
-            if number.is_multiple_of(step) {
-                self.strips[place].images.push((
-                    format!("{} ({:.2} s)", entry.batch, entry.start_s),
-                    image,
-                    scale,
-                ));
+            let scale = self.writers[place].1.append(image.view())?;
+            if number.is_multiple_of(count.div_ceil(SHOWN)) {
+                let picture = match image.len_of(Axis(2)) {
+                    1 => Picture::grey(image.index_axis(Axis(2), 0), scale),
+                    _ => Picture::rgb(image.view(), scale),
+                };
+                let caption = format!("batch {} ({:.2} s)", entry.batch, entry.start_s);
+                self.strips[place].pictures.push(picture.with_caption(caption));
             }
         }
         Ok(())

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use raysweep_config::{BatchesPlan, ConfigError, DotRigFile, Places, Plan, StageTable};
 use raysweep_core::{CameraSettings, MirrorPath, PathError, PixelFormat, Shutter, decoding_message};
 use raysweep_pipeline::dots::{ColumnStage, DotScan, column_stage};
+use raysweep_session::pattern::PatternFile;
 use raysweep_session::stack::Contents;
 use raysweep_transport::dots::{Correction, FrameShape, Region, Sampling};
 use serde::Deserialize;
@@ -14,6 +15,16 @@ use serde_json::Value;
 use super::product::DotSpec;
 use crate::mirror_response::Predistortion;
 use crate::saturation::saturation_dn;
+
+/// Memory for one value of an image while it is drawn and written: the image, its holes being filled, its copies as
+/// NPY and EXR; measured for `dual`, which needs most.
+const DRAWN_BYTES: u64 = 40;
+/// Disk space of one value of a video: NPY, EXR and PNG.
+const STORED_BYTES: u64 = 12;
+/// Memory of a video's pictures in the report.
+const STRIP_BYTES: u64 = 6 * 3 << 20;
+/// Memory for each pair of dots in the confusion matrix while it is written: its image, and its copies as NPY and EXR.
+const CONFUSION_BYTES: u64 = 24;
 
 /// A plan of batches on a dot rig: everything that acquisition and processing share.
 pub struct DotTask {
@@ -33,6 +44,8 @@ pub struct DotTask {
     pub specs: Vec<DotSpec>,
     /// Corrections of single pixels.
     pub correct: CorrectOptions,
+    /// Folders whose files the plan may name.
+    pub(super) folders: Vec<PathBuf>,
     denoise: StageTable,
     stages: Vec<StageTable>,
     places: Places,
@@ -100,6 +113,7 @@ impl DotTask {
             predistortion,
             specs,
             correct,
+            folders: rig.plan_folders.clone(),
             denoise,
             stages,
             places,
@@ -114,6 +128,50 @@ impl DotTask {
     /// What the pipeline extracts from the frames of one pass of `batches` batches.
     pub fn scan(&self, batches: u32) -> DotScan {
         scan(&self.batches, self.shape, batches)
+    }
+
+    /// Memory that making the products takes at most, in bytes. Reads the headers of the plan's pattern files.
+    ///
+    /// # Errors
+    /// For a pattern file that is not allowed, or none.
+    pub fn products_bytes(&self) -> Result<u64, ConfigError> {
+        let mut patterns = 0;
+        for (index, spec) in self.specs.iter().enumerate() {
+            let of_place = |message| self.refuse(&["product", &index.to_string(), "image"], message);
+            if let Some(pattern) = self.open_pattern(spec).map_err(of_place)? {
+                patterns += pattern.bytes();
+            }
+        }
+        let drawn = self.specs.iter().map(|spec| spec.values(self) * DRAWN_BYTES).max().unwrap_or(0);
+        let shown = self.specs.iter().map(|spec| spec.videos().len() as u64).sum::<u64>() * STRIP_BYTES;
+        let dots = u64::from(self.batches.dots);
+        let confusion = if self.batches.calibration.is_empty() { 0 } else { CONFUSION_BYTES * dots * dots };
+        // While a pattern is read, its file is in memory as well.
+        Ok(3 * patterns + drawn + shown + confusion)
+    }
+
+    /// Disk space of the products, in bytes.
+    pub fn products_disk_bytes(&self) -> u64 {
+        let values = self.specs.iter().map(|spec| spec.values(self)).sum::<u64>();
+        u64::from(self.batches.count) * values * STORED_BYTES
+    }
+
+    /// Opens the pattern file of a product, if it has one.
+    ///
+    /// # Errors
+    /// What is wrong with the file, or where it must be.
+    pub(super) fn open_pattern(&self, spec: &DotSpec) -> Result<Option<PatternFile>, String> {
+        let Some(path) = spec.pattern_file() else { return Ok(None) };
+        let opened = PatternFile::open_below(&self.folders, path);
+        let folders = self.folders.iter().map(|folder| folder.display().to_string()).collect::<Vec<_>>();
+        let allowed = if folders.is_empty() { "none".into() } else { folders.join(", ") };
+        opened.map(Some).map_err(|error| {
+            format!(
+                "product {}: image = {:?}: {error}; the folders that a plan may name files in are those of `plan_folders` in the rig file: {allowed}",
+                spec.name,
+                path.display().to_string()
+            )
+        })
     }
 
     /// An error about a value of the plan.

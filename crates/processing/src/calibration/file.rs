@@ -1,8 +1,7 @@
 //! `calibration.toml` and `calibration.npz`: a calibration as sessions and the data folder keep it.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -10,8 +9,8 @@ use jiff::Timestamp;
 use ndarray::{Array1, Array2, Array3};
 use ndarray_npy::{NpzReader, NpzWriter};
 use raysweep_config::{ConfigError, RigFile};
-use raysweep_core::{CameraCapabilities, PixelFormat};
-use raysweep_session::durable;
+use raysweep_core::{CameraCapabilities, PixelFormat, io_text};
+use raysweep_session::{durable, input};
 use raysweep_transport::plane::board::times::BoardStrip;
 use raysweep_transport::plane::board::{BoardCalibration, Estimate, FlickeringLamp};
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
@@ -287,8 +286,7 @@ impl KeptCalibration {
         let Some(header) = CalibrationHeader::read(folder)? else { return Ok(None) };
         let path = folder.join("calibration.npz");
         let in_file = |why: String| format!("{}: {why}", path.display());
-        let file = File::open(&path).map_err(|error| in_file(error.to_string()))?;
-        let bytes = limited(file, header.most_bytes()).map_err(in_file)?;
+        let bytes = input::read(&path, header.most_bytes()).map_err(|error| in_file(io_text(&error)))?;
         if sha256(&bytes) != header.arrays_sha256 {
             return Err(in_file(
                 "its SHA-256 is not the arrays_sha256 of calibration.toml: it was changed or damaged".into(),
@@ -422,12 +420,11 @@ impl CalibrationHeader {
     pub fn read(folder: &Path) -> Result<Option<Self>, String> {
         let path = folder.join("calibration.toml");
         let in_file = |why: String| format!("{}: {why}", path.display());
-        let text = match File::open(&path) {
-            Ok(file) => limited(file, MAX_HEADER_BYTES).map_err(in_file)?,
+        let text = match input::read_text(&path, MAX_HEADER_BYTES) {
+            Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(error) => return Err(in_file(error.to_string())),
+            Err(error) => return Err(in_file(io_text(&error))),
         };
-        let text = String::from_utf8(text).map_err(|error| in_file(error.to_string()))?;
         let header: Self = toml::from_str(&text).map_err(|error| in_file(error.to_string()))?;
         if header.schema != SCHEMA {
             let schema = header.schema;
@@ -493,16 +490,6 @@ impl ValidFor {
 
 fn estimate([value, sd]: Pair) -> Estimate {
     Estimate { value, sd }
-}
-
-/// Reads a file of at most so many bytes.
-fn limited(file: File, most_bytes: u64) -> Result<Vec<u8>, String> {
-    let mut bytes = Vec::new();
-    file.take(most_bytes.saturating_add(1)).read_to_end(&mut bytes).map_err(|error| error.to_string())?;
-    if bytes.len() as u64 > most_bytes {
-        return Err(format!("it is longer than the {most_bytes} bytes of a calibration"));
-    }
-    Ok(bytes)
 }
 
 fn encoded(arrays: &CalibrationArrays) -> raysweep_session::Result<Vec<u8>> {

@@ -1,5 +1,6 @@
 //! `flat` in `dots.zarr`: the flat field applied to a run's columns.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::Array2;
@@ -48,11 +49,22 @@ impl Dots {
     /// Reads the flat field of a camera of `size` (rows, columns).
     ///
     /// # Errors
-    /// [`Error::Io`] if it is missing, [`Error::Shape`] if its size differs, [`Error::Zarr`] if it is
-    /// damaged.
+    /// As [`FlatArrays::read`].
     pub fn read_flat(&self, size: [usize; 2]) -> Result<FlatArrays> {
-        let path = self.dir.join("flat");
-        if !self.has_flat() {
+        FlatArrays::read(&self.dir, size)
+    }
+}
+
+impl FlatArrays {
+    /// Reads the flat field of a camera of `size` (rows, columns) from the `dots.zarr` of any session. Nothing is
+    /// unpacked before it is known to have this size.
+    ///
+    /// # Errors
+    /// [`Error::Io`] if it is missing, [`Error::Shape`] if its size differs, [`Error::Zarr`] or [`Error::Codec`] if it
+    /// is damaged.
+    pub fn read(dots: &Path, size: [usize; 2]) -> Result<FlatArrays> {
+        let path = dots.join("flat");
+        if !path.is_dir() {
             let why = "the session has no flat field: give a session whose plan has batches.flat_frames";
             let missing = std::io::Error::new(std::io::ErrorKind::NotFound, why);
             return Err(Error::io("read", &path)(missing));
@@ -63,13 +75,16 @@ impl Dots {
             name: &str,
             size: [usize; 2],
         ) -> Result<Array2<T>> {
+            let path = store.root().join(name);
+            zarr::check_metadata_file(&path)?;
             let array = zarr::open_array(store, name, 2)?;
-            let (found, path) = (zarr::shape_of(&array), store.root().join(name));
+            let found = zarr::shape_of(&array);
             if found != size {
                 let what = format!("the flat field {}", path.display());
                 let allowed = format!("{size:?}, the camera's rows and columns");
                 return Err(Error::Shape { what, found, allowed });
             }
+            zarr::check_only_chunk(&array, size_of::<T>())?;
             array
                 .retrieve_array_subset_opt(&array.subset_all(), &zarr::codec_options())
                 .map_err(Error::zarr("read", &path))
@@ -96,5 +111,41 @@ mod tests {
         assert_eq!(dots.read_flat([2, 32]).unwrap(), flat);
         let error = dots.read_flat([4, 32]).unwrap_err();
         assert!(matches!(&error, Error::Shape { found, .. } if found == &[2, 32]), "{error}");
+    }
+
+    #[test]
+    fn a_chunk_that_does_not_say_truly_how_long_it_becomes_is_not_unpacked() {
+        let dir = tempfile::tempdir().unwrap();
+        let shape = StackShape { contents: Contents::Batches { batches: 4, dots: 3 }, rows: 2, columns: 32 };
+        let dots = Dots::create(dir.path(), &shape).unwrap();
+        let (gain, repaired) = (Array2::ones((2, 32)), Array2::from_elem((2, 32), false));
+        dots.write_flat(&FlatArrays { gain, repaired }).unwrap();
+        let chunk = dir.path().join("flat/gain/c.0.0");
+        let sound = std::fs::read(&chunk).unwrap();
+        let packed = |bytes: usize| zstd::bulk::compress(&vec![0; bytes], 1).unwrap();
+        // A frame whose header alone claims 2^60 bytes, and one that does not say (RFC 8878).
+        let claims = [&[0x28, 0xb5, 0x2f, 0xfd, 0xe0][..], &(1u64 << 60).to_le_bytes()].concat();
+        let silent = zstd::stream::encode_all(&vec![0u8; 64 << 20][..], 1).unwrap();
+        let two = [sound.clone(), packed(1 << 20)].concat();
+        for bomb in [packed(64 << 20), claims, silent, two, packed(255), Vec::new(), vec![1; 4096]] {
+            std::fs::write(&chunk, &bomb).unwrap();
+            let error = dots.read_flat([2, 32]).unwrap_err();
+            assert!(matches!(error, Error::Codec { .. } | Error::Io { .. }), "{} bytes: {error}", bomb.len());
+        }
+        std::fs::write(&chunk, &sound).unwrap();
+        dots.read_flat([2, 32]).unwrap();
+        let metadata = dir.path().join("flat/gain/zarr.json");
+        let text = std::fs::read_to_string(&metadata).unwrap();
+        for (from, to) in [
+            ("\"zstd\"", "\"crc32c\""),
+            ("\"chunk_shape\": [\n        2", "\"chunk_shape\": [\n        4000000"),
+        ] {
+            assert!(text.contains(from), "{text}");
+            std::fs::write(&metadata, text.replace(from, to)).unwrap();
+            assert!(dots.read_flat([2, 32]).is_err(), "{to}");
+        }
+        std::fs::remove_file(&metadata).unwrap();
+        nix::unistd::mkfifo(&metadata, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        assert!(matches!(dots.read_flat([2, 32]), Err(Error::Io { .. })));
     }
 }

@@ -52,8 +52,11 @@ pub fn check(task: &DotTask, lab: &Lab<'_>, pace: Pace) -> Result<CheckReport, C
         );
     }
     let room = lab.room(
-        frames as u64 * frame_bytes + BATCHES_IN_MEMORY * batch_bytes + 16 * image_bytes,
-        total * (batch_bytes + 4 * 8 * image_bytes) + raw_bytes + OTHER_BYTES,
+        frames as u64 * frame_bytes
+            + BATCHES_IN_MEMORY * batch_bytes
+            + 16 * image_bytes
+            + task.products_bytes()?,
+        total * batch_bytes + task.products_disk_bytes() + raw_bytes + OTHER_BYTES,
     );
     Ok(CheckReport {
         points: plan.total(),
