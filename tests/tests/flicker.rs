@@ -6,6 +6,7 @@ use std::fs;
 use std::path::Path;
 
 use ndarray::{Array3, Axis, s};
+use raysweep::control::Control;
 use raysweep::rig::Rig;
 use raysweep_processing::calibration::{CalibratedFlicker, KeptCalibration};
 use raysweep_session::ledger::FrameStarts;
