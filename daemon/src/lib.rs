@@ -1,8 +1,10 @@
 //! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
 
+pub mod arguments;
 pub mod cli;
 pub mod control;
 mod devices;
+pub mod journal;
 pub mod live;
 pub mod mirror;
 mod plane;
