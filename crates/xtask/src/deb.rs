@@ -83,7 +83,8 @@ fn crates() -> Done<String> {
         "--format={p}: {l}",
     ]))?;
     // Crates of this project have a path.
-    let lines = said.lines().filter(|line| !line.contains(" (/")).map(|line| line.replace(" (proc-macro)", ""));
+    let lines =
+        said.lines().filter(|line| !line.contains(" (/")).map(|line| line.replace(" (proc-macro)", ""));
     let lines: std::collections::BTreeSet<String> = lines.map(|line| line.replace(" (*)", "")).collect();
     Ok(lines.into_iter().map(|line| line + "\n").collect())
 }
@@ -103,10 +104,8 @@ fn changelog() -> Done<String> {
 
 fn output(command: &mut Command) -> Done<String> {
     let name = command.get_program().to_string_lossy().into_owned();
-    let output = command
-        .stderr(Stdio::inherit())
-        .output()
-        .map_err(|error| format!("cannot start {name}: {error}"))?;
+    let output =
+        command.stderr(Stdio::inherit()).output().map_err(|error| format!("cannot start {name}: {error}"))?;
     if !output.status.success() {
         return Err(format!("{name} ended with {}", output.status));
     }

@@ -265,7 +265,15 @@ impl RigFile {
         let sim: Option<SimConfig> = document.take_or_default("sim");
         let calibration: Option<CalibrationUse> = document.take_or_default("calibration");
         let auto_resume: Option<bool> = document.take_or_default("auto_resume");
-        document.refuse_others(&["kind", "auto_resume", "camera", "vsync", "projector", "calibration", "sim"]);
+        document.refuse_others(&[
+            "kind",
+            "auto_resume",
+            "camera",
+            "vsync",
+            "projector",
+            "calibration",
+            "sim",
+        ]);
         if let Some(camera) = &camera {
             camera.check(&mut document);
         }

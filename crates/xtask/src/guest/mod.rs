@@ -106,7 +106,8 @@ fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
 
 /// Builds programs with the tests of the daemon, and so with what `cargo xtask test` has built; returns their folder.
 fn build_programs(names: &[&str]) -> Done<PathBuf> {
-    let test = TESTS.iter().find(|test| test.programs.contains(&"raysweepd")).ok_or("no test of the daemon")?;
+    let test =
+        TESTS.iter().find(|test| test.programs.contains(&"raysweepd")).ok_or("no test of the daemon")?;
     let built = build(&[test])?;
     let daemon = built.iter().find(|built| built.name == "raysweepd").ok_or("cargo built no raysweepd")?;
     let folder = daemon.path.parent().ok_or("raysweepd in no folder")?;

@@ -42,8 +42,7 @@ pub fn follow(machine: &mut Machine, run: &Path, names: &[&str], limit_s: u32) -
             Some("0") if printed > 0 => {}
             Some("0") => failures.push(format!("{name}: no check in it")),
             Some(KILLED) => {
-                failures
-                    .push(failure(&folder, &format!("{name} did not end within {limit_s} s")));
+                failures.push(failure(&folder, &format!("{name} did not end within {limit_s} s")));
             }
             Some(code) => failures.push(failure(&folder, &format!("{name} ended with code {code}"))),
             None => {

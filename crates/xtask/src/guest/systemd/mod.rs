@@ -159,7 +159,10 @@ impl Guest {
         let began = Instant::now();
         while !midway.exists() {
             if began.elapsed() > Duration::from_secs(STAGE_LIMIT_S.into()) {
-                return Err(format!("the guest has begun no run; its log is {}", midway.with_file_name("log").display()));
+                return Err(format!(
+                    "the guest has begun no run; its log is {}",
+                    midway.with_file_name("log").display()
+                ));
             }
             std::thread::sleep(Duration::from_millis(20));
         }
@@ -185,7 +188,7 @@ impl Guest {
         let mut random = Random::new(seed);
         let mut completed = 0;
         for _ in 0..POWER_LOSSES {
-            let end = 1 + random.next() as usize % (entries.len() - 1);
+            let end = 1 + random.number() as usize % (entries.len() - 1);
             let what = format!("power loss at write {end} of {} (seed {seed})", entries.len());
             disk::copy(&before, &self.disk)?;
             writes::replay(&self.disk, &entries, end, &mut random)?;
@@ -208,7 +211,11 @@ impl Guest {
         let _ = std::fs::remove_dir_all(&data);
         std::fs::create_dir_all(&data).map_err(|error| format!("{}: {error}", data.display()))?;
         let dump = format!("rdump /var/lib/raysweep {}", data.display());
-        run(Command::new("debugfs").args(["-R", &dump]).arg(&self.disk).stdout(Stdio::null()).stderr(Stdio::null()))?;
+        run(Command::new("debugfs")
+            .args(["-R", &dump])
+            .arg(&self.disk)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null()))?;
         let data = data.join("raysweep");
         let daemon = Daemon::start(programs, &self.share.join("rig.toml"), &data)?;
         let resumed = Command::new(programs.join("raysweep"))
@@ -261,7 +268,14 @@ impl Guest {
         qemu.args(["-device", "virtio-blk-pci,drive=d0", "-serial", "null"]);
         super::qemu::mount(&mut qemu, "share", Path::new("share"), "");
         if stage.name == SERVICE.name {
-            qemu.args(["-device", "qemu-xhci,id=usb", "-device", "virtio-serial-pci", "-device", "virtio-gpu-pci"]);
+            qemu.args([
+                "-device",
+                "qemu-xhci,id=usb",
+                "-device",
+                "virtio-serial-pci",
+                "-device",
+                "virtio-gpu-pci",
+            ]);
             super::qemu::pipe(&mut qemu, "serial");
             qemu.args(["-device", "usb-serial,chardev=serial,always-plugged=true"]);
         }
@@ -271,7 +285,11 @@ impl Guest {
 
 fn folders(path: &Path) -> Done<Vec<PathBuf>> {
     let entries = std::fs::read_dir(path).map_err(|error| format!("{}: {error}", path.display()))?;
-    Ok(entries.flatten().map(|entry| entry.path()).filter(|path| path.join("ledger.jsonl").exists()).collect())
+    Ok(entries
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|path| path.join("ledger.jsonl").exists())
+        .collect())
 }
 
 fn open(path: &Path) -> Done<std::fs::File> {

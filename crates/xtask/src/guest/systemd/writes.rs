@@ -8,7 +8,7 @@ use std::path::Path;
 use crate::run::Done;
 
 const SECTOR: u64 = 512;
-const MAGIC: u64 = 0x6a73_6677_7368_72;
+const MAGIC: u64 = 0x006a_7366_7773_6872;
 const FLUSH: u64 = 1;
 const FUA: u64 = 2;
 const DISCARD: u64 = 4;
@@ -56,7 +56,7 @@ pub fn replay(disk: &Path, entries: &[Entry], end: usize, random: &mut Random) -
     let file = File::options().write(true).open(disk).map_err(failed)?;
     let flushed = entries[..end].iter().rposition(|entry| entry.flags & FLUSH != 0).unwrap_or(0);
     for (index, entry) in entries[..end].iter().enumerate() {
-        if index < flushed || entry.flags & FUA != 0 || random.next() % 2 == 0 {
+        if index < flushed || entry.flags & FUA != 0 || random.number() % 2 == 0 {
             file.write_all_at(&entry.bytes, entry.at).map_err(failed)?;
         }
     }
@@ -73,7 +73,7 @@ impl Random {
     }
 
     /// The next number.
-    pub fn next(&mut self) -> u64 {
+    pub fn number(&mut self) -> u64 {
         self.0 ^= self.0 >> 12;
         self.0 ^= self.0 << 25;
         self.0 ^= self.0 >> 27;
@@ -95,8 +95,14 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("raysweep-writes-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         let disk = folder.join("disk");
-        let entries =
-            [entry(0, 1, 0), entry(0, 0, FLUSH), entry(1, 2, 0), entry(2, 3, FUA), entry(3, 4, 0), entry(0, 9, 0)];
+        let entries = [
+            entry(0, 1, 0),
+            entry(0, 0, FLUSH),
+            entry(1, 2, 0),
+            entry(2, 3, FUA),
+            entry(3, 4, 0),
+            entry(0, 9, 0),
+        ];
         let mut lost = [false; 4];
         for seed in 1..40 {
             std::fs::write(&disk, vec![0; 4 * SECTOR as usize]).unwrap();
@@ -119,7 +125,12 @@ mod tests {
             bytes
         };
         // Magic, version, number of entries; a write of sector 7; a flush.
-        let log = [sector(&[MAGIC, 1, 2]), sector(&[7, 1, FUA, 0]), vec![5; SECTOR as usize], sector(&[0, 0, FLUSH, 0])];
+        let log = [
+            sector(&[MAGIC, 1, 2]),
+            sector(&[7, 1, FUA, 0]),
+            vec![5; SECTOR as usize],
+            sector(&[0, 0, FLUSH, 0]),
+        ];
         std::fs::write(&path, log.concat()).unwrap();
         let entries = read(&path).unwrap();
         let [write, flush] = entries.as_slice() else { panic!("{} entries", entries.len()) };
