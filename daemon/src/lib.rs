@@ -1,9 +1,11 @@
 //! `raysweepd`, the daemon that owns a rig, and `raysweep`, its client.
 
+pub mod arguments;
 pub mod cli;
 mod computing;
 pub mod control;
 mod devices;
+pub mod journal;
 pub mod live;
 pub mod mirror;
 mod plane;

@@ -178,6 +178,17 @@ impl Runner {
         }
     }
 
+    /// Allows no more runs if none is in progress. Returns whether none is.
+    pub fn close_if_idle(&self) -> bool {
+        // No run can begin while this is locked.
+        let _current = self.current.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_idle = matches!(self.board.status().state, RunState::Idle | RunState::Faulted);
+        if is_idle {
+            self.closed.store(true, Ordering::Relaxed);
+        }
+        is_idle
+    }
+
     fn order(&self, order: Order, from: &[RunState], to: Option<RunState>) -> Result<(), RpcError> {
         let current = self.lock();
         let state = self.board.status().state;

@@ -1,8 +1,9 @@
-//! `cargo xtask demo | test | packages | fresh | guest | bench`: the project's own commands. Uses only std, so that it
+//! `cargo xtask demo | test | packages | fresh | deb | guest | bench`: the project's own commands. Uses only std, so that it
 //! builds quickly everywhere.
 
 mod bench;
 mod daemon;
+mod deb;
 mod demo;
 mod fresh;
 mod guest;
@@ -26,7 +27,9 @@ usage: cargo xtask <command>
                      --no-guest leaves those out
   packages           what the tests need of Debian, what of it is missing, and how to install it
   fresh [12|13]...   runs demo and test of the last commit on a bare Debian 12 and 13, or on one
+  deb                builds the Debian package and prints its path
   guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
+  guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power
   bench [NAME]       measures; without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {
@@ -44,10 +47,12 @@ fn main() -> ExitCode {
             None => test::test(if options.is_empty() { Guest::Run } else { Guest::Skip }),
         },
         ["packages"] => packages::print(),
-        [command @ ("demo" | "packages"), unknown, ..] => {
+        ["deb"] => deb::deb(),
+        [command @ ("demo" | "packages" | "deb"), unknown, ..] => {
             Err(format!("`{unknown}` is not an option of {command}; it has none"))
         }
         ["fresh", releases @ ..] => fresh::fresh(releases),
+        ["guest", "--systemd"] => guest::systemd::systemd(),
         ["guest", names @ ..] => guest::guest(names),
         ["bench", arguments @ ..] => bench::bench(arguments),
         [unknown, ..] => Err(format!("`{unknown}` is not a command\n{USAGE}")),

@@ -23,7 +23,10 @@ pub fn test(wanted: Guest) -> Done {
     run(cargo().args(["check", "--manifest-path", "fuzz/Cargo.toml"]))?;
     run(cargo().args(["test", "--workspace", "--all-features"]).env("RAYSWEEP_PYTHON", python))?;
     match wanted {
-        Guest::Run => guest::guest(&[]),
+        Guest::Run => {
+            guest::guest(&[])?;
+            guest::systemd::systemd()
+        }
         Guest::Skip => {
             println!("{}", guest::skipped());
             Ok(())

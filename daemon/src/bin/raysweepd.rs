@@ -1,64 +1,34 @@
 //! The daemon: owns a rig, serves a socket, and shuts down cleanly.
 
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bytesize::ByteSize;
 use clap::Parser;
 use nix::sys::stat::{Mode, umask};
 use nix::unistd::{AccessFlags, access};
 use raysweep::Runner;
+use raysweep::arguments::DaemonArguments;
 use raysweep::control::Control;
+use raysweep::journal;
 use raysweep::live::{LiveError, LiveFile};
 use raysweep::mirror;
-use raysweep::rig::AnyRig;
+use raysweep::rig::{AnyRig, RigError};
 use raysweep::server::{self, Access, Listening};
 use raysweep_core::io_text;
 use raysweep_drivers::mirror::{Parked, park};
 use sd_notify::NotifyState;
-use tokio::signal::unix::{SignalKind, signal};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
-/// Capture daemon for light-transport rigs.
-#[derive(Parser)]
-#[command(
-    name = "raysweepd",
-    version,
-    after_help = "Exit codes:\n  0  shut down cleanly\n  1  could not start, or failed\n  2  wrong usage"
-)]
-struct Arguments {
-    /// The rig file.
-    #[arg(long, value_name = "FILE")]
-    rig: PathBuf,
-    /// Socket for clients; under systemd's socket activation, the passed socket is used instead.
-    #[arg(long, value_name = "PATH", default_value = "/run/raysweep/raysweepd.sock")]
-    socket: PathBuf,
-    /// File with the newest live images, which clients map [default: the socket's path with the extension `live`]
-    #[arg(long, value_name = "PATH")]
-    live: Option<PathBuf>,
-    /// Data folder, in which sessions are stored.
-    #[arg(long, value_name = "DIR", default_value = "/var/lib/raysweep")]
-    data: PathBuf,
-    /// Group whose members may operate the rig; other users who can connect may only observe.
-    #[arg(long, value_name = "GROUP", default_value = "raysweep")]
-    operators: String,
-    /// Memory limit for the results of a run, such as 2GB; larger sweeps are solved in strips of camera rows after their
-    /// end [default: the free memory when the run begins]
-    #[arg(long, value_name = "SIZE", value_parser = raysweep::cli::memory_size)]
-    memory: Option<ByteSize>,
-    /// Read the rig file, open every device once, print what was found, and exit.
-    #[arg(long)]
-    check: bool,
-}
+/// Exit code if the rig file cannot be used: starting again would not help, and systemd does not.
+const UNUSABLE: u8 = 2;
 
 fn main() -> ExitCode {
-    let colours = std::io::stderr().is_terminal();
-    tracing_subscriber::fmt().with_writer(std::io::stderr).with_target(false).with_ansi(colours).init();
+    journal::log_to_stderr();
     // The group may read sessions and process them; nobody else may write them.
     umask(Mode::S_IWGRP | Mode::S_IRWXO);
-    let mut arguments = Arguments::parse();
+    let mut arguments = DaemonArguments::parse();
     // Clients print the paths of sessions, in other working directories.
     if let Ok(data) = std::path::absolute(&arguments.data) {
         arguments.data = data;
@@ -68,14 +38,18 @@ fn main() -> ExitCode {
         Err(error) => {
             for line in error.to_string().lines() {
                 // Excerpts of files are indented.
-                if line.starts_with("  ") { eprintln!("{line}") } else { eprintln!("raysweepd: {line}") }
+                let program = if line.starts_with("  ") { "" } else { "raysweepd: " };
+                eprintln!("{}{program}{line}", journal::error_prefix());
             }
-            ExitCode::FAILURE
+            match error.downcast_ref() {
+                Some(RigError::Read { .. } | RigError::Config(_)) => ExitCode::from(UNUSABLE),
+                _ => ExitCode::FAILURE,
+            }
         }
     }
 }
 
-fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
+fn run(arguments: &DaemonArguments) -> Result<(), Box<dyn std::error::Error>> {
     let rig = AnyRig::load(&arguments.rig)?;
     if !arguments.check {
         prepare_data(&arguments.data).map_err(|error| {
@@ -128,7 +102,7 @@ fn run(arguments: &Arguments) -> Result<(), Box<dyn std::error::Error>> {
 }
 
 /// The live file at the requested path; by default beside the socket, where failure is tolerated: no run needs it.
-fn live_file(arguments: &Arguments) -> Result<Option<LiveFile>, LiveError> {
+fn live_file(arguments: &DaemonArguments) -> Result<Option<LiveFile>, LiveError> {
     if let Some(path) = &arguments.live {
         return LiveFile::create(path).map(Some);
     }
@@ -152,7 +126,7 @@ fn prepare_data(folder: &Path) -> std::io::Result<()> {
     Ok(access(folder, AccessFlags::W_OK | AccessFlags::X_OK)?)
 }
 
-async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn std::error::Error>> {
+async fn serve(arguments: &DaemonArguments, runner: Arc<Runner>) -> Result<(), Box<dyn std::error::Error>> {
     let Listening { listener, file } = match Listening::inherited()? {
         Some(listening) => listening,
         None => Listening::bind(&arguments.socket)?,
@@ -161,6 +135,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut hangup = signal(SignalKind::hangup())?;
+    let retire = signal(SignalKind::user_defined1())?;
     let watchdog = tokio::spawn(feed_watchdog(runner.clone()));
     let _ = sd_notify::notify(&[NotifyState::Ready]);
     let ended = {
@@ -171,6 +146,7 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
                 _ = interrupt.recv() => {}
                 // The terminal was closed.
                 _ = hangup.recv() => {}
+                () = idle_after(retire, runner.clone()) => {}
             }
             tracing::info!("shutting down");
             let _ = sd_notify::notify(&[NotifyState::Stopping]);
@@ -184,6 +160,19 @@ async fn serve(arguments: &Arguments, runner: Arc<Runner>) -> Result<(), Box<dyn
     watchdog.abort();
     drop(file);
     Ok(served?)
+}
+
+/// Waits for the signal by which an upgrade asks the daemon to end, and then until no run is in progress.
+async fn idle_after(mut asked: Signal, runner: Arc<Runner>) {
+    asked.recv().await;
+    tracing::info!("asked to end once no run is in progress");
+    loop {
+        let runner = runner.clone();
+        if tokio::task::spawn_blocking(move || runner.close_if_idle()).await.unwrap_or(false) {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    }
 }
 
 /// The path of a socket: its own, or the one that was asked for.

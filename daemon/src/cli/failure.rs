@@ -12,6 +12,7 @@ use raysweep_proto::{ClientError, ErrorCode, RpcError};
 use serde_json::{Value, json};
 
 use super::exit::Exit;
+use crate::journal;
 use crate::live::LiveError;
 use raysweep_processing::ProcessError;
 
@@ -105,7 +106,7 @@ impl CommandFailure {
                 let _ = writeln!(io::stdout(), "{}", json!({ "error": failure.for_programs() }));
             }
             Self::Plan(problem) => eprintln!("{:?}", miette::Report::new(*problem)),
-            failure => eprintln!("raysweep: {failure}"),
+            failure => eprintln!("{}raysweep: {failure}", journal::error_prefix()),
         }
         exit
     }

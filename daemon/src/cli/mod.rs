@@ -5,8 +5,10 @@ mod devices;
 mod exit;
 mod failure;
 mod follow;
+mod manuals;
 mod preview;
 mod printer;
+mod resume;
 mod show;
 mod view;
 
@@ -107,7 +109,12 @@ enum Command {
     /// Acquire the missing points of a session, and follow the run as `run` does
     Resume {
         /// The session's folder, or its name within the daemon's data folder
-        session: PathBuf,
+        #[arg(required_unless_present = "auto")]
+        session: Option<PathBuf>,
+        /// Resume the newest session if a crash or a power failure cut it off and its rig file has `auto_resume = true`:
+        /// the service does this when it starts
+        #[arg(long, conflicts_with = "session")]
+        auto: bool,
         /// Return at once instead of following the run
         #[arg(long)]
         detach: bool,
@@ -139,6 +146,9 @@ enum Command {
         /// Park when standard input is closed: raysweepd starts its guardian process like this
         #[arg(long)]
         when_closed: bool,
+        /// Print nothing if no mirror was ever moved
+        #[arg(long)]
+        if_moved: bool,
     },
     /// List the daemon's sessions, oldest first
     Sessions,
@@ -167,6 +177,12 @@ enum Command {
     Verify {
         /// The session's folder
         session: PathBuf,
+    },
+    /// Write manual pages and shell completions of all programs, for packages
+    #[command(hide = true)]
+    Manuals {
+        /// The folder to create
+        folder: PathBuf,
     },
     /// Copy a session's products, report and manifest; needs no daemon
     Export {
@@ -251,7 +267,17 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             return run(&socket, printer, Path::new("calibrate"), calibration::PLAN, about);
         }
         Command::Calibration(command) => return calibration::calibration(&socket, command, printer),
-        Command::Resume { session, detach } => {
+        Command::Resume { session, detach, .. } => {
+            let session = match session {
+                Some(session) => session,
+                None => match resume::cut_off(&connect()?.sessions()?)? {
+                    Ok(session) => session,
+                    Err(why) => {
+                        printer.print(&json!({ "resumed": null, "why": why }), |_| why.clone())?;
+                        return Ok(Exit::Done);
+                    }
+                },
+            };
             // The daemon's working directory is another: what exists here is named in full.
             let session = fs::canonicalize(&session).unwrap_or(session);
             return begin_run(&socket, printer, detach, |client| Ok(client.resume(&session)?));
@@ -278,7 +304,8 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             connect()?.arm_light()?;
             printer.print(&Empty {}, |_| "light is permitted until the next boot".into())?;
         }
-        Command::Park { state, when_closed } => {
+        Command::Park { state, if_moved: true, .. } if !state.exists() => {}
+        Command::Park { state, when_closed, .. } => {
             let is_there = state.exists();
             let parked = if when_closed {
                 mirror::park_when_closed(io::stdin(), &state)?
@@ -304,6 +331,9 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&value, |_| show::processed(&made))?;
         }
         Command::Verify { session } => return verify(&session, printer),
+        Command::Manuals { folder } => {
+            manuals::write(&folder).map_err(|source| CommandFailure::Write { path: folder, source })?;
+        }
         Command::Export { session, to, accept_damage } => {
             let to = to.unwrap_or_else(|| export_folder(&session));
             let files = export(&session, &to, accept_damage)?;

@@ -26,6 +26,8 @@ pub struct RigFile {
     pub projector: ProjectorSection,
     /// `[calibration]`: how calibrations are used.
     pub calibration: CalibrationUse,
+    /// `auto_resume`: whether the service resumes a sweep that a crash cut off, with nobody present.
+    pub auto_resume: bool,
     /// `[sim]`, for the driver `sim`.
     pub sim: SimConfig,
     /// Positions of the values in the text.
@@ -264,7 +266,16 @@ impl RigFile {
             document.require("projector", "a table [projector] with a driver");
         let sim: Option<SimConfig> = document.take_or_default("sim");
         let calibration: Option<CalibrationUse> = document.take_or_default("calibration");
-        document.refuse_others(&["kind", "camera", "vsync", "projector", "calibration", "sim"]);
+        let auto_resume: Option<bool> = document.take_or_default("auto_resume");
+        document.refuse_others(&[
+            "kind",
+            "auto_resume",
+            "camera",
+            "vsync",
+            "projector",
+            "calibration",
+            "sim",
+        ]);
         if let Some(camera) = &camera {
             camera.check(&mut document);
         }
@@ -286,8 +297,11 @@ impl RigFile {
             );
             document.refuse(&["calibration", "strip_columns"], message);
         }
-        let (Some(calibration), Some(sim)) = (calibration, sim) else { return document.finish(None) };
-        let rig = Self { camera, vsync, projector, calibration, sim, places: document.places().clone() };
+        let (Some(calibration), Some(auto_resume), Some(sim)) = (calibration, auto_resume, sim) else {
+            return document.finish(None);
+        };
+        let places = document.places().clone();
+        let rig = Self { camera, vsync, projector, calibration, auto_resume, sim, places };
         rig.check(&mut document);
         document.finish(Some(rig))
     }
@@ -356,6 +370,10 @@ impl RigFile {
     /// Checks rules that involve several tables.
     fn check(&self, document: &mut Document<'_>) {
         let (camera, vsync, projector) = (&self.camera, &self.vsync, &self.projector);
+        if self.auto_resume && projector.driver == ProjectorDriver::External {
+            let message = "auto_resume = true: a projector of the driver \"external\" needs an operator; leave auto_resume out, or use another driver";
+            document.refuse(&["auto_resume"], message);
+        }
         if !document.is_sound(&[
             &["vsync", "period_us"],
             &["projector", "rows"],

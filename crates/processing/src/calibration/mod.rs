@@ -15,7 +15,9 @@ use raysweep_session::{Result, Session, durable};
 use raysweep_transport::plane::board::Estimate;
 use raysweep_transport::plane::board::times::RowTimes;
 
-pub use self::file::{CalibratedAmbient, CalibratedFlicker, CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in};
+pub use self::file::{
+    CalibratedAmbient, CalibratedFlicker, CalibrationHeader, KeptCalibration, Pair, ValidFor, current_in,
+};
 use self::file::{CalibratedLight, CalibratedTiming, CalibrationArrays, SCHEMA};
 pub use self::images::{BoardImages, BoardPixels, CalibrationError};
 pub use self::task::{BoardPurpose, BoardView, CalibrationTask};

@@ -7,10 +7,10 @@ use super::kernel::GuestKernel;
 use crate::run::{Done, program};
 
 /// Modules needed before the host's folders are mounted.
-const BOOT_MODULES: [&str; 3] = ["virtio_pci", "9pnet_virtio", "9p"];
+pub const BOOT_MODULES: [&str; 3] = ["virtio_pci", "9pnet_virtio", "9p"];
 
 /// Init script (process 1). Programs and libraries are the host's own; `run.sh` is generated for each run.
-const INIT: &str = "\
+pub const INIT: &str = "\
 #!/bin/busybox sh
 /bin/busybox mkdir -p /proc /sys /dev /tmp /usr /share /etc /lib64
 /bin/busybox --install -s /bin
@@ -37,19 +37,19 @@ sh /share/run.sh
 poweroff -f
 ";
 
-/// Writes the initramfs: an uncompressed cpio archive in `newc` format.
-pub fn write(path: &Path, kernel: &GuestKernel) -> Done {
+/// Writes the initramfs with these modules and this script as process 1: an uncompressed cpio archive in `newc` format.
+pub fn write(path: &Path, kernel: &GuestKernel, modules: &[&str], init: &str) -> Done {
     let busybox = program("busybox").ok_or("no busybox on the path: install busybox-static")?;
     let mut archive = Archive::default();
     for folder in ["bin", "lib"] {
         archive.folder(folder);
     }
-    archive.file("init", INIT.as_bytes());
+    archive.file("init", init.as_bytes());
     archive.file("bin/busybox", &read(&busybox)?);
     let release = format!("lib/modules/{}", kernel.release());
     let unpacked = kernel.modules.join(kernel.release());
     archive.file(&format!("{release}/modules.dep"), &read(&unpacked.join("modules.dep"))?);
-    for file in kernel.files_of(&BOOT_MODULES)? {
+    for file in kernel.files_of(modules)? {
         archive.file(&format!("{release}/{file}"), &read(&unpacked.join(&file))?);
     }
     std::fs::write(path, archive.finish()).map_err(|error| format!("{}: {error}", path.display()))

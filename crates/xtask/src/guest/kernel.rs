@@ -12,7 +12,9 @@ const META_PACKAGE: &str = "linux-image-amd64";
 
 /// Folders of the modules that tests may request. Unpacking all 4000 modules would take longer than the tests. Every
 /// entry must exist in both releases: `fs/f*` stands for `fs/fscache`, which in Debian 13 is part of `fs/netfs`.
-const MODULE_FOLDERS: [&str; 15] = [
+const MODULE_FOLDERS: [&str; 20] = [
+    "crypto/crc32c_generic.ko*",
+    "drivers/block/virtio_blk.ko*",
     "drivers/char",
     "drivers/gpu/drm/*.ko*",
     "drivers/gpu/drm/display",
@@ -24,7 +26,10 @@ const MODULE_FOLDERS: [&str; 15] = [
     "drivers/video",
     "drivers/virtio",
     "fs/9p",
+    "fs/ext4",
     "fs/f*",
+    "fs/jbd2",
+    "fs/mbcache.ko*",
     "fs/netfs",
     "lib",
     "net/9p",
@@ -43,13 +48,17 @@ impl GuestKernel {
     /// Returns the kernel in `folder`; downloads and unpacks it if necessary.
     pub fn fetch(folder: &Path) -> Done<Self> {
         let kept = folder.join("kernel");
-        if !kept.join("vmlinux").exists() {
+        // A kernel that was unpacked for fewer modules is unpacked anew.
+        let folders = MODULE_FOLDERS.join("\n");
+        if std::fs::read_to_string(kept.join("folders")).ok().as_ref() != Some(&folders) {
             // Renamed only when complete, so that an interrupted download is restarted.
             let fresh = folder.join("kernel.part");
             let _ = std::fs::remove_dir_all(&fresh);
             let _ = std::fs::remove_dir_all(&kept);
             std::fs::create_dir_all(&fresh).map_err(|error| format!("{}: {error}", fresh.display()))?;
             unpack(&download(&fresh)?, &fresh)?;
+            std::fs::write(fresh.join("folders"), folders)
+                .map_err(|error| format!("{}: {error}", fresh.display()))?;
             std::fs::rename(&fresh, &kept).map_err(|error| format!("{}: {error}", kept.display()))?;
         }
         let modules = kept.join("lib/modules");

@@ -11,6 +11,7 @@ mod kernel;
 mod qemu;
 mod report;
 mod script;
+pub mod systemd;
 mod table;
 
 use std::path::PathBuf;
@@ -40,10 +41,11 @@ pub fn guest(names: &[&str]) -> Done {
     let script = run.join("run.sh");
     std::fs::write(&script, script::script(&tests))
         .map_err(|error| format!("{}: {error}", script.display()))?;
-    initramfs::write(&run.join("initramfs"), &kernel)?;
+    initramfs::write(&run.join("initramfs"), &kernel, &initramfs::BOOT_MODULES, initramfs::INIT)?;
     println!("kernel guest: Linux {}, {} tests", kernel.release(), tests.len());
     let mut machine = qemu::Machine::start(&kernel, &run, &tests)?;
-    let checks = report::follow(&mut machine, &run, &tests)?;
+    let names: Vec<&str> = tests.iter().map(|test| test.name).collect();
+    let checks = report::follow(&mut machine, &run, &names, script::TEST_LIMIT_S)?;
     println!("kernel guest: {checks} checks passed in {:.0} s", began.elapsed().as_secs_f64());
     Ok(())
 }
@@ -100,6 +102,19 @@ fn build(tests: &[&GuestTest]) -> Done<Vec<Executable>> {
         }
     }
     Ok(all)
+}
+
+/// Builds programs with the tests of the daemon, and so with what `cargo xtask test` has built; returns their folder.
+fn build_programs(names: &[&str]) -> Done<PathBuf> {
+    let test =
+        TESTS.iter().find(|test| test.programs.contains(&"raysweepd")).ok_or("no test of the daemon")?;
+    let built = build(&[test])?;
+    let daemon = built.iter().find(|built| built.name == "raysweepd").ok_or("cargo built no raysweepd")?;
+    let folder = daemon.path.parent().ok_or("raysweepd in no folder")?;
+    match names.iter().find(|name| !folder.join(name).exists()) {
+        Some(missing) => Err(format!("cargo built no {missing} in {}", folder.display())),
+        None => Ok(folder.to_owned()),
+    }
 }
 
 /// Paths of the executables in cargo's JSON messages.

@@ -18,26 +18,11 @@ pub struct Machine(Child);
 impl Machine {
     /// Boots the guest. It powers off once it has run the tests.
     pub fn start(kernel: &GuestKernel, run: &Path, tests: &[&GuestTest]) -> Done<Self> {
-        let log = run.join("qemu.log");
-        let log = std::fs::File::create(&log).map_err(|error| format!("{}: {error}", log.display()))?;
-        let mut qemu = Command::new("qemu-system-x86_64");
-        // Paths of sockets are limited to 108 bytes and target folders may be longer, so all paths are relative.
-        qemu.current_dir(run).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
-        qemu.args(["-machine", "pc", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "1024"]);
-        qemu.args(["-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"]);
-        qemu.args(["-serial", "file:console"]);
-        qemu.arg("-kernel").arg(&kernel.image).args(["-initrd", "initramfs", "-append", KERNEL_ARGUMENTS]);
+        let mut qemu = Self::command(kernel, run, KERNEL_ARGUMENTS)?;
         mount(&mut qemu, "usr", Path::new("/usr"), ",readonly=on");
         mount(&mut qemu, "modules", &kernel.modules, ",readonly=on");
         mount(&mut qemu, "share", Path::new("."), "");
-        qemu.args([
-            "-device",
-            "virtio-rng-pci",
-            "-device",
-            "qemu-xhci,id=usb",
-            "-device",
-            "virtio-serial-pci",
-        ]);
+        qemu.args(["-device", "qemu-xhci,id=usb", "-device", "virtio-serial-pci"]);
         pipe(&mut qemu, "qmp");
         qemu.args(["-mon", "chardev=qmp,mode=control"]);
         // Tests may share pipes and devices.
@@ -47,7 +32,32 @@ impl Machine {
         devices.iter().for_each(|device| {
             qemu.args(["-device", device]);
         });
+        Self::spawn(qemu)
+    }
+
+    /// QEMU with a processor, memory, a console and the kernel, which takes `initramfs` from the folder `run`.
+    pub fn command(kernel: &GuestKernel, run: &Path, kernel_arguments: &str) -> Done<Command> {
+        let log = run.join("qemu.log");
+        let log = std::fs::File::create(&log).map_err(|error| format!("{}: {error}", log.display()))?;
+        let mut qemu = Command::new("qemu-system-x86_64");
+        // Paths of sockets are limited to 108 bytes and target folders may be longer, so all paths are relative.
+        qemu.current_dir(run).stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
+        qemu.args(["-machine", "pc", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2", "-m", "1024"]);
+        qemu.args(["-nodefaults", "-no-user-config", "-no-reboot", "-display", "none"]);
+        qemu.args(["-serial", "file:console", "-device", "virtio-rng-pci"]);
+        qemu.arg("-kernel").arg(&kernel.image).args(["-initrd", "initramfs", "-append", kernel_arguments]);
+        Ok(qemu)
+    }
+
+    /// Starts QEMU.
+    pub fn spawn(mut qemu: Command) -> Done<Self> {
         qemu.spawn().map(Self).map_err(|error| format!("cannot start qemu-system-x86_64: {error}"))
+    }
+
+    /// Waits until the guest has powered off.
+    pub fn wait(mut self) {
+        // An error means that there is no such process any more.
+        let _ = self.0.wait();
     }
 
     /// Whether the guest has powered off or failed.
@@ -65,7 +75,7 @@ impl Drop for Machine {
 }
 
 /// Makes a host folder available to the guest.
-fn mount(qemu: &mut Command, tag: &str, path: &Path, options: &str) {
+pub fn mount(qemu: &mut Command, tag: &str, path: &Path, options: &str) {
     // QEMU expects commas in values to be doubled.
     let path = path.display().to_string().replace(',', ",,");
     qemu.args([
@@ -77,7 +87,7 @@ fn mount(qemu: &mut Command, tag: &str, path: &Path, options: &str) {
 
 /// Adds a pair of connected character devices: `name` for a device or the monitor, the other for programs in the guest.
 /// They are connected through a socket, since QEMU cannot connect two directly.
-fn pipe(qemu: &mut Command, name: &str) {
+pub fn pipe(qemu: &mut Command, name: &str) {
     qemu.args(["-chardev", &format!("socket,id={name},path={name}.socket,server=on,wait=off")]);
     qemu.args(["-chardev", &format!("socket,id={name}-guest,path={name}.socket")]);
     qemu.args(["-device", &format!("virtserialport,chardev={name}-guest,name={name}")]);

@@ -1,0 +1,90 @@
+//! The session that `resume --auto` resumes.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use raysweep_config::AnyRigFile;
+use raysweep_proto::SessionInfo;
+
+use super::CommandFailure;
+
+/// The newest session if it was cut off and may be resumed with nobody present; otherwise, why there is none.
+///
+/// # Errors
+/// If its rig file cannot be read.
+pub(super) fn cut_off(sessions: &[SessionInfo]) -> Result<Result<PathBuf, String>, CommandFailure> {
+    let Some(newest) = sessions.iter().rfind(|session| session.state != "unreadable") else {
+        return Ok(Err("no session to resume".into()));
+    };
+    let shown = newest.session.display();
+    if newest.state != "unfinished" {
+        return Ok(Err(format!("nothing to resume: the newest session, {shown}, is {}", newest.state)));
+    }
+    let read = |file| {
+        let path = newest.session.join(file);
+        fs::read_to_string(&path).map_err(|source| CommandFailure::File { path, source })
+    };
+    // Calibrations and darks ask an operator to put something before the camera; a film's scene has moved on.
+    let plan = toml::from_str::<toml::Table>(&read("plan.toml")?).unwrap_or_default();
+    if plan.get("kind").and_then(toml::Value::as_str) != Some("sweep") {
+        return Ok(Err(format!("{shown} was cut off; only sweeps are resumed with nobody present")));
+    }
+    let rig = AnyRigFile::parse(&read("rig.toml")?);
+    if !matches!(rig, Ok(AnyRigFile::Plane(rig)) if rig.auto_resume) {
+        return Ok(Err(format!(
+            "{shown} was cut off; its rig file does not say `auto_resume = true`: `raysweep resume {}`",
+            name(&newest.session)
+        )));
+    }
+    Ok(Ok(newest.session.clone()))
+}
+
+fn name(session: &Path) -> String {
+    session.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERMITTED: &str = "kind = \"plane\"\nauto_resume = true\ncamera.driver = \"sim\"\nvsync.driver = \"sim\"\nprojector.driver = \"sim\"\n";
+
+    fn session(folder: &Path, state: &str, rig: &str, plan: &str) -> SessionInfo {
+        fs::write(folder.join("rig.toml"), rig).unwrap();
+        fs::write(folder.join("plan.toml"), plan).unwrap();
+        SessionInfo {
+            session: folder.to_owned(),
+            name: "a".into(),
+            created: String::new(),
+            stored: 1,
+            points: 2,
+            state: state.into(),
+        }
+    }
+
+    #[test]
+    fn only_a_cut_off_sweep_of_a_rig_that_permits_it_is_resumed() {
+        let folder = tempfile::tempdir().unwrap();
+        let sweep = "kind = \"sweep\"";
+        let forbidden = PERMITTED.replace("true", "false");
+        let why = |state, rig: &str, plan| {
+            cut_off(&[session(folder.path(), state, rig, plan)]).unwrap().err().unwrap_or_default()
+        };
+        assert_eq!(why("unfinished", PERMITTED, sweep), "");
+        assert!(why("cancelled", PERMITTED, sweep).contains("is cancelled"));
+        assert!(why("unfinished", &forbidden, sweep).contains("auto_resume"));
+        assert!(why("unfinished", PERMITTED, "kind = \"darks\"").contains("only sweeps"));
+        assert!(cut_off(&[]).unwrap().is_err());
+    }
+
+    #[test]
+    fn an_older_session_is_left_alone() {
+        let (old, new) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        let sessions = [
+            session(old.path(), "unfinished", PERMITTED, "kind = \"sweep\""),
+            session(new.path(), "complete", PERMITTED, "kind = \"sweep\""),
+        ];
+        assert!(cut_off(&sessions).unwrap().is_err());
+        assert_eq!(cut_off(&sessions[..1]).unwrap().unwrap(), old.path());
+    }
+}
