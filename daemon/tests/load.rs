@@ -33,7 +33,7 @@ impl Stage for Stopwatch {
     }
 
     fn apply(&self, unit: &Unit, image: Array2<f32>) -> Result<Array2<f32>, StageError> {
-        if let Some(exposed_ns) = unit.last_exposure_ns {
+        if let Some(exposed_ns) = unit.starts_ns.last() {
             let _ = self.0.send((Clock::real().now_ns() - exposed_ns) as f64 * 1e-3);
         }
         Ok(image)

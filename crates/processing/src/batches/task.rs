@@ -22,7 +22,7 @@ const DRAWN_BYTES: u64 = 40;
 /// Disk space of one value of a video: NPY, EXR and PNG.
 const STORED_BYTES: u64 = 12;
 /// Memory of a video's pictures in the report.
-const STRIP_BYTES: u64 = 6 * 3 << 20;
+const STRIP_BYTES: u64 = (6 * 3) << 20;
 /// Memory for each pair of dots in the confusion matrix while it is written: its image, and its copies as NPY and EXR.
 const CONFUSION_BYTES: u64 = 24;
 

@@ -434,7 +434,7 @@ fn fit(
         right += light;
     }
     let ridge = 1e-9 * normal.trace() / unknowns as f64;
-    if !(ridge > 0.0) {
+    if ridge <= 0.0 || ridge.is_nan() {
         return Err(CalibrateError::NoPixels);
     }
     normal += DMatrix::identity(unknowns, unknowns) * ridge;

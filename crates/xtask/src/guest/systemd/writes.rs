@@ -56,7 +56,7 @@ pub fn replay(disk: &Path, entries: &[Entry], end: usize, random: &mut Random) -
     let file = File::options().write(true).open(disk).map_err(failed)?;
     let flushed = entries[..end].iter().rposition(|entry| entry.flags & FLUSH != 0).unwrap_or(0);
     for (index, entry) in entries[..end].iter().enumerate() {
-        if index < flushed || entry.flags & FUA != 0 || random.number() % 2 == 0 {
+        if index < flushed || entry.flags & FUA != 0 || random.number().is_multiple_of(2) {
             file.write_all_at(&entry.bytes, entry.at).map_err(failed)?;
         }
     }
