@@ -25,8 +25,6 @@ pub(crate) struct FrameStamps {
 const DARK_ROOM: f64 = 2e-5;
 /// Largest amplitude that may remain, of white in a row's time.
 const MOST_FLICKER: f64 = 0.0005;
-/// Light is not negative, so an amplitude cannot much exceed the level.
-const MOST_SHARE: f64 = 1.2;
 /// A dark image with a larger share of saturated pixels is not used.
 const MOST_SATURATED: f64 = 0.01;
 /// Time between the end of a run and the start of the next, on their common clock. What it is does not matter as long
@@ -211,14 +209,12 @@ impl<'a> RoomImages<'a> {
             return (None, RoomFindings { remark: None, warning });
         }
         match self.fitted(seen, stack, roles) {
-            Some(lamp)
-                if lamp.is_steady(share.unwrap_or_else(|| lamp.share())) && lamp.share() < MOST_SHARE =>
-            {
+            Some(lamp) if lamp.is_seen() => {
                 // Flicker in the dark images changes what they seem to show of the level.
                 let level = self.level(Some(&lamp)).unwrap_or(level);
                 let darks = self.darks.keys().copied().collect();
                 let room = RoomFlicker { lamp, darks, times: self.times };
-                let said = room.say(level, self.rows, roles, (frames, rate_hz));
+                let said = room.say((level, share), self.rows, roles, (frames, rate_hz));
                 (Some(room), RoomFindings { remark: Some(("room light", said)), warning: None })
             }
             _ if share.is_none() => (None, RoomFindings::default()),
@@ -302,7 +298,7 @@ impl RoomFlicker {
 
     fn say(
         &self,
-        level: f64,
+        (level, share): (f64, Option<f64>),
         rows: &[usize],
         roles: &[(PointRole, PointRole)],
         (frames, rate_hz): (u32, f64),
@@ -312,7 +308,8 @@ impl RoomFlicker {
             .iter()
             .flat_map(|&(light, dark)| rows.iter().map(move |&t| self.excess_us(light, dark, t).powi(2)));
         let (sum, count) = squares.fold((0.0, 0), |(sum, count), square| (sum + square, count + 1));
-        let percent = 100.0 * self.lamp.share();
+        // Images at even distances may hardly show the lamp itself, only how it changes.
+        let percent = 100.0 * share.unwrap_or_else(|| self.lamp.share());
         let removed_us = (sum / f64::from(count.max(1))).sqrt();
         let cure = match cancelling_frames(frequency_hz, &[rate_hz], frames) {
             Some(enough) if enough == frames => String::new(),

@@ -57,6 +57,8 @@ pub struct LampFlicker {
     /// Times of the amplitudes, ascending; between them `c` is linear.
     knots_s: Vec<f64>,
     amplitudes: Vec<Complex<f64>>,
+    /// Share that it explains of what pixels of a row have in common and transport does not explain.
+    explained: f64,
 }
 
 /// Frequencies that are tried. The rows from which a sweep is judged lie too far apart for higher ones.
@@ -68,6 +70,8 @@ const FINE_HZ: f64 = 0.004;
 /// Flicker must explain this many times the variance of the rest, and at least half of what the images show.
 const LEAST_EVIDENCE: f64 = 40.0;
 const LEAST_EXPLAINED: f64 = 0.5;
+/// A lamp must explain this share of what a sweep shows beyond its scene; a dozen unknowns explain some of anything.
+const LEAST_SEEN: f64 = 0.7;
 /// Light is not negative, so an amplitude cannot much exceed the level.
 const MOST_SHARE: f64 = 1.2;
 /// Time between amplitudes.
@@ -78,6 +82,8 @@ const MOST_KNOTS: usize = 32;
 const PAUSE_S: f64 = 2.0 * KNOT_S;
 /// The smoothness with which scene and flicker are told apart.
 const PRIOR: Prior = Prior::Split { alpha: 0.01, beta: 0.001 };
+/// Frequencies whose rows' levels are found.
+const PEAKS: usize = 8;
 /// How often the rows' levels, or the frequency, are found again.
 const ROUNDS: usize = 4;
 /// Most frames that are proposed for an average.
@@ -131,14 +137,9 @@ impl DarkFlicker {
     /// of the room explain everything. `rows` are the camera rows of the means.
     pub fn find(darks: &[DarkRows], rows: &[usize], row_time_s: f64) -> Option<Self> {
         let series = DarkSeries::new(darks, rows, row_time_s)?;
-        let steps = ((HIGHEST_HZ - LOWEST_HZ) / series.step_hz).ceil() as usize;
-        let start = series.best((0..=steps).map(|step| LOWEST_HZ + series.step_hz * step as f64).collect());
-        let mut best = series.refined(start, series.step_hz)?;
-        let mut series = series;
-        for _ in 0..ROUNDS {
-            series.set_levels(darks, &best);
-            best = series.refined(Some(best), 10.0 * FINE_HZ)?;
-        }
+        // Images at even distances look alike under several frequencies, until the levels of the rows are right.
+        let best = series.peaks().into_iter().filter_map(|peak| series.settled(darks, peak));
+        let best = best.max_by(|a, b| a.explained.total_cmp(&b.explained))?;
         let total: f64 = series.rest.iter().map(|rest| rest * rest).sum();
         let degrees = (series.rest.len() - 2 * rows.len()).saturating_sub(2).max(1) as f64;
         let variance = (total - best.explained) / degrees;
@@ -157,6 +158,7 @@ struct DarkFit {
 }
 
 /// Dark images without what a constant and a part that grows with the exposure explain in each row.
+#[derive(Clone)]
 struct DarkSeries<'a> {
     rows: &'a [usize],
     row_time_s: f64,
@@ -203,15 +205,43 @@ impl<'a> DarkSeries<'a> {
         Some(Self { rows, row_time_s, frames: frames.collect(), basis, rest, levels, step_hz })
     }
 
+    /// The frequencies that explain the images best, each better than its neighbours.
+    fn peaks(&self) -> Vec<DarkFit> {
+        let steps = ((HIGHEST_HZ - LOWEST_HZ) / self.step_hz).ceil() as usize;
+        let fits: Vec<Option<DarkFit>> = (0..=steps)
+            .into_par_iter()
+            .map(|step| self.fit(LOWEST_HZ + self.step_hz * step as f64))
+            .collect();
+        let explained = |fit: &Option<DarkFit>| fit.map_or(0.0, |fit| fit.explained);
+        let is_peak = |fits: &&[Option<DarkFit>]| {
+            explained(&fits[1]) >= explained(&fits[0]) && explained(&fits[1]) >= explained(&fits[2])
+        };
+        let mut peaks: Vec<DarkFit> = fits.windows(3).filter(is_peak).filter_map(|fits| fits[1]).collect();
+        peaks.sort_by(|a, b| b.explained.total_cmp(&a.explained));
+        peaks.truncate(PEAKS);
+        peaks
+    }
+
+    /// A peak with the levels of the rows that belong to it.
+    fn settled(&self, darks: &[DarkRows], peak: DarkFit) -> Option<DarkFit> {
+        let mut series = self.clone();
+        let mut best = series.refined(peak, self.step_hz)?;
+        for _ in 0..ROUNDS {
+            series.set_levels(darks, &best);
+            best = series.refined(best, 10.0 * FINE_HZ)?;
+        }
+        Some(best)
+    }
+
     /// The best of these frequencies.
     fn best(&self, frequencies: Vec<f64>) -> Option<DarkFit> {
         let fits: Vec<DarkFit> = frequencies.into_par_iter().filter_map(|f| self.fit(f)).collect();
         fits.into_iter().max_by(|a, b| a.explained.total_cmp(&b.explained))
     }
 
-    fn refined(&self, around: Option<DarkFit>, within_hz: f64) -> Option<DarkFit> {
+    fn refined(&self, around: DarkFit, within_hz: f64) -> Option<DarkFit> {
         let steps = (within_hz / FINE_HZ).ceil() as i32;
-        let middle = around?.frequency_hz;
+        let middle = around.frequency_hz;
         self.best((-steps..=steps).map(|step| middle + FINE_HZ * f64::from(step)).collect())
     }
 
@@ -310,7 +340,8 @@ impl LampFlicker {
             turned.for_each(|(amplitude, &knot_s)| *amplitude *= turn(-drift_hz, knot_s));
         }
         amplitudes = fit(&projected, images, &knots_s, (frequency_hz, row_time_s))?;
-        Ok(Self { frequency_hz, row_time_s, knots_s, amplitudes })
+        let explained = explained(&projected, images, &knots_s, (frequency_hz, row_time_s), &amplitudes);
+        Ok(Self { frequency_hz, row_time_s, knots_s, amplitudes, explained })
     }
 
     /// By how much longer than it did an exposure of camera row `t` would have seen the steady light of the room for
@@ -337,10 +368,10 @@ impl LampFlicker {
             / self.amplitudes.len().max(1) as f64
     }
 
-    /// Whether the amplitude stays within half and one and a half times `share`, as that of a lamp does. What merely
-    /// fits the images does not.
-    pub fn is_steady(&self, share: f64) -> bool {
-        self.amplitudes.iter().all(|amplitude| (0.5..=1.5).contains(&(amplitude.norm() / share)))
+    /// Whether the sweep shows this lamp: it explains most of what the pixels of a row have in common beyond the scene's
+    /// light. What has another phase in each image does not look like a lamp.
+    pub fn is_seen(&self) -> bool {
+        self.explained >= LEAST_SEEN && self.share() <= MOST_SHARE
     }
 }
 
@@ -409,20 +440,9 @@ fn fit(
     (frequency_hz, row_time_s): (f64, f64),
 ) -> Result<Vec<Complex<f64>>, CalibrateError> {
     let unknowns = 2 * knots_s.len();
-    let seen = DMatrix::from_fn(images.len(), knots_s.len(), |image, knot| {
-        let hat = |time_s: f64| {
-            let at = hats(knots_s, time_s).into_iter().flatten().find(|(at, _)| *at == knot);
-            at.map_or(0.0, |(_, hat)| hat)
-        };
-        let TimedImage { light, dark } = &images[image];
-        light.phasor(frequency_hz, hat) - dark.phasor(frequency_hz, hat)
-    });
+    let seen = seen_us(images, knots_s, frequency_hz);
     let of_row = |row: &ProjectedRow| {
-        let turned = turn(frequency_hz, row_time_s * row.t as f64);
-        let columns = DMatrix::from_fn(images.len(), unknowns, |image, unknown| {
-            let seen = seen[(image, unknown / 2)] * turned;
-            if unknown % 2 == 0 { seen.re } else { -seen.im }
-        });
+        let columns = columns(&seen, turn(frequency_hz, row_time_s * row.t as f64));
         let normal = columns.tr_mul(&(&projected.projectors[row.projector] * &columns)) * row.weight;
         (normal, columns.tr_mul(&row.light))
     };
@@ -440,6 +460,47 @@ fn fit(
     normal += DMatrix::identity(unknowns, unknowns) * ridge;
     let found = normal.cholesky().ok_or(PlaneError::NotConvex)?.solve(&right);
     Ok((0..knots_s.len()).map(|knot| Complex::new(found[2 * knot], found[2 * knot + 1])).collect())
+}
+
+/// What each image saw of unit amplitude at each knot, less its dark image, in row 0 and in us.
+fn seen_us(images: &[TimedImage], knots_s: &[f64], frequency_hz: f64) -> DMatrix<Complex<f64>> {
+    DMatrix::from_fn(images.len(), knots_s.len(), |image, knot| {
+        let hat = |time_s: f64| {
+            let at = hats(knots_s, time_s).into_iter().flatten().find(|(at, _)| *at == knot);
+            at.map_or(0.0, |(_, hat)| hat)
+        };
+        let TimedImage { light, dark } = &images[image];
+        light.phasor(frequency_hz, hat) - dark.phasor(frequency_hz, hat)
+    })
+}
+
+/// The same for real and imaginary parts of the amplitudes, in the row of this phase.
+fn columns(seen_us: &DMatrix<Complex<f64>>, turned: Complex<f64>) -> DMatrix<f64> {
+    DMatrix::from_fn(seen_us.nrows(), 2 * seen_us.ncols(), |image, unknown| {
+        let seen = seen_us[(image, unknown / 2)] * turned;
+        if unknown % 2 == 0 { seen.re } else { -seen.im }
+    })
+}
+
+/// Share of the rows' common light that amplitudes explain.
+fn explained(
+    projected: &Projected,
+    images: &[TimedImage],
+    knots_s: &[f64],
+    (frequency_hz, row_time_s): (f64, f64),
+    amplitudes: &[Complex<f64>],
+) -> f64 {
+    let seen = seen_us(images, knots_s, frequency_hz);
+    let parts = amplitudes.iter().flat_map(|amplitude| [amplitude.re, amplitude.im]);
+    let parts = DVector::from_iterator(2 * amplitudes.len(), parts);
+    let (mut before, mut after) = (0.0, 0.0);
+    for row in projected.rows.iter().filter(|row| row.weight > 0.0) {
+        let flicker = columns(&seen, turn(frequency_hz, row_time_s * row.t as f64)) * &parts;
+        let rest = &row.light - &projected.projectors[row.projector] * flicker * row.weight;
+        before += row.light.norm_squared() / row.weight;
+        after += rest.norm_squared() / row.weight;
+    }
+    if before > 0.0 { 1.0 - after / before } else { 0.0 }
 }
 
 /// Times for amplitudes: ends of every stretch without a pause, and evenly between them.
