@@ -45,7 +45,7 @@ const LOGGED: Stage = Stage { name: "logged", script: include_str!("cut.sh") };
 const BOOT: Stage = Stage { name: "boot", script: include_str!("boot.sh") };
 
 /// Limit of a stage: some take a minute, and a busy machine several times as long.
-const STAGE_LIMIT_S: u32 = 600;
+const STAGE_LIMIT_S: u32 = 1200;
 
 /// Power losses that are made from the log of one run.
 const POWER_LOSSES: u64 = 5;

@@ -1,3 +1,5 @@
+# The unit loads the drivers' modules.
+depmod
 systemctl start multi-user.target
 
 installs() {
@@ -6,7 +8,7 @@ installs() {
 check "the package installs, and its simulated rig serves" installs
 useradd -m -G raysweep ada
 useradd -m eve
-operator_at_once() { systemctl stop raysweepd.service && code 0 as ada raysweep status && is_active; }
+operator_at_once() { systemctl stop raysweepd.service && code 0 as ada raysweep status && await is_active; }
 check "a member of the group uses it at once: the socket starts the daemon" operator_at_once
 observer() { code 0 as eve raysweep status && code 5 as eve raysweep run /share/plan.toml && code 5 as eve raysweep cancel; }
 check "any other user may look, and is refused orders" observer
@@ -15,7 +17,11 @@ check "rmem_max acts without a reboot" buffers
 examples() {
     folder=/usr/share/doc/raysweep/examples
     ! grep -r "tests/data" $folder /etc/raysweep || return 1
-    [ -e $folder/scenes/p2r_corner.npz ] && as ada raysweep check $folder/plans/paper.toml
+    for rig in $folder/rigs/*.toml; do
+        scene=$(sed -n 's/^scene = "\(.*\.np[yz]\)".*/\1/p' "$rig")
+        [ -z "$scene" ] || [ -e "$folder/rigs/$scene" ] || { echo "$rig: no $scene"; return 1; }
+    done
+    [ -e $folder/scenes/p2r_corner.npz ] && [ -e $folder/plans/quick.toml ]
 }
 check "examples name only what is installed" examples
 pages() { zgrep -q "raysweep" /usr/share/man/man1/raysweep-run.1.gz /usr/share/man/man8/raysweepd.8.gz; }
@@ -28,12 +34,14 @@ printf '[Service]\nExecReload=/bin/sh /share/open.sh\n' >/etc/systemd/system/ray
 systemctl daemon-reload
 systemctl restart raysweepd.service
 
-policies() {
-    for task in /proc/$(property MainPID)/task/*/stat; do sed 's/.*) //' "$task" 2>/dev/null | cut -d' ' -f39; done
+# Whether a thread of the daemon has the policy SCHED_FIFO, field 41 of proc(5)'s stat.
+is_fifo() { cat /proc/"$(property MainPID)"/task/*/stat 2>/dev/null | sed 's/.*) //' | cut -d' ' -f39 | grep -qx 1; }
+sweep() {
+    runuser -u ada -- raysweep run /share/plan.toml </dev/null &
+    client=$!
+    await is_fifo && code 0 wait $client && is_complete && bits >/share/bits
 }
-is_fifo() { policies | grep -qx 1; }
-sweep() { begin && check "threads of devices have SCHED_FIFO" is_fifo && code 0 wait $client && is_complete && bits >/share/bits; }
-check "an operator's sweep over the socket completes" sweep
+check "an operator's sweep over the socket completes; threads of devices have SCHED_FIFO" sweep
 
 devices() {
     # Plugged in after the daemon was started.
@@ -50,6 +58,61 @@ devices() {
     systemctl reload raysweepd.service
 }
 check "a device of each class is opened by the service, plugged in after its start" devices
+
+mirror() {
+    modprobe virtio_console
+    for port in /sys/class/virtio-ports/*; do
+        [ "$(cat "$port/name")" != serial-guest ] || peer=/dev/${port##*/}
+    done
+    sh /share/optotune.sh "$peer" /share/mirror.log &
+    controller=$!
+    # What the daemon writes before a mirror leaves its origin.
+    sed "s/BOOT/$(cat /proc/sys/kernel/random/boot_id)/" /share/mirror.json >$DATA/mirror.json
+    chown raysweep:raysweep $DATA/mirror.json
+    systemctl kill --kill-who=main --signal=KILL raysweepd.service
+    await grep -q "XY=0" /share/mirror.log
+    parked=$?
+    await is_active
+    kill $controller
+    cat /share/mirror.log
+    rm -f $DATA/mirror.json*
+    return $parked
+}
+check "ExecStopPost parks a mirror after SIGKILL" mirror
+
+score() { systemd-analyze security --no-pager raysweepd.service | sed -n 's/.*Overall exposure level.*: \([0-9.]*\) .*/\1/p'; }
+at_most() { echo "exposure $1, at most $2"; [ -n "$1" ] && [ "$(printf '%s\n' "$1" "$2" | sort -n | tail -n 1)" = "$2" ]; }
+check "exposure of the unit" at_most "$(score)" 2.0
+unusable() {
+    echo 'kind = "cube"' >/etc/raysweep/rig.toml
+    ! systemctl restart raysweepd.service || return 1
+    restarts=$(property NRestarts)
+    code 4 timeout 60 runuser -u ada -- raysweep status || return 1
+    [ "$(property NRestarts)" = "$restarts" ] && journalctl -u raysweepd.service -p err -o cat | grep "rig.toml"
+}
+check "an unusable rig file: an error in the journal, no restart, and clients are told" unusable
+missing() {
+    rm /etc/raysweep/rig.toml
+    systemctl reset-failed raysweepd.service raysweepd.socket
+    systemctl restart raysweepd.socket
+    code 4 timeout 60 runuser -u ada -- raysweep status && [ "$(property ActiveState)" != activating ] &&
+        journalctl -o cat | grep "Assertion failed"
+}
+check "no rig file: the same" missing
+repaired() {
+    cp /share/rig.toml /etc/raysweep/rig.toml
+    systemctl reset-failed raysweepd.service raysweepd.socket
+    systemctl restart raysweepd.socket && code 0 as ada raysweep status
+}
+check "with a rig file it serves again" repaired
+simulated() {
+    install -D -m 644 /usr/share/raysweep/simulated.conf /etc/systemd/system/raysweepd.service.d/simulated.conf
+    systemctl daemon-reload && systemctl restart raysweepd.service && at_most "$(score)" 0.5 &&
+        observer && begin && code 0 wait $client && is_complete && same_bits
+}
+check "with simulated.conf: exposure, operator and observer" simulated
+rm /etc/systemd/system/raysweepd.service.d/*.conf
+systemctl daemon-reload
 
 crash() {
     begin && pid=$(property MainPID) && kill -9 "$pid" && code 4 wait $client && await is_active &&
@@ -78,69 +141,15 @@ watchdog() {
 check "the watchdog ends a daemon that hangs (SIGSTOP), and the run completes" watchdog
 
 upgrade() {
-    begin && pid=$(property MainPID) && dpkg -i /share/raysweep.deb && [ "$(property MainPID)" = "$pid" ] &&
-        code 0 wait $client && is_complete && same_bits || return 1
+    # Paused, the run is in progress as long as the installation takes.
+    begin && as ada raysweep pause && pid=$(property MainPID) && dpkg -i /share/raysweep.deb &&
+        [ "$(property MainPID)" = "$pid" ] && as ada raysweep continue && code 0 wait $client && is_complete &&
+        same_bits || return 1
     has_retired() { [ "$(property MainPID)" != "$pid" ]; }
-    await has_retired && cmp /share/rig.toml /etc/raysweep/rig.toml && code 0 as ada raysweep status &&
-        [ "$(property MainPID)" != "$pid" ]
+    await has_retired && cmp /share/rig.toml /etc/raysweep/rig.toml && code 0 as ada raysweep status && await is_active
 }
 check "an upgrade lets the run end, keeps rig file and sessions, and then takes effect" upgrade
 
-mirror() {
-    modprobe virtio_console
-    for port in /sys/class/virtio-ports/*; do
-        [ "$(cat "$port/name")" != serial-guest ] || peer=/dev/${port##*/}
-    done
-    sh /share/optotune.sh "$peer" /share/mirror.log &
-    controller=$!
-    # What the daemon writes before a mirror leaves its origin.
-    sed "s/BOOT/$(cat /proc/sys/kernel/random/boot_id)/" /share/mirror.json >$DATA/mirror.json
-    chown raysweep:raysweep $DATA/mirror.json
-    systemctl kill --kill-who=main --signal=KILL raysweepd.service
-    await grep -q "XY=0" /share/mirror.log
-    parked=$?
-    await is_active
-    kill $controller
-    cat /share/mirror.log
-    rm -f $DATA/mirror.json*
-    return $parked
-}
-check "ExecStopPost parks a mirror after SIGKILL" mirror
-
-score() { systemd-analyze security --no-pager raysweepd.service | sed -n 's/.*Overall exposure level.*: \([0-9.]*\) .*/\1/p'; }
-at_most() { echo "exposure $1, at most $2"; [ -n "$1" ] && [ "$(printf '%s\n' "$1" "$2" | sort -n | tail -n 1)" = "$2" ]; }
-check "exposure of the unit" at_most "$(score)" 2.0
-simulated() {
-    install -D -m 644 /usr/share/raysweep/simulated.conf /etc/systemd/system/raysweepd.service.d/simulated.conf
-    systemctl daemon-reload && systemctl restart raysweepd.service && at_most "$(score)" 0.5 &&
-        observer && begin && code 0 wait $client && is_complete && same_bits
-}
-check "with simulated.conf: exposure, operator and observer" simulated
-rm /etc/systemd/system/raysweepd.service.d/*.conf
-systemctl daemon-reload
-
-unusable() {
-    echo 'kind = "cube"' >/etc/raysweep/rig.toml
-    ! systemctl restart raysweepd.service || return 1
-    restarts=$(property NRestarts)
-    code 4 timeout 60 runuser -u ada -- raysweep status || return 1
-    [ "$(property NRestarts)" = "$restarts" ] && journalctl -u raysweepd.service -p err -o cat | grep "rig.toml"
-}
-check "an unusable rig file: an error in the journal, no restart, and clients are told" unusable
-missing() {
-    rm /etc/raysweep/rig.toml
-    systemctl reset-failed raysweepd.service raysweepd.socket
-    systemctl restart raysweepd.socket
-    code 4 timeout 60 runuser -u ada -- raysweep status && [ "$(property ActiveState)" != activating ] &&
-        journalctl -o cat | grep "Assertion failed"
-}
-check "no rig file: the same" missing
-repaired() {
-    cp /share/rig.toml /etc/raysweep/rig.toml
-    systemctl reset-failed raysweepd.service raysweepd.socket
-    systemctl restart raysweepd.socket && code 0 as ada raysweep status
-}
-check "with a rig file it serves again" repaired
 log() {
     journalctl -u raysweepd.service -o cat >/share/service/journal
     ! grep -E '^(<[0-9]>|20[0-9][0-9]-)' /share/service/journal && ! grep -i "mirror is parked" /share/service/journal
