@@ -50,6 +50,8 @@ fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Cou
         prior: Prior::SPLIT,
         noise,
         frames: &frames,
+        darks: &[],
+        calibration: None,
     };
     let measure = |seed| {
         let mut stack = photographed_in(frames[0], &ideal, seed);
@@ -168,7 +170,15 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
                 variance_ratio: None,
                 u0_rows: None,
             };
-            let of = Uncertainty { timing: &timing, settings: &settings, prior, noise, frames: &frames };
+            let of = Uncertainty {
+                timing: &timing,
+                settings: &settings,
+                prior,
+                noise,
+                frames: &frames,
+                darks: &[],
+                calibration: None,
+            };
             let sd = of.of_bands(&transport, &samples, &bands).unwrap();
             for (sd, variance) in sd.iter().zip(variances) {
                 let (sd, expected) = (f64::from(*sd), variance.sqrt());
@@ -191,7 +201,15 @@ fn dark_pixels_are_certain_and_misfits_are_refused() {
     let of = |frames: &[usize], samples: &Samples| {
         let settings = paper_sweep();
         let noise = camera_noise();
-        let of = Uncertainty { timing: &timing, settings: &settings, prior: Prior::SPLIT, noise, frames };
+        let of = Uncertainty {
+            timing: &timing,
+            settings: &settings,
+            prior: Prior::SPLIT,
+            noise,
+            frames,
+            darks: &[],
+            calibration: None,
+        };
         of.of_bands(&transport, samples, &bands())
     };
     assert_eq!(of(&[1; 75], &samples), Ok(Array3::zeros((5, 2, 3))));
@@ -248,6 +266,8 @@ fn direct_light_between_rows_is_judged_where_it_lies() {
             prior: Prior::SPLIT,
             noise: camera_noise(),
             frames: &frames,
+            darks: &[],
+            calibration: None,
         };
         let sd = |u0_rows| {
             let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows };
