@@ -170,6 +170,7 @@ impl DemuxFold {
         let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
+        let mut dark_frames = Vec::with_capacity(taken.len());
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
         for (index, (role, sample)) in taken.into_iter().enumerate() {
@@ -178,6 +179,7 @@ impl DemuxFold {
             }
             if let Some(dark) = self.dark_of(&darks, role) {
                 images.index_axis_mut(Axis(0), index).assign(&((&sample.image - &dark.image) * &scale));
+                dark_frames.push(dark.setting.delays_us.len().max(1));
             }
             settings.push(sample.setting.clone());
         }
@@ -186,6 +188,8 @@ impl DemuxFold {
             prior: self.options.prior(),
             exposures_us,
             settings,
+            dark_frames,
+            calibration: None,
             images,
             valid,
             regular: None,

@@ -323,13 +323,29 @@ fn coverage() {
         let runs = std::env::var("RUNS").map_or(100, |runs| runs.parse().unwrap());
         for seed in 0..runs {
             let session = Session::taken(case(100 + seed));
-            let times = match session.fit() { Ok(times) => times, Err(error) => { println!("{error}"); refused += 1; continue } };
+            let times = match session.fit() {
+                Ok(times) => times,
+                Err(error) => {
+                    println!("{error}");
+                    refused += 1;
+                    continue;
+                }
+            };
             let errors = errors(&session.rig, &times);
             for (index, sds) in errors.sds.iter().enumerate() {
                 within[index] += usize::from(sds.abs() < 1.0);
                 squares[index] += sds * sds / runs as f64;
             }
-            println!("{:.2?} {:.2e} {:.2e}", errors.sds, times.row_time_us.sd, times.camera_row_time_us.sd);
+            println!(
+                "{:.2?} {:.2e} {:.2e} latency {:.2} {:.2} jitter {:.2} useful {}",
+                errors.sds,
+                times.row_time_us.sd,
+                times.camera_row_time_us.sd,
+                errors.latency_us,
+                times.latency_sd_us,
+                times.jitter_us.value,
+                times.useful_frames
+            );
             rows += errors.rows_within_sd / runs as f64;
         }
         println!(

@@ -150,9 +150,9 @@ impl Rig {
         // A response is measured over 21 rows: 0.4 % in all, the same for neighbours in a column.
         let errors: Vec<[f64; 16]> = (0..(rows / 21 + 1) * case.columns)
             .map(|_| {
-                std::array::from_fn(
-                    |d| if (3..12).contains(&d) { case.response_error * unit.sample(&mut random) } else { 0.0 },
-                )
+                std::array::from_fn(|d| {
+                    if (3..12).contains(&d) { case.response_error * unit.sample(&mut random) } else { 0.0 }
+                })
             })
             .collect();
         let mut response = Array3::zeros((16, rows, case.columns));

@@ -21,9 +21,9 @@ pub(super) fn changes(
 ) -> [Array2<f64>; CalibrationParameter::ALL.len()] {
     let slots = &problem.model.slots;
     let predicted = light.dot(&problem.weights.t());
-    let class = timing.response().map(|response| {
-        response.classes(t, columns.iter().copied(), PLACE_STEPS).swap_remove(0)
-    });
+    let class = timing
+        .response()
+        .map(|response| response.classes(t, columns.iter().copied(), PLACE_STEPS).swap_remove(0));
     let change = |weights: Array2<f64>, step: f64| (light.dot(&weights.t()) - &predicted) / step;
     let at_other_times = |settings: &[Setting]| weights_of(timing, settings, slots, t, class.as_ref());
     let of_response = |derivative: fn(&Shares) -> Shares| match &class {

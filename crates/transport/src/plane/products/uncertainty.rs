@@ -148,7 +148,8 @@ impl Uncertainty<'_> {
             for (index, &(at, column)) in tile.pixels.iter().enumerate() {
                 for (band, sd) in rows[at].data.out.column_mut(column).iter_mut().enumerate() {
                     let row = index * bands.len() + band;
-                    let smoothed = stiff.row(row).iter().zip(rough.row(index)).map(|(a, b)| (a * b).abs()).sum::<f64>();
+                    let smoothed =
+                        stiff.row(row).iter().zip(rough.row(index)).map(|(a, b)| (a * b).abs()).sum::<f64>();
                     let sparse = solutions.row(row).sum().abs();
                     *sd = (BIAS_FACTOR * (prior.alpha() * smoothed + prior.beta() / 2.0 * sparse)) as f32;
                 }
@@ -215,7 +216,8 @@ impl Uncertainty<'_> {
         let changes = changes(self.timing, &settings, problem, (t, &columns), light);
         let bands = gains.nrows() / tile.pixels.len();
         Array1::from_shape_fn(gains.nrows(), |row| {
-            covariance.variance_of(&changes.each_ref().map(|change| gains.row(row).dot(&change.row(row / bands))))
+            covariance
+                .variance_of(&changes.each_ref().map(|change| gains.row(row).dot(&change.row(row / bands))))
         })
     }
 
@@ -314,12 +316,7 @@ impl Problem<'_> {
     }
 
     /// The light of each unknown in a pixel's profile; `otherwise` for those that are not part of the profile.
-    fn unknowns(
-        &self,
-        places: &[(usize, usize)],
-        profile: ArrayView1<f32>,
-        otherwise: f32,
-    ) -> Array1<f32> {
+    fn unknowns(&self, places: &[(usize, usize)], profile: ArrayView1<f32>, otherwise: f32) -> Array1<f32> {
         let mut light = Array1::from_elem(self.model.slots.len(), otherwise);
         places.iter().for_each(|&(slot, place)| light[slot] = profile[place]);
         if let Some(Spike { own, neighbour: Some(neighbour), share }) = self.spike {
