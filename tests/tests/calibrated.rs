@@ -19,7 +19,7 @@ use raysweep_pipeline::{
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{data, rig_text};
 use raysweep_transport::plane::board::times::{BoardStrip, JitterGauge};
-use raysweep_transport::plane::board::{BoardCalibration, Estimate};
+use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
 use raysweep_transport::plane::{
     NoiseModel, PixelResponse, RESPONSE_ROWS, Setting, Transport, relative_rows,
 };
@@ -94,11 +94,10 @@ impl Studio {
             row_starts_us: self.sim().row_starts_us().unwrap().iter().map(|us| us - sooner_us).collect(),
             camera_row_time_us: exact(truth.camera_row_time_us),
             exposure_offset_us: exact(LONGER_US),
-            latency_sd_us: 0.0,
+            jitter_us: 0.0,
+            covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &beam).unwrap(),
-            place_sd_rows: 0.0,
             white_dn: Array2::from_shape_fn(size, |(t, s)| self.white_dn(t, s) as f32),
-            white_relative_sd: 0.0,
             strip: None,
             lamp: None,
         }

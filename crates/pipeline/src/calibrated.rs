@@ -17,6 +17,8 @@ const NEAR_ROWS: f64 = 0.1;
 pub struct CalibrationDrift {
     /// By how much later than calibrated light arrives; 0 if it was not found, or is not to be believed.
     pub late_us: f64,
+    /// Standard deviation of that time; `None` if the calibration's own time is kept.
+    pub late_sd_us: Option<f64>,
     /// Median distance of direct light from its place, in projector rows; `None` if it was not found.
     pub u0_rows: Option<f64>,
     /// What was found, each as a key and a sentence.
@@ -39,7 +41,8 @@ pub(crate) struct Images<'a> {
 impl CalibrationDrift {
     /// Finds it from images with these settings.
     pub(crate) fn of(timing: &RowTiming, settings: &[Setting], images: &Images<'_>) -> Self {
-        let mut drift = Self { late_us: 0.0, u0_rows: None, remarks: Vec::new(), warnings: Vec::new() };
+        let mut drift =
+            Self { late_us: 0.0, late_sd_us: None, u0_rows: None, remarks: Vec::new(), warnings: Vec::new() };
         drift.find_latency(timing, settings, images);
         drift.find_place(timing, settings, images);
         drift
@@ -59,6 +62,7 @@ impl CalibrationDrift {
                     ));
                 } else {
                     self.late_us = late_us;
+                    self.late_sd_us = Some(found.standard_error_us);
                     if late_us.abs() > NEAR_US {
                         self.warnings.push(format!("{comes}: calibrate again soon"));
                     }

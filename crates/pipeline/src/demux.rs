@@ -192,6 +192,7 @@ impl DemuxFold {
         let mut valid = is_masked.then(|| Array3::from_elem(shape, true));
         let mut images = Array3::zeros(shape);
         let mut settings = Vec::with_capacity(taken.len());
+        let mut dark_frames = Vec::with_capacity(taken.len());
         let point_of = |role: &PointRole| self.schedule.points.iter().find(|point| point.role == *role);
         let StripFindings { late_us, .. } = self.jitter();
         let exposures_us = taken.keys().filter_map(point_of).map(|point| point.exposure_us).collect();
@@ -206,6 +207,7 @@ impl DemuxFold {
                 if let Some(flicker) = &flicker {
                     flicker.subtract(role, self.schedule_dark(role), image);
                 }
+                dark_frames.push(dark.setting.delays_us.len().max(1));
             }
             settings.push(sample.setting.earlier(late_us.get(&role).copied().unwrap_or(0.0)));
         }
@@ -214,6 +216,8 @@ impl DemuxFold {
             prior: self.options.prior(),
             exposures_us,
             settings,
+            dark_frames,
+            calibration: None,
             images,
             valid,
             regular: None,

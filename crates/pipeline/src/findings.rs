@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 
 use ndarray::{Array3, Axis, s};
+use raysweep_transport::plane::board::CalibrationCovariance;
 use raysweep_transport::plane::calibrate::{
     BeamEstimate, CalibrateError, Choice, FlyingSpot, Optics, OpticsEstimate, Sample, candidates,
     choose_prior, estimate_optics, settings_on_direct_row,
@@ -57,6 +58,8 @@ pub struct Choices {
     steady: Vec<usize>,
     /// By how much later than modelled light arrives.
     late_us: f64,
+    /// What is not known of the calibration, after the run has refined it.
+    calibration: Option<CalibrationCovariance>,
     noise: Option<NoiseModel>,
     coupling: Option<Coupling>,
     /// The reasons for the choices.
@@ -102,9 +105,10 @@ pub fn choose(
     let settings = stack.settings.clone();
     let (cut, spot) = cut_by_the_spot(geometry, &stack, &mut findings)?;
     stack.keep(|n| !cut.contains(&n));
-    if geometry.calibration.is_some() {
-        findings.check_calibration(&mut stack, rows);
-    }
+    let calibration = geometry.calibration.as_ref().map(|calibration| {
+        let late_sd_us = findings.check_calibration(&mut stack, rows);
+        late_sd_us.map_or(calibration.covariance, |sd_us| calibration.covariance.with_latency_sd(sd_us))
+    });
     let late_us = findings.late_us.unwrap_or(0.0);
     let uncut: Vec<usize> = all.iter().copied().filter(|n| !cut.contains(n)).collect();
     let planned = planned.with_settings(stack.settings.clone())?;
@@ -157,11 +161,11 @@ pub fn choose(
         // Neighbours see the spot at other times, so images that depend on it are not coupled.
         Some(spot) => {
             let demux = demux.with_settings(settings)?.with_spot(spot)?;
-            Choices { demux, kept: all, steady: uncut, late_us, noise, coupling, findings }
+            Choices { demux, kept: all, steady: uncut, late_us, calibration, noise, coupling, findings }
         }
         None => {
             let steady = (0..uncut.len()).collect();
-            Choices { demux, kept: uncut, steady, late_us, noise, coupling, findings }
+            Choices { demux, kept: uncut, steady, late_us, calibration, noise, coupling, findings }
         }
     })
 }
@@ -174,8 +178,8 @@ impl Findings {
     }
 
     /// Checks the calibration by a stack that contains only the camera rows `rows`, and corrects the delays of its
-    /// images for the latency found.
-    fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize]) {
+    /// images for the latency found. Returns the standard deviation of that latency.
+    fn check_calibration(&mut self, stack: &mut SweepStack, rows: &[usize]) -> Option<f64> {
         let valid = stack.valid.as_ref().map(|valid| valid.view());
         let images = calibrated::Images { rows, images: stack.images.view(), valid };
         let drift = calibrated::CalibrationDrift::of(&stack.timing, &stack.settings, &images);
@@ -184,6 +188,7 @@ impl Findings {
         self.u0_rows = drift.u0_rows.unwrap_or(0.0);
         self.remarks.extend(drift.remarks);
         self.warnings.extend(drift.warnings);
+        drift.late_sd_us
     }
 }
 
@@ -269,6 +274,7 @@ impl Choices {
         stack.timing = self.demux.timing().clone();
         stack.prior = self.demux.prior();
         stack.noise = self.noise;
+        stack.calibration = self.calibration;
         stack.one_band = self.findings.one_band;
         stack.u0_rows = self.demux.u0_rows().map(|u0_rows| u0_rows.slice(s![rows.clone(), ..]).to_owned());
         let images = coupled.as_ref().unwrap_or(&stack.images);

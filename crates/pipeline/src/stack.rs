@@ -1,7 +1,8 @@
 //! The images of a sweep, ready to be demultiplexed.
 
 use ndarray::{Array2, Array3, Axis};
-use raysweep_transport::plane::{NoiseModel, Prior, RowTiming, Setting};
+use raysweep_transport::plane::board::CalibrationCovariance;
+use raysweep_transport::plane::{DarkImage, NoiseModel, Prior, RowTiming, Setting};
 
 /// The images from which a transport was computed.
 #[derive(Debug, Clone)]
@@ -14,6 +15,11 @@ pub struct SweepStack {
     pub exposures_us: Vec<f64>,
     /// Delays and exposure of each image.
     pub settings: Vec<Setting>,
+    /// Number of frames averaged in the dark image that was subtracted from each image. Images with the same planned
+    /// exposure share one.
+    pub dark_frames: Vec<usize>,
+    /// Errors of the calibration that the timing contains; `None` without one.
+    pub calibration: Option<CalibrationCovariance>,
     /// `[settings, t, s]` of all camera rows, or those of a [`crate::Strip`]; dark image subtracted, 1 = a white pixel
     /// lit by its own projector row.
     pub images: Array3<f32>,
@@ -43,6 +49,8 @@ impl SweepStack {
             prior: self.prior,
             exposures_us: self.exposures_us.clone(),
             settings: self.settings.clone(),
+            dark_frames: self.dark_frames.clone(),
+            calibration: None,
             images: self.images.select(Axis(1), rows),
             valid: self.valid.as_ref().map(|valid| valid.select(Axis(1), rows)),
             regular: None,
@@ -55,10 +63,23 @@ impl SweepStack {
         }
     }
 
+    /// The dark images that were subtracted.
+    pub(crate) fn darks(&self) -> Vec<DarkImage> {
+        let mut darks: Vec<(f64, DarkImage)> = Vec::new();
+        for (n, (&exposure_us, &frames)) in self.exposures_us.iter().zip(&self.dark_frames).enumerate() {
+            match darks.iter_mut().find(|(of_us, _)| *of_us == exposure_us) {
+                Some((_, dark)) => dark.settings.push(n),
+                None => darks.push((exposure_us, DarkImage { settings: vec![n], frames })),
+            }
+        }
+        darks.into_iter().map(|(_, dark)| dark).collect()
+    }
+
     /// Keeps the images for whose index `kept` returns true.
     pub(crate) fn keep(&mut self, kept: impl Fn(usize) -> bool) {
         let kept: Vec<usize> = (0..self.settings.len()).filter(|&n| kept(n)).collect();
         self.exposures_us = kept.iter().map(|&n| self.exposures_us[n]).collect();
+        self.dark_frames = kept.iter().map(|&n| self.dark_frames[n]).collect();
         self.settings = kept.iter().map(|&n| self.settings[n].clone()).collect();
         self.images = self.images.select(Axis(0), &kept);
         self.valid = self.valid.as_ref().map(|valid| valid.select(Axis(0), &kept));

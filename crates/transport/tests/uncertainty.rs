@@ -11,8 +11,8 @@ use common::{ELECTRONS_PER_COUNT, READ_NOISE_ELECTRONS, WHITE_COUNTS};
 use common::{corner, ideal_stack, paper_sweep, photographed_in, timing};
 use ndarray::{Array1, Array2, Array3, Axis, concatenate, s};
 use raysweep_transport::plane::{
-    Coupling, Demux, NoiseModel, PlaneError, Prior, RowModel, RowTiming, Samples, Setting, Transport,
-    Uncertainty, reach, reference,
+    Coupling, DarkImage, Demux, NoiseModel, PlaneError, Prior, RowModel, RowTiming, Samples, Setting,
+    Transport, Uncertainty, reach, reference,
 };
 
 /// The noise of one frame of the test camera.
@@ -50,6 +50,8 @@ fn spread(rows: Range<usize>, margin: usize, frames: usize, coupling: Option<Cou
         prior: Prior::SPLIT,
         noise,
         frames: &frames,
+        darks: &[],
+        calibration: None,
     };
     let measure = |seed| {
         let mut stack = photographed_in(frames[0], &ideal, seed);
@@ -101,6 +103,76 @@ fn coupled_measurements_spread_as_predicted() {
         let spread = spread(56..66, 3, frames, Some(Coupling::default()));
         assert!(spread.iter().all(|spread| (0.8..1.4).contains(spread)), "{frames}: {spread:?}");
     }
+}
+
+/// Repeated measurements of two camera rows, each with dark images of its own: for each band, the share of the
+/// deviations from their mean within one standard deviation, as stated with and without the dark images.
+#[test]
+fn dark_images_that_images_share_are_part_of_the_uncertainty() {
+    const REPEATS: u64 = 40;
+    let rows = 62..64;
+    let ideal = ideal_stack(&corner(), &paper_sweep()).slice(s![.., rows.clone(), ..;8]).to_owned();
+    let timing = timing().window(rows.start, rows.len()).unwrap();
+    let settings = paper_sweep();
+    let demux = Demux::new(timing.clone(), settings.clone(), Prior::SPLIT).unwrap();
+    let frames = [8; 75];
+    // The paper's sweep has 5 exposures of 15 delays each.
+    let darks: Vec<DarkImage> =
+        (0..5).map(|e| DarkImage { settings: (15 * e..15 * (e + 1)).collect(), frames: 8 }).collect();
+    let bands =
+        [vec![0..=0], vec![-10..=-1, 1..=10], vec![i32::MIN..=-11, 11..=i32::MAX], vec![i32::MIN..=i32::MAX]];
+    let measured: Vec<[Array3<f32>; 3]> = (0..REPEATS)
+        .map(|seed| {
+            let mut stack = photographed_in(8, &ideal, seed);
+            let dark = photographed_in(8, &Array3::zeros((5, 2, ideal.dim().2)), 1000 + seed);
+            for n in 0..75 {
+                let lit = &stack.index_axis(Axis(0), n) - &dark.index_axis(Axis(0), n / 15);
+                stack.index_axis_mut(Axis(0), n).assign(&lit);
+            }
+            let estimate = demux.solve(stack.view(), None).unwrap();
+            let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows: None };
+            let noise = camera_noise();
+            let sd = |darks| {
+                let of = Uncertainty {
+                    timing: &timing,
+                    settings: &settings,
+                    prior: Prior::SPLIT,
+                    noise,
+                    frames: &frames,
+                    darks,
+                    calibration: None,
+                };
+                of.of_bands(&estimate, &samples, &bands).unwrap()
+            };
+            let lights = bands.each_ref().map(|band| light(&estimate, band).insert_axis(Axis(0)));
+            let lights = concatenate(Axis(0), &lights.each_ref().map(|light| light.view())).unwrap();
+            [lights, sd(&darks), sd(&[])]
+        })
+        .collect();
+    let mean =
+        measured.iter().fold(Array3::<f32>::zeros(measured[0][0].raw_dim()), |sum, [light, ..]| sum + light)
+            / REPEATS as f32;
+    let nearer = (1.0 - 1.0 / REPEATS as f32).sqrt();
+    let within = |stated: usize| -> [f64; 4] {
+        std::array::from_fn(|band| {
+            let (mut inside, mut all) = (0.0, 0.0);
+            for one in &measured {
+                let deviation = (&one[0] - &mean).index_axis_move(Axis(0), band);
+                for (deviation, sd) in
+                    deviation.iter().zip(one[stated].index_axis(Axis(0), band)).filter(|(_, sd)| **sd > 0.0)
+                {
+                    all += 1.0;
+                    inside += f64::from(u8::from(deviation.abs() < nearer * sd));
+                }
+            }
+            inside / all
+        })
+    };
+    let (with, without) = (within(1), within(2));
+    println!("with dark images {with:.3?}, without {without:.3?}");
+    assert!(with.iter().all(|share| (0.63..0.73).contains(share)), "{with:?}");
+    // Without them, the light of all rows together errs more than it should.
+    assert!(without[3] < 0.6, "{without:?}");
 }
 
 /// A profile of 31 rows around `u = 0`: a direct spike over a hill of indirect light that is cut off at 0.
@@ -168,7 +240,15 @@ fn equals_the_change_of_the_estimate_with_each_sample() {
                 variance_ratio: None,
                 u0_rows: None,
             };
-            let of = Uncertainty { timing: &timing, settings: &settings, prior, noise, frames: &frames };
+            let of = Uncertainty {
+                timing: &timing,
+                settings: &settings,
+                prior,
+                noise,
+                frames: &frames,
+                darks: &[],
+                calibration: None,
+            };
             let sd = of.of_bands(&transport, &samples, &bands).unwrap();
             for (sd, variance) in sd.iter().zip(variances) {
                 let (sd, expected) = (f64::from(*sd), variance.sqrt());
@@ -191,7 +271,15 @@ fn dark_pixels_are_certain_and_misfits_are_refused() {
     let of = |frames: &[usize], samples: &Samples| {
         let settings = paper_sweep();
         let noise = camera_noise();
-        let of = Uncertainty { timing: &timing, settings: &settings, prior: Prior::SPLIT, noise, frames };
+        let of = Uncertainty {
+            timing: &timing,
+            settings: &settings,
+            prior: Prior::SPLIT,
+            noise,
+            frames,
+            darks: &[],
+            calibration: None,
+        };
         of.of_bands(&transport, samples, &bands())
     };
     assert_eq!(of(&[1; 75], &samples), Ok(Array3::zeros((5, 2, 3))));
@@ -248,6 +336,8 @@ fn direct_light_between_rows_is_judged_where_it_lies() {
             prior: Prior::SPLIT,
             noise: camera_noise(),
             frames: &frames,
+            darks: &[],
+            calibration: None,
         };
         let sd = |u0_rows| {
             let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows };

@@ -13,6 +13,7 @@ use raysweep_transport::plane::advice::{
     Arrangement, Calibrated, Conditions, Design, Noise, PredictedError, Proposal, Search, Spread, Usable,
     white_light,
 };
+use raysweep_transport::plane::board::CalibrationParameter;
 use raysweep_transport::plane::calibrate::settings_on_direct_row;
 use raysweep_transport::plane::{Demux, PlaneError, Setting};
 
@@ -91,10 +92,26 @@ impl From<NoAdvice> for RpcError {
 /// a second.
 const MAX_WORK: f64 = 1e9;
 
-/// What a rig is taken to be known to: that of a calibration whose latency the run itself refines. Edges in time are
-/// known to what VSYNC stamps leave.
-const CALIBRATED: Calibrated =
-    Calibrated { latency_us: 0.3, edge_us: 0.5, exposure_us: 0.1, place_rows: 0.02 };
+/// What a rig without a calibration is taken to be known to: what the search for better settings would want of one.
+const ASSUMED: Calibrated = Calibrated { latency_us: 0.3, edge_us: 0.5, exposure_us: 0.1, place_rows: 0.02 };
+/// To what a sweep finds the latency from its own images.
+const REFINED_LATENCY_US: f64 = 0.3;
+
+/// How well a task's rig is known: as its calibration says, if it has one. Edges are known to what VSYNC stamps leave.
+fn known<T: Searched>(of: &T) -> Calibrated {
+    let Some(calibration) = &of.task().geometry.calibration else { return ASSUMED };
+    let sd = |parameter| calibration.covariance.sd(parameter);
+    let latency_us = sd(CalibrationParameter::Latency);
+    Calibrated {
+        latency_us: match T::ARRANGEMENT {
+            Arrangement::Sweep => latency_us.min(REFINED_LATENCY_US),
+            Arrangement::Film => latency_us,
+        },
+        edge_us: calibration.jitter_us,
+        exposure_us: sd(CalibrationParameter::ExposureOffset),
+        place_rows: sd(CalibrationParameter::Place),
+    }
+}
 
 /// Predicts the error of `planned`, and searches for better settings that take no more frames and no more time.
 ///
@@ -107,7 +124,7 @@ pub fn advise<T: Searched>(
 ) -> Result<PlanAdvice, NoAdvice> {
     let adviser = Adviser::new(planned, rig, camera)?;
     let (most_frames, most_periods) = (total_frames(planned), adviser.total_periods(planned));
-    let search = adviser.search(CALIBRATED, |other: &T| {
+    let search = adviser.search(known(planned), |other: &T| {
         total_frames(other) <= most_frames && adviser.total_periods(other) <= most_periods
     });
     let advice = search.advise()?;
@@ -147,8 +164,8 @@ pub fn design<T: Searched>(
 ) -> Result<DesignReport, NoAdvice> {
     let adviser = Adviser::new(planned, rig, camera)?;
     let period_s = planned.task().geometry.raster.period_us * 1e-6;
-    let edge_us = positive("edge_us", params.edge_us)?.unwrap_or(CALIBRATED.edge_us);
-    let calibrated = Calibrated { edge_us, ..CALIBRATED };
+    let edge_us = positive("edge_us", params.edge_us)?.unwrap_or(known(planned).edge_us);
+    let calibrated = Calibrated { edge_us, ..known(planned) };
     let wanted = (positive("error", params.error)?, positive("light_s", params.light_s)?);
     let found = match wanted {
         (Some(error), None) => adviser.search(calibrated, |_| true).of_error(error)?,

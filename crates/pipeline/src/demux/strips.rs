@@ -105,7 +105,7 @@ fn not_read(what: String) -> NotSolved {
 mod tests {
     use ndarray::{Array2, concatenate, s};
     use raysweep_core::{Counts, Raster, SettingsId};
-    use raysweep_transport::plane::board::{BoardCalibration, Estimate};
+    use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
     use raysweep_transport::plane::{PixelResponse, RESPONSE_ROWS, Setting};
 
     use super::*;
@@ -247,11 +247,10 @@ mod tests {
             row_starts_us: timing.row_starts_us().to_vec(),
             camera_row_time_us: Estimate { value: 20.0, sd: 0.0 },
             exposure_offset_us: Estimate { value: 0.5, sd: 0.0 },
-            latency_sd_us: 0.0,
+            jitter_us: 0.0,
+            covariance: CalibrationCovariance::independent([0.0; 5]),
             response: PixelResponse::with_beam(places, &shares).unwrap(),
-            place_sd_rows: 0.0,
             white_dn,
-            white_relative_sd: 0.0,
             strip: None,
             lamp: None,
         }))

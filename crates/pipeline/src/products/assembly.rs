@@ -89,6 +89,10 @@ impl Assembly {
                 uncertainty::make(name, band.of_stack(stack), first_row, stack, transport, mask)
                     .map_err(not_made)?
             }
+            ProductKind::PriorBias(band) => {
+                uncertainty::make_bias(name, band.of_stack(stack), first_row, stack, transport, mask)
+                    .map_err(not_made)?
+            }
             ProductKind::DelayProfile(options) => {
                 options.add(&mut self.sums, first_row, stack, transport);
                 return Ok(());

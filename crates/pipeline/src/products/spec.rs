@@ -41,6 +41,7 @@ pub(super) enum ProductKind {
     Relight(Relight),
     DelayProfile(ProfileOptions),
     Uncertainty(Band),
+    PriorBias(Band),
 }
 
 impl ProductKind {
@@ -53,14 +54,14 @@ impl ProductKind {
                 let own = width.range();
                 vec![i32::MIN..=*own.start() - 1, *own.end() + 1..=i32::MAX]
             }
-            Self::Band(band) | Self::Uncertainty(band) => band.open_ranges(),
+            Self::Band(band) | Self::Uncertainty(band) | Self::PriorBias(band) => band.open_ranges(),
             Self::Relight(_) => vec![i32::MIN..=i32::MAX],
         }
     }
 }
 
 /// The kinds by their names in plans.
-const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile, uncertainty";
+const KINDS: &str = "epipolar, non-epipolar, band, regular, relight, delay-profile, uncertainty, prior-bias";
 
 /// The file name of the transport itself, which products must not use.
 const TAKEN_NAME: &str = "transport";
@@ -103,6 +104,7 @@ impl ProductSpec {
             "non-epipolar" => ProductKind::NonEpipolar(parse::<Width>(kind, options)?.check().map_err(one)?),
             "band" => ProductKind::Band(parse::<Band>(kind, options)?.check().map_err(one)?),
             "uncertainty" => ProductKind::Uncertainty(parse::<Band>(kind, options)?.check().map_err(one)?),
+            "prior-bias" => ProductKind::PriorBias(parse::<Band>(kind, options)?.check().map_err(one)?),
             "relight" => {
                 let (beam, pattern): (Map<_, _>, Map<_, _>) =
                     options.clone().into_iter().partition(|(key, _)| key == "beam");
@@ -152,7 +154,9 @@ impl ProductSpec {
     pub fn beyond(&self, (first, last): (i32, i32)) -> Option<String> {
         let what = match &self.kind {
             ProductKind::Epipolar(width) | ProductKind::NonEpipolar(width) => width.beyond(first, last),
-            ProductKind::Band(band) | ProductKind::Uncertainty(band) => band.beyond(first, last),
+            ProductKind::Band(band) | ProductKind::Uncertainty(band) | ProductKind::PriorBias(band) => {
+                band.beyond(first, last)
+            }
             ProductKind::Regular | ProductKind::Relight(_) | ProductKind::DelayProfile(_) => None,
         }?;
         Some(format!("product {}: {what}", self.name))
@@ -167,7 +171,8 @@ impl ProductSpec {
             | ProductKind::Epipolar(_)
             | ProductKind::NonEpipolar(_)
             | ProductKind::Band(_)
-            | ProductKind::Uncertainty(_) => 1,
+            | ProductKind::Uncertainty(_)
+            | ProductKind::PriorBias(_) => 1,
         }
     }
 }
@@ -182,6 +187,7 @@ impl ProductKind {
             Self::Relight(_) => "relight".into(),
             Self::DelayProfile(options) => options.default_name(),
             Self::Uncertainty(band) => format!("uncertainty_{}", band.default_name()),
+            Self::PriorBias(band) => format!("prior_bias_{}", band.default_name()),
         }
     }
 }

@@ -76,6 +76,8 @@ fn stack() -> SweepStack {
         timing: timing(),
         prior: Prior::SPLIT,
         exposures_us: points.iter().map(|point| point.exposure_us).collect(),
+        dark_frames: vec![1; settings.len()],
+        calibration: None,
         settings,
         images: ndarray::stack(Axis(0), &views).unwrap(),
         valid: None,
@@ -244,6 +246,7 @@ fn products_of_strips_have_the_bits_of_the_whole() {
         json!({ "kind": "delay-profile", "pixel": [3, 1] }),
         json!({ "kind": "delay-profile", "region": [1, 6, 0, 3] }),
         json!({ "kind": "uncertainty", "from_rows": 1, "to_rows": 3 }),
+        json!({ "kind": "prior-bias", "from_rows": 1, "to_rows": 3 }),
     ] {
         let spec = spec(&table).unwrap();
         let whole = spec.make(&stack, &transport()).unwrap();
@@ -265,6 +268,7 @@ fn what_was_not_taken_is_not_made() {
     stack.images = stack.images.slice(s![..1, .., ..]).to_owned();
     stack.settings.truncate(1);
     stack.exposures_us.truncate(1);
+    stack.dark_frames.truncate(1);
     for table in [json!({ "kind": "regular" }), json!({ "kind": "delay-profile", "pixel": [0, 0] })] {
         assert!(spec(&table).unwrap().make(&stack, &transport()).is_err(), "{table}");
     }

@@ -12,7 +12,9 @@ use raysweep_config::{ConfigError, RigFile};
 use raysweep_core::{CameraCapabilities, PixelFormat, io_text};
 use raysweep_session::{durable, input};
 use raysweep_transport::plane::board::times::BoardStrip;
-use raysweep_transport::plane::board::{BoardCalibration, Estimate, FlickeringLamp};
+use raysweep_transport::plane::board::{
+    BoardCalibration, CalibrationCovariance, CalibrationParameter, Estimate, FlickeringLamp,
+};
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -102,6 +104,10 @@ pub struct CalibratedTiming {
     pub jitter_us: Pair,
     /// First projector row that the image sees, and the row after the last.
     pub seen_rows: [usize; 2],
+    /// Covariance of the latency and the exposure offset, in square microseconds; `None` in files of earlier versions,
+    /// which take them as independent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub latency_exposure_covariance_us2: Option<f64>,
 }
 
 /// CalibratedLight and sensor.
@@ -118,6 +124,10 @@ pub struct CalibratedLight {
     pub prnu: Pair,
     /// Number of pixels with unusual dark current or noise.
     pub hot_pixels: usize,
+    /// Standard deviation of the width of a pixel's response, relative to itself; `None` in files of earlier versions,
+    /// which take it as exact.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub response_width_sd: Option<f64>,
 }
 
 /// The room's light.
@@ -362,25 +372,41 @@ impl KeptCalibration {
     /// # Errors
     /// When the arrays hold no usable response.
     fn board(&self, strip: Option<BoardStrip>) -> Result<Arc<BoardCalibration>, ConfigError> {
-        let CalibratedTiming { camera_row_time_us, exposure_offset_us, latency_sd_us, .. } =
-            self.header.timing;
-        let [white_dn, white_sd] = self.header.light.white_dn;
-        let place_sd: Vec<f32> = self.arrays.place_sd.iter().copied().filter(|sd| sd.is_finite()).collect();
+        let CalibratedTiming { camera_row_time_us, exposure_offset_us, jitter_us, .. } = self.header.timing;
         let response = PixelResponse::new(self.arrays.place.clone(), self.arrays.response.clone())
             .map_err(|error| ConfigError::of_field("calibration", error.to_string()))?;
         Ok(Arc::new(BoardCalibration {
             row_starts_us: self.arrays.row_starts_us.to_vec(),
             camera_row_time_us: estimate(camera_row_time_us),
             exposure_offset_us: estimate(exposure_offset_us),
-            latency_sd_us,
+            jitter_us: jitter_us[0],
+            covariance: self.covariance(),
             response,
-            place_sd_rows: place_sd.iter().map(|&sd| f64::from(sd)).sum::<f64>()
-                / place_sd.len().max(1) as f64,
             white_dn: self.arrays.white_dn.clone(),
-            white_relative_sd: white_sd / white_dn,
             strip,
             lamp: self.header.ambient.as_ref().and_then(CalibratedAmbient::lamp),
         }))
+    }
+
+    /// Covariance of what a run takes from the calibration, for a typical pixel.
+    fn covariance(&self) -> CalibrationCovariance {
+        let (timing, arrays) = (&self.header.timing, &self.arrays);
+        let white = arrays.white_sd.iter().zip(&arrays.white_dn).map(|(sd, dn)| sd / dn);
+        let [_, exposure_sd_us] = timing.exposure_offset_us;
+        let sds = [
+            timing.latency_sd_us,
+            exposure_sd_us,
+            median(arrays.place_sd.iter().copied()),
+            self.header.light.response_width_sd.unwrap_or(0.0),
+            median(white),
+        ];
+        let mut covariance = CalibrationCovariance::independent(sds);
+        let mixed_us2 = timing.latency_exposure_covariance_us2.unwrap_or(0.0);
+        let [latency, exposure] = [CalibrationParameter::Latency, CalibrationParameter::ExposureOffset];
+        for (a, b) in [(latency, exposure), (exposure, latency)] {
+            covariance.matrix[a as usize][b as usize] = mixed_us2;
+        }
+        covariance
     }
 }
 
@@ -486,6 +512,13 @@ impl ValidFor {
         }
         Ok(())
     }
+}
+
+/// Median of the finite values; 0 if there are none.
+fn median(values: impl Iterator<Item = f32>) -> f64 {
+    let mut values: Vec<f32> = values.filter(|value| value.is_finite()).collect();
+    values.sort_by(f32::total_cmp);
+    values.get(values.len() / 2).map_or(0.0, |&value| f64::from(value))
 }
 
 fn estimate([value, sd]: Pair) -> Estimate {

@@ -77,6 +77,7 @@ impl BoardFindings {
                 latency_sd_us: times.latency_sd_us,
                 jitter_us: pair(times.jitter_us),
                 seen_rows: [times.seen_rows.start, times.seen_rows.end],
+                latency_exposure_covariance_us2: Some(times.covariance[0][1]),
             },
             light: CalibratedLight {
                 white_dn: pair(pixels.white.level_dn),
@@ -84,6 +85,7 @@ impl BoardFindings {
                 read_noise_e: pair(pixels.transfer.read_noise_e),
                 prnu: pair(pixels.prnu),
                 hot_pixels: pixels.dark.hot.iter().filter(|hot| **hot).count(),
+                response_width_sd: Some(pixels.responses.width_sd()),
             },
             ambient: self.ambient(),
             checks: self.checks(),

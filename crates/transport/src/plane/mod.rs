@@ -15,7 +15,7 @@
 //! and the [`Beam`] the spread of a row; it and [`Setting`] contain the quantities on the right-hand side.
 //! [`RowModel`] is `A` for one camera row with its borders and the neighbouring frames, and [`Demux`] inverts it with
 //! a [`Prior`]. [`Coupling`] averages similar pixels beforehand, based on a [`NoiseModel`], and [`Uncertainty`]
-//! computes the noise that remains in the result. [`calibrate`] estimates the model's parameters from the stack
+//! computes what noise and errors of a calibration leave in the result. [`calibrate`] estimates the model's parameters from the stack
 //! itself.
 //!
 //! The folders import each other in one direction: `solve` imports `model`; [`calibrate`], `products` and [`advice`]
@@ -36,7 +36,7 @@ pub use model::{
     Setting, Shares, Slot, SlotKind, Transport, delay_us, offset_us, predict, reach, relative_rows,
 };
 pub use noise::{Coupled, Coupling, NoiseModel};
-pub use products::{DelayProfile, RelitBeam, Samples, Uncertainty, relight, relight_rows};
+pub use products::{DarkImage, DelayProfile, RelitBeam, Samples, Uncertainty, relight, relight_rows};
 #[doc(hidden)]
 pub use solve::linear;
 pub use solve::{Bracket, Demux, Prior, SimdLevel, objectives_bytes, reference};

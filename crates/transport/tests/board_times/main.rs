@@ -302,22 +302,54 @@ fn a_flying_spot_does_not_fit() {
 #[test]
 #[ignore = "takes minutes"]
 fn coverage() {
-    for case in [Case::full as fn(u64) -> Case, Case::window] {
+    let none = |seed| Case { unevenness: 0.0, response_error: 0.0, kinks_us: 0.0, ..Case::window(seed) };
+    let kinks = |seed| Case { kinks_us: 20.0, ..none(seed) };
+    let uneven = |seed| Case { unevenness: 0.01, ..none(seed) };
+    let response = |seed| Case { response_error: 0.001, ..none(seed) };
+    let cases: [(&str, &dyn Fn(u64) -> Case); 6] = [
+        ("window", &Case::window),
+        ("full", &Case::full),
+        ("none", &none),
+        ("kinks", &kinks),
+        ("uneven", &uneven),
+        ("response", &response),
+    ];
+    for (name, case) in cases {
+        if std::env::var("CASE").is_ok_and(|only| only != name) {
+            continue;
+        }
         let mut within = [0; 5];
-        let (mut rows, mut squares) = (0.0, [0.0; 5]);
-        let runs = 30;
+        let (mut rows, mut squares, mut refused) = (0.0, [0.0; 5], 0);
+        let runs = std::env::var("RUNS").map_or(100, |runs| runs.parse().unwrap());
         for seed in 0..runs {
             let session = Session::taken(case(100 + seed));
-            let errors = errors(&session.rig, &session.fit().unwrap());
-            println!("{errors:.6?}");
+            let times = match session.fit() {
+                Ok(times) => times,
+                Err(error) => {
+                    println!("{error}");
+                    refused += 1;
+                    continue;
+                }
+            };
+            let errors = errors(&session.rig, &times);
             for (index, sds) in errors.sds.iter().enumerate() {
                 within[index] += usize::from(sds.abs() < 1.0);
                 squares[index] += sds * sds / runs as f64;
             }
+            println!(
+                "{:.2?} {:.2e} {:.2e} latency {:.2} {:.2} jitter {:.2} useful {}",
+                errors.sds,
+                times.row_time_us.sd,
+                times.camera_row_time_us.sd,
+                errors.latency_us,
+                times.latency_sd_us,
+                times.jitter_us.value,
+                times.useful_frames
+            );
             rows += errors.rows_within_sd / runs as f64;
         }
         println!(
-            "tau, rc, delta, mode, latency: {within:?} of {runs}, rms {:.2?}, rows {rows:.2}",
+            "{name} tau, rc, delta, mode, latency: {within:?} of {runs} ({refused} refused), rms {:.2?}, rows {rows:.2}",
             squares.map(f64::sqrt)
         );
     }

@@ -47,6 +47,10 @@ pub struct Case {
     /// Whether the delay acts on global exposures.
     pub global_delay_acts: bool,
     pub slopes: Slopes,
+    /// Standard deviation of the brightness of drawn rows.
+    pub unevenness: f64,
+    /// Standard deviation of the shares of a response.
+    pub response_error: f64,
 }
 
 impl Case {
@@ -67,6 +71,8 @@ impl Case {
             exposure_step_us: 0.0,
             global_delay_acts: true,
             slopes: [0.0, 0.0],
+            unevenness: 0.01,
+            response_error: 0.001,
         }
     }
 
@@ -123,7 +129,7 @@ impl Rig {
             first as f64 + t as f64 + 0.3 + 0.9 * x + 0.4 * (3.0 * y).sin()
         });
         let brightness: Vec<f64> =
-            (0..PROJECTOR_ROWS).map(|_| 1.0 + 0.01 * unit.sample(&mut random)).collect();
+            (0..PROJECTOR_ROWS).map(|_| 1.0 + case.unevenness * unit.sample(&mut random)).collect();
         let white_dn = Array2::from_shape_fn(shape, |(t, s)| {
             let (y, x) = (t as f64 / rows as f64 - 0.5, s as f64 / case.columns as f64 - 0.5);
             let shade = 1.0 - 0.3 * (x * x + y * y);
@@ -144,9 +150,9 @@ impl Rig {
         // A response is measured over 21 rows: 0.4 % in all, the same for neighbours in a column.
         let errors: Vec<[f64; 16]> = (0..(rows / 21 + 1) * case.columns)
             .map(|_| {
-                std::array::from_fn(
-                    |d| if (3..12).contains(&d) { 0.001 * unit.sample(&mut random) } else { 0.0 },
-                )
+                std::array::from_fn(|d| {
+                    if (3..12).contains(&d) { case.response_error * unit.sample(&mut random) } else { 0.0 }
+                })
             })
             .collect();
         let mut response = Array3::zeros((16, rows, case.columns));

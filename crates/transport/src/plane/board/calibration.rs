@@ -2,8 +2,8 @@ use ndarray::{Array2, s};
 
 use super::super::error::check_shape;
 use super::super::{CameraRows, FIRST_RESPONSE_ROW, PixelResponse, PlaneError, RowTiming};
-use super::Estimate;
 use super::times::BoardStrip;
+use super::{CalibrationCovariance, Estimate};
 
 /// What images of a board have shown of a rig, in the form in which sweeps and films use it.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,17 +16,15 @@ pub struct BoardCalibration {
     pub camera_row_time_us: Estimate,
     /// What exposures have more than their nominal length.
     pub exposure_offset_us: Estimate,
-    /// Standard deviation of the time of all rows together.
-    pub latency_sd_us: f64,
+    /// Jitter of the light of a frame that the time stamps of the VSYNC edges do not show: the standard deviation.
+    pub jitter_us: f64,
+    /// Errors that all pixels and images of a run share.
+    pub covariance: CalibrationCovariance,
     /// Where each pixel looks and how rows share its direct light. `[t, s]` are the camera's rows and columns.
     pub response: PixelResponse,
-    /// Standard deviation of the place of a pixel, in projector rows.
-    pub place_sd_rows: f64,
     /// Counts above black that a pixel collects in one pass of a white picture, `[t, s]`; NaN where the board was not
     /// lit.
     pub white_dn: Array2<f32>,
-    /// Standard deviation of the white level relative to itself.
-    pub white_relative_sd: f64,
     /// Where the board stays in view during runs, if it does.
     pub strip: Option<BoardStrip>,
     /// A lamp that flickered in the room; `None` if none did, or it was not measured.

@@ -7,9 +7,11 @@
 //! in order (`crates/processing/src/calibration/images.rs`).
 
 mod calibration;
+mod covariance;
 mod estimate;
 pub mod images;
 pub mod times;
 
 pub use calibration::{BoardCalibration, FlickeringLamp};
+pub use covariance::{CalibrationCovariance, CalibrationParameter};
 pub use estimate::Estimate;

@@ -14,6 +14,14 @@ impl Setting {
         Self { delays_us: vec![delay_us], exposure_us }
     }
 
+    /// The same setting with an exposure that begins at the same time and is longer by `by_us`.
+    pub fn longer(&self, by_us: f64) -> Self {
+        Self {
+            delays_us: self.delays_us.iter().map(|delay_us| delay_us + by_us / 2.0).collect(),
+            exposure_us: self.exposure_us + by_us,
+        }
+    }
+
     /// The same setting with its delays reduced by `by_us`: that of light which comes so much later than assumed.
     pub fn earlier(&self, by_us: f64) -> Self {
         Self { delays_us: self.delays_us.iter().map(|delay_us| delay_us - by_us).collect(), ..*self }

@@ -43,6 +43,13 @@ impl NoiseModel {
         (self.read_variance + self.gain * intensity.max(0.0)) / frames as f64
     }
 
+    /// The same without the noise of dark images that were subtracted from the images to which it was fitted, each with
+    /// this many frames for every frame of its dark image.
+    #[must_use]
+    pub fn without_darks(self, frames_per_dark_frame: f64) -> Self {
+        Self { read_variance: self.read_variance / (1.0 + frames_per_dark_frame), ..self }
+    }
+
     /// Fits the noise to a stack `[settings, t, s]` whose images are means of `frames[setting]` frames.
     ///
     /// A pixel is compared with the mean of its left and right neighbours, each scaled to the pixel's own total, so

@@ -1,9 +1,10 @@
-//! What is made of a transport: profiles over the delay, images under other light, and the noise of both.
+//! What is made of a transport: profiles over the delay, images under other light, and how far to trust them.
 
 mod profile;
 mod relight;
+mod sensitivity;
 mod uncertainty;
 
 pub use profile::DelayProfile;
 pub use relight::{RelitBeam, relight, relight_rows};
-pub use uncertainty::{Samples, Uncertainty};
+pub use uncertainty::{DarkImage, Samples, Uncertainty};

@@ -2,22 +2,28 @@ use std::ops::RangeInclusive;
 
 use ndarray::{Array1, Array2, Array3, ArrayView1, ArrayView2, ArrayView3, ArrayViewMut2, Axis};
 
+use super::super::board::CalibrationCovariance;
 use super::super::error::check_shape;
 use super::super::noise::check_shapes;
 use super::super::solve::pivot::minimise_free;
-use super::super::solve::tiles::{Objectives, Problem, Row, Spike, Tile};
+use super::super::solve::tiles::{Objectives, Problem, Row, Spike, Tile, TileWork};
 use super::super::{NoiseModel, PlaneError, Prior, RowTiming, Setting, SimdLevel, SlotKind, Transport};
+use super::sensitivity::changes;
 
-/// The uncertainty of a transport due to the noise of its stack.
+/// The uncertainty of a transport due to the noise of its stack and the errors of the calibration.
 ///
 /// Where `T > 0`, the estimate is linear in the samples: with `F` the free rows of a pixel,
 /// `T_F = H_FF^-1 (A_F' I - beta/2)`, `H = A'A + alpha D'D`. The covariance of the free rows is therefore
 /// `H_FF^-1 A_F' S A_F H_FF^-1`, with `S` the diagonal covariance of the samples, and that of all other rows is 0.
 /// Rows of the next or previous frame, whose estimates were dropped, count as free.
 ///
-/// It is the spread of repeated measurements around their mean, and includes nothing else: neither the bias of the
-/// prior, which smooths what the settings cannot resolve, nor that of coupling, nor errors of delays, beam, or
-/// alignment.
+/// `S` also contains the noise of the dark images: all images of one exposure share that of theirs, so that it adds up
+/// over them in long bands. Errors of a calibration change the light that the model predicts by `J = dA/dq T` for each
+/// parameter `q`, and add `J C J'` with the covariance `C` of the parameters.
+///
+/// It is the spread of repeated measurements, each with a calibration of its own if that is given, around their mean.
+/// It does not include the bias of the prior, which smooths what the settings cannot resolve (see
+/// [`Self::prior_bias_in_rows`]), nor that of coupling.
 #[derive(Debug, Clone)]
 pub struct Uncertainty<'a> {
     /// The timing of the stack.
@@ -30,6 +36,19 @@ pub struct Uncertainty<'a> {
     pub noise: NoiseModel,
     /// Number of frames averaged in each setting's image.
     pub frames: &'a [usize],
+    /// The dark images that were subtracted; a setting has at most one.
+    pub darks: &'a [DarkImage],
+    /// Errors of the calibration that the timing contains; `None` for those of noise alone.
+    pub calibration: Option<&'a CalibrationCovariance>,
+}
+
+/// A dark image that was subtracted from images of several settings, which share its noise.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DarkImage {
+    /// Indices of the settings.
+    pub settings: Vec<usize>,
+    /// Number of frames averaged in it.
+    pub frames: usize,
 }
 
 /// A stack and the known properties of its samples.
@@ -45,6 +64,9 @@ pub struct Samples<'a> {
     /// `[t, s]`; `None` for row 0.
     pub u0_rows: Option<ArrayView2<'a, f32>>,
 }
+
+/// Factor of the bound of the prior's bias: with it, the bound holds for 95 % of the pixels of the family of scenes.
+const BIAS_FACTOR: f64 = 1.0;
 
 /// Light of a row below this share of the direct light that reaches it is attributed to rounding.
 const ROUNDING: f32 = 1e-6;
@@ -81,41 +103,122 @@ impl Uncertainty<'_> {
         samples: &Samples,
         bands: &[Vec<RangeInclusive<i32>>],
     ) -> Result<Array3<f32>, PlaneError> {
+        self.for_each_tile(first_row, transport, samples, bands, &|problem, tile, rows| {
+            let gains = problem.solutions(bands, transport.u_min, tile, rows)?.dot(&problem.weights.t());
+            let light = problem.light(transport.u_min, tile, rows);
+            let t = first_row + rows[tile.pixels[0].0].data.t;
+            let systematic = self.systematic(t, problem, tile, &light, &gains);
+            let of_pixels = gains.axis_chunks_iter(Axis(0), bands.len());
+            let of_pixels = of_pixels.zip(systematic.axis_chunks_iter(Axis(0), bands.len()));
+            for ((gains, systematic), &(at, column)) in of_pixels.zip(&tile.pixels) {
+                let Data { t, out, .. } = &mut rows[at].data;
+                let pixel = Pixel::new(self, samples, &problem.settings, *t, column);
+                let each = out.column_mut(column).into_iter().zip(gains.rows()).zip(systematic);
+                for ((sd, gains), systematic) in each {
+                    // Errors that neighbours share are the same after coupling.
+                    *sd = (pixel.variance_of(gains) + systematic).sqrt() as f32;
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// The bias that the prior gives to each band, `[bands, t, s]`: a bound that holds for 95 % of the pixels.
+    ///
+    /// Without noise, the estimate of a band differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where `g =
+    /// H_FF^-1 e` for the band's rows `e`, and `T` the truth. The bound takes the estimate for the truth and the terms of the
+    /// sum by their sizes, so that terms that cancel by chance do not hide the others. What the estimate is smoother
+    /// than the truth is made up for by a factor, which was set on the family of scenes of [`super::super::advice`].
+    ///
+    /// # Errors
+    /// Those of [`Self::of_bands_in_rows`].
+    pub fn prior_bias_in_rows(
+        &self,
+        first_row: usize,
+        transport: &Transport,
+        samples: &Samples,
+        bands: &[Vec<RangeInclusive<i32>>],
+    ) -> Result<Array3<f32>, PlaneError> {
+        let prior = self.prior;
+        self.for_each_tile(first_row, transport, samples, bands, &|problem, tile, rows| {
+            let solutions = problem.solutions(bands, transport.u_min, tile, rows)?;
+            let differences = prior.differences(&problem.model.slots);
+            let rough = problem.light(transport.u_min, tile, rows).dot(&differences.t());
+            let stiff = solutions.dot(&differences.t());
+            for (index, &(at, column)) in tile.pixels.iter().enumerate() {
+                for (band, sd) in rows[at].data.out.column_mut(column).iter_mut().enumerate() {
+                    let row = index * bands.len() + band;
+                    let smoothed =
+                        stiff.row(row).iter().zip(rough.row(index)).map(|(a, b)| (a * b).abs()).sum::<f64>();
+                    let sparse = solutions.row(row).sum().abs();
+                    *sd = (BIAS_FACTOR * (prior.alpha() * smoothed + prior.beta() / 2.0 * sparse)) as f32;
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// Calls `work` for the pixels of the camera rows starting at `first_row`, and returns its results,
+    /// `[bands, t, s]`.
+    fn for_each_tile(
+        &self,
+        first_row: usize,
+        transport: &Transport,
+        samples: &Samples,
+        bands: &[Vec<RangeInclusive<i32>>],
+        work: &impl for<'r> TileWork<Data<'r>>,
+    ) -> Result<Array3<f32>, PlaneError> {
         self.check(first_row, transport, samples)?;
         let (_, rows, columns) = transport.t.dim();
-        let mut sd = Array3::zeros((bands.len(), rows, columns));
+        let mut out = Array3::zeros((bands.len(), rows, columns));
         if bands.is_empty() {
-            return Ok(sd);
+            return Ok(out);
         }
-        let mut judged: Vec<Row<Data>> = sd
+        let mut judged: Vec<Row<Data>> = out
             .axis_iter_mut(Axis(1))
             .enumerate()
-            .map(|(t, sd)| {
+            .map(|(t, out)| {
                 let valid = samples.valid.map(|valid| valid.index_axis_move(Axis(1), t));
                 let u0_rows = samples.u0_rows.map(|u0_rows| u0_rows.index_axis_move(Axis(0), t));
                 let profiles = transport.t.index_axis(Axis(1), t);
-                Row::new(first_row + t, columns, valid, u0_rows, Data { t, profiles, sd })
+                Row::new(first_row + t, columns, valid, u0_rows, Data { t, profiles, out })
             })
             .collect();
         let reach = transport.u_min..=transport.u_max();
         let Self { timing, settings, prior, .. } = *self;
         let objectives =
             Objectives { timing, settings, bracket_light: None, prior, reach: &reach, spot: None };
-        let work = |problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
+        let of_samples = |problem: &Problem, tile: &Tile, rows: &mut [Row<Data>]| {
+            if tile.pixels.is_empty() {
+                return Ok(());
+            }
             let masked =
                 tile.valid.as_ref().map(|valid| problem.of_samples(valid.view(), &prior)).transpose()?;
-            let problem = masked.as_ref().unwrap_or(problem);
-            let gains = problem.gains(bands, transport.u_min, tile, rows)?;
-            for (gains, &(at, column)) in gains.axis_chunks_iter(Axis(0), bands.len()).zip(&tile.pixels) {
-                let Data { t, sd, .. } = &mut rows[at].data;
-                let pixel = Pixel::new(self, samples, &problem.settings, *t, column);
-                let variances = gains.rows().into_iter().map(|gains| pixel.variance_of(gains));
-                sd.column_mut(column).iter_mut().zip(variances).for_each(|(sd, v)| *sd = v.sqrt() as f32);
-            }
-            Ok(())
+            work(masked.as_ref().unwrap_or(problem), tile, rows)
         };
-        objectives.for_each_tile(&mut judged, &|| true, &work)?;
-        Ok(sd)
+        objectives.for_each_tile(&mut judged, &|| true, &of_samples)?;
+        Ok(out)
+    }
+
+    /// Variance of each band of each pixel of a tile in camera row `t` through errors of the calibration,
+    /// `[pixels * bands]`.
+    fn systematic(
+        &self,
+        t: usize,
+        problem: &Problem,
+        tile: &Tile,
+        light: &Array2<f64>,
+        gains: &Array2<f64>,
+    ) -> Array1<f64> {
+        let Some(covariance) = self.calibration else { return Array1::zeros(gains.nrows()) };
+        let columns: Vec<usize> = tile.pixels.iter().map(|&(_, column)| column).collect();
+        let settings: Vec<Setting> = problem.settings.iter().map(|&n| self.settings[n].clone()).collect();
+        let changes = changes(self.timing, &settings, problem, (t, &columns), light);
+        let bands = gains.nrows() / tile.pixels.len();
+        Array1::from_shape_fn(gains.nrows(), |row| {
+            covariance
+                .variance_of(&changes.each_ref().map(|change| gains.row(row).dot(&change.row(row / bands))))
+        })
     }
 
     fn check(&self, first_row: usize, transport: &Transport, samples: &Samples) -> Result<(), PlaneError> {
@@ -147,12 +250,13 @@ struct Data<'a> {
     /// The row's part of the transport, `[reach, columns]`.
     profiles: ArrayView2<'a, f32>,
     /// The result, `[bands, columns]`.
-    sd: ArrayViewMut2<'a, f32>,
+    out: ArrayViewMut2<'a, f32>,
 }
 
 impl Problem<'_> {
-    /// The derivative of each band of each pixel of a tile with respect to each sample, `[pixels * bands, settings]`.
-    fn gains(
+    /// `H_FF^-1 e` for the rows `e` of each band and the free rows `F` of each pixel of a tile, `[pixels * bands,
+    /// slots]`. Times the weights it is the derivative of the band with respect to each sample.
+    fn solutions(
         &self,
         bands: &[Vec<RangeInclusive<i32>>],
         u_min: i32,
@@ -173,7 +277,7 @@ impl Problem<'_> {
         }
         let solutions = minimise_free(SimdLevel::best(), &self.quadratic, linear, free.view());
         match solutions.iter().all(|entry| entry.is_finite()) {
-            true => Ok(solutions.dot(&self.weights.t())),
+            true => Ok(solutions),
             false => Err(PlaneError::NotConvex),
         }
     }
@@ -197,7 +301,23 @@ impl Problem<'_> {
     /// The unknowns that are free in a pixel's profile, by slot. Those that are not part of the profile count as
     /// free.
     fn lit(&self, places: &[(usize, usize)], profile: ArrayView1<f32>) -> Array1<bool> {
-        let mut light = Array1::from_elem(self.model.slots.len(), 1.0_f32);
+        self.unknowns(places, profile, 1.0).mapv(|light| light > 0.0)
+    }
+
+    /// The light of each unknown of the pixels of a tile, `[pixels, slots]`; 0 for those that are not part of profiles.
+    fn light(&self, u_min: i32, tile: &Tile, rows: &[Row<Data>]) -> Array2<f64> {
+        let places: Vec<(usize, usize)> = self.places(u_min).collect();
+        let mut light = Array2::zeros((tile.pixels.len(), self.model.slots.len()));
+        for (mut light, &(at, column)) in light.rows_mut().into_iter().zip(&tile.pixels) {
+            let unknowns = self.unknowns(&places, rows[at].data.profiles.column(column), 0.0);
+            light.assign(&unknowns.mapv(|light| f64::from(light.max(0.0))));
+        }
+        light
+    }
+
+    /// The light of each unknown in a pixel's profile; `otherwise` for those that are not part of the profile.
+    fn unknowns(&self, places: &[(usize, usize)], profile: ArrayView1<f32>, otherwise: f32) -> Array1<f32> {
+        let mut light = Array1::from_elem(self.model.slots.len(), otherwise);
         places.iter().for_each(|&(slot, place)| light[slot] = profile[place]);
         if let Some(Spike { own, neighbour: Some(neighbour), share }) = self.spike {
             // Direct light that falls on the neighbour's row does not count as the neighbour's own light.
@@ -206,15 +326,17 @@ impl Problem<'_> {
             light[own] = direct;
             light[neighbour] -= direct * (share + ROUNDING);
         }
-        light.mapv(|light| light > 0.0)
+        light
     }
 }
 
 /// The samples of one pixel.
 struct Pixel {
     light: Array1<f64>,
-    /// Before coupling.
+    /// Before coupling, without that of dark images.
     variance: Array1<f64>,
+    /// For each dark image, 1 for the samples from which it was subtracted, and its variance.
+    darks: Vec<(Array1<f64>, f64)>,
     variance_ratio: f64,
 }
 
@@ -224,8 +346,13 @@ impl Pixel {
         let light: Array1<f64> = settings.iter().map(|&n| f64::from(samples.stack[[n, t, column]])).collect();
         let variances =
             settings.iter().zip(&light).map(|(&n, &light)| of.noise.variance(light, of.frames[n]));
+        let dark = |dark: &DarkImage| {
+            let subtracted = settings.iter().map(|n| f64::from(u8::from(dark.settings.contains(n))));
+            (subtracted.collect(), of.noise.variance(0.0, dark.frames))
+        };
         Self {
             variance: variances.collect(),
+            darks: of.darks.iter().map(dark).collect(),
             light,
             variance_ratio: samples.variance_ratio.map_or(1.0, |ratio| f64::from(ratio[[t, column]])),
         }
@@ -233,12 +360,19 @@ impl Pixel {
 
     /// Variance of the sum of the samples weighted by `gains`.
     fn variance_of(&self, gains: ArrayView1<f64>) -> f64 {
-        let independent = (&gains * &gains).dot(&self.variance);
+        let independent = self.independent(gains);
         if self.variance_ratio == 1.0 {
             return independent;
         }
         // Coupling keeps the noise of the pixel's total, by which the whole profile is scaled.
-        let scaling = (gains.dot(&self.light) / self.light.sum()).powi(2) * self.variance.sum();
+        let of_total = self.independent(Array1::ones(gains.len()).view());
+        let scaling = (gains.dot(&self.light) / self.light.sum()).powi(2) * of_total;
         self.variance_ratio * independent + (1.0 - self.variance_ratio) * scaling
+    }
+
+    /// The same before coupling.
+    fn independent(&self, gains: ArrayView1<f64>) -> f64 {
+        let darks = self.darks.iter().map(|(subtracted, variance)| variance * gains.dot(subtracted).powi(2));
+        (&gains * &gains).dot(&self.variance) + darks.sum::<f64>()
     }
 }

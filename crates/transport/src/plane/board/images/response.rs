@@ -167,6 +167,30 @@ impl Responses {
         Ok(Self { place, place_sd, response, response_sd, checks })
     }
 
+    /// Standard deviation of the width of a response relative to itself: the median over the lit pixels. The shares are
+    /// taken as independent.
+    pub fn width_sd(&self) -> f64 {
+        let relative = |(t, s): (usize, usize)| {
+            let (shares, sds) =
+                (self.response.slice(ndarray::s![.., t, s]), self.response_sd.slice(ndarray::s![.., t, s]));
+            let moment = |power: i32| -> f64 {
+                shares.iter().zip(ROWS).map(|(&share, d)| f64::from(share) * f64::from(d).powi(power)).sum()
+            };
+            let (centroid, variance) = (moment(1), self.second_moment(t, s));
+            let of_row = |(&sd, d): (&f32, i32)| {
+                (f64::from(sd) * ((f64::from(d) - centroid).powi(2) - variance)).powi(2)
+            };
+            // The width is the root of the variance.
+            sds.iter().zip(ROWS).map(of_row).sum::<f64>().sqrt() / (2.0 * variance)
+        };
+        let mut widths: Vec<f64> = ndarray::indices(self.place.dim())
+            .into_iter()
+            .map(relative)
+            .filter(|sd| sd.is_finite())
+            .collect();
+        median(&mut widths).unwrap_or(0.0)
+    }
+
     /// Second central moment of a pixel's response, in rows^2; NaN where unlit.
     fn second_moment(&self, t: usize, s: usize) -> f64 {
         let [mut first, mut second] = [0.0; 2];
