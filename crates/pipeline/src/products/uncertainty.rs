@@ -31,7 +31,7 @@ pub(super) fn make(
     Ok(Product::Image { name, about, image, mask })
 }
 
-/// The bound of the prior's bias for the same rows.
+/// The size of the prior's bias for the same rows.
 pub(super) fn make_bias(
     name: String,
     band: Band,
@@ -44,7 +44,7 @@ pub(super) fn make_bias(
     let image = image(stack, none, |model, samples| {
         model.prior_bias_in_rows(first_row, transport, samples, &[band.ranges()])
     })?;
-    let about = format!("what the prior may add to or take from {}, in 95 % of the pixels", band.says());
+    let about = format!("size of the bias that the prior may give to {}", band.says());
     Ok(Product::Image { name, about, image, mask })
 }
 

@@ -298,7 +298,7 @@ fn a_flying_spot_does_not_fit() {
 }
 
 /// Share of errors within one standard deviation: `cargo test -p raysweep-transport --test board_times -- --ignored
-/// --nocapture coverage`.
+/// --nocapture coverage`, with `CASE` for one of the cases and `RUNS` for the number of runs of each.
 #[test]
 #[ignore = "takes minutes"]
 fn coverage() {

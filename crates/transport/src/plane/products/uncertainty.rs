@@ -65,9 +65,6 @@ pub struct Samples<'a> {
     pub u0_rows: Option<ArrayView2<'a, f32>>,
 }
 
-/// Factor of the bound of the prior's bias: with it, the bound holds for 95 % of the pixels of the family of scenes.
-const BIAS_FACTOR: f64 = 1.0;
-
 /// Light of a row below this share of the direct light that reaches it is attributed to rounding.
 const ROUNDING: f32 = 1e-6;
 
@@ -123,12 +120,12 @@ impl Uncertainty<'_> {
         })
     }
 
-    /// The bias that the prior gives to each band, `[bands, t, s]`: a bound that holds for 95 % of the pixels.
+    /// Size of the bias that the prior gives to each band, `[bands, t, s]`.
     ///
     /// Without noise, the estimate of a band differs from the truth by `alpha (D g)'(D T) + beta/2 sum(g)`, where `g =
-    /// H_FF^-1 e` for the band's rows `e`, and `T` the truth. The bound takes the estimate for the truth and the terms of the
-    /// sum by their sizes, so that terms that cancel by chance do not hide the others. What the estimate is smoother
-    /// than the truth is made up for by a factor, which was set on the family of scenes of [`super::super::advice`].
+    /// H_FF^-1 e` for the band's rows `e`, and `T` the truth. Here the estimate is taken for the truth, and the terms of
+    /// the sum by their sizes, so that terms that cancel by chance do not hide the others. Where the truth is rougher
+    /// than the estimate shows, the bias may be larger.
     ///
     /// # Errors
     /// Those of [`Self::of_bands_in_rows`].
@@ -151,7 +148,7 @@ impl Uncertainty<'_> {
                     let smoothed =
                         stiff.row(row).iter().zip(rough.row(index)).map(|(a, b)| (a * b).abs()).sum::<f64>();
                     let sparse = solutions.row(row).sum().abs();
-                    *sd = (BIAS_FACTOR * (prior.alpha() * smoothed + prior.beta() / 2.0 * sparse)) as f32;
+                    *sd = (prior.alpha() * smoothed + prior.beta() / 2.0 * sparse) as f32;
                 }
             }
             Ok(())
