@@ -62,7 +62,7 @@ fn sweep(folder: &Path, clients: usize) -> Swept {
     let identify = |_: &tokio::net::UnixStream| {
         static NEXT: AtomicU64 = AtomicU64::new(0);
         let uid = (NEXT.fetch_add(1, Ordering::Relaxed) % 8) as u32;
-        Ok(Peer { uid: 100_000 + uid, gid: if uid % 2 == 0 { 0 } else { 65534 } })
+        Ok(Peer { uid: 100_000 + uid, gid: if uid.is_multiple_of(2) { 0 } else { 65534 } })
     };
     let listening = {
         let _within = runtime.enter();
