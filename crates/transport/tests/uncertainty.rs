@@ -132,7 +132,7 @@ fn dark_images_that_images_share_are_part_of_the_uncertainty() {
             let estimate = demux.solve(stack.view(), None).unwrap();
             let samples = Samples { stack: stack.view(), valid: None, variance_ratio: None, u0_rows: None };
             let noise = camera_noise();
-            let sd = |darks| {
+            let sd = |darks: &[DarkImage]| {
                 let of = Uncertainty {
                     timing: &timing,
                     settings: &settings,

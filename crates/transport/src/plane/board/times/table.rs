@@ -1,7 +1,7 @@
 use std::ops::Range;
 
-/// Rows from one knot to the next: few, because the covariance does not contain what the spline cannot follow of a kink.
-const KNOT_ROWS: usize = 4;
+/// Rows from one knot to the next.
+const KNOT_ROWS: usize = 8;
 /// Rows beyond those seen that the spline covers, because their light reaches them.
 const BORDER_ROWS: usize = 4;
 
