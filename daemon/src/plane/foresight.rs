@@ -10,8 +10,8 @@ use raysweep_transport::plane::calibrate::{averaged_share, can_be_followed, canc
 /// Condition number from which on noise is amplified more than the prior can compensate.
 const ILL_CONDITIONED: f64 = 1e9;
 
-/// Flicker with a smaller amplitude does no harm, of white in a row's time.
-const MOST_FLICKER: f64 = 0.0005;
+/// Flicker with a smaller amplitude is lost in the noise of a mean, of white in a row's time.
+const LEAST_FLICKER: f64 = 0.0001;
 
 /// The model that a task's points give on its rig.
 pub struct Model {
@@ -56,7 +56,7 @@ impl Model {
     /// number, and without one nothing removes the flicker.
     pub fn lamp_warning(&self, task: &PlaneTask, key: Option<&str>) -> Option<String> {
         let FlickeringLamp { frequency_hz, amplitude } = task.geometry.calibration.as_ref()?.lamp?;
-        if amplitude <= MOST_FLICKER {
+        if amplitude <= LEAST_FLICKER {
             return None;
         }
         let lit = task.schedule.points.iter().zip(&self.periods);

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use ndarray::{Array2, Array3, Axis};
+use raysweep_core::Shutter;
 use raysweep_session::ledger::{FrameStarts, PointEntry, State};
 use raysweep_session::stack::{Stack, crc32};
 use raysweep_transport::plane::board::Estimate;
@@ -16,6 +17,8 @@ use raysweep_transport::plane::{NoiseModel, PlaneError};
 use super::task::{AMBIENT_US, BoardPurpose, CalibrationTask, ROWS_PER_BLOCK, WHOLE_US};
 use crate::plane::place;
 
+/// Light of the room, of white in the time of a row, that is not worth subtracting.
+const DARK_ROOM: f64 = 2e-5;
 /// Fewer frames of an exposure do not show the room's light.
 const LEAST_AMBIENT_FRAMES: usize = 8;
 
@@ -133,8 +136,9 @@ pub struct BoardPixels {
     pub prnu: Estimate,
     /// White.
     pub white: WhiteMap,
-    /// The room's light; `None` if too few of its frames have time stamps of one run.
-    pub ambient: Option<Ambient>,
+    /// The room's light, and the run whose clock its flicker has; `None` if too few of its frames have time stamps of
+    /// one run.
+    pub ambient: Option<(Ambient, u32)>,
     /// The places of single pixels against a smooth map.
     pub places: RowPlaces,
     /// Place and response.
@@ -170,7 +174,7 @@ impl BoardPixels {
         let white = WhiteMap::new(white.view(), black.view(), full_scale_dn, noise)?;
         white.check(full_scale_dn)?;
         let ambient = room(images, &dark, noise)?;
-        if let Some(ambient) = &ambient {
+        if let Some((ambient, _)) = &ambient {
             ambient.check(white.level_dn.value, task.task.geometry.raster.row_time_us)?;
         }
         let lit = white.lit();
@@ -188,6 +192,27 @@ impl BoardPixels {
         Ok(Self { dark, transfer, prnu, white, ambient, places, responses, columns })
     }
 
+    /// The room's light in an image of a single frame, unless the room is dark.
+    fn ambient_dn(
+        &self,
+        images: &BoardImages<'_>,
+        purpose: BoardPurpose,
+        entry: &PointEntry,
+    ) -> Option<Array2<f32>> {
+        let geometry = &images.task.task.geometry;
+        let (ambient, run) = self.ambient.as_ref()?;
+        if ambient.level_of_white(self.white.level_dn.value, geometry.raster.row_time_us) < DARK_ROOM {
+            return None;
+        }
+        let start = entry.exposed.as_ref().filter(|exposed| exposed.run == *run);
+        let opened_s = start.and_then(|exposed| exposed.starts_ns.first()).map(|&start| start as f64 * 1e-9);
+        let row_time_us = match images.task.shutter(purpose) {
+            Shutter::Rolling => geometry.camera_row_time_us,
+            Shutter::Global => 0.0,
+        };
+        Some(ambient.light_dn(entry.exposure_us, opened_s, row_time_us))
+    }
+
     /// Frames of the white board, as shares of white averaged over columns.
     fn board_frames(
         &self,
@@ -196,7 +221,11 @@ impl BoardPixels {
     ) -> Result<Vec<BoardFrame>, CalibrationError> {
         let frame = |ordinal| {
             let (image, entry) = images.image(ordinal)?;
-            let light = (image - self.dark.image(entry.exposure_us)) / &self.white.white_dn;
+            let mut light = image - self.dark.image(entry.exposure_us);
+            if let Some(ambient_dn) = self.ambient_dn(images, purpose, entry) {
+                light -= &ambient_dn;
+            }
+            let light = light / &self.white.white_dn;
             let setting = images.task.board_setting(purpose, entry);
             Ok(BoardFrame { setting, light: self.columns.average(light.view())? })
         };
@@ -235,7 +264,7 @@ fn room(
     images: &BoardImages<'_>,
     dark: &DarkFit,
     noise: SensorNoise,
-) -> Result<Option<Ambient>, CalibrationError> {
+) -> Result<Option<(Ambient, u32)>, CalibrationError> {
     let Some(run) = images.run_of_ambient() else { return Ok(None) };
     let exposures = [(BoardPurpose::Black, WHOLE_US), (BoardPurpose::Ambient, AMBIENT_US)];
     let [black, short] = exposures.map(|(purpose, exposure_us)| {
@@ -254,7 +283,8 @@ fn room(
     let usable = dark.hot.mapv(|hot| !hot);
     let geometry = &images.task.task.geometry;
     let rate_hz = 1e6 / geometry.raster.period_us;
-    Ok(Some(ambient(&runs, geometry.camera_row_time_us, rate_hz, noise, Some(usable.view()))?))
+    let found = ambient(&runs, geometry.camera_row_time_us, rate_hz, noise, Some(usable.view()))?;
+    Ok(Some((found, run)))
 }
 
 fn dark(images: &BoardImages<'_>) -> Result<DarkFit, CalibrationError> {

@@ -117,7 +117,7 @@ impl BoardFindings {
             dark_offset_dn: pixels.dark.offset_dn.clone(),
             dark_slope_dn_per_us: pixels.dark.slope_dn_per_us.clone(),
             dark_covariance: pixels.dark.covariance.clone(),
-            ambient_dn_per_us: pixels.ambient.as_ref().map(|ambient| ambient.level_dn_per_us.clone()),
+            ambient_dn_per_us: pixels.ambient.as_ref().map(|(ambient, _)| ambient.level_dn_per_us.clone()),
         };
         KeptCalibration::new(header, arrays)
     }
@@ -125,7 +125,7 @@ impl BoardFindings {
     /// The room's light, in the form in which it is kept.
     fn ambient(&self) -> Option<CalibratedAmbient> {
         let Self { pixels, times } = self;
-        let ambient = pixels.ambient.as_ref()?;
+        let (ambient, _) = pixels.ambient.as_ref()?;
         let white_dn = pixels.white.level_dn.value;
         let flicker = ambient.flicker.as_ref().map(|flicker| CalibratedFlicker {
             frequency_hz: pair(flicker.frequency_hz),

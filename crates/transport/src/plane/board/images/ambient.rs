@@ -115,6 +115,20 @@ impl Ambient {
         median(&mut levels).unwrap_or(0.0) * row_time_us / white_dn
     }
 
+    /// The room's light in an exposure that begins at `opened_s` in row 0, `[t, s]` in DN; without a time, on average.
+    pub fn light_dn(&self, exposure_us: f64, opened_s: Option<f64>, camera_row_time_us: f64) -> Array2<f32> {
+        let mut light_dn = &self.level_dn_per_us * exposure_us as f32;
+        if let Some((flicker, opened_s)) = self.flicker.zip(opened_s) {
+            let middle_s = opened_s + exposure_us * 0.5e-6 - flicker.reference_s;
+            for (t, mut row) in light_dn.rows_mut().into_iter().enumerate() {
+                let share =
+                    flicker.share_at(exposure_us * 1e-6, middle_s + t as f64 * camera_row_time_us * 1e-6);
+                row.mapv_inplace(|light| light * (1.0 + share) as f32);
+            }
+        }
+        light_dn
+    }
+
     /// Refuses flicker that the frames of a run could not follow.
     ///
     /// # Errors
