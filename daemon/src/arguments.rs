@@ -6,8 +6,6 @@ use std::path::PathBuf;
 use bytesize::ByteSize;
 use clap::Parser;
 
-use crate::cli::memory_size;
-
 /// Capture daemon for light-transport rigs.
 #[derive(Parser)]
 #[command(
@@ -82,4 +80,12 @@ fn serial(text: &str) -> Result<String, String> {
     } else {
         Err(format!("{text}: a serial number has 1 to 15 ASCII characters"))
     }
+}
+
+/// Reads the size of a memory limit.
+///
+/// # Errors
+/// What to give instead.
+pub fn memory_size(text: &str) -> Result<ByteSize, String> {
+    text.parse().map_err(|_not_a_size| "give a size, such as 2GB or 512MiB".to_owned())
 }

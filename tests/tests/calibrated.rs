@@ -18,8 +18,8 @@ use raysweep_pipeline::{
 };
 use raysweep_sim::PlaneRig;
 use raysweep_tests::{data, rig_text};
-use raysweep_transport::plane::board::times::{BoardStrip, JitterGauge};
-use raysweep_transport::plane::board::{BoardCalibration, CalibrationCovariance, Estimate};
+use raysweep_transport::plane::board::times::JitterGauge;
+use raysweep_transport::plane::board::{BoardCalibration, BoardStrip, CalibrationCovariance, Estimate};
 use raysweep_transport::plane::{
     NoiseModel, PixelResponse, RESPONSE_ROWS, Setting, Transport, relative_rows,
 };

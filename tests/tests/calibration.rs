@@ -270,6 +270,6 @@ fn calibrations_are_listed_and_chosen() {
     let sweep =
         bench.run("kind = \"sweep\"\n[sweep]\ndelay_us = [0, 20]\nexposure_us = [600]\naverage = 1\n");
     let refused = control.use_calibration(Path::new("none")).unwrap_err();
-    assert!(refused.message.contains("raysweep calibration list"), "{}", refused.message);
+    assert!(refused.message.contains("`raysweep sessions` lists the names"), "{}", refused.message);
     assert!(sweep.session.join("calibration.toml").exists());
 }

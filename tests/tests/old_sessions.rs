@@ -37,7 +37,7 @@ fn transport(session: &Path) -> Array3<f32> {
 fn an_interrupted_sweep_is_resumed_to_the_bits_of_a_whole_one() {
     let read = |file: &str| fs::read_to_string(data("sessions/sweep").join(file)).unwrap();
     let bench = Bench::new(&read("rig.toml"));
-    let session = copy("sweep", bench.folder.path());
+    let session = copy("sweep", &bench.folder.path().join("sessions"));
     assert_eq!(Session::open(&session).unwrap().state().unwrap().stored_points(), 2);
     let resumed = bench.resume(&session);
     assert_eq!(

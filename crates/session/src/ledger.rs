@@ -26,7 +26,7 @@ use crate::damage::Damage;
 use crate::durable::DraftFile;
 use crate::{Error, Result, input};
 
-/// Length at which a ledger is full: twice that of the longest run, 388,800 batches.
+/// Length at which a ledger is full: an estimate of twice what the longest run writes, 388,800 batches.
 const MOST_BYTES: u64 = 256 << 20;
 
 /// Neither follows a link nor waits for the other end of a pipe.

@@ -12,6 +12,7 @@ mod resume;
 mod show;
 mod view;
 
+use crate::arguments::memory_size;
 use std::ffi::OsString;
 use std::fs;
 use std::io;
@@ -367,14 +368,6 @@ fn run(
     begin_run(socket, printer, detach, |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
     })
-}
-
-/// Reads the size of a memory limit.
-///
-/// # Errors
-/// What to give instead.
-pub fn memory_size(text: &str) -> Result<ByteSize, String> {
-    text.parse().map_err(|_not_a_size| "give a size, such as 2GB or 512MiB".to_owned())
 }
 
 /// Begins a run and follows it, unless it is to be left alone.

@@ -11,9 +11,8 @@ use ndarray_npy::{NpzReader, NpzWriter};
 use raysweep_config::{ConfigError, RigFile};
 use raysweep_core::{CameraCapabilities, PixelFormat, io_text};
 use raysweep_session::{durable, input};
-use raysweep_transport::plane::board::times::BoardStrip;
 use raysweep_transport::plane::board::{
-    BoardCalibration, CalibrationCovariance, CalibrationParameter, Estimate, FlickeringLamp,
+    BoardCalibration, BoardStrip, CalibrationCovariance, CalibrationParameter, Estimate, FlickeringLamp,
 };
 use raysweep_transport::plane::{NoiseModel, PixelResponse, RESPONSE_ROWS};
 use serde::{Deserialize, Serialize};

@@ -1,8 +1,9 @@
+use std::ops::Range;
+
 use ndarray::{Array2, s};
 
 use super::super::error::check_shape;
-use super::super::{CameraRows, FIRST_RESPONSE_ROW, PixelResponse, PlaneError, RowTiming};
-use super::times::BoardStrip;
+use super::super::{CameraRows, FIRST_RESPONSE_ROW, NoiseModel, PixelResponse, PlaneError, RowTiming};
 use super::{CalibrationCovariance, Estimate};
 
 /// What images of a board have shown of a rig, in the form in which sweeps and films use it.
@@ -29,6 +30,17 @@ pub struct BoardCalibration {
     pub strip: Option<BoardStrip>,
     /// A lamp that flickered in the room; `None` if none did, or it was not measured.
     pub lamp: Option<FlickeringLamp>,
+}
+
+/// The columns of the image in which the white board stays in view while a scene is measured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BoardStrip {
+    /// The columns.
+    pub columns: Range<usize>,
+    /// Noise of one frame, in shares of white.
+    pub noise: NoiseModel,
+    /// Standard deviation of the lateness of a frame's light, before it is measured.
+    pub jitter_us: f64,
 }
 
 /// A lamp that flickers.

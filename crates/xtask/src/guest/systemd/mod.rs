@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use self::writes::Random;
+use self::writes::ReplayRandom;
 use super::initramfs;
 use super::kernel::GuestKernel;
 use super::qemu::Machine;
@@ -185,7 +185,7 @@ impl Guest {
         machine.wait();
         let entries = writes::read(&log)?;
         let seed = seed();
-        let mut random = Random::new(seed);
+        let mut random = ReplayRandom::new(seed);
         let mut completed = 0;
         for _ in 0..POWER_LOSSES {
             let end = 1 + random.number() as usize % (entries.len() - 1);

@@ -14,7 +14,7 @@ const FUA: u64 = 2;
 const DISCARD: u64 = 4;
 
 /// A write, or a flush if it is empty.
-pub struct Entry {
+pub struct LoggedWrite {
     /// Byte of the disk at which it begins.
     at: u64,
     bytes: Vec<u8>,
@@ -22,7 +22,7 @@ pub struct Entry {
 }
 
 /// Reads a log.
-pub fn read(path: &Path) -> Done<Vec<Entry>> {
+pub fn read(path: &Path) -> Done<Vec<LoggedWrite>> {
     let failed = |what: &str| format!("{}: {what}", path.display());
     let file = File::open(path).map_err(|error| failed(&error.to_string()))?;
     let word = |at: u64| -> Done<u64> {
@@ -44,14 +44,14 @@ pub fn read(path: &Path) -> Done<Vec<Entry>> {
             file.read_exact_at(&mut bytes, at).map_err(|error| failed(&error.to_string()))?;
             at += count * SECTOR;
         }
-        entries.push(Entry { at: sector * SECTOR, bytes, flags });
+        entries.push(LoggedWrite { at: sector * SECTOR, bytes, flags });
     }
     Ok(entries)
 }
 
 /// Writes to `disk` what it would hold after a power loss before entry `end`: all until the last flush; of what was in
 /// flight since, each write or not, by `random`; writes that bypass the cache always.
-pub fn replay(disk: &Path, entries: &[Entry], end: usize, random: &mut Random) -> Done {
+pub fn replay(disk: &Path, entries: &[LoggedWrite], end: usize, random: &mut ReplayRandom) -> Done {
     let failed = |error| format!("{}: {error}", disk.display());
     let file = File::options().write(true).open(disk).map_err(failed)?;
     let flushed = entries[..end].iter().rposition(|entry| entry.flags & FLUSH != 0).unwrap_or(0);
@@ -64,9 +64,9 @@ pub fn replay(disk: &Path, entries: &[Entry], end: usize, random: &mut Random) -
 }
 
 /// A generator of random numbers (xorshift64*), so that a seed gives the same power losses again.
-pub struct Random(u64);
+pub struct ReplayRandom(u64);
 
-impl Random {
+impl ReplayRandom {
     /// With a seed other than 0.
     pub fn new(seed: u64) -> Self {
         Self(seed.max(1))
@@ -85,9 +85,9 @@ impl Random {
 mod tests {
     use super::*;
 
-    fn entry(at: u64, byte: u8, flags: u64) -> Entry {
+    fn entry(at: u64, byte: u8, flags: u64) -> LoggedWrite {
         let bytes = if flags & FLUSH != 0 { Vec::new() } else { vec![byte; SECTOR as usize] };
-        Entry { at: at * SECTOR, bytes, flags }
+        LoggedWrite { at: at * SECTOR, bytes, flags }
     }
 
     #[test]
@@ -106,7 +106,7 @@ mod tests {
         let mut lost = [false; 4];
         for seed in 1..40 {
             std::fs::write(&disk, vec![0; 4 * SECTOR as usize]).unwrap();
-            replay(&disk, &entries, 5, &mut Random::new(seed)).unwrap();
+            replay(&disk, &entries, 5, &mut ReplayRandom::new(seed)).unwrap();
             let bytes = std::fs::read(&disk).unwrap();
             let sectors: Vec<u8> = bytes.chunks(SECTOR as usize).map(|sector| sector[0]).collect();
             assert!(sectors[0] == 1 && sectors[2] == 3, "{sectors:?}");

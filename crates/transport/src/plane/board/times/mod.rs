@@ -33,4 +33,4 @@ pub use settings::{
     BoardFrame, BoardSetting, ExposureMode, Nominal, arrival_settings, check_settings, sweep_settings,
 };
 pub use spot::{SpotSlopes, spot_slopes};
-pub use strip::{BoardStrip, JitterGauge, Lateness};
+pub use strip::{JitterGauge, Lateness};

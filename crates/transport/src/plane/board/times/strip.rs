@@ -3,21 +3,10 @@ use std::ops::Range;
 use ndarray::{ArrayView2, s};
 
 use super::super::super::{NoiseModel, PlaneError, Setting};
-use super::super::{BoardCalibration, Estimate};
+use super::super::{BoardCalibration, BoardStrip, Estimate};
 use super::columns::Columns;
 use super::model::{BoardSamples, Clocks, FrameComparison, Sweep};
 use super::settings::{BoardFrame, BoardSetting, ExposureMode};
-
-/// The columns of the image in which the white board stays in view while a scene is measured.
-#[derive(Debug, Clone, PartialEq)]
-pub struct BoardStrip {
-    /// The columns.
-    pub columns: Range<usize>,
-    /// Noise of one frame, in shares of white.
-    pub noise: NoiseModel,
-    /// Standard deviation of the lateness of a frame's light, before it is measured.
-    pub jitter_us: f64,
-}
 
 /// Measures how late the light of an image is against the VSYNC edge, from a strip of the board in view.
 ///
