@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use guest::wait_for;
 use process::Process;
 use raysweep_core::{Edge, LossCause, Vsync};
-use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig};
+use raysweep_drivers::vsync::fx2lafw::{Fx2Lafw, Fx2LafwConfig, Usb};
 use raysweep_proto::{Client, Event, RunParams};
 use raysweep_session::Session;
 use raysweep_session::ledger::State;
@@ -72,14 +72,19 @@ fn plug(signal: Signal) -> (Plugged, Fx2Faults) {
     (plugged.join().unwrap(), faults)
 }
 
+/// The driver's view of the analyser, once the kernel has enumerated it.
+fn open_analyser() -> Fx2Lafw<Usb> {
+    let config =
+        Fx2LafwConfig { sample_rate_hz: SAMPLE_RATE_HZ, latency_us: 0.0, ..Fx2LafwConfig::default() };
+    wait_for("the analyser", || Fx2Lafw::open(&config).ok())
+}
+
 /// Delay of the driver's stamps in this guest: emulation slows down every transfer. A lab measures its own value.
 fn lateness_us() -> f64 {
     static MEASURED: OnceLock<f64> = OnceLock::new();
     *MEASURED.get_or_init(|| {
         let (_plugged, _) = plug(signal(0.0, 0.0));
-        let config =
-            Fx2LafwConfig { sample_rate_hz: SAMPLE_RATE_HZ, latency_us: 0.0, ..Fx2LafwConfig::default() };
-        let mut vsync = wait_for("the analyser", || Fx2Lafw::open(&config).ok());
+        let mut vsync = open_analyser();
         let late_ns = |edge: Edge| (edge.host_ns + PERIOD_NS / 2).rem_euclid(PERIOD_NS) - PERIOD_NS / 2;
         let mut late: Vec<i64> = Vec::new();
         while late.len() < 120 {
@@ -104,6 +109,7 @@ struct Lab {
 impl Lab {
     /// Starts the daemon. The analyser must be plugged in already.
     fn new(latency_us: f64) -> Self {
+        drop(open_analyser());
         let folder = tempfile::tempdir().unwrap();
         let rig = format!(
             "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\nrows = 8\nrow_time_us = 22.22\n\
@@ -140,7 +146,6 @@ impl Lab {
             match event.unwrap() {
                 Event::Progress(progress) => meanwhile(progress.points_stored),
                 Event::Finished { session, state, error, missing, .. } => {
-                    println!("{}", std::fs::read_to_string(self.path("log")).unwrap());
                     println!("{state} after {:?}", began.elapsed());
                     assert_eq!((state.as_str(), error, missing), ("complete", None, 0));
                     return Session::open(&session).unwrap().state().unwrap();
@@ -149,6 +154,13 @@ impl Lab {
             }
         }
         panic!("the daemon ended before the run");
+    }
+}
+
+impl Drop for Lab {
+    fn drop(&mut self) {
+        // The only trace of a daemon that failed in the guest.
+        println!("{}", std::fs::read_to_string(self.path("log")).unwrap_or_default());
     }
 }
 

@@ -1,5 +1,7 @@
 //! The tests that run in the guest.
 
+use super::qemu::Clock;
+
 /// An integration test and its requirements on the guest.
 pub struct GuestTest {
     /// File name in the crate's `tests` folder, without `.rs`.
@@ -14,6 +16,13 @@ pub struct GuestTest {
     pub pipes: &'static [&'static str],
     /// Environment variables that tell the test its devices.
     pub environment: &'static [(&'static str, &'static str)],
+}
+
+impl GuestTest {
+    /// The clock that suits the test's devices.
+    pub fn clock(&self) -> Clock {
+        if self.devices.is_empty() && self.pipes.is_empty() { Clock::Instructions } else { Clock::Host }
+    }
 }
 
 /// To add a test, add its line here, and its modules' folder in `kernel.rs` if that is new.
