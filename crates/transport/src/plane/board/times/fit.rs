@@ -35,8 +35,9 @@ const BLOCK_ROWS: usize = 21;
 /// Limits of what is accepted.
 const MAX_CHI2_PER_SAMPLE: f64 = 3.0;
 const MAX_EXPOSURE_DIFFERENCE_US: f64 = 0.3;
-/// A difference of exposures is refused if it exceeds the limit by this many standard deviations.
-const DIFFERENCE_SDS: f64 = 3.0;
+/// A difference of exposures is refused if it exceeds the limit by this many standard deviations: ten or more are
+/// judged in a calibration, and a good rig must not be refused.
+const DIFFERENCE_SDS: f64 = 5.0;
 /// What single exposures may differ from the others, while it is fixed and while it is fitted.
 const FIXED_US: f64 = 1e-4;
 const FREE_US: f64 = 20.0;
@@ -86,6 +87,7 @@ impl RowTimes {
 ///
 /// Unknowns are the table's coefficients, then the camera's row time, the offset of the global mode, what exposures
 /// have more than nominal, and what each exposure other than the shortest rolling one has more than that.
+#[derive(Clone)]
 struct Fit<'a> {
     columns: &'a Columns,
     frames: &'a [BoardFrame],
@@ -444,12 +446,15 @@ impl<'a> Fit<'a> {
 
     /// Fits the length of each exposure, and refuses those that are longer than others by more than they should.
     fn check_exposures(&self) -> Result<(), TimesError> {
-        let Normal { matrix, right, .. } = self.normal(true);
-        let cholesky = matrix.cholesky().ok_or(TimesError::Undetermined)?;
-        let (differences_us, covariance) = (cholesky.solve(&right), cholesky.inverse());
+        if self.exposures_us.len() < 2 {
+            return Ok(());
+        }
+        let mut fit = self.clone();
+        fit.steps(MAX_STEPS, true)?;
+        let covariance = fit.covariance(true)?;
         for (index, &exposure_us) in self.exposures_us.iter().enumerate().skip(1) {
             let unknown = self.table.coefficients + 2 + index;
-            let difference_us = differences_us[unknown] + self.unknowns[unknown];
+            let difference_us = fit.unknowns[unknown];
             let sd_us = covariance[(unknown, unknown)].sqrt();
             if difference_us.abs() > MAX_EXPOSURE_DIFFERENCE_US + DIFFERENCE_SDS * sd_us {
                 return Err(TimesError::Granular {
@@ -464,15 +469,15 @@ impl<'a> Fit<'a> {
         Ok(())
     }
 
-    /// Covariance of the unknowns.
+    /// Covariance of the unknowns. `free` frees the differences between exposures.
     ///
     /// Residuals are not independent: the brightness of a drawn row is wrong in all columns and all frames, and the
     /// response of a few columns over many rows. The inverse of the normal matrix alone would be several times too
     /// small. So the scatter of the scores is summed over camera rows, and over blocks of rows in a group of columns,
     /// and what both contain is subtracted (clustered in two ways). Jitters and priors are independent and enter as
     /// they are.
-    fn covariance(&self) -> Result<DMatrix<f64>, TimesError> {
-        let Normal { matrix, frames, .. } = self.normal(false);
+    fn covariance(&self, free: bool) -> Result<DMatrix<f64>, TimesError> {
+        let Normal { matrix, frames, .. } = self.normal(free);
         let count = self.unknowns.len();
         let (rows, groups) = (self.columns.rows(), self.columns.groups());
         let sweep = self.sweep();
@@ -512,7 +517,7 @@ impl<'a> Fit<'a> {
         let mut scatter = by_row + by_block - &cells * cells.transpose();
         scatter += &jitters * jitters.transpose() * self.jitter_prior_us.powi(-2);
         let mut right = DVector::zeros(count);
-        self.add_priors(&mut scatter, &mut right, false);
+        self.add_priors(&mut scatter, &mut right, free);
         let inverse = matrix.cholesky().ok_or(TimesError::Undetermined)?.inverse();
         let covariance = &inverse * scatter * &inverse;
         // A difference of sums of squares may be slightly negative.
@@ -523,7 +528,7 @@ impl<'a> Fit<'a> {
     }
 
     fn result(&self, jitter_us: Estimate, residuals: Vec<Residual>) -> Result<RowTimes, TimesError> {
-        let covariance = self.covariance()?;
+        let covariance = self.covariance(false)?;
         let coefficients = self.table.coefficients;
         let seen_rows = self.columns.seen_rows();
         let unknown = |index: usize| {
