@@ -1,13 +1,16 @@
 //! Files that others may have put in place: opened without waiting for a writer, read within limits, and, where a
 //! client names them, found below an allowed folder without following symbolic links.
 
+use std::ffi::OsStr;
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
+use std::os::fd::OwnedFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Component, Path, PathBuf};
 
 use nix::errno::Errno;
-use nix::fcntl::{OFlag, OpenHow, ResolveFlag, openat2};
+use nix::fcntl::{OFlag, openat, readlinkat};
+use nix::sys::stat::Mode;
 use raysweep_core::Size;
 
 /// Opens a regular file of at most `most_bytes` for reading. Anything else is refused: a pipe without a writer would
@@ -92,17 +95,39 @@ fn inside(folder: &Path, path: &Path) -> Option<PathBuf> {
     inner.components().any(|part| matches!(part, Component::Normal(_))).then(|| inner.to_owned())
 }
 
+/// Opens one part of the path after the other. `openat2` would do this at once, but fails in services with
+/// `RestrictSUIDSGID=`, because systemd cannot see its arguments.
 fn open_inside(folder: &Path, inner: &Path, flags: OFlag) -> io::Result<File> {
-    let how = OpenHow::new().flags(flags | OFlag::O_CLOEXEC).resolve(
-        ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS | ResolveFlag::RESOLVE_NO_MAGICLINKS,
-    );
     let refused = |what: &str| io::Error::new(ErrorKind::PermissionDenied, what);
-    match openat2(File::open(folder)?, inner, how) {
-        Ok(file) => Ok(file.into()),
-        Err(Errno::ELOOP) => Err(refused("there is a symbolic link in its path, which is not followed")),
-        Err(Errno::EXDEV) => Err(refused("its path leads out of the folder that is allowed")),
-        Err(errno) => Err(errno.into()),
+    let mut parts = Vec::new();
+    for part in inner.components() {
+        match part {
+            Component::Normal(name) => parts.push(name),
+            Component::CurDir => {}
+            // As no link is followed, the folder above is that of the name before.
+            _ if parts.pop().is_some() => {}
+            _ => return Err(refused("its path leads out of the folder that is allowed")),
+        }
     }
+    let Some((name, above)) = parts.split_last() else {
+        return Err(refused("it is the folder that is allowed, not a file in it"));
+    };
+    let mut place = OwnedFd::from(File::open(folder)?);
+    let step = |place: &OwnedFd, name: &OsStr, flags: OFlag| {
+        openat(place, name, flags | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC, Mode::empty()).map_err(|errno| {
+            let is_link = || readlinkat(place, name).is_ok();
+            match errno {
+                Errno::ELOOP | Errno::ENOTDIR if is_link() => {
+                    refused("there is a symbolic link in its path, which is not followed")
+                }
+                _ => errno.into(),
+            }
+        })
+    };
+    for name in above {
+        place = step(&place, name, OFlag::O_PATH | OFlag::O_DIRECTORY)?;
+    }
+    Ok(step(&place, name, flags)?.into())
 }
 
 fn regular(file: File, most_bytes: u64) -> io::Result<File> {
@@ -128,7 +153,6 @@ mod tests {
     use std::fs;
     use std::os::unix::fs::symlink;
 
-    use nix::sys::stat::Mode;
     use nix::unistd::mkfifo;
 
     use super::*;

@@ -15,11 +15,12 @@ const KEPT: Duration = Duration::from_secs(30 * 24 * 3600);
 const PACKAGES: &str = "usr-is-merged,systemd,systemd-sysv,dbus,udev,kmod,libaravis-0.8-0";
 
 /// Modules that the checks load; more would take `depmod` in the guest longer.
-const MODULES: [&str; 10] = [
+const MODULES: [&str; 11] = [
     "cdc-acm",
     "dummy_hcd",
     "ftdi_sio",
     "g_serial",
+    "usb_f_acm",
     "pps-ldisc",
     "usbserial",
     "virtio-gpu",

@@ -56,7 +56,7 @@ check "the service opens a device of each class, plugged in after its start, and
 mirror() {
     modprobe virtio_console
     for port in /sys/class/virtio-ports/*; do
-        [ "$(cat "$port/name")" != serial-guest ] || peer=/dev/${port##*/}
+        [ "$(cat "$port/name")" != serial ] || peer=/dev/${port##*/}
     done
     sh /share/optotune.sh "$peer" /share/mirror.log &
     controller=$!
@@ -89,8 +89,8 @@ missing() {
     rm /etc/raysweep/rig.toml
     systemctl reset-failed raysweepd.service raysweepd.socket
     systemctl restart raysweepd.socket
-    code 4 timeout 60 runuser -u ada -- raysweep status && [ "$(property ActiveState)" != activating ] &&
-        journalctl -o cat | grep "Assertion failed"
+    code 4 timeout 60 runuser -u ada -- raysweep status && [ "$(property ActiveState)" = failed ] &&
+        journalctl -u raysweepd.service -p err -o cat | grep "rig.toml.*No such file"
 }
 check "no rig file: the same" missing
 repaired() {
