@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::run::{Done, run};
@@ -21,7 +22,9 @@ impl Daemon {
     /// Starts the daemon from a folder of programs, and waits until it listens.
     pub fn start(programs: &Path, rig: &Path, data: &Path) -> Done<Self> {
         // Paths of sockets are limited to 108 bytes; checkout paths may be longer.
-        let runtime = std::env::temp_dir().join(format!("raysweep-xtask-{}", std::process::id()));
+        static STARTED: AtomicU32 = AtomicU32::new(0);
+        let number = STARTED.fetch_add(1, Ordering::Relaxed);
+        let runtime = std::env::temp_dir().join(format!("raysweep-xtask-{}-{number}", std::process::id()));
         std::fs::create_dir_all(&runtime).map_err(|error| format!("{}: {error}", runtime.display()))?;
         let process = Command::new(programs.join("raysweepd"))
             .arg("--rig")

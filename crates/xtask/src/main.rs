@@ -1,4 +1,4 @@
-//! `cargo xtask demo | test | packages | fresh | deb | guest | bench`: the project's own commands. Uses only std, so that it
+//! `cargo xtask demo | test | packages | fresh | deb | guest | soak | bench`: the project's own commands. Uses only std, so that it
 //! builds quickly everywhere.
 
 mod bench;
@@ -12,6 +12,7 @@ mod packages;
 mod python;
 mod rootfs;
 mod run;
+mod soak;
 mod test;
 
 use std::process::ExitCode;
@@ -30,6 +31,8 @@ usage: cargo xtask <command>
   deb                builds the Debian package and prints its path
   guest [TEST...]    the drivers' tests against real kernel drivers in a QEMU guest, or some of them
   guest --systemd    the package under systemd in a QEMU guest: installed, used, killed, cut off from power
+  soak [--minutes N] all procedures with faults, bad clients and kills for 20 minutes, or as many as given; a report with
+                     what grew, differed or got lost
   bench [NAME]       measures; without a name, tells which benchmarks there are";
 
 fn main() -> ExitCode {
@@ -54,6 +57,11 @@ fn main() -> ExitCode {
         ["fresh", releases @ ..] => fresh::fresh(releases),
         ["guest", "--systemd"] => guest::systemd::systemd(),
         ["guest", names @ ..] => guest::guest(names),
+        ["soak"] => soak::soak(20.0),
+        ["soak", "--minutes", minutes] => match minutes.parse::<f64>() {
+            Ok(minutes) if (0.0..=100_000.0).contains(&minutes) => soak::soak(minutes),
+            _ => Err(format!("`{minutes}` is not a number of minutes from 0 to 100000")),
+        },
         ["bench", arguments @ ..] => bench::bench(arguments),
         [unknown, ..] => Err(format!("`{unknown}` is not a command\n{USAGE}")),
         [] => Err(USAGE.to_owned()),

@@ -12,7 +12,7 @@ const META_PACKAGE: &str = "linux-image-amd64";
 
 /// Folders of the modules that tests may request. Unpacking all 4000 modules would take longer than the tests. Every
 /// entry must exist in both releases: `fs/f*` stands for `fs/fscache`, which in Debian 13 is part of `fs/netfs`.
-const MODULE_FOLDERS: [&str; 20] = [
+const MODULE_FOLDERS: [&str; 21] = [
     "crypto/crc32c_generic.ko*",
     "drivers/block/virtio_blk.ko*",
     "drivers/char",
@@ -26,6 +26,7 @@ const MODULE_FOLDERS: [&str; 20] = [
     "drivers/video",
     "drivers/virtio",
     "fs/9p",
+    "fs/configfs",
     "fs/ext4",
     "fs/f*",
     "fs/jbd2",

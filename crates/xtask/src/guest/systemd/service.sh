@@ -39,7 +39,7 @@ check "an operator's sweep over the socket completes" sweep
 
 devices() {
     # Plugged in after the daemon was started.
-    modprobe dummy_hcd && modprobe usb_f_acm && modprobe g_serial idVendor=0x0925 idProduct=0x3881
+    modprobe dummy_hcd && modprobe g_serial idVendor=0x0925 idProduct=0x3881
     modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=3
     modprobe xhci_pci && modprobe ftdi_sio && modprobe virtio-gpu
     ldattach pps /dev/ttyS1
