@@ -278,6 +278,7 @@ impl Runner {
             orders: orders.clone(),
             board: self.board.clone(),
             live: self.outlet(&dir),
+            probes: self.probes.clone(),
         };
         let Foreseen { procedure, shape, .. } = foreseen;
         let thread = thread::Builder::new()

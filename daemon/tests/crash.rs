@@ -2,6 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
 
+mod outcome;
 mod process;
 
 use std::path::{Path, PathBuf};
@@ -9,10 +10,10 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
+use outcome::{Outcome, outcome};
 use process::Process;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
-use raysweep_core::Counts;
 use raysweep_proto::{Client, ClientError, ErrorCode, Event, RunParams};
 use raysweep_session::Session;
 use raysweep_session::film::TransportFilm;
@@ -106,30 +107,6 @@ fn end(daemon: &mut Daemon, begin: impl FnOnce(&mut Client)) -> (PathBuf, String
         }
     }
     panic!("the daemon ended before the run");
-}
-
-/// What must be the same after a crash: each point's attempt, settings, delays and data, and all products. The fate of
-/// frames that still had the previous settings belongs to the run's history, not to the point.
-#[derive(PartialEq)]
-struct Outcome {
-    points: Vec<String>,
-    files: Vec<(String, Vec<u8>)>,
-}
-
-fn outcome(session: &Path) -> Outcome {
-    let state = Session::open(session).unwrap().state().unwrap();
-    assert!(state.counts.balanced(), "{:?}", state.counts);
-    let points =
-        ArrayName::ALL.into_iter().flat_map(|array| state.stored(array).cloned().collect::<Vec<_>>());
-    let points = points.map(|point| PointEntry { counts: Counts::default(), exposed: None, ..point });
-    let points = points.map(|point| serde_json::to_string(&point).unwrap()).collect();
-    let mut files: Vec<_> = std::fs::read_dir(session.join("products"))
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .map(|path| (path.file_name().unwrap().to_string_lossy().into_owned(), std::fs::read(path).unwrap()))
-        .collect();
-    files.sort();
-    Outcome { points, files }
 }
 
 /// Waits until the ledger has a given number of lines.

@@ -100,6 +100,48 @@ fn every_signal_that_asks_for_the_end_ends_a_run_in_order() {
     }
 }
 
+/// Waits until a run is under way.
+fn running(client: &mut Client) {
+    while client.status().unwrap().state != RunState::Running {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+fn a_second_sigterm_does_not_cut_the_end_of_a_run_short() {
+    let lab = Lab::new();
+    let mut daemon = lab.daemon_after("true");
+    let mut client = lab.client();
+    client.run(&RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap();
+    running(&mut client);
+    daemon.signal(Signal::SIGTERM);
+    daemon.signal(Signal::SIGTERM);
+    assert!(daemon.wait().success());
+    assert_eq!(lab.session().state().unwrap().end.unwrap().state, EndState::Cancelled);
+}
+
+#[test]
+fn a_daemon_that_was_stopped_for_a_while_loses_frames_and_no_point() {
+    let lab = Lab::new();
+    let daemon = lab.daemon_after("true");
+    let mut client = lab.client();
+    // In real time: the camera goes on while the daemon stands still.
+    let short = PLAN.replace("4000", "20");
+    client.run(&RunParams { plan: short, ..RunParams::default() }).unwrap();
+    running(&mut client);
+    daemon.signal(Signal::SIGSTOP);
+    std::thread::sleep(Duration::from_millis(800));
+    daemon.signal(Signal::SIGCONT);
+    let began = Instant::now();
+    while client.status().unwrap().state != RunState::Idle {
+        assert!(began.elapsed() < Duration::from_secs(60), "{:?}", client.status().unwrap());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let state = lab.session().state().unwrap();
+    assert_eq!((state.end.as_ref().unwrap().state, state.missing_points()), (EndState::Complete, 0));
+    assert!(state.counts.balanced(), "{:?}", state.counts);
+}
+
 #[test]
 fn what_others_left_in_the_folders_does_not_hinder_a_start() {
     let lab = Lab::new();

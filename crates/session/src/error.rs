@@ -4,6 +4,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use raysweep_core::io_text;
+use zarrs::array::ArrayError;
+use zarrs::storage::StorageError;
 
 /// A result of this crate.
 pub type Result<T> = std::result::Result<T, Error>;
@@ -125,6 +127,21 @@ pub enum Error {
 }
 
 impl Error {
+    /// Whether the disk takes nothing at present, because it is full or read-only. The same write succeeds once that is
+    /// mended.
+    pub fn is_mendable(&self) -> bool {
+        let kind = match self {
+            Error::Io { source, .. } => Some(source.kind()),
+            Error::Zarr { source, .. } => match source.downcast_ref() {
+                Some(ArrayError::StorageError(StorageError::IOError(error))) => Some(error.kind()),
+                _ => None,
+            },
+            _ => None,
+        };
+        use io::ErrorKind::{QuotaExceeded, ReadOnlyFilesystem, StorageFull};
+        matches!(kind, Some(StorageFull | QuotaExceeded | ReadOnlyFilesystem))
+    }
+
     /// For `map_err`: the operation and its path.
     pub(crate) fn io(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Error {
         move |source| Error::Io { action, path: path.to_owned(), source }

@@ -38,7 +38,10 @@ pub struct Ledger {
     path: PathBuf,
     file: File,
     len: u64,
+    /// Whether an earlier line is damaged.
     broken: bool,
+    /// Whether a part of a line that could not be written may follow the last line.
+    torn: bool,
     chain: Chain,
     state: State,
 }
@@ -111,8 +114,15 @@ impl Ledger {
         lock(&file, path)?;
         let first = Entry::Session(session);
         let state = State::replay(std::iter::once(&first)).map_err(refused(path))?;
-        let mut ledger =
-            Ledger { path: path.to_owned(), file, len: 0, broken: false, chain: Chain::new(), state };
+        let mut ledger = Ledger {
+            path: path.to_owned(),
+            file,
+            len: 0,
+            broken: false,
+            torn: false,
+            chain: Chain::new(),
+            state,
+        };
         ledger.append_line(&first)?;
         files.iter().try_for_each(|files| ledger.append(files))?;
         draft.commit()?;
@@ -149,7 +159,7 @@ impl Ledger {
                 .and_then(|()| file.sync_all())
                 .map_err(Error::io("cut the torn last line off", path))?;
         }
-        Ok((Ledger { path: path.to_owned(), file, len, broken, chain, state }, text))
+        Ok((Ledger { path: path.to_owned(), file, len, broken, torn: false, chain, state }, text))
     }
 
     /// The state so far.
@@ -181,9 +191,7 @@ impl Ledger {
             return Err(refused(&self.path)("it would not read back unchanged; every number must be finite"));
         }
         if self.broken {
-            return Err(refused(&self.path)(
-                "an earlier line is damaged, or could not be removed after a failed write; open the session again",
-            ));
+            return Err(refused(&self.path)("an earlier line is damaged; open the session again"));
         }
         // The closing brace follows the checksum.
         line.pop();
@@ -191,13 +199,24 @@ impl Ledger {
         if self.len + line.len() as u64 > MOST_BYTES {
             return Err(refused(&self.path)("the ledger is full: begin another session"));
         }
+        self.cut_torn().map_err(Error::io("append to", &self.path))?;
         if let Err(error) = self.file.write_all(&line).and_then(|()| self.file.sync_data()) {
-            // Half a line followed by another line would damage the ledger permanently.
-            self.broken = self.file.set_len(self.len).is_err();
+            self.torn = true;
+            // If this fails too, the next append begins with it.
+            let _ = self.cut_torn();
             return Err(Error::io("append to", &self.path)(error));
         }
         self.len += line.len() as u64;
         self.chain.follow(&line);
+        Ok(())
+    }
+
+    /// Removes what a failed write has left. Half a line followed by another one would damage the ledger permanently.
+    fn cut_torn(&mut self) -> io::Result<()> {
+        if self.torn {
+            self.file.set_len(self.len)?;
+            self.torn = false;
+        }
         Ok(())
     }
 }

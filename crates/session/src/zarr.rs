@@ -1,6 +1,7 @@
 //! Shared by `stack.zarr` and `transport.zarr`: a durable store, and chunks at the edge of an array.
 
 use std::fs::File;
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -82,9 +83,12 @@ impl WritableStorageTraits for DurableStore {
                 .and_then(|mut file| durable::write_in_pieces(&mut file, &value));
             return written.map_err(StorageError::from);
         }
-        durable::create_dir_within(parent)
-            .and_then(|()| durable::write(&path, &value))
-            .map_err(|error| StorageError::Other(error.to_string()))
+        durable::create_dir_within(parent).and_then(|()| durable::write(&path, &value)).map_err(|error| {
+            match &error {
+                Error::Io { source, .. } => io::Error::new(source.kind(), error.to_string()).into(),
+                _ => StorageError::Other(error.to_string()),
+            }
+        })
     }
 
     fn set_partial_many(

@@ -106,7 +106,8 @@ impl Opened {
     /// # Errors
     /// The first device that cannot be opened; a camera whose size differs from the task's.
     pub fn open(rig: &Rig, task: &Arc<PlaneTask>, run: &Run) -> Result<Self, RunError> {
-        let Devices { camera, vsync, projector, questions, stand, clock, pace } = rig.open()?;
+        let Devices { camera, vsync, projector, questions, stand, clock, pace } =
+            run.probes.instead_of(rig.open()?);
         let operator = questions
             .map(|questions| Operator::start(questions, run.orders.clone(), run.board.clone()))
             .transpose()?;

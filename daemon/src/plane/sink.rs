@@ -13,6 +13,7 @@ use raysweep_session::stack::{ArrayName, Stack};
 use crate::live::LiveEstimate;
 use crate::run::life::Run;
 use crate::run::orders::Order;
+use crate::run::patience::write_patiently;
 use crate::run::progress::ProgressMeter;
 
 /// What the run is told about its points, in order.
@@ -116,10 +117,12 @@ impl PointSink {
         let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
         let clipped =
             unit.clipped.as_ref().filter(|_| array == ArrayName::Sum && self.stack.has(ArrayName::Clipped));
-        let clipped_crc32 =
-            clipped.map(|frames| self.stack.write(ArrayName::Clipped, index, frames.view())).transpose()?;
-        let crc32 = self.stack.write(array, index, unit.sum.view())?;
-        self.run.ledger.append(&Entry::Point(PointEntry {
+        let (Run { ledger, orders, board, .. }, stack) = (&mut self.run, &self.stack);
+        let (clipped_crc32, crc32) = write_patiently(orders, board, || {
+            let clipped = clipped.map(|frames| stack.write(ArrayName::Clipped, index, frames.view()));
+            Ok((clipped.transpose()?, stack.write(array, index, unit.sum.view())?))
+        })?;
+        let entry = Entry::Point(PointEntry {
             array,
             index,
             attempt: unit.id.attempt,
@@ -131,7 +134,8 @@ impl PointSink {
             crc32,
             clipped_crc32,
             exposed: Some(FrameStarts { run: unit.run, starts_ns: unit.starts_ns.clone() }),
-        }))
+        });
+        write_patiently(orders, board, || ledger.append(&entry))
     }
 
     fn fail(&mut self, id: SettingsId, failure: Failure, counts: Counts) {
@@ -172,7 +176,8 @@ impl PointSink {
 
     /// Appends an entry that no stored data depend on: a failure ends the run, but nothing must be undone.
     pub fn append(&mut self, entry: &Entry) {
-        if let Err(error) = self.run.ledger.append(entry) {
+        let Run { ledger, orders, board, .. } = &mut self.run;
+        if let Err(error) = write_patiently(orders, board, || ledger.append(entry)) {
             tracing::error!(%error, "ledger not written");
             self.note_write_error(error);
         }

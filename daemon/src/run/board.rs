@@ -79,6 +79,11 @@ impl StatusBoard {
 
     /// Pauses the run for a task of the operator, unless the run is about to end.
     pub fn ask(&self, task: &str) {
+        self.pause_for(format!("{task}, then `raysweep continue`"));
+    }
+
+    /// Pauses the run and says what it waits for, unless the run is about to end. Returns whether it is paused.
+    pub fn pause_for(&self, text: String) -> bool {
         let mut status = self.lock();
         if status.state.may_become(RunState::Paused) {
             status.state = RunState::Paused;
@@ -86,10 +91,10 @@ impl StatusBoard {
             let _ = self.events.send(Event::State { state: RunState::Paused, session });
         }
         if status.state == RunState::Paused {
-            let text = format!("{task}, then `raysweep continue`");
             status.question = Some(text.clone());
             let _ = self.events.send(Event::Ask { text });
         }
+        status.state == RunState::Paused
     }
 
     /// Sets the session of the run that is being prepared.

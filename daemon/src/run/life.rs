@@ -3,6 +3,7 @@
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use raysweep_pipeline::message_of;
 use raysweep_proto::{CheckReport, DesignParams, DesignReport, ErrorCode, Event, RpcError, RunState};
@@ -15,7 +16,10 @@ use super::board::StatusBoard;
 use super::error::RunError;
 use super::orders::{Order, Orders};
 use crate::live::Outlet;
+use crate::probes::Probes;
 
+/// How long the end of a run waits for its other threads.
+const MOST_HELD: Duration = Duration::from_secs(10);
 /// Most damaged images that a warning names.
 const MOST_NAMED: usize = 10;
 
@@ -84,6 +88,8 @@ pub struct Run {
     pub board: Arc<StatusBoard>,
     /// Where live images are published during the run, if anywhere.
     pub live: Option<Outlet>,
+    /// What tests insert.
+    pub probes: Probes,
 }
 
 impl Run {
@@ -149,7 +155,7 @@ fn failed(error: &RunError, points: usize, dir: &Path) -> Ended {
         error: Some(error.to_string()),
         ..end_entry(EndState::Faulted, stored, missing)
     };
-    let recorded = Session::open(dir).and_then(|session| session.resume()).and_then(|mut ledger| {
+    let recorded = Session::open(dir).and_then(|session| freed(&session)).and_then(|mut ledger| {
         let end = faulted(ledger.state().stored_points(), ledger.state().missing_points());
         ledger.append(&Entry::End(end.clone())).map(|()| end)
     });
@@ -160,6 +166,19 @@ fn failed(error: &RunError, points: usize, dir: &Path) -> Ended {
         faulted(stored, points.saturating_sub(stored))
     });
     Ended { end, warnings: Vec::new() }
+}
+
+/// The ledger of a run that has ended. After a panic, the run's other threads hold it until they have ended too.
+fn freed(session: &Session) -> raysweep_session::Result<Ledger> {
+    let began = Instant::now();
+    loop {
+        match session.resume() {
+            Err(raysweep_session::Error::InUse { .. }) if began.elapsed() < MOST_HELD => {
+                std::thread::sleep(Duration::from_millis(10));
+            }
+            freed => return freed,
+        }
+    }
 }
 
 /// Reports the end of a run.

@@ -4,4 +4,5 @@ pub mod board;
 pub mod error;
 pub mod life;
 pub mod orders;
+pub mod patience;
 pub mod progress;

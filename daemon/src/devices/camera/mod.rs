@@ -76,6 +76,8 @@ const POOL_BUFFERS: usize = 40;
 const POLL: Duration = Duration::from_millis(100);
 /// A camera that delivers no frames for this long, beyond the frame time, has lost its trigger.
 const PATIENCE: Duration = Duration::from_secs(2);
+/// Most frames in a row whose timestamps do not rise while exposures of a certain time are waited for.
+const MOST_STANDING_FRAMES: u32 = 100;
 /// Frames to skip before a run's first point, and at most after a pass's last, so that the line is known around each
 /// frame.
 const MARGIN_FRAMES: u32 = 6;
@@ -292,6 +294,7 @@ impl Acquisition {
         let mut left = frames;
         let mut watchdog = Watchdog::default();
         let mut reached_ns = i64::MIN;
+        let mut standing = 0;
         while (left > 0 || reached_ns < not_before_ns) && self.orders.go_on() {
             let Some(received) = self.receive(POLL)? else {
                 watchdog.missed(POLL, self.longest_frame_us, self.camera.state())?;
@@ -299,6 +302,14 @@ impl Acquisition {
             };
             watchdog.feed();
             let start_ns = received.stamp.exposure_start_ns;
+            standing = if start_ns > reached_ns { 0 } else { standing + 1 };
+            if standing > MOST_STANDING_FRAMES {
+                let what = format!(
+                    "its clock stands still: {standing} frames say that they are not later than the one before them; \
+                     switch the camera off and on, and resume the session"
+                );
+                return Err(DeviceError::new("camera", DeviceErrorKind::Protocol, what));
+            }
             if let Taken::Passed = self.pass(received)? {
                 left = left.saturating_sub(1);
                 reached_ns = start_ns;

@@ -15,6 +15,8 @@ use raysweep_transport::plane::Setting;
 use super::worker::{Account, CycleFrames, Worker};
 use crate::plane::PointSink;
 use crate::rig::Pace;
+use crate::run::life::Run;
+use crate::run::patience::write_patiently;
 
 /// The pipeline's sink of a film.
 pub struct FilmSink {
@@ -267,15 +269,17 @@ impl FilmSink {
             // A single frame with at most 16 bits per pixel.
             place.zip_mut_with(&frame.raw, |place, &counts| *place = counts.min(u32::from(u16::MAX)) as u16);
         }
-        film.film.write(cycle.number as usize, raw.view())?;
-        self.points.run.ledger.append(&Entry::Cycle(CycleEntry {
+        let entry = Entry::Cycle(CycleEntry {
             cycle: cycle.number as usize,
             start_s: film.seconds_since_start(first_ns),
             exposure_us: frames[0].setting.exposure_us,
             delays_us: frames.iter().flat_map(|frame| frame.setting.delays_us.clone()).collect(),
             counts: cycle.counts.clone(),
             crc32: crc32(raw.view()),
-        }))?;
+        });
+        let Run { ledger, orders, board, .. } = &mut self.points.run;
+        write_patiently(orders, board, || film.film.write(cycle.number as usize, raw.view()))?;
+        write_patiently(orders, board, || ledger.append(&entry))?;
         film.note_stored(first_ns);
         match images_of(&frames).and_then(|images| film.exposed(cycle.number, images, (first_ns, last_ns))) {
             Some(exposed) => film.worker.cycle(exposed),

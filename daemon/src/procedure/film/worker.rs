@@ -18,6 +18,7 @@ use crate::live::{EPIPOLAR, INDIRECT, Outlet};
 use crate::rig::Pace;
 use crate::run::board::StatusBoard;
 use crate::run::orders::{Order, Orders};
+use crate::run::patience::write_patiently;
 
 /// Capacity of the solver's queue of cycles.
 const WAITING_CYCLES: usize = 4;
@@ -250,7 +251,8 @@ impl Solving {
                 }
             };
             self.publish(&exposed, is_sliding, &transport, solve_time);
-            if !is_sliding && let Err(error) = self.transports.write(*cycle as usize, transport.t.view()) {
+            let store = || self.transports.write(*cycle as usize, transport.t.view());
+            if !is_sliding && let Err(error) = write_patiently(&self.orders, &self.board, store) {
                 tracing::error!(%error, cycle, "transport not stored");
                 self.orders.give(Order::Fault);
                 return Err(error);

@@ -1,0 +1,52 @@
+//! Patience with a disk that is full or read-only.
+
+use std::time::Duration;
+
+use raysweep_proto::RunState;
+use raysweep_session::Result;
+
+use super::board::StatusBoard;
+use super::orders::{Order, Orders};
+
+/// How long a run rests before it tries a failed write again.
+const RETRY: Duration = Duration::from_secs(1);
+
+/// Writes what belongs to a run. While the disk is full or read-only, the run is paused and says why, and the write is
+/// tried again and again: the run goes on by itself once the disk is mended. A run that is told to end does not wait.
+///
+/// # Errors
+/// The write's error, if waiting does not help or is over.
+pub fn write_patiently<T>(
+    orders: &Orders,
+    board: &StatusBoard,
+    mut write: impl FnMut() -> Result<T>,
+) -> Result<T> {
+    // Whether the run is paused for the disk, and not because an operator paused it before.
+    let mut is_paused_here = false;
+    let mut is_told = false;
+    loop {
+        let written = write();
+        let Err(error) = &written else {
+            if is_paused_here && orders.now() == Order::Pause && board.go(RunState::Running).is_ok() {
+                tracing::info!("the disk can be written again; the run goes on");
+                orders.give(Order::Go);
+            }
+            return written;
+        };
+        if !error.is_mendable() || !orders.go_on() {
+            return written;
+        }
+        // Also after `continue`, which makes no room on the disk.
+        if orders.now() == Order::Go || !is_told {
+            tracing::warn!(%error, "the run waits for the disk");
+            let what = "make room on the disk, or make it writable; the run then goes on by itself";
+            is_told = board.pause_for(format!("{error}: {what}"));
+            if !is_told {
+                return written;
+            }
+            is_paused_here |= orders.now() == Order::Go;
+            orders.give(Order::Pause);
+        }
+        orders.rest(RETRY);
+    }
+}

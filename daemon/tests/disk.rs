@@ -1,0 +1,208 @@
+//! Disks that refuse or are slow: `strace` makes single system calls of the real daemon fail, or last long, while a
+//! session is resumed whose folder is known.
+
+#![allow(clippy::unwrap_used, reason = "a test that cannot go on may panic")]
+
+mod outcome;
+mod process;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use outcome::{Outcome, outcome};
+use process::Process;
+use raysweep_proto::{Client, Event, RunParams, RunState};
+use tempfile::TempDir;
+
+const RIG: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n\
+                   [projector]\ndriver = \"sim\"\nrows = 8\n\
+                   [sim]\nscene = \"v-groove\"\nscene_rows = 8\nscene_columns = 8\nseed = 11\n";
+const PLAN: &str =
+    "kind = \"sweep\"\n[sweep]\naverage = 2\ndelay_us = [-60, 0, 60]\nexposure_us = [50, 100]\n";
+
+/// A session that a run has completed, and is cut back to its beginning.
+struct Begun {
+    folder: TempDir,
+    session: PathBuf,
+    whole: Outcome,
+}
+
+/// How a run ended.
+#[derive(Debug)]
+struct Ended {
+    state: String,
+    error: Option<String>,
+    /// What it was paused for.
+    waited_for: Vec<String>,
+}
+
+impl Begun {
+    fn new() -> Self {
+        let folder = tempfile::tempdir_in("/dev/shm").unwrap();
+        std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+        let mut daemon = Self::daemon(folder.path(), Command::new(env!("CARGO_BIN_EXE_raysweepd")));
+        let (events, mut client) = Self::clients(folder.path(), &mut daemon);
+        let session = client.run(&RunParams { plan: PLAN.into(), ..RunParams::default() }).unwrap().session;
+        assert_eq!(ended(events, &mut client, |_| {}).state, "complete");
+        let whole = outcome(&session);
+        let ledger = std::fs::read_to_string(session.join("ledger.jsonl")).unwrap();
+        let begun: String = ledger.split_inclusive('\n').take(2).collect();
+        std::fs::write(session.join("ledger.jsonl"), begun).unwrap();
+        for made in ["products", "transport.zarr", "stack.zarr/sum/c.2.0.0"] {
+            let made = session.join(made);
+            if made.is_dir() { std::fs::remove_dir_all(made) } else { std::fs::remove_file(made) }.unwrap();
+        }
+        std::fs::create_dir(session.join("products")).unwrap();
+        Self { folder, session, whole }
+    }
+
+    fn daemon(folder: &Path, mut command: Command) -> Process {
+        command.arg("--rig").arg(folder.join("rig.toml")).arg("--socket").arg(folder.join("socket"));
+        Process::start(command.arg("--data").arg(folder.join("sessions")).stderr(Stdio::null()))
+    }
+
+    /// A client that has subscribed, and another one.
+    fn clients(folder: &Path, daemon: &mut Process) -> (impl Iterator<Item = Event> + use<>, Client) {
+        let began = Instant::now();
+        let socket = folder.join("socket");
+        let client = loop {
+            match Client::connect(&socket) {
+                Ok(client) => break client,
+                Err(_) => assert!(!daemon.has_ended() && began.elapsed() < Duration::from_secs(60)),
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        };
+        (client.subscribe().unwrap().map(Result::unwrap), Client::connect(&socket).unwrap())
+    }
+
+    /// Resumes the session while `strace` tampers with calls that concern a file of it. `paused` is done when the run
+    /// waits for the disk.
+    fn resume(&self, file: &str, tamper: &str, paused: impl FnMut(&mut Client)) -> Ended {
+        let command = tampered(tamper, &[self.session.join(file)]);
+        let mut daemon = Self::daemon(self.folder.path(), command);
+        let (events, mut client) = Self::clients(self.folder.path(), &mut daemon);
+        client.resume(&self.session).unwrap();
+        ended(events, &mut client, paused)
+    }
+}
+
+/// The daemon, whose calls that concern these files are tampered with.
+fn tampered(tamper: &str, files: &[PathBuf]) -> Command {
+    let mut command = Command::new("strace");
+    command.args(["-D", "-f", "-qqq", "-o", "/dev/null", "-e", &format!("inject={tamper}")]);
+    for file in files {
+        command.arg("-P").arg(file);
+    }
+    command.arg(env!("CARGO_BIN_EXE_raysweepd"));
+    command
+}
+
+fn ended(
+    events: impl Iterator<Item = Event>,
+    client: &mut Client,
+    mut paused: impl FnMut(&mut Client),
+) -> Ended {
+    let mut waited_for = Vec::new();
+    for event in events {
+        match event {
+            Event::Ask { text } => {
+                let status = client.status().unwrap();
+                assert_eq!((status.state, status.question.as_ref()), (RunState::Paused, Some(&text)));
+                waited_for.push(text);
+                paused(client);
+            }
+            Event::Finished { state, error, .. } => return Ended { state, error, waited_for },
+            _ => {}
+        }
+    }
+    panic!("the daemon ended before the run");
+}
+
+/// The file in which a point of the sweep is written.
+const DATA: &str = "stack.zarr/sum/c.2.0.0.raysweep-tmp";
+
+#[test]
+fn a_run_on_a_full_or_read_only_disk_is_paused_and_goes_on_by_itself() {
+    // A file that cannot be made, written, synced or named, and a line that cannot be written or synced.
+    let cases = [
+        (DATA, "openat:error=EROFS:when=1..2", "Read-only"),
+        (DATA, "write:error=ENOSPC:when=1", "No space"),
+        (DATA, "fsync:error=EDQUOT:when=1", "uota exceeded"),
+        (DATA, "rename:error=ENOSPC:when=1", "No space"),
+        ("ledger.jsonl", "write:error=ENOSPC:when=4..5", "No space"),
+        ("ledger.jsonl", "fdatasync:error=ENOSPC:when=5", "No space"),
+    ];
+    std::thread::scope(|scope| {
+        for (file, tamper, says) in cases {
+            scope.spawn(move || {
+                let begun = Begun::new();
+                let ended = begun.resume(file, tamper, |_| {});
+                assert_eq!(ended.state, "complete", "{tamper}: {ended:?}");
+                let [text] = &ended.waited_for[..] else { panic!("{tamper}: {ended:?}") };
+                assert!(text.contains(says) && text.contains("goes on by itself"), "{tamper}: {text}");
+                let found = outcome(&begun.session);
+                assert!(found == begun.whole, "{tamper}: other bits");
+            });
+        }
+    });
+}
+
+#[test]
+fn a_run_that_waits_for_the_disk_can_be_continued_and_cancelled() {
+    let begun = Begun::new();
+    let mut pauses = 0;
+    // Continuing makes no room: the run is paused again. Cancelling ends it with what is wrong.
+    let ended = begun.resume(DATA, "write:error=ENOSPC", |client| {
+        pauses += 1;
+        if pauses == 1 { client.go_on() } else { client.cancel() }.unwrap();
+    });
+    assert_eq!((ended.state.as_str(), ended.waited_for.len()), ("faulted", 2), "{ended:?}");
+    assert!(ended.error.unwrap().contains("No space left"));
+    let mended = begun.resume("nothing", "write:error=ENOSPC", |_| {});
+    assert_eq!(mended.state, "complete", "{mended:?}");
+    assert!(outcome(&begun.session) == begun.whole, "other bits");
+}
+
+#[test]
+fn a_disk_that_fails_ends_the_run_with_its_cause() {
+    for (file, tamper) in [(DATA, "fsync:error=EIO"), ("ledger.jsonl", "fdatasync:error=EIO:when=5")] {
+        let begun = Begun::new();
+        let ended = begun.resume(file, tamper, |_| {});
+        assert_eq!((ended.state.as_str(), ended.waited_for.len()), ("faulted", 0), "{tamper}: {ended:?}");
+        assert!(ended.error.unwrap().contains("Input/output error"), "{tamper}");
+        assert_eq!(begun.resume("nothing", "write:error=EIO", |_| {}).state, "complete");
+        assert!(outcome(&begun.session) == begun.whole, "{tamper}: other bits");
+    }
+}
+
+#[test]
+fn a_slow_disk_changes_no_bit() {
+    let begun = Begun::new();
+    let ended = begun.resume("ledger.jsonl", "fdatasync:delay_exit=50000", |_| {});
+    assert_eq!((ended.state.as_str(), ended.waited_for.len()), ("complete", 0), "{ended:?}");
+    assert!(outcome(&begun.session) == begun.whole, "other bits");
+}
+
+#[test]
+fn a_film_on_a_full_disk_is_held_between_two_cycles_and_loses_none() {
+    let folder = tempfile::tempdir_in("/dev/shm").unwrap();
+    std::fs::write(folder.path().join("rig.toml"), RIG).unwrap();
+    // A film cannot be resumed, so its folder is not known before: it is named after the second in which it begins.
+    let stamp = |second| {
+        let begins = jiff::Timestamp::now() + jiff::SignedDuration::from_secs(second);
+        let stamp = begins.to_zoned(jiff::tz::TimeZone::UTC).strftime("%Y%m%d-%H%M%S").to_string();
+        folder.path().join(format!("sessions/{stamp}_film/film.zarr/film/c.3.0.0.0.raysweep-tmp"))
+    };
+    let files: Vec<PathBuf> = (0..60).map(stamp).collect();
+    let command = tampered("fsync:error=ENOSPC:when=1", &files);
+    let mut daemon = Begun::daemon(folder.path(), command);
+    let (events, mut client) = Begun::clients(folder.path(), &mut daemon);
+    let plan =
+        "kind = \"film\"\nname = \"film\"\n[film]\ncycles = 6\ndelay_us = [-60, 0, 60]\nexposure_us = 50\n";
+    let session = client.run(&RunParams { plan: plan.into(), ..RunParams::default() }).unwrap().session;
+    let ended = ended(events, &mut client, |_| {});
+    assert_eq!((ended.state.as_str(), ended.waited_for.len()), ("complete", 1), "{ended:?}");
+    let state = raysweep_session::Session::open(&session).unwrap().state().unwrap();
+    assert_eq!(state.cycles().count(), 6);
+}
