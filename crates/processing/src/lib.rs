@@ -17,6 +17,7 @@ mod saturation;
 mod software;
 mod stored;
 pub mod sweep;
+mod video;
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -200,8 +200,14 @@ pub struct Status {
     /// the run's probe.
     #[serde(default)]
     pub settings_latency: Option<SettingsLatency>,
+    /// How the last run ended: `complete`, `cancelled` or `faulted`; `None` during a run.
+    #[serde(default)]
+    pub ended: Option<String>,
     /// Why the last run faulted.
     pub error: Option<String>,
+    /// Reasons why the last run's results may be worse than they look.
+    #[serde(default)]
+    pub warnings: Vec<String>,
     /// The file with the newest live images, if there is one; `describe` returns its layout.
     #[serde(default)]
     pub live: Option<PathBuf>,

@@ -24,9 +24,15 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(session) = &status.session {
         rows.push(("session", session.display().to_string()));
     }
+    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
+    rows.extend(status.ended.iter().map(|ended| ("ended", ended.clone())));
     if let Some(progress) = &status.progress {
-        rows.push(("stored", format!("{} of {}", progress.points_stored, progress.points_planned)));
-        rows.push(("pace", pace(progress)));
+        let (stored, planned) = (progress.points_stored, progress.points_planned);
+        rows.push(("stored", format!("{stored} of {planned}, with dark and regular images")));
+        match is_over {
+            true => rows.push(("lost", progress.counts.losses())),
+            false => rows.push(("pace", pace(progress))),
+        }
         rows.push(("elapsed", duration(progress.elapsed_s)));
     }
     if let Some(film) = &status.film {
@@ -59,6 +65,7 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(error) = &status.error {
         rows.push(("error", error.clone()));
     }
+    rows.extend(status.warnings.iter().map(|warning| ("warning", warning.clone())));
     block(&rows)
 }
 

@@ -209,8 +209,8 @@ impl Rig {
             ProjectorDriver::Drm => (Box::new(self.open_drm()?), None),
             ProjectorDriver::External => {
                 // A run that waits for its operator can be cancelled, so there is no need for a timeout.
-                let (projector, questions) = External::new(Duration::MAX);
-                (Box::new(projector), Some(questions))
+                let (operated, questions) = External::new(Duration::MAX);
+                (simulated.followed(operated), Some(questions))
             }
             ProjectorDriver::Sim => (simulated.projector()?, None),
         };

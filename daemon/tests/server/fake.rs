@@ -197,7 +197,9 @@ impl Control for Fake {
             vsync_clock: None,
             film: None,
             settings_latency: None,
+            ended: None,
             error: None,
+            warnings: Vec::new(),
             live: self.live.exists().then(|| self.live.clone()),
             mirror: Some(MirrorStatus { parked: true, laser: false, light: "armed".into() }),
         }

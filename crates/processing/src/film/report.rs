@@ -9,6 +9,7 @@ use raysweep_session::report::{
 };
 use raysweep_session::{Result, Session};
 
+use super::product::{FilmProducts, FilmVideo};
 use super::task::FilmTask;
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, subtitle};
@@ -22,12 +23,24 @@ const PERCENTILE: f64 = 99.5;
 ///
 /// # Errors
 /// When its transports cannot be read or the report cannot be written.
-pub fn write(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<()> {
-    let page = make(session, state, task, problems)?.to_html()?;
+pub fn write(
+    session: &Session,
+    state: &State,
+    task: &FilmTask,
+    products: &FilmProducts,
+    problems: &[String],
+) -> Result<()> {
+    let page = make(session, state, task, products, problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())
 }
 
-fn make(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<Report> {
+fn make(
+    session: &Session,
+    state: &State,
+    task: &FilmTask,
+    products: &FilmProducts,
+    problems: &[String],
+) -> Result<Report> {
     let mut sections = Vec::new();
     let mut blocks: Vec<Block> =
         problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone())).collect();
@@ -36,6 +49,7 @@ fn make(session: &Session, state: &State, task: &FilmTask, problems: &[String]) 
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
     sections.push(cycles(session, state)?);
+    sections.extend(products.videos.iter().map(video));
     sections.push(pace(state));
     sections.push(trust(state, task));
     Ok(Report {
@@ -129,6 +143,16 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
         intro: "Some of the cycles, evenly spread. Epipolar: light from the pixel's own projector row; indirect: from all others within the reach. Each sheet has one scale.".into(),
         blocks,
     })
+}
+
+fn video(FilmVideo { name, about, pictures }: &FilmVideo) -> Section {
+    Section {
+        title: format!("Product {name}"),
+        intro: format!(
+            "{about}. Some of its images, with one scale; products/{name}.mp4 shows all, and products/{name}.npy has their values."
+        ),
+        blocks: vec![Block::Pictures(pictures.clone())],
+    }
 }
 
 fn pace(state: &State) -> Section {

@@ -7,29 +7,15 @@ mod task;
 
 use std::sync::Arc;
 
-use raysweep_config::plan::products_of_argument;
-use raysweep_config::{ConfigError, Places, SweepPlan};
-use raysweep_pipeline::ProductSpec;
+use raysweep_config::SweepPlan;
 
 pub use self::report::write as write_report;
 pub use self::results::{Results, write_products};
 pub use self::strips::Overview;
 pub use self::task::SweepTask;
-use self::task::append_product;
 use crate::memory::{MemoryNeed, available_bytes};
-use crate::plane::{PlaneTask, manifest};
+use crate::plane::{append_argument, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
-
-/// Appends the products that a command line argument asks for: the keys of a `[[product]]`, separated by commas.
-fn append_argument(specs: &mut Vec<ProductSpec>, argument: &str, task: &PlaneTask) -> Result<(), String> {
-    let shown = |(error, text): (ConfigError, String)| error.render("--product", &text);
-    let (tables, places, text): (_, Places, _) = products_of_argument(argument).map_err(shown)?;
-    for (index, table) in tables.iter().enumerate() {
-        append_product(specs, table, index, task, &|path, message| places.error(path, message))
-            .map_err(|error| error.render("--product", &text))?;
-    }
-    Ok(())
-}
 
 /// Makes the products of a stored sweep again.
 ///
