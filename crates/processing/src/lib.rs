@@ -30,7 +30,7 @@ use raysweep_session::{Session, manifest};
 
 use self::stored::read;
 
-pub use export::export;
+pub use export::{ExportScope, copy_acquired, export};
 pub use software::SOFTWARE;
 pub use stored::{Asked, ProcessError, Processed, Stored};
 

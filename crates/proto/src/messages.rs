@@ -414,6 +414,9 @@ pub enum Event {
         /// Reasons why the results may be worse than they look.
         #[serde(default)]
         warnings: Vec<String>,
+        /// What the run found, beside its products, in a sentence each.
+        #[serde(default)]
+        found: Vec<String>,
         /// Seconds from the end of the last frame's exposure to the transport on disk; `None` if no transport
         /// was computed.
         #[serde(default)]

@@ -34,7 +34,7 @@ use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::printer::Printer;
 use self::view::EventView;
-use raysweep_processing::{Asked, ProcessError, export, process_asked};
+use raysweep_processing::{Asked, ExportScope, ProcessError, copy_acquired, export, process_asked};
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
 
@@ -122,7 +122,8 @@ enum Command {
     },
     /// Follow the run in progress to its end; Ctrl-C stops following
     Watch,
-    /// Write the live estimate as a picture: epipolar light on the left, indirect light on the right
+    /// Write the live images as a picture: epipolar light on the left, indirect light on the right; on a dot rig the newest
+    /// batch under all dots
     Preview {
         /// The PNG file to write
         #[arg(long, value_name = "FILE", default_value = "preview.png")]
@@ -153,10 +154,14 @@ enum Command {
     },
     /// List the daemon's sessions, oldest first
     Sessions,
-    /// Make a session's products and report again from its stored data; needs no daemon
+    /// Make a session's products and report again from its stored data; needs no daemon, unless the session is given by
+    /// its name
     Process {
-        /// The session's folder
+        /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
+        /// Make them in this new folder, and leave those of the session as they are
+        #[arg(long, value_name = "DIR")]
+        to: Option<PathBuf>,
         /// Also make this product, a `[[product]]` in one line: 'kind = "epipolar", width_rows = 5'; may be repeated
         #[arg(long = "product", value_name = "KEYS")]
         products: Vec<String>,
@@ -174,9 +179,9 @@ enum Command {
         #[arg(long)]
         accept_edits: bool,
     },
-    /// Check all checksums of a session, and list what is damaged; needs no daemon
+    /// Check all checksums of a session, and list what is damaged; needs no daemon, unless the session is given by its name
     Verify {
-        /// The session's folder
+        /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
     },
     /// Write manual pages and shell completions of all programs, for packages
@@ -185,13 +190,16 @@ enum Command {
         /// The folder to create
         folder: PathBuf,
     },
-    /// Copy a session's products, report and manifest; needs no daemon
+    /// Copy a session's products, report and manifest; needs no daemon, unless the session is given by its name
     Export {
-        /// The session's folder
+        /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
         /// The folder to create [default: the session's name with `-export`, in the current folder]
         #[arg(long, value_name = "DIR")]
         to: Option<PathBuf>,
+        /// Also copy its arrays: the images that the camera took, and the light transport
+        #[arg(long)]
+        stack: bool,
         /// Copy the files even if some are damaged
         #[arg(long)]
         accept_damage: bool,
@@ -322,7 +330,12 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             }
         }
         Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
-        Command::Process { session, products, only, memory, accept_damage, accept_edits } => {
+        Command::Process { session, to, products, only, memory, accept_damage, accept_edits } => {
+            let session = folder_of(session, &socket);
+            if let Some(to) = &to {
+                copy_acquired(&session, to)?;
+            }
+            let session = to.unwrap_or(session);
             let memory_limit_bytes = memory.map(|size| size.as_u64());
             let asked = Asked { products, only, memory_limit_bytes, accept_damage, accept_edits };
             let made = process_asked(&session, &asked)?;
@@ -331,13 +344,15 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             });
             printer.print(&value, |_| show::processed(&made))?;
         }
-        Command::Verify { session } => return verify(&session, printer),
+        Command::Verify { session } => return verify(&folder_of(session, &socket), printer),
         Command::Manuals { folder } => {
             manuals::write(&folder).map_err(|source| CommandFailure::Write { path: folder, source })?;
         }
-        Command::Export { session, to, accept_damage } => {
+        Command::Export { session, to, stack, accept_damage } => {
+            let session = folder_of(session, &socket);
             let to = to.unwrap_or_else(|| export_folder(&session));
-            let files = export(&session, &to, accept_damage)?;
+            let scope = if stack { ExportScope::ResultsAndArrays } else { ExportScope::Results };
+            let files = export(&session, &to, accept_damage, scope)?;
             let value = json!({ "folder": to, "files": files });
             printer.print(&value, |_| format!("{files} files copied to {}", to.display()))?;
         }
@@ -400,9 +415,12 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
         return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
     };
     let mut view = EventView::new(printer.json);
-    if let Some(text) = status.question {
-        // Asked before anybody watched.
-        view.show(&Event::Ask { text }).map_err(CommandFailure::Output)?;
+    // What was said before anybody watched.
+    let state = Event::State { state: status.state, session: Some(session.clone()) };
+    let said =
+        [Some(state), status.progress.map(Event::Progress), status.question.map(|text| Event::Ask { text })];
+    for event in said.into_iter().flatten() {
+        view.show(&event).map_err(CommandFailure::Output)?;
     }
     follow(events, &session, interrupts, view, OnInterrupt::Leave)
 }
@@ -424,6 +442,16 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 fn read_plan(path: &Path) -> Result<String, CommandFailure> {
     fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })
+}
+
+/// The folder of a session, which is given by its folder, or by its name in the data folder of the daemon, if that answers.
+fn folder_of(given: PathBuf, socket: &Path) -> PathBuf {
+    if given.exists() || given.components().count() != 1 {
+        return given;
+    }
+    let listed = Client::connect(socket).and_then(|mut client| client.sessions()).unwrap_or_default();
+    let named = listed.into_iter().find(|info| info.session.file_name() == Some(given.as_os_str()));
+    named.map_or(given, |info| info.session)
 }
 
 fn export_folder(session: &Path) -> PathBuf {

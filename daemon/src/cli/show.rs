@@ -393,11 +393,11 @@ pub(super) fn audit(audit: &Audit, stored: usize, points: usize) -> String {
     lines.join("\n")
 }
 
-/// Rate, losses and remaining time.
+/// Remaining time, rate and losses, what matters most first.
 pub(super) fn pace(progress: &Progress) -> String {
     let left =
         progress.left_s.map_or_else(|| "time left unknown".into(), |left| format!("{} left", duration(left)));
-    format!("{:.0} frames/s  {}  {left}", progress.frames_per_s, progress.counts.losses())
+    format!("{left}  {:.0} frames/s  {}", progress.frames_per_s, progress.counts.losses())
 }
 
 /// Text for a state.

@@ -137,6 +137,15 @@ pub enum Pace {
     Devices,
 }
 
+impl Pace {
+    /// What to tell of the times of a run, if they are not those of the host's clock.
+    pub fn of_times(self) -> Option<String> {
+        let said =
+            "times of light are those of the simulated rig, which does not wait for the clock on the wall";
+        (self == Self::Pipeline).then(|| said.into())
+    }
+}
+
 impl Rig {
     /// Reads a rig file and builds what can be built without opening devices.
     ///

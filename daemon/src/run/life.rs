@@ -123,6 +123,8 @@ pub struct Ended {
     pub end: EndEntry,
     /// Warnings for the operator.
     pub warnings: Vec<String>,
+    /// What the run found, beside its products, in a sentence each.
+    pub found: Vec<String>,
 }
 
 /// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon
@@ -159,11 +161,11 @@ fn failed(error: &RunError, points: usize, dir: &Path) -> Ended {
         let stored = stored.map_or(0, |state| state.stored_points());
         faulted(stored, points.saturating_sub(stored))
     });
-    Ended { end, warnings: Vec::new() }
+    Ended { end, warnings: Vec::new(), found: Vec::new() }
 }
 
 /// Reports the end of a run.
-fn finish(Ended { end, warnings }: Ended, board: &StatusBoard, dir: &Path) {
+fn finish(Ended { end, warnings, found }: Ended, board: &StatusBoard, dir: &Path) {
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
         tracing::error!(%error, session = %dir.display(), "run faulted");
@@ -180,6 +182,7 @@ fn finish(Ended { end, warnings }: Ended, board: &StatusBoard, dir: &Path) {
         missing: end.missing,
         film: board.status().film,
         warnings,
+        found,
         final_s: end.final_s,
         light_s: end.light_s,
     };

@@ -69,6 +69,7 @@ impl Fake {
             missing,
             film: None,
             warnings: Vec::new(),
+            found: Vec::new(),
             final_s: None,
             light_s: None,
         });

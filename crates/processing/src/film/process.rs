@@ -30,9 +30,10 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     Arc::make_mut(&mut task.task).left_out = state.left_out();
     stored.check_contents(task.contents())?;
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
-    let specs = products(&task, asked, stored)?;
+    let (specs, wanted) = products(&task, asked, stored)?;
+    let is_wanted = |name: &str| specs[..wanted].iter().any(|spec| spec.name() == name);
     let mut problems = make_transports(session, &task, state, &stages)?;
-    let mut products = write_products(session, state, &task, &specs, &|| true)?;
+    let mut products = write_products(session, state, &task, &specs, &is_wanted, &|| true)?;
     problems.append(&mut products.problems);
     report::write(session, state, &task, &products, &problems)?;
     manifest::write(session, state, &task.task, &rig)?;
@@ -44,22 +45,31 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     })
 }
 
-/// The products of the plan and those asked for.
-fn products(task: &FilmTask, asked: &Asked, stored: &Stored<'_>) -> Result<Vec<ProductSpec>, ProcessError> {
-    let mut specs = match asked.only {
-        true => Vec::new(),
-        false => task.products().map_err(|error| stored.in_plan(&error))?,
-    };
+/// The products of the plan and those asked for, and how many of them are to be written: the first ones. The others are
+/// only shown in the report, which is written anew.
+fn products(
+    task: &FilmTask,
+    asked: &Asked,
+    stored: &Stored<'_>,
+) -> Result<(Vec<ProductSpec>, usize), ProcessError> {
+    let of_plan = task.products().map_err(|error| stored.in_plan(&error))?;
+    let mut specs = if asked.only { Vec::new() } else { of_plan.clone() };
     let reach_rows = task.solver().map_err(|error| stored.in_plan(&error))?.reach_rows();
     for argument in &asked.products {
-        let planned = specs.len();
+        let before = specs.len();
         append_argument(&mut specs, argument, &task.task).map_err(ProcessError::Product)?;
         let refused = |spec: &ProductSpec| spec.not_of_a_film().or_else(|| spec.beyond(reach_rows));
-        if let Some(what) = specs[planned..].iter().find_map(refused) {
+        if let Some(what) = specs[before..].iter().find_map(refused) {
             return Err(ProcessError::Product(format!("--product {argument}: {what}")));
         }
     }
-    Ok(specs)
+    let wanted = specs.len();
+    for spec in of_plan {
+        if specs.iter().all(|other| other.name() != spec.name()) {
+            specs.push(spec);
+        }
+    }
+    Ok((specs, wanted))
 }
 
 /// Computes the transports of all stored cycles; returns the problems.

@@ -4,8 +4,8 @@ use ndarray::{Array2, Axis};
 use raysweep_pipeline::ProductSpec;
 use raysweep_session::film::{CycleEntry, TransportFilm};
 use raysweep_session::ledger::State;
-use raysweep_session::products::VideoWriter;
-use raysweep_session::report::Picture;
+use raysweep_session::products::{VideoWriter, video_tone_map};
+use raysweep_session::report::{Picture, ToneMap};
 use raysweep_session::{Result, Session};
 use raysweep_transport::plane::Transport;
 use serde_json::json;
@@ -33,7 +33,8 @@ pub(super) struct FilmVideo {
     pub pictures: Vec<Picture>,
 }
 
-/// Makes the products of a film from its stored transports. Returns early, with what is made so far, soon after `go_on`
+/// Makes the products of a film from its stored transports, and writes those with a wanted name; all are shown in the
+/// report. Returns early, with what is made so far, soon after `go_on`
 /// returns false.
 ///
 /// # Errors
@@ -43,6 +44,7 @@ pub fn write_products(
     state: &State,
     task: &FilmTask,
     specs: &[ProductSpec],
+    is_wanted: &dyn Fn(&str) -> bool,
     go_on: &dyn Fn() -> bool,
 ) -> Result<FilmProducts> {
     let mut made = FilmProducts::default();
@@ -68,7 +70,8 @@ pub fn write_products(
             return Ok(made);
         }
     };
-    let mut drafts: Vec<Draft<'_>> = specs.iter().map(Draft::new).collect();
+    let mut drafts: Vec<Draft<'_>> =
+        specs.iter().map(|spec| Draft::new(spec, is_wanted(spec.name()))).collect();
     for (number, entry) in cycles.iter().enumerate() {
         if !go_on() {
             return Ok(made);
@@ -89,28 +92,32 @@ pub fn write_products(
         drafts = sound;
     }
     let mut encoder = Encoder::default();
-    for Draft { spec, writer, about, pictures } in drafts {
-        let Some(writer) = writer.filter(|_| go_on()) else { continue };
-        writer.commit()?;
-        encoder.encode(session.products().dir(), spec.name(), images_per_s(&cycles))?;
+    for Draft { spec, writer, about, pictures, .. } in drafts.into_iter().take_while(|_| go_on()) {
+        if let Some(writer) = writer {
+            writer.commit()?;
+            encoder.encode(session.products().dir(), spec.name(), images_per_s(&cycles))?;
+        }
         made.videos.push(FilmVideo { name: spec.name().to_owned(), about, pictures });
     }
     made.problems.append(&mut encoder.problems);
     Ok(made)
 }
 
-/// A product that is being written.
+/// A product that is being made.
 struct Draft<'a> {
     spec: &'a ProductSpec,
-    /// `None` before its first image.
+    is_written: bool,
+    /// `None` before its first image, and if it is not written.
     writer: Option<VideoWriter>,
+    /// `None` before its first image.
+    tone_map: Option<ToneMap>,
     about: String,
     pictures: Vec<Picture>,
 }
 
 impl<'a> Draft<'a> {
-    fn new(spec: &'a ProductSpec) -> Self {
-        Self { spec, writer: None, about: String::new(), pictures: Vec::new() }
+    fn new(spec: &'a ProductSpec, is_written: bool) -> Self {
+        Self { spec, is_written, writer: None, tone_map: None, about: String::new(), pictures: Vec::new() }
     }
 
     fn append(
@@ -121,23 +128,15 @@ impl<'a> Draft<'a> {
         (number, image): (usize, Array2<f32>),
         about: String,
     ) -> Result<()> {
-        let writer = match &mut self.writer {
-            Some(writer) => writer,
-            None => {
-                let mut metadata = task.task.metadata();
-                let at: Vec<usize> = cycles.iter().map(|entry| entry.cycle).collect();
-                let start_s: Vec<f64> = cycles.iter().map(|entry| entry.start_s).collect();
-                metadata.insert("about".into(), json!(about));
-                metadata.insert("axes".into(), json!(["k", "t", "s"]));
-                metadata.insert("k".into(), json!({ "is": "cycle", "at": at, "start_s": start_s }));
-                metadata.insert("images_per_s".into(), json!(images_per_s(cycles)));
-                let size = [image.nrows(), image.ncols(), 1];
-                self.about = about;
-                let writer = session.products().video(self.spec.name(), cycles.len(), size, &metadata)?;
-                self.writer.insert(writer)
-            }
-        };
-        let tone_map = writer.append(image.view().insert_axis(Axis(2)))?;
+        let tone_map = *self.tone_map.get_or_insert_with(|| video_tone_map(&[image.view()]));
+        if self.is_written {
+            let writer = match &mut self.writer {
+                Some(writer) => writer,
+                None => self.writer.insert(begin(session, task, cycles, (self.spec.name(), &about), &image)?),
+            };
+            writer.append(image.view().insert_axis(Axis(2)))?;
+        }
+        self.about = about;
         if number.is_multiple_of(cycles.len().div_ceil(SHOWN)) {
             let entry = cycles[number];
             let caption = format!("cycle {} ({:.2} s)", entry.cycle, entry.start_s);
@@ -145,6 +144,24 @@ impl<'a> Draft<'a> {
         }
         Ok(())
     }
+}
+
+/// Begins the video of a product.
+fn begin(
+    session: &Session,
+    task: &FilmTask,
+    cycles: &[&CycleEntry],
+    (name, about): (&str, &str),
+    image: &Array2<f32>,
+) -> Result<VideoWriter> {
+    let mut metadata = task.task.metadata();
+    let at: Vec<usize> = cycles.iter().map(|entry| entry.cycle).collect();
+    let start_s: Vec<f64> = cycles.iter().map(|entry| entry.start_s).collect();
+    metadata.insert("about".into(), json!(about));
+    metadata.insert("axes".into(), json!(["k", "t", "s"]));
+    metadata.insert("k".into(), json!({ "is": "cycle", "at": at, "start_s": start_s }));
+    metadata.insert("images_per_s".into(), json!(images_per_s(cycles)));
+    session.products().video(name, cycles.len(), [image.nrows(), image.ncols(), 1], &metadata)
 }
 
 /// The pace of a video: that of the cycles, on average.

@@ -44,7 +44,8 @@ fn make(
     let mut sections = Vec::new();
     let mut blocks: Vec<Block> =
         problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone())).collect();
-    blocks.extend(shortcomings(state).into_iter().map(|text| Block::Note(NoteLevel::Warning, text)));
+    let texts = shortcomings(state, transports_missing(session, state)?);
+    blocks.extend(texts.into_iter().map(|text| Block::Note(NoteLevel::Warning, text)));
     if !blocks.is_empty() {
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
@@ -60,8 +61,21 @@ fn make(
     })
 }
 
-/// Ways in which the film falls short of its plan.
-pub fn shortcomings(state: &State) -> Vec<String> {
+/// The number of stored cycles that have no transport; those that were missing when the film ended may have been made
+/// since.
+fn transports_missing(session: &Session, state: &State) -> Result<usize> {
+    let Ok(transports) = TransportFilm::open(&session.transport_film_path()) else {
+        return Ok(state.stored_points());
+    };
+    let mut missing = 0;
+    for entry in state.cycles() {
+        missing += usize::from(!transports.contains(entry.cycle)?);
+    }
+    Ok(missing)
+}
+
+/// Ways in which the film falls short of its plan, given the number of stored cycles without a transport.
+pub fn shortcomings(state: &State, transports_missing: usize) -> Vec<String> {
     let Some(film) = &state.film else { return Vec::new() };
     let mut texts = Vec::new();
     if film.cycles_incomplete > 0 {
@@ -70,10 +84,9 @@ pub fn shortcomings(state: &State) -> Vec<String> {
             film.cycles_incomplete
         ));
     }
-    if film.transports_missing > 0 {
+    if transports_missing > 0 {
         texts.push(format!(
-            "{} stored cycles had no transport when the film ended: `raysweep process` makes them",
-            film.transports_missing
+            "{transports_missing} stored cycles have no transport: `raysweep process` makes them"
         ));
     }
     texts.extend(film.calibration_warnings.iter().cloned());

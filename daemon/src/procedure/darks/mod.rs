@@ -79,6 +79,6 @@ impl Measurement for DarksRun {
             EndState::Complete => make(&session, ledger.state(), &darks, &rig.file)?,
             EndState::Cancelled | EndState::Faulted => Vec::new(),
         };
-        Ok(Ended { end, warnings })
+        Ok(Ended { end, warnings, found: Vec::new() })
     }
 }

@@ -114,6 +114,8 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
+    /// What to tell of its times, if they are simulated.
+    simulated: Option<String>,
 }
 
 impl FilmRun {
@@ -131,6 +133,7 @@ impl FilmRun {
         let cycles = CyclePlan::new(task, opened.camera());
         let account = Arc::new(Account::new(film.points()));
         let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
+        let simulated = opened.pace.of_times();
         let planned = missing.len() + film.points();
         let processing = Processing::without_demux(self.stages.clone());
         // A film's own transports serve as its live estimate.
@@ -167,6 +170,7 @@ impl FilmRun {
             exposures,
             latency,
             fault: points.write_error.map(RunError::from).or(no_light).or(fault),
+            simulated,
         })
     }
 
@@ -220,7 +224,8 @@ impl FilmRun {
 /// a short one; but its products are not made, so that it ends soon.
 fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended, RunError> {
     let FilmRun { rig, film, products, .. } = run;
-    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
+    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault, simulated } =
+        acquired;
     let state = end_state(fault.as_ref(), orders);
     let stored = ledger.state().stored_points();
     let end = EndEntry {
@@ -233,7 +238,7 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
     };
     let go_on = || orders.go_on();
     let mut made = match state {
-        EndState::Complete => write_products(&session, ledger.state(), film, products, &go_on)?,
+        EndState::Complete => write_products(&session, ledger.state(), film, products, &|_| true, &go_on)?,
         EndState::Cancelled | EndState::Faulted => FilmProducts::default(),
     };
     problems.append(&mut made.problems);
@@ -247,6 +252,7 @@ fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended,
         write_report(&session, ledger.state(), film, &made, &problems)?;
         manifest::write(&session, ledger.state(), &film.task, &rig.file)?;
     }
-    problems.extend(shortcomings(ledger.state()));
-    Ok(Ended { end, warnings: problems })
+    let missing = ledger.state().film.as_ref().map_or(0, |film| film.transports_missing);
+    problems.extend(shortcomings(ledger.state(), missing));
+    Ok(Ended { end, warnings: problems, found: simulated.into_iter().collect() })
 }

@@ -118,6 +118,8 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
+    /// What to tell of its times, if they are simulated.
+    simulated: Option<String>,
 }
 
 /// Acquires what is missing.
@@ -143,6 +145,7 @@ fn acquire(
     let live = run.live.clone().and_then(start_live);
     let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
     sink.live = live;
+    let simulated = opened.pace.of_times();
     let again = regular_again(task, &missing, &state);
     let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| {
         acquire_points(passes, sweep, again, missing)
@@ -161,6 +164,7 @@ fn acquire(
         exposures,
         latency,
         fault: sink.write_error.map(RunError::from).or(no_light).or(fault),
+        simulated,
     })
 }
 
@@ -217,7 +221,7 @@ fn conclude(
     live: Option<&Outlet>,
 ) -> Result<Ended, RunError> {
     let task = &*sweep.task;
-    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault, simulated } = acquired;
     let whole = fault.is_none() && missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let make = || match in_strips {
@@ -245,7 +249,7 @@ fn conclude(
         if let Some((live, overview)) = live.zip(overview.as_ref()) {
             show_last(live, overview, stored, computed);
         }
-        write_products(&session, task, &results.products)?;
+        write_products(&session, task, results, &|_| true)?;
         ledger.append(&Entry::End(end.clone()))?;
         write_report(&session, ledger.state(), sweep, results, overview.as_ref())?;
         manifest::write(&session, ledger.state(), task, &rig.file)?;
@@ -254,7 +258,11 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    Ok(Ended { end, warnings: results.map_or_else(Vec::new, Results::into_warnings) })
+    Ok(Ended {
+        end,
+        warnings: results.map_or_else(Vec::new, Results::into_warnings),
+        found: simulated.into_iter().collect(),
+    })
 }
 
 /// Publishes the result where the earlier estimates were published.
