@@ -327,6 +327,18 @@ pub struct SessionInfo {
     pub points: usize,
     /// `complete`, `cancelled` or `faulted`; `unfinished` if no run has ended; `unreadable`.
     pub state: String,
+    /// Kind of the plan; empty if it is unreadable.
+    #[serde(default)]
+    pub kind: String,
+    /// Who ran it.
+    #[serde(default)]
+    pub operator: Option<String>,
+    /// What was in front of the camera.
+    #[serde(default)]
+    pub sample: Option<String>,
+    /// Its tags.
+    #[serde(default)]
+    pub tags: Vec<String>,
 }
 
 /// One entry of `calibrations`.

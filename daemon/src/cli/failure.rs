@@ -37,6 +37,8 @@ pub(super) enum CommandFailure {
     Live(#[from] LiveError),
     #[error("{0}")]
     Calibration(String),
+    #[error("{0}")]
+    Sessions(String),
     #[error(transparent)]
     Process(#[from] ProcessError),
     #[cfg(feature = "aravis")]
@@ -134,6 +136,7 @@ impl CommandFailure {
             Self::File { .. }
             | Self::NotPng(_)
             | Self::Calibration(_)
+            | Self::Sessions(_)
             | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             #[cfg(feature = "aravis")]
             Self::WhichCamera(_) => Exit::Usage,

@@ -9,6 +9,7 @@ mod manuals;
 mod preview;
 mod printer;
 mod resume;
+mod sessions;
 mod show;
 mod view;
 
@@ -33,10 +34,12 @@ use self::exit::Exit;
 use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::printer::Printer;
+use self::sessions::{Compared, SessionFilter, Shown};
 use self::view::EventView;
 use raysweep_processing::{Asked, ExportScope, ProcessError, copy_acquired, export, process_asked};
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
+use raysweep_session::ledger::Remark;
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -153,7 +156,56 @@ enum Command {
         if_moved: bool,
     },
     /// List the daemon's sessions, oldest first
-    Sessions,
+    Sessions(SessionFilter),
+    /// Show a session on one screen: settings, counts, findings, remarks and files
+    Show {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+    },
+    /// Compare two sessions: settings, calibration, counts and products
+    Diff {
+        /// The first session's folder or name
+        a: PathBuf,
+        /// The second session's folder or name
+        b: PathBuf,
+        /// Also draw a product of the first, of the second and their difference, side by side, as this PNG file
+        #[arg(long, value_name = "FILE")]
+        picture: Option<PathBuf>,
+        /// The product to draw
+        #[arg(long, value_name = "NAME", default_value = "epipolar", requires = "picture")]
+        product: String,
+    },
+    /// Run the plan of a session again with the same metadata, say what has changed since, and follow the run as `run` does
+    Rerun {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// Return at once instead of following the run
+        #[arg(long)]
+        detach: bool,
+    },
+    /// Add a dated remark to a session's ledger, where nothing is ever changed
+    Note {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// The remark
+        text: String,
+        /// Who says it
+        #[arg(long, value_name = "NAME")]
+        by: Option<String>,
+    },
+    /// Move a session to the folder .trash beside it, from which `restore` brings it back
+    Trash {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// Delete it instead; nothing brings it back
+        #[arg(long)]
+        for_good: bool,
+    },
+    /// Move a session back from the folder .trash
+    Restore {
+        /// The session's folder in .trash
+        session: PathBuf,
+    },
     /// Make a session's products and report again from its stored data; needs no daemon, unless the session is given by
     /// its name
     Process {
@@ -329,7 +381,55 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                 parked => printer.print(&show::parked_name(parked), |_| show::parked(parked))?,
             }
         }
-        Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
+        Command::Sessions(filter) => {
+            let mut listed = connect()?.sessions()?;
+            listed.retain(|session| filter.keeps(session));
+            printer.print(&listed, |sessions| show::sessions(sessions))?;
+        }
+        Command::Show { session } => {
+            printer.print(&Shown::read(&folder_of(session, &socket))?, Shown::text)?;
+        }
+        Command::Diff { a, b, picture, product } => {
+            let (a, b) = (folder_of(a, &socket), folder_of(b, &socket));
+            if let Some(path) = picture {
+                let png = sessions::picture_of_difference([&a, &b], &product)?;
+                fs::write(&path, png).map_err(|source| CommandFailure::Write { path, source })?;
+            }
+            printer.print(&Compared::read([&a, &b])?, Compared::text)?;
+        }
+        Command::Rerun { session, detach } => {
+            return rerun(&socket, printer, &folder_of(session, &socket), detach);
+        }
+        Command::Note { session, text, by } => {
+            if text.trim().is_empty() {
+                return Err(CommandFailure::Sessions("the remark is empty: say something".into()));
+            }
+            let remark = Remark { at: jiff::Timestamp::now(), by, text };
+            let noted =
+                Session::open(&folder_of(session, &socket)).and_then(|session| session.note(remark.clone()));
+            noted.map_err(ProcessError::from)?;
+            printer.print(&remark, |_| "noted".into())?;
+        }
+        Command::Trash { session, for_good } => {
+            let session = Session::open(&folder_of(session, &socket)).map_err(ProcessError::from)?;
+            let dir = session.dir().to_owned();
+            match for_good {
+                true => {
+                    session.delete_for_good().map_err(ProcessError::from)?;
+                    printer.print(&json!({ "deleted": dir }), |_| format!("{} is deleted", dir.display()))?;
+                }
+                false => {
+                    let to = session.trash().map_err(ProcessError::from)?;
+                    let said = format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
+                    printer.print(&json!({ "moved_to": to }), |_| said)?;
+                }
+            }
+        }
+        Command::Restore { session } => {
+            let to =
+                Session::open(&session).and_then(|session| session.restore()).map_err(ProcessError::from)?;
+            printer.print(&json!({ "moved_to": to }), |_| format!("moved to {}", to.display()))?;
+        }
         Command::Process { session, to, products, only, memory, accept_damage, accept_edits } => {
             let session = folder_of(session, &socket);
             if let Some(to) = &to {
@@ -382,6 +482,24 @@ fn run(
     let params = RunParams { plan: text.to_owned(), operator, sample, note, tags };
     begin_run(socket, printer, detach, |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
+    })
+}
+
+/// Runs the plan of a session again, and says what has changed since.
+fn rerun(socket: &Path, printer: Printer, session: &Path, detach: bool) -> Result<Exit, CommandFailure> {
+    let params = sessions::run_again(session)?;
+    let plan = session.join("plan.toml");
+    begin_run(socket, printer, detach, |client| {
+        let started =
+            client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &params.plan))?;
+        let said = match sessions::changes(session, &started.session) {
+            Ok(changes) if changes.is_empty() => "nothing on the rig has changed since".into(),
+            Ok(changes) => format!("changed since: {}", changes.join("\n               ")),
+            // The run goes on all the same.
+            Err(failure) => format!("what has changed since is not known: {failure}"),
+        };
+        eprintln!("{said}");
+        Ok(started)
     })
 }
 

@@ -1,7 +1,7 @@
 //! The program `raysweep`: its output and exit codes.
 
 use std::fs;
-use std::io::{BufRead, BufReader, Lines};
+use std::io::{BufRead, BufReader, Lines, Write};
 use std::path::PathBuf;
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::time::Duration;
@@ -203,6 +203,32 @@ fn a_session_is_found_by_its_name_wherever_a_folder_is_wanted() {
         let (_, _, err) = run(&daemon, &[command, "nothing"]);
         assert!(err.contains("nothing") && !err.contains("/data"), "{command}: {err}");
     }
+}
+
+#[test]
+fn enter_answers_the_question_of_the_run_that_shows_it() {
+    let daemon = Daemon::start();
+    let terminal = nix::pty::openpty(None, None).unwrap();
+    let mut child = command(&daemon, &["run", &plan(&daemon, "hang")])
+        .stdin(Stdio::from(terminal.slave))
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.any(|line| line.unwrap() == "running"));
+    // Typed before the question: no answer to it.
+    let mut keyboard = fs::File::from(terminal.master);
+    keyboard.write_all(b"\n").unwrap();
+    assert_eq!(run(&daemon, &["pause"]).0, 0);
+    let text = "cover the lens, then `raysweep continue`".to_owned();
+    daemon.fake.publish(Event::Ask { text });
+    assert!(lines.any(|line| line.unwrap().contains("press Enter")));
+    assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Paused);
+    keyboard.write_all(b"\n").unwrap();
+    assert!(lines.any(|line| line.unwrap() == "running"), "Enter continues the run");
+    assert_eq!(run(&daemon, &["cancel"]).0, 0);
+    assert_eq!(child.wait().unwrap().code(), Some(3));
 }
 
 #[test]

@@ -173,6 +173,10 @@ pub fn listed() -> SessionInfo {
         stored: 75,
         points: 75,
         state: "complete".into(),
+        kind: "sweep".into(),
+        operator: Some("Ada".into()),
+        sample: Some("candle".into()),
+        tags: vec!["a".into()],
     }
 }
 
