@@ -34,7 +34,7 @@ use self::exit::Exit;
 use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::printer::Printer;
-use self::sessions::{Compared, SessionFilter, Shown};
+use self::sessions::{Compared, SessionFilter, SessionView};
 use self::view::EventView;
 use raysweep_processing::{Asked, ExportScope, ProcessError, copy_acquired, export, process_asked};
 use raysweep_session::Session;
@@ -387,7 +387,7 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             printer.print(&listed, |sessions| show::sessions(sessions))?;
         }
         Command::Show { session } => {
-            printer.print(&Shown::read(&folder_of(session, &socket))?, Shown::text)?;
+            printer.print(&SessionView::read(&folder_of(session, &socket))?, SessionView::text)?;
         }
         Command::Diff { a, b, picture, product } => {
             let (a, b) = (folder_of(a, &socket), folder_of(b, &socket));

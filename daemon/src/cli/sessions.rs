@@ -75,7 +75,7 @@ impl SessionFilter {
 
 /// What `show` tells of a session.
 #[derive(Debug, Serialize)]
-pub(super) struct Shown {
+pub(super) struct SessionView {
     session: PathBuf,
     name: String,
     kind: String,
@@ -104,7 +104,7 @@ pub(super) struct Shown {
     pictures: Vec<PathBuf>,
 }
 
-impl Shown {
+impl SessionView {
     /// Reads a session.
     pub fn read(dir: &Path) -> Result<Self, CommandFailure> {
         let session = Session::open(dir).map_err(ProcessError::from)?;
@@ -225,8 +225,8 @@ impl Compared {
     /// Compares two sessions.
     pub fn read(folders: [&Path; 2]) -> Result<Self, CommandFailure> {
         let [a, b] = folders;
-        let [first, second] = [Shown::read(a)?, Shown::read(b)?];
-        let names = |shown: &Shown| -> BTreeSet<String> {
+        let [first, second] = [SessionView::read(a)?, SessionView::read(b)?];
+        let names = |shown: &SessionView| -> BTreeSet<String> {
             let stem = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
             shown.products.iter().filter_map(stem).filter(|name| !name.ends_with("_mask")).collect()
         };
