@@ -508,6 +508,10 @@ impl Control for Runner {
             stored: session.stored,
             points: session.points,
             state: session.end.map_or("unfinished", EndState::name).into(),
+            kind: session.kind,
+            operator: session.operator,
+            sample: session.sample,
+            tags: session.tags,
         });
         let unreadable = listing.unreadable.into_iter().map(|(dir, error)| SessionInfo {
             session: dir,
@@ -516,6 +520,10 @@ impl Control for Runner {
             stored: 0,
             points: 0,
             state: "unreadable".into(),
+            kind: String::new(),
+            operator: None,
+            sample: None,
+            tags: Vec::new(),
         });
         Ok(readable.chain(unreadable).collect())
     }

@@ -13,7 +13,7 @@ use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use raysweep::Probes;
 use raysweep::control::Control;
 use raysweep_pipeline::{Stage, StageError, Unit};
-use raysweep_processing::{Asked, Processed, export, process, process_asked};
+use raysweep_processing::{Asked, ExportScope, Processed, export, process, process_asked};
 use raysweep_proto::{Event, ResumeParams, RunParams};
 use raysweep_session::integrity::{Audit, Damage};
 use raysweep_session::stack::ArrayName;
@@ -304,11 +304,11 @@ fn a_damaged_product_is_not_certified_and_not_copied() {
     };
     assert!(damaged(&folder)[0].starts_with("products/epipolar.npy is damaged"), "{:?}", damaged(&folder));
     let to = bench.folder.path().join("copy");
-    let refused = export(&folder, &to, false).unwrap_err().to_string();
+    let refused = export(&folder, &to, false, ExportScope::Results).unwrap_err().to_string();
     assert!(refused.contains("products/epipolar.npy") && !to.exists(), "{refused}");
     process(&folder).unwrap();
     assert_eq!(damaged(&folder), [""; 0]);
-    export(&folder, &to, false).unwrap();
+    export(&folder, &to, false, ExportScope::Results).unwrap();
 }
 
 #[test]

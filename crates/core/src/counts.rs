@@ -103,9 +103,10 @@ impl Counts {
     /// The lost frames by cause, as text.
     pub fn losses(&self) -> String {
         let causes: Vec<_> = self.lost.iter().map(|(cause, frames)| format!("{frames} {cause}")).collect();
-        match causes.is_empty() {
-            true => "none lost".into(),
-            false => format!("{} lost ({})", self.lost_total(), causes.join(", ")),
+        match self.lost.first_key_value() {
+            None => "none lost".into(),
+            Some((cause, frames)) if causes.len() == 1 => format!("{frames} lost ({cause})"),
+            Some(_) => format!("{} lost ({})", self.lost_total(), causes.join(", ")),
         }
     }
 
@@ -163,6 +164,7 @@ mod tests {
         let mut counts = Counts::default();
         assert_eq!(counts.losses(), "none lost");
         counts.lose(LossCause::CameraGap, 3);
+        assert_eq!(counts.losses(), "3 lost (camera gap)");
         counts.lose(LossCause::Jitter, 1);
         assert_eq!(counts.losses(), "4 lost (3 camera gap, 1 jitter)");
     }

@@ -13,6 +13,7 @@ mod film;
 mod findings;
 mod flicker;
 mod jitter;
+mod light;
 mod pipeline;
 mod product;
 mod products;
@@ -33,6 +34,7 @@ pub use demux::{DEMUX, DemuxFold, DemuxOptions, PREDICTED_SHARE, Snapshot, Solve
 pub use edges::{EdgeTracker, Line};
 pub use film::{Cycle, CycleOrder, FilmFrame, FilmSolver};
 pub use findings::{Findings, name as prior_name, rows_to_choose_by};
+pub use light::SeenLight;
 pub use pipeline::{Ordered, Pipeline, PipelineConfig, PipelineError, Sink};
 pub use product::{Product, Profile};
 pub use products::mask;

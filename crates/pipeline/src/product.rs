@@ -36,6 +36,16 @@ pub enum Product {
     Profile(Profile),
 }
 
+impl Product {
+    /// The name of its files, without extension.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Image { name, .. } | Self::Sequence { name, .. } => name,
+            Self::Profile(profile) => &profile.name,
+        }
+    }
+}
+
 /// Light as a function of the delay at one exposure.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Profile {

@@ -17,6 +17,7 @@ mod saturation;
 mod software;
 mod stored;
 pub mod sweep;
+mod video;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -29,7 +30,7 @@ use raysweep_session::{Session, manifest};
 
 use self::stored::read;
 
-pub use export::export;
+pub use export::{ExportScope, copy_acquired, export};
 pub use software::SOFTWARE;
 pub use stored::{Asked, ProcessError, Processed, Stored};
 

@@ -343,6 +343,10 @@ fn advice(path: &Path) -> String {
         return "no access to its folder; ask the daemon's administrator".into();
     };
     match Group::from_gid(Gid::from_raw(metadata.gid())) {
+        // Its members could do anything on this machine.
+        Ok(_) if metadata.gid() == 0 => {
+            "the daemon was started by root, and its socket is for root alone: start it with raysweepd.service, or as a user whose group you are in".into()
+        }
         Ok(Some(group)) => {
             format!("join the group `{0}` (`usermod -aG {0} USER` as root) and log in again", group.name)
         }
@@ -396,9 +400,19 @@ mod tests {
     #[test]
     fn the_advice_names_the_group_of_the_socket() {
         let file = tempfile::NamedTempFile::new().unwrap();
+        let users = Group::from_name("users").unwrap().map(|group| group.gid.as_raw());
+        let is_given =
+            users.is_some_and(|gid| std::os::unix::fs::chown(file.path(), None, Some(gid)).is_ok());
         let gid = Gid::from_raw(std::fs::metadata(file.path()).unwrap().gid());
         let name = Group::from_gid(gid).unwrap().unwrap().name;
-        assert!(advice(file.path()).contains(&format!("`{name}`")));
+        assert_eq!(name == "users", is_given);
+        assert_eq!(advice(file.path()).contains(&format!("join the group `{name}`")), gid.as_raw() != 0);
+    }
+
+    #[test]
+    fn nobody_is_told_to_join_the_group_of_root() {
+        let advice = advice(Path::new("/"));
+        assert!(advice.contains("started by root") && !advice.contains("join"), "{advice}");
     }
 
     #[test]

@@ -200,8 +200,14 @@ pub struct Status {
     /// the run's probe.
     #[serde(default)]
     pub settings_latency: Option<SettingsLatency>,
+    /// How the last run ended: `complete`, `cancelled` or `faulted`; `None` during a run.
+    #[serde(default)]
+    pub ended: Option<String>,
     /// Why the last run faulted.
     pub error: Option<String>,
+    /// Reasons why the last run's results may be worse than they look.
+    #[serde(default)]
+    pub warnings: Vec<String>,
     /// The file with the newest live images, if there is one; `describe` returns its layout.
     #[serde(default)]
     pub live: Option<PathBuf>,
@@ -321,6 +327,18 @@ pub struct SessionInfo {
     pub points: usize,
     /// `complete`, `cancelled` or `faulted`; `unfinished` if no run has ended; `unreadable`.
     pub state: String,
+    /// Kind of the plan; empty if it is unreadable.
+    #[serde(default)]
+    pub kind: String,
+    /// Who ran it.
+    #[serde(default)]
+    pub operator: Option<String>,
+    /// What was in front of the camera.
+    #[serde(default)]
+    pub sample: Option<String>,
+    /// Its tags.
+    #[serde(default)]
+    pub tags: Vec<String>,
 }
 
 /// One entry of `calibrations`.
@@ -408,6 +426,9 @@ pub enum Event {
         /// Reasons why the results may be worse than they look.
         #[serde(default)]
         warnings: Vec<String>,
+        /// What the run found, beside its products, in a sentence each.
+        #[serde(default)]
+        found: Vec<String>,
         /// Seconds from the end of the last frame's exposure to the transport on disk; `None` if no transport
         /// was computed.
         #[serde(default)]

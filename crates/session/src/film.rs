@@ -209,6 +209,16 @@ impl<T: Element + ElementOwned + Clone + Default> CycleArray<T> {
         }))
     }
 
+    /// Whether a cycle was written, without decoding it.
+    ///
+    /// # Errors
+    /// [`Error::Index`], or [`Error::Zarr`] if the file system refuses.
+    pub fn contains(&self, cycle: usize) -> Result<bool> {
+        self.check(cycle)?;
+        let stored = self.array.retrieve_encoded_chunk(&[cycle as u64, 0, 0, 0]);
+        Ok(stored.map_err(Error::zarr("read", &self.path))?.is_some())
+    }
+
     fn check(&self, cycle: usize) -> Result<()> {
         let len = self.cycles();
         if cycle < len { Ok(()) } else { Err(Error::Index { array: "cycle", index: cycle, len }) }

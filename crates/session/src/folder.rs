@@ -10,7 +10,7 @@ use raysweep_core::io_text;
 
 use crate::dots::Dots;
 use crate::film::Film;
-use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, SessionEntry, State};
+use crate::ledger::{self, EndState, Entry, Ledger, LedgerText, Remark, SessionEntry, State};
 use crate::manifest::{self, FileRecord};
 use crate::products::Products;
 use crate::stack::{Contents, Stack};
@@ -161,6 +161,61 @@ impl Session {
         ledger::read_state(&self.ledger_path())
     }
 
+    /// Appends a remark to the ledger, in which nothing is ever changed.
+    ///
+    /// # Errors
+    /// [`Error::InUse`] during a run, [`Error::Io`] if the ledger cannot be written.
+    pub fn note(&self, remark: Remark) -> Result<()> {
+        Ledger::open(&self.ledger_path())?.append(&Entry::Note(remark))
+    }
+
+    /// Moves the session to the folder [`TRASH`] beside it, where no list shows it; returns its new folder.
+    ///
+    /// # Errors
+    /// [`Error::InUse`] during a run, [`Error::Io`] if it is there already or the file system refuses.
+    pub fn trash(&self) -> Result<PathBuf> {
+        let dir = fs::canonicalize(&self.dir).map_err(Error::io("find", &self.dir))?;
+        let trash = dir.parent().unwrap_or(&dir).join(TRASH);
+        self.move_to(&dir, &trash)
+    }
+
+    /// Moves a session back from the folder [`TRASH`]; returns its folder.
+    ///
+    /// # Errors
+    /// [`Error::NotASession`] if it is not in such a folder; otherwise as [`Session::trash`].
+    pub fn restore(&self) -> Result<PathBuf> {
+        let dir = fs::canonicalize(&self.dir).map_err(Error::io("find", &self.dir))?;
+        let trash = dir.parent().filter(|parent| parent.file_name().is_some_and(|name| name == TRASH));
+        let Some(data) = trash.and_then(Path::parent) else {
+            let why = format!("it is not in a folder {TRASH}, so there is nothing to restore");
+            return Err(Error::NotASession { path: dir, why });
+        };
+        self.move_to(&dir, data)
+    }
+
+    /// Deletes the session. Its ledger goes first, so that what is left of it after a failure is no session.
+    ///
+    /// # Errors
+    /// [`Error::InUse`] during a run, [`Error::Io`] if the file system refuses.
+    pub fn delete_for_good(self) -> Result<()> {
+        let ledger = self.ledger_path();
+        let _locked = Ledger::open_damaged(&ledger)?;
+        fs::remove_file(&ledger).map_err(Error::io("delete", &ledger))?;
+        fs::remove_dir_all(&self.dir).map_err(Error::io("delete", &self.dir))
+    }
+
+    fn move_to(&self, dir: &Path, folder: &Path) -> Result<PathBuf> {
+        // No run goes on in a folder that is moved; a damaged ledger is moved too.
+        let _locked = Ledger::open_damaged(&self.ledger_path())?;
+        durable::create_dir_all(folder)?;
+        let target = folder.join(dir.file_name().unwrap_or_default());
+        if target.exists() {
+            return Err(Error::io("replace", &target)(io::ErrorKind::AlreadyExists.into()));
+        }
+        fs::rename(dir, &target).map_err(Error::io("move", dir))?;
+        Ok(target)
+    }
+
     /// Opens the stack for reading and writing.
     ///
     /// # Errors
@@ -267,6 +322,10 @@ impl Session {
     }
 }
 
+/// The folder in a data folder to which sessions are moved that are no longer wanted. It is not a session itself, so no
+/// list shows what is in it.
+pub const TRASH: &str = ".trash";
+
 /// A session in a list of sessions.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SessionSummary {
@@ -276,6 +335,12 @@ pub struct SessionSummary {
     pub name: String,
     /// The plan's kind.
     pub kind: String,
+    /// Who ran it.
+    pub operator: Option<String>,
+    /// What was in front of the camera.
+    pub sample: Option<String>,
+    /// Its tags.
+    pub tags: Vec<String>,
     /// Creation time, UTC.
     pub created: Timestamp,
     /// Planned points: of a sweep, cycles of a film, batches, or axes of a mirror.
@@ -315,6 +380,9 @@ pub fn list(root: &Path) -> Result<Listing> {
                 end: state.end.as_ref().map(|end| end.state),
                 name: state.session.name,
                 kind: state.session.kind,
+                operator: state.session.operator,
+                sample: state.session.sample,
+                tags: state.session.tags,
                 created: state.session.created,
                 dir,
             }),

@@ -20,7 +20,9 @@ use nix::fcntl::OFlag;
 use serde::Deserialize;
 
 use self::chain::{Chain, Fit};
-pub use self::entry::{AxisEntry, EndEntry, EndState, Entry, FORMAT, FrameStarts, PointEntry, SessionEntry};
+pub use self::entry::{
+    AxisEntry, EndEntry, EndState, Entry, FORMAT, FrameStarts, PointEntry, Remark, SessionEntry,
+};
 pub use self::state::{Replay, State};
 use crate::damage::Damage;
 use crate::durable::DraftFile;

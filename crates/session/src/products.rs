@@ -15,7 +15,7 @@ use ndarray::{Array2, ArrayRef, ArrayView2, ArrayView3, Axis, Dimension};
 use ndarray_npy::{WritableElement, WriteNpyExt};
 use serde_json::{Map, Value};
 
-pub use self::video::VideoWriter;
+pub use self::video::{VideoWriter, video_tone_map};
 pub use self::volume::VolumeWriter;
 use crate::{Error, Result, durable, exr_file};
 

@@ -31,10 +31,14 @@ pub(super) enum CommandFailure {
         "no live image yet: a run publishes its first after some points; `raysweep preview --follow` waits for it"
     )]
     NoLiveImage,
+    #[error("{}: the picture is a PNG file: give a name that ends in .png", .0.display())]
+    NotPng(PathBuf),
     #[error(transparent)]
     Live(#[from] LiveError),
     #[error("{0}")]
     Calibration(String),
+    #[error("{0}")]
+    Sessions(String),
     #[error(transparent)]
     Process(#[from] ProcessError),
     #[cfg(feature = "aravis")]
@@ -129,7 +133,11 @@ impl CommandFailure {
             },
             Self::Client(_) => Exit::Unreachable,
             Self::Plan(_) => Exit::Refused,
-            Self::File { .. } | Self::Calibration(_) | Self::Process(ProcessError::Product(_)) => Exit::Usage,
+            Self::File { .. }
+            | Self::NotPng(_)
+            | Self::Calibration(_)
+            | Self::Sessions(_)
+            | Self::Process(ProcessError::Product(_)) => Exit::Usage,
             #[cfg(feature = "aravis")]
             Self::WhichCamera(_) => Exit::Usage,
             #[cfg(feature = "aravis")]

@@ -1,9 +1,11 @@
 //! Follows a run to its end.
 
-use std::io;
+use std::io::{self, IsTerminal};
+use std::os::fd::AsFd;
 use std::path::Path;
 use std::time::Duration;
 
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use raysweep_proto::{Client, Event, Subscription};
 use tokio::runtime::Runtime;
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -55,6 +57,15 @@ impl Interrupts {
     }
 }
 
+/// Whether somebody at the terminal has pressed Enter since the last call. Reads the line.
+fn enter_pressed() -> bool {
+    let stdin = io::stdin();
+    let mut ready = [PollFd::new(stdin.as_fd(), PollFlags::POLLIN)];
+    let is_ready = poll(&mut ready, PollTimeout::ZERO).is_ok_and(|ready| ready > 0);
+    // A terminal gives whole lines. At its end there is nobody.
+    is_ready && stdin.lines().next().is_some_and(|line| line.is_ok())
+}
+
 /// Shows events until the run of `session` has ended.
 pub(super) fn follow(
     mut events: Subscription,
@@ -63,8 +74,19 @@ pub(super) fn follow(
     mut view: EventView,
     mut on_interrupt: OnInterrupt,
 ) -> Result<Exit, CommandFailure> {
-    let mut cancelled = false;
+    let (mut cancelled, mut is_asked) = (false, false);
+    let is_attended = io::stdin().is_terminal() && matches!(on_interrupt, OnInterrupt::Cancel(_));
     loop {
+        if is_attended
+            && enter_pressed()
+            && is_asked
+            && let OnInterrupt::Cancel(client) = &mut on_interrupt
+        {
+            is_asked = false;
+            if let Err(error) = client.go_on() {
+                view.note(&error.to_string());
+            }
+        }
         if interrupts.pending() {
             match &mut on_interrupt {
                 OnInterrupt::Cancel(client) if !cancelled => {
@@ -84,6 +106,16 @@ pub(super) fn follow(
         }
         let Some(event) = events.next_within(PATIENCE)? else { continue };
         view.show(&event).map_err(CommandFailure::Output)?;
+        match &event {
+            // What was typed before the question is no answer to it.
+            Event::State { .. } => is_asked = false,
+            Event::Ask { text } if is_attended && text.ends_with("`raysweep continue`") => {
+                enter_pressed();
+                is_asked = true;
+                view.note("or press Enter here when it is done");
+            }
+            _ => {}
+        }
         if let Event::Finished { session: ended, state, missing, .. } = &event
             && ended == session
         {

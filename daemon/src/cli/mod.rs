@@ -9,6 +9,7 @@ mod manuals;
 mod preview;
 mod printer;
 mod resume;
+mod sessions;
 mod show;
 mod view;
 
@@ -33,10 +34,12 @@ use self::exit::Exit;
 use self::failure::CommandFailure;
 use self::follow::{Interrupts, OnInterrupt, follow};
 use self::printer::Printer;
+use self::sessions::{Compared, SessionFilter, SessionView};
 use self::view::EventView;
-use raysweep_processing::{Asked, ProcessError, export, process_asked};
+use raysweep_processing::{Asked, ExportScope, ProcessError, copy_acquired, export, process_asked};
 use raysweep_session::Session;
 use raysweep_session::integrity::Audit;
+use raysweep_session::ledger::Remark;
 
 /// Where the packaged daemon listens.
 const DEFAULT_SOCKET: &str = "/run/raysweep/raysweepd.sock";
@@ -122,7 +125,8 @@ enum Command {
     },
     /// Follow the run in progress to its end; Ctrl-C stops following
     Watch,
-    /// Write the live estimate as a picture: epipolar light on the left, indirect light on the right
+    /// Write the live images as a picture: epipolar light on the left, indirect light on the right; on a dot rig the newest
+    /// batch under all dots
     Preview {
         /// The PNG file to write
         #[arg(long, value_name = "FILE", default_value = "preview.png")]
@@ -152,11 +156,64 @@ enum Command {
         if_moved: bool,
     },
     /// List the daemon's sessions, oldest first
-    Sessions,
-    /// Make a session's products and report again from its stored data; needs no daemon
-    Process {
-        /// The session's folder
+    Sessions(SessionFilter),
+    /// Show a session on one screen: settings, counts, findings, remarks and files
+    Show {
+        /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
+    },
+    /// Compare two sessions: settings, calibration, counts and products
+    Diff {
+        /// The first session's folder or name
+        a: PathBuf,
+        /// The second session's folder or name
+        b: PathBuf,
+        /// Also draw a product of the first, of the second and their difference, side by side, as this PNG file
+        #[arg(long, value_name = "FILE")]
+        picture: Option<PathBuf>,
+        /// The product to draw
+        #[arg(long, value_name = "NAME", default_value = "epipolar", requires = "picture")]
+        product: String,
+    },
+    /// Run the plan of a session again with the same metadata, say what has changed since, and follow the run as `run` does
+    Rerun {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// Return at once instead of following the run
+        #[arg(long)]
+        detach: bool,
+    },
+    /// Add a dated remark to a session's ledger, where nothing is ever changed
+    Note {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// The remark
+        text: String,
+        /// Who says it
+        #[arg(long, value_name = "NAME")]
+        by: Option<String>,
+    },
+    /// Move a session to the folder .trash beside it, from which `restore` brings it back
+    Trash {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// Delete it instead; nothing brings it back
+        #[arg(long)]
+        for_good: bool,
+    },
+    /// Move a session back from the folder .trash
+    Restore {
+        /// The session's folder in .trash
+        session: PathBuf,
+    },
+    /// Make a session's products and report again from its stored data; needs no daemon, unless the session is given by
+    /// its name
+    Process {
+        /// The session's folder, or its name within the daemon's data folder
+        session: PathBuf,
+        /// Make them in this new folder, and leave those of the session as they are
+        #[arg(long, value_name = "DIR")]
+        to: Option<PathBuf>,
         /// Also make this product, a `[[product]]` in one line: 'kind = "epipolar", width_rows = 5'; may be repeated
         #[arg(long = "product", value_name = "KEYS")]
         products: Vec<String>,
@@ -174,9 +231,9 @@ enum Command {
         #[arg(long)]
         accept_edits: bool,
     },
-    /// Check all checksums of a session, and list what is damaged; needs no daemon
+    /// Check all checksums of a session, and list what is damaged; needs no daemon, unless the session is given by its name
     Verify {
-        /// The session's folder
+        /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
     },
     /// Write manual pages and shell completions of all programs, for packages
@@ -185,13 +242,16 @@ enum Command {
         /// The folder to create
         folder: PathBuf,
     },
-    /// Copy a session's products, report and manifest; needs no daemon
+    /// Copy a session's products, report and manifest; needs no daemon, unless the session is given by its name
     Export {
-        /// The session's folder
+        /// The session's folder, or its name within the daemon's data folder
         session: PathBuf,
         /// The folder to create [default: the session's name with `-export`, in the current folder]
         #[arg(long, value_name = "DIR")]
         to: Option<PathBuf>,
+        /// Also copy its arrays: the images that the camera took, and the light transport
+        #[arg(long)]
+        stack: bool,
         /// Copy the files even if some are damaged
         #[arg(long)]
         accept_damage: bool,
@@ -321,8 +381,61 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
                 parked => printer.print(&show::parked_name(parked), |_| show::parked(parked))?,
             }
         }
-        Command::Sessions => printer.print(&connect()?.sessions()?, |sessions| show::sessions(sessions))?,
-        Command::Process { session, products, only, memory, accept_damage, accept_edits } => {
+        Command::Sessions(filter) => {
+            let mut listed = connect()?.sessions()?;
+            listed.retain(|session| filter.keeps(session));
+            printer.print(&listed, |sessions| show::sessions(sessions))?;
+        }
+        Command::Show { session } => {
+            printer.print(&SessionView::read(&folder_of(session, &socket))?, SessionView::text)?;
+        }
+        Command::Diff { a, b, picture, product } => {
+            let (a, b) = (folder_of(a, &socket), folder_of(b, &socket));
+            if let Some(path) = picture {
+                let png = sessions::picture_of_difference([&a, &b], &product)?;
+                fs::write(&path, png).map_err(|source| CommandFailure::Write { path, source })?;
+            }
+            printer.print(&Compared::read([&a, &b])?, Compared::text)?;
+        }
+        Command::Rerun { session, detach } => {
+            return rerun(&socket, printer, &folder_of(session, &socket), detach);
+        }
+        Command::Note { session, text, by } => {
+            if text.trim().is_empty() {
+                return Err(CommandFailure::Sessions("the remark is empty: say something".into()));
+            }
+            let remark = Remark { at: jiff::Timestamp::now(), by, text };
+            let noted =
+                Session::open(&folder_of(session, &socket)).and_then(|session| session.note(remark.clone()));
+            noted.map_err(ProcessError::from)?;
+            printer.print(&remark, |_| "noted".into())?;
+        }
+        Command::Trash { session, for_good } => {
+            let session = Session::open(&folder_of(session, &socket)).map_err(ProcessError::from)?;
+            let dir = session.dir().to_owned();
+            match for_good {
+                true => {
+                    session.delete_for_good().map_err(ProcessError::from)?;
+                    printer.print(&json!({ "deleted": dir }), |_| format!("{} is deleted", dir.display()))?;
+                }
+                false => {
+                    let to = session.trash().map_err(ProcessError::from)?;
+                    let said = format!("moved to {0}; `raysweep restore {0}` brings it back", to.display());
+                    printer.print(&json!({ "moved_to": to }), |_| said)?;
+                }
+            }
+        }
+        Command::Restore { session } => {
+            let to =
+                Session::open(&session).and_then(|session| session.restore()).map_err(ProcessError::from)?;
+            printer.print(&json!({ "moved_to": to }), |_| format!("moved to {}", to.display()))?;
+        }
+        Command::Process { session, to, products, only, memory, accept_damage, accept_edits } => {
+            let session = folder_of(session, &socket);
+            if let Some(to) = &to {
+                copy_acquired(&session, to)?;
+            }
+            let session = to.unwrap_or(session);
             let memory_limit_bytes = memory.map(|size| size.as_u64());
             let asked = Asked { products, only, memory_limit_bytes, accept_damage, accept_edits };
             let made = process_asked(&session, &asked)?;
@@ -331,13 +444,15 @@ fn execute(arguments: Arguments) -> Result<Exit, CommandFailure> {
             });
             printer.print(&value, |_| show::processed(&made))?;
         }
-        Command::Verify { session } => return verify(&session, printer),
+        Command::Verify { session } => return verify(&folder_of(session, &socket), printer),
         Command::Manuals { folder } => {
             manuals::write(&folder).map_err(|source| CommandFailure::Write { path: folder, source })?;
         }
-        Command::Export { session, to, accept_damage } => {
+        Command::Export { session, to, stack, accept_damage } => {
+            let session = folder_of(session, &socket);
             let to = to.unwrap_or_else(|| export_folder(&session));
-            let files = export(&session, &to, accept_damage)?;
+            let scope = if stack { ExportScope::ResultsAndArrays } else { ExportScope::Results };
+            let files = export(&session, &to, accept_damage, scope)?;
             let value = json!({ "folder": to, "files": files });
             printer.print(&value, |_| format!("{files} files copied to {}", to.display()))?;
         }
@@ -367,6 +482,24 @@ fn run(
     let params = RunParams { plan: text.to_owned(), operator, sample, note, tags };
     begin_run(socket, printer, detach, |client| {
         client.run(&params).map_err(|error| CommandFailure::of_plan(error, path, text))
+    })
+}
+
+/// Runs the plan of a session again, and says what has changed since.
+fn rerun(socket: &Path, printer: Printer, session: &Path, detach: bool) -> Result<Exit, CommandFailure> {
+    let params = sessions::run_again(session)?;
+    let plan = session.join("plan.toml");
+    begin_run(socket, printer, detach, |client| {
+        let started =
+            client.run(&params).map_err(|error| CommandFailure::of_plan(error, &plan, &params.plan))?;
+        let said = match sessions::changes(session, &started.session) {
+            Ok(changes) if changes.is_empty() => "nothing on the rig has changed since".into(),
+            Ok(changes) => format!("changed since: {}", changes.join("\n               ")),
+            // The run goes on all the same.
+            Err(failure) => format!("what has changed since is not known: {failure}"),
+        };
+        eprintln!("{said}");
+        Ok(started)
     })
 }
 
@@ -400,9 +533,12 @@ fn watch(socket: &Path, printer: Printer) -> Result<Exit, CommandFailure> {
         return Err(ClientError::Rpc(RpcError::new(ErrorCode::NotRunning, message)).into());
     };
     let mut view = EventView::new(printer.json);
-    if let Some(text) = status.question {
-        // Asked before anybody watched.
-        view.show(&Event::Ask { text }).map_err(CommandFailure::Output)?;
+    // What was said before anybody watched.
+    let state = Event::State { state: status.state, session: Some(session.clone()) };
+    let said =
+        [Some(state), status.progress.map(Event::Progress), status.question.map(|text| Event::Ask { text })];
+    for event in said.into_iter().flatten() {
+        view.show(&event).map_err(CommandFailure::Output)?;
     }
     follow(events, &session, interrupts, view, OnInterrupt::Leave)
 }
@@ -424,6 +560,16 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 fn read_plan(path: &Path) -> Result<String, CommandFailure> {
     fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })
+}
+
+/// The folder of a session, which is given by its folder, or by its name in the data folder of the daemon, if that answers.
+fn folder_of(given: PathBuf, socket: &Path) -> PathBuf {
+    if given.exists() || given.components().count() != 1 {
+        return given;
+    }
+    let listed = Client::connect(socket).and_then(|mut client| client.sessions()).unwrap_or_default();
+    let named = listed.into_iter().find(|info| info.session.file_name() == Some(given.as_os_str()));
+    named.map_or(given, |info| info.session)
 }
 
 fn export_folder(session: &Path) -> PathBuf {

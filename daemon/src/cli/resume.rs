@@ -59,6 +59,10 @@ mod tests {
             stored: 1,
             points: 2,
             state: state.into(),
+            kind: "sweep".into(),
+            operator: None,
+            sample: None,
+            tags: Vec::new(),
         }
     }
 

@@ -24,9 +24,15 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(session) = &status.session {
         rows.push(("session", session.display().to_string()));
     }
+    let is_over = matches!(status.state, RunState::Idle | RunState::Faulted);
+    rows.extend(status.ended.iter().map(|ended| ("ended", ended.clone())));
     if let Some(progress) = &status.progress {
-        rows.push(("stored", format!("{} of {}", progress.points_stored, progress.points_planned)));
-        rows.push(("pace", pace(progress)));
+        let (stored, planned) = (progress.points_stored, progress.points_planned);
+        rows.push(("stored", format!("{stored} of {planned}, with dark and regular images")));
+        match is_over {
+            true => rows.push(("lost", progress.counts.losses())),
+            false => rows.push(("pace", pace(progress))),
+        }
         rows.push(("elapsed", duration(progress.elapsed_s)));
     }
     if let Some(film) = &status.film {
@@ -59,6 +65,7 @@ pub(super) fn status(status: &Status) -> String {
     if let Some(error) = &status.error {
         rows.push(("error", error.clone()));
     }
+    rows.extend(status.warnings.iter().map(|warning| ("warning", warning.clone())));
     block(&rows)
 }
 
@@ -266,15 +273,22 @@ pub(super) fn sessions(sessions: &[SessionInfo]) -> String {
     let row = |session: &SessionInfo| {
         let points = format!("{}/{}", session.stored, session.points);
         let folder = session.session.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        [folder, session.state.clone(), points, session.name.clone()]
+        let told = [session.operator.clone(), session.sample.clone(), Some(session.tags.join(", "))];
+        let [operator, sample, tags] = told.map(Option::unwrap_or_default);
+        [folder, session.state.clone(), points, session.name.clone(), operator, sample, tags]
     };
-    let mut rows = vec![["session", "state", "stored", "name"].map(str::to_owned)];
+    // Folders are named after the time at which their session began.
+    let heads = ["session (UTC)", "state", "stored", "name", "operator", "sample", "tags"];
+    let mut rows = vec![heads.map(str::to_owned)];
     rows.extend(sessions.iter().map(row));
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-    let widths = [width(0), width(1), width(2)];
-    let line = |[folder, state, points, name]: &[String; 4]| {
-        let [w0, w1, w2] = widths;
-        format!("{folder:w0$}  {state:w1$}  {points:>w2$}  {name}")
+    let widths: [usize; 7] = std::array::from_fn(width);
+    let line = |[folder, state, points, name, operator, sample, tags]: &[String; 7]| {
+        let [w0, w1, w2, w3, w4, w5, _] = widths;
+        let line = format!(
+            "{folder:w0$}  {state:w1$}  {points:>w2$}  {name:w3$}  {operator:w4$}  {sample:w5$}  {tags}"
+        );
+        line.trim_end().to_owned()
     };
     rows.iter().map(line).collect::<Vec<_>>().join("\n")
 }
@@ -386,11 +400,11 @@ pub(super) fn audit(audit: &Audit, stored: usize, points: usize) -> String {
     lines.join("\n")
 }
 
-/// Rate, losses and remaining time.
+/// Remaining time, rate and losses, what matters most first.
 pub(super) fn pace(progress: &Progress) -> String {
     let left =
         progress.left_s.map_or_else(|| "time left unknown".into(), |left| format!("{} left", duration(left)));
-    format!("{:.0} frames/s  {}  {left}", progress.frames_per_s, progress.counts.losses())
+    format!("{left}  {:.0} frames/s  {}", progress.frames_per_s, progress.counts.losses())
 }
 
 /// Text for a state.
@@ -411,7 +425,7 @@ fn name(session: &Path) -> String {
 }
 
 /// Seconds as hours, minutes and seconds.
-fn duration(seconds: f64) -> String {
+pub(super) fn duration(seconds: f64) -> String {
     match Duration::try_from_secs_f64(seconds.ceil()) {
         Ok(duration) => FormattedDuration(duration).to_string(),
         Err(_) => "unknown".into(),
@@ -419,7 +433,7 @@ fn duration(seconds: f64) -> String {
 }
 
 /// Formats rows of a label and its value.
-fn block(rows: &[(&str, String)]) -> String {
+pub(super) fn block(rows: &[(&str, String)]) -> String {
     rows.iter().map(|(word, text)| format!("{word:10} {text}")).collect::<Vec<_>>().join("\n")
 }
 

@@ -11,7 +11,8 @@ use super::show::{self, Ending};
 /// Interval between progress lines where no bar can be drawn.
 const PACE: Duration = Duration::from_secs(5);
 
-const BAR: &str = "{prefix:>9} [{wide_bar}] {pos}/{len} stored  {msg}";
+/// Fits into 80 columns: the message is cut where the terminal ends, so the line never wraps.
+const BAR: &str = "{prefix:>9} [{bar:20}] {pos}/{len}  {wide_msg}";
 
 /// Displays a run's events.
 pub(super) struct EventView {
@@ -66,6 +67,7 @@ impl EventView {
                 missing,
                 film,
                 warnings,
+                found,
                 final_s,
                 light_s,
             } => {
@@ -77,6 +79,9 @@ impl EventView {
                 }
                 for warning in warnings {
                     self.note(&format!("warning: {warning}"));
+                }
+                for found in found {
+                    self.note(found);
                 }
                 let summary = match film {
                     Some(film) => show::film_ending(session, state, report.as_deref(), film),

@@ -3,8 +3,11 @@
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 
+use ndarray::Array2;
 use raysweep_core::{Counts, LossCause, SettingsId, VsyncStats};
-use raysweep_pipeline::{Failure, Ordered, Sink, StageError, Unit};
+use raysweep_pipeline::{
+    Failure, Ordered, Point, PointRole, SeenLight, Sink, StageError, SweepGeometry, Unit,
+};
 use raysweep_processing::plane::{PlaneTask, Processing, place};
 use raysweep_proto::Event;
 use raysweep_session::ledger::{Entry, FrameStarts, PointEntry};
@@ -39,6 +42,8 @@ pub struct PointSink {
     pub live: Option<LiveEstimate>,
     /// The first write error, which ends the run.
     pub write_error: Option<raysweep_session::Error>,
+    /// What was seen of the projector's light, if that was too little: this ends the run too.
+    pub no_light: Option<SeenLight>,
 }
 
 impl Sink for PointSink {
@@ -46,6 +51,21 @@ impl Sink for PointSink {
         match item {
             Ordered::Unit(unit, image) => {
                 let unit = Unit { run: self.run.ledger.state().runs, ..unit };
+                if self.role_of(unit.id) == PointRole::Regular {
+                    self.look_for_light(&unit);
+                }
+                if self.no_light.is_some() {
+                    let mut counts = unit.counts.clone();
+                    counts.cancelled += std::mem::take(&mut counts.averaged);
+                    self.fail(unit.id, Failure::Interrupted, counts);
+                    return;
+                }
+                if self.is_stored_regular(unit.id) {
+                    let mut counts = unit.counts;
+                    counts.settling += std::mem::take(&mut counts.averaged);
+                    self.outside(counts);
+                    return;
+                }
                 if let Err(error) = self.store(&unit) {
                     tracing::error!(%error, point = unit.id.point, "point not stored");
                     self.note_write_error(error);
@@ -72,8 +92,7 @@ impl Sink for PointSink {
             Ordered::Failed(id, failure, counts) => self.fail(id, failure, counts),
             Ordered::Flushed(outside, vsync) => {
                 if outside != Counts::default() {
-                    self.progress.counts.add(&outside);
-                    self.append(&Entry::Outside { counts: outside });
+                    self.outside(outside);
                 }
                 self.vsync = Some(vsync);
                 self.run.board.publish(Event::Progress(self.progress.shown()));
@@ -109,12 +128,58 @@ impl PointSink {
             vsync: None,
             live: None,
             write_error: None,
+            no_light: None,
         };
         (sink, results)
     }
 
+    fn role_of(&self, id: SettingsId) -> PointRole {
+        self.task.schedule.points[id.point as usize].role
+    }
+
+    /// Judges by the regular image, which collects all light there is, whether the run sees any. Without light, no further
+    /// point is stored, and a resumed run takes them all.
+    fn look_for_light(&mut self, regular: &Unit) {
+        let SweepGeometry { white_dn, saturation_dn, .. } = self.task.geometry;
+        let seen = self
+            .dark()
+            .and_then(|dark| SeenLight::between(regular.mean().view(), dark.view(), white_dn, saturation_dn));
+        if let Some(none) = seen.filter(|seen| !seen.is_light()) {
+            self.note_no_light(none);
+        }
+    }
+
+    /// Whether this is a regular image that was taken again, only to look for light.
+    fn is_stored_regular(&self, id: SettingsId) -> bool {
+        self.role_of(id) == PointRole::Regular
+            && self.run.ledger.state().point(ArrayName::Regular, 0).is_some()
+    }
+
+    /// The stored dark image of the longest exposure, in counts.
+    fn dark(&self) -> Option<Array2<f32>> {
+        let stored = |point: &Point| {
+            let (array, index) = place(point.role);
+            let entry = self.run.ledger.state().point(array, index).filter(|_| array == ArrayName::Dark)?;
+            let sum = self.stack.read_point(array, index).ok()?;
+            Some(sum.mapv(|sum| sum as f32 / entry.frames as f32))
+        };
+        self.task.schedule.points.iter().rev().find_map(stored)
+    }
+
+    /// Ends the run, because it sees no light.
+    pub fn note_no_light(&mut self, seen: SeenLight) {
+        self.run.orders.give(Order::Fault);
+        self.no_light.get_or_insert(seen);
+    }
+
+    /// Counts frames that belong to no stored point.
+    pub fn outside(&mut self, counts: Counts) {
+        self.progress.counts.add(&counts);
+        self.append(&Entry::Outside { counts });
+    }
+
     fn store(&mut self, unit: &Unit) -> raysweep_session::Result<()> {
-        let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
+        let (array, index) = place(self.role_of(unit.id));
         let clipped =
             unit.clipped.as_ref().filter(|_| array == ArrayName::Sum && self.stack.has(ArrayName::Clipped));
         let (Run { ledger, orders, board, .. }, stack) = (&mut self.run, &self.stack);
@@ -139,7 +204,7 @@ impl PointSink {
     }
 
     fn fail(&mut self, id: SettingsId, failure: Failure, counts: Counts) {
-        let (array, index) = place(self.task.schedule.points[id.point as usize].role);
+        let (array, index) = place(self.role_of(id));
         self.progress.counts.add(&counts);
         if counts.lost_total() > 0 {
             self.run.board.publish(Event::Lost {
@@ -169,7 +234,7 @@ impl PointSink {
 
     fn note_stage_error(&mut self, unit: &Unit, error: &StageError) {
         tracing::error!(%error, point = unit.id.point, "stored, but left out of the results");
-        let (array, index) = place(self.task.schedule.points[unit.id.point as usize].role);
+        let (array, index) = place(self.role_of(unit.id));
         self.processing.problems.push(error.to_string());
         self.append(&Entry::StageFailed { array, index, attempt: unit.id.attempt, error: error.to_string() });
     }

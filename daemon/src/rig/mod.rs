@@ -137,6 +137,15 @@ pub enum Pace {
     Devices,
 }
 
+impl Pace {
+    /// What to tell of the times of a run, if they are not those of the host's clock.
+    pub fn of_times(self) -> Option<String> {
+        let said =
+            "times of light are those of the simulated rig, which does not wait for the clock on the wall";
+        (self == Self::Pipeline).then(|| said.into())
+    }
+}
+
 impl Rig {
     /// Reads a rig file and builds what can be built without opening devices.
     ///
@@ -209,8 +218,8 @@ impl Rig {
             ProjectorDriver::Drm => (Box::new(self.open_drm()?), None),
             ProjectorDriver::External => {
                 // A run that waits for its operator can be cancelled, so there is no need for a timeout.
-                let (projector, questions) = External::new(Duration::MAX);
-                (Box::new(projector), Some(questions))
+                let (operated, questions) = External::new(Duration::MAX);
+                (simulated.followed(operated), Some(questions))
             }
             ProjectorDriver::Sim => (simulated.projector()?, None),
         };

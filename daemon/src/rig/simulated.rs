@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use raysweep_config::RigFile;
 use raysweep_config::rig::plane::CameraDriver;
-use raysweep_core::{Camera, Clock, Projector, Vsync};
+use raysweep_core::{Camera, Clock, DeviceError, Pattern, Projector, Shown, Vsync};
+use raysweep_drivers::projector::external::External;
 use raysweep_sim::bench::{RemoteProjector, RemoteVsync};
 use raysweep_sim::{PlaneDevices, PlaneRig, PlaneSetup, SimError, SubjectSwitch};
 
@@ -77,9 +78,36 @@ impl Simulated {
         }
     }
 
+    /// A projector that its operator works. In a simulation, the light then is as the operator has said that it is.
+    pub(super) fn followed(&mut self, operated: External) -> Box<dyn Projector> {
+        match self.projector.take() {
+            Some(light) => Box::new(Followed { operated, light }),
+            None => Box::new(operated),
+        }
+    }
+
     /// What places subjects before the camera.
     pub(super) fn stand(&mut self) -> Result<Stand, RigError> {
         self.subject.take().map(Stand::Simulated).ok_or_else(|| not_simulated("camera"))
+    }
+}
+
+/// A simulated projector that shows what its operator has confirmed.
+struct Followed {
+    operated: External,
+    light: Box<dyn Projector>,
+}
+
+impl Projector for Followed {
+    fn show(&mut self, pattern: &Pattern) -> Result<Shown, DeviceError> {
+        self.operated.show(pattern)?;
+        self.light.show(pattern)
+    }
+
+    fn blank(&mut self) -> Result<Shown, DeviceError> {
+        // Dark in any case: nobody waits for the operator at the end of a run.
+        let (operated, light) = (self.operated.blank(), self.light.blank());
+        operated.and(light)
     }
 }
 

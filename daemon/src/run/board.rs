@@ -34,7 +34,9 @@ impl StatusBoard {
             vsync_clock: None,
             film: None,
             settings_latency: None,
+            ended: None,
             error: None,
+            warnings: Vec::new(),
             live: None,
             mirror: None,
         };
@@ -69,6 +71,7 @@ impl StatusBoard {
         status.question = None;
         if next == RunState::Preparing {
             (status.session, status.progress, status.vsync, status.error) = (None, None, None, None);
+            (status.ended, status.warnings) = (None, Vec::new());
             (status.film, status.settings_latency, status.vsync_clock) = (None, None, None);
         }
         let event = Event::State { state: next, session: status.session.clone() };
@@ -134,6 +137,9 @@ impl StatusBoard {
             Event::Progress(progress) => status.progress = Some(progress.clone()),
             Event::Vsync(vsync) => status.vsync = Some(*vsync),
             Event::Film(estimate) => status.film = Some(estimate.film.clone()),
+            Event::Finished { state, warnings, .. } => {
+                (status.ended, status.warnings) = (Some(state.clone()), warnings.clone());
+            }
             _ => {}
         }
         let _ = self.events.send(event);

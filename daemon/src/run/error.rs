@@ -2,7 +2,7 @@
 
 use raysweep_config::ConfigError;
 use raysweep_core::{Counts, DeviceError};
-use raysweep_pipeline::PipelineError;
+use raysweep_pipeline::{PipelineError, SeenLight};
 use raysweep_processing::response::ResponseError;
 
 use crate::rig::RigError;
@@ -53,6 +53,18 @@ pub enum RunError {
     /// The plan is not the one that the session was begun with.
     #[error("plan.toml was changed after the session was begun: {0}; restore the original")]
     OtherPlan(String),
+    /// The projector's light does not reach the camera.
+    #[error(
+        "the camera sees no light: {seen}. Likely causes: the lens cap is on, or the aperture closed; the projector is off, asleep or shows another input; its light does not fall on what the camera sees; {cause}. No lit image is stored: remove the cause, then {then}"
+    )]
+    NoLight {
+        /// The figures.
+        seen: SeenLight,
+        /// A cause that depends on the procedure.
+        cause: &'static str,
+        /// What to do after removing the cause.
+        then: &'static str,
+    },
     /// Points failed repeatedly.
     #[error(
         "{points} points failed in {passes} passes in a row; frames of the last pass: {}, {interrupted} attempts interrupted. The ledger lists the cause of each failure: fix it and resume the session",
@@ -99,6 +111,11 @@ mod tests {
             raysweep_transport::dots::DotsError::TooFew { what: "dark frames", given: 3, needed: 16 }.into(),
             RunError::Frame("frame does not match its format".into()),
             RunError::Plan(ConfigError::of_field("kind", "the plan's message")),
+            RunError::NoLight {
+                seen: SeenLight { mean_dn: 0.01, error_dn: 0.02, white_dn: 2500.0 },
+                cause: "the projector's cause",
+                then: "do this",
+            },
             RunError::Hopeless { points: 3, passes: 8, counts, interrupted: 1 },
             RunError::Interrupted,
             RunError::Panicked("index out of bounds".into()),

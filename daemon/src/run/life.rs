@@ -129,6 +129,8 @@ pub struct Ended {
     pub end: EndEntry,
     /// Warnings for the operator.
     pub warnings: Vec<String>,
+    /// What the run found, beside its products, in a sentence each.
+    pub found: Vec<String>,
 }
 
 /// The run's thread: acquires, makes the results, and reports the end. Errors and panics never leave the daemon
@@ -165,7 +167,7 @@ fn failed(error: &RunError, points: usize, dir: &Path) -> Ended {
         let stored = stored.map_or(0, |state| state.stored_points());
         faulted(stored, points.saturating_sub(stored))
     });
-    Ended { end, warnings: Vec::new() }
+    Ended { end, warnings: Vec::new(), found: Vec::new() }
 }
 
 /// The ledger of a run that has ended. After a panic, the run's other threads hold it until they have ended too.
@@ -182,7 +184,7 @@ fn freed(session: &Session) -> raysweep_session::Result<Ledger> {
 }
 
 /// Reports the end of a run.
-fn finish(Ended { end, warnings }: Ended, board: &StatusBoard, dir: &Path) {
+fn finish(Ended { end, warnings, found }: Ended, board: &StatusBoard, dir: &Path) {
     let state = if end.state == EndState::Faulted { RunState::Faulted } else { RunState::Idle };
     if let Some(error) = &end.error {
         tracing::error!(%error, session = %dir.display(), "run faulted");
@@ -199,6 +201,7 @@ fn finish(Ended { end, warnings }: Ended, board: &StatusBoard, dir: &Path) {
         missing: end.missing,
         film: board.status().film,
         warnings,
+        found,
         final_s: end.final_s,
         light_s: end.light_s,
     };

@@ -1,7 +1,7 @@
 //! Orders given to a run from outside while it acquires.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// An order to a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,24 +18,40 @@ pub enum Order {
 
 /// The order in force, shared between the run's threads and those that give orders.
 pub struct Orders {
-    order: Mutex<Order>,
+    given: Mutex<Given>,
     changed: Condvar,
+}
+
+/// The order in force, and the pauses so far.
+struct Given {
+    order: Order,
+    /// When the present pause began.
+    paused_since: Option<Instant>,
+    /// Length of the pauses that are over.
+    paused: Duration,
 }
 
 impl Default for Orders {
     fn default() -> Self {
-        Self { order: Mutex::new(Order::Go), changed: Condvar::new() }
+        let given = Given { order: Order::Go, paused_since: None, paused: Duration::ZERO };
+        Self { given: Mutex::new(given), changed: Condvar::new() }
     }
 }
 
 impl Orders {
-    fn lock(&self) -> MutexGuard<'_, Order> {
-        self.order.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> MutexGuard<'_, Given> {
+        self.given.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The order in force.
     pub fn now(&self) -> Order {
-        *self.lock()
+        self.lock().order
+    }
+
+    /// How long the run has been told to pause, in all.
+    pub fn paused(&self) -> Duration {
+        let given = self.lock();
+        given.paused + given.paused_since.map_or(Duration::ZERO, |since| since.elapsed())
     }
 
     /// Whether acquisition continues, now or after a pause.
@@ -45,32 +61,35 @@ impl Orders {
 
     /// Gives an order. The first order to end is final.
     pub fn give(&self, order: Order) {
-        let mut now = self.lock();
-        if matches!(*now, Order::Go | Order::Pause) {
-            *now = order;
+        let mut given = self.lock();
+        if matches!(given.order, Order::Go | Order::Pause) {
+            given.order = order;
+            if order == Order::Pause {
+                given.paused_since.get_or_insert_with(Instant::now);
+            } else if let Some(since) = given.paused_since.take() {
+                given.paused += since.elapsed();
+            }
             self.changed.notify_all();
         }
     }
 
     /// Waits for `time`, unless the run ends.
     pub fn rest(&self, time: Duration) {
-        let ends = |now: &mut Order| matches!(now, Order::Go | Order::Pause);
+        let ends = |given: &mut Given| matches!(given.order, Order::Go | Order::Pause);
         let _ = self.changed.wait_timeout_while(self.lock(), time, ends);
     }
 
     /// Waits while the order is to pause.
     pub fn wait_while_paused(&self) {
-        let mut now = self.lock();
-        while *now == Order::Pause {
-            now = self.changed.wait(now).unwrap_or_else(PoisonError::into_inner);
+        let mut given = self.lock();
+        while given.order == Order::Pause {
+            given = self.changed.wait(given).unwrap_or_else(PoisonError::into_inner);
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::time::Instant;
-
     use super::*;
 
     #[test]
@@ -87,5 +106,24 @@ mod tests {
         let began = Instant::now();
         orders.rest(Duration::from_millis(20));
         assert!(began.elapsed() >= Duration::from_millis(20));
+    }
+
+    #[test]
+    fn pauses_add_up_and_end_with_the_next_order() {
+        let orders = Orders::default();
+        assert_eq!(orders.paused(), Duration::ZERO);
+        orders.give(Order::Pause);
+        std::thread::sleep(Duration::from_millis(20));
+        assert!(orders.paused() >= Duration::from_millis(20));
+        orders.give(Order::Go);
+        let first = orders.paused();
+        std::thread::sleep(Duration::from_millis(5));
+        assert_eq!(orders.paused(), first);
+        orders.give(Order::Pause);
+        std::thread::sleep(Duration::from_millis(5));
+        orders.give(Order::Cancel);
+        let both = orders.paused();
+        assert!(both >= first + Duration::from_millis(5));
+        assert_eq!(orders.paused(), both);
     }
 }

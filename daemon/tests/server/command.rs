@@ -1,14 +1,14 @@
 //! The program `raysweep`: its output and exit codes.
 
 use std::fs;
-use std::io::{BufRead, BufReader, Lines};
+use std::io::{BufRead, BufReader, Lines, Write};
 use std::path::PathBuf;
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use raysweep::live::{EPIPOLAR, INDIRECT, LiveFile};
+use raysweep::live::{EPIPOLAR, FLOODLIT, INDIRECT, LiveFile};
 use raysweep::server::{Access, Limits, Peer};
 use raysweep_core::VsyncStats;
 use raysweep_proto::{Event, RunState};
@@ -48,7 +48,7 @@ fn a_run_is_followed_to_its_end_and_the_exit_code_tells_how_it_went() {
         let (exit, out, err) = run(&daemon, &["run", &plan(&daemon, text)]);
         assert_eq!(exit, code, "{text}: {out}{err}");
         assert!(out.contains(wanted) && out.contains(session().to_str().unwrap()), "{text}: {out}");
-        assert!(err.contains("37/75 stored") && err.contains("4 lost (4 camera gap)"), "{text}: {err}");
+        assert!(err.contains("37/75 stored") && err.contains("4 lost (camera gap)"), "{text}: {err}");
         assert_eq!(out.contains("report.html"), text != "fault", "{text}: {out}");
         assert_eq!(err.contains("unplugged"), text == "fault", "{text}: {err}");
     }
@@ -151,6 +151,100 @@ fn the_preview_is_a_picture_of_both_images_and_is_followed_to_the_result() {
 }
 
 #[test]
+fn the_preview_shows_batches_and_cycles_and_writes_no_other_format() {
+    let daemon = Daemon::start();
+    let output = daemon.folder.path().join("seen.png");
+    let live = LiveFile::create(&daemon.fake.live).unwrap();
+    let show = |names: &[&str], metadata: Value| {
+        for name in names {
+            let image = ndarray::Array2::from_elem((6, 8), 0.5).into_dyn();
+            live.publish(name, image.view(), metadata.as_object().unwrap()).unwrap();
+        }
+    };
+    let arguments = ["preview", "--output", output.to_str().unwrap()];
+    show(&[FLOODLIT], serde_json::json!({ "batch": 3 }));
+    let (exit, out, err) = run(&daemon, &arguments);
+    assert!(exit == 0 && out.contains("of batch 3"), "{out}{err}");
+    // As wide as one image.
+    assert_eq!(u32::from_be_bytes(fs::read(&output).unwrap()[16..20].try_into().unwrap()), 8);
+    show(&[EPIPOLAR, INDIRECT], serde_json::json!({ "cycle": 7 }));
+    let (exit, out, err) = run(&daemon, &arguments);
+    assert!(exit == 0 && out.contains("of cycle 7"), "{out}{err}");
+    let (exit, _, err) = run(&daemon, &["preview", "--output", "seen.jpg"]);
+    assert!(exit == 2 && err.contains("ends in .png"), "{err}");
+}
+
+#[test]
+fn a_film_is_followed_by_the_preview_to_the_end_of_its_run() {
+    let daemon = Daemon::start();
+    let live = LiveFile::create(&daemon.fake.live).unwrap();
+    let metadata = serde_json::json!({ "cycle": 7 });
+    for name in [EPIPOLAR, INDIRECT] {
+        let image = ndarray::Array2::from_elem((6, 8), 0.5).into_dyn();
+        live.publish(name, image.view(), metadata.as_object().unwrap()).unwrap();
+    }
+    assert_eq!(run(&daemon, &["run", &plan(&daemon, "hang"), "--detach"]).0, 0);
+    let output = daemon.folder.path().join("seen.png");
+    let arguments = ["preview", "--follow", "--output", output.to_str().unwrap()];
+    let mut child = command(&daemon, &arguments).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    assert!(lines.next().unwrap().unwrap().contains("of cycle 7"));
+    // It has seen the run before it drew anything.
+    assert_eq!(run(&daemon, &["cancel"]).0, 0);
+    assert_eq!(child.wait().unwrap().code(), Some(0));
+}
+
+#[test]
+fn a_session_is_found_by_its_name_wherever_a_folder_is_wanted() {
+    let daemon = Daemon::start();
+    for command in ["process", "verify", "export"] {
+        let (exit, _, err) = run(&daemon, &[command, "20260101-000000_fake"]);
+        assert!(exit == 1 && err.contains("/data/20260101-000000_fake"), "{command}: {err}");
+        let (_, _, err) = run(&daemon, &[command, "nothing"]);
+        assert!(err.contains("nothing") && !err.contains("/data"), "{command}: {err}");
+    }
+}
+
+#[test]
+fn enter_answers_the_question_of_the_run_that_shows_it() {
+    let daemon = Daemon::start();
+    let terminal = nix::pty::openpty(None, None).unwrap();
+    let mut child = command(&daemon, &["run", &plan(&daemon, "hang")])
+        .stdin(Stdio::from(terminal.slave))
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.any(|line| line.unwrap() == "running"));
+    // Typed before the question: no answer to it.
+    let mut keyboard = fs::File::from(terminal.master);
+    keyboard.write_all(b"\n").unwrap();
+    assert_eq!(run(&daemon, &["pause"]).0, 0);
+    let text = "cover the lens, then `raysweep continue`".to_owned();
+    daemon.fake.publish(Event::Ask { text });
+    assert!(lines.any(|line| line.unwrap().contains("press Enter")));
+    assert_eq!(*daemon.fake.state.lock().unwrap(), RunState::Paused);
+    keyboard.write_all(b"\n").unwrap();
+    assert!(lines.any(|line| line.unwrap() == "running"), "Enter continues the run");
+    assert_eq!(run(&daemon, &["cancel"]).0, 0);
+    assert_eq!(child.wait().unwrap().code(), Some(3));
+}
+
+#[test]
+fn who_watches_a_run_is_told_its_state_and_progress_at_once() {
+    let daemon = Daemon::start();
+    assert_eq!(run(&daemon, &["run", &plan(&daemon, "hang"), "--detach"]).0, 0);
+    let mut child =
+        command(&daemon, &["watch"]).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert_eq!(lines.next().unwrap().unwrap(), "running");
+    assert!(lines.next().unwrap().unwrap().contains("37/75 stored"));
+    assert_eq!(run(&daemon, &["cancel"]).0, 0);
+    assert_eq!(child.wait().unwrap().code(), Some(3));
+}
+
+#[test]
 fn a_bad_plan_is_shown_with_its_file_and_line() {
     let daemon = Daemon::start();
     let plan = plan(&daemon, "bad\n12 = count\n");
@@ -248,9 +342,11 @@ fn watch_begins_with_what_an_operator_was_asked_before() {
     run(&daemon, &["run", &plan(&daemon, "hang"), "--detach"]);
     run(&daemon, &["pause"]);
     let mut child = command(&daemon, &["watch", "--json"]).stdout(Stdio::piped()).spawn().unwrap();
-    let first = BufReader::new(child.stdout.take().unwrap()).lines().next().unwrap().unwrap();
-    let asked = &json_lines(&first)[0];
-    assert_eq!((&asked["event"], &asked["text"]), (&"ask".into(), &"cover the lens".into()));
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines().take(3);
+    let said: Vec<Value> = lines.flat_map(|line| json_lines(&line.unwrap())).collect();
+    let kinds: Vec<_> = said.iter().map(|line| line["event"].as_str().unwrap()).collect();
+    assert_eq!(kinds, ["state", "progress", "ask"]);
+    assert_eq!((&said[0]["state"], &said[2]["text"]), (&"paused".into(), &"cover the lens".into()));
     kill(Pid::from_raw(child.id() as i32), Signal::SIGINT).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0));
 }

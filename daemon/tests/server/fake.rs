@@ -69,6 +69,7 @@ impl Fake {
             missing,
             film: None,
             warnings: Vec::new(),
+            found: Vec::new(),
             final_s: None,
             light_s: None,
         });
@@ -172,6 +173,10 @@ pub fn listed() -> SessionInfo {
         stored: 75,
         points: 75,
         state: "complete".into(),
+        kind: "sweep".into(),
+        operator: Some("Ada".into()),
+        sample: Some("candle".into()),
+        tags: vec!["a".into()],
     }
 }
 
@@ -197,7 +202,9 @@ impl Control for Fake {
             vsync_clock: None,
             film: None,
             settings_latency: None,
+            ended: None,
             error: None,
+            warnings: Vec::new(),
             live: self.live.exists().then(|| self.live.clone()),
             mirror: Some(MirrorStatus { parked: true, laser: false, light: "armed".into() }),
         }

@@ -5,4 +5,5 @@ mod command;
 mod docs;
 mod fake;
 mod malformed;
+mod sessions;
 mod socket;

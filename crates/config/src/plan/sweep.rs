@@ -271,6 +271,16 @@ impl GridPlan {
                 is_grid = false;
                 continue;
             }
+            if let Axis::Range { start, stop, count: 1 } = axis
+                && start != stop
+            {
+                let places: Vec<String> = at(&["count"]);
+                let message = format!(
+                    "{name} = {axis}: one value cannot be both {start} and {stop}: give count = 2 or more, or a list with the value"
+                );
+                document.refuse_new(&places.iter().map(String::as_str).collect::<Vec<_>>(), message);
+                continue;
+            }
             let values = axis.values();
             if let Some(value) = values.iter().find(|value| !value.is_finite()) {
                 refuse(at(&[]), format!("{name} contains {value}: must be finite"));
@@ -337,6 +347,21 @@ mod tests {
         assert_eq!(plan.procedure, Procedure::Sweep(sweep));
         let even = Axis::of_values(vec![-1500.0, 0.0, 1500.0]);
         assert_eq!(even, Axis::Range { start: -1500.0, stop: 1500.0, count: 3 });
+    }
+
+    #[test]
+    fn a_range_of_one_value_has_one_end() {
+        let text = |stop| {
+            format!(
+                "kind = \"sweep\"\n[sweep]\nexposure_us = [600]\ndelay_us = {{ start = -1500, stop = {stop}, count = 1 }}"
+            )
+        };
+        let refused = parse(&text(1500)).unwrap_err();
+        assert_eq!(refused.first().field.as_deref(), Some("sweep.delay_us.count"));
+        assert!(refused.to_string().contains("both -1500 and 1500"), "{refused}");
+        assert!(parse(&text(-1500)).is_ok());
+        let stored = crate::plan::Plan::parse_stored(&text(1500));
+        assert!(stored.is_ok(), "sessions stay readable: {stored:?}");
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! Figures and warnings of a sweep, accumulated over its camera rows from top to bottom.
 
+use std::ops::RangeInclusive;
+
 use ndarray::Array2;
 use raysweep_transport::plane::Transport;
 
@@ -22,6 +24,8 @@ pub struct SweepSummary {
 
 /// Largest relative error with which the transport should predict the regular image.
 const CLOSE_SHARE: f64 = 0.02;
+/// Beyond this range of predicted over captured light, the transport does not describe the scene at all.
+const EXPLAINED_SHARE: RangeInclusive<f64> = 0.8..=1.25;
 /// A larger share of saturated pixels causes a warning: highlights are normal, saturated areas are not.
 const SATURATED_SHARE: f64 = 0.01;
 
@@ -109,7 +113,14 @@ impl Regular {
         } else if self.captured > 0.0 {
             let share = self.predicted / self.captured;
             figures.push((PREDICTED_SHARE, share));
-            if (share - 1.0).abs() > CLOSE_SHARE {
+            if !EXPLAINED_SHARE.contains(&share) {
+                warnings.push(format!(
+                    "THE TRANSPORT DOES NOT EXPLAIN WHAT THE CAMERA SAW: IT PREDICTS {:.1} % OF THE LIGHT OF THE REGULAR IMAGE, WHERE {:.0} TO {:.0} % ARE ALLOWED. Do not use it: the delays are wrong (projector.first_row_us, camera.trigger_latency_us), or the row time, white_dn or the dark images, or the scene or the light changed during the run",
+                    share * 100.0,
+                    EXPLAINED_SHARE.start() * 100.0,
+                    EXPLAINED_SHARE.end() * 100.0
+                ));
+            } else if (share - 1.0).abs() > CLOSE_SHARE {
                 warnings.push(format!(
                     "the transport predicts {:.1} % of the light of the regular image: light from beyond the sweep's reach, or a wrong row time, white_dn or dark image",
                     share * 100.0

@@ -3,6 +3,7 @@
 
 mod assembly;
 mod band;
+mod frame;
 pub mod mask;
 mod profile;
 mod relight;

@@ -130,6 +130,11 @@ impl Relight {
         Ok(())
     }
 
+    /// Whether it is more than one image.
+    pub(super) fn is_sequence(&self) -> bool {
+        matches!(self.pattern, RowPattern::Line(_))
+    }
+
     /// The number of its images.
     pub(super) fn images(&self, geometry: &SweepGeometry) -> usize {
         match &self.pattern {

@@ -1,9 +1,6 @@
 //! Makes videos, report and manifest from stored batches: the same after a run and offline.
 
 use std::collections::BTreeMap;
-use std::io::ErrorKind;
-use std::path::Path;
-use std::process::{Command, Stdio};
 
 use ndarray::{Array3, Array4, Axis};
 use raysweep_config::DotRigFile;
@@ -12,7 +9,7 @@ use raysweep_session::ledger::State;
 use raysweep_session::pattern::PatternFile;
 use raysweep_session::products::VideoWriter;
 use raysweep_session::report::Picture;
-use raysweep_session::{Result, Session, durable, manifest, pattern};
+use raysweep_session::{Result, Session, manifest, pattern};
 use serde_json::{Map, Value, json};
 
 use super::calibration::{Calibration, read_batch};
@@ -21,6 +18,7 @@ use super::report::{self, VideoStrip};
 use super::task::DotTask;
 use crate::mirror_response::Predistortion;
 use crate::software::SOFTWARE;
+use crate::video::Encoder;
 
 /// Number of images of a video in the report.
 const SHOWN: usize = 6;
@@ -87,7 +85,7 @@ pub fn make(
         videos = continued;
     }
     let mut strips = Vec::new();
-    let mut encoder = Encoder { problems: Vec::new() };
+    let mut encoder = Encoder::default();
     for Video { writers, strips: of_video, .. } in videos {
         if !go_on() {
             break;
@@ -169,50 +167,6 @@ impl Video<'_> {
             }
         }
         Ok(())
-    }
-}
-
-/// Encodes PNG sequences as video files, where ffmpeg is installed.
-struct Encoder {
-    problems: Vec<String>,
-}
-
-impl Encoder {
-    fn encode(&mut self, products: &Path, name: &str, images_per_s: f64) -> Result<()> {
-        let target = products.join(format!("{name}.mp4"));
-        durable::write_by(&target, |draft| match encode_to(draft, &products.join(name), images_per_s) {
-            Ok(()) => true,
-            Err(problem) => {
-                if !self.problems.contains(&problem) {
-                    self.problems.push(problem);
-                }
-                false
-            }
-        })
-    }
-}
-
-/// Encodes the images of a folder as one file; the error says why not.
-fn encode_to(target: &Path, images: &Path, images_per_s: f64) -> std::result::Result<(), String> {
-    let failed = |what: String| {
-        let name = images.file_name().unwrap_or_default().to_string_lossy();
-        format!("ffmpeg could not make {name}.mp4: {what}")
-    };
-    let ended = Command::new("ffmpeg")
-        .args(["-y", "-loglevel", "error", "-framerate", &format!("{images_per_s:.4}"), "-i"])
-        .arg(images.join("%04d.png"))
-        // Players need even sides and half-resolution chroma.
-        .args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-pix_fmt", "yuv420p"])
-        // The temporary file's name does not say the format.
-        .args(["-f", "mp4"])
-        .arg(target)
-        .stdin(Stdio::null())
-        .output();
-    match ended {
-        Ok(output) if output.status.success() => Ok(()),
-        Ok(output) => Err(failed(String::from_utf8_lossy(&output.stderr).trim().to_owned())),
-        Err(error) if error.kind() == ErrorKind::NotFound => Err("ffmpeg is not installed, so there are only PNG sequences and no video files: install it and run `raysweep process`".into()),
-        Err(error) => Err(failed(error.to_string())),
     }
 }
 

@@ -1,9 +1,11 @@
 //! Films: one light transport per cycle of a few settings.
 
 mod process;
+mod product;
 mod report;
 mod task;
 
 pub use self::process::process;
+pub use self::product::{FilmProducts, write_products};
 pub use self::report::{shortcomings, write as write_report};
 pub use self::task::{FilmTask, create_transports};

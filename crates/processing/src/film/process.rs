@@ -5,22 +5,23 @@ use std::sync::Arc;
 use ndarray::{Array2, Axis};
 use raysweep_config::FilmPlan;
 use raysweep_core::{Counts, SettingsId};
-use raysweep_pipeline::{Point, Stages, Unit, run_stages};
+use raysweep_pipeline::{Point, ProductSpec, Stages, Unit, run_stages};
 use raysweep_session::Session;
 use raysweep_session::film::{CycleEntry, crc32};
 use raysweep_session::ledger::State;
 use raysweep_session::stack::ArrayName;
 use raysweep_transport::plane::Setting;
 
+use super::product::write_products;
 use super::report;
 use super::task::{FilmTask, create_transports};
-use crate::plane::{manifest, unit_of};
+use crate::plane::{append_argument, manifest, unit_of};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
 
-/// Recomputes the transports of a stored film.
+/// Recomputes the transports of a stored film, and its products.
 ///
 /// # Errors
-/// When products are asked for (films have none), or the session cannot be written.
+/// When a product cannot be made from a film, before anything is written; when the session cannot be written.
 pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Processed, ProcessError> {
     let Stored { session, state, plan, .. } = stored;
     let rig = stored.plane_rig()?;
@@ -29,12 +30,12 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
     Arc::make_mut(&mut task.task).left_out = state.left_out();
     stored.check_contents(task.contents())?;
     let stages = task.stages().map_err(|error| stored.in_plan(&error))?;
-    if !asked.products.is_empty() {
-        let message = "a film has no products: leave --product out";
-        return Err(ProcessError::Product(message.into()));
-    }
-    let problems = make_transports(session, &task, state, &stages)?;
-    report::write(session, state, &task, &problems)?;
+    let (specs, wanted) = products(&task, asked, stored)?;
+    let is_wanted = |name: &str| specs[..wanted].iter().any(|spec| spec.name() == name);
+    let mut problems = make_transports(session, &task, state, &stages)?;
+    let mut products = write_products(session, state, &task, &specs, &is_wanted, &|| true)?;
+    problems.append(&mut products.problems);
+    report::write(session, state, &task, &products, &problems)?;
     manifest::write(session, state, &task.task, &rig)?;
     Ok(Processed {
         report: session.report_path(),
@@ -42,6 +43,33 @@ pub fn process(stored: &Stored<'_>, film: FilmPlan, asked: &Asked) -> Result<Pro
         points: shape.points(),
         problems,
     })
+}
+
+/// The products of the plan and those asked for, and how many of them are to be written: the first ones. The others are
+/// only shown in the report, which is written anew.
+fn products(
+    task: &FilmTask,
+    asked: &Asked,
+    stored: &Stored<'_>,
+) -> Result<(Vec<ProductSpec>, usize), ProcessError> {
+    let of_plan = task.products().map_err(|error| stored.in_plan(&error))?;
+    let mut specs = if asked.only { Vec::new() } else { of_plan.clone() };
+    let reach_rows = task.solver().map_err(|error| stored.in_plan(&error))?.reach_rows();
+    for argument in &asked.products {
+        let before = specs.len();
+        append_argument(&mut specs, argument, &task.task).map_err(ProcessError::Product)?;
+        let refused = |spec: &ProductSpec| spec.not_of_a_film().or_else(|| spec.beyond(reach_rows));
+        if let Some(what) = specs[before..].iter().find_map(refused) {
+            return Err(ProcessError::Product(format!("--product {argument}: {what}")));
+        }
+    }
+    let wanted = specs.len();
+    for spec in of_plan {
+        if specs.iter().all(|other| other.name() != spec.name()) {
+            specs.push(spec);
+        }
+    }
+    Ok((specs, wanted))
 }
 
 /// Computes the transports of all stored cycles; returns the problems.

@@ -9,6 +9,7 @@ use raysweep_session::report::{
 };
 use raysweep_session::{Result, Session};
 
+use super::product::{FilmProducts, FilmVideo};
 use super::task::FilmTask;
 use crate::plane::report::{jitter, settings};
 use crate::report::{accounts, subtitle};
@@ -22,20 +23,34 @@ const PERCENTILE: f64 = 99.5;
 ///
 /// # Errors
 /// When its transports cannot be read or the report cannot be written.
-pub fn write(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<()> {
-    let page = make(session, state, task, problems)?.to_html()?;
+pub fn write(
+    session: &Session,
+    state: &State,
+    task: &FilmTask,
+    products: &FilmProducts,
+    problems: &[String],
+) -> Result<()> {
+    let page = make(session, state, task, products, problems)?.to_html()?;
     raysweep_session::durable::write(&session.report_path(), page.as_bytes())
 }
 
-fn make(session: &Session, state: &State, task: &FilmTask, problems: &[String]) -> Result<Report> {
+fn make(
+    session: &Session,
+    state: &State,
+    task: &FilmTask,
+    products: &FilmProducts,
+    problems: &[String],
+) -> Result<Report> {
     let mut sections = Vec::new();
     let mut blocks: Vec<Block> =
         problems.iter().map(|problem| Block::Note(NoteLevel::Error, problem.clone())).collect();
-    blocks.extend(shortcomings(state).into_iter().map(|text| Block::Note(NoteLevel::Warning, text)));
+    let texts = shortcomings(state, transports_missing(session, state)?);
+    blocks.extend(texts.into_iter().map(|text| Block::Note(NoteLevel::Warning, text)));
     if !blocks.is_empty() {
         sections.push(Section { title: "Problems".into(), intro: String::new(), blocks });
     }
     sections.push(cycles(session, state)?);
+    sections.extend(products.videos.iter().map(video));
     sections.push(pace(state));
     sections.push(trust(state, task));
     Ok(Report {
@@ -46,8 +61,21 @@ fn make(session: &Session, state: &State, task: &FilmTask, problems: &[String]) 
     })
 }
 
-/// Ways in which the film falls short of its plan.
-pub fn shortcomings(state: &State) -> Vec<String> {
+/// The number of stored cycles that have no transport; those that were missing when the film ended may have been made
+/// since.
+fn transports_missing(session: &Session, state: &State) -> Result<usize> {
+    let Ok(transports) = TransportFilm::open(&session.transport_film_path()) else {
+        return Ok(state.stored_points());
+    };
+    let mut missing = 0;
+    for entry in state.cycles() {
+        missing += usize::from(!transports.contains(entry.cycle)?);
+    }
+    Ok(missing)
+}
+
+/// Ways in which the film falls short of its plan, given the number of stored cycles without a transport.
+pub fn shortcomings(state: &State, transports_missing: usize) -> Vec<String> {
     let Some(film) = &state.film else { return Vec::new() };
     let mut texts = Vec::new();
     if film.cycles_incomplete > 0 {
@@ -56,10 +84,9 @@ pub fn shortcomings(state: &State) -> Vec<String> {
             film.cycles_incomplete
         ));
     }
-    if film.transports_missing > 0 {
+    if transports_missing > 0 {
         texts.push(format!(
-            "{} stored cycles had no transport when the film ended: `raysweep process` makes them",
-            film.transports_missing
+            "{transports_missing} stored cycles have no transport: `raysweep process` makes them"
         ));
     }
     texts.extend(film.calibration_warnings.iter().cloned());
@@ -129,6 +156,16 @@ fn cycles(session: &Session, state: &State) -> Result<Section> {
         intro: "Some of the cycles, evenly spread. Epipolar: light from the pixel's own projector row; indirect: from all others within the reach. Each sheet has one scale.".into(),
         blocks,
     })
+}
+
+fn video(FilmVideo { name, about, pictures }: &FilmVideo) -> Section {
+    Section {
+        title: format!("Product {name}"),
+        intro: format!(
+            "{about}. Some of its images, with one scale; products/{name}.mp4 shows all, and products/{name}.npy has their values."
+        ),
+        blocks: vec![Block::Pictures(pictures.clone())],
+    }
 }
 
 fn pace(state: &State) -> Section {

@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 
-use raysweep_config::{ConfigError, FilmPlan, Plan};
-use raysweep_pipeline::{FilmSolver, Point, PointRole, Schedule, Stages};
+use raysweep_config::{ConfigError, FilmPlan, Plan, ProductTable};
+use raysweep_pipeline::{FilmSolver, Point, PointRole, ProductSpec, Schedule, Stages};
 use raysweep_session::film::TransportFilm;
 use raysweep_session::stack::Contents;
 use raysweep_session::{Result, Session};
 use serde_json::json;
 
-use crate::plane::{KnownRig, PlaneTask};
+use crate::plane::{KnownRig, PlaneTask, planned_products};
 
 /// Frames of the dark image: its noise enters every cycle, so it averages many.
 const DARK_FRAMES: u32 = 32;
@@ -21,13 +21,14 @@ pub struct FilmTask {
     pub film: FilmPlan,
     /// The dark image, the settings of a cycle, and the model.
     pub task: Arc<PlaneTask>,
+    products: Vec<ProductTable>,
 }
 
 impl FilmTask {
     /// A film on a rig; see [`PlaneTask::new`].
     pub fn new(plan: &Plan, film: FilmPlan, rig: &KnownRig<'_>) -> Self {
         let task = PlaneTask::new(plan, schedule(&film), film.max_jitter_us, rig);
-        Self { film, task: Arc::new(task) }
+        Self { film, task: Arc::new(task), products: plan.products.clone().unwrap_or_default() }
     }
 
     /// The same task with another film, if the plan allows it.
@@ -35,7 +36,7 @@ impl FilmTask {
         let is_possible = film.is_possible();
         let mut task = (*self.task).clone();
         task.schedule = schedule(&film);
-        is_possible.then(|| Self { film, task: Arc::new(task) })
+        is_possible.then(|| Self { film, task: Arc::new(task), products: self.products.clone() })
     }
 
     /// What its session stores.
@@ -56,6 +57,20 @@ impl FilmTask {
     pub fn stages(&self) -> std::result::Result<Stages, ConfigError> {
         let (stages, _) = self.task.made_stages()?;
         Ok(stages)
+    }
+
+    /// The products that the plan names; none if it names none, because a film may have tens of thousands of cycles.
+    ///
+    /// # Errors
+    /// With the position in the plan's text of the product that cannot be made.
+    pub fn products(&self) -> std::result::Result<Vec<ProductSpec>, ConfigError> {
+        let specs = planned_products(&self.products, &self.task)?;
+        for (index, spec) in specs.iter().enumerate() {
+            if let Some(what) = spec.not_of_a_film() {
+                return Err(self.task.refuse(&["product", &index.to_string(), "kind"], what));
+            }
+        }
+        Ok(specs)
     }
 
     /// The solver that computes the transport of each cycle.

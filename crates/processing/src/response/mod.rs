@@ -12,6 +12,7 @@ use std::path::Path;
 use raysweep_config::{DotRigFile, ResponsePlan};
 use raysweep_session::ledger::State;
 use raysweep_session::{Result, Session};
+use raysweep_transport::dots::identify::Resonance;
 
 pub use self::analysis::ResponseError;
 use self::analysis::{FoundAxis, analyse};
@@ -44,6 +45,15 @@ impl MirrorFindings {
     /// Warnings for the operator about the results.
     pub fn warnings(&self) -> Vec<String> {
         self.axes.iter().zip(AXES).filter_map(|(axis, name)| axis.warning(name)).collect()
+    }
+
+    /// The resonance that was identified of each axis, in a sentence.
+    pub fn resonances(&self) -> Vec<String> {
+        let of = |(axis, name): (&FoundAxis, &str)| {
+            let Resonance { f0_hz, q } = axis.found.as_ref().ok()?.resonance;
+            Some(format!("axis {name}: resonance f0 {f0_hz:.2} Hz, quality factor Q {q:.2}"))
+        };
+        self.axes.iter().zip(AXES).filter_map(of).collect()
     }
 
     /// Stores the response in the session's folder and, if given, in `data`, where later runs find it. If one axis

@@ -7,29 +7,15 @@ mod task;
 
 use std::sync::Arc;
 
-use raysweep_config::plan::products_of_argument;
-use raysweep_config::{ConfigError, Places, SweepPlan};
-use raysweep_pipeline::ProductSpec;
+use raysweep_config::SweepPlan;
 
 pub use self::report::write as write_report;
 pub use self::results::{Results, write_products};
 pub use self::strips::Overview;
 pub use self::task::SweepTask;
-use self::task::append_product;
 use crate::memory::{MemoryNeed, available_bytes};
-use crate::plane::{PlaneTask, manifest};
+use crate::plane::{append_argument, manifest};
 use crate::stored::{Asked, ProcessError, Processed, Stored};
-
-/// Appends the products that a command line argument asks for: the keys of a `[[product]]`, separated by commas.
-fn append_argument(specs: &mut Vec<ProductSpec>, argument: &str, task: &PlaneTask) -> Result<(), String> {
-    let shown = |(error, text): (ConfigError, String)| error.render("--product", &text);
-    let (tables, places, text): (_, Places, _) = products_of_argument(argument).map_err(shown)?;
-    for (index, table) in tables.iter().enumerate() {
-        append_product(specs, table, index, task, &|path, message| places.error(path, message))
-            .map_err(|error| error.render("--product", &text))?;
-    }
-    Ok(())
-}
 
 /// Makes the products of a stored sweep again.
 ///
@@ -44,9 +30,10 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     Arc::make_mut(&mut sweep.task).left_out = state.left_out();
     let task = &*sweep.task;
     let mut processing = sweep.processing().map_err(|error| stored.in_plan(&error))?;
-    if asked.only {
-        processing.products.clear();
-    }
+    let of_plan = match asked.only {
+        true => std::mem::take(&mut processing.products),
+        false => Vec::new(),
+    };
     for argument in &asked.products {
         let planned = processing.products.len();
         append_argument(&mut processing.products, argument, task).map_err(ProcessError::Product)?;
@@ -58,6 +45,10 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
             return Err(ProcessError::Product(format!("--product {argument}: {what}")));
         }
     }
+    let wanted: Vec<String> = processing.products.iter().map(|spec| spec.name().to_owned()).collect();
+    let is_wanted = |name: &str| wanted.iter().any(|wanted| wanted == name);
+    // Not written again, but shown in the report, which is written anew.
+    processing.products.extend(of_plan.into_iter().filter(|spec| !is_wanted(spec.name())));
     let memory = MemoryNeed::of_sweep(task, &processing.products)
         .map_err(|error| ProcessError::Config(error.to_string()))?;
     let available_bytes = available_bytes(asked.memory_limit_bytes);
@@ -76,7 +67,7 @@ pub fn process(stored: &Stored<'_>, sweep: SweepPlan, asked: &Asked) -> Result<P
     };
     results.write_transport()?;
     let overview = results.overview();
-    write_products(session, task, &results.products)?;
+    write_products(session, task, &results, &is_wanted)?;
     write_report(session, state, &sweep, &results, overview.as_ref())?;
     manifest::write(session, state, task, &rig)?;
     Ok(Processed {

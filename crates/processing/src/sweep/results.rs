@@ -182,16 +182,26 @@ impl TransportWriter {
     }
 }
 
-/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY).
+/// Writes everything but the transport: images (EXR, NPY), sequences (EXR, NPY), profiles (CSV, NPY). Of the products,
+/// only those with a wanted name are written; the report shows all of them.
 ///
 /// # Errors
 /// When the session cannot be written.
-pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product]) -> Result<()> {
+pub fn write_products(
+    session: &Session,
+    task: &PlaneTask,
+    results: &Results,
+    is_wanted: &dyn Fn(&str) -> bool,
+) -> Result<()> {
     let files = session.products();
-    for product in products {
+    let mut common = task.metadata();
+    // As it was found, if the rig file does not state it.
+    let found = results.summary.as_ref().and_then(|summary| summary.findings.beam_sigma_rows);
+    common.extend(found.map(|sigma_rows| ("beam_sigma_rows".to_owned(), json!(sigma_rows))));
+    for product in results.products.iter().filter(|product| is_wanted(product.name())) {
         match product {
             Product::Image { name, about, image, mask } => {
-                let mut metadata = task.metadata();
+                let mut metadata = common.clone();
                 metadata.insert("axes".into(), json!(["t", "s"]));
                 metadata.insert("about".into(), json!(about));
                 metadata.insert("mask".into(), mask_bits());
@@ -199,7 +209,7 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
             }
             Product::Sequence { name, about, axis, at, images, mask } => {
                 let layers: Vec<String> = (0..at.len()).map(|k| format!("k{k:04}")).collect();
-                let mut metadata = task.metadata();
+                let mut metadata = common.clone();
                 metadata.insert("axes".into(), json!(["k", "t", "s"]));
                 metadata.insert("about".into(), json!(about));
                 metadata.insert("k".into(), json!({ "is": axis, "at": at }));
@@ -209,7 +219,7 @@ pub fn write_products(session: &Session, task: &PlaneTask, products: &[Product])
             }
             Product::Profile(profile) => {
                 let columns = profile.columns();
-                let mut metadata = task.metadata();
+                let mut metadata = common.clone();
                 metadata.insert("axes".into(), json!(["delay", "column"]));
                 metadata.insert("about".into(), json!(profile.about));
                 metadata.insert("exposure_us".into(), json!(profile.exposure_us));

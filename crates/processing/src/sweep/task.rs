@@ -7,7 +7,7 @@ use raysweep_core::Pattern;
 use raysweep_pipeline::{Point, PointRole, ProductSpec, Schedule};
 use raysweep_session::stack::Contents;
 
-use crate::plane::{KnownRig, PlaneTask, Processing};
+use crate::plane::{KnownRig, PlaneTask, Processing, planned_products};
 
 /// Minimum number of frames of a dark image: its noise enters all images of its exposure, so it must be small.
 const MIN_DARK_AVERAGE: u32 = 8;
@@ -74,13 +74,7 @@ impl SweepTask {
             let what = "products need the light transport: add a [[stage]] with name = \"demux\"";
             return Err(self.task.refuse(&["product"], what));
         }
-        let mut specs = Vec::new();
-        for (index, table) in tables.iter().enumerate() {
-            append_product(&mut specs, table, index, &self.task, &|path, message| {
-                self.task.refuse(path, message)
-            })?;
-        }
-        Ok(specs)
+        planned_products(tables, &self.task)
     }
 }
 
@@ -112,35 +106,4 @@ fn schedule(sweep: &SweepPlan, period_us: f64) -> Schedule {
     let index = sweep.settings_us().len() as u32;
     points.extend(sweep.bracket.map(|_| point(PointRole::Bracket(index), 0.0, shortest_us)));
     Schedule { points }
-}
-
-/// Appends the product that a table asks for to the others. `refuse` makes an error about a value of the document in
-/// which the product has the number `index`.
-pub(super) fn append_product(
-    specs: &mut Vec<ProductSpec>,
-    table: &ProductTable,
-    index: usize,
-    task: &PlaneTask,
-    refuse: &dyn Fn(&[&str], String) -> ConfigError,
-) -> Result<(), ConfigError> {
-    let index = index.to_string();
-    let refused = |path: &[String], message: String| {
-        let path: Vec<&str> =
-            ["product", &index].into_iter().chain(path.iter().map(String::as_str)).collect();
-        refuse(&path, message)
-    };
-    let ProductTable { kind, name, options } = table;
-    let spec = ProductSpec::new(kind, name.as_deref(), options, &task.schedule, &task.geometry)
-        .map_err(|error| refused(&error.path, error.to_string()))?;
-    if specs.iter().any(|other| other.name() == spec.name()) {
-        let message = format!(
-            "product {kind}: two products are named {:?} and would overwrite each other: give one of them another `name`",
-            spec.name()
-        );
-        // A name that is not in the file follows from the kind.
-        let path: &[String] = if name.is_some() { &["name".into()] } else { &[] };
-        return Err(refused(path, message));
-    }
-    specs.push(spec);
-    Ok(())
 }

@@ -99,6 +99,20 @@ pub enum Entry {
     },
     /// An acquisition run has ended.
     End(EndEntry),
+    /// Somebody's remark about the session.
+    Note(Remark),
+}
+
+/// A remark about a session, made after its run began.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Remark {
+    /// When it was made, UTC.
+    pub at: Timestamp,
+    /// Who made it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
+    /// What it says.
+    pub text: String,
 }
 
 /// Description of a session.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use raysweep_core::{Counts, FilmSummary};
 
-use super::entry::{AxisEntry, EndEntry, Entry, PointEntry, SessionEntry};
+use super::entry::{AxisEntry, EndEntry, Entry, PointEntry, Remark, SessionEntry};
 use crate::damage::{Damage, DamagedPart};
 use crate::dots::BatchEntry;
 use crate::film::CycleEntry;
@@ -23,6 +23,8 @@ pub struct State {
     pub end: Option<EndEntry>,
     /// Summary of the film, once it is over.
     pub film: Option<FilmSummary>,
+    /// Remarks, oldest first.
+    pub remarks: Vec<Remark>,
     stored: BTreeMap<(ArrayName, usize), PointEntry>,
     cycles: BTreeMap<usize, CycleEntry>,
     batches: BTreeMap<usize, BatchEntry>,
@@ -47,6 +49,7 @@ impl State {
             counts: Counts::default(),
             end: None,
             film: None,
+            remarks: Vec::new(),
             stored: BTreeMap::new(),
             cycles: BTreeMap::new(),
             batches: BTreeMap::new(),
@@ -204,6 +207,7 @@ impl State {
             | Entry::Run { .. }
             | Entry::Film(_)
             | Entry::Outside { .. }
+            | Entry::Note(_)
             | Entry::End(_) => Ok(()),
         }
     }
@@ -243,6 +247,7 @@ impl State {
             Entry::Outside { counts } | Entry::AttemptInterrupted { counts, .. } => self.counts.add(counts),
             Entry::StageFailed { .. } => {}
             Entry::End(end) => self.end = Some(end.clone()),
+            Entry::Note(remark) => self.remarks.push(remark.clone()),
         }
         Ok(())
     }

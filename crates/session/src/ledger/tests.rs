@@ -68,6 +68,11 @@ fn all_kinds() -> Vec<Entry> {
         failed(1, 0),
         Entry::Outside { counts: Counts { expected: 3, cancelled: 3, ..Counts::default() } },
         end(EndState::Faulted),
+        Entry::Note(Remark {
+            at: "2026-03-05T00:00:00Z".parse().unwrap(),
+            by: Some("Ada".into()),
+            text: "a \"fingerprint\" on the lens\nsecond line".into(),
+        }),
     ]
 }
 
@@ -88,7 +93,7 @@ fn every_kind_of_entry_reads_back_to_the_last_bit() {
     let entries = read(&path).unwrap();
     assert_eq!(entries[0], Entry::Session(session()));
     assert_eq!(entries[1..], all_kinds());
-    assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), 6);
+    assert_eq!(fs::read_to_string(&path).unwrap().lines().count(), 7);
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
 
-use ndarray::{ArrayView3, Axis};
+use ndarray::{ArrayView2, ArrayView3, Axis};
 use ndarray_npy::write_zeroed_npy;
 use serde_json::{Map, Value};
 
@@ -94,10 +94,7 @@ impl VideoWriter {
         let at = self.header_bytes + (self.next * bytes.len()) as u64;
         self.npy.file().write_all_at(&bytes, at).map_err(self.npy.failed())?;
         let planes: Vec<_> = image.axis_iter(Axis(2)).collect();
-        let tone_map = *self.tone_map.get_or_insert_with(|| {
-            let ToneMap { white } = ToneMap::percentile(&planes, PERCENTILE);
-            ToneMap { white: white * HEADROOM }
-        });
+        let tone_map = *self.tone_map.get_or_insert_with(|| video_tone_map(&planes));
         let names: &[&str] = if channels == 1 { &["Y"] } else { &["R", "G", "B"] };
         let exr: Vec<_> = names.iter().copied().zip(planes.iter().map(|plane| plane.view())).collect();
         let picture = match channels {
@@ -127,6 +124,12 @@ impl VideoWriter {
         metadata.insert("png_white".into(), self.tone_map.map_or(Value::Null, |map| map.white.into()));
         durable::write(&self.sidecar, &sidecar(&self.name, &metadata)?)
     }
+}
+
+/// The tone map of a video whose first image has these planes.
+pub fn video_tone_map(planes: &[ArrayView2<f32>]) -> ToneMap {
+    let ToneMap { white } = ToneMap::percentile(planes, PERCENTILE);
+    ToneMap { white: white * HEADROOM }
 }
 
 #[cfg(test)]

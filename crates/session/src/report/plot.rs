@@ -114,8 +114,8 @@ impl Plot {
                 .y_desc(&self.y_label)
                 .x_labels(7)
                 .y_labels(6)
-                .x_label_formatter(&|x| short(*x))
-                .y_label_formatter(&|y| short(*y))
+                .x_label_formatter(&|x| tick(*x, bounds.x))
+                .y_label_formatter(&|y| tick(*y, bounds.y))
                 .draw()?;
             for guide in &self.guides {
                 let line = vec![(guide.x, bounds.y.0), (guide.x, bounds.y.1)];
@@ -209,6 +209,11 @@ fn span(values: impl Iterator<Item = f64>) -> (f64, f64) {
     if low < high { (low, high) } else { (low - 0.5, high + 0.5) }
 }
 
+/// The label of a tick on an axis with these ends. Steps that are added up miss zero by rounding.
+fn tick(value: f64, (low, high): (f64, f64)) -> String {
+    short(if value.abs() < 1e-9 * (high - low) { 0.0 } else { value })
+}
+
 fn dots(series: &Series, colour: RGBColor) -> impl Iterator<Item = Circle<(f64, f64), i32>> {
     series.points.iter().map(move |&point| Circle::new(point, 3, colour.filled()))
 }
@@ -217,4 +222,16 @@ fn parse_hex(colour: &str) -> RGBColor {
     let channel =
         |at: usize| colour.get(at..at + 2).and_then(|hex| u8::from_str_radix(hex, 16).ok()).unwrap_or(0);
     RGBColor(channel(1), channel(3), channel(5))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tick_at_zero_is_zero_however_its_steps_add_up() {
+        assert_eq!(tick(-5.55e-17, (-0.4, 0.4)), "0");
+        assert_eq!(tick(-5.55e-17, (-1e-16, 1e-16)), short(-5.55e-17));
+        assert_eq!(tick(0.25, (-0.4, 0.4)), "0.25");
+    }
 }

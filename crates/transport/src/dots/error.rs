@@ -41,6 +41,18 @@ pub enum DotsError {
         /// The number needed.
         needed: usize,
     },
+    /// The trailing dot is not seen.
+    #[error(
+        "the trailing dot is not seen: of {frames} frames, the brightest is {energy:.0} counts above the median in batches.trailing_region, and more than {needed:.0} are needed. Likely causes: the lens cap is on, or the aperture closed; the laser is off or its shutter closed; the dot does not land in the trailing region; the exposure is too short, or at the wrong time for the mirror's samples"
+    )]
+    NoDot {
+        /// Number of frames.
+        frames: usize,
+        /// The largest energy, above the median.
+        energy: f64,
+        /// The energy that is exceeded if there is a dot.
+        needed: f64,
+    },
     /// Correspondences do not determine the fundamental matrix.
     #[error(
         "the correspondences lie on one plane (singular value ratio {ratio:.1e}, at least {needed:.1e} needed): \

@@ -62,6 +62,9 @@ impl Observation {
     }
 }
 
+/// The trailing dot is seen if its energy exceeds the median by this many times the median deviation.
+const LEAST_SPREADS: f64 = 12.0;
+
 /// Midpoint between the region's energy without and with the trailing dot, from a run of some batches: the median and
 /// the largest energy of the frames that are not saturated.
 ///
@@ -74,9 +77,11 @@ pub fn pulse_threshold(run: &[Observation]) -> Result<u64, DotsError> {
     let dark = median(&mut energies);
     energies.iter_mut().for_each(|energy| *energy = (*energy - dark).abs());
     let spread = median(&mut energies);
-    let allowed = "far above the noise: show the region where the trailing dot lands, over some batches";
-    check_range("trailing dot's energy", largest - dark, largest - dark > 12.0 * spread.max(1.0), allowed)?;
-    Ok(((dark + largest) / 2.0) as u64)
+    let (energy, needed) = (largest - dark, LEAST_SPREADS * spread.max(1.0));
+    match energy > needed {
+        true => Ok(((dark + largest) / 2.0) as u64),
+        false => Err(DotsError::NoDot { frames: run.len(), energy, needed }),
+    }
 }
 
 /// The batch and index of a frame, or the reason why it is not used.

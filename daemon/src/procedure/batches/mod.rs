@@ -81,6 +81,6 @@ impl Measurement for BatchesRun {
             problems = make(&session, ledger.state(), &task, &task.specs, problems, &go_on)?;
             write_manifest(&session, ledger.state(), &task, &rig.file)?;
         }
-        Ok(Ended { end, warnings: problems })
+        Ok(Ended { end, warnings: problems, found: Vec::new() })
     }
 }

@@ -82,7 +82,7 @@ impl BatchSink {
     pub fn start(writing: Writing) -> Result<Self, PipelineError> {
         let (items, inbox) = sync_channel(WAITING_BATCHES);
         let planned = writing.task.batches.total();
-        let progress = ProgressMeter::new(0, planned);
+        let progress = ProgressMeter::new(&writing.orders, 0, planned);
         let writer = BatchWriter { writing, progress, first_ns: None, problems: Vec::new(), error: None };
         let thread = thread::Builder::new()
             .name("dots-writer".into())

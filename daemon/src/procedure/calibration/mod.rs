@@ -146,7 +146,7 @@ impl Measurement for CalibrationRun {
         let stages: Arc<[_]> = Arc::new([]);
         let processing = Processing::without_demux(stages.clone());
         let planned = task.schedule.points.len();
-        let progress = ProgressMeter::new(planned - missing.len(), planned);
+        let progress = ProgressMeter::new(&run.orders, planned - missing.len(), planned);
         let (session, data) = (run.session.clone(), run.data.clone());
         let (sink, results) = PointSink::new(task, run, stack, processing, progress);
         let mut pixels = None;
@@ -190,6 +190,6 @@ impl Measurement for CalibrationRun {
             kept.use_in(&data)?;
             warnings = found.warnings();
         }
-        Ok(Ended { end, warnings })
+        Ok(Ended { end, warnings, found: Vec::new() })
     }
 }

@@ -58,7 +58,7 @@ impl Measurement for DarksRun {
         let missing = missing(&darks.task, state);
         let stages: Arc<[_]> = Arc::new([]);
         let processing = Processing::without_demux(stages.clone());
-        let progress = ProgressMeter::new(darks.points() - missing.len(), darks.points());
+        let progress = ProgressMeter::new(&run.orders, darks.points() - missing.len(), darks.points());
         let (sink, results) = PointSink::new(&darks.task, run, stack, processing, progress);
         let taken =
             opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| passes.acquire(missing))?;
@@ -79,6 +79,6 @@ impl Measurement for DarksRun {
             EndState::Complete => make(&session, ledger.state(), &darks, &rig.file)?,
             EndState::Cancelled | EndState::Faulted => Vec::new(),
         };
-        Ok(Ended { end, warnings })
+        Ok(Ended { end, warnings, found: Vec::new() })
     }
 }

@@ -2,7 +2,7 @@
 
 use raysweep_config::ConfigError;
 use raysweep_core::{CameraCapabilities, Readout};
-use raysweep_pipeline::PointRole;
+use raysweep_pipeline::{PointRole, ProductSpec};
 use raysweep_processing::film::FilmTask;
 use raysweep_processing::memory::MemoryNeed;
 use raysweep_proto::{CheckReport, FilmCheck};
@@ -14,17 +14,22 @@ use crate::procedure::lab::Lab;
 /// Disk space of the report and other small files, in bytes.
 const OTHER_BYTES: u64 = 10_000_000;
 
+/// Disk space of a pixel of a product's image: float32 in its array and its EXR file, 8 bits in its picture and video.
+const BYTES_PER_PRODUCT_PIXEL: u64 = 4 + 4 + 1 + 1;
+
 /// Predicts a film.
 ///
 /// # Errors
 /// When the plan gives no model on this rig.
-pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError> {
+pub fn check(film: &FilmTask, products: &[ProductSpec], lab: &Lab<'_>) -> Result<CheckReport, ConfigError> {
     let task = &*film.task;
     let model = Model::of(task, lab.camera, "film")?;
     let cycles = of_cycles(film, lab.camera, model.reach());
     let memory = MemoryNeed::of_film(task).map_err(|error| task.refuse(&["film"], error.to_string()))?;
     let minutes = film.points() as f64 / cycles.transports_per_s / 60.0;
-    let disk_bytes = (cycles.disk_bytes_per_minute as f64 * minutes) as u64 + OTHER_BYTES;
+    let image_bytes = (task.geometry.height * task.geometry.width) as u64 * BYTES_PER_PRODUCT_PIXEL;
+    let product_bytes = (products.len() * film.points()) as u64 * image_bytes;
+    let disk_bytes = (cycles.disk_bytes_per_minute as f64 * minutes) as u64 + product_bytes + OTHER_BYTES;
     let room = lab.room(memory.bytes(lab.memory_free_bytes()), disk_bytes);
     let (mut dark_frames, mut dark_periods) = (0, 0);
     for (point, periods) in task.schedule.points.iter().zip(&model.periods) {
@@ -36,6 +41,7 @@ pub fn check(film: &FilmTask, lab: &Lab<'_>) -> Result<CheckReport, ConfigError>
     let settings = task.settings().count();
     let light_periods = dark_periods + cycles.cycles as u64 * u64::from(cycles.periods_per_cycle);
     let mut warnings = model.warnings(task);
+    warnings.extend(products.iter().filter_map(|spec| spec.beyond(model.reach_rows)));
     warnings.extend(model.lamp_warning(task, None));
     warnings.extend(room.warnings());
     Ok(CheckReport {

@@ -10,9 +10,11 @@ use std::sync::Arc;
 
 use raysweep_config::{ConfigError, FilmPlan, Plan};
 use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats, ns_from_us};
-use raysweep_pipeline::{CycleOrder, Point, PointRole, Stages};
+use raysweep_pipeline::{CycleOrder, Point, PointRole, ProductSpec, Stages};
 use raysweep_processing::calibration::KeptCalibration;
-use raysweep_processing::film::{FilmTask, create_transports, shortcomings, write_report};
+use raysweep_processing::film::{
+    FilmProducts, FilmTask, create_transports, shortcomings, write_products, write_report,
+};
 use raysweep_processing::plane::{Processing, manifest};
 use raysweep_proto::{CheckReport, DesignParams, DesignReport, RpcError};
 use raysweep_session::Session;
@@ -41,6 +43,7 @@ struct FilmRun {
     camera: CameraCapabilities,
     calibration: Option<KeptCalibration>,
     film: FilmTask,
+    products: Vec<ProductSpec>,
     stages: Stages,
 }
 
@@ -54,15 +57,12 @@ pub fn foresee(
     plan: &Plan,
     own: FilmPlan,
 ) -> Result<Foreseen, ConfigError> {
-    if plan.products.is_some() {
-        let message = "kind = \"film\" takes no [[product]], because its result is a transport for each cycle: leave it out";
-        return Err(plan.places.error(&["product"], message));
-    }
     let film = FilmTask::new(plan, own, &rig.known()?);
+    let products = film.products()?;
     let stages = lab.probes.after(&film.stages()?);
     let shape = StackShape { contents: film.contents(), rows: lab.camera.height, columns: lab.camera.width };
     Ok(Foreseen {
-        report: rig.warned(check::check(&film, lab)?),
+        report: rig.warned(check::check(&film, &products, lab)?),
         kind: plan.procedure.kind(),
         name: plan.name.clone(),
         shape,
@@ -73,6 +73,7 @@ pub fn foresee(
             camera: lab.camera.clone(),
             calibration: rig.calibration,
             film,
+            products,
             stages,
         }),
     })
@@ -97,7 +98,7 @@ impl Measurement for FilmRun {
     fn measure(self: Box<Self>, run: Run) -> Result<Ended, RunError> {
         let orders = run.orders.clone();
         let acquired = self.acquire(run)?;
-        conclude(acquired, &self.film, &self.rig, &orders)
+        conclude(acquired, &self, &orders)
     }
 }
 
@@ -113,6 +114,8 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
+    /// What to tell of its times, if they are simulated.
+    simulated: Option<String>,
 }
 
 impl FilmRun {
@@ -130,10 +133,12 @@ impl FilmRun {
         let cycles = CyclePlan::new(task, opened.camera());
         let account = Arc::new(Account::new(film.points()));
         let frames = self.cycles(&run, &cycles, opened.camera(), opened.pace, &account)?;
+        let simulated = opened.pace.of_times();
         let planned = missing.len() + film.points();
         let processing = Processing::without_demux(self.stages.clone());
         // A film's own transports serve as its live estimate.
-        let (points, results) = PointSink::new(task, run, stack, processing, ProgressMeter::new(0, planned));
+        let progress = ProgressMeter::new(&run.orders, 0, planned);
+        let (points, results) = PointSink::new(task, run, stack, processing, progress);
         let sink = FilmSink { points, film: frames };
         let under_way = CYCLES_UNDER_WAY * cycles.shots.len();
         let taken = opened.acquire(self.stages.clone(), under_way, sink, &results, |passes| {
@@ -145,6 +150,11 @@ impl FilmRun {
         })?;
         let Taken { sink: FilmSink { mut points, film: frames }, exposures, latency, fault } = taken;
         let solved = frames.finish();
+        let no_light = points.no_light.map(|seen| RunError::NoLight {
+            seen,
+            cause: "every exposure lies where the projector draws nothing that the camera sees (film.delay_us, projector.first_row_us); the projector stays lit in the dark image too",
+            then: "run the plan again",
+        });
         let summary = account.summary();
         points.append(&Entry::Film(summary.clone()));
         points.run.board.set_film(summary);
@@ -159,7 +169,8 @@ impl FilmRun {
             vsync: points.vsync,
             exposures,
             latency,
-            fault: points.write_error.map(RunError::from).or(fault),
+            fault: points.write_error.map(RunError::from).or(no_light).or(fault),
+            simulated,
         })
     }
 
@@ -209,9 +220,12 @@ impl FilmRun {
     }
 }
 
-/// Writes a film's report. Its transports exist already, so a film that was ended early is like a short one.
-fn conclude(acquired: Acquired, film: &FilmTask, rig: &Rig, orders: &Orders) -> Result<Ended, RunError> {
-    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault } = acquired;
+/// Makes a film's products, and writes its report. Its transports exist already, so a film that was ended early is like
+/// a short one; but its products are not made, so that it ends soon.
+fn conclude(acquired: Acquired, run: &FilmRun, orders: &Orders) -> Result<Ended, RunError> {
+    let FilmRun { rig, film, products, .. } = run;
+    let Acquired { session, mut ledger, mut problems, vsync, exposures, latency, fault, simulated } =
+        acquired;
     let state = end_state(fault.as_ref(), orders);
     let stored = ledger.state().stored_points();
     let end = EndEntry {
@@ -222,11 +236,23 @@ fn conclude(acquired: Acquired, film: &FilmTask, rig: &Rig, orders: &Orders) -> 
         settings_latency: latency,
         ..end_entry(state, stored, ledger.state().missing_points())
     };
+    let go_on = || orders.go_on();
+    let mut made = match state {
+        EndState::Complete => write_products(&session, ledger.state(), film, products, &|_| true, &go_on)?,
+        EndState::Cancelled | EndState::Faulted => FilmProducts::default(),
+    };
+    problems.append(&mut made.problems);
+    if state != EndState::Complete && !products.is_empty() {
+        problems.push(
+            "the film was ended early, so its products are not made: `raysweep process` makes them".into(),
+        );
+    }
     ledger.append(&Entry::End(end.clone()))?;
     if state != EndState::Faulted {
-        write_report(&session, ledger.state(), film, &problems)?;
+        write_report(&session, ledger.state(), film, &made, &problems)?;
         manifest::write(&session, ledger.state(), &film.task, &rig.file)?;
     }
-    problems.extend(shortcomings(ledger.state()));
-    Ok(Ended { end, warnings: problems })
+    let missing = ledger.state().film.as_ref().map_or(0, |film| film.transports_missing);
+    problems.extend(shortcomings(ledger.state(), missing));
+    Ok(Ended { end, warnings: problems, found: simulated.into_iter().collect() })
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use ndarray::{Array2, Array3, Axis};
 use raysweep_core::{Counts, LossCause, SettingsId};
-use raysweep_pipeline::{Cycle, FilmFrame, Ordered, PipelineError, Sink, StageError, Unit};
+use raysweep_pipeline::{Cycle, FilmFrame, Ordered, PipelineError, SeenLight, Sink, StageError, Unit};
 use raysweep_processing::plane::PlaneTask;
 use raysweep_proto::Event;
 use raysweep_session::film::{CycleEntry, Film, crc32};
@@ -42,6 +42,11 @@ pub struct Cycles {
     /// The newest frame of each setting that has an image.
     newest: Vec<Option<FilmFrame>>,
     first_start_ns: Option<i64>,
+    /// Light of a white pixel, and the level from which pixels saturate, in counts.
+    white_dn: f64,
+    saturation_dn: f64,
+    /// Whether a cycle has shown light.
+    is_lit: bool,
     /// Starts of the first and the last stored cycle.
     stored_span_ns: Option<(i64, i64)>,
 }
@@ -78,6 +83,9 @@ impl Cycles {
             cycle: None,
             newest: vec![None; settings],
             first_start_ns: None,
+            white_dn: task.geometry.white_dn,
+            saturation_dn: task.geometry.saturation_dn,
+            is_lit: false,
             stored_span_ns: None,
         }
     }
@@ -101,6 +109,18 @@ impl Cycles {
 
     fn seconds_since_start(&self, time_ns: i64) -> f64 {
         (time_ns - self.first_start_ns.unwrap_or(time_ns)) as f64 * 1e-9
+    }
+
+    /// The light in the brightest frame of a cycle, if it is none and no earlier cycle had any.
+    fn no_light(&mut self, cycle: &Cycle) -> Option<SeenLight> {
+        let dark = self.dark.as_ref().filter(|_| !self.is_lit)?;
+        let images = cycle.frames.iter().flatten().filter_map(|frame| frame.image.as_ref());
+        let seen = images.filter_map(|image| {
+            SeenLight::between(image.view(), dark.view(), self.white_dn, self.saturation_dn)
+        });
+        let brightest = seen.max_by(|a, b| a.mean_dn.total_cmp(&b.mean_dn))?;
+        self.is_lit = brightest.is_light();
+        (!self.is_lit).then_some(brightest)
     }
 
     fn exposed(
@@ -234,6 +254,13 @@ impl FilmSink {
 
     fn close_cycle(&mut self, mut cycle: Cycle) {
         let missing = cycle.missing();
+        if missing.is_empty()
+            && let Some(none) = self.film.no_light(&cycle)
+        {
+            self.points.note_no_light(none);
+            self.give_up_whole(cycle);
+            return;
+        }
         let stored = missing.is_empty().then(|| self.store_cycle(&cycle));
         match stored {
             Some(Ok(())) => {
@@ -290,10 +317,15 @@ impl FilmSink {
 
     /// The film has no further frames; an incomplete cycle was cut short by a cancel or a fault.
     fn film_over(&mut self) {
-        let Some(mut cycle) = self.film.cycle.take() else { return };
+        if let Some(cycle) = self.film.cycle.take() {
+            self.give_up_whole(cycle);
+        }
+    }
+
+    /// Leaves out a cycle as if it had not been planned.
+    fn give_up_whole(&mut self, mut cycle: Cycle) {
         give_up(&mut cycle.counts, None);
-        self.points.progress.counts.add(&cycle.counts);
-        self.points.append(&Entry::Outside { counts: cycle.counts });
+        self.points.outside(cycle.counts);
     }
 
     fn note_stage_error(&mut self, unit: &Unit, setting: usize, error: &StageError) {

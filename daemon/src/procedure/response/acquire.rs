@@ -84,7 +84,7 @@ struct Recorder {
 
 impl Recorder {
     fn passes(&mut self, player: &mut Player<'_>) -> Result<(), RunError> {
-        let mut progress = ProgressMeter::new(0, AXES.len());
+        let mut progress = ProgressMeter::new(&self.run.orders, 0, AXES.len());
         player.place(Subject::Plane(0), 1)?;
         if !self.run.orders.go_on() {
             return Ok(());

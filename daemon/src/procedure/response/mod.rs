@@ -69,6 +69,8 @@ impl Measurement for ResponseRun {
         if let Some(findings) = &findings {
             findings.write(&session, ledger.state(), &task, &rig.file)?;
         }
-        Ok(Ended { end, warnings: findings.map_or_else(Vec::new, |findings| findings.warnings()) })
+        let said = findings.map(|findings| (findings.warnings(), findings.resonances()));
+        let (warnings, found) = said.unwrap_or_default();
+        Ok(Ended { end, warnings, found })
     }
 }

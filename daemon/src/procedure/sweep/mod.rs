@@ -7,16 +7,16 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use raysweep_config::{ConfigError, Plan, SweepPlan};
-use raysweep_core::{CameraCapabilities, SettingsId, SettingsLatency, VsyncStats};
+use raysweep_core::{CameraCapabilities, Pattern, SettingsId, SettingsLatency, VsyncStats};
 use raysweep_pipeline::PointRole;
 use raysweep_processing::calibration::KeptCalibration;
 use raysweep_processing::memory::{MemoryNeed, available_bytes};
-use raysweep_processing::plane::{Processing, manifest};
+use raysweep_processing::plane::{PlaneTask, Processing, manifest};
 use raysweep_processing::sweep::{Overview, Results, SweepTask, write_products, write_report};
 use raysweep_proto::{CheckReport, DesignParams, DesignReport, RpcError};
 use raysweep_session::Session;
-use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger};
-use raysweep_session::stack::StackShape;
+use raysweep_session::ledger::{EndEntry, EndState, Entry, Ledger, State};
+use raysweep_session::stack::{ArrayName, StackShape};
 
 use crate::devices::camera::Exposures;
 use crate::live::{LiveEstimate, Outlet};
@@ -118,6 +118,8 @@ struct Acquired {
     latency: Option<SettingsLatency>,
     /// The fault that ended acquisition early, if any.
     fault: Option<RunError>,
+    /// What to tell of its times, if they are simulated.
+    simulated: Option<String>,
 }
 
 /// Acquires what is missing.
@@ -139,13 +141,21 @@ fn acquire(
     processing.feed_stored(task, &state, &stack, &|| run.orders.go_on());
     let planned = task.schedule.points.len();
     let stages = processing.stages.clone();
-    let progress = ProgressMeter::new(planned - missing.len(), planned);
+    let progress = ProgressMeter::new(&run.orders, planned - missing.len(), planned);
     let live = run.live.clone().and_then(start_live);
     let (mut sink, results) = PointSink::new(task, run, stack, processing, progress);
     sink.live = live;
-    let taken = opened
-        .acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| acquire_points(passes, sweep, missing))?;
+    let simulated = opened.pace.of_times();
+    let again = regular_again(task, &missing, &state);
+    let taken = opened.acquire(stages, UNITS_UNDER_WAY, sink, &results, |passes| {
+        acquire_points(passes, sweep, again, missing)
+    })?;
     let Taken { sink, exposures, latency, fault } = taken;
+    let no_light = sink.no_light.map(|seen| RunError::NoLight {
+        seen,
+        cause: "the projector stays lit in the dark images too",
+        then: "`raysweep resume` the session",
+    });
     Ok(Acquired {
         session: sink.run.session,
         ledger: sink.run.ledger,
@@ -153,20 +163,28 @@ fn acquire(
         vsync: sink.vsync,
         exposures,
         latency,
-        fault: sink.write_error.map(RunError::from).or(fault),
+        fault: sink.write_error.map(RunError::from).or(no_light).or(fault),
+        simulated,
     })
 }
 
-/// Acquires the points of the sweep under white, then its bracket under less light.
+/// Acquires the points of the sweep under white, then its bracket under less light; before them, the regular image
+/// `again`, if a resumed run needs it to see whether there is light.
 fn acquire_points(
     passes: &mut Passes<'_>,
     sweep: &SweepTask,
+    again: Option<SettingsId>,
     missing: Vec<SettingsId>,
 ) -> Result<(), RunError> {
     let point_of = |id: SettingsId| sweep.task.schedule.points[id.point as usize];
     let (bracket, others): (Vec<_>, Vec<_>) =
         missing.into_iter().partition(|&id| matches!(point_of(id).role, PointRole::Bracket(_)));
-    passes.acquire(others)?;
+    if let Some(again) = again {
+        passes.acquire_under(Some(&Pattern::White), vec![passes.attempt_at(again, point_of(again))])?;
+    }
+    if passes.go_on() {
+        passes.acquire(others)?;
+    }
     let attempts: Vec<_> = bracket.into_iter().map(|id| passes.attempt_at(id, point_of(id))).collect();
     match sweep.bracket_picture() {
         Some(picture) if !attempts.is_empty() && passes.go_on() => {
@@ -174,6 +192,17 @@ fn acquire_points(
         }
         _ => Ok(()),
     }
+}
+
+/// The regular image, if it is stored and lit points are missing: a resumed run takes it again before them, only to see
+/// whether there is light, because they may be points that see none.
+fn regular_again(task: &PlaneTask, missing: &[SettingsId], state: &State) -> Option<SettingsId> {
+    let points = &task.schedule.points;
+    let regular = points.iter().position(|point| point.role == PointRole::Regular)? as u32;
+    let is_lit = |id: &SettingsId| !matches!(points[id.point as usize].role, PointRole::Dark(_));
+    let is_missing = missing.iter().any(|id| id.point == regular);
+    let attempt = state.next_attempt(ArrayName::Regular, 0);
+    (!is_missing && missing.iter().any(is_lit)).then_some(SettingsId { point: regular, attempt })
 }
 
 /// Starts the running estimate; the run works without it too.
@@ -192,7 +221,7 @@ fn conclude(
     live: Option<&Outlet>,
 ) -> Result<Ended, RunError> {
     let task = &*sweep.task;
-    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault } = acquired;
+    let Acquired { session, mut ledger, processing, vsync, exposures, latency, fault, simulated } = acquired;
     let whole = fault.is_none() && missing(task, ledger.state()).is_empty();
     let began = Instant::now();
     let make = || match in_strips {
@@ -220,7 +249,7 @@ fn conclude(
         if let Some((live, overview)) = live.zip(overview.as_ref()) {
             show_last(live, overview, stored, computed);
         }
-        write_products(&session, task, &results.products)?;
+        write_products(&session, task, results, &|_| true)?;
         ledger.append(&Entry::End(end.clone()))?;
         write_report(&session, ledger.state(), sweep, results, overview.as_ref())?;
         manifest::write(&session, ledger.state(), task, &rig.file)?;
@@ -229,7 +258,11 @@ fn conclude(
     } else {
         ledger.append(&Entry::End(end.clone()))?;
     }
-    Ok(Ended { end, warnings: results.map_or_else(Vec::new, Results::into_warnings) })
+    Ok(Ended {
+        end,
+        warnings: results.map_or_else(Vec::new, Results::into_warnings),
+        found: simulated.into_iter().collect(),
+    })
 }
 
 /// Publishes the result where the earlier estimates were published.

@@ -1,0 +1,122 @@
+//! Whether the projector's light reaches the camera at all: a lens cap or a dark projector leaves images that nothing
+//! but their brightness tells from those of a scene.
+
+use std::fmt;
+
+use ndarray::{ArrayView2, Zip};
+
+/// An image is lit if its mean exceeds the dark image's by this many standard errors.
+const LEAST_SIGMAS: f64 = 5.0;
+/// It must also exceed it by this share of a white pixel's light: the dark level of a camera drifts by less, and a
+/// scene of black velvet reflects more.
+const LEAST_SHARE: f64 = 2e-4;
+
+/// By how much an image is brighter than the dark one, averaged over its pixels, in counts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SeenLight {
+    /// The mean difference.
+    pub mean_dn: f64,
+    /// Its standard error, from the differences of the pixels.
+    pub error_dn: f64,
+    /// The light of a white pixel's own row.
+    pub white_dn: f64,
+}
+
+impl SeenLight {
+    /// Compares an image with light and one without, both in counts, where the latter is below `saturation_dn`; `None`
+    /// if it is nowhere, so that nothing can be seen. `white_dn` is a white pixel's light.
+    pub fn between(
+        lit: ArrayView2<f32>,
+        dark: ArrayView2<f32>,
+        white_dn: f64,
+        saturation_dn: f64,
+    ) -> Option<Self> {
+        let (mut pixels, mut sum, mut squares) = (0.0, 0.0, 0.0);
+        Zip::from(lit).and(dark).for_each(|&lit, &dark| {
+            if f64::from(dark) < saturation_dn {
+                let difference = f64::from(lit) - f64::from(dark);
+                pixels += 1.0;
+                sum += difference;
+                squares += difference * difference;
+            }
+        });
+        let mean_dn = sum / pixels;
+        let variance = (squares / pixels - mean_dn * mean_dn).max(0.0);
+        (pixels > 0.0).then(|| Self { mean_dn, error_dn: (variance / pixels).sqrt(), white_dn })
+    }
+
+    /// The smallest mean difference that counts as light.
+    pub fn least_dn(&self) -> f64 {
+        (LEAST_SIGMAS * self.error_dn).max(LEAST_SHARE * self.white_dn)
+    }
+
+    /// Whether there is light.
+    pub fn is_light(&self) -> bool {
+        self.mean_dn > self.least_dn()
+    }
+}
+
+impl fmt::Display for SeenLight {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (mean, error, white) = (self.mean_dn, self.error_dn, self.white_dn);
+        write!(
+            f,
+            "on average {mean:+.3} ± {error:.3} counts more with light than without, at least {:.3} are needed, and white gives {white:.0}",
+            self.least_dn()
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::Array2;
+
+    use super::*;
+    use crate::regularity::tests::Normal;
+
+    /// Noise of two counts about a dark level of 64.
+    fn dark(seed: u64) -> Array2<f32> {
+        let mut normal = Normal::new(seed);
+        Array2::from_shape_simple_fn((128, 128), || (64.0 + 2.0 * normal.next()) as f32)
+    }
+
+    fn seen(lit: &Array2<f32>) -> SeenLight {
+        SeenLight::between(lit.view(), dark(1).view(), 200.0, 255.0).unwrap()
+    }
+
+    #[test]
+    fn noise_and_a_drifting_dark_level_are_no_light() {
+        for seed in 2..40 {
+            assert!(!seen(&dark(seed)).is_light(), "{}", seen(&dark(seed)));
+        }
+        assert!(!seen(&(dark(2) + 0.03)).is_light());
+        // A projector that was lit only while it should have been dark.
+        assert!(!seen(&(dark(2) - 40.0)).is_light());
+    }
+
+    #[test]
+    fn a_dim_scene_and_a_small_bright_object_are_light() {
+        assert!(seen(&(dark(2) + 0.5)).is_light());
+        let mut object = dark(2);
+        object.slice_mut(ndarray::s![60..66, 60..66]).mapv_inplace(|dn| dn + 60.0);
+        assert!(seen(&object).is_light(), "{}", seen(&object));
+    }
+
+    #[test]
+    fn the_figures_are_the_means_and_the_standard_errors_of_the_differences() {
+        let lit = ndarray::arr2(&[[10.0, 12.0], [14.0, 16.0]]);
+        let dark = Array2::from_elem((2, 2), 3.0);
+        let seen = SeenLight::between(lit.view(), dark.view(), 100.0, 255.0).unwrap();
+        assert_eq!((seen.mean_dn, seen.error_dn), (10.0, 5.0_f64.sqrt() / 2.0));
+        assert_eq!(seen.least_dn(), 2.5 * 5.0_f64.sqrt());
+    }
+
+    #[test]
+    fn where_the_dark_image_saturates_nothing_can_be_seen() {
+        let (lit, mut dark) = (Array2::from_elem((2, 2), 255.0), Array2::from_elem((2, 2), 255.0));
+        assert_eq!(SeenLight::between(lit.view(), dark.view(), 100.0, 255.0), None);
+        dark[[0, 1]] = 5.0;
+        let seen = SeenLight::between(lit.view(), dark.view(), 100.0, 255.0).unwrap();
+        assert_eq!((seen.mean_dn, seen.error_dn, seen.is_light()), (250.0, 0.0, true));
+    }
+}

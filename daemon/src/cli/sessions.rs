@@ -1,0 +1,481 @@
+//! Finding, reading and keeping sessions: `sessions`, `show`, `diff`, `rerun`, `note`, `trash` and `restore`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use jiff::civil::Date;
+use jiff::tz::TimeZone;
+use ndarray::{Array2, Axis, concatenate};
+use raysweep_core::Counts;
+use raysweep_processing::ProcessError;
+use raysweep_processing::calibration::CalibrationHeader;
+use raysweep_proto::{RunParams, SessionInfo};
+use raysweep_session::Session;
+use raysweep_session::ledger::{EndState, Remark};
+use raysweep_session::report::{Picture, ToneMap};
+use serde::Serialize;
+use serde_json::Value;
+
+use super::failure::CommandFailure;
+use super::show::{block, duration};
+
+/// Columns between the images of a picture.
+const GAP_PX: usize = 4;
+/// Percentile of the pixels that maps to white in a picture.
+const PERCENTILE: f64 = 99.5;
+
+/// Which sessions to list; those that fit all of it.
+#[derive(Debug, Default, clap::Args)]
+pub(super) struct SessionFilter {
+    /// Only those whose name contains this; the plan gives the name
+    #[arg(long, value_name = "NAME")]
+    plan: Option<String>,
+    /// Only those whose operator's name contains this
+    #[arg(long, value_name = "NAME")]
+    operator: Option<String>,
+    /// Only those whose sample's name contains this
+    #[arg(long, value_name = "NAME")]
+    sample: Option<String>,
+    /// Only those with this tag; may be repeated
+    #[arg(long = "tag", value_name = "TAG")]
+    tags: Vec<String>,
+    /// Only those begun on this day or later, in UTC, such as 2026-11-22
+    #[arg(long, value_name = "DATE")]
+    since: Option<Date>,
+    /// Only those begun on this day or earlier, in UTC
+    #[arg(long, value_name = "DATE")]
+    until: Option<Date>,
+    /// Only those in this state
+    #[arg(long, value_name = "STATE", value_parser = ["complete", "cancelled", "faulted", "unfinished", "unreadable"])]
+    state: Option<String>,
+}
+
+impl SessionFilter {
+    /// Whether a session is to be listed.
+    pub fn keeps(&self, info: &SessionInfo) -> bool {
+        let contains = |wanted: &Option<String>, found: Option<&str>| {
+            let found = found.unwrap_or_default().to_lowercase();
+            wanted.as_ref().is_none_or(|wanted| found.contains(&wanted.to_lowercase()))
+        };
+        let created = || {
+            let created: Timestamp = info.created.parse().ok()?;
+            Some(created.to_zoned(TimeZone::UTC).date())
+        };
+        contains(&self.plan, Some(&info.name))
+            && contains(&self.operator, info.operator.as_deref())
+            && contains(&self.sample, info.sample.as_deref())
+            && self.tags.iter().all(|tag| info.tags.contains(tag))
+            && self.since.is_none_or(|since| created().is_some_and(|created| created >= since))
+            && self.until.is_none_or(|until| created().is_some_and(|created| created <= until))
+            && self.state.as_ref().is_none_or(|state| *state == info.state)
+    }
+}
+
+/// What `show` tells of a session.
+#[derive(Debug, Serialize)]
+pub(super) struct SessionView {
+    session: PathBuf,
+    name: String,
+    kind: String,
+    created: Timestamp,
+    operator: Option<String>,
+    sample: Option<String>,
+    note: Option<String>,
+    tags: Vec<String>,
+    software: String,
+    state: String,
+    error: Option<String>,
+    stored: usize,
+    points: usize,
+    counts: Counts,
+    light_s: Option<f64>,
+    /// `plan.toml`, by key.
+    settings: BTreeMap<String, String>,
+    /// When the calibration was measured that it uses.
+    calibration: Option<Timestamp>,
+    findings: BTreeMap<String, String>,
+    remarks: Vec<Remark>,
+    report: Option<PathBuf>,
+    /// The arrays and images of its products.
+    products: Vec<PathBuf>,
+    /// Pictures that any program shows.
+    pictures: Vec<PathBuf>,
+}
+
+impl SessionView {
+    /// Reads a session.
+    pub fn read(dir: &Path) -> Result<Self, CommandFailure> {
+        let session = Session::open(dir).map_err(ProcessError::from)?;
+        let state = session.state().map_err(ProcessError::from)?;
+        let (stored, points) = (state.stored_points(), state.session.shape.points());
+        let in_products = files_below(&session.products_path());
+        let with_ending = |ending: &str| -> Vec<PathBuf> {
+            in_products
+                .iter()
+                .filter(|path| path.extension().is_some_and(|found| found == ending))
+                .cloned()
+                .collect()
+        };
+        let report = session.report_path();
+        let (entry, remarks, end) = (state.session.clone(), state.remarks.clone(), state.end.clone());
+        Ok(Self {
+            session: dir.to_owned(),
+            name: entry.name,
+            kind: entry.kind,
+            created: entry.created,
+            operator: entry.operator,
+            sample: entry.sample,
+            note: entry.note,
+            tags: entry.tags,
+            software: entry.software,
+            state: end.as_ref().map_or("unfinished", |end| EndState::name(end.state)).to_owned(),
+            error: end.as_ref().and_then(|end| end.error.clone()),
+            stored,
+            points,
+            counts: state.counts,
+            light_s: end.and_then(|end| end.light_s),
+            settings: flat(&session.plan_path())?,
+            calibration: calibration_of(dir),
+            findings: findings_of(&session),
+            remarks,
+            report: report.exists().then_some(report),
+            products: with_ending("npy"),
+            // Of a video, the first.
+            pictures: with_ending("png").into_iter().filter(|path| path.ends_with("0000.png")).collect(),
+        })
+    }
+
+    /// One screen.
+    pub fn text(&self) -> String {
+        let made = self.created.strftime("%Y-%m-%d %H:%M:%S UTC").to_string();
+        let mut rows = vec![
+            ("session", self.session.display().to_string()),
+            ("made", format!("{made}, by {}", self.software)),
+            ("plan", format!("{} (kind {})", self.name, self.kind)),
+        ];
+        let told = [("operator", &self.operator), ("sample", &self.sample), ("note", &self.note)];
+        rows.extend(told.into_iter().filter_map(|(key, text)| Some((key, text.clone()?))));
+        if !self.tags.is_empty() {
+            rows.push(("tags", self.tags.join(", ")));
+        }
+        rows.push(("state", format!("{}: {} of {} stored", self.state, self.stored, self.points)));
+        rows.extend(self.error.iter().map(|error| ("error", error.clone())));
+        let Counts { expected, averaged, .. } = self.counts;
+        rows.push(("frames", format!("{averaged} used of {expected}, {}", self.counts.losses())));
+        rows.extend(self.light_s.map(|light_s| ("light", duration(light_s))));
+        let calibration = self.calibration.map(|made| made.strftime("%Y-%m-%d %H:%M UTC").to_string());
+        rows.extend(calibration.map(|made| ("calibrated", made)));
+        let settings = self.settings.iter().filter(|(key, _)| !["kind", "name"].contains(&key.as_str()));
+        let mut title = "settings";
+        for (key, value) in settings {
+            rows.push((title, format!("{key} = {value}")));
+            title = "";
+        }
+        title = "findings";
+        for (key, said) in &self.findings {
+            rows.push((title, format!("{key}: {said}")));
+            title = "";
+        }
+        title = "remarks";
+        for Remark { at, by, text } in &self.remarks {
+            let by = by.as_ref().map_or_else(String::new, |by| format!(", {by}"));
+            rows.push((title, format!("{}{by}: {text}", at.strftime("%Y-%m-%d %H:%M UTC"))));
+            title = "";
+        }
+        rows.extend(self.report.iter().map(|report| ("report", report.display().to_string())));
+        for (key, paths) in [("products", &self.products), ("pictures", &self.pictures)] {
+            title = key;
+            for path in paths {
+                rows.push((title, path.display().to_string()));
+                title = "";
+            }
+        }
+        block(&rows)
+    }
+}
+
+/// What differs between two sessions.
+#[derive(Debug, Serialize)]
+pub(super) struct Compared {
+    /// Sentences about plan, rig file, calibration and software; empty if nothing differs.
+    settings: Vec<String>,
+    /// Points stored, of those planned.
+    stored: [[usize; 2]; 2],
+    counts: [Counts; 2],
+    /// Products that both have, with the same shape.
+    products: BTreeMap<String, Difference>,
+    /// Products that only one of them has, or that have another shape.
+    unlike: Vec<String>,
+}
+
+/// The difference of an image, B - A.
+#[derive(Debug, Serialize, PartialEq)]
+struct Difference {
+    /// Root mean square of the first image.
+    rms: f64,
+    /// Root mean square of the difference.
+    rms_difference: f64,
+    /// The largest difference of a pixel, with its sign.
+    largest: f64,
+}
+
+impl Compared {
+    /// Compares two sessions.
+    pub fn read(folders: [&Path; 2]) -> Result<Self, CommandFailure> {
+        let [a, b] = folders;
+        let [first, second] = [SessionView::read(a)?, SessionView::read(b)?];
+        let names = |shown: &SessionView| -> BTreeSet<String> {
+            let stem = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
+            shown.products.iter().filter_map(stem).filter(|name| !name.ends_with("_mask")).collect()
+        };
+        let (mut products, mut unlike) = (BTreeMap::new(), Vec::new());
+        for name in names(&first).union(&names(&second)) {
+            match (image(a, name), image(b, name)) {
+                (Some(first), Some(second)) if first.dim() == second.dim() => {
+                    products.insert(name.clone(), Difference::of(&first, &second));
+                }
+                // Arrays of more axes follow from the same stack.
+                (None, None) => {}
+                _ => unlike.push(name.clone()),
+            }
+        }
+        Ok(Self {
+            settings: changes(a, b)?,
+            stored: [[first.stored, first.points], [second.stored, second.points]],
+            counts: [first.counts, second.counts],
+            products,
+            unlike,
+        })
+    }
+
+    /// As text.
+    pub fn text(&self) -> String {
+        let mut rows = Vec::new();
+        let mut title = "settings";
+        if self.settings.is_empty() {
+            rows.push((title, "the same".to_owned()));
+        }
+        for said in &self.settings {
+            rows.push((title, said.clone()));
+            title = "";
+        }
+        for (which, ([stored, points], counts)) in ["A", "B"].iter().zip(self.stored.iter().zip(&self.counts))
+        {
+            let Counts { expected, averaged, .. } = counts;
+            rows.push((
+                which,
+                format!(
+                    "{stored} of {points} stored, {averaged} frames used of {expected}, {}",
+                    counts.losses()
+                ),
+            ));
+        }
+        title = "products";
+        for (name, Difference { rms, rms_difference, largest }) in &self.products {
+            let share =
+                if *rms > 0.0 { format!(" ({:.2} %)", 100.0 * rms_difference / rms) } else { String::new() };
+            rows.push((
+                title,
+                format!("{name}: RMS of B - A {rms_difference:.3e}{share}, at most {largest:+.3e}"),
+            ));
+            title = "";
+        }
+        rows.extend(self.unlike.iter().map(|name| ("", format!("{name}: not in both, or of another shape"))));
+        block(&rows)
+    }
+}
+
+impl Difference {
+    fn of(a: &Array2<f32>, b: &Array2<f32>) -> Self {
+        let difference = b.mapv(f64::from) - a.mapv(f64::from);
+        let rms = |image: &Array2<f64>| (image.mapv(|value| value * value).mean().unwrap_or(0.0)).sqrt();
+        let largest = difference
+            .iter()
+            .copied()
+            .fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
+        Self { rms: rms(&a.mapv(f64::from)), rms_difference: rms(&difference), largest }
+    }
+}
+
+/// A picture of a product in two sessions and of the size of their difference, side by side, as a PNG file. The first two
+/// have one scale, and the difference its own.
+pub(super) fn picture_of_difference(folders: [&Path; 2], product: &str) -> Result<Vec<u8>, CommandFailure> {
+    let [a, b] = folders.map(|folder| {
+        image(folder, product).ok_or_else(|| {
+            CommandFailure::Sessions(format!(
+                "{} has no image {product}: `raysweep show` lists its products",
+                folder.display()
+            ))
+        })
+    });
+    let (a, b) = (a?, b?);
+    if a.dim() != b.dim() {
+        let message =
+            format!("{product} has {:?} pixels in one session and {:?} in the other", a.dim(), b.dim());
+        return Err(CommandFailure::Sessions(message));
+    }
+    let difference = (&b - &a).mapv(f32::abs);
+    let scaled = |image: &Array2<f32>, ToneMap { white }: ToneMap| image.mapv(|light| light / white);
+    let common = ToneMap::percentile(&[a.view(), b.view()], PERCENTILE);
+    let own = ToneMap::percentile(&[difference.view()], PERCENTILE);
+    let gap = Array2::zeros((a.nrows(), GAP_PX));
+    let images = [scaled(&a, common), gap.clone(), scaled(&b, common), gap, scaled(&difference, own)];
+    let views: Vec<_> = images.iter().map(|image| image.view()).collect();
+    let all =
+        concatenate(Axis(1), &views).map_err(|error| CommandFailure::Output(std::io::Error::other(error)))?;
+    Ok(Picture::grey(all.view(), ToneMap { white: 1.0 }).to_png().map_err(ProcessError::from)?)
+}
+
+/// The plan of a session and what is known of it, for the same run again.
+pub(super) fn run_again(dir: &Path) -> Result<RunParams, CommandFailure> {
+    let session = Session::open(dir).map_err(ProcessError::from)?;
+    let entry = session.state().map_err(ProcessError::from)?.session;
+    let path = session.plan_path();
+    let plan = fs::read_to_string(&path).map_err(|source| CommandFailure::File { path, source })?;
+    Ok(RunParams { plan, operator: entry.operator, sample: entry.sample, note: entry.note, tags: entry.tags })
+}
+
+/// What differs between the settings of two sessions, in a sentence each.
+pub(super) fn changes(before: &Path, after: &Path) -> Result<Vec<String>, CommandFailure> {
+    let mut found = Vec::new();
+    for file in ["plan.toml", "rig.toml"] {
+        let (a, b) = (flat(&before.join(file))?, flat(&after.join(file))?);
+        let keys: BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+        for key in keys {
+            match (a.get(key), b.get(key)) {
+                (Some(a), Some(b)) if a == b => {}
+                (Some(a), Some(b)) => found.push(format!("{file}: {key} = {b}, was {a}")),
+                (None, Some(b)) => found.push(format!("{file}: {key} = {b}, was not given")),
+                (Some(a), None) => found.push(format!("{file}: {key} is not given, was {a}")),
+                (None, None) => {}
+            }
+        }
+    }
+    let made = |dir| calibration_of(dir).map_or_else(|| "none".to_owned(), |made| made.to_string());
+    let software = |dir| -> Result<String, CommandFailure> {
+        let state = Session::open(dir).and_then(|session| session.state()).map_err(ProcessError::from)?;
+        Ok(state.session.software)
+    };
+    let others =
+        [("calibration", made(before), made(after)), ("software", software(before)?, software(after)?)];
+    let changed = others.into_iter().filter(|(_, a, b)| a != b);
+    found.extend(changed.map(|(what, a, b)| format!("{what}: {b}, was {a}")));
+    Ok(found)
+}
+
+/// A TOML file's values by their keys, such as `sweep.delay_us`.
+fn flat(path: &Path) -> Result<BTreeMap<String, String>, CommandFailure> {
+    fn walk(prefix: &str, value: &toml::Value, found: &mut BTreeMap<String, String>) {
+        let below = |key: &str| if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") };
+        match value {
+            toml::Value::Table(table) => {
+                table.iter().for_each(|(key, value)| walk(&below(key), value, found))
+            }
+            toml::Value::Array(tables) if tables.iter().any(toml::Value::is_table) => {
+                (0..)
+                    .zip(tables)
+                    .for_each(|(index, value): (usize, _)| walk(&below(&index.to_string()), value, found));
+            }
+            value => drop(found.insert(prefix.to_owned(), value.to_string())),
+        }
+    }
+    let text =
+        fs::read_to_string(path).map_err(|source| CommandFailure::File { path: path.to_owned(), source })?;
+    let table: toml::Table = toml::from_str(&text).map_err(|error| {
+        CommandFailure::Sessions(format!("{} cannot be read: {}", path.display(), error.message()))
+    })?;
+    let mut found = BTreeMap::new();
+    walk("", &toml::Value::Table(table), &mut found);
+    Ok(found)
+}
+
+fn calibration_of(dir: &Path) -> Option<Timestamp> {
+    CalibrationHeader::read(dir).ok().flatten().map(|header| header.made)
+}
+
+/// What the transport's metadata tell of how it was made.
+fn findings_of(session: &Session) -> BTreeMap<String, String> {
+    let text = fs::read(session.products_path().join("transport.json")).unwrap_or_default();
+    let metadata: Value = serde_json::from_slice(&text).unwrap_or_default();
+    let findings = metadata.get("findings").and_then(Value::as_object).into_iter().flatten();
+    findings.map(|(key, said)| (key.clone(), said.as_str().unwrap_or_default().to_owned())).collect()
+}
+
+/// An image among a session's products.
+fn image(dir: &Path, name: &str) -> Option<Array2<f32>> {
+    Session::open(dir).ok()?.products().read_image(name).ok()
+}
+
+/// All files below a folder, by name.
+fn files_below(dir: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut paths: Vec<PathBuf> =
+        entries.flat_map(|path| if path.is_dir() { files_below(&path) } else { vec![path] }).collect();
+    paths.sort();
+    paths
+}
+
+#[cfg(test)]
+mod tests {
+    use ndarray::arr2;
+
+    use super::*;
+
+    fn info() -> SessionInfo {
+        SessionInfo {
+            session: "/data/20261122-235900_paper".into(),
+            name: "paper".into(),
+            created: "2026-11-22T23:59:00Z".into(),
+            stored: 1,
+            points: 2,
+            state: "complete".into(),
+            kind: "sweep".into(),
+            operator: Some("Ada Lovelace".into()),
+            sample: None,
+            tags: vec!["a".into(), "b".into()],
+        }
+    }
+
+    #[test]
+    fn a_session_is_listed_if_it_fits_every_word_of_the_filter() {
+        use clap::Parser;
+
+        #[derive(clap::Parser)]
+        struct Line {
+            #[command(flatten)]
+            filter: SessionFilter,
+        }
+        let keeps = |line: &str| {
+            let words = std::iter::once("sessions").chain(line.split_whitespace());
+            Line::try_parse_from(words).unwrap().filter.keeps(&info())
+        };
+        for line in [
+            "",
+            "--plan PAP --operator lovelace --tag b --tag a --state complete",
+            "--since 2026-11-22 --until 2026-11-22",
+        ] {
+            assert!(keeps(line), "{line}");
+        }
+        for line in [
+            "--plan film",
+            "--operator Grace",
+            "--sample candle",
+            "--tag a --tag c",
+            "--state faulted",
+            "--since 2026-11-23",
+            "--until 2026-11-21",
+        ] {
+            assert!(!keeps(line), "{line}");
+        }
+        assert!(Line::try_parse_from(["sessions", "--since", "yesterday"]).is_err());
+    }
+
+    #[test]
+    fn the_difference_of_images_is_that_of_their_pixels() {
+        let (a, b) = (arr2(&[[3.0, 4.0]]), arr2(&[[3.0, 1.0]]));
+        let found = Difference::of(&a, &b);
+        assert_eq!((found.rms, found.rms_difference, found.largest), (12.5_f64.sqrt(), 4.5_f64.sqrt(), -3.0));
+    }
+}

@@ -1,0 +1,168 @@
+//! `raysweep show`, `diff`, `rerun`, `note`, `trash` and `restore`, on stored sessions.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use raysweep_session::Session;
+use raysweep_session::integrity::Audit;
+use serde_json::Value;
+
+use crate::fake::Daemon;
+
+/// Exit code, standard output, standard error.
+fn run(arguments: &[&str]) -> (i32, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_raysweep"))
+        .args(["--socket", "/nonexistent/socket"])
+        .args(arguments)
+        .output()
+        .unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+fn done(arguments: &[&str]) -> String {
+    let (exit, out, err) = run(arguments);
+    assert_eq!(exit, 0, "{arguments:?}: {out}{err}");
+    out
+}
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).unwrap();
+    for entry in fs::read_dir(from).unwrap().map(Result::unwrap) {
+        let target = to.join(entry.file_name());
+        match entry.path().is_dir() {
+            true => copy(&entry.path(), &target),
+            false => drop(fs::copy(entry.path(), target).unwrap()),
+        }
+    }
+}
+
+/// A copy of the stored sweep in a data folder.
+fn stored(data: &Path, name: &str) -> PathBuf {
+    let to = data.join(name);
+    copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/sessions/sweep"), &to);
+    to
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+#[test]
+fn a_session_is_shown_on_one_screen_with_its_remarks() {
+    let data = tempfile::tempdir().unwrap();
+    let session = stored(data.path(), "20260101-000000_sweep");
+    done(&["process", text(&session)]);
+    done(&["note", text(&session), "a fingerprint on the lens", "--by", "Ada"]);
+    done(&["note", text(&session), "wiped it"]);
+    let shown = done(&["show", text(&session)]);
+    for part in [
+        "frames",
+        "settings",
+        "sweep.average = ",
+        "a fingerprint on the lens",
+        ", Ada: ",
+        "prior: ",
+        "report.html",
+        "epipolar.npy",
+    ] {
+        assert!(shown.contains(part), "{part} in {shown}");
+    }
+    assert!(shown.find("fingerprint") < shown.find("wiped it"), "oldest first: {shown}");
+    let shown: Value = serde_json::from_str(&done(&["show", text(&session), "--json"])).unwrap();
+    assert_eq!(shown["remarks"][1]["text"], "wiped it");
+    // A remark is under the ledger's checksums, and changes nothing else.
+    let (_, audit) = Audit::of(&Session::open(&session).unwrap()).unwrap();
+    assert!(audit.damage.is_empty(), "{:?}", audit.damage);
+    let ledger = session.join("ledger.jsonl");
+    let edited = fs::read_to_string(&ledger).unwrap().replace("fingerprint", "Fingerprint");
+    fs::write(&ledger, edited).unwrap();
+    assert_eq!(run(&["verify", text(&session)]).0, 1, "an edited remark is noticed");
+    assert_eq!(run(&["note", text(&session), " "]).0, 2, "an empty remark");
+}
+
+#[test]
+fn sessions_are_moved_away_and_back_and_deleted_only_for_good() {
+    let data = tempfile::tempdir().unwrap();
+    let session = stored(data.path(), "20260101-000000_sweep");
+    let before = fs::read(session.join("ledger.jsonl")).unwrap();
+    done(&["trash", text(&session)]);
+    let trashed = data.path().join(".trash/20260101-000000_sweep");
+    assert!(!session.exists() && trashed.exists());
+    let listed = raysweep_session::list(data.path()).unwrap();
+    assert!(listed.sessions.is_empty() && listed.unreadable.is_empty());
+    // Another of the same name is not overwritten, neither there nor here.
+    stored(data.path(), "20260101-000000_sweep");
+    for arguments in [["trash", text(&session)], ["restore", text(&trashed)]] {
+        let (exit, _, err) = run(&arguments);
+        assert!(exit == 1 && err.contains("20260101-000000_sweep"), "{err}");
+    }
+    assert_eq!(run(&["restore", text(&session)]).0, 1, "it is not in the trash");
+    done(&["trash", text(&session), "--for-good"]);
+    assert!(!session.exists() && trashed.exists(), "the one in the trash is another");
+    done(&["restore", text(&trashed)]);
+    assert_eq!(fs::read(session.join("ledger.jsonl")).unwrap(), before);
+    // While somebody works on it, it stays where it is.
+    let locked = Session::open(&session).unwrap().resume().unwrap();
+    for arguments in [
+        &["trash", text(&session)][..],
+        &["trash", text(&session), "--for-good"],
+        &["note", text(&session), "x"],
+    ] {
+        let (exit, _, err) = run(arguments);
+        assert!(exit == 1 && session.exists(), "{arguments:?}: {err}");
+    }
+    drop(locked);
+}
+
+#[test]
+fn two_sessions_are_compared_by_settings_and_by_their_images() {
+    let data = tempfile::tempdir().unwrap();
+    let (a, b) = (stored(data.path(), "a"), stored(data.path(), "b"));
+    let plan = fs::read_to_string(b.join("plan.toml")).unwrap();
+    fs::write(b.join("plan.toml"), format!("{plan}\n[[stage]]\nname = \"demux\"\nprior = \"paper\"\n"))
+        .unwrap();
+    done(&["process", text(&a)]);
+    done(&["process", text(&b), "--accept-edits"]);
+    let same: Value = serde_json::from_str(&done(&["diff", text(&a), text(&a), "--json"])).unwrap();
+    assert_eq!(same["settings"], Value::Array(Vec::new()));
+    assert_eq!(same["products"]["epipolar"]["rms_difference"], 0.0);
+    let picture = data.path().join("seen.png");
+    let arguments = ["diff", text(&a), text(&b), "--picture", text(&picture)];
+    let out = done(&arguments);
+    assert!(out.contains("stage.0.prior = \"paper\", was not given"), "{out}");
+    let compared: Value = serde_json::from_str(&done(&["diff", text(&a), text(&b), "--json"])).unwrap();
+    // By other means: from the files themselves.
+    let image = |dir: &Path| Session::open(dir).unwrap().products().read_image("epipolar").unwrap();
+    let (one, other) = (image(&a), image(&b));
+    let squares: f64 = one.iter().zip(&other).map(|(a, b)| (f64::from(*b) - f64::from(*a)).powi(2)).sum();
+    let expected = (squares / one.len() as f64).sqrt();
+    let found = compared["products"]["epipolar"]["rms_difference"].as_f64().unwrap();
+    assert!(expected > 0.0 && (found / expected - 1.0).abs() < 1e-9, "{found}, {expected}");
+    let width = u32::from_be_bytes(fs::read(&picture).unwrap()[16..20].try_into().unwrap()) as usize;
+    assert_eq!(width, 3 * one.ncols() + 2 * 4);
+    let (exit, _, err) = run(&[&arguments[..], &["--product", "nothing"]].concat());
+    assert!(exit == 2 && err.contains("no image nothing"), "{err}");
+}
+
+#[test]
+fn a_session_is_run_again_with_its_plan_and_what_was_known_of_it() {
+    let daemon = Daemon::start();
+    let session = stored(daemon.folder.path(), "20260101-000000_sweep");
+    let output = Command::new(env!("CARGO_BIN_EXE_raysweep"))
+        .env("RAYSWEEP_SOCKET", &daemon.path)
+        .args(["rerun", text(&session), "--detach"])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let runs = daemon.fake.runs.lock().unwrap();
+    assert_eq!(runs[0].plan, fs::read_to_string(session.join("plan.toml")).unwrap());
+    let entry = Session::open(&session).unwrap().state().unwrap().session;
+    assert_eq!(
+        (&runs[0].operator, &runs[0].sample, &runs[0].tags),
+        (&entry.operator, &entry.sample, &entry.tags)
+    );
+    // The fake has no session that it could be compared with.
+    assert!(String::from_utf8(output.stderr).unwrap().contains("what has changed since is not known"));
+}
