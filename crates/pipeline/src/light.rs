@@ -3,7 +3,7 @@
 
 use std::fmt;
 
-use ndarray::{ArrayView2, Zip};
+use ndarray::ArrayView2;
 
 /// An image is lit if its mean exceeds the dark image's by this many standard errors.
 const LEAST_SIGMAS: f64 = 5.0;
@@ -11,12 +11,16 @@ const LEAST_SIGMAS: f64 = 5.0;
 /// scene of black velvet reflects more.
 const LEAST_SHARE: f64 = 2e-4;
 
+/// Standard deviation of a normal distribution whose median absolute deviation is 1.
+const SIGMAS_PER_MEDIAN_DEVIATION: f64 = 1.4826;
+
 /// By how much an image is brighter than the dark one, averaged over its pixels, in counts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SeenLight {
     /// The mean difference.
     pub mean_dn: f64,
-    /// Its standard error, from the differences of the pixels.
+    /// Its standard error without any light, from the median deviation of the pixels' differences, which the light of a
+    /// small object does not increase.
     pub error_dn: f64,
     /// The light of a white pixel's own row.
     pub white_dn: f64,
@@ -31,18 +35,14 @@ impl SeenLight {
         white_dn: f64,
         saturation_dn: f64,
     ) -> Option<Self> {
-        let (mut pixels, mut sum, mut squares) = (0.0, 0.0, 0.0);
-        Zip::from(lit).and(dark).for_each(|&lit, &dark| {
-            if f64::from(dark) < saturation_dn {
-                let difference = f64::from(lit) - f64::from(dark);
-                pixels += 1.0;
-                sum += difference;
-                squares += difference * difference;
-            }
-        });
-        let mean_dn = sum / pixels;
-        let variance = (squares / pixels - mean_dn * mean_dn).max(0.0);
-        (pixels > 0.0).then(|| Self { mean_dn, error_dn: (variance / pixels).sqrt(), white_dn })
+        let pairs = lit.iter().zip(&dark).filter(|&(_, &dark)| f64::from(dark) < saturation_dn);
+        let mut values: Vec<f64> = pairs.map(|(&lit, &dark)| f64::from(lit) - f64::from(dark)).collect();
+        let pixels = values.len() as f64;
+        let mean_dn = values.iter().sum::<f64>() / pixels;
+        let middle = upper_median(&mut values)?;
+        values.iter_mut().for_each(|value| *value = (*value - middle).abs());
+        let scatter_dn = SIGMAS_PER_MEDIAN_DEVIATION * upper_median(&mut values)?;
+        Some(Self { mean_dn, error_dn: scatter_dn / pixels.sqrt(), white_dn })
     }
 
     /// The smallest mean difference that counts as light.
@@ -54,6 +54,12 @@ impl SeenLight {
     pub fn is_light(&self) -> bool {
         self.mean_dn > self.least_dn()
     }
+}
+
+/// The middle value, of two the larger one; `None` without any.
+fn upper_median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    (!values.is_empty()).then(|| *values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 impl fmt::Display for SeenLight {
@@ -103,12 +109,13 @@ mod tests {
     }
 
     #[test]
-    fn the_figures_are_the_means_and_the_standard_errors_of_the_differences() {
+    fn the_figures_are_the_mean_and_its_error_by_the_median_deviation() {
+        // Differences of 7, 9, 11 and 13; from the upper median 11 they deviate by 4, 2, 0 and 2.
         let lit = ndarray::arr2(&[[10.0, 12.0], [14.0, 16.0]]);
         let dark = Array2::from_elem((2, 2), 3.0);
         let seen = SeenLight::between(lit.view(), dark.view(), 100.0, 255.0).unwrap();
-        assert_eq!((seen.mean_dn, seen.error_dn), (10.0, 5.0_f64.sqrt() / 2.0));
-        assert_eq!(seen.least_dn(), 2.5 * 5.0_f64.sqrt());
+        assert_eq!((seen.mean_dn, seen.error_dn), (10.0, 1.4826));
+        assert_eq!(seen.least_dn(), 5.0 * 1.4826);
     }
 
     #[test]

@@ -73,6 +73,18 @@ impl Rig {
     /// Waits until the mirror is parked; checks that the light went off first and that there was no step on the way.
     /// Returns when that was.
     pub fn assert_parked(&self) -> Timing {
+        self.assert_parked_with_steps(LIMITS.max_step.0 / 6.5 * 2047.0)
+    }
+
+    /// The same after the end of a process that played [`batch()`]: if it died within a write, the place from which the
+    /// mirror is taken to its origin is known to half a write, or 32 samples.
+    pub fn assert_parked_after_kill(&self) -> Timing {
+        let half_a_write =
+            codes(&batch()).windows(33).map(|held| largest_step(&[held[0], held[32]])).fold(0.0, f64::max);
+        self.assert_parked_with_steps(half_a_write.max(LIMITS.max_step.0 / 6.5 * 2047.0))
+    }
+
+    fn assert_parked_with_steps(&self, most_codes: f64) -> Timing {
         let deadline = Instant::now() + Duration::from_secs(60);
         loop {
             let parked = self.pty.look(|truth| truth.parked_since_ns.zip(truth.dark_since_ns));
@@ -86,7 +98,7 @@ impl Rig {
         let truth = self.pty.truth();
         let step = largest_step(&truth.held);
         // Two codes: rounding at both ends.
-        let allowed = LIMITS.max_step.0 / 6.5 * 2047.0 + 2.0;
+        let allowed = most_codes + 2.0;
         assert!(step <= allowed, "a step of {step} codes, {allowed} are allowed");
         assert_eq!(truth.overfills, 0);
         Timing {

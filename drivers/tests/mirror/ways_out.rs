@@ -233,7 +233,7 @@ fn sigkill_then_park() {
         end(&mut child, Signal::SIGKILL);
         let parked = park(&rig.state()).unwrap();
         assert!(matches!(parked, Parked::From(_)), "{parked:?}");
-        rig.assert_parked().print("SIGKILL, then park", since_ns);
+        rig.assert_parked_after_kill().print("SIGKILL, then park", since_ns);
         assert_eq!(park(&rig.state()).unwrap(), Parked::Already);
         // The path was correct up to where it was stopped.
         let truth = rig.pty.truth();
@@ -262,7 +262,7 @@ fn sigkill_with_a_guardian() {
     rig.await_light(20_000);
     let since_ns = now_ns();
     end(&mut child, Signal::SIGKILL);
-    rig.assert_parked().print("SIGKILL, guardian", since_ns);
+    rig.assert_parked_after_kill().print("SIGKILL, guardian", since_ns);
     assert_eq!(park(&rig.state()).unwrap(), Parked::Already, "the guardian has noted it");
 }
 
@@ -273,7 +273,7 @@ fn sigterm_without_a_handler_with_a_guardian() {
     rig.await_light(20_000);
     let since_ns = now_ns();
     end(&mut child, Signal::SIGTERM);
-    rig.assert_parked().print("SIGTERM, guardian", since_ns);
+    rig.assert_parked_after_kill().print("SIGTERM, guardian", since_ns);
     assert_eq!(park(&rig.state()).unwrap(), Parked::Already, "the guardian has noted it");
 }
 
@@ -285,7 +285,7 @@ fn the_next_driver_parks_what_the_last_one_left() {
     let since_ns = now_ns();
     end(&mut child, Signal::SIGKILL);
     let mirror = rig.open();
-    rig.assert_parked().print("SIGKILL, next driver", since_ns);
+    rig.assert_parked_after_kill().print("SIGKILL, next driver", since_ns);
     drop(mirror);
 }
 
@@ -302,7 +302,7 @@ fn a_port_that_a_dying_process_releases_after_the_lock_is_waited_for() {
     });
     assert!(matches!(park(&rig.state()).unwrap(), Parked::From(_)));
     release.join().unwrap();
-    rig.assert_parked();
+    rig.assert_parked_after_kill();
 }
 
 #[test]

@@ -317,6 +317,8 @@ fn a_panic_of_the_run_s_thread_ends_the_run() {
 #[test]
 fn nothing_is_measured_with_the_wall_clock() {
     let labels = [
+        // When a remark on a session was made.
+        "daemon/src/cli/mod.rs",
         // The age of a calibration.
         "daemon/src/procedure/lab.rs",
         // When a session was created, and when a run began.

@@ -21,7 +21,7 @@ use std::time::Instant;
 use crate::packages;
 use crate::run::{Done, cargo, target};
 use kernel::GuestKernel;
-use qemu::Clock;
+use qemu::GuestClock;
 use table::{GuestTest, TESTS};
 
 /// Runs the given tests, or all.
@@ -42,7 +42,7 @@ pub fn guest(names: &[&str]) -> Done {
     initramfs::write(&run.join("initramfs"), &kernel, &initramfs::BOOT_MODULES, initramfs::INIT)?;
     println!("kernel guest: Linux {}, {} tests", kernel.release(), tests.len());
     let mut checks = 0;
-    for clock in [Clock::Instructions, Clock::Host] {
+    for clock in [GuestClock::Instructions, GuestClock::Host] {
         let tests: Vec<_> = tests.iter().copied().filter(|test| test.clock() == clock).collect();
         if tests.is_empty() {
             continue;

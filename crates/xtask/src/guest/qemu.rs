@@ -14,7 +14,7 @@ const KERNEL_ARGUMENTS: &str = "console=ttyS0 loglevel=4 panic=-1 clocksource=hp
 
 /// What the guest's time is counted in.
 #[derive(Clone, Copy, PartialEq)]
-pub enum Clock {
+pub enum GuestClock {
     /// Instructions, 2 ns each: time stops while a busy host does not run the guest. With the host's clock, USB stamps
     /// scattered by up to 440 us on a busy machine, with this one by 15 us. Excludes a second processor, at whose start
     /// the kernel hangs, and devices of QEMU, which work by the host's clock.
@@ -23,7 +23,7 @@ pub enum Clock {
     Host,
 }
 
-impl Clock {
+impl GuestClock {
     /// QEMU's arguments.
     pub fn arguments(self) -> &'static [&'static str] {
         match self {
@@ -38,7 +38,7 @@ pub struct Machine(Child);
 
 impl Machine {
     /// Boots the guest. It powers off once it has run the tests.
-    pub fn start(kernel: &GuestKernel, run: &Path, tests: &[&GuestTest], clock: Clock) -> Done<Self> {
+    pub fn start(kernel: &GuestKernel, run: &Path, tests: &[&GuestTest], clock: GuestClock) -> Done<Self> {
         let mut qemu = Self::command(kernel, run, KERNEL_ARGUMENTS)?;
         mount(&mut qemu, "usr", Path::new("/usr"), ",readonly=on");
         mount(&mut qemu, "modules", &kernel.modules, ",readonly=on");

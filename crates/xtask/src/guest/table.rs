@@ -1,6 +1,6 @@
 //! The tests that run in the guest.
 
-use super::qemu::Clock;
+use super::qemu::GuestClock;
 
 /// An integration test and its requirements on the guest.
 pub struct GuestTest {
@@ -20,8 +20,12 @@ pub struct GuestTest {
 
 impl GuestTest {
     /// The clock that suits the test's devices.
-    pub fn clock(&self) -> Clock {
-        if self.devices.is_empty() && self.pipes.is_empty() { Clock::Instructions } else { Clock::Host }
+    pub fn clock(&self) -> GuestClock {
+        if self.devices.is_empty() && self.pipes.is_empty() {
+            GuestClock::Instructions
+        } else {
+            GuestClock::Host
+        }
     }
 }
 

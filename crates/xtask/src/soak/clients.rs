@@ -12,6 +12,9 @@ const STATUS: &[u8] = b"{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"status\"}\n";
 const SUBSCRIBE: &[u8] = b"{\"jsonrpc\":\"2.0\",\"id\":1,\"method\":\"subscribe\"}\n";
 const ASK_EVERY: Duration = Duration::from_millis(50);
 
+/// An answer that takes longer counts as none.
+const PATIENCE: Duration = Duration::from_secs(10);
+
 /// Clients at work.
 pub struct Clients {
     over: Arc<AtomicBool>,
@@ -44,6 +47,7 @@ fn ask(socket: &Path, over: &AtomicBool) -> Vec<f64> {
     let mut latencies_ms = Vec::new();
     let Ok(mut stream) = UnixStream::connect(socket) else { return vec![f64::INFINITY] };
     let Ok(answers) = stream.try_clone() else { return vec![f64::INFINITY] };
+    let _ = answers.set_read_timeout(Some(PATIENCE));
     let mut answers = BufReader::new(answers);
     let mut answer = String::new();
     while !over.load(Ordering::Relaxed) {
@@ -64,10 +68,13 @@ fn misbehave(socket: &Path, over: &AtomicBool) {
     let deep = [b"[".repeat(100_000), b"\n".to_vec()].concat();
     let messages: [&[u8]; 7] =
         [b"", b"\n\n\0\xff\n", b"{\"jsonrpc\":\"2.0\",\"id\":", STATUS, SUBSCRIBE, &long, &deep];
-    // Nobody reads from these.
+    // One that never reads, and others that stay for a while.
+    let subscriber =
+        UnixStream::connect(socket).and_then(|mut stream| stream.write_all(SUBSCRIBE).map(|()| stream));
     let mut idle = Vec::new();
     for message in messages.iter().cycle() {
         if over.load(Ordering::Relaxed) {
+            drop(subscriber);
             return;
         }
         if let Ok(mut stream) = UnixStream::connect(socket) {

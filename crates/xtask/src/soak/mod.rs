@@ -1,9 +1,10 @@
 //! `cargo xtask soak`: the daemon on simulated rigs with faults, for as long as one likes. Rounds of all procedures run
-//! one after the other, beside clients that ask, misbehave and go away; each round also kills a daemon in mid-run and
-//! resumes the run. Judged is what may not grow or differ: memory, descriptors and threads at rest between rounds, the
-//! accounting of each session, and the bits of resumed runs.
+//! one after the other, beside clients that ask, misbehave and go away; each round also kills a daemon in the middle of a
+//! sweep and resumes it. Judged is what may not grow or differ: memory, descriptors and threads at rest between rounds,
+//! the accounting of each session, and the bits of resumed runs.
 
 mod clients;
+mod ledger;
 mod process;
 mod report;
 
@@ -13,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use self::clients::Clients;
 use self::process::AtRest;
-use self::report::Report;
+use self::report::SoakReport;
 use crate::daemon::Daemon;
 use crate::run::{Done, cargo, root, run, target};
 
@@ -22,9 +23,6 @@ const PLANE: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriv
     rows = 48\n[sim]\nscene = \"v-groove\"\nscene_rows = 48\nscene_columns = 32\nseed = 1\n\
     [sim.vsync]\nmissing = 0.02\nfalse_edges = 0.02\nunseen = 0.02\n\
     [sim.camera]\ndropped = 0.02\nlate_frames_max = 2\n";
-/// One without faults: what is lost and taken again has other noise, so only its runs have the same bits each time.
-const FLAWLESS: &str = "kind = \"plane\"\n[camera]\ndriver = \"sim\"\n[vsync]\ndriver = \"sim\"\n[projector]\ndriver = \"sim\"\n\
-    rows = 48\n[sim]\nscene = \"v-groove\"\nscene_rows = 48\nscene_columns = 32\nseed = 1\n";
 const DOTS: &str = "kind = \"dots\"\n[camera]\ndriver = \"sim\"\n[mirror]\ndriver = \"sim\"\n[sim.dots]\nscene = \"v-groove\"\nseed = 1\n\
     [sim.dots.camera]\ndropped = 0.0001\n";
 
@@ -39,6 +37,9 @@ const BATCHES: &str = "kind = \"batches\"\nname = \"batches\"\n[batches]\ncount 
 
 /// Rounds until memory, descriptors and threads have settled.
 const WARM_UP_ROUNDS: usize = 2;
+
+/// Longer than any run takes on a busy machine.
+const RUN_LIMIT: Duration = Duration::from_secs(600);
 
 /// What is wrong with a soak.
 type Findings = Vec<String>;
@@ -61,9 +62,10 @@ pub fn soak(minutes: f64) -> Done {
         (&dots, &response),
     ];
     let undisturbed = soak.undisturbed()?;
-    let mut report = Report::default();
+    let mut report = SoakReport::default();
     let end = Instant::now() + Duration::from_secs_f64(minutes * 60.0);
     let mut random = u64::from(std::process::id());
+    println!("seed of the kills: {random}");
     while report.rounds() <= WARM_UP_ROUNDS + 2 || Instant::now() < end {
         let clients = [Clients::start(&plane.daemon.socket()), Clients::start(&dots.daemon.socket())];
         for (rig, plan) in procedures {
@@ -73,14 +75,14 @@ pub fn soak(minutes: f64) -> Done {
         for clients in clients {
             report.asked(clients.stop());
         }
-        report.rested([&plane, &dots].map(|rig| AtRest::of(rig.daemon.id())));
+        report.rested([AtRest::of(plane.daemon.id())?, AtRest::of(dots.daemon.id())?]);
         println!("{}", report.last_round());
     }
+    let findings = report.findings(WARM_UP_ROUNDS);
+    let path = report.write(&soak.folder, &findings)?;
+    println!("{}\nreport: {}", report.table(&findings), path.display());
     plane.daemon.stop()?;
     dots.daemon.stop()?;
-    let path = report.write(&soak.folder)?;
-    println!("{}\nreport: {}", report.table(), path.display());
-    let findings = report.findings(WARM_UP_ROUNDS);
     if findings.is_empty() { Ok(()) } else { Err(findings.join("\n")) }
 }
 
@@ -116,31 +118,35 @@ impl Soak {
         client
     }
 
-    /// Checksums of a session; its folder is removed.
+    /// Checksums and accounting of a session; its folder is removed.
     fn verify(&self, session: &Path) -> Done<Findings> {
+        let mut findings = ledger::audit(session);
         let verified = Command::new(self.programs.join("raysweep")).arg("verify").arg(session).output();
         let verified = verified.map_err(|error| format!("cannot start raysweep: {error}"))?;
         let _ = std::fs::remove_dir_all(session);
         let said = String::from_utf8_lossy(&verified.stdout);
-        Ok(if verified.status.success() { vec![] } else { vec![format!("{}: {said}", session.display())] })
+        if !verified.status.success() {
+            findings.push(format!("{}: {said}", session.display()));
+        }
+        Ok(findings)
     }
 
-    /// The transport of the sweep on the flawless rig.
+    /// The transport of the sweep when nothing disturbs the daemon.
     fn undisturbed(&self) -> Done<Vec<u8>> {
-        let rig = Rig::start(self, "flawless", FLAWLESS)?;
+        let rig = Rig::start(self, "undisturbed", PLANE)?;
         let (session, _) = rig.session(self, SWEEP)?;
         let bits = std::fs::read(session.join("products/transport.npy"));
         rig.daemon.stop()?;
         bits.map_err(|error| format!("{}: {error}", session.display()))
     }
 
-    /// Kills the flawless rig's daemon in the middle of a sweep, again and again, and completes the sweep.
+    /// Kills a daemon on the plane rig in the middle of a sweep, again and again, and completes the sweep.
     fn killed(&self, undisturbed: &[u8], random: &mut u64) -> Done<Killed> {
         let plan = self.write("killed.toml", SWEEP)?;
         let mut session: Option<PathBuf> = None;
         let mut kills = 0;
         loop {
-            let rig = Rig::start(self, "killed", FLAWLESS)?;
+            let rig = Rig::start(self, "killed", PLANE)?;
             let mut client = match &session {
                 None => self.client(&rig.daemon, &["run", "--json"]).arg(&plan).quiet()?,
                 Some(session) => self.client(&rig.daemon, &["resume", "--json"]).arg(session).quiet()?,
@@ -151,6 +157,9 @@ impl Soak {
                 let ended = client.try_wait().map_err(|error| format!("raysweep: {error}"))?;
                 if ended.is_some() || kills < 3 && began.elapsed() > after {
                     break ended;
+                }
+                if began.elapsed() > RUN_LIMIT {
+                    return Err(format!("a killed run did not end within {RUN_LIMIT:?}"));
                 }
                 std::thread::sleep(Duration::from_millis(5));
             };
@@ -202,10 +211,20 @@ impl Rig {
     /// Runs a plan to its end; returns the session and the last event.
     fn session(&self, soak: &Soak, plan: &str) -> Done<(PathBuf, String)> {
         let plan = soak.write("plan.toml", plan)?;
-        let ran = soak.client(&self.daemon, &["run", "--json"]).arg(&plan).output();
-        let said =
-            String::from_utf8_lossy(&ran.map_err(|error| format!("cannot start raysweep: {error}"))?.stdout)
-                .into_owned();
+        let output = soak.folder.join("output");
+        let file =
+            std::fs::File::create(&output).map_err(|error| format!("{}: {error}", output.display()))?;
+        let mut client = soak.client(&self.daemon, &["run", "--json"]);
+        let client = client.arg(&plan).stdout(file).spawn();
+        let mut client = client.map_err(|error| format!("cannot start raysweep: {error}"))?;
+        let began = Instant::now();
+        while let Ok(None) = client.try_wait() {
+            if began.elapsed() > RUN_LIMIT {
+                return Err(format!("a run did not end within {RUN_LIMIT:?}"));
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let said = read(&output)?;
         let last = said.lines().find(|line| line.contains("\"event\":\"finished\"")).unwrap_or_default();
         let session = newest(&self.data)?.ok_or_else(|| format!("no session: {said}"))?;
         Ok((session, last.to_owned()))
@@ -218,7 +237,6 @@ impl Rig {
         let kind =
             plan.lines().find_map(|line| line.strip_prefix("kind = ")).unwrap_or_default().replace('"', "");
         let mut findings = Findings::new();
-        // Frames that were taken must be stored, or lost for a reason; points must be there, all of them.
         if !last.contains("\"state\":\"complete\"") || !last.contains("\"missing\":0") {
             findings.push(format!("{kind}: {last}"));
         }

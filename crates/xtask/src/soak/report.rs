@@ -12,7 +12,7 @@ const MOST_GROWTH_MIB: f64 = 16.0;
 
 /// What has happened so far.
 #[derive(Default)]
-pub struct Report {
+pub struct SoakReport {
     runs: Vec<Ran>,
     kills: usize,
     killed_runs: usize,
@@ -22,7 +22,7 @@ pub struct Report {
     rests: Vec<[AtRest; 2]>,
 }
 
-impl Report {
+impl SoakReport {
     /// A run has ended.
     pub fn ran(&mut self, mut ran: Ran) {
         self.findings.append(&mut ran.findings);
@@ -71,20 +71,24 @@ impl Report {
         let mut findings = self.findings.clone();
         for (daemon, name) in ["plane", "dots"].into_iter().enumerate() {
             let rests: Vec<AtRest> = self.rests.iter().skip(warm_up).map(|rests| rests[daemon]).collect();
-            let (Some(first), Some(last)) = (rests.first(), rests.last()) else { continue };
-            let grown_mib = slope(&rests.iter().map(|rest| rest.resident_mib).collect::<Vec<_>>())
-                * (rests.len() - 1) as f64;
-            if grown_mib > MOST_GROWTH_MIB {
+            let memory_mib: Vec<f64> = rests.iter().map(|rest| rest.resident_mib).collect();
+            let grown_mib = slope(&memory_mib) * rests.len().saturating_sub(1) as f64;
+            if rests.len() > 1 && grown_mib > MOST_GROWTH_MIB {
                 findings.push(format!(
                     "{name}: memory at rest has grown by {grown_mib:.0} MiB; {MOST_GROWTH_MIB} are allowed"
                 ));
             }
+            // Growth is what the later rounds have in common.
+            let (early, late) = rests.split_at(rests.len() / 2);
+            let most = |of: fn(&AtRest) -> usize| early.iter().map(of).max().unwrap_or(usize::MAX);
+            let least = |of: fn(&AtRest) -> usize| late.iter().map(of).min().unwrap_or(0);
             for (what, before, after) in [
-                ("descriptors", first.descriptors, last.descriptors),
-                ("threads", first.threads, last.threads),
+                ("descriptors", most(|rest| rest.descriptors), least(|rest| rest.descriptors)),
+                ("threads", most(|rest| rest.threads), least(|rest| rest.threads)),
             ] {
                 if after > before {
-                    findings.push(format!("{name}: {after} {what} at rest, {before} after the warm-up"));
+                    findings
+                        .push(format!("{name}: at least {after} {what} at rest, at most {before} before"));
                 }
             }
         }
@@ -96,7 +100,7 @@ impl Report {
     }
 
     /// Counts and latencies.
-    pub fn table(&self) -> String {
+    pub fn table(&self, findings: &Findings) -> String {
         let mut table = String::new();
         let mut kinds: Vec<&str> = self.runs.iter().map(|ran| ran.kind.as_str()).collect();
         kinds.sort_unstable();
@@ -135,17 +139,17 @@ impl Report {
                 );
             }
         }
-        let _ = write!(table, "{:<12} {:>5}", "findings", self.findings.len());
+        let _ = write!(table, "{:<12} {:>5}", "findings", findings.len());
         table
     }
 
     /// Writes the page; returns its path.
-    pub fn write(&self, folder: &Path) -> Done<PathBuf> {
+    pub fn write(&self, folder: &Path, findings: &Findings) -> Done<PathBuf> {
         let path = folder.join("report.html");
         let mut page = String::from(
             "<!doctype html><meta charset=utf-8><title>Soak</title><style>body{font:16px sans-serif;max-width:50em;margin:2em auto}svg{width:100%}</style><h1>Soak</h1>\n",
         );
-        let _ = writeln!(page, "<pre>{}</pre>", escaped(&self.table()));
+        let _ = writeln!(page, "<pre>{}</pre>", escaped(&self.table(findings)));
         for (daemon, name) in ["plane", "dots"].into_iter().enumerate() {
             let at_rest = |value: fn(&AtRest) -> f64| {
                 self.rests.iter().map(|rests| value(&rests[daemon])).collect::<Vec<_>>()
@@ -153,6 +157,10 @@ impl Report {
             page += &plot(
                 &format!("{name} rig: memory at rest after each round, MiB"),
                 &at_rest(|rest| rest.resident_mib),
+            );
+            page += &plot(
+                &format!("{name} rig: threads at rest after each round"),
+                &at_rest(|rest| rest.threads as f64),
             );
             page += &plot(
                 &format!("{name} rig: descriptors at rest after each round"),
@@ -164,7 +172,7 @@ impl Report {
         let percentiles: Vec<f64> =
             (0..=99).map(|percent| quantile(&sorted, f64::from(percent) / 100.0)).collect();
         page += &plot("answers to status: latency in ms against the percentile, 0 to 99", &percentiles);
-        for finding in &self.findings {
+        for finding in findings {
             let _ = writeln!(page, "<p>{}</p>", escaped(finding));
         }
         std::fs::write(&path, page).map_err(|error| format!("{}: {error}", path.display()))?;
@@ -235,7 +243,7 @@ mod tests {
     #[test]
     fn what_grows_is_found() {
         let rest = |mib: f64, descriptors| AtRest { resident_mib: mib, descriptors, threads: 9 };
-        let mut report = Report::default();
+        let mut report = SoakReport::default();
         for round in 0..6 {
             report.rested([rest(50.0, 20), rest(50.0 + 10.0 * f64::from(round), 20 + round as usize)]);
         }

@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use self::writes::ReplayRandom;
 use super::initramfs;
 use super::kernel::GuestKernel;
-use super::qemu::{Clock, Machine};
+use super::qemu::{GuestClock, Machine};
 use super::report;
 use crate::daemon::Daemon;
 use crate::packages;
@@ -254,7 +254,7 @@ impl Guest {
              systemd.run_success_action=poweroff-force systemd.run_failure_action=poweroff-force{masks}"
         );
         let mut qemu = Machine::command(&self.kernel, &self.run, &arguments)?;
-        qemu.args(Clock::Host.arguments());
+        qemu.args(GuestClock::Host.arguments());
         match log {
             None => qemu.args(["-drive", "if=none,id=d0,format=raw,cache=unsafe,file=disk"]),
             Some(_) => qemu.args([
