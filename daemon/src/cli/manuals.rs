@@ -8,7 +8,7 @@ use clap::CommandFactory;
 use clap_complete::Shell;
 use clap_mangen::Man;
 
-use super::Arguments;
+use super::arguments::Arguments;
 use crate::arguments::{DaemonArguments, SimCameraArguments};
 
 /// Writes `man/*.1`, `man/raysweepd.8` and `completions/SHELL/*` below a folder.

@@ -270,17 +270,17 @@ fn a_camera_that_refuses_settings_ends_the_run() {
 
 #[test]
 fn a_camera_whose_clock_is_frozen_stores_nothing_more() {
-    faults_and_resumes(Fault::CameraClockIsFrozen, MIDWAY, "");
+    faults_and_resumes(Fault::CameraClockIsFrozen, MIDWAY, "its clock stands still");
 }
 
 #[test]
 fn a_camera_whose_clock_jumps_stores_nothing_more() {
-    faults_and_resumes(Fault::CameraClockJumps, MIDWAY, "");
+    faults_and_resumes(Fault::CameraClockJumps, MIDWAY, "lost (edge missing)");
 }
 
 #[test]
 fn a_camera_that_says_wrong_exposures_stores_nothing_more() {
-    faults_and_resumes(Fault::CameraSaysWrongExposures, MIDWAY, "");
+    faults_and_resumes(Fault::CameraSaysWrongExposures, MIDWAY, "lost (settings mismatch)");
 }
 
 #[test]
@@ -290,7 +290,7 @@ fn a_watcher_that_is_gone_ends_the_run() {
 
 #[test]
 fn a_watcher_whose_clock_is_frozen_stores_nothing_more() {
-    faults_and_resumes(Fault::WatcherClockIsFrozen, MIDWAY, "");
+    faults_and_resumes(Fault::WatcherClockIsFrozen, MIDWAY, "lost (edge missing)");
 }
 
 #[test]
